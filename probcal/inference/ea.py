@@ -1,0 +1,100 @@
+"""Evidence approximation and MAP: the joint Laplace evidence with every trajectory marginalised."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from probcal.inference.run import CHUNK, Outcome, Progress, finish, first_precisions, run_chunks
+from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Prior
+from probcal.problem import Problem, Spec, System
+from probcal.smoothing.information import laplace, update_levels
+from probcal.smoothing.mode import Point, find_mode
+
+MODE_STEPS = 30  # Gauss-Newton steps between two updates of the precisions
+
+
+class _State(NamedTuple):
+    point: Point
+    alpha: jax.Array  # precisions at which the point is the mode, once done
+    evidence: jax.Array
+    gamma: jax.Array
+    done: jax.Array
+    settled: jax.Array  # the last search for the mode converged
+
+
+@partial(jax.jit, static_argnames=("spec", "prior"))
+def _chunk(
+    spec: Spec, prior: Prior, system: System, state: _State, surveyed: jax.Array, tolerance: float
+) -> tuple[_State, tuple[jax.Array, jax.Array]]:
+    """A few outer iterations: mode, evidence at that mode, then new precisions and levels; stops when done."""
+
+    def iterate(state: _State) -> _State:
+        mode = find_mode(spec, system, state.point, state.alpha, MODE_STEPS, 1e-2 * tolerance)
+        found = laplace(spec, system, mode.point, state.alpha)
+        gain = jnp.abs(found.evidence - state.evidence)
+        learning = isinstance(prior, ARD) or mode.point.levels.shape[0] > 0
+        done = (gain < tolerance) & mode.converged if learning else mode.converged | (found.evidence == state.evidence)
+        point, alpha = mode.point, state.alpha
+        if isinstance(prior, ARD):
+            learnt = jnp.clip(prior.mackay(found.gamma, point.z), *PRECISION_BOUNDS)
+            alpha = jnp.where(done | surveyed, alpha, learnt)
+        if point.levels.shape[0]:
+            moved = update_levels(spec, system, point, found.covariance)
+            point = jax.tree.map(lambda new, old: jnp.where(done, old, new), moved, point)
+        return _State(point, alpha, found.evidence, found.gamma, done, mode.converged)
+
+    def body(state: _State, _):
+        after = jax.lax.cond(state.done, lambda s: s, iterate, state)
+        return after, (after.evidence, state.done)
+
+    return jax.lax.scan(body, state, length=CHUNK)
+
+
+def _maximise(
+    method: "EA | MAP", problem: Problem, prior: Prior, start: Point, progress: Progress | None
+) -> Outcome:
+    alpha = first_precisions(problem, prior)
+    blank = jnp.zeros_like(alpha)
+    state = _State(start, alpha, jnp.asarray(-jnp.inf), blank, jnp.asarray(False), jnp.asarray(False))
+    surveyed = jnp.asarray(problem.surveyed)
+
+    def step(state: _State):
+        return _chunk(problem.spec, prior, problem.system, state, surveyed, method.tolerance)
+
+    state, trace = run_chunks(step, state, method.iterations, method.name, progress)
+    return finish(problem, prior, state.point, state.alpha, bool(state.done & state.settled), trace)
+
+
+@dataclass(frozen=True)
+class EA:
+    """Evidence approximation (MacKay updates of Paper B 25, trajectories marginalised exactly): the default.
+
+    `tolerance` is the change of log evidence, in nats, at which it stops; `iterations` caps the outer loop.
+    """
+
+    iterations: int = 200
+    tolerance: float = 1e-3
+
+    name: ClassVar[str] = "EA"
+    priors: ClassVar[tuple[type, ...]] = (ARD,)
+    intervals: ClassVar[str] = (
+        "plug-in: the precisions (and unknown levels) are taken as known, so the intervals are too narrow"
+    )
+    maximise: ClassVar[Callable[..., Outcome]] = _maximise
+
+
+@dataclass(frozen=True)
+class MAP:
+    """Joint mode of trajectories and biases under a given prior (maximum likelihood with `Flat`), with its Laplace covariance."""
+
+    iterations: int = 100
+    tolerance: float = 1e-6
+
+    name: ClassVar[str] = "MAP"
+    priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat)
+    intervals: ClassVar[str] = "Laplace: exact for the given prior where the problem is linear and Gaussian"
+    maximise: ClassVar[Callable[..., Outcome]] = _maximise

@@ -1,0 +1,147 @@
+"""The one verb: `fit(problem, method)` turns a problem into a DataTree, whatever the method."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from probcal import tree
+from probcal.inference.ea import EA, MAP
+from probcal.inference.em import EM, EMEA
+from probcal.inference.run import Outcome, Progress
+from probcal.priors import PRIORS, Flat, Prior
+from probcal.problem import Problem
+from probcal.simulate import Key, as_key
+from probcal.smoothing.draws import draw, predictive, residuals
+from probcal.smoothing.information import moments
+from probcal.smoothing.mode import Point
+from probcal.smoothing.start import automatic_start, track_mode
+from probcal.types import FitError, InputError, float64
+
+Method = EA | EMEA | EM | MAP
+CHAINS, DRAWS = 4, 250
+# names on the command line: method, and the prior it means where that is not the method's first
+METHODS: dict[str, tuple[type[Method], Prior | None]] = {
+    "ea": (EA, None),
+    "em-ea": (EMEA, None),
+    "em": (EM, None),
+    "map": (MAP, None),
+    "ml": (MAP, Flat()),
+}
+
+
+def choose_prior(method: Method, prior: Prior | None) -> Prior:
+    """The prior of a fit: the given one if the method takes it, else the method's first."""
+    if prior is None:
+        return method.priors[0]()
+    if not isinstance(prior, method.priors):
+        allowed = ", ".join(name for name, kind in PRIORS.items() if kind in method.priors)
+        raise InputError(f"{method.name} does not take the prior {type(prior).__name__}; it takes: {allowed}")
+    return prior
+
+
+@float64
+def fit(
+    problem: Problem,
+    method: Method | None = None,
+    *,
+    prior: Prior | None = None,
+    key: Key = 0,
+    start: Point | None = None,
+    progress: Progress | None = None,
+    predictive_draws: bool | None = None,
+) -> xr.DataTree:
+    """Calibrate: estimate the biases of a problem and the tracks of its targets.
+
+    `method` is a value (`EA()` by default); `prior` defaults to the method's own; `key` is a seed or jax key
+    of the draws; `start` replaces the automatic start. `predictive_draws` forces or forbids the groups of
+    draws by datum and of trajectories, by default written up to 2e7 values each. The attributes `status` and
+    `message` say what the fit is worth. Raises `InputError` for a prior that the method does not take and
+    `FitError` where a flat prior leaves a singular problem without any interval.
+    """
+    method = EA() if method is None else method
+    if not isinstance(method, Method):
+        raise InputError(f"method must be a value such as EA() or MAP(), got {method!r}")
+    prior = choose_prior(method, prior)
+    if not problem.labels:
+        raise InputError("the problem has no free bias; declare a Bias, a survey or a scale, or use track()")
+    start = automatic_start(problem) if start is None else start
+    outcome = method.maximise(problem, prior, start, progress)
+    seed = int(key) if isinstance(key, (int, np.integer)) else -1
+    return tree.build(problem, _result(problem, method, prior, outcome, as_key(key), seed, predictive_draws))
+
+
+def _result(
+    problem: Problem, method: Method, prior: Prior, outcome: Outcome, key: jax.Array, seed: int, wanted: bool | None
+) -> tree.Result:
+    spec, system, point = problem.spec, problem.system, outcome.point
+    found = outcome.laplace
+    if not bool(jnp.isfinite(found.covariance).all()):  # a flat prior on a singular problem: no interval exists
+        raise FitError(outcome.message)
+    keys = jax.random.split(key, 2)
+    z, states = draw(spec, system, point, found.covariance, keys[0], CHAINS * DRAWS)
+    data = sum(int(np.asarray(r.mask).size) for r in system.rows) * CHAINS * DRAWS
+    size = sum(s.size for s in states)
+    by_datum = data <= tree.LARGEST if wanted is None else wanted
+    log_likelihood, replicas = (None, None)
+    if by_datum:
+        log_likelihood, replicas = predictive(spec, system, point.levels, z, states, keys[1])
+    before = track_mode(problem, _uncalibrated(point))
+    shape = (CHAINS, DRAWS)
+
+    def split(a: jax.Array) -> np.ndarray:
+        return np.asarray(a).reshape(*shape, *a.shape[1:])
+
+    spread = moments(spec, system, point, found.covariance)
+    old, new = residuals(spec, system, before), residuals(spec, system, point)
+    return tree.Result(
+        method=method.name, prior=type(prior).__name__, seed=seed, approximate="Laplace",
+        intervals=method.intervals, status=outcome.status, message=outcome.message, z=np.asarray(point.z),
+        covariance=np.asarray(found.covariance), precision=np.asarray(outcome.alpha), gamma=np.asarray(found.gamma),
+        bias_status=outcome.bias_status, information=np.asarray(found.information),
+        evidence=None if isinstance(prior, Flat) else float(found.evidence), objective=outcome.trace,
+        levels=np.asarray(point.levels), directions=outcome.weak, draws=split(z),
+        states=[split(s) for s in states] if (size <= tree.LARGEST if wanted is None else wanted) else None,
+        log_likelihood=[split(a) for a in log_likelihood] if log_likelihood is not None else None,
+        replicas=[split(a) for a in replicas] if replicas is not None else None,
+        tracks=_tracks(point, before, spread, found.covariance),
+        residuals=([np.asarray(r) for r, _ in old], [np.asarray(r) for r, _ in new], [np.asarray(s) for _, s in new]),
+    )  # fmt: skip
+
+
+def _uncalibrated(point: Point) -> Point:
+    return point._replace(z=jnp.zeros_like(point.z))
+
+
+def _tracks(point: Point, before: Point, spread: list[Any], covariance: jax.Array) -> list[tree.Tracks]:
+    found = []
+    for states, old, moment in zip(point.states, before.states, spread, strict=True):
+        variance = jnp.diagonal(moment.states, axis1=1, axis2=2)
+        variance = variance + jnp.einsum("eni,ij,enj->en", moment.response, covariance, moment.response)
+        found.append(tree.Tracks(np.asarray(states), np.sqrt(np.maximum(np.asarray(variance), 0.0)), np.asarray(old)))
+    return found
+
+
+@float64
+def track(problem: Problem, calibration: xr.DataTree) -> xr.DataTree:
+    """Tracks of other data with a calibration applied: a tree with group `track` (mean, sd, before).
+
+    The biases are held at the calibrated means; the sd carries their covariance. Biases are matched by label;
+    raises `InputError` if the calibration lacks one.
+    """
+    group = calibration["calibration"].to_dataset()
+    known = [str(label) for label in group["label"].values]
+    for label in problem.labels:
+        if label not in known:
+            raise InputError(f'the calibration has no bias "{label}"; fit the same network, or fix that bias')
+    chosen = group.sel(label=list(problem.labels))
+    z = jnp.asarray(chosen["mean"].values / problem.scales)
+    covariance = group["covariance"].sel(label=list(problem.labels), label_other=list(problem.labels)).values
+    covariance = jnp.asarray(covariance / np.outer(problem.scales, problem.scales))
+    start = automatic_start(problem)
+    before = track_mode(problem, _uncalibrated(start))
+    after = track_mode(problem, start._replace(z=z))
+    spread = moments(problem.spec, problem.system, after, covariance)
+    return tree.build_tracks(problem, _tracks(after, before, spread, covariance))

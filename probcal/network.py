@@ -1,0 +1,207 @@
+"""Nodes and placed sensors, and the table of biases that follows from them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from probcal.sensor import Bias, Sensor, SensorType
+from probcal.types import AXES, InputError, nearest
+
+POSE_UNITS = {"position": "m", "heading": "rad", "pitch": "rad", "roll": "rad", "clock": "m"}
+Spread = float | Bias
+
+
+@dataclass(frozen=True)
+class Path:
+    """Known path of a moving node: times (T,) in s, positions (T, d) in m, headings (T,) in rad (interpolated)."""
+
+    time: Any
+    position: Any
+    heading: Any = None
+
+    def __post_init__(self):
+        time = np.asarray(self.time, float)
+        position = np.asarray(self.position, float)
+        heading = np.zeros(len(time)) if self.heading is None else np.unwrap(np.asarray(self.heading, float))
+        if time.ndim != 1 or position.shape[:1] != time.shape or position.ndim != 2 or heading.shape != time.shape:
+            raise InputError("Path: time has shape (T,), position (T, 2 or 3), heading (T,)")
+        if not (np.isfinite(time).all() and np.isfinite(position).all() and np.isfinite(heading).all()):
+            raise InputError("Path: time, position and heading must be finite; drop the gaps")
+        if not (np.diff(time) > 0).all():
+            raise InputError("Path: time must increase")
+        for name, value in (("time", time), ("position", position), ("heading", heading)):
+            object.__setattr__(self, name, value)
+
+    def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (N, d) and headings (N,) at times (N,)."""
+        columns = [np.interp(time, self.time, column) for column in self.position.T]
+        return np.stack(columns, -1), np.interp(time, self.time, self.heading)
+
+
+class Node:
+    """A mast, a box in the grass, a robot: a stated pose and further components (`clock`, ...), some biased.
+
+    position (d,) in m, heading (pitch, roll) in rad, or a known `path`; extras such as `clock=0.0` are numbers.
+    `survey` and `scale` give standard deviations by component (a bare number means the position; a `Bias`
+    carries another unit): `survey` is how well the stated value is known, `scale` is governed by the prior
+    chosen at the fit, neither means known. Raises `InputError` naming node and component.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        position: Sequence[float] | np.ndarray | None = None,
+        heading: float = 0.0,
+        *,
+        survey: Spread | Mapping[str, Spread] | None = None,
+        scale: Spread | Mapping[str, Spread] | None = None,
+        path: Path | None = None,
+        **components: float,
+    ):
+        self.name = str(name)
+        self.path = path
+        if (position is None) == (path is None):
+            raise InputError(f'node "{name}": give either position or path')
+        stated = path.position[0] if path is not None else np.asarray(position, float)
+        if stated.shape not in ((2,), (3,)) or not np.isfinite(stated).all():
+            raise InputError(f'node "{name}": position must be 2 or 3 finite numbers, got {position!r}')
+        self.position = stated
+        self.components = {"heading": heading, "pitch": 0.0, "roll": 0.0, "clock": 0.0} | components
+        for component, value in self.components.items():
+            if not np.isfinite(value):
+                raise InputError(f'node "{name}": {component} must be a finite number, got {value!r}')
+        self.spread: dict[str, tuple[str, Bias]] = {}
+        for kind, given in (("survey", survey), ("scale", scale)):
+            entries = given if isinstance(given, Mapping) else {} if given is None else {"position": given}
+            for component, value in entries.items():
+                self._add(kind, component, value)
+
+    def _add(self, kind: str, component: str, value: Spread) -> None:
+        known = ["position", *self.components]
+        if component not in known:
+            raise InputError(f'node "{self.name}": {kind} names "{component}"{nearest(component, known)}')
+        if component in ("pitch", "roll") and self.dimension == 2:
+            raise InputError(f'node "{self.name}": {component} has no meaning in 2-D')
+        if component in self.spread:
+            raise InputError(f'node "{self.name}": {component} has both survey and scale; give one')
+        if not isinstance(value, Bias):
+            number = float(value)
+            if not (np.isfinite(number) and number > 0):
+                raise InputError(
+                    f'node "{self.name}": {kind} of {component} is {number:g}: it must be positive;'
+                    f" leave it out where the stated value is known"
+                )
+            value = Bias(POSE_UNITS.get(component, "1"), number)
+        self.spread[component] = (kind, value)
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates."""
+        return len(self.position)
+
+
+@dataclass(frozen=True)
+class BiasRecord:
+    """One bias of the network: label, unit, scale, whether `survey` or `scale` governs it, and where it lives."""
+
+    label: str
+    unit: str
+    scale: float
+    nominal: float
+    kind: str
+    owner: str
+    component: str
+    axis: int = 0
+
+
+class Network:
+    """Placed sensors with their nodes; the biases follow, in the order of nodes, then sensors.
+
+    Raises `InputError` for names used twice, mixed dimensions, or a biased component that no sensor reads.
+    """
+
+    def __init__(self, sensors: Sequence[Sensor]):
+        self.sensors = tuple(sensors)
+        if not self.sensors:
+            raise InputError("the network has no sensor; place some with sensor_type.on(node)")
+        for placed in self.sensors:
+            if not isinstance(placed, Sensor):
+                raise InputError(f"the network holds {placed!r}; place a sensor with sensor_type.on(node)")
+        self.nodes = self._collect_nodes()
+        self.types: tuple[SensorType, ...] = tuple({id(s.type): s.type for s in self.sensors}.values())
+        self._check_names()
+        self.dimension = self.nodes[0].dimension
+        for node in self.nodes:
+            if node.dimension != self.dimension:
+                raise InputError(
+                    f'node "{node.name}" is {node.dimension}-D, node "{self.nodes[0].name}" {self.dimension}-D'
+                )
+        self.biases = tuple(self._node_biases() + self._sensor_biases())
+        self._check_labels()
+
+    def _check_labels(self) -> None:
+        labels = [bias.label for bias in self.biases]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise InputError(f'two biases are called "{label}"; give node, sensor and bias names that differ')
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of all biases."""
+        return tuple(bias.label for bias in self.biases)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Scalar channels of all sensor types, each once."""
+        return tuple(dict.fromkeys(name for t in self.types for name, _ in t.expand(self.dimension)))
+
+    def _collect_nodes(self) -> tuple[Node, ...]:
+        nodes: dict[str, Node] = {}
+        for placed in self.sensors:
+            for node in placed.nodes:
+                if not isinstance(node, Node):
+                    raise InputError(f'sensor "{placed.name}" is placed on {node!r}; place it on a Node')
+                if nodes.setdefault(node.name, node) is not node:
+                    raise InputError(f'two nodes are called "{node.name}"')
+        return tuple(nodes.values())
+
+    def _check_names(self) -> None:
+        seen: dict[str, str] = {}
+        for placed in self.sensors:
+            if placed.name in seen:
+                raise InputError(f'two sensors are called "{placed.name}"; place one with .on(node, name="...")')
+            seen[placed.name] = "sensor"
+        for node in self.nodes:
+            users = [placed for placed in self.sensors if placed.name == node.name]
+            if users and node not in users[0].nodes:
+                raise InputError(f'"{node.name}" is the name of a node and of a sensor elsewhere; rename one')
+        for kind in self.types:
+            if kind.name in seen or kind.name in {node.name for node in self.nodes}:
+                raise InputError(f'"{kind.name}" is the name of a sensor type; rename the node or sensor')
+
+    def _node_biases(self) -> list[BiasRecord]:
+        records = []
+        for node in self.nodes:
+            read = {c for s in self.sensors if node in s.nodes for c in s.type.pose_components}
+            for component, (kind, bias) in node.spread.items():
+                if component not in read:
+                    raise InputError(f'node "{node.name}": {component} has a {kind}, but none of its sensors reads it')
+                for axis in range(self.dimension if component == "position" else 1):
+                    suffix = f"_{AXES[axis]}" if component == "position" else ""
+                    label = f"{node.name}.{component}{suffix}"
+                    records.append(BiasRecord(label, bias.unit, bias.scale, 0.0, kind, node.name, component, axis))
+        return records
+
+    def _sensor_biases(self) -> list[BiasRecord]:
+        records: dict[str, BiasRecord] = {}
+        for placed in self.sensors:
+            for name, bias in placed.type.biases.items():
+                owner = placed.type.name if bias.shared else placed.name
+                label = f"{owner}.{name}"
+                record = BiasRecord(label, bias.unit, bias.scale, bias.nominal, "scale", owner, name)
+                if label in records and not bias.shared:
+                    raise InputError(f'two biases are called "{label}"')
+                records[label] = record
+        return list(records.values())

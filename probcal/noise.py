@@ -1,0 +1,179 @@
+"""Noise families: each maps a measured and a predicted value to innovation, likelihood, score and information.
+
+Steps of an algorithm use the positive step weight; covariance, gamma and evidence use the expected
+information (for a Student-t the two differ).
+To add a family, write a frozen dataclass with the methods of `Gaussian`.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import gammaln
+
+from probcal.geometry import wrap
+from probcal.types import InputError
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A noise level that is estimated along: a guess, known to within a factor (one standard deviation)."""
+
+    guess: float
+    factor: float = 3.0
+
+    def __post_init__(self):
+        if not (np.isfinite(self.guess) and self.guess > 0):
+            raise InputError(f"Unknown(guess={self.guess}): the guess must be positive")
+        if not (np.isfinite(self.factor) and self.factor > 1):
+            raise InputError(f"Unknown(factor={self.factor}): the factor must be greater than 1")
+
+
+Level = float | Unknown
+
+
+def guess_of(level: Level) -> float:
+    """Number to start from: the level itself, or the guess of an `Unknown`."""
+    return float(level.guess if isinstance(level, Unknown) else level)
+
+
+def check_level(level: Level, what: str, *, zero: bool = False) -> None:
+    """Raise `InputError` unless the level is a positive (or, where allowed, zero) finite number."""
+    if isinstance(level, Unknown):
+        return
+    try:
+        value = float(level)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is {level!r}: give a number or Unknown(guess, factor)") from None
+    if not np.isfinite(value) or value < 0 or (value == 0 and not zero):
+        raise InputError(f"{what} is {value:g}: it must be positive")
+
+
+class Family(Protocol):
+    """What a noise family answers; `y`, `predicted`, `std` are arrays of one shape, `period` a number or None."""
+
+    def innovation(self, y, predicted, period: float | None): ...
+    def log_likelihood(self, y, predicted, std, period: float | None): ...
+    def score(self, y, predicted, std, period: float | None): ...
+    def weight(self, y, predicted, std, period: float | None): ...
+    def information(self, predicted, std): ...
+    def level_score(self, y, predicted, std, period: float | None): ...
+    def sample(self, key, predicted, std): ...
+    def check(self, y: np.ndarray) -> np.ndarray: ...
+
+
+class _Location:
+    """Noise added to the predicted value; a wrapped channel compares angles around the circle."""
+
+    def innovation(self, y, predicted, period):
+        return y - predicted if period is None else wrap(y - predicted, period)
+
+    def check(self, y):
+        return np.ones(y.shape, bool)
+
+
+@dataclass(frozen=True)
+class Gaussian(_Location):
+    """Additive Gaussian noise of standard deviation `std`."""
+
+    def log_likelihood(self, y, predicted, std, period):
+        """Log density of each datum."""
+        r = self.innovation(y, predicted, period) / std
+        return -0.5 * r**2 - jnp.log(std) - 0.5 * np.log(2 * np.pi)
+
+    def score(self, y, predicted, std, period):
+        """Derivative of the log density by the predicted value."""
+        return self.innovation(y, predicted, period) / std**2
+
+    def weight(self, y, predicted, std, period):
+        """Positive curvature used by a step."""
+        return 1.0 / std**2
+
+    def information(self, predicted, std):
+        """Expected information about the predicted value."""
+        return jnp.ones_like(predicted) / std**2
+
+    def level_score(self, y, predicted, std, period):
+        """One plus the derivative of the log density by log std (the mean square of a whitened residual)."""
+        return (self.innovation(y, predicted, period) / std) ** 2
+
+    def sample(self, key, predicted, std):
+        """Draw measured values around the predicted ones."""
+        return predicted + std * jax.random.normal(key, predicted.shape, predicted.dtype)
+
+
+@dataclass(frozen=True)
+class StudentT(_Location):
+    """Additive Student-t noise with scale `std` and `df` degrees of freedom, for channels with outliers."""
+
+    df: float = 4.0
+
+    def __post_init__(self):
+        if not (np.isfinite(self.df) and self.df > 0):
+            raise InputError(f"StudentT(df={self.df}): the degrees of freedom must be positive")
+
+    def log_likelihood(self, y, predicted, std, period):
+        """Log density of each datum."""
+        r2 = (self.innovation(y, predicted, period) / std) ** 2
+        constant = gammaln((self.df + 1) / 2) - gammaln(self.df / 2) - 0.5 * np.log(self.df * np.pi)
+        return constant - jnp.log(std) - 0.5 * (self.df + 1) * jnp.log1p(r2 / self.df)
+
+    def score(self, y, predicted, std, period):
+        """Derivative of the log density by the predicted value."""
+        return self.weight(y, predicted, std, period) * self.innovation(y, predicted, period)
+
+    def weight(self, y, predicted, std, period):
+        """Positive curvature used by a step: an outlying datum counts less."""
+        return (self.df + 1) / (self.df * std**2 + self.innovation(y, predicted, period) ** 2)
+
+    def information(self, predicted, std):
+        """Expected information about the predicted value."""
+        return (self.df + 1) / (self.df + 3) * jnp.ones_like(predicted) / std**2
+
+    def level_score(self, y, predicted, std, period):
+        """One plus the derivative of the log density by log std."""
+        r2 = self.innovation(y, predicted, period) ** 2
+        return self.weight(y, predicted, std, period) * r2
+
+    def sample(self, key, predicted, std):
+        """Draw measured values around the predicted ones."""
+        return predicted + std * jax.random.t(key, self.df, predicted.shape, predicted.dtype)
+
+
+@dataclass(frozen=True)
+class Bernoulli:
+    """A yes-or-no channel (1 or 0): the sensor function returns the log odds of 1; `std` has no meaning."""
+
+    def innovation(self, y, predicted, period):
+        """Measured value minus the predicted probability."""
+        return y - jax.nn.sigmoid(predicted)
+
+    def log_likelihood(self, y, predicted, std, period):
+        """Log probability of each datum."""
+        return y * jax.nn.log_sigmoid(predicted) + (1 - y) * jax.nn.log_sigmoid(-predicted)
+
+    def score(self, y, predicted, std, period):
+        """Derivative of the log probability by the log odds."""
+        return self.innovation(y, predicted, period)
+
+    def weight(self, y, predicted, std, period):
+        """Positive curvature used by a step."""
+        return self.information(predicted, std)
+
+    def information(self, predicted, std):
+        """Expected information about the log odds."""
+        return jax.nn.sigmoid(predicted) * jax.nn.sigmoid(-predicted)
+
+    def level_score(self, y, predicted, std, period):
+        """There is no level: one, so that nothing is learnt of it."""
+        return jnp.ones_like(predicted)
+
+    def sample(self, key, predicted, std):
+        """Draw ones and zeros."""
+        return jax.random.bernoulli(key, jax.nn.sigmoid(predicted)).astype(predicted.dtype)
+
+    def check(self, y):
+        """Which values are legal: 0 and 1."""
+        return (y == 0) | (y == 1)

@@ -1,0 +1,344 @@
+"""Problem = network + motion + table (+ fixed biases): labels above, arrays below."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from os import PathLike
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from probcal.motion import Motion, Target, as_motion
+from probcal.network import BiasRecord, Network
+from probcal.noise import Bernoulli, Level, Unknown, guess_of
+from probcal.rows import Block, Layout, Rows, make_block, pose_entries, pose_vector
+from probcal.table import Measurements, Table, measure, read_table
+from probcal.types import InputError, float64, nearest
+
+DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
+
+
+class Recursion(NamedTuple):
+    """Arrays of one recursion: E epochs of targets that share a state layout of n entries."""
+
+    F: jax.Array  # (E, n, n) transitions, 0 at the first epoch of a target
+    L: jax.Array  # (E, n, n) noise factors (start factors at a first epoch), unused columns 0
+    level: jax.Array  # (E, n) which unknown level multiplies a column of L, H where known
+    drift: jax.Array  # (E, n) known part: start means, means of white components
+
+
+class System(NamedTuple):
+    """All numbers of a problem, as one pytree that jitted kernels take as an argument."""
+
+    recursions: tuple[Recursion, ...]
+    rows: tuple[Rows, ...]
+    level_spread: jax.Array  # (H,) standard deviation of each log level
+
+
+@dataclass(frozen=True)
+class Spec:
+    """Static form of a problem: its blocks, and the recursion that each reads."""
+
+    blocks: tuple[Block, ...]
+    recursion: tuple[int, ...]
+    biases: int  # M, number of free biases
+
+
+@dataclass(frozen=True, eq=False)
+class Epochs:
+    """Labels of one recursion: time (E,) and target name (E,) of each epoch, and its state components."""
+
+    time: np.ndarray
+    target: np.ndarray
+    layout: Layout
+    components: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class LevelRecord:
+    """One unknown noise level: label, unit, guess and the factor within which it is known."""
+
+    label: str
+    unit: str
+    guess: float
+    factor: float
+
+
+class Problem:
+    """A network, the motion of its targets and a table of rows, compiled to arrays.
+
+    `motion` is one motion for all targets, or a mapping from target name to motion or `Target`. `data` is a
+    path or a DataFrame. `fix` holds biases at a value: labels or patterns (`"beacon_0.*"`) at 0, or a mapping
+    to values. `idle` allows sensors without rows. Raises `InputError` naming what is wrong.
+    """
+
+    @float64
+    def __init__(
+        self,
+        network: Network,
+        motion: Any,
+        data: str | PathLike[str] | pd.DataFrame | Table,
+        *,
+        fix: Mapping[str, float] | Iterable[str] = (),
+        idle: bool = False,
+    ):
+        self.network = network
+        self.motion = motion
+        self.fixed = _fixed(network, fix)
+        self.idle = idle
+        self.biases: tuple[BiasRecord, ...] = tuple(b for b in network.biases if b.label not in self.fixed)
+        self.scales = np.array([bias.scale for bias in self.biases])
+        self.surveyed = np.array([bias.kind == "survey" for bias in self.biases], bool)
+        self.measurements = measure(read_table(data), network)
+        _check_rows(self.measurements, network, idle)
+        self.levels: tuple[LevelRecord, ...]
+        self._compile()
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the free biases, in the order of every bias array."""
+        return tuple(bias.label for bias in self.biases)
+
+    @property
+    def extent(self) -> float:
+        """Diagonal of the network in metres, or the largest measured length if that is larger."""
+        lengths = [1.0, float(np.linalg.norm(np.ptp(self.node_positions, axis=0)))]
+        for j, name in enumerate(self.measurements.channels):
+            units = {dict(t.expand(self.network.dimension))[name].unit for t in self.network.types
+                     if name in dict(t.expand(self.network.dimension))}  # fmt: skip
+            there = self.measurements.value[self.measurements.measured[:, j], j]
+            if units == {"m"} and len(there):
+                lengths.append(float(np.quantile(np.abs(there), 0.99)))
+        return max(lengths)
+
+    @property
+    def node_positions(self) -> np.ndarray:
+        """Stated positions of all nodes (a path's points for a moving one), shape (points, d)."""
+        return np.concatenate(
+            [n.position[None] if n.path is None else n.path.position for n in self.network.nodes]
+        )
+
+    def rebuild(self, data: Any = None, **changes: Any) -> "Problem":
+        """The same problem with other data, fixed biases or idle rule."""
+        settings = {"fix": self.fixed, "idle": self.idle} | changes
+        return Problem(self.network, self.motion, self.measurements.table if data is None else data, **settings)
+
+    def _target(self, name: str) -> Target:
+        declared = self.motion
+        if isinstance(declared, Mapping):
+            if name not in declared:
+                raise InputError(f'target "{name}" has no motion{nearest(name, declared)}')
+            declared = declared[name]
+        return declared if isinstance(declared, Target) else Target(declared)
+
+    def _compile(self) -> None:
+        data = self.measurements
+        targets = {name: self._target(name) for name in data.target_names}
+        motions = {name: as_motion(target.motion) for name, target in targets.items()}
+        for name, motion in motions.items():
+            if "position" not in {component for component, *_ in motion.layout(self.network.dimension)}:
+                raise InputError(f'target "{name}": the motion has no position; add ConstantVelocity(std) or Static()')
+        levels = _Levels()
+        layouts: dict[Layout, list[str]] = {}
+        for name, motion in motions.items():
+            layouts.setdefault(motion.layout(self.network.dimension), []).append(name)
+        recursions, self.epochs = [], []
+        epoch_of = np.zeros(len(data.time), int)
+        recursion_of = np.zeros(len(data.time), int)
+        for r, (layout, names) in enumerate(layouts.items()):
+            parts, offset = [], 0
+            times, owners = [], []
+            for name in names:
+                rows = data.target == data.target_names.index(name)
+                time = np.unique(data.time[rows])
+                if motions[name].static:
+                    time = time[:1]
+                else:
+                    epoch_of[rows] = np.searchsorted(time, data.time[rows])
+                epoch_of[rows] += offset
+                recursion_of[rows] = r
+                offset += len(time)
+                parts.append(self._chain(name, targets[name], motions[name], time, levels))
+                times.append(time)
+                owners.append(np.full(len(time), name))
+            recursions.append(Recursion(*(np.concatenate(column) for column in zip(*parts, strict=True))))
+            components = motions[names[0]].labels(self.network.dimension)
+            self.epochs.append(Epochs(np.concatenate(times), np.concatenate(owners), layout, components))
+        blocks, rows_of, recursion_index = [], [], []
+        self.row_index: list[np.ndarray] = []  # rows of the table behind each block
+        for kind in self.network.types:
+            channel_levels = _channel_levels(kind, self.network.dimension, levels)
+            for r, epochs in enumerate(self.epochs):
+                block = make_block(self.network, kind, epochs.layout)
+                chosen = self._rows_of(kind, recursion_of == r)
+                if len(chosen):
+                    blocks.append(block)
+                    rows_of.append(self._rows(block, chosen, epoch_of[chosen], channel_levels))
+                    recursion_index.append(r)
+                    self.row_index.append(chosen)
+        self.levels = tuple(levels.records)
+        self.spec = Spec(tuple(blocks), tuple(recursion_index), len(self.biases))
+        spread = np.array([np.log(level.factor) for level in self.levels])
+        recursions = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in recursions]
+        rows_of = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in rows_of]
+        self.system = jax.tree.map(jnp.asarray, System(tuple(recursions), tuple(rows_of), spread))
+
+    def _rows_of(self, kind: Any, inside: np.ndarray) -> np.ndarray:
+        ours = [k for k, placed in enumerate(self.network.sensors) if placed.type is kind]
+        return np.flatnonzero(inside & np.isin(self.measurements.sensor, ours))
+
+    def _chain(
+        self, name: str, target: Target, motion: Motion, time: np.ndarray, levels: "_Levels"
+    ) -> tuple[np.ndarray, ...]:
+        """Arrays of one target's epochs: F, L, level, drift."""
+        d = self.network.dimension
+        n, epochs = motion.size(d), len(time)
+        F, L = np.zeros((epochs, n, n)), np.zeros((epochs, n, n))
+        level, drift = np.full((epochs, n), -1), np.zeros((epochs, n))
+        dt = np.diff(time, prepend=time[0])
+        row = column = 0
+        for component in motion.components:
+            transition, factor = component.transition(dt, d), component.noise_factor(dt, d)
+            size, width = factor.shape[1:]
+            here, noise = slice(row, row + size), slice(column, column + width)
+            F[:, here, here] = transition
+            L[:, here, noise] = factor * guess_of(component.std)
+            level[:, noise] = levels.of(component.std, f"motion.{component.names()[-1][0]}_std", "")
+            drift[:, here] = component.mean
+            if not component.memoryless:
+                F[0, here, here], drift[0, here] = 0.0, 0.0
+                L[0, here, :], level[0, noise] = 0.0, -1
+                mean, std = self._start(name, component, target, motion, time)
+                drift[0, here] = mean
+                L[0, here, here] = np.diag(std)
+            row, column = row + size, column + size
+        F[0] = 0.0
+        return F, L, level, drift
+
+    def _start(
+        self, name: str, component: Any, target: Target, motion: Motion, time: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Start mean and standard deviation of a component: declared, its own, or wide."""
+        d, extent = self.network.dimension, self.extent
+        duration = float(np.ptp(time)) or 1.0
+        speed = DIFFUSE * extent / duration + guess_of(component.std) * np.sqrt(duration)
+        wide = {
+            "position": (self.node_positions.mean(0), DIFFUSE * extent),
+            "velocity": (0.0, speed),
+            "acceleration": (0.0, speed / duration),
+        }
+        given = wide | component.start() | dict(target.start)
+        means, stds = [], []
+        for part, per_axis in component.names():
+            if part not in given:
+                raise InputError(f'target "{name}": give the start of "{part}", as in Target(motion, start={{"{part}": (mean, std)}})')
+            width = d if per_axis else 1
+            mean, std = given[part]
+            try:
+                means.append(np.broadcast_to(np.asarray(mean, float), (width,)))
+            except ValueError:
+                raise InputError(f'target "{name}": the start mean of "{part}" must have {width} value(s)') from None
+            stds.append(np.full(width, float(std)))
+        return np.concatenate(means), np.concatenate(stds)
+
+    def _rows(self, block: Block, chosen: np.ndarray, epoch: np.ndarray, channel_levels: list[int]) -> Rows:
+        data, network = self.measurements, self.network
+        ours = [k for k, placed in enumerate(network.sensors) if placed.type is block.type]
+        sensor = np.searchsorted(ours, data.sensor[chosen])
+        nodes = [network.sensors[k].nodes for k in ours]
+        entries = pose_entries(network.dimension, block.extras)
+        pose = np.zeros((len(chosen), block.type.arity, len(entries)))
+        for s, pair in enumerate(nodes):
+            for a, node in enumerate(pair):
+                pose[sensor == s, a] = pose_vector(node, block.extras, data.time[chosen][sensor == s])
+        index, scale, base = self._local(block, ours)
+        names = [name for name, _ in block.type.expand(network.dimension)]
+        columns = [data.channels.index(name) for name in names]
+        pick = np.ix_(chosen, columns)
+        declared = np.array([1.0 if isinstance(c.noise, Bernoulli) else guess_of(c.std) for c in block.channels])
+        own = data.has_std[pick]
+        return Rows(
+            epoch=epoch, sensor=sensor, pose=pose, index=index, scale=scale, base=base,
+            y=np.where(data.measured[pick], data.value[pick], 0.0),
+            mask=data.measured[pick].astype(float),
+            std=np.where(own, data.std[pick], declared),
+            level=np.where(own, -1, np.asarray(channel_levels)),
+        )  # fmt: skip
+
+    def _local(self, block: Block, ours: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Which biases the sensors of a block read: index, scale, fixed part, each (S, p)."""
+        records = {(b.owner, b.component, b.axis): b for b in self.network.biases}
+        number = {label: m for m, label in enumerate(self.labels)}
+        entries = pose_entries(self.network.dimension, block.extras)
+        index, scale, base = [], [], []
+        for k in ours:
+            placed = self.network.sensors[k]
+            keys = [(placed.nodes[a].name, *entries[e]) for a, e in block.free]
+            keys += [(placed.type.name if b.shared else placed.name, n, 0) for n, b in placed.type.biases.items()]
+            found = [records.get(key) for key in keys]
+            free = [b is not None and b.label in number for b in found]
+            index.append([number[b.label] if f and b else len(number) for b, f in zip(found, free, strict=True)])
+            scale.append([b.scale if f and b else 0.0 for b, f in zip(found, free, strict=True)])
+            base.append([b.nominal + self.fixed.get(b.label, 0.0) if b else 0.0 for b in found])
+        shape = (len(ours), len(block.free) + len(block.type.biases))
+        return (
+            np.array(index, int).reshape(shape), np.array(scale, float).reshape(shape), np.array(base, float).reshape(shape)
+        )  # fmt: skip
+
+
+class _Levels:
+    """Collects unknown noise levels; equal declarations under one label are one level."""
+
+    def __init__(self) -> None:
+        self.records: list[LevelRecord] = []
+
+    def of(self, level: Level, label: str, unit: str) -> int:
+        """Number of the level, -1 where it is known."""
+        if not isinstance(level, Unknown):
+            return -1
+        record = LevelRecord(label, unit, level.guess, level.factor)
+        if record not in self.records:
+            twins = sum(other.label.split("#")[0] == label for other in self.records)
+            if twins:
+                record = LevelRecord(f"{label}#{twins + 1}", unit, level.guess, level.factor)
+            self.records.append(record)
+        return self.records.index(record)
+
+
+def _channel_levels(kind: Any, dimension: int, levels: _Levels) -> list[int]:
+    """Level number of each scalar channel of a type; a channel declared per axis has one level."""
+    numbers = []
+    for name, channel in kind.channels.items():
+        level = -1 if isinstance(channel.noise, Bernoulli) else levels.of(channel.std, f"{kind.name}.{name}_std", channel.unit)
+        numbers += [level] * (dimension if channel.per_axis else 1)
+    return numbers
+
+
+def _fixed(network: Network, fix: Mapping[str, float] | Iterable[str]) -> dict[str, float]:
+    """Labels and values of the fixed biases, patterns expanded."""
+    given = dict(fix) if isinstance(fix, Mapping) else dict.fromkeys([fix] if isinstance(fix, str) else fix, 0.0)
+    fixed: dict[str, float] = {}
+    for pattern, value in given.items():
+        found = [label for label in network.labels if fnmatchcase(label, pattern)]
+        if not found:
+            raise InputError(f'fix: no bias is called "{pattern}"{nearest(pattern, network.labels)}')
+        if not np.isfinite(value):
+            raise InputError(f'fix "{pattern}": the value must be finite, got {value}')
+        fixed |= dict.fromkeys(found, float(value))
+    return fixed
+
+
+def _check_rows(data: Measurements, network: Network, idle: bool) -> None:
+    source = data.table.source
+    measured = data.measured.any(1)
+    if measured.sum() == 0:
+        raise InputError(f"{source} has no measured value; fill the channel columns")
+    if measured.sum() == 1:
+        raise InputError(f"{source} has one measured row only; a fit needs at least two")
+    seen = set(data.sensor[measured])
+    for k, placed in enumerate(network.sensors):
+        if k not in seen and not idle:
+            raise InputError(f'{source} has no row of sensor "{placed.name}"; add its rows or take it out of the network')

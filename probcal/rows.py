@@ -1,0 +1,208 @@
+"""The narrow waist where sensors meet numbers: predict, innovation, log_likelihood and linearise a block of rows.
+
+A block holds the rows of one sensor type seeing targets of one state layout, gathered and vmapped.
+Labels stay above; here are a static `Block` (what to compute) and a pytree `Rows` (the numbers).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.motion import view
+from probcal.network import Network, Node
+from probcal.sensor import Channel, SensorType
+from probcal.types import InputError, PoseView, nearest
+
+Layout = tuple[tuple[str, int, int, bool], ...]
+
+
+@dataclass(frozen=True)
+class Block:
+    """What a block of rows computes; hashable, so that one compiled kernel serves all data of this form."""
+
+    type: SensorType
+    layout: Layout  # state components (name, start, stop, per axis)
+    dimension: int
+    used: tuple[int, ...]  # state entries that the function reads
+    extras: tuple[str, ...]  # pose components beyond the position, in the order of a pose vector
+    free: tuple[tuple[int, int], ...]  # (node, entry of its pose vector) of the biased pose entries
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """Scalar channels in order."""
+        return tuple(channel for _, channel in self.type.expand(self.dimension))
+
+
+class Rows(NamedTuple):
+    """Numbers of a block: N rows of C channels by S sensors with p biases and nodes of P pose entries each."""
+
+    epoch: jax.Array  # (N,) epoch of the recursion
+    sensor: jax.Array  # (N,) sensor within the block
+    pose: jax.Array  # (N, nodes, P) stated poses
+    index: jax.Array  # (S, p) which bias, M where fixed
+    scale: jax.Array  # (S, p) scale of z, 0 where fixed
+    base: jax.Array  # (S, p) fixed part: nominal value of a sensor bias, value of a fixed bias
+    y: jax.Array  # (N, C) measured, 0 where missing
+    mask: jax.Array  # (N, C) 1 where measured
+    std: jax.Array  # (N, C) noise level, or its guess
+    level: jax.Array  # (N, C) which unknown level multiplies std, H where known
+
+
+class Linearised(NamedTuple):
+    """Derivatives of a block at one point; masked data have weight, score and information zero."""
+
+    score: jax.Array  # (N, C) of the log-likelihood by the predicted value
+    weight: jax.Array  # (N, C) step weight or expected information
+    state: jax.Array  # (N, C, used) Jacobian by the state entries in `used`
+    bias: jax.Array  # (N, C, p) Jacobian by z
+
+
+def make_block(network: Network, kind: SensorType, layout: Layout) -> Block:
+    """Static part for the sensors of one type; raises `InputError` for a component nobody states."""
+    known = {name: (start, stop) for name, start, stop, _ in layout}
+    asked = {name for name in kind.target_components if name in known}
+    missing = sorted(kind.target_components - set(known) - {"velocity", "acceleration"})
+    if missing:
+        raise InputError(
+            f'sensor {kind.name} reads target.{missing[0]}, which the motion does not have{nearest(missing[0], known)};'
+            f' add it, as in motion + White("{missing[0]}", unit, std)'
+        )
+    used = tuple(sorted(i for name in asked for i in range(*known[name])))
+    placed = [s for s in network.sensors if s.type is kind]
+    extras = tuple(sorted(kind.pose_components - {"position"}))
+    for sensor in placed:
+        for node in sensor.nodes:
+            for name in extras:
+                if name not in node.components:
+                    raise InputError(
+                        f'sensor {kind.name} reads pose.{name}, which node "{node.name}" does not have'
+                        f"{nearest(name, node.components)}; state it, as in Node(..., {name}=0.0)"
+                    )
+    entries = pose_entries(network.dimension, extras)
+    free = tuple(
+        (a, e)
+        for a in range(kind.arity)
+        for e, (component, _) in enumerate(entries)
+        if any(component in s.nodes[a].spread for s in placed)
+    )
+    return Block(kind, layout, network.dimension, used, extras, free)
+
+
+def pose_entries(dimension: int, extras: tuple[str, ...]) -> list[tuple[str, int]]:
+    """Entries of a pose vector as (component, axis)."""
+    return [("position", axis) for axis in range(dimension)] + [(name, 0) for name in extras]
+
+
+def pose_vector(node: Node, extras: tuple[str, ...], time: np.ndarray) -> np.ndarray:
+    """Stated pose of a node at times (N,), shape (N, P)."""
+    if node.path is None:
+        position = np.broadcast_to(node.position, (len(time), node.dimension))
+        heading = np.full(len(time), float(node.components["heading"]))
+    else:
+        position, heading = node.path.at(time)
+        heading = heading + node.components["heading"]
+    others = [heading if name == "heading" else np.full(len(time), float(node.components[name])) for name in extras]
+    return np.concatenate([position, *(column[:, None] for column in others)], 1)
+
+
+def _local(block: Block, rows: Rows, z: jax.Array) -> jax.Array:
+    """Biases of each row, in their units, shape (N, p)."""
+    padded = jnp.concatenate([z, jnp.zeros(1, z.dtype)])
+    return (rows.base + rows.scale * padded[rows.index])[rows.sensor]
+
+
+def _one(block: Block, state: jax.Array, pose: jax.Array, local: jax.Array) -> jax.Array:
+    """Predicted channels (C,) of one row from its state (n,), poses (nodes, P) and biases (p,)."""
+    if block.free:
+        where = np.asarray(block.free)
+        pose = pose.at[where[:, 0], where[:, 1]].add(local[: len(where)])
+    poses = [
+        PoseView(
+            "the node",
+            {"position": pose[a, : block.dimension], "heading": 0.0, "pitch": 0.0, "roll": 0.0}
+            | {name: pose[a, block.dimension + k] for k, name in enumerate(block.extras)},
+        )
+        for a in range(block.type.arity)
+    ]
+    biases = dict(zip(block.type.biases, local[len(block.free) :], strict=True))
+    return block.type.evaluate(view(block.layout, state), poses, biases)
+
+
+def predict(block: Block, rows: Rows, states: jax.Array, z: jax.Array) -> jax.Array:
+    """Predicted values (N, C) from the states of all epochs (E, n) and the biases z (M,)."""
+    local = _local(block, rows, z)
+    return jax.vmap(lambda x, pose, b: _one(block, x, pose, b))(states[rows.epoch], rows.pose, local)
+
+
+def noise_std(rows: Rows, levels: jax.Array) -> jax.Array:
+    """Noise levels (N, C), with the estimated log factors of the unknown ones."""
+    factors = jnp.concatenate([jnp.exp(levels), jnp.ones(1, levels.dtype)])
+    return rows.std * factors[rows.level]
+
+
+def _by_channel(block: Block, method: str, *columns: jax.Array, period: bool = True) -> jax.Array:
+    """Apply a method of each channel's noise family to the columns of (N, C) arrays."""
+    parts = []
+    for c, channel in enumerate(block.channels):
+        arguments = [column[:, c] for column in columns]
+        call = getattr(channel.noise, method)
+        parts.append(call(*arguments, channel.period) if period else call(*arguments))
+    return jnp.stack(parts, 1)
+
+
+def innovation(block: Block, rows: Rows, predicted: jax.Array) -> jax.Array:
+    """Measured minus predicted, wrapped, zero where missing, shape (N, C)."""
+    return rows.mask * _by_channel(block, "innovation", rows.y, predicted)
+
+
+def log_likelihood(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
+    """Log density of every datum, zero where missing, shape (N, C)."""
+    return rows.mask * _by_channel(block, "log_likelihood", rows.y, predicted, noise_std(rows, levels))
+
+
+def level_score(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
+    """One plus the derivative of each log density by log std, zero where missing, shape (N, C)."""
+    return rows.mask * _by_channel(block, "level_score", rows.y, predicted, noise_std(rows, levels))
+
+
+def information(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
+    """Expected information of every datum about its predicted value, zero where missing, shape (N, C)."""
+    return rows.mask * _by_channel(block, "information", predicted, noise_std(rows, levels), period=False)
+
+
+def sample(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array, key: jax.Array) -> jax.Array:
+    """Draw measured values (N, C) around the predicted ones; angles are wrapped."""
+    std, drawn = noise_std(rows, levels), []
+    for c, channel in enumerate(block.channels):
+        value = channel.noise.sample(jax.random.fold_in(key, c), predicted[:, c], std[:, c])
+        if channel.period is not None:
+            value = jnp.mod(value + channel.period / 2, channel.period) - channel.period / 2
+        drawn.append(value)
+    return jnp.stack(drawn, 1)
+
+
+def linearise(
+    block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: bool
+) -> Linearised:
+    """Score, weight and Jacobians at one point; `expected` takes the information instead of the step weight."""
+    local = _local(block, rows, z)
+    used = np.asarray(block.used, int)
+    reached = states[rows.epoch]
+
+    def one(entries: jax.Array, state: jax.Array, pose: jax.Array, b: jax.Array) -> jax.Array:
+        return _one(block, state.at[used].set(entries) if len(used) else state, pose, b)
+
+    inputs = len(used) + local.shape[1]
+    jacobian = jax.jacrev if len(block.channels) < inputs else jax.jacfwd
+    by_state, by_bias = jax.vmap(jacobian(one, argnums=(0, 3)))(reached[:, used], reached, rows.pose, local)
+    predicted = jax.vmap(one)(reached[:, used], reached, rows.pose, local)
+    std = noise_std(rows, levels)
+    score = rows.mask * _by_channel(block, "score", rows.y, predicted, std)
+    if expected:
+        weight = rows.mask * _by_channel(block, "information", predicted, std, period=False)
+    else:
+        weight = rows.mask * _by_channel(block, "weight", rows.y, predicted, std)
+    return Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])

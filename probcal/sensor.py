@@ -1,0 +1,210 @@
+"""Declaration of a sensor type: the physics of one sensor that sees one target, as a function."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.noise import Bernoulli, Family, Gaussian, Level, check_level
+from probcal.types import AXES, InputError, PoseView, TargetView, nearest
+
+VECTORS = ("position", "velocity", "acceleration")
+PERIODS = {"rad": 2 * np.pi, "deg": 360.0}
+
+
+@dataclass(frozen=True)
+class Bias:
+    """An unknown parameter of a sensor: its unit, prior scale (standard deviation) and nominal value.
+
+    The function receives nominal + bias, tables report the bias. `shared="type"` gives one bias to all
+    sensors of the type.
+    """
+
+    unit: str
+    scale: float
+    nominal: float = 0.0
+    shared: str | None = None
+
+    def __post_init__(self):
+        if not isinstance(self.unit, str):
+            raise InputError(f"Bias({self.unit!r}, ...): the first argument is the unit, a string such as \"m\"")
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise InputError(f"Bias({self.unit!r}, scale={self.scale}): the scale must be positive; to fix a bias use fix=")
+        if not np.isfinite(self.nominal):
+            raise InputError(f"Bias({self.unit!r}, nominal={self.nominal}): the nominal value must be finite")
+        if self.shared not in (None, "type"):
+            raise InputError(f'Bias({self.unit!r}, shared={self.shared!r}): shared is None or "type"')
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One measured quantity: its unit, noise level (a number or `Unknown`), noise family and wrapping.
+
+    `wrap=True` compares angles around the circle; `per_axis=True` makes one channel a coordinate
+    (`position_x`, `position_y`, ...).
+    """
+
+    unit: str
+    std: Level = 1.0
+    noise: Family = field(default_factory=Gaussian)
+    wrap: bool = False
+    per_axis: bool = False
+
+    def __post_init__(self):
+        if not isinstance(self.unit, str):
+            raise InputError(f"Channel({self.unit!r}, ...): the first argument is the unit, a string such as \"m\"")
+        if not isinstance(self.noise, Bernoulli):
+            check_level(self.std, f"Channel({self.unit!r}): std")
+        if self.wrap and self.unit not in PERIODS:
+            raise InputError(f"Channel({self.unit!r}, wrap=True): only angles in rad or deg wrap")
+
+    @property
+    def period(self) -> float | None:
+        """Length of the circle in the channel's unit, or None."""
+        return PERIODS[self.unit] if self.wrap else None
+
+
+@dataclass(frozen=True, eq=False)
+class SensorType:
+    """A declared sensor type; `on(node)` places one, `on(a, b)` places a two-node sensor."""
+
+    name: str
+    function: Callable[..., Mapping[str, Any]]
+    channels: Mapping[str, Channel]
+    biases: Mapping[str, Bias]
+    arity: int
+    target_components: frozenset[str]
+    pose_components: frozenset[str]
+
+    def on(self, *nodes: Any, name: str | None = None) -> "Sensor":
+        """Place a sensor of this type on its node(s); the name defaults to that of the node(s)."""
+        if len(nodes) != self.arity:
+            raise InputError(f"{self.name} uses {self.arity} node(s), {len(nodes)} given")
+        return Sensor(self, tuple(nodes), name or "-".join(str(node.name) for node in nodes))
+
+    def expand(self, dimension: int) -> tuple[tuple[str, Channel], ...]:
+        """Scalar channels by name, those declared per axis once a coordinate."""
+        named: list[tuple[str, Channel]] = []
+        for name, channel in self.channels.items():
+            axes = [f"_{axis}" for axis in AXES[:dimension]] if channel.per_axis else [""]
+            named += [(name + axis, channel) for axis in axes]
+        return tuple(named)
+
+    def evaluate(self, target: TargetView, poses: list[PoseView], biases: Mapping[str, Any]) -> jax.Array:
+        """Predicted values of one row, shape (channels,), in the order of `expand`."""
+        values = self.function(target, *poses, **biases)
+        parts = [jnp.atleast_1d(jnp.asarray(values[name])) for name in self.channels]
+        for name, part in zip(self.channels, parts, strict=True):
+            width = target.position.shape[0] if self.channels[name].per_axis else 1
+            if part.shape != (width,):
+                raise InputError(
+                    f'sensor {self.name}: channel "{name}" has shape {part.shape}, expected '
+                    f"{(width,) if self.channels[name].per_axis else 'a scalar'}"
+                )
+        return jnp.concatenate(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A placed sensor: its type, its node(s) and its unique name, which the table's `sensor` column holds."""
+
+    type: SensorType
+    nodes: tuple[Any, ...]
+    name: str
+
+
+class _Probe:
+    """Stands for a target or a pose at decoration: answers any component and records what is asked for."""
+
+    def __init__(self, dimension: int, asked: set[str]):
+        self._dimension = dimension
+        self._asked = asked
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        self._asked.add(name)
+        return jnp.ones(self._dimension) if name in VECTORS else jnp.ones(())
+
+    def at(self, dt: Any) -> "_Probe":
+        self._asked |= set(VECTORS)
+        return self
+
+    def local(self, point: Any) -> jax.Array:
+        self._asked |= {"position", "heading"} | ({"pitch", "roll"} if self._dimension == 3 else set())
+        return point - jnp.ones(self._dimension)
+
+
+def _probe(function: Callable, arity: int, biases: Mapping[str, Bias]) -> tuple[Any, set[str], set[str]]:
+    """Call the function on probes in 2-D, then 3-D: its channels and the components it asks for."""
+    failure: Exception | None = None
+    returned: Any = None
+    target_asked: set[str] = set()
+    pose_asked: set[str] = set()
+    for dimension in (2, 3):
+        target: set[str] = set()
+        pose: set[str] = set()
+
+        def call(dimension: int = dimension, target: set[str] = target, pose: set[str] = pose) -> Any:
+            poses = [_Probe(dimension, pose) for _ in range(arity)]
+            return function(_Probe(dimension, target), *poses, **{name: jnp.ones(()) for name in biases})
+
+        try:
+            returned = jax.eval_shape(call)
+            target_asked |= target
+            pose_asked |= pose
+        except Exception as error:  # whatever the user's function raises is reported with its name
+            failure = error
+    if returned is None:
+        raise InputError(f"sensor {function.__name__}: the function failed on a trial call: {failure}") from failure
+    return returned, target_asked, pose_asked
+
+
+def sensor(**channels: Channel) -> Callable[[Callable[..., Mapping[str, Any]]], SensorType]:
+    """Declare a sensor type from a function `f(target, pose, *, bias=Bias(...))` that returns its channels.
+
+    The function sees one target and one pose (two for a two-node sensor) and returns a dict of scalars by
+    channel name; keyword-only arguments are its biases. Raises `InputError` naming function and argument.
+    """
+    for name, channel in channels.items():
+        if not isinstance(channel, Channel):
+            raise InputError(f"sensor channel {name}={channel!r}: give Channel(unit, std=...)")
+    if not channels:
+        raise InputError("sensor() needs at least one channel, such as @sensor(range=Channel(\"m\", std=1.0))")
+
+    def declare(function: Callable[..., Mapping[str, Any]]) -> SensorType:
+        label = function.__name__
+        positional, biases = [], {}
+        for parameter in inspect.signature(function).parameters.values():
+            if parameter.kind is parameter.KEYWORD_ONLY:
+                if not isinstance(parameter.default, Bias):
+                    raise InputError(f'sensor {label}: argument "{parameter.name}" needs Bias(unit, scale) as default')
+                biases[parameter.name] = parameter.default
+            elif parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD):
+                positional.append(parameter.name)
+            else:
+                raise InputError(f'sensor {label}: argument "*{parameter.name}" is not allowed')
+        arity = len(positional) - 1
+        if arity not in (1, 2):
+            raise InputError(
+                f"sensor {label}: the arguments are (target, pose, *, biases) or (target, pose_a, pose_b, *, biases),"
+                f" found ({', '.join(positional)})"
+            )
+        returned, target_asked, pose_asked = _probe(function, arity, biases)
+        if not isinstance(returned, Mapping) or set(returned) != set(channels):
+            found = sorted(returned) if isinstance(returned, Mapping) else type(returned).__name__
+            wrong = next((n for n in found if n not in channels), None) if isinstance(returned, Mapping) else None
+            hint = nearest(wrong, channels) if wrong else ""
+            raise InputError(
+                f"sensor {label}: returns {found}, but the declared channels are {sorted(channels)}{hint}"
+            )
+        return SensorType(
+            name=label, function=function, channels=dict(channels), biases=biases, arity=arity,
+            target_components=frozenset(target_asked), pose_components=frozenset(pose_asked),
+        )
+
+    return declare

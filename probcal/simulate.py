@@ -1,0 +1,236 @@
+"""Simulated recordings with their truth, and truth read from files; truth is used for scoring only."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from probcal import rows
+from probcal.network import Network
+from probcal.noise import Bernoulli
+from probcal.problem import Problem
+from probcal.types import AXES, InputError, float64, nearest
+
+Key = int | jax.Array
+
+
+def as_key(key: Key) -> jax.Array:
+    """A jax key from a seed or a key."""
+    return jax.random.key(key) if isinstance(key, (int, np.integer)) else key
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What is known of the truth: tracks (columns time, [target], position_x, ...) and biases by label."""
+
+    tracks: pd.DataFrame | str | PathLike[str] | None = None
+    biases: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self):
+        if self.tracks is not None and not isinstance(self.tracks, pd.DataFrame):
+            object.__setattr__(self, "tracks", _read(Path(self.tracks)))
+        if isinstance(self.tracks, pd.DataFrame):
+            for column in ("time", "position_x", "position_y"):
+                if column not in self.tracks.columns:
+                    raise InputError(f'truth: the tracks have no column "{column}"')
+
+    def positions(self, time: np.ndarray, target: np.ndarray, dimension: int) -> np.ndarray:
+        """True positions (E, d) at times and targets (E,), interpolated; NaN outside the recorded track."""
+        found = np.full((len(time), dimension), np.nan)
+        if not isinstance(self.tracks, pd.DataFrame):
+            return found
+        owner = self.tracks["target"].astype(str) if "target" in self.tracks else None
+        columns = [f"position_{axis}" for axis in AXES[:dimension]]
+        for name in np.unique(target):
+            track = self.tracks if owner is None else self.tracks[owner == name]
+            if not len(track):
+                continue
+            track = track.sort_values("time")
+            mine = target == name
+            known, at = track["time"].to_numpy(float), time[mine]
+            if len(known) == 1:
+                found[mine] = track[columns].to_numpy(float)
+                continue
+            inside = (at >= known[0] - 1e-9) & (at <= known[-1] + 1e-9)
+            values = np.stack([np.interp(at, known, track[c].to_numpy(float)) for c in columns], -1)
+            found[mine] = np.where(inside[:, None], values, np.nan)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A simulated table (columns of `probcal.table`) and its truth."""
+
+    table: pd.DataFrame
+    truth: Truth
+
+    def write(self, path: str | PathLike[str]) -> list[Path]:
+        """Write PATH and, beside it, PATH's `.tracks.csv` and `.biases.csv`; returns the files."""
+        path = Path(path)
+        tracks, biases = _beside(path)
+        tables = [(path, self.table), (tracks, self.truth.tracks)]
+        tables.append((biases, pd.DataFrame({"bias": list(self.truth.biases), "value": list(self.truth.biases.values())})))
+        for target, frame in tables:
+            frame.to_csv(target, index=False)
+        return [target for target, _ in tables]
+
+
+def truth_beside(path: str | PathLike[str]) -> Truth | None:
+    """Truth that `Simulation.write` left beside a table, or None."""
+    tracks, biases = _beside(Path(path))
+    if not tracks.exists() and not biases.exists():
+        return None
+    values = _read(biases) if biases.exists() else pd.DataFrame({"bias": [], "value": []})
+    return Truth(tracks if tracks.exists() else None, dict(zip(values["bias"], values["value"].astype(float), strict=True)))
+
+
+def _beside(path: Path) -> tuple[Path, Path]:
+    return path.with_suffix(".tracks.csv"), path.with_suffix(".biases.csv")
+
+
+def _read(path: Path) -> pd.DataFrame:
+    try:
+        return pd.read_csv(path)
+    except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        raise InputError(f"truth {path}: cannot be read as CSV ({error})") from None
+
+
+@float64
+def simulate(
+    network: Network,
+    motion: Any,
+    time: Any,
+    key: Key = 0,
+    *,
+    share: float = 1.0,
+    biases: Mapping[str, float] | None = None,
+    tracks: Mapping[str, Any] | None = None,
+    schedule: pd.DataFrame | None = None,
+    missing: float = 0.0,
+    outliers: float = 0.0,
+    outlier_scale: float = 10.0,
+) -> Simulation:
+    """Simulate every sensor seeing every target at each time (T,) in s (or the rows of a `schedule`).
+
+    Biases are drawn from their scales, a `share` of them non-zero, unless given by label. `tracks` maps
+    target names to positions (T, d) or to frames with state columns; what they leave out is drawn from the
+    motion. `missing` data are left blank, `outliers` get `outlier_scale` times the noise on top.
+    """
+    for name, value in (("share", share), ("missing", missing), ("outliers", outliers)):
+        if not 0 <= value <= 1:
+            raise InputError(f"simulate: {name}={value} must lie between 0 and 1")
+    time = np.asarray(time, float)
+    keys = jax.random.split(as_key(key), 6)
+    targets = list(tracks) if tracks else list(motion) if isinstance(motion, Mapping) else ["target"]
+    plan = _plan(network, time, targets) if schedule is None else schedule.reset_index(drop=True)
+    problem = Problem(network, motion, _blank(network, plan), idle=True)
+    z = _biases(problem, share, biases, keys[0])
+    states = [_states(problem, r, tracks, keys[1]) for r in range(len(problem.epochs))]
+    columns = {name: np.full(len(plan), np.nan) for name in network.channel_names}
+    levels = jnp.zeros(len(problem.levels))
+    pieces = zip(problem.spec.blocks, problem.system.rows, problem.spec.recursion, problem.row_index, strict=True)
+    for b, (block, data, r, index) in enumerate(pieces):
+        predicted = rows.predict(block, data, jnp.asarray(states[r]), jnp.asarray(z))
+        seed = jax.random.split(jax.random.fold_in(keys[2], b), 3)
+        value = np.array(rows.sample(block, data, predicted, levels, seed[0]))
+        value = _spoil(block, data, value, outliers, outlier_scale, seed[1])
+        gone = np.asarray(jax.random.uniform(seed[2], value.shape)) < missing
+        for c, (name, _) in enumerate(block.type.expand(network.dimension)):
+            columns[name][index] = np.where(gone[:, c], np.nan, value[:, c])
+    table = plan[["time", "sensor", *(["target"] if "target" in plan else [])]].assign(**columns)
+    table = table[~table[list(columns)].isna().all(axis=1)].reset_index(drop=True)
+    parts = [
+        pd.DataFrame(np.asarray(x), columns=list(e.components)).assign(time=e.time, target=e.target)
+        for x, e in zip(states, problem.epochs, strict=True)
+    ]
+    track = pd.concat(parts, ignore_index=True)
+    track = track[["time", "target", *(c for c in track.columns if c not in ("time", "target"))]]
+    values = dict(zip(problem.labels, (z * problem.scales).tolist(), strict=True))
+    return Simulation(table, Truth(track, values))
+
+
+def _plan(network: Network, time: np.ndarray, targets: list[str]) -> pd.DataFrame:
+    names = [placed.name for placed in network.sensors]
+    grid = [(t, sensor, target) for target in targets for t in time for sensor in names]
+    plan = pd.DataFrame(grid, columns=["time", "sensor", "target"])
+    return plan if targets != ["target"] else plan.drop(columns="target")
+
+
+def _blank(network: Network, plan: pd.DataFrame) -> pd.DataFrame:
+    """The plan with every channel of its sensors filled with 0, so that all rows exist."""
+    own = {s.name: {name for name, _ in s.type.expand(network.dimension)} for s in network.sensors}
+    filled = {
+        name: [0.0 if name in own.get(sensor, ()) else np.nan for sensor in plan["sensor"]]
+        for name in network.channel_names
+    }
+    return plan.assign(**filled)
+
+
+def _biases(problem: Problem, share: float, given: Mapping[str, float] | None, key: jax.Array) -> np.ndarray:
+    draw, chosen = jax.random.split(key)
+    shape = (len(problem.labels),)
+    z = np.array(jax.random.normal(draw, shape))
+    zero = np.asarray(jax.random.uniform(chosen, shape)) >= share
+    z[zero & ~problem.surveyed] = 0.0
+    if given is not None:
+        z[:] = 0.0
+        for label, value in given.items():
+            if label not in problem.labels:
+                raise InputError(f'simulate: no bias is called "{label}"{nearest(label, problem.labels)}')
+            m = problem.labels.index(label)
+            z[m] = value / problem.scales[m]
+    return z
+
+
+def _states(problem: Problem, r: int, tracks: Mapping[str, Any] | None, key: jax.Array) -> np.ndarray:
+    """States (E, n) of one recursion: drawn from the motion, given components put over."""
+    part, epochs = problem.system.recursions[r], problem.epochs[r]
+    noise = np.asarray(jax.random.normal(jax.random.fold_in(key, r), part.drift.shape))
+    F, L, drift = (np.asarray(a) for a in (part.F, part.L, part.drift))
+    states = np.zeros_like(noise)
+    previous = np.zeros(noise.shape[1])
+    for e in range(len(noise)):
+        previous = F[e] @ previous + drift[e] + L[e] @ noise[e]
+        states[e] = previous
+    for name, track in (tracks or {}).items():
+        mine = np.flatnonzero(epochs.target == name)
+        if not len(mine):
+            continue
+        frame = _frame(track, problem.network.dimension, len(mine), name)
+        for j, component in enumerate(epochs.components):
+            if component in frame:
+                states[mine, j] = frame[component].to_numpy(float)
+            elif component.startswith("velocity") and len(mine) > 1:
+                position = component.replace("velocity", "position")
+                states[mine, j] = np.gradient(frame[position].to_numpy(float), epochs.time[mine])
+    return states
+
+
+def _frame(track: Any, dimension: int, epochs: int, name: str) -> pd.DataFrame:
+    if not isinstance(track, pd.DataFrame):
+        array = np.atleast_2d(np.asarray(track, float))
+        if array.shape[1] != dimension:
+            raise InputError(f'simulate: track "{name}" has shape {array.shape}, expected (times, {dimension})')
+        track = pd.DataFrame(array, columns=[f"position_{axis}" for axis in AXES[:dimension]])
+    if len(track) != epochs:
+        raise InputError(f'simulate: track "{name}" has {len(track)} positions for {epochs} epochs')
+    return track
+
+
+def _spoil(block: rows.Block, data: rows.Rows, value: np.ndarray, share: float, scale: float, key: jax.Array) -> np.ndarray:
+    """Put outliers on a share of the data: more noise, or the wrong answer of a yes-or-no channel."""
+    pick, size = jax.random.split(key)
+    hit = np.asarray(jax.random.uniform(pick, value.shape)) < share
+    extra = scale * np.asarray(data.std) * np.asarray(jax.random.normal(size, value.shape))
+    for c, channel in enumerate(block.channels):
+        wrong = 1 - value[:, c] if isinstance(channel.noise, Bernoulli) else value[:, c] + extra[:, c]
+        value[:, c] = np.where(hit[:, c], wrong, value[:, c])
+        if channel.period is not None:
+            value[:, c] = (value[:, c] + channel.period / 2) % channel.period - channel.period / 2
+    return value

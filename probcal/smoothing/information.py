@@ -1,0 +1,119 @@
+"""The Laplace approximation at a point: marginal information of the biases, gamma, evidence, and what noise levels learn."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from probcal import linalg, rows
+from probcal.problem import Spec, System
+from probcal.smoothing import recursion as rec
+from probcal.smoothing.mode import Point, eliminate, factors, linearise, log_likelihood, of_both, of_states
+
+
+class Laplace(NamedTuple):
+    """Gaussian approximation of the posterior of z at one consistent point, trajectories marginalised."""
+
+    information: jax.Array  # (M, M) of the data about z
+    covariance: jax.Array  # (M, M) of z
+    gamma: jax.Array  # (M,) 1 - alpha Sigma: 0 prior only, 1 data only
+    evidence: jax.Array  # log p(data | alpha, levels), Laplace (exact on a linear-Gaussian problem)
+
+
+@partial(jax.jit, static_argnames="spec")
+def laplace(spec: Spec, system: System, point: Point, alpha: jax.Array) -> Laplace:
+    """Evidence and covariance with every trajectory marginalised exactly, at the mode for alpha (M,).
+
+    An alpha of 0 is a flat prior: its density counts as one. The expected information is used throughout.
+    """
+    solved = eliminate(spec, system, point, expected=True)
+    covariance, logdet = linalg.inverse_and_logdet(solved.information + jnp.diag(alpha))
+    fit = log_likelihood(spec, system, point) - 0.5 * sum(jnp.sum(u**2) for u in point.noises)
+    prior = 0.5 * jnp.sum(jnp.log(jnp.where(alpha > 0, alpha, 1.0))) - 0.5 * jnp.sum(alpha * point.z**2)
+    spread = -0.5 * jnp.sum((point.levels / system.level_spread) ** 2)
+    evidence = fit + prior + spread - 0.5 * (solved.logdet + logdet)
+    gamma = jnp.clip(1.0 - alpha * jnp.diagonal(covariance), 0.0, 1.0)
+    return Laplace(solved.information, covariance, gamma, evidence)
+
+
+class Moments(NamedTuple):
+    """Posterior moments of one recursion with the biases integrated out."""
+
+    response: jax.Array  # (E, n, M) derivative of the states' mode by z
+    states: jax.Array  # (E, n, n) covariance given z
+    noises: jax.Array  # (E, n) variance of each whitened noise, biases included
+
+
+@partial(jax.jit, static_argnames="spec")
+def moments(spec: Spec, system: System, point: Point, covariance: jax.Array) -> list[Moments]:
+    """Trajectory moments of each recursion at a point, for a covariance (M, M) of z."""
+    lins = linearise(spec, system, point, expected=True)
+    found = []
+    parts = zip(
+        system.recursions,
+        of_states(spec, system, lins, point.states),
+        of_both(spec, system, lins, point.states),
+        strict=True,
+    )
+    for part, (J, _), cross in parts:
+        L = factors(part, point.levels)
+        gain = rec.gains(part.F, L, J)
+        smooth = rec.smooth(part.F, L, J, gain, cross)
+        states, noises = rec.covariances(part.F, L, J, gain)
+        spread = jnp.einsum("eni,ij,enj->en", smooth.noises, covariance, smooth.noises)
+        found.append(Moments(-smooth.states, states, jnp.diagonal(noises, axis1=1, axis2=2) + spread))
+    return found
+
+
+@partial(jax.jit, static_argnames="spec")
+def predicted_variances(
+    spec: Spec, system: System, point: Point, covariance: jax.Array, found: list[Moments]
+) -> list[jax.Array]:
+    """Posterior variance (N, C) of each predicted value, biases and trajectories both uncertain."""
+    variances = []
+    lins = linearise(spec, system, point, expected=True)
+    for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
+        used = jnp.asarray(block.used, int)
+        P = found[r].states[:, used[:, None], used[None, :]][data.epoch]
+        N, C, p = lin.bias.shape
+        columns = jnp.einsum("ncu,num->ncm", lin.state, found[r].response[:, used][data.epoch])
+        columns = jnp.concatenate([columns, jnp.zeros((N, C, 1))], 2)
+        index = jnp.broadcast_to(data.index[data.sensor][:, None, :], (N, C, p))
+        columns = columns.at[jnp.arange(N)[:, None, None], jnp.arange(C)[None, :, None], index].add(lin.bias)[:, :, :-1]
+        own = jnp.einsum("ncu,nuv,ncv->nc", lin.state, P, lin.state)
+        variances.append(own + jnp.einsum("ncm,ml,ncl->nc", columns, covariance, columns))
+    return variances
+
+
+def update_levels(spec: Spec, system: System, point: Point, covariance: jax.Array) -> Point:
+    """One MacKay step of every unknown noise level, kept within its declared factor by its log-normal prior.
+
+    A level sigma of N whitened residuals v solves N - sum Var v = sum v^2 (Paper B 25, for noise). The
+    trajectory stays; its whitened noises are rescaled.
+    """
+    H = point.levels.shape[0]
+    count, square, variance = jnp.zeros(H + 1), jnp.zeros(H + 1), jnp.zeros(H + 1)
+    found = moments(spec, system, point, covariance)
+    spread = predicted_variances(spec, system, point, covariance, found)
+    for block, data, r, var in zip(spec.blocks, system.rows, spec.recursion, spread, strict=True):
+        predicted = rows.predict(block, data, point.states[r], point.z)
+        weight = rows.information(block, data, predicted, point.levels)
+        count = count.at[data.level].add(data.mask)
+        square = square.at[data.level].add(rows.level_score(block, data, predicted, point.levels))
+        variance = variance.at[data.level].add(weight * var)
+    for part, u, moment in zip(system.recursions, point.noises, found, strict=True):
+        active = jnp.any(part.L != 0, 1)
+        count = count.at[part.level].add(active)
+        square = square.at[part.level].add(active * u**2)
+        variance = variance.at[part.level].add(active * moment.noises)
+    free = jnp.maximum(count - variance, 1e-3 * count + 1e-9)[:H]
+    step = jnp.zeros(H)
+    for _ in range(8):  # Newton: -free t - square/2 exp(-2 t) - (level + t)^2 / (2 spread^2) is concave
+        pull = square[:H] * jnp.exp(-2 * step)
+        gradient = -free + pull - (point.levels + step) / system.level_spread**2
+        step = step + gradient / (2 * pull + 1 / system.level_spread**2)
+    levels = point.levels + jnp.clip(step, -1.0, 1.0)
+    ratio = jnp.concatenate([jnp.exp(point.levels - levels), jnp.ones(1)])
+    noises = tuple(u * ratio[part.level] for part, u in zip(system.recursions, point.noises, strict=True))
+    return point._replace(levels=levels, noises=noises)

@@ -1,0 +1,211 @@
+"""The joint mode of trajectories and biases: an arrowhead Gauss-Newton system, each trajectory eliminated first.
+
+With every trajectory marginalised, the biases have information G - B' X, X the smoothed response of the
+trajectories to each bias (`../shared/papers` standard form: H'R^-1 H - H'R^-1 H_x W^-1 H_x'R^-1 H).
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from probcal import linalg, rows
+from probcal.problem import Recursion, Spec, System
+from probcal.rows import Linearised
+from probcal.smoothing import recursion as rec
+
+HALVINGS = 12  # step lengths tried before the damping grows
+DAMPING = 1e10  # damping at which the iteration gives up
+
+
+class Point(NamedTuple):
+    """Where the joint density is evaluated: states and whitened noises of each recursion, biases, log levels."""
+
+    states: tuple[jax.Array, ...]  # (E, n) each
+    noises: tuple[jax.Array, ...]  # (E, n) each
+    z: jax.Array  # (M,)
+    levels: jax.Array  # (H,)
+
+
+class Eliminated(NamedTuple):
+    """The system with all trajectories eliminated: what a step, a covariance or an evidence needs."""
+
+    information: jax.Array  # (M, M) of the biases
+    score: jax.Array  # (M,)
+    states: tuple[jax.Array, ...]  # (E, n, 1 + M): new states at fixed z, response to each bias
+    noises: tuple[jax.Array, ...]  # (E, n, 1 + M)
+    logdet: jax.Array  # log det of the posterior precision of all whitened noises
+
+
+def factors(part: Recursion, levels: jax.Array) -> jax.Array:
+    """Noise factors with the estimated levels, (E, n, n)."""
+    scale = jnp.concatenate([jnp.exp(levels), jnp.ones(1, levels.dtype)])[part.level]
+    return part.L * scale[:, None, :]
+
+
+def log_likelihood(spec: Spec, system: System, point: Point) -> jax.Array:
+    """Log-likelihood of all data at a point."""
+    total = jnp.zeros(())
+    for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True):
+        predicted = rows.predict(block, data, point.states[r], point.z)
+        total = total + jnp.sum(rows.log_likelihood(block, data, predicted, point.levels))
+    return total
+
+
+def cost(spec: Spec, system: System, point: Point, alpha: jax.Array) -> jax.Array:
+    """Negative log joint density of data, trajectories and biases, up to normalising constants."""
+    prior = sum(jnp.sum(u**2) for u in point.noises) + jnp.sum(alpha * point.z**2)
+    return 0.5 * prior - log_likelihood(spec, system, point)
+
+
+def linearise(spec: Spec, system: System, point: Point, *, expected: bool) -> list[Linearised]:
+    """Every block linearised at a point, with step weights or the expected information."""
+    return [
+        rows.linearise(block, data, point.states[r], point.z, point.levels, expected=expected)
+        for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True)
+    ]
+
+
+def of_states(
+    spec: Spec, system: System, lins: list[Linearised], states: tuple[jax.Array, ...]
+) -> list[tuple[jax.Array, jax.Array]]:
+    """Rows compressed onto the states: information J (E, n, n) and score (E, n) of each recursion."""
+    parts = [(jnp.zeros((*x.shape, x.shape[1])), jnp.zeros(x.shape)) for x in states]
+    for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
+        used, E = jnp.asarray(block.used, int), states[r].shape[0]
+        J = jax.ops.segment_sum(jnp.einsum("ncu,nc,ncv->nuv", lin.state, lin.weight, lin.state), data.epoch, E)
+        score = jax.ops.segment_sum(jnp.einsum("ncu,nc->nu", lin.state, lin.score), data.epoch, E)
+        before = parts[r]
+        parts[r] = (before[0].at[:, used[:, None], used[None, :]].add(J), before[1].at[:, used].add(score))
+    return parts
+
+
+def of_biases(spec: Spec, system: System, lins: list[Linearised]) -> tuple[jax.Array, jax.Array]:
+    """Rows compressed onto the biases at fixed trajectories: information (M, M) and score (M,) (Paper C 35-36)."""
+    M = spec.biases
+    G, g = jnp.zeros((M + 1, M + 1)), jnp.zeros(M + 1)
+    for data, lin in zip(system.rows, lins, strict=True):
+        S = data.index.shape[0]
+        own = jax.ops.segment_sum(jnp.einsum("ncp,nc,ncq->npq", lin.bias, lin.weight, lin.bias), data.sensor, S)
+        pull = jax.ops.segment_sum(jnp.einsum("ncp,nc->np", lin.bias, lin.score), data.sensor, S)
+        G = G.at[data.index[:, :, None], data.index[:, None, :]].add(own)
+        g = g.at[data.index].add(pull)
+    return G[:M, :M], g[:M]
+
+
+def of_both(
+    spec: Spec, system: System, lins: list[Linearised], states: tuple[jax.Array, ...]
+) -> list[jax.Array]:
+    """Cross information of states and biases, (E, n, M) of each recursion."""
+    M = spec.biases
+    parts = [jnp.zeros((*x.shape, M)) for x in states]
+    for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
+        weighted = jnp.einsum("ncp,nc,ncu->npu", lin.bias, lin.weight, lin.state)
+        summed = jnp.zeros((states[r].shape[0], M + 1, len(block.used)))
+        summed = summed.at[data.epoch[:, None], data.index[data.sensor]].add(weighted)
+        parts[r] = parts[r].at[:, jnp.asarray(block.used, int)].add(summed[:, :M].mT)
+    return parts
+
+
+def eliminate(spec: Spec, system: System, point: Point, *, expected: bool, joint: bool = True) -> Eliminated:
+    """Linearise at a point and eliminate every trajectory; without `joint` the biases are held."""
+    lins = linearise(spec, system, point, expected=expected)
+    compressed = of_states(spec, system, lins, point.states)
+    if joint:
+        information, score = of_biases(spec, system, lins)
+        crosses = of_both(spec, system, lins, point.states)
+    else:
+        information, score = jnp.zeros((0, 0)), jnp.zeros(0)
+        crosses = [jnp.zeros((*x.shape, 0)) for x in point.states]
+    states, noises, logdet = [], [], jnp.zeros(())
+    parts = zip(system.recursions, compressed, crosses, point.states, point.noises, strict=True)
+    for part, (J, pull), cross, x, u in parts:
+        L = factors(part, point.levels)
+        gain = rec.gains(part.F, L, J)
+        columns = jnp.concatenate([pull[:, :, None], cross], 2)
+        drift = jnp.zeros_like(columns).at[:, :, 0].set(-(L @ u[:, :, None])[:, :, 0])
+        smooth = rec.smooth(part.F, L, J, gain, columns, drift)
+        information = information - jnp.einsum("eni,enj->ij", cross, smooth.states[:, :, 1:])
+        score = score - jnp.einsum("eni,en->i", cross, smooth.states[:, :, 0])
+        states.append(smooth.states.at[:, :, 0].add(x))
+        noises.append(smooth.noises)
+        logdet = logdet + gain.logdet
+    information = 0.5 * (information + information.T)
+    return Eliminated(information, score, tuple(states), tuple(noises), logdet)
+
+
+def _proposal(spec: Spec, system: System, point: Point, alpha: jax.Array, damping: jax.Array, joint: bool) -> Point:
+    """Full Gauss-Newton step from a point."""
+    solved = eliminate(spec, system, point, expected=False, joint=joint)
+    dz = jnp.zeros_like(point.z)
+    if joint and spec.biases:  # an arrowhead: the tip first, then the trajectories follow
+        matrix = solved.information + jnp.diag(alpha + damping)
+        dz = linalg.solve_positive(matrix, solved.score - alpha * point.z)
+    move = jnp.concatenate([jnp.ones(1), -dz[: solved.states[0].shape[2] - 1]])
+    return point._replace(
+        states=tuple(s @ move for s in solved.states),
+        noises=tuple(s @ move for s in solved.noises),
+        z=point.z + dz,
+    )
+
+
+def _between(a: Point, b: Point, t: jax.Array) -> Point:
+    """Point a + t (b - a); consistent trajectories stay consistent."""
+    return jax.tree.map(lambda p, q: p + t * (q - p), a, b)
+
+
+class _Search(NamedTuple):
+    point: Point
+    cost: jax.Array
+    damping: jax.Array
+    change: jax.Array
+    iteration: jax.Array
+    done: jax.Array
+
+
+class Mode(NamedTuple):
+    """Outcome of a search for the mode."""
+
+    point: Point
+    cost: jax.Array
+    iterations: jax.Array
+    converged: jax.Array
+
+
+@partial(jax.jit, static_argnames=("spec", "joint"))
+def find_mode(
+    spec: Spec, system: System, start: Point, alpha: jax.Array, iterations: int, tolerance: float, *, joint: bool = True
+) -> Mode:
+    """Damped Gauss-Newton (iterated EKS, with the biases if `joint`) until the cost changes by less than `tolerance`.
+
+    The start must be a consistent trajectory (states made of its whitened noises). A step that does not
+    lower the cost, or reaches a non-finite one, is halved, then damped.
+    """
+
+    def body(s: _Search) -> _Search:
+        proposal = _proposal(spec, system, s.point, alpha, s.damping, joint)
+
+        def shorter(state):
+            t, _, tries = state
+            t = jnp.where(tries == 0, 1.0, 0.5 * t)
+            return t, cost(spec, system, _between(s.point, proposal, t), alpha), tries + 1
+
+        def worse(state):
+            _, value, tries = state
+            return (tries == 0) | (~(value <= s.cost) & (tries < HALVINGS))
+
+        t, value, tries = jax.lax.while_loop(worse, shorter, (jnp.ones(()), s.cost, 0))
+        better = value <= s.cost
+        point = jax.tree.map(lambda new, old: jnp.where(better, new, old), _between(s.point, proposal, t), s.point)
+        damping = jnp.where(better & (tries <= 2), s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
+        damping = jnp.where(damping < 1e-6, 0.0, damping)
+        change = jnp.where(better, s.cost - value, jnp.inf)
+        done = (better & (change < tolerance) & (s.damping <= 1.0)) | (damping > DAMPING)
+        return _Search(point, jnp.where(better, value, s.cost), damping, change, s.iteration + 1, done)
+
+    first = _Search(
+        start, cost(spec, system, start, alpha), jnp.zeros(()), jnp.full((), jnp.inf), jnp.zeros((), int), jnp.zeros((), bool)
+    )
+    last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations), body, first)
+    return Mode(last.point, last.cost, last.iteration, last.done & (last.change < tolerance))

@@ -1,0 +1,181 @@
+"""The automatic start: a track found from the data alone, without truth and without a hand-made guess.
+
+Every target is placed on a grid of candidate positions; for each epoch and candidate the other state
+components (power, emission range, ...) are profiled out, and the noise is widened by the prior spread of the
+biases. The best path through the grid (Viterbi, over windows of epochs) is then smoothed by the motion model
+into a consistent trajectory.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import rows
+from probcal.problem import Problem, Recursion, Spec, System
+from probcal.smoothing import recursion as rec
+from probcal.smoothing.mode import Point, factors, find_mode
+
+WINDOWS = 60  # at most so many windows a target
+INNER = {2: 24, 3: 10}  # grid points an axis inside the network
+OUTER = {2: 48, 3: 60}  # directions of the outer rings
+RINGS = (0.8, 1.2, 1.8, 2.8, 5.0, 9.0)  # their radii in extents
+ROBUST = 4.0  # degrees of freedom of the start's Student-t loss
+
+
+def candidates(problem: Problem) -> np.ndarray:
+    """Candidate positions, shape (candidates, d): a grid over the network and rings around it."""
+    nodes, d = problem.node_positions, problem.network.dimension
+    low, high = nodes.min(0), nodes.max(0)
+    margin = 0.3 * np.linalg.norm(high - low) + 0.02 * problem.extent
+    axes = [np.linspace(a - margin, b + margin, INNER[d]) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, d)
+    k = np.arange(OUTER[d])
+    if d == 2:
+        angle = 2 * np.pi * k / OUTER[d]
+        directions = np.stack([np.cos(angle), np.sin(angle)], -1)
+    else:  # a Fibonacci sphere
+        height = 1 - 2 * (k + 0.5) / OUTER[d]
+        angle = np.pi * (3 - np.sqrt(5)) * k
+        radius = np.sqrt(1 - height**2)
+        directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1)
+    rings = [nodes.mean(0) + factor * problem.extent * directions for factor in RINGS]
+    return np.concatenate([grid, *rings])
+
+
+def _widened(lin: rows.Linearised) -> jax.Array:
+    """Data precision with the prior spread of the biases (one scale each) added to the noise, (N, C)."""
+    spread = jnp.sum(lin.bias**2, -1)
+    return lin.weight / (1.0 + lin.weight * spread)
+
+
+@partial(jax.jit, static_argnames=("spec", "r", "span"))
+def _profile(spec: Spec, system: System, r: int, span: tuple[int, int], place: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Loss (E,) and states (E, n) of recursion r with the position at `place` (E, d), other components profiled."""
+    part = system.recursions[r]
+    E, n = part.drift.shape
+    z, levels = jnp.zeros(spec.biases), jnp.zeros(system.level_spread.shape)
+    resting = jax.lax.scan(lambda x, k: ((y := k[0] @ x + k[1]), y), jnp.zeros(n), (part.F, part.drift))[1]
+    states = resting.at[:, span[0] : span[1]].set(place)
+    mine = [(block, data) for block, data, own in zip(spec.blocks, system.rows, spec.recursion, strict=True) if own == r]
+    held = np.zeros(n, bool)
+    for name, start, stop, _ in mine[0][0].layout if mine else ():
+        held[start:stop] = name in ("position", "velocity", "acceleration")
+    first = part.F[:, 0, 0] == 0
+    precision = 1.0 / jnp.maximum(jnp.sum(factors(part, levels) ** 2, 2), 1e-12)
+    precision = jnp.where(held[None, :], 1e12, jnp.where(first[:, None], precision, jnp.min(precision, 0)[None, :]))
+    for _ in range(2):
+        A, b = jax.vmap(jnp.diag)(precision), precision * (resting - states) * ~held[None, :]
+        for block, data in mine:
+            lin = rows.linearise(block, data, states, z, levels, expected=False)
+            weight = _widened(lin)
+            pull = lin.score / jnp.maximum(lin.weight, 1e-300) * (lin.weight > 0) * weight
+            used = jnp.asarray(block.used, int)
+            A = A.at[:, used[:, None], used[None, :]].add(
+                jax.ops.segment_sum(jnp.einsum("ncu,nc,ncv->nuv", lin.state, weight, lin.state), data.epoch, E)
+            )
+            b = b.at[:, used].add(jax.ops.segment_sum(jnp.einsum("ncu,nc->nu", lin.state, pull), data.epoch, E))
+        loose = jnp.asarray(np.flatnonzero(~held), int)
+        if len(loose):
+            step = jnp.linalg.solve(A[:, loose[:, None], loose[None, :]], b[:, loose][:, :, None])[:, :, 0]
+            states = states.at[:, loose].add(step)
+    loss = jnp.zeros(E)
+    for block, data in mine:
+        lin = rows.linearise(block, data, states, z, levels, expected=False)
+        weight = _widened(lin)
+        residual = lin.score / jnp.maximum(lin.weight, 1e-300) * (lin.weight > 0)
+        each = 0.5 * (ROBUST + 1) * jnp.log1p(weight * residual**2 / ROBUST)
+        loss = loss + jax.ops.segment_sum(jnp.sum(jnp.where(jnp.isfinite(each), each, 1e6), 1), data.epoch, E)
+    return loss, states
+
+
+@partial(jax.jit, static_argnames=("spec", "r", "span"))
+def _losses(spec: Spec, system: System, r: int, span: tuple[int, int], places: jax.Array) -> jax.Array:
+    """Loss of every candidate at every epoch, (candidates, E)."""
+    E = system.recursions[r].drift.shape[0]
+    width = span[1] - span[0]
+    return jax.lax.map(lambda c: _profile(spec, system, r, span, jnp.broadcast_to(c, (E, width)))[0], places)
+
+
+def _viterbi(loss: np.ndarray, squared: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Cheapest path: losses (windows, candidates), squared distances, expected step between windows."""
+    total, back = loss[0], []
+    for k in range(1, len(loss)):
+        through = total[:, None] + 0.5 * squared / steps[k - 1] ** 2
+        best = through.argmin(0)
+        total = through[best, np.arange(len(best))] + loss[k]
+        back.append(best)
+    path = [int(total.argmin())]
+    for best in reversed(back):
+        path.append(int(best[path[-1]]))
+    return np.array(path[::-1])
+
+
+def _path(problem: Problem, time: np.ndarray, loss: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Positions (E, d) of one target along the cheapest path through the candidates."""
+    windows = np.array_split(np.arange(len(time)), min(WINDOWS, len(time)))
+    centre = np.array([time[w].mean() for w in windows])
+    inside = np.stack([loss[:, w].sum(1) for w in windows])
+    squared = ((places[:, None] - places[None]) ** 2).sum(-1)
+    spacing = np.sqrt(np.partition(squared[: INNER[problem.network.dimension] ** problem.network.dimension], 1, 1)[:, 1].max())
+    span = np.linalg.norm(np.ptp(problem.node_positions, axis=0)) or problem.extent
+    pace = 3 * span / max(float(np.ptp(time)), 1e-9)
+    path = places[_viterbi(inside, squared, 1.5 * spacing + pace * np.diff(centre))]
+    return np.stack([np.interp(time, centre, column) for column in path.T], -1)
+
+
+@jax.jit
+def _consistent(part: Recursion, states: jax.Array, weight: jax.Array, levels: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Smooth pseudo-measured states (E, n) of precision `weight` (E, n) into a trajectory of the motion model."""
+    L = factors(part, levels)
+    J = jax.vmap(jnp.diag)(weight)
+    gain = rec.gains(part.F, L, J)
+    smooth = rec.smooth(part.F, L, J, gain, (weight * states)[:, :, None], part.drift[:, :, None])
+    return smooth.states[:, :, 0], smooth.noises[:, :, 0]
+
+
+def project(problem: Problem, tracks: list[np.ndarray], precision: list[np.ndarray]) -> Point:
+    """Point at zero biases whose trajectories follow given states (E, n) with given precisions (E, n)."""
+    levels = jnp.zeros(len(problem.levels))
+    pairs = [
+        _consistent(part, jnp.asarray(states), jnp.asarray(weight), levels)
+        for part, states, weight in zip(problem.system.recursions, tracks, precision, strict=True)
+    ]
+    return Point(tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), jnp.zeros(problem.spec.biases), levels)
+
+
+def automatic_start(problem: Problem, iterations: int = 30) -> Point:
+    """Trajectories and biases from the data alone, near the joint mode at the declared scales.
+
+    Grid, Viterbi path, motion model, iterated EKS at zero biases, then a few joint steps.
+    """
+    places = candidates(problem)
+    tracks, precisions = [], []
+    for r, epochs in enumerate(problem.epochs):
+        span = next((start, stop) for name, start, stop, _ in epochs.layout if name == "position")
+        loss = np.asarray(_losses(problem.spec, problem.system, r, span, jnp.asarray(places)))
+        track = np.zeros((len(epochs.time), span[1] - span[0]))
+        for name in dict.fromkeys(epochs.target):
+            mine = epochs.target == name
+            track[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)
+        _, states = _profile(problem.spec, problem.system, r, span, jnp.asarray(track))
+        states = np.array(states)
+        spread = np.asarray(jnp.sum(problem.system.recursions[r].L ** 2, 2))
+        precision = np.where(spread > 0, 1e4 / np.maximum(spread, 1e-300), 1e-9)
+        for name, start, stop, _ in epochs.layout:
+            if name == "position":
+                precision[:, start:stop] = 1.0 / (0.05 * problem.extent) ** 2
+            elif name in ("velocity", "acceleration"):
+                precision[:, start:stop] = 0.0
+        tracks.append(states)
+        precisions.append(precision)
+    point = project(problem, tracks, precisions)
+    tracked = track_mode(problem, point, iterations)
+    return find_mode(problem.spec, problem.system, tracked, jnp.ones(problem.spec.biases), iterations, 1e-3).point
+
+
+def track_mode(problem: Problem, point: Point, iterations: int = 100) -> Point:
+    """Trajectories at held biases: iterated EKS from a point."""
+    alpha = jnp.zeros(problem.spec.biases)
+    return find_mode(problem.spec, problem.system, point, alpha, iterations, 1e-6, joint=False).point

@@ -1,0 +1,253 @@
+"""The only writer of results: one labelled DataTree from every method, and its netCDF file."""
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from probcal.problem import Problem
+from probcal.types import InputError
+
+INTERVAL = 0.89  # probability of lower to upper
+LARGEST = 20_000_000  # values of a group of draws above which it is written on request only
+SUMMARY = ("bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma")
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Posterior moments of one recursion: mean and sd (E, n), and the mean without calibration (E, n)."""
+
+    mean: np.ndarray
+    sd: np.ndarray
+    before: np.ndarray
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a method hands over, in z and in the order of `problem.labels`; arrays of NumPy."""
+
+    method: str
+    prior: str
+    seed: int
+    approximate: str
+    intervals: str
+    status: str
+    message: str
+    z: np.ndarray  # (M,)
+    covariance: np.ndarray  # (M, M)
+    precision: np.ndarray  # (M,)
+    gamma: np.ndarray  # (M,)
+    bias_status: Sequence[str]
+    information: np.ndarray  # (M, M)
+    evidence: float | None
+    objective: np.ndarray  # trace
+    levels: np.ndarray  # (H,) log factors
+    directions: Sequence[Any]  # name, information, vector, sentence
+    draws: np.ndarray  # (chain, draw, M) of z
+    states: Sequence[np.ndarray] | None  # (chain, draw, E, n) of each recursion
+    log_likelihood: Sequence[np.ndarray] | None  # (chain, draw, N, C) of each block
+    replicas: Sequence[np.ndarray] | None
+    tracks: Sequence[Tracks]
+    residuals: tuple[Sequence[np.ndarray], Sequence[np.ndarray], Sequence[np.ndarray]]  # before, after, std
+
+
+def _suffix(problem: Problem, r: int) -> str:
+    return "" if len(problem.epochs) == 1 else f"_{r}"
+
+
+def _datum(problem: Problem) -> tuple[dict[str, Any], list[tuple[np.ndarray, np.ndarray]]]:
+    """Coordinates of the measured data, and where each block keeps them (rows, channels)."""
+    data, network = problem.measurements, problem.network
+    picks, columns = [], []
+    for block, index, numbers in zip(problem.spec.blocks, problem.row_index, problem.system.rows, strict=True):
+        where = np.nonzero(np.asarray(numbers.mask))
+        picks.append(where)
+        rows, channels = index[where[0]], np.array([name for name, _ in block.type.expand(network.dimension)])[where[1]]
+        columns.append((rows, channels, np.asarray(numbers.y)[where]))
+    row = np.concatenate([c[0] for c in columns])
+    names = np.array([s.name for s in network.sensors])
+    coords = {
+        "sensor": ("datum", names[data.sensor[row]]),
+        "channel": ("datum", np.concatenate([c[1] for c in columns])),
+        "target": ("datum", np.array(data.target_names)[data.target[row]]),
+        "time": ("datum", data.time[row]),
+        "row": ("datum", data.table.lines[row]),
+    }
+    return {"coords": coords, "y": np.concatenate([c[2] for c in columns])}, picks
+
+
+def _gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Measured data of all blocks, last axis datum, from arrays (..., N, C)."""
+    return np.concatenate([np.asarray(p)[..., rows, channels] for p, (rows, channels) in zip(parts, picks, strict=True)], -1)
+
+
+def build(problem: Problem, result: Result) -> xr.DataTree:
+    """Assemble the DataTree of a fit (groups posterior, calibration, track, observed_data, ...)."""
+    datum, picks = _datum(problem)
+    coords, labels = datum["coords"], list(problem.labels)
+    scales = problem.scales
+    sample = ("chain", "draw")
+    chains, draws = result.draws.shape[:2]
+    base = {"chain": np.arange(chains), "draw": np.arange(draws)}
+    posterior: dict[str, Any] = {"bias": ((*sample, "label"), result.draws * scales)}
+    track = _track(problem, result.tracks)
+    if result.states is not None:
+        for r, states in enumerate(result.states):
+            s = _suffix(problem, r)
+            posterior[f"state{s}"] = ((*sample, f"epoch{s}", f"component{s}"), states)
+    z = ("label", labels)
+    sd = np.sqrt(np.diag(result.covariance))
+    half = stats.norm.ppf(0.5 + INTERVAL / 2)
+    calibration = {
+        "mean": result.z * scales, "sd": sd * scales,
+        "lower": (result.z - half * sd) * scales, "upper": (result.z + half * sd) * scales,
+        "gamma": result.gamma, "precision": result.precision, "scale": scales,
+        "status": np.array(result.bias_status, str), "unit": np.array([b.unit for b in problem.biases], str),
+        "kind": np.array([b.kind for b in problem.biases], str),
+    }  # fmt: skip
+    log_prior = stats.norm.logpdf(result.draws, 0.0, 1 / np.sqrt(np.maximum(result.precision, 1e-300)))
+    before, after, std = (_gather(parts, picks) for parts in result.residuals)
+    groups: dict[str, xr.Dataset] = {
+        "posterior": xr.Dataset(posterior, coords={**base, "label": z, **track.coords}),
+        "calibration": xr.Dataset(
+            {k: ("label", v) for k, v in calibration.items()}
+            | {
+                "covariance": (("label", "label_other"), result.covariance * np.outer(scales, scales)),
+                "information": (("label", "label_other"), result.information),
+            },
+            coords={"label": z, "label_other": labels},
+        ),
+        "track": track,
+        "observed_data": xr.Dataset({"y": ("datum", datum["y"])}, coords=coords),
+        "residual": xr.Dataset(
+            {"before": ("datum", before), "after": ("datum", after), "std": ("datum", std)}, coords=coords
+        ),
+        "optimisation": xr.Dataset({"objective": ("iteration", result.objective)}),
+        "constant_data": _constant(problem),
+    }
+    if (result.precision > 0).all():
+        groups["log_prior"] = xr.Dataset({"bias": ((*sample, "label"), log_prior)}, coords={**base, "label": z})
+    for name, parts in (("log_likelihood", result.log_likelihood), ("posterior_predictive", result.replicas)):
+        if parts is not None:
+            groups[name] = xr.Dataset({"y": ((*sample, "datum"), _gather(parts, picks))}, coords={**base, **coords})
+    if problem.levels:
+        guess = np.array([level.guess for level in problem.levels])
+        groups["level"] = xr.Dataset(
+            {"std": ("level", guess * np.exp(result.levels)), "guess": ("level", guess)},
+            coords={"level": [level.label for level in problem.levels]},
+        )
+    if result.directions:
+        groups["direction"] = xr.Dataset(
+            {
+                "information": ("direction", [d.information for d in result.directions]),
+                "sentence": ("direction", [d.sentence for d in result.directions]),
+                "vector": (("direction", "label"), np.stack([d.vector for d in result.directions])),
+            },
+            coords={"direction": [d.name for d in result.directions], "label": labels},
+        )
+    attrs = {
+        "method": result.method, "prior": result.prior, "seed": result.seed, "approximate": result.approximate,
+        "intervals": result.intervals, "interval_probability": INTERVAL, "status": result.status,
+        "message": result.message, "data": problem.measurements.table.source,
+        "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
+    }  # fmt: skip
+    if result.evidence is not None:
+        attrs["log_evidence"] = result.evidence
+    for group in groups.values():
+        group.attrs.update(inference_library="probcal", inference_library_version=version("probcal"))
+    tree = xr.DataTree.from_dict(groups)
+    tree.attrs.update(attrs)
+    return tree
+
+
+def _track(problem: Problem, tracks: Sequence[Tracks]) -> xr.Dataset:
+    """Mean, sd and uncalibrated mean of every state, with times and targets of the epochs."""
+    values: dict[str, Any] = {}
+    coords: dict[str, Any] = {}
+    for r, (epochs, moments) in enumerate(zip(problem.epochs, tracks, strict=True)):
+        s = _suffix(problem, r)
+        coords |= {
+            f"component{s}": list(epochs.components),
+            f"epoch_time{s}": (f"epoch{s}", epochs.time),
+            f"epoch_target{s}": (f"epoch{s}", np.asarray(epochs.target, str)),
+        }
+        for name, value in (("mean", moments.mean), ("sd", moments.sd), ("before", moments.before)):
+            values[f"{name}{s}"] = ((f"epoch{s}", f"component{s}"), value)
+    return xr.Dataset(values, coords=coords)
+
+
+def build_tracks(problem: Problem, tracks: Sequence[Tracks]) -> xr.DataTree:
+    """A tree of tracks alone, for data to which a calibration was applied."""
+    tree = xr.DataTree.from_dict({"track": _track(problem, tracks)})
+    tree.attrs["data"] = problem.measurements.table.source
+    return tree
+
+
+def _constant(problem: Problem) -> xr.Dataset:
+    """Stated positions of the nodes, their calibrated shift by label, and the fixed biases."""
+    d, nodes = problem.network.dimension, problem.network.nodes
+    values = {
+        "node_position": (("node", "axis"), np.stack([n.position for n in nodes])),
+        "moving": ("node", np.array([n.path is not None for n in nodes])),
+    }
+    coords = {"node": [n.name for n in nodes], "axis": ["x", "y", "z"][:d]}
+    if problem.fixed:
+        values["fixed"] = ("fixed_label", np.array(list(problem.fixed.values())))
+        coords["fixed_label"] = list(problem.fixed)
+    return xr.Dataset(values, coords=coords)
+
+
+def add_scores(tree: xr.DataTree, scores: Mapping[str, float], biases: Mapping[str, float]) -> xr.DataTree:
+    """Add what the truth says of a fit: scores as attributes, true biases to the calibration group."""
+    tree.attrs.update({name: float(value) for name, value in scores.items()})
+    known = {label: value for label, value in biases.items() if label in tree["calibration"]["label"]}
+    if known:
+        tree["truth"] = xr.DataTree(
+            xr.Dataset({"bias": ("label", list(known.values()))}, coords={"label": list(known)})
+        )
+    return tree
+
+
+def summary(tree: xr.DataTree) -> Any:
+    """One row a bias as a DataFrame: bias, unit, scale, mean, sd, lower, upper, gamma, precision, status."""
+    group = tree["calibration"].to_dataset()
+    frame = group[[*SUMMARY[1:], "precision", "status"]].to_dataframe().reset_index()
+    return frame.rename(columns={"label": "bias"})[[*SUMMARY, "precision", "status"]]
+
+
+def save(tree: xr.DataTree, path: str | PathLike[str]) -> Path:
+    """Write netCDF in one step: a file of that name is whole or absent."""
+    path = Path(path)
+    handle, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    os.close(handle)
+    try:
+        tree.to_netcdf(draft, engine="h5netcdf")
+        os.replace(draft, path)
+    finally:
+        Path(draft).unlink(missing_ok=True)
+    return path
+
+
+def load(path: str | PathLike[str]) -> xr.DataTree:
+    """Read a fit back from its file, or from the folder that holds `fit.nc`."""
+    path = Path(path)
+    path = path / "fit.nc" if path.is_dir() else path
+    try:
+        with xr.open_datatree(path, engine="h5netcdf") as tree:
+            tree = tree.load()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} is not a fit written by probcal ({type(error).__name__}: {error})") from None
+    if "calibration" not in tree.children:
+        raise InputError(f"{path} is not a fit written by probcal: it has no group calibration")
+    return tree
+
+

@@ -1,0 +1,99 @@
+"""Errors, the float64 entry-point guard, and the views that a sensor function reads."""
+
+import functools
+from collections.abc import Callable, Iterable, Mapping
+from difflib import get_close_matches
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Array = jax.Array | np.ndarray
+AXES = ("x", "y", "z")
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class InputError(ValueError):
+    """A declaration, table or argument that cannot be used; the text says what to do about it."""
+
+
+class FitError(RuntimeError):
+    """A fit that left nothing to report: the text says why and what to do."""
+
+
+def float64(function: Callable[P, R]) -> Callable[P, R]:
+    """Run a public entry point in double precision without touching the global configuration of jax."""
+
+    @functools.wraps(function)
+    def entry(*args: P.args, **kwargs: P.kwargs) -> R:
+        with jax.enable_x64(True):
+            return function(*args, **kwargs)
+
+    return entry
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return `; did you mean "..."?` for the nearest known name, or the list of what is known."""
+    names = [str(item) for item in known]
+    close = get_close_matches(str(name), names, n=1)
+    if close:
+        return f'; did you mean "{close[0]}"?'
+    shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+    return f"; known: {shown}" if names else ""
+
+
+class View:
+    """Named components, read as attributes by a sensor function (`target.position`, `pose.heading`)."""
+
+    def __init__(self, owner: str, components: Mapping[str, Any]):
+        self._owner = owner
+        self._components = dict(components)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        try:
+            return self._components[name]
+        except KeyError:
+            raise InputError(
+                f'{self._owner} has no component "{name}"{nearest(name, self._components)}'
+            ) from None
+
+
+class TargetView(View):
+    """One target at one instant: its state components by name, in metres, seconds and radians."""
+
+    def at(self, dt: Any) -> "TargetView":
+        """Extrapolate by `dt` seconds along velocity and acceleration; other components stay."""
+        moved = dict(self._components)
+        acceleration = moved.get("acceleration")
+        if "velocity" in moved:
+            moved["position"] = moved["position"] + dt * moved["velocity"]
+        if acceleration is not None:
+            moved["position"] = moved["position"] + 0.5 * dt**2 * acceleration
+            moved["velocity"] = moved["velocity"] + dt * acceleration
+        return TargetView(self._owner, moved)
+
+
+class PoseView(View):
+    """One node at one instant, already corrected for its biases: position, heading and what it owns."""
+
+    def local(self, point: Any) -> jax.Array:
+        """Turn a point from the common frame into the node's own axes (x ahead, y left, z up).
+
+        Rotation is heading about z, then pitch (nose up), then roll, all in radians; in 2-D heading alone.
+        """
+        offset = point - self.position
+        c, s = jnp.cos(self.heading), jnp.sin(self.heading)
+        ahead = c * offset[0] + s * offset[1]
+        left = -s * offset[0] + c * offset[1]
+        if offset.shape[0] == 2:
+            return jnp.stack([ahead, left])
+        cp, sp = jnp.cos(self.pitch), jnp.sin(self.pitch)
+        cr, sr = jnp.cos(self.roll), jnp.sin(self.roll)
+        forward = cp * ahead + sp * offset[2]
+        above = -sp * ahead + cp * offset[2]
+        return jnp.stack([forward, cr * left + sr * above, -sr * left + cr * above])
