@@ -30,9 +30,9 @@ def scores(tree: xr.DataTree, truth: Truth) -> dict[str, float]:
         found |= {"position_rmse_before": positions[0], "position_rmse_after": positions[1]}
     if "calibration" in tree.children and truth.biases:
         group = tree["calibration"].to_dataset()
-        known = [str(label) for label in group["label"].values if str(label) in truth.biases]
+        known = [str(label) for label in group["bias_label"].values if str(label) in truth.biases]
         if known:
-            chosen = group.sel(label=known)
+            chosen = group.sel(bias_label=known)
             true = np.array([truth.biases[label] for label in known])
             error = (chosen["mean"].values - true) / chosen["scale"].values
             inside = (chosen["lower"].values <= true) & (true <= chosen["upper"].values)

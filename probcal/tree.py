@@ -98,13 +98,13 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
     sample = ("chain", "draw")
     chains, draws = result.draws.shape[:2]
     base = {"chain": np.arange(chains), "draw": np.arange(draws)}
-    posterior: dict[str, Any] = {"bias": ((*sample, "label"), result.draws * scales)}
+    posterior: dict[str, Any] = {"bias": ((*sample, "bias_label"), result.draws * scales)}
     track = _track(problem, result.tracks)
     if result.states is not None:
         for r, states in enumerate(result.states):
             s = _suffix(problem, r)
             posterior[f"state{s}"] = ((*sample, f"epoch{s}", f"component{s}"), states)
-    z = ("label", labels)
+    z = ("bias_label", labels)
     sd = np.sqrt(np.diag(result.covariance))
     half = stats.norm.ppf(0.5 + INTERVAL / 2)
     calibration = {
@@ -117,14 +117,14 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
     log_prior = stats.norm.logpdf(result.draws, 0.0, 1 / np.sqrt(np.maximum(result.precision, 1e-300)))
     before, after, std = (_gather(parts, picks) for parts in result.residuals)
     groups: dict[str, xr.Dataset] = {
-        "posterior": xr.Dataset(posterior, coords={**base, "label": z, **track.coords}),
+        "posterior": xr.Dataset(posterior, coords={**base, "bias_label": z, **track.coords}),
         "calibration": xr.Dataset(
-            {k: ("label", v) for k, v in calibration.items()}
+            {k: ("bias_label", v) for k, v in calibration.items()}
             | {
-                "covariance": (("label", "label_other"), result.covariance * np.outer(scales, scales)),
-                "information": (("label", "label_other"), result.information),
+                "covariance": (("bias_label", "bias_label_other"), result.covariance * np.outer(scales, scales)),
+                "information": (("bias_label", "bias_label_other"), result.information),
             },
-            coords={"label": z, "label_other": labels},
+            coords={"bias_label": z, "bias_label_other": labels},
         ),
         "track": track,
         "observed_data": xr.Dataset({"y": ("datum", datum["y"])}, coords=coords),
@@ -135,7 +135,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         "constant_data": _constant(problem),
     }
     if (result.precision > 0).all():
-        groups["log_prior"] = xr.Dataset({"bias": ((*sample, "label"), log_prior)}, coords={**base, "label": z})
+        groups["log_prior"] = xr.Dataset({"bias": ((*sample, "bias_label"), log_prior)}, coords={**base, "bias_label": z})
     for name, parts in (("log_likelihood", result.log_likelihood), ("posterior_predictive", result.replicas)):
         if parts is not None:
             groups[name] = xr.Dataset({"y": ((*sample, "datum"), _gather(parts, picks))}, coords={**base, **coords})
@@ -150,9 +150,9 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
             {
                 "information": ("direction", [d.information for d in result.directions]),
                 "sentence": ("direction", [d.sentence for d in result.directions]),
-                "vector": (("direction", "label"), np.stack([d.vector for d in result.directions])),
+                "vector": (("direction", "bias_label"), np.stack([d.vector for d in result.directions])),
             },
-            coords={"direction": [d.name for d in result.directions], "label": labels},
+            coords={"direction": [d.name for d in result.directions], "bias_label": labels},
         )
     attrs = {
         "method": result.method, "prior": result.prior, "seed": result.seed, "approximate": result.approximate,
@@ -209,10 +209,10 @@ def _constant(problem: Problem) -> xr.Dataset:
 def add_scores(tree: xr.DataTree, scores: Mapping[str, float], biases: Mapping[str, float]) -> xr.DataTree:
     """Add what the truth says of a fit: scores as attributes, true biases to the calibration group."""
     tree.attrs.update({name: float(value) for name, value in scores.items()})
-    known = {label: value for label, value in biases.items() if label in tree["calibration"]["label"]}
+    known = {label: value for label, value in biases.items() if label in tree["calibration"]["bias_label"]}
     if known:
         tree["truth"] = xr.DataTree(
-            xr.Dataset({"bias": ("label", list(known.values()))}, coords={"label": list(known)})
+            xr.Dataset({"bias": ("bias_label", list(known.values()))}, coords={"bias_label": list(known)})
         )
     return tree
 
@@ -221,7 +221,7 @@ def summary(tree: xr.DataTree) -> Any:
     """One row a bias as a DataFrame: bias, unit, scale, mean, sd, lower, upper, gamma, precision, status."""
     group = tree["calibration"].to_dataset()
     frame = group[[*SUMMARY[1:], "precision", "status"]].to_dataframe().reset_index()
-    return frame.rename(columns={"label": "bias"})[[*SUMMARY, "precision", "status"]]
+    return frame.rename(columns={"bias_label": "bias"})[[*SUMMARY, "precision", "status"]]
 
 
 def save(tree: xr.DataTree, path: str | PathLike[str]) -> Path:

@@ -132,13 +132,13 @@ def track(problem: Problem, calibration: xr.DataTree) -> xr.DataTree:
     raises `InputError` if the calibration lacks one.
     """
     group = calibration["calibration"].to_dataset()
-    known = [str(label) for label in group["label"].values]
+    known = [str(label) for label in group["bias_label"].values]
     for label in problem.labels:
         if label not in known:
             raise InputError(f'the calibration has no bias "{label}"; fit the same network, or fix that bias')
-    chosen = group.sel(label=list(problem.labels))
+    chosen = group.sel(bias_label=list(problem.labels))
     z = jnp.asarray(chosen["mean"].values / problem.scales)
-    covariance = group["covariance"].sel(label=list(problem.labels), label_other=list(problem.labels)).values
+    covariance = group["covariance"].sel(bias_label=list(problem.labels), bias_label_other=list(problem.labels)).values
     covariance = jnp.asarray(covariance / np.outer(problem.scales, problem.scales))
     start = automatic_start(problem)
     before = track_mode(problem, _uncalibrated(start))
