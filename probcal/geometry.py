@@ -27,5 +27,5 @@ def elevation(line: Any) -> jax.Array:
 
 
 def wrap(angle: Any, period: float = 2 * np.pi) -> jax.Array:
-    """The angle shifted by whole periods into [-period/2, period/2)."""
-    return jnp.mod(angle + 0.5 * period, period) - 0.5 * period
+    """The angle shifted by whole periods into [-period/2, period/2]."""
+    return angle - period * jnp.round(angle / period)

@@ -2,14 +2,38 @@
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve
+from jax.scipy.linalg import solve_triangular
 
-UNROLL = 12  # largest matrix whose Cholesky factor is written out instead of calling LAPACK
+UNROLL = 12  # largest matrix whose factors are written out instead of calling LAPACK
+BASE = 16  # largest block that a dense factorisation hands to LAPACK
+NARROW = 64  # most columns for which a product is written as a sum: inside a scan a small dot costs more
+
+
+def multiply(left: jax.Array, right: jax.Array) -> jax.Array:
+    """Product of a small (n, k) and a (k, m) matrix, in the form that is fast inside a scan."""
+    if left.shape[1] > UNROLL or right.shape[1] > NARROW:
+        return left @ right
+    return jnp.sum(left[:, :, None] * right[None, :, :], 1)
 
 
 def tria(columns: jax.Array) -> jax.Array:
-    """Lower-triangular (n, n) L with L L' = columns columns', for columns (n, m), m >= n, of any rank."""
-    return jnp.linalg.qr(columns.T, mode="r").T
+    """Lower-triangular (n, n) L with L L' = columns columns', for columns (n, m), m >= n, of any rank.
+
+    Small ones by modified Gram-Schmidt, whose triangle is backward stable at any rank (Bjorck 1967).
+    """
+    n = columns.shape[0]
+    if n > UNROLL:
+        return jnp.linalg.qr(columns.T, mode="r").T
+    rows = [columns[i] for i in range(n)]
+    lower = [[jnp.zeros((), columns.dtype)] * n for _ in range(n)]
+    for j in range(n):
+        length = jnp.sqrt(jnp.sum(rows[j] ** 2))
+        unit = rows[j] / jnp.where(length > 0, length, 1.0)
+        lower[j][j] = length
+        for i in range(j + 1, n):
+            lower[i][j] = jnp.sum(rows[i] * unit)
+            rows[i] = rows[i] - lower[i][j] * unit
+    return jnp.stack([jnp.stack(row) for row in lower])
 
 
 def _unrolled_cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
@@ -30,8 +54,7 @@ def inverse_cholesky(matrix: jax.Array) -> jax.Array:
     """Inverse C^-1 (lower) of the Cholesky factor of a small positive definite (n, n) matrix."""
     n = matrix.shape[0]
     if n > UNROLL:
-        factor = jnp.linalg.cholesky(matrix)
-        return jax.scipy.linalg.solve_triangular(factor, jnp.eye(n, dtype=matrix.dtype), lower=True)
+        return factor_and_inverse(matrix)[1]
     lower = _unrolled_cholesky(matrix)
     zero = jnp.zeros((), matrix.dtype)
     inverse = [[zero] * n for _ in range(n)]
@@ -45,28 +68,54 @@ def inverse_cholesky(matrix: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack(row) for row in inverse])
 
 
+def factor_and_inverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Lower Cholesky factor L of a positive definite (n, n) matrix, and L^-1, by halves.
+
+    Products do the work: LAPACK sees blocks of at most `BASE`, since its threaded triangular solves wait
+    milliseconds for a busy core. Non-finite where the matrix is not positive definite.
+    """
+    n = matrix.shape[0]
+    if n <= BASE:
+        lower = jnp.linalg.cholesky(matrix)
+        return lower, solve_triangular(lower, jnp.eye(n, dtype=matrix.dtype), lower=True)
+    h = n // 2
+    first, first_inverse = factor_and_inverse(matrix[:h, :h])
+    below = matrix[h:, :h] @ first_inverse.T
+    last, last_inverse = factor_and_inverse(matrix[h:, h:] - below @ below.T)
+    corner = jnp.zeros((h, n - h), matrix.dtype)
+    inverse_below = -(last_inverse @ below) @ first_inverse
+    return (
+        jnp.block([[first, corner], [below, last]]),
+        jnp.block([[first_inverse, corner], [inverse_below, last_inverse]]),
+    )
+
+
 def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:
     """Solve a symmetric positive definite system; non-finite where the matrix is not positive definite."""
-    return cho_solve(cho_factor(matrix, lower=True), right)
+    _, inverse = factor_and_inverse(matrix)
+    return inverse.T @ (inverse @ right)
 
 
 def inverse_and_logdet(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Inverse and log determinant of a symmetric positive definite matrix, by one Cholesky factor."""
-    factor = jnp.linalg.cholesky(matrix)
-    inverse = cho_solve((factor, True), jnp.eye(matrix.shape[0], dtype=matrix.dtype))
-    return inverse, 2.0 * jnp.sum(jnp.log(jnp.diagonal(factor)))
+    """Inverse and log determinant of a symmetric positive definite matrix."""
+    lower, inverse = factor_and_inverse(matrix)
+    return inverse.T @ inverse, 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower)))
 
 
 def inverse_diagonal(matrix: jax.Array) -> jax.Array:
     """Diagonal of the inverse of a symmetric positive definite matrix."""
-    root = jnp.linalg.cholesky(matrix)
-    inverse = jax.scipy.linalg.solve_triangular(root, jnp.eye(matrix.shape[0], dtype=matrix.dtype), lower=True)
-    return jnp.sum(inverse**2, 0)
+    return jnp.sum(factor_and_inverse(matrix)[1] ** 2, 0)
 
 
 def factor(matrix: jax.Array) -> jax.Array:
     """Lower Cholesky factor of a symmetric positive definite matrix."""
-    return jnp.linalg.cholesky(matrix)
+    return factor_and_inverse(matrix)[0]
+
+
+def solve_batched(matrices: jax.Array, right: jax.Array) -> jax.Array:
+    """Solve small positive definite systems (E, n, n) for vectors (E, n)."""
+    inverses = jax.vmap(inverse_cholesky)(matrices)
+    return (inverses.mT @ (inverses @ right[:, :, None]))[:, :, 0]
 
 
 def spectrum(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -1,7 +1,6 @@
 """Weak directions of the biases by name: what neither data nor survey fix, and what to anchor.
 
-A direction is weak when its marginal information is below 1 in units of the prior scale; a surveyed bias
-brings an information of 1 of its own.
+A direction is weak when its marginal information is below 1 in units of the prior scale.
 """
 
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ import numpy as np
 from probcal.problem import Problem
 from probcal.types import AXES
 
-WEAK = 1.0 - 1e-6  # marginal information below which a direction is left to the prior
+WEAK = 1.0  # marginal information below which a direction is left to the prior
 RIDGE = 1e-2  # keeps the completion of a pattern from running along other weak directions
 INVOLVED = 0.3  # share of the largest entry above which a bias is named
 
@@ -36,40 +35,60 @@ class Direction:
 def weak_directions(problem: Problem, information: np.ndarray, z: np.ndarray) -> tuple[Direction, ...]:
     """Name the directions of marginal information below 1 at biases z (M,), the weakest first.
 
-    Translations, rotations, dilation and common shifts are tried first, each completed by the other biases
-    that move along; what remains is described by its largest entries.
+    Surveyed biases are marginalised with their survey. Translations, rotations, dilation and common shifts
+    are tried first, each completed by the other biases that move along; what remains is described by its
+    largest entries.
     """
-    if not len(z):
+    free = ~problem.surveyed
+    if not free.any():
         return ()
-    known = information + np.diag(problem.surveyed.astype(float))
+    known = _marginal(information, free)
     values, vectors = np.linalg.eigh(known)
     missing = int((values < WEAK).sum())
     if not missing:
         return ()
-    tried = []
-    for name, pattern, remedy in _patterns(problem, z):
-        vector = _complete(known, pattern)
-        tried.append((float(vector @ known @ vector), name, vector, pattern != 0, remedy))
+    labels = [label for label, own in zip(problem.labels, free, strict=True) if own]
     found: list[Direction] = []
-    basis = np.zeros((len(z), 0))
-    for strength, name, vector, own, remedy in sorted(tried, key=lambda entry: entry[0]):
+    basis = np.zeros((len(labels), 0))
+    for name, pattern, remedy in _patterns(problem, z):
+        own = pattern[free] != 0
+        if not own.any() or len(found) == missing:
+            continue
+        vector = _complete(known, pattern[free])
+        strength = float(vector @ known @ vector)
         rest = vector - basis @ (basis.T @ vector)
-        if strength < WEAK and np.linalg.norm(rest) > 0.5 and len(found) < missing:
+        if strength < WEAK and np.linalg.norm(rest) > 0.5:
             basis = np.concatenate([basis, rest[:, None] / np.linalg.norm(rest)], 1)
-            involved = _involved(problem, np.where(own, 0.0, vector), np.abs(vector).max())
-            found.append(Direction(name, strength, vector, involved, remedy))
+            involved = _involved(labels, np.where(own, 0.0, vector), np.abs(vector).max())
+            found.append(Direction(name, strength, _spread(vector, free), involved, remedy))
     weak = vectors[:, :missing]
-    left = np.linalg.svd(weak @ weak.T - (weak @ weak.T @ basis) @ basis.T)[0][:, : missing - len(found)]
+    left = np.linalg.svd(weak - basis @ (basis.T @ weak))[0][:, : missing - len(found)]
     for vector in left.T:
-        involved = _involved(problem, vector, np.abs(vector).max())
+        involved = _involved(labels, vector, np.abs(vector).max())
         remedy = f"fix or survey {involved[0]}, or add a pass that excites it"
-        found.append(Direction("a combination", float(vector @ known @ vector), vector, involved, remedy))
+        strength = float(vector @ known @ vector)
+        found.append(Direction("a combination", strength, _spread(vector, free), involved, remedy))
     return tuple(sorted(found, key=lambda direction: direction.information))
 
 
-def _involved(problem: Problem, vector: np.ndarray, largest: float) -> tuple[str, ...]:
+def _marginal(information: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Information of the free biases with the surveyed ones marginalised."""
+    held = ~free
+    inner = information[np.ix_(held, held)] + np.eye(held.sum())
+    cross = information[np.ix_(held, free)]
+    return information[np.ix_(free, free)] - cross.T @ np.linalg.solve(inner, cross)
+
+
+def _spread(vector: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Vector of the free biases in the order of all."""
+    whole = np.zeros(len(free))
+    whole[free] = vector
+    return whole
+
+
+def _involved(labels: list[str], vector: np.ndarray, largest: float) -> tuple[str, ...]:
     order = np.argsort(-np.abs(vector))
-    return tuple(problem.labels[m] for m in order if abs(vector[m]) > INVOLVED * largest)
+    return tuple(labels[m] for m in order if abs(vector[m]) > INVOLVED * largest)
 
 
 def _complete(information: np.ndarray, pattern: np.ndarray) -> np.ndarray:
@@ -84,52 +103,59 @@ def _complete(information: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 
 
 def _patterns(problem: Problem, z: np.ndarray) -> list[tuple[str, np.ndarray, str]]:
-    """Candidate directions in z: rigid motions, dilation, and a shift common to all biases of one name."""
-    d = problem.network.dimension
-    place = {(b.owner, b.axis): m for m, b in enumerate(problem.biases) if b.component == "position"}
-    heading = [m for m, b in enumerate(problem.biases) if b.component == "heading"]
-    nodes = {node.name: node for node in problem.network.nodes}
-    owners = list(dict.fromkeys(owner for owner, _ in place))
-    found = []
-    if owners:
-        shift = z * problem.scales
-        at = {
-            owner: nodes[owner].position
-            + np.array([shift[place[owner, a]] if (owner, a) in place else 0.0 for a in range(d)])
-            for owner in owners
-        }
-        centre = np.mean(list(at.values()), 0)
-
-        def positions(move) -> np.ndarray:
-            pattern = np.zeros(len(z))
-            for (owner, axis), m in place.items():
-                pattern[m] = move(at[owner] - centre)[axis] / problem.scales[m]
-            return pattern
-
-        for axis in range(d):
-            step = np.eye(d)[axis]
-            remedy = "anchor the position of one node (fix it, or give it a survey)"
-            found.append((f"translation along {AXES[axis]}", positions(lambda r, step=step: step), remedy))
-        planes = [(0, 1)] if d == 2 else [(0, 1), (1, 2), (2, 0)]
-        for a, b in planes:
-
-            def turn(r, a=a, b=b):
-                moved = np.zeros(d)
-                moved[a], moved[b] = -r[b], r[a]
-                return moved
-
-            pattern = positions(turn)
-            if (a, b) == (0, 1):
-                for m in heading:
-                    pattern[m] = 1.0 / problem.scales[m]
-            axis = "" if d == 2 else f" about {AXES[3 - a - b]}"
-            found.append((f"rotation{axis}", pattern, "anchor the positions of two nodes, or one heading with one position"))
-        remedy = "anchor the positions of two nodes, or one range scale"
-        found.append(("dilation: all positions grow or shrink about their centre", positions(lambda r: r), remedy))
+    """Candidate directions in z, in the order in which names are preferred: rigid motions, dilation, common shifts."""
+    found = [*_rigid(problem, z)]
     for component in dict.fromkeys(b.component for b in problem.biases if b.component != "position"):
         members = [m for m, b in enumerate(problem.biases) if b.component == component]
         if len(members) > 1:
             pattern = np.zeros(len(z))
             pattern[members] = 1.0 / problem.scales[members]
             found.append((f"a common {component} of all", pattern, f"fix the {component} of one of them"))
-    return [(name, pattern, remedy) for name, pattern, remedy in found if np.abs(pattern).max() > 0]
+    return found
+
+
+def _rigid(problem: Problem, z: np.ndarray) -> list[tuple[str, np.ndarray, str]]:
+    """Translation, rotation and dilation of all nodes; about the anchor where one node is anchored."""
+    d = problem.network.dimension
+    place = {
+        (b.owner, b.axis): m for m, b in enumerate(problem.biases) if b.component == "position" and b.kind == "scale"
+    }
+    owners = {owner for owner, _ in place}
+    anchors = [node.position for node in problem.network.nodes if node.name not in owners]
+    if not owners or len(anchors) > 1:
+        return []
+    shift = z * problem.scales
+    at = {node.name: np.array(node.position) for node in problem.network.nodes if node.name in owners}
+    for (owner, axis), m in place.items():
+        at[owner][axis] += shift[m]
+    centre = anchors[0] if anchors else np.mean(list(at.values()), 0)
+    about = " about the anchor" if anchors else ""
+
+    def pattern(move: np.ndarray) -> np.ndarray:
+        """Velocities move @ (position - centre) of all free positions, in z."""
+        vector = np.zeros(len(z))
+        for (owner, axis), m in place.items():
+            vector[m] = move[axis] @ (at[owner] - centre) / problem.scales[m]
+        return vector
+
+    found = []
+    if not anchors:
+        for axis in range(d):
+            vector = np.zeros(len(z))
+            for (_, a), m in place.items():
+                vector[m] = (a == axis) / problem.scales[m]
+            remedy = "anchor the position of one node (fix it, or give it a survey)"
+            found.append((f"translation of all nodes along {AXES[axis]}", vector, remedy))
+    headed = ", or one heading" if any(b.component == "heading" for b in problem.biases) else ""
+    for a, b in [(0, 1)] if d == 2 else [(0, 1), (1, 2), (2, 0)]:
+        turn = np.zeros((d, d))
+        turn[a, b], turn[b, a] = -1.0, 1.0
+        vector = pattern(turn)
+        for m, bias in enumerate(problem.biases):
+            if bias.component == "heading" and (a, b) == (0, 1):
+                vector[m] = 1.0 / problem.scales[m]
+        name = "rotation" if d == 2 else f"rotation around {AXES[3 - a - b]}"
+        found.append((name + about, vector, f"anchor the position of one more node{headed}"))
+    remedy = "anchor the positions of two nodes, or fix one range scale"
+    found.append((f"dilation: all positions grow or shrink together{about}", pattern(np.eye(d)), remedy))
+    return found

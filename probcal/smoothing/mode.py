@@ -126,13 +126,25 @@ def eliminate(spec: Spec, system: System, point: Point, *, expected: bool, joint
         columns = jnp.concatenate([pull[:, :, None], cross], 2)
         drift = jnp.zeros_like(columns).at[:, :, 0].set(-(L @ u[:, :, None])[:, :, 0])
         smooth = rec.smooth(part.F, L, J, gain, columns, drift)
-        information = information - jnp.einsum("eni,enj->ij", cross, smooth.states[:, :, 1:])
+        information = information + _reduction(cross, J, smooth)
         score = score - jnp.einsum("eni,en->i", cross, smooth.states[:, :, 0])
         states.append(smooth.states.at[:, :, 0].add(x))
         noises.append(smooth.noises)
         logdet = logdet + gain.logdet
     information = 0.5 * (information + information.T)
     return Eliminated(information, score, tuple(states), tuple(noises), logdet)
+
+
+def _reduction(cross: jax.Array, J: jax.Array, smooth: rec.Smoothed) -> jax.Array:
+    """What eliminating one recursion takes from the information of the biases, -B'W^-1 B, shape (M, M).
+
+    Written as the least-squares cost at the smoothed response X with noises U, -B'X - X'(B - JX) + U'U: an
+    error of X enters squared, so that a row with huge derivatives (a target passing a sensor) does no harm.
+    """
+    X, U = smooth.states[:, :, 1:], smooth.noises[:, :, 1:]
+    left = jnp.concatenate([cross, X, U], 1)
+    right = jnp.concatenate([-X, J @ X - cross, U], 1)
+    return jnp.einsum("eni,enj->ij", left, right)
 
 
 def _proposal(spec: Spec, system: System, point: Point, alpha: jax.Array, damping: jax.Array, joint: bool) -> Point:

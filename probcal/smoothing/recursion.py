@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from probcal.linalg import inverse_cholesky, tria
+from probcal.linalg import inverse_cholesky, multiply, tria
 
 
 class Gains(NamedTuple):
@@ -36,9 +36,9 @@ def gains(F: jax.Array, L: jax.Array, J: jax.Array) -> Gains:
 
     def step(root, epoch):
         F_k, L_k, J_k = epoch
-        predicted = tria(jnp.concatenate([F_k @ root, L_k], 1))
-        inverse = inverse_cholesky(eye + predicted.T @ J_k @ predicted)
-        updated = predicted @ inverse.T
+        predicted = tria(jnp.concatenate([multiply(F_k, root), L_k], 1))
+        inverse = inverse_cholesky(eye + multiply(predicted.T, multiply(J_k, predicted)))
+        updated = multiply(predicted, inverse.T)
         return updated, (predicted, updated, jnp.diagonal(inverse))
 
     _, (predicted, updated, diagonals) = jax.lax.scan(step, jnp.zeros_like(eye), (F, L, J))
@@ -53,29 +53,32 @@ def smooth(F: jax.Array, L: jax.Array, J: jax.Array, gain: Gains, b: jax.Array, 
     x_k = x_k|k + P+ F' lambda_k+1, u_k = L' lambda_k.
     """
     carry = jnp.zeros_like(b[0])
-    source = gain.updated @ (gain.updated.mT @ b)
+    covariance = gain.updated @ gain.updated.mT
+    source = covariance @ b
     if c is not None:
         source = source + gain.keep @ c
 
     def forward(x, epoch):
         T_k, s_k = epoch
-        x = T_k @ x + s_k
+        x = multiply(T_k, x) + s_k
         return x, x
 
     _, filtered = jax.lax.scan(forward, carry, (gain.keep @ F, source))
     before = jnp.concatenate([carry[None], filtered[:-1]])
-    predicted = F @ before if c is None else F @ before + c
+    loss = gain.keep.mT @ J
+    pulls = gain.keep.mT @ b - (loss @ F) @ before  # keep' (b - J predicted)
+    if c is not None:
+        pulls = pulls - loss @ c
     F_next = jnp.concatenate([F[1:], jnp.zeros_like(F[:1])])
 
     def backward(adjoint, epoch):
         T_k, g_k = epoch
         following = adjoint
-        adjoint = T_k @ adjoint + g_k
+        adjoint = multiply(T_k, adjoint) + g_k
         return adjoint, (adjoint, following)
 
-    pulls = gain.keep.mT @ (b - J @ predicted)
     _, (adjoint, following) = jax.lax.scan(backward, carry, (gain.keep.mT @ F_next.mT, pulls), reverse=True)
-    states = filtered + gain.updated @ (gain.updated.mT @ (F_next.mT @ following))
+    states = filtered + (covariance @ F_next.mT) @ following
     return Smoothed(states, L.mT @ adjoint)
 
 
@@ -85,10 +88,10 @@ def covariances(F: jax.Array, L: jax.Array, J: jax.Array, gain: Gains) -> tuple[
 
     def backward(information, epoch):
         F_k, keep, J_k, updated = epoch
-        ahead = F_k.T @ information @ F_k
-        here = keep.T @ J_k + keep.T @ ahead @ keep
-        state = updated @ updated.T
-        return here, (here, state - state @ ahead @ state)
+        ahead = multiply(F_k.T, multiply(information, F_k))
+        here = multiply(keep.T, J_k + multiply(ahead, keep))
+        state = multiply(updated, updated.T)
+        return here, (here, state - multiply(state, multiply(ahead, state)))
 
     start = jnp.zeros_like(F[0])
     _, (adjoint, states) = jax.lax.scan(backward, start, (F_next, gain.keep, J, gain.updated), reverse=True)
@@ -101,7 +104,7 @@ def trajectory(F: jax.Array, L: jax.Array, c: jax.Array, noises: jax.Array) -> j
 
     def step(x, epoch):
         F_k, s_k = epoch
-        x = F_k @ x + s_k
+        x = multiply(F_k, x) + s_k
         return x, x
 
     source = L @ noises + c

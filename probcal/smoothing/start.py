@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import rows
+from probcal import linalg, rows
 from probcal.problem import Problem, Recursion, Spec, System
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Point, factors, find_mode
@@ -78,7 +78,7 @@ def _profile(spec: Spec, system: System, r: int, span: tuple[int, int], place: j
             b = b.at[:, used].add(jax.ops.segment_sum(jnp.einsum("ncu,nc->nu", lin.state, pull), data.epoch, E))
         loose = jnp.asarray(np.flatnonzero(~held), int)
         if len(loose):
-            step = jnp.linalg.solve(A[:, loose[:, None], loose[None, :]], b[:, loose][:, :, None])[:, :, 0]
+            step = linalg.solve_batched(A[:, loose[:, None], loose[None, :]], b[:, loose])
             states = states.at[:, loose].add(step)
     loss = jnp.zeros(E)
     for block, data in mine:

@@ -1,0 +1,301 @@
+"""The command line: simulate, fit, track, report. Bad input ends with exit code 2, a fit that is no answer with 1."""
+
+import importlib.util
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+import typer
+import xarray as xr
+from rich.console import Console
+
+from probcal.diagnostics import scores
+from probcal.inference import METHODS, fit, track
+from probcal.inference.run import Progress
+from probcal.priors import PRIORS
+from probcal.problem import Problem
+from probcal.simulate import Simulation, Truth, truth_beside
+from probcal.tree import add_scores, load, save, summary
+from probcal.types import FitError, InputError, nearest
+
+app = typer.Typer(
+    help="Bayesian calibration of sensor networks from targets of opportunity.",
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+)  # fmt: skip
+
+Model = Annotated[Path, typer.Argument(help="model file that defines problem(data=None)", show_default=False)]
+Data = Annotated[Path | None, typer.Argument(help="table of rows (CSV); the model's own data if left out")]
+Seed = Annotated[int, typer.Option(min=0, help="seed of everything random")]
+
+
+def main() -> None:
+    """Entry point: one sentence on stderr and exit code 2 for bad input, 1 for a fit that left no answer."""
+    try:
+        app()
+    except InputError as error:
+        _say(error)
+        sys.exit(2)
+    except FitError as error:
+        _say(error)
+        sys.exit(1)
+
+
+def _say(text: object) -> None:
+    print(f"probcal: {text}", file=sys.stderr)
+
+
+def load_model(path: Path) -> ModuleType:
+    """Import a model file; raises `InputError` if it is missing, fails, or defines no problem."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such model file")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"{path} is not a Python file; a model file defines problem(data=None)")
+    module = importlib.util.module_from_spec(spec)
+    sys.path.insert(0, str(path.parent.resolve()))
+    try:
+        spec.loader.exec_module(module)
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from None
+    except Exception as error:  # whatever the user's file raises is told in one sentence
+        raise InputError(f"{path.name} cannot be loaded: {type(error).__name__}: {_one_line(error)}") from None
+    finally:
+        sys.path.pop(0)
+    return module
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _call(module: ModuleType, path: Path, name: str, *arguments: Any) -> Any:
+    """Call a function of a model file; its own failures become one sentence."""
+    function = getattr(module, name, None)
+    if not callable(function):
+        raise InputError(f"{path.name} defines no {name}(); a model file defines problem(data=None) and, to simulate, scenario(key)")
+    try:
+        return function(*arguments)
+    except (InputError, FitError):
+        raise
+    except Exception as error:
+        raise InputError(f"{path.name}: {name}() failed with {type(error).__name__}: {_one_line(error)}") from None
+
+
+def _problem(model: Path, data: Path | None, fix: list[str] = [], *, idle: bool = False) -> tuple[ModuleType, Problem]:  # noqa: B006
+    module = load_model(model)
+    if data is not None and not data.exists():
+        raise InputError(f"{data}: no such file")
+    problem = _call(module, model, "problem", data)
+    if not isinstance(problem, Problem):
+        raise InputError(f"{model.name}: problem() returned {type(problem).__name__}; return a probcal.Problem with a network")
+    if fix or idle:
+        problem = problem.rebuild(fix=problem.fixed | dict.fromkeys(fix, 0.0), idle=idle)
+    return module, problem
+
+
+def _truth(module: ModuleType, model: Path, data: Path | None) -> Truth | None:
+    beside = truth_beside(data) if data is not None else None
+    if beside is not None or not hasattr(module, "truth"):
+        return beside
+    return _call(module, model, "truth", data)
+
+
+@contextmanager
+def _progress() -> Iterator[Progress | None]:
+    """A line on a terminal that follows the iterations; nothing where stderr is a file."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield None
+        return
+    with console.status("starting: compiling, finding the tracks") as status:
+        yield lambda method, count, value: status.update(f"{method}: iteration {count}, objective {value:.3f}")
+
+
+def _folder(path: Path) -> Path:
+    """Make a folder and check that it can be written, before any work is done."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from None
+    return path
+
+
+def _write_csv(frame: pd.DataFrame, path: Path) -> None:
+    """Write a table in one step."""
+    draft = path.with_name(f".{path.name}.part")
+    try:
+        frame.to_csv(draft, index=False)
+        os.replace(draft, path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from None
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def table_text(tree: xr.DataTree) -> str:
+    """The table of biases as printed: label, unit, scale, mean, sd, interval, gamma, status."""
+    frame = summary(tree)
+    numbers = ["scale", "mean", "sd", "lower", "upper"]
+    for name in numbers:
+        frame[name] = [f"{value:.4g}" for value in frame[name]]
+    frame["gamma"] = [f"{value:.3f}" for value in frame["gamma"]]
+    shown = frame[["bias", "unit", *numbers, "gamma", "status"]]
+    return shown.to_string(index=False, justify="right")
+
+
+@app.command(name="fit")
+def fit_command(
+    model: Model,
+    data: Data = None,
+    method: Annotated[str, typer.Option(help=" | ".join(METHODS))] = "ea",
+    prior: Annotated[str | None, typer.Option(help=" | ".join(PRIORS) + "; the method's own if left out")] = None,
+    fix: Annotated[list[str], typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = [],  # noqa: B006
+    seed: Seed = 0,
+    out: Annotated[Path | None, typer.Option(help="folder for fit.nc, summary.csv, report.html")] = None,
+) -> None:
+    """Calibrate: one row a bias, and where the truth is known the position error before and after."""
+    if method not in METHODS:
+        raise InputError(f'--method "{method}" is not known{nearest(method, METHODS)}')
+    if prior is not None and prior not in PRIORS:
+        raise InputError(f'--prior "{prior}" is not known{nearest(prior, PRIORS)}')
+    kind, implied = METHODS[method]
+    chosen = PRIORS[prior]() if prior is not None else implied
+    if out is not None:
+        _folder(out)
+    began = time.perf_counter()
+    module, problem = _problem(model, data, fix)
+    truth = _truth(module, model, data)
+    with _progress() as progress:
+        tree = fit(problem, kind(), prior=chosen, key=seed, progress=progress)
+    tree.attrs["model"] = model.stem
+    if truth is not None:
+        add_scores(tree, scores(tree, truth), truth.biases)
+    print(table_text(tree))
+    _print_verdict(tree, time.perf_counter() - began)
+    if out is not None:
+        _write(tree, out)
+    raise typer.Exit(0 if tree.attrs["status"] == "converged" else 1)
+
+
+def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
+    attrs = tree.attrs
+    iterations = tree["optimisation"].sizes["iteration"]
+    print(f"{attrs['method']} ({attrs['prior']}): {attrs['status']} after {iterations} iterations, {seconds:.1f} s")
+    print(f"intervals are {attrs['interval_probability']:.0%}; {attrs['intervals']}")
+    if "level" in tree.children:
+        for label, std in zip(tree["level"]["level"].values, tree["level"]["std"].values, strict=True):
+            print(f"estimated {label} = {std:.4g}")
+    if "position_rmse_after" in attrs:
+        print(f"position RMSE before {attrs['position_rmse_before']:.3f} m, after {attrs['position_rmse_after']:.3f} m")
+    if attrs["message"]:
+        print(attrs["message"], file=sys.stdout if attrs["status"] == "converged" else sys.stderr)
+
+
+def _write(tree: xr.DataTree, out: Path) -> None:
+    try:
+        save(tree, out / "fit.nc")
+    except OSError as error:
+        raise InputError(f"{out} cannot be written: {error.strerror}") from None
+    _write_csv(summary(tree), out / "summary.csv")
+    print(f"written: {out / 'fit.nc'}, {out / 'summary.csv'}" + (f", {_report(tree, out)}" if _can_plot() else ""))
+    if not _can_plot():
+        print('report.html is left out: pip install "probcal[plot]"')
+
+
+def _can_plot() -> bool:
+    return all(importlib.util.find_spec(name) is not None for name in ("matplotlib", "jinja2"))
+
+
+def _report(tree: xr.DataTree, out: Path) -> Path:
+    from probcal.report import write_report  # the plot packages are an extra
+
+    path = out / "report.html"
+    try:
+        write_report(tree, path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from None
+    return path
+
+
+@app.command(name="simulate")
+def simulate_command(
+    model: Model,
+    seed: Seed = 0,
+    out: Annotated[Path | None, typer.Option(help="table to write (MODEL-SEED.csv if left out)")] = None,
+) -> None:
+    """Simulate a model's scenario: the table, and beside it its true tracks and biases."""
+    module = load_model(model)
+    simulation = _call(module, model, "scenario", seed)
+    if not isinstance(simulation, Simulation):
+        raise InputError(f"{model.name}: scenario() returned {type(simulation).__name__}; return probcal.simulate(...)")
+    path = Path(f"{model.stem}-{seed}.csv") if out is None else out
+    _folder(path.parent)
+    try:
+        written = simulation.write(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from None
+    print(f"written: {', '.join(str(p) for p in written)} ({len(simulation.table)} rows)")
+
+
+@app.command(name="track")
+def track_command(
+    model: Model,
+    data: Data = None,
+    calibration: Annotated[Path | None, typer.Option(help="folder (or fit.nc) of a fit", show_default=False)] = None,
+    out: Annotated[Path, typer.Option(help="table of tracks to write")] = Path("tracks.csv"),
+) -> None:
+    """Tracks of other data with a calibration applied: time, target, each state component with its sd."""
+    if calibration is None:
+        raise InputError("track needs --calibration DIR, the folder of a fit")
+    known = load(calibration)
+    if known.attrs.get("status") in ("at bound", "diverged"):
+        raise InputError(f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first")
+    _folder(out.parent)
+    module, problem = _problem(model, data, idle=True)
+    tree = track(problem, known)
+    frame = track_table(tree)
+    _write_csv(frame, out)
+    truth = _truth(module, model, data)
+    found = scores(tree, truth) if truth is not None else {}
+    if "position_rmse_after" in found:
+        print(f"position RMSE before {found['position_rmse_before']:.3f} m, after {found['position_rmse_after']:.3f} m")
+    print(f"written: {out} ({len(frame)} epochs)")
+
+
+def track_table(tree: xr.DataTree) -> pd.DataFrame:
+    """Tracks as a table: time, target, then each component and its sd."""
+    group, parts = tree["track"].to_dataset(), []
+    for name in (str(n) for n in group.data_vars if str(n).startswith("mean")):
+        s = name.removeprefix("mean")
+        columns: dict[str, np.ndarray] = {"time": group[f"epoch_time{s}"].values, "target": group[f"epoch_target{s}"].values}
+        for component in group[f"component{s}"].values:
+            columns[str(component)] = group[name].sel({f"component{s}": component}).values
+            columns[f"{component}_sd"] = group[f"sd{s}"].sel({f"component{s}": component}).values
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)
+
+
+@app.command(name="report")
+def report_command(
+    folder: Annotated[Path, typer.Argument(help="folder of a fit", show_default=False)],
+) -> None:
+    """Write report.html of a saved fit: map, forest of biases, residuals, trace."""
+    if not _can_plot():
+        raise InputError('the report needs plot packages: pip install "probcal[plot]"')
+    tree = load(folder)
+    target = folder if folder.is_dir() else folder.parent
+    print(f"written: {_report(tree, _folder(target))}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,457 @@
+"""Pictures of a saved fit: map, biases, residuals, objective, gamma; matplotlib figures without pyplot."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse
+from matplotlib.ticker import MaxNLocator
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#5d3a9b")
+BEFORE = "#a6a6a6"
+GAMMA = "viridis_r"  # light: prior only, dark: data only
+INTERVAL = 0.89  # probability of an interval where the tree does not say
+POINTS = 3_000  # of one track
+ALL_POINTS = 40_000  # of all tracks together
+ROWS = 120  # biases in one forest
+NAMED = 60  # nodes, targets or biases above which names are left out
+LINEAR = 12.0  # scales up to which the axis of the forest stays linear
+
+
+@dataclass(frozen=True)
+class _Track:
+    """Positions (E, 2) of one target in order of time."""
+
+    target: str
+    before: np.ndarray
+    after: np.ndarray
+
+
+def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw stated and calibrated nodes with their ellipses, and the tracks before and after calibration."""
+    ax = _axes(ax, 9.0, 6.5)
+    tracks = list(_tracks(tree))
+    keys = _draw_tracks(ax, tracks)
+    keys += _draw_nodes(ax, tree)
+    nodes = tree["constant_data"].to_dataset()
+    space = nodes.sizes["axis"] > 2
+    ax.set(xlabel="x in m", ylabel="y in m")
+    ax.set_title("Map of nodes and tracks" + (" (x-y plane, z not shown)" if space else ""), loc="left")
+    ax.set_aspect("equal", adjustable="box")
+    _limit(ax, tree, tracks)
+    ax.legend(handles=keys, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
+    return ax
+
+
+def plot_biases(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw mean and interval of every bias in units of its scale, coloured by gamma, with the true value."""
+    group = tree["calibration"].to_dataset()
+    total = group.sizes["bias_label"]
+    group = group.isel(bias_label=_largest(group))
+    labels, scale, gamma = group["bias_label"].values, group["scale"].values, group["gamma"].values
+    mean, lower, upper = (group[name].values / scale for name in ("mean", "lower", "upper"))
+    rows = np.arange(len(labels))
+    ax = _axes(ax, 9.0, min(2.0 + 0.24 * len(rows), 24.0))
+    ax.axvline(0.0, color="0.3", linewidth=0.8, zorder=1)
+    ax.hlines(rows, lower, upper, color="0.55", linewidth=2.0, zorder=2)
+    dots = ax.scatter(
+        mean, rows, c=np.nan_to_num(gamma), cmap=GAMMA, norm=Normalize(0.0, 1.0),
+        s=30, edgecolor="0.2", linewidth=0.6, zorder=3,
+    )  # fmt: skip
+    true = _true(tree, labels) / scale
+    if np.isfinite(true).any():
+        ax.plot(true, rows, "x", color="#d00000", markersize=6, markeredgewidth=1.6, zorder=4)
+    _mark_status(ax, group["status"].values, _text_size(len(rows)))
+    ax.set_yticks(rows, [_plain(label) for label in labels], fontsize=_text_size(len(rows)))
+    ax.set_ylim(len(rows) - 0.3, -0.7)
+    ax.grid(axis="x", color="0.9", zorder=0)
+    _scale_axis(ax, np.concatenate([lower, upper, true, [-1.0, 1.0]]))
+    ax.set_xlabel(f"bias in units of its scale, {_probability(tree):.0%} interval")
+    _title_biases(ax, len(rows), total, bool(np.isfinite(true).any()))
+    ax.figure.colorbar(
+        dots, ax=ax, label="gamma (0 prior only, 1 data only)", location="bottom", shrink=0.6, aspect=40
+    )
+    return ax
+
+
+def plot_residuals(tree: xr.DataTree, axes: Sequence[Axes] | None = None) -> list[Axes]:
+    """Draw residual/std of every channel before and after calibration, one axes a channel."""
+    group = tree["residual"].to_dataset()
+    channels = list(dict.fromkeys(group["channel"].values.tolist()))
+    if axes is None:
+        columns = min(len(channels), 3)
+        lines = -(-len(channels) // columns)
+        figure = Figure(figsize=(9.0 if columns > 1 else 6.0, 0.3 + 3.1 * lines), layout="constrained")
+        grid = figure.subplots(lines, columns, squeeze=False).ravel()
+        for ax in grid[len(channels) :]:
+            ax.remove()
+        axes = list(grid[: len(channels)])
+    for ax, channel in zip(axes, channels, strict=True):
+        chosen = group.isel(datum=group["channel"].values == channel)
+        _draw_residuals(ax, str(channel), chosen)
+    return list(axes)
+
+
+def plot_objective(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw the objective over the iterations."""
+    ax = _axes(ax, 6.0, 3.4)
+    trace = tree["optimisation"].to_dataset()["objective"].values
+    steps = np.arange(1, len(trace) + 1)
+    known = np.isfinite(trace)
+    ax.plot(steps[known], trace[known], "o-", color=COLOURS[0], markersize=3.5 if len(trace) < 60 else 0)
+    evidence = tree.attrs.get("log_evidence")
+    is_evidence = evidence is not None and known.any() and np.isclose(trace[known][-1], evidence, rtol=1e-6)
+    ax.set(xlabel="iteration", ylabel="log evidence" if is_evidence else "objective")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.ticklabel_format(axis="y", useOffset=False, style="plain")
+    ax.grid(color="0.9")
+    ax.set_title(f"Objective over {len(trace)} iterations", loc="left")
+    return ax
+
+
+def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw gamma of all biases in ascending order, coloured by the kind of bias."""
+    group = tree["calibration"].to_dataset()
+    labels, gamma = group["bias_label"].values.astype(str), np.nan_to_num(group["gamma"].values)
+    order = np.argsort(gamma, kind="stable")
+    names = np.array([_bias(label) for label in labels[order]])
+    ax = _axes(ax, 9.0, 4.6)
+    for k, name in enumerate(dict.fromkeys(names.tolist())):
+        mine = names == name
+        marker = "os^Dv"[(k // len(COLOURS)) % 5]
+        ax.plot(
+            np.nonzero(mine)[0],
+            gamma[order][mine],
+            marker,
+            color=_colour(k),
+            markersize=5,
+            label=_plain(name),
+        )
+    if len(labels) <= NAMED:
+        ax.set_xticks(
+            np.arange(len(labels)), [_plain(label) for label in labels[order]], rotation=90, fontsize=7
+        )
+    else:
+        ax.set_xlabel("bias, sorted by gamma")
+    ax.set(ylim=(-0.04, 1.04), ylabel="gamma")
+    ax.grid(axis="y", color="0.9")
+    ax.set_title(f"How well the data determine {len(labels)} biases (0 prior only, 1 data only)", loc="left")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
+    return ax
+
+
+# What all pictures share
+
+
+def _axes(ax: Axes | None, width: float, height: float) -> Axes:
+    return Figure(figsize=(width, height), layout="constrained").subplots() if ax is None else ax
+
+
+def _colour(k: int) -> str:
+    return COLOURS[k % len(COLOURS)]
+
+
+def _plain(text: object, longest: int = 40) -> str:
+    """Text that matplotlib shows as it stands: no formula, no hidden legend entry, not too long."""
+    text = str(text).replace("\n", " ")
+    text = text if len(text) <= longest else text[: longest // 2] + "..." + text[-longest // 2 + 3 :]
+    return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
+
+
+def _probability(tree: xr.DataTree) -> float:
+    return float(tree.attrs.get("interval_probability", INTERVAL))
+
+
+def _bias(label: str) -> str:
+    """Name of a bias without its owner: `heading` of `radar_2.heading`."""
+    return label.rsplit(".", 1)[-1]
+
+
+# Map
+
+
+def _tracks(tree: xr.DataTree) -> Iterator[_Track]:
+    """Positions of every target of every recursion (suffixes `_0`, `_1` where there are several)."""
+    group = tree["track"].to_dataset()
+    for name in group.data_vars:
+        if not str(name).startswith("mean"):
+            continue
+        s = str(name).removeprefix("mean")
+        axes = ["position_x", "position_y"]
+        if not np.isin(axes, group[f"component{s}"].values).all():
+            continue
+        before, after = (
+            group[f"{kind}{s}"].sel({f"component{s}": axes}).values for kind in ("before", "mean")
+        )
+        times, owners = group[f"epoch_time{s}"].values, group[f"epoch_target{s}"].values
+        for target in dict.fromkeys(owners.tolist()):
+            mine = np.nonzero(owners == target)[0]
+            mine = mine[np.argsort(times[mine], kind="stable")]
+            yield _Track(str(target), before[mine], after[mine])
+
+
+def _thin(path: np.ndarray, most: int) -> np.ndarray:
+    """At most `most` points of a path (E, 2), evenly spaced, both ends kept."""
+    if len(path) <= most:
+        return path
+    return path[np.linspace(0, len(path) - 1, most).round().astype(int)]
+
+
+def _draw_tracks(ax: Axes, tracks: list[_Track]) -> list[Line2D]:
+    """Draw all tracks and return the legend entries."""
+    most = min(POINTS, max(2, ALL_POINTS // max(len(tracks), 1)))
+    for k, track in enumerate(tracks):
+        before, after = _thin(track.before, most), _thin(track.after, most)
+        if len(after) == 1:
+            ax.plot(*before.T, "o", color=BEFORE, markersize=3, zorder=2)
+            ax.plot(*after.T, "o", color=_colour(k), markersize=5, zorder=3)
+        else:
+            ax.plot(*before.T, "-", color=BEFORE, linewidth=0.7, zorder=2)
+            ax.plot(*after.T, "-", color=_colour(k), linewidth=1.2, zorder=3)
+    keys = [Line2D([], [], color=BEFORE, linewidth=0.9, label="before calibration")] if tracks else []
+    if len(tracks) > 12:
+        return [*keys, Line2D([], [], color=_colour(0), label=f"{len(tracks)} targets, after")]
+    for k, track in enumerate(tracks):
+        style: dict[str, Any] = (
+            {"marker": "o", "linestyle": ""} if len(track.after) == 1 else {"linestyle": "-"}
+        )
+        keys.append(
+            Line2D([], [], color=_colour(k), markersize=5, label=f"{_plain(track.target)}, after", **style)
+        )
+    return keys
+
+
+def _stated(nodes: xr.Dataset) -> np.ndarray:
+    return nodes["node_position"].values[:, :2]
+
+
+def _shifts(tree: xr.DataTree) -> dict[str, float]:
+    """Value of every bias, estimated or fixed, by label."""
+    group, nodes = tree["calibration"].to_dataset(), tree["constant_data"].to_dataset()
+    found = dict(zip(group["bias_label"].values.tolist(), group["mean"].values.tolist(), strict=True))
+    if "fixed" in nodes:
+        found |= dict(zip(nodes["fixed_label"].values.tolist(), nodes["fixed"].values.tolist(), strict=True))
+    return found
+
+
+def _calibrated(tree: xr.DataTree) -> np.ndarray:
+    """Positions (node, 2) with their biases added."""
+    nodes, shifts = tree["constant_data"].to_dataset(), _shifts(tree)
+    axes = ("position_x", "position_y")
+    moved = [[shifts.get(f"{node}.{axis}", 0.0) for axis in axes] for node in nodes["node"].values]
+    return _stated(nodes) + np.array(moved)
+
+
+def _draw_nodes(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
+    """Draw all nodes and return the legend entries."""
+    nodes = tree["constant_data"].to_dataset()
+    names, stated, calibrated = nodes["node"].values.astype(str), _stated(nodes), _calibrated(tree)
+    labels = set(tree["calibration"].to_dataset()["bias_label"].values.tolist())
+    free = [f"{name}.position_x" in labels or f"{name}.position_y" in labels for name in names]
+    keys = []
+    for moving, marker, text in ((False, "s", "stated position"), (True, "D", "start of a moving node")):
+        chosen = nodes["moving"].values.astype(bool) == moving
+        if chosen.any():
+            style: dict[str, Any] = {"color": "black", "markerfacecolor": "none", "markersize": 7}
+            ax.plot(*stated[chosen].T, marker, zorder=5, **style)
+            keys.append(Line2D([], [], marker=marker, linestyle="", label=text, **style))
+    if any(free):
+        ax.plot(*calibrated[free].T, ".", color="black", markersize=6, zorder=6)
+        for name, start, end in zip(names[free], stated[free], calibrated[free], strict=True):
+            _draw_shift(ax, tree, name, start, end)
+        label = f"calibrated, {_probability(tree):.0%} ellipse"
+        keys.append(Line2D([], [], marker=".", linestyle="", color="black", label=label))
+    keys += _draw_headings(ax, tree, calibrated)
+    box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8}
+    if len(names) <= NAMED:
+        for name, place in zip(names, stated, strict=True):
+            ax.annotate(
+                _plain(name), place, xytext=(6, 6), textcoords="offset points", zorder=7, bbox=box,
+                fontsize=8 if len(names) <= 25 else 6, annotation_clip=True,
+            )  # fmt: skip
+    return keys
+
+
+def _draw_shift(ax: Axes, tree: xr.DataTree, name: str, start: np.ndarray, end: np.ndarray) -> None:
+    """Draw the arrow from the stated to the calibrated position, and the ellipse of the latter."""
+    if not np.isfinite(end).all():
+        return
+    arrow = {"arrowstyle": "->", "color": "black", "linewidth": 0.9, "shrinkA": 0.0, "shrinkB": 0.0}
+    ax.annotate("", tuple(end), tuple(start), arrowprops=arrow, zorder=5, annotation_clip=False)
+    covariance = _position_covariance(tree, name)
+    if not np.isfinite(covariance).all():
+        return
+    values, vectors = np.linalg.eigh(covariance)
+    width, height = 2.0 * np.sqrt(-2.0 * np.log1p(-_probability(tree)) * np.maximum(values, 0.0))
+    angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
+    ax.add_patch(
+        Ellipse(
+            tuple(end),
+            width,
+            height,
+            angle=angle,
+            facecolor="#00000018",
+            edgecolor="black",
+            linewidth=0.8,
+            zorder=4,
+        )
+    )
+
+
+def _position_covariance(tree: xr.DataTree, name: str) -> np.ndarray:
+    """Covariance (2, 2) of x and y of a node; a coordinate that is no bias has none."""
+    group = tree["calibration"].to_dataset()
+    axes = [f"{name}.position_x", f"{name}.position_y"]
+    chosen = group["covariance"].reindex(bias_label=axes, bias_label_other=axes, fill_value=0.0)
+    return chosen.values
+
+
+def _draw_headings(ax: Axes, tree: xr.DataTree, calibrated: np.ndarray) -> list[Line2D]:
+    """Draw the calibrated heading of nodes with a heading bias, where the stated ones are saved."""
+    nodes, shifts = tree["constant_data"].to_dataset(), _shifts(tree)
+    if "node_heading" not in nodes:
+        return []
+    names = nodes["node"].values.astype(str)
+    turned = np.array([f"{name}.heading" in shifts for name in names])
+    if not turned.any():
+        return []
+    angle = nodes["node_heading"].values[turned] + [shifts[f"{name}.heading"] for name in names[turned]]
+    ax.quiver(
+        *calibrated[turned].T, np.cos(angle), np.sin(angle), color="#d00000", angles="xy",
+        scale_units="width", scale=22.0, width=0.004,
+        headwidth=1.0, headlength=0.0, headaxislength=0.0, zorder=5,
+    )  # fmt: skip
+    return [Line2D([], [], color="#d00000", label="calibrated heading")]
+
+
+def _limit(ax: Axes, tree: xr.DataTree, tracks: list[_Track]) -> None:
+    """Fit the axes to nodes and tracks; what flew off before calibration, or in a diverged fit, is cut."""
+    stated = _stated(tree["constant_data"].to_dataset())
+    after = [_calibrated(tree), *(track.after for track in tracks)]
+    before = _known([track.before for track in tracks])
+    before = np.quantile(before, [0.01, 0.99], axis=0) if len(before) else before
+    anchor, rest = _known([stated, *after]), before
+    if tree.attrs.get("status") == "diverged":
+        anchor, rest = _known([stated, before]), _known(after)
+    low, high = anchor.min(0), anchor.max(0)
+    reach = max(float((high - low).max()), 1.0)
+    both = np.concatenate([anchor, np.clip(rest, low - reach, high + reach)])
+    low, high = both.min(0), both.max(0)
+    margin = 0.07 * max(float((high - low).max()), 1.0)
+    ax.set_xlim(low[0] - margin, high[0] + margin)
+    ax.set_ylim(low[1] - margin, high[1] + margin)
+
+
+def _known(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Finite points (N, 2) of all parts."""
+    points = np.concatenate([np.empty((0, 2)), *parts])
+    return points[np.isfinite(points).all(1)]
+
+
+# Forest
+
+
+def _largest(group: xr.Dataset) -> np.ndarray:
+    """Rows of the forest in the order of the tree: all, or those of largest |mean| in scales."""
+    size = np.abs(np.nan_to_num(group["mean"].values / group["scale"].values, nan=np.inf))
+    return np.sort(np.argsort(-size, kind="stable")[:ROWS])
+
+
+def _title_biases(ax: Axes, shown: int, total: int, true: bool) -> None:
+    some = (
+        f"{shown} of {total} biases, those of largest |mean| / scale" if shown < total else f"{total} biases"
+    )
+    ax.set_title(some + (" (cross: true value)" if true else ""), loc="left")
+
+
+def _true(tree: xr.DataTree, labels: np.ndarray) -> np.ndarray:
+    """True value of every label, NaN where none is known."""
+    if "truth" not in tree.children:
+        return np.full(len(labels), np.nan)
+    known = tree["truth"].to_dataset()["bias"]
+    values = dict(zip(known["bias_label"].values.tolist(), known.values.tolist(), strict=True))
+    return np.array([values.get(label, np.nan) for label in labels.tolist()])
+
+
+def _text_size(rows: int) -> float:
+    return 8.0 if rows <= 80 else 7.0
+
+
+def _mark_status(ax: Axes, status: np.ndarray, size: float) -> None:
+    """Write what happened to a bias at the right of its row."""
+    for row, text in enumerate(status.tolist()):
+        if text in ("at bound", "pruned", "diverged"):
+            colour = "0.4" if text == "pruned" else "#b00000"
+            ax.text(
+                1.01, row, text, transform=ax.get_yaxis_transform(), va="center", fontsize=size, color=colour
+            )
+
+
+def _scale_axis(ax: Axes, values: np.ndarray) -> None:
+    """Set the limits of the forest; far values get an axis that is logarithmic beyond a few scales."""
+    values = values[np.isfinite(values)]
+    low, high = values.min(), values.max()
+    if max(-low, high) > LINEAR:
+        ax.set_xscale("symlog", linthresh=3.0)
+        ax.set_xlim(1.5 * low, 1.5 * high)
+    else:
+        margin = 0.04 * (high - low)
+        ax.set_xlim(low - margin, high + margin)
+
+
+# Residuals
+
+
+def _draw_residuals(ax: Axes, channel: str, group: xr.Dataset) -> None:
+    """Draw both histograms of one channel over the standard normal density."""
+    ratios = {kind: _ratio(group, kind) for kind in ("before", "after")}
+    limit = _robust_limit(ratios)
+    edges = np.linspace(-limit, limit, 61)
+    styles: dict[str, dict[str, Any]] = {
+        "before": {"histtype": "stepfilled", "color": "0.78"},
+        "after": {"histtype": "step", "color": COLOURS[0], "linewidth": 1.5},
+    }
+    width = edges[1] - edges[0]
+    for kind, ratio in ratios.items():
+        if len(ratio):
+            outside = int((np.abs(ratio) > limit).sum())
+            label = kind + (f" ({outside} outside)" if outside else "")
+            ax.hist(
+                ratio,
+                edges.tolist(),
+                weights=np.full(len(ratio), 1 / (len(ratio) * width)),
+                label=label,
+                **styles[kind],
+            )
+    x = np.linspace(-limit, limit, 241)
+    ax.plot(
+        x,
+        np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi),
+        "--",
+        color="0.15",
+        linewidth=1.0,
+        label="standard normal",
+    )
+    ax.set(xlim=(-limit, limit), xlabel="residual / std", ylabel="density")
+    ax.set_title(f"{_plain(channel)} ({group.sizes['datum']} data)", loc="left", fontsize=10)
+    ax.set_ylim(0.0, 1.45 * ax.get_ylim()[1])
+    ax.legend(fontsize=7, frameon=False, loc="upper right")
+
+
+def _ratio(group: xr.Dataset, kind: str) -> np.ndarray:
+    """Finite residuals in units of std."""
+    std = group["std"].values
+    usable = np.isfinite(group[kind].values) & (std > 0)
+    return group[kind].values[usable] / std[usable]
+
+
+def _robust_limit(ratios: dict[str, np.ndarray]) -> float:
+    """Half width of the picture: what holds 98 % of the data, within 4 to 12 std."""
+    sizes = [np.quantile(np.abs(ratio), 0.98) for ratio in ratios.values() if len(ratio)]
+    return float(np.clip(max(sizes, default=4.0), 4.0, 12.0))
