@@ -24,30 +24,15 @@ def tria(columns: jax.Array) -> jax.Array:
     n = columns.shape[0]
     if n > UNROLL:
         return jnp.linalg.qr(columns.T, mode="r").T
-    rows = [columns[i] for i in range(n)]
-    lower = [[jnp.zeros((), columns.dtype)] * n for _ in range(n)]
+    below = jnp.arange(n)
+    left, lower = columns, []
     for j in range(n):
-        length = jnp.sqrt(jnp.sum(rows[j] ** 2))
-        unit = rows[j] / jnp.where(length > 0, length, 1.0)
-        lower[j][j] = length
-        for i in range(j + 1, n):
-            lower[i][j] = jnp.sum(rows[i] * unit)
-            rows[i] = rows[i] - lower[i][j] * unit
-    return jnp.stack([jnp.stack(row) for row in lower])
-
-
-def _unrolled_cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
-    n = matrix.shape[0]
-    lower: list[list[jax.Array]] = [[matrix[i, j] for j in range(n)] for i in range(n)]
-    for j in range(n):
-        for k in range(j):
-            lower[j][j] = lower[j][j] - lower[j][k] ** 2
-        lower[j][j] = jnp.sqrt(lower[j][j])
-        for i in range(j + 1, n):
-            for k in range(j):
-                lower[i][j] = lower[i][j] - lower[i][k] * lower[j][k]
-            lower[i][j] = lower[i][j] / lower[j][j]
-    return lower
+        length = jnp.sqrt(jnp.sum(left[j] ** 2))
+        unit = left[j] / jnp.where(length > 0, length, 1.0)
+        column = jnp.where(below >= j, jnp.sum(left * unit[None, :], 1), 0.0)
+        left = left - column[:, None] * unit[None, :]
+        lower.append(column)
+    return jnp.stack(lower, 1)
 
 
 def inverse_cholesky(matrix: jax.Array) -> jax.Array:
@@ -55,17 +40,14 @@ def inverse_cholesky(matrix: jax.Array) -> jax.Array:
     n = matrix.shape[0]
     if n > UNROLL:
         return factor_and_inverse(matrix)[1]
-    lower = _unrolled_cholesky(matrix)
-    zero = jnp.zeros((), matrix.dtype)
-    inverse = [[zero] * n for _ in range(n)]
-    for j in range(n):
-        inverse[j][j] = 1.0 / lower[j][j]
-        for i in range(j + 1, n):
-            total = lower[i][j] * inverse[j][j]
-            for k in range(j + 1, i):
-                total = total + lower[i][k] * inverse[k][j]
-            inverse[i][j] = -total / lower[i][i]
-    return jnp.stack([jnp.stack(row) for row in inverse])
+    below = jnp.arange(n)
+    left = jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], 1)
+    rows = []
+    for j in range(n):  # elimination of [A, I]: the pivot rows become [C', C^-1]
+        pivot = left[j] / jnp.sqrt(left[j, j])
+        left = left - jnp.where(below > j, pivot[:n], 0.0)[:, None] * pivot[None, :]
+        rows.append(pivot[n:])
+    return jnp.stack(rows)
 
 
 def factor_and_inverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:

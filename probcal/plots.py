@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Ellipse, FancyArrowPatch
 from matplotlib.ticker import MaxNLocator
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#5d3a9b")
@@ -21,6 +22,7 @@ POINTS = 3_000  # of one track
 ALL_POINTS = 40_000  # of all tracks together
 ROWS = 120  # biases in one forest
 NAMED = 60  # nodes, targets or biases above which names are left out
+INVALID = ("at bound", "diverged")  # status of a fit or a bias whose numbers are no estimate
 LINEAR = 12.0  # scales up to which the axis of the forest stays linear
 
 
@@ -36,15 +38,15 @@ class _Track:
 def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw stated and calibrated nodes with their ellipses, and the tracks before and after calibration."""
     ax = _axes(ax, 9.0, 6.5)
+    ax.set_aspect("equal", adjustable="box")
     tracks = list(_tracks(tree))
+    _limit(ax, tree, tracks)
     keys = _draw_tracks(ax, tracks)
     keys += _draw_nodes(ax, tree)
     nodes = tree["constant_data"].to_dataset()
     space = nodes.sizes["axis"] > 2
     ax.set(xlabel="x in m", ylabel="y in m")
     ax.set_title("Map of nodes and tracks" + (" (x-y plane, z not shown)" if space else ""), loc="left")
-    ax.set_aspect("equal", adjustable="box")
-    _limit(ax, tree, tracks)
     ax.legend(handles=keys, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
     return ax
 
@@ -58,7 +60,7 @@ def plot_biases(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     mean, lower, upper = (group[name].values / scale for name in ("mean", "lower", "upper"))
     rows = np.arange(len(labels))
     ax = _axes(ax, 9.0, min(2.0 + 0.24 * len(rows), 24.0))
-    ax.axvline(0.0, color="0.3", linewidth=0.8, zorder=1)
+    ax.axvline(0.0, color="0.3", linewidth=0.8, zorder=1.8)
     ax.hlines(rows, lower, upper, color="0.55", linewidth=2.0, zorder=2)
     dots = ax.scatter(
         mean, rows, c=np.nan_to_num(gamma), cmap=GAMMA, norm=Normalize(0.0, 1.0),
@@ -74,9 +76,7 @@ def plot_biases(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     _scale_axis(ax, np.concatenate([lower, upper, true, [-1.0, 1.0]]))
     ax.set_xlabel(f"bias in units of its scale, {_probability(tree):.0%} interval")
     _title_biases(ax, len(rows), total, bool(np.isfinite(true).any()))
-    ax.figure.colorbar(
-        dots, ax=ax, label="gamma (0 prior only, 1 data only)", location="bottom", shrink=0.6, aspect=40
-    )
+    _gamma_bar(ax, dots)
     return ax
 
 
@@ -85,7 +85,7 @@ def plot_residuals(tree: xr.DataTree, axes: Sequence[Axes] | None = None) -> lis
     group = tree["residual"].to_dataset()
     channels = list(dict.fromkeys(group["channel"].values.tolist()))
     if axes is None:
-        columns = min(len(channels), 3)
+        columns = 2 if len(channels) == 4 else min(len(channels), 3)
         lines = -(-len(channels) // columns)
         figure = Figure(figsize=(9.0 if columns > 1 else 6.0, 0.3 + 3.1 * lines), layout="constrained")
         grid = figure.subplots(lines, columns, squeeze=False).ravel()
@@ -122,6 +122,7 @@ def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     order = np.argsort(gamma, kind="stable")
     names = np.array([_bias(label) for label in labels[order]])
     ax = _axes(ax, 9.0, 4.6)
+    size = 5.0 if len(labels) <= NAMED else 3.0
     for k, name in enumerate(dict.fromkeys(names.tolist())):
         mine = names == name
         marker = "os^Dv"[(k // len(COLOURS)) % 5]
@@ -130,7 +131,7 @@ def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
             gamma[order][mine],
             marker,
             color=_colour(k),
-            markersize=5,
+            markersize=size,
             label=_plain(name),
         )
     if len(labels) <= NAMED:
@@ -150,7 +151,7 @@ def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
 
 
 def _axes(ax: Axes | None, width: float, height: float) -> Axes:
-    return Figure(figsize=(width, height), layout="constrained").subplots() if ax is None else ax
+    return Figure(figsize=(width, height), layout="compressed").subplots() if ax is None else ax
 
 
 def _colour(k: int) -> str:
@@ -258,7 +259,11 @@ def _draw_nodes(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
     for moving, marker, text in ((False, "s", "stated position"), (True, "D", "start of a moving node")):
         chosen = nodes["moving"].values.astype(bool) == moving
         if chosen.any():
-            style: dict[str, Any] = {"color": "black", "markerfacecolor": "none", "markersize": 7}
+            style: dict[str, Any] = {
+                "color": "black",
+                "markerfacecolor": "none",
+                "markersize": 7 if len(names) <= 25 else 4,
+            }
             ax.plot(*stated[chosen].T, marker, zorder=5, **style)
             keys.append(Line2D([], [], marker=marker, linestyle="", label=text, **style))
     if any(free):
@@ -279,17 +284,22 @@ def _draw_nodes(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
 
 
 def _draw_shift(ax: Axes, tree: xr.DataTree, name: str, start: np.ndarray, end: np.ndarray) -> None:
-    """Draw the arrow from the stated to the calibrated position, and the ellipse of the latter."""
+    """Draw the arrow from the stated to the calibrated position, unless too short to see, and the ellipse."""
     if not np.isfinite(end).all():
         return
-    arrow = {"arrowstyle": "->", "color": "black", "linewidth": 0.9, "shrinkA": 0.0, "shrinkB": 0.0}
-    ax.annotate("", tuple(end), tuple(start), arrowprops=arrow, zorder=5, annotation_clip=False)
+    if np.linalg.norm(end - start) > 0.01 * np.ptp(ax.get_xlim()):
+        style: dict[str, Any] = {"arrowstyle": "->", "mutation_scale": 10.0, "shrinkA": 0.0, "shrinkB": 0.0}
+        ax.add_patch(
+            FancyArrowPatch(tuple(start), tuple(end), color="black", linewidth=0.9, zorder=5, **style)
+        )
     covariance = _position_covariance(tree, name)
     if not np.isfinite(covariance).all():
         return
-    values, vectors = np.linalg.eigh(covariance)
-    width, height = 2.0 * np.sqrt(-2.0 * np.log1p(-_probability(tree)) * np.maximum(values, 0.0))
-    angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
+    (xx, xy), (_, yy) = covariance
+    spread = np.hypot((xx - yy) / 2, xy)
+    variances = np.maximum([(xx + yy) / 2 + spread, (xx + yy) / 2 - spread], 0.0)
+    width, height = 2.0 * np.sqrt(-2.0 * np.log1p(-_probability(tree)) * variances)
+    angle = np.degrees(np.arctan2(2 * xy, xx - yy) / 2)
     ax.add_patch(
         Ellipse(
             tuple(end),
@@ -324,7 +334,7 @@ def _draw_headings(ax: Axes, tree: xr.DataTree, calibrated: np.ndarray) -> list[
     angle = nodes["node_heading"].values[turned] + [shifts[f"{name}.heading"] for name in names[turned]]
     ax.quiver(
         *calibrated[turned].T, np.cos(angle), np.sin(angle), color="#d00000", angles="xy",
-        scale_units="width", scale=22.0, width=0.004,
+        scale_units="width", scale=22.0 if len(names) <= 25 else 45.0, width=0.004,
         headwidth=1.0, headlength=0.0, headaxislength=0.0, zorder=5,
     )  # fmt: skip
     return [Line2D([], [], color="#d00000", label="calibrated heading")]
@@ -358,14 +368,17 @@ def _known(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _largest(group: xr.Dataset) -> np.ndarray:
-    """Rows of the forest in the order of the tree: all, or those of largest |mean| in scales."""
+    """Rows of the forest in the order of the tree: all, or invalid ones and those of largest |mean|/scale."""
     size = np.abs(np.nan_to_num(group["mean"].values / group["scale"].values, nan=np.inf))
+    size[np.isin(group["status"].values, INVALID)] = np.inf
     return np.sort(np.argsort(-size, kind="stable")[:ROWS])
 
 
 def _title_biases(ax: Axes, shown: int, total: int, true: bool) -> None:
     some = (
-        f"{shown} of {total} biases, those of largest |mean| / scale" if shown < total else f"{total} biases"
+        f"{shown} of {total} biases: the largest |mean| / scale, and any invalid"
+        if shown < total
+        else f"{total} biases"
     )
     ax.set_title(some + (" (cross: true value)" if true else ""), loc="left")
 
@@ -379,6 +392,13 @@ def _true(tree: xr.DataTree, labels: np.ndarray) -> np.ndarray:
     return np.array([values.get(label, np.nan) for label in labels.tolist()])
 
 
+def _gamma_bar(ax: Axes, dots: PathCollection) -> None:
+    """Add the colour bar of gamma below the axes, at a distance that does not grow with the rows."""
+    height = max(ax.figure.bbox.height / ax.figure.dpi - 1.5, 1.0)
+    bar = ax.inset_axes((0.25, -0.75 / height, 0.5, 0.12 / height))
+    ax.figure.colorbar(dots, cax=bar, orientation="horizontal", label="gamma (0 prior only, 1 data only)")
+
+
 def _text_size(rows: int) -> float:
     return 8.0 if rows <= 80 else 7.0
 
@@ -386,7 +406,7 @@ def _text_size(rows: int) -> float:
 def _mark_status(ax: Axes, status: np.ndarray, size: float) -> None:
     """Write what happened to a bias at the right of its row."""
     for row, text in enumerate(status.tolist()):
-        if text in ("at bound", "pruned", "diverged"):
+        if text in (*INVALID, "pruned"):
             colour = "0.4" if text == "pruned" else "#b00000"
             ax.text(
                 1.01, row, text, transform=ax.get_yaxis_transform(), va="center", fontsize=size, color=colour

@@ -13,7 +13,7 @@ from probcal.sensor import Bias, Channel, sensor
 
 @sensor(range=Channel("m", std=1.0))
 def ranger(target, pose, *, range_offset=Bias("m", 1.0), range_scale=Bias("1", 0.1)):
-    """Range with an offset and a scale: (1 + range_scale) |p - s| + range_offset."""
+    """Range with an offset and a scale: (1 + range_scale) |p - s| + range_offset (thesis 2.5-2.6, with a scale)."""
     return dict(range=(1 + range_scale) * norm(target.position - pose.position) + range_offset)
 
 
@@ -25,14 +25,14 @@ def toa(target, pose):
 
 @sensor(difference=Channel("m", std=1.0))
 def tdoa(target, first, second, *, difference_offset=Bias("m", 1.0)):
-    """Time difference of arrival times propagation speed: |p - b| - |p - a| + clock_b - clock_a (thesis 2.8)."""
+    """Time difference of arrival times propagation speed: |p - b| - |p - a| + clocks (thesis 2.8, sign turned)."""
     ranges = norm(target.position - second.position) - norm(target.position - first.position)
     return dict(difference=ranges + second.clock - first.clock + difference_offset)
 
 
 @sensor(azimuth=Channel("rad", std=np.deg2rad(1.0), wrap=True))
 def doa(target, pose):
-    """Direction of arrival in the plane, from the node's heading (thesis 2.11; the heading is the bearing bias)."""
+    """Direction of arrival in the plane, from the node's heading (thesis 2.10-2.11)."""
     return dict(azimuth=bearing(target.position - pose.position) - pose.heading)
 
 
@@ -66,7 +66,7 @@ def radar_3d(target, pose, *, range_offset=Bias("m", 10.0)):
 
 @sensor(level=Channel("dB", std=2.0))
 def rss(target, pose, *, gain=Bias("dB", 3.0), exponent=Bias("1", 0.5, nominal=2.0, shared="type")):
-    """Received signal strength: power - 10 exponent log10 r + gain (RSS paper 3; Paper A 6)."""
+    """Received signal strength: power - 10 exponent log10 r + gain (thesis 2.13, Paper A 6)."""
     distance = norm(target.position - pose.position)
     return dict(level=target.power - 10 * exponent * jnp.log10(jnp.maximum(distance, 1e-3)) + gain)
 

@@ -40,7 +40,7 @@ def draw(
         smooth = rec.smooth(part.F, L, J, gain, columns).states
         free = prior - smooth[:, :, :count] - smooth[:, :, count:] @ dz.T
         trajectories.append(jnp.moveaxis(point.states[r][:, :, None] + free, 2, 0))
-    return point.z + dz, tuple(trajectories)
+    return point.z[None, :] + dz, tuple(trajectories)
 
 
 @partial(jax.jit, static_argnames="spec")

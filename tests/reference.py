@@ -1,0 +1,317 @@
+"""A deliberately naive second implementation for linear networks: NumPy, loops, a dense joint Gaussian.
+
+It reads declarations (network, motions, table) and calls the sensor functions on its own views; nothing of
+probcal's table, rows, recursion or linear algebra is used. Everything is written for clarity at toy size.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+
+from probcal.motion import ConstantVelocity, Motion, RandomWalk, Static, White
+
+AXES = "xyz"
+
+
+class Pose(SimpleNamespace):
+    """Position, heading, pitch, roll and what the node owns; `local` by explicit rotation matrices."""
+
+    def local(self, point):
+        c, s = np.cos(self.heading), np.sin(self.heading)
+        if len(self.position) == 2:
+            return np.array([[c, -s], [s, c]]).T @ (point - self.position)
+        yaw = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        c, s = np.cos(self.pitch), np.sin(self.pitch)
+        nose_up = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])  # x ahead rises towards z
+        c, s = np.cos(self.roll), np.sin(self.roll)
+        roll = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+        return (yaw @ nose_up @ roll).T @ (point - self.position)
+
+
+def components(motion):
+    return motion.components if isinstance(motion, Motion) else (motion,)
+
+
+def names_of(motion, d):
+    """Scalar state components in order."""
+    found = []
+    for part in components(motion):
+        if isinstance(part, ConstantVelocity):
+            found += [f"position_{a}" for a in AXES[:d]] + [f"velocity_{a}" for a in AXES[:d]]
+        elif isinstance(part, Static):
+            found += [f"position_{a}" for a in AXES[:d]]
+        else:
+            found.append(part.name)
+    return found
+
+
+def step_of(motion, dt, d):
+    """Transition, drift and noise covariance over one time step."""
+    names = names_of(motion, d)
+    F, c, Q = np.zeros((len(names),) * 2), np.zeros(len(names)), np.zeros((len(names),) * 2)
+    for part in components(motion):
+        if isinstance(part, ConstantVelocity):
+            for a in AXES[:d]:
+                p, v = names.index(f"position_{a}"), names.index(f"velocity_{a}")
+                F[p, p] = F[v, v] = 1.0
+                F[p, v] = dt
+                if part.singular:
+                    g = np.array([dt**2 / 2, dt])
+                    block = part.std**2 * np.outer(g, g)
+                else:
+                    block = part.std**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+                Q[np.ix_([p, v], [p, v])] = block
+        elif isinstance(part, Static):
+            for a in AXES[:d]:
+                F[names.index(f"position_{a}"), names.index(f"position_{a}")] = 1.0
+        elif isinstance(part, RandomWalk):
+            k = names.index(part.name)
+            F[k, k], Q[k, k] = 1.0, part.std**2 * dt
+        elif isinstance(part, White):
+            k = names.index(part.name)
+            c[k], Q[k, k] = part.mean, part.std**2
+        else:
+            raise TypeError(part)
+    return F, c, Q
+
+
+def start_of(target, d):
+    """Mean and covariance at the first epoch; positions and velocities must be declared."""
+    names = names_of(target.motion, d)
+    given = dict(target.start)
+    for part in components(target.motion):
+        if isinstance(part, RandomWalk):
+            given.setdefault(part.name, part.initial)
+        if isinstance(part, White):
+            given[part.name] = (part.mean, part.std)
+    mean, variance = np.zeros(len(names)), np.zeros(len(names))
+    for name, (m, s) in given.items():
+        mine = [k for k, n in enumerate(names) if n == name or n in [f"{name}_{a}" for a in AXES]]
+        mean[mine], variance[mine] = m, s**2
+    assert (variance > 0).all(), "the reference needs every start"
+    return mean, np.diag(variance)
+
+
+@dataclass
+class Chain:
+    """Epochs of one target: times and, for each, transition, drift and noise covariance."""
+
+    target: str
+    names: list
+    times: list
+    steps: list  # (F, c, Q); the first has F = 0 and the start
+
+
+@dataclass
+class Datum:
+    """One measured value: which epoch of which target, and its affine form y = H x + G z + offset + noise."""
+
+    chain: int
+    epoch: int
+    H: np.ndarray
+    G: np.ndarray
+    offset: float
+    y: float
+    std: float
+
+
+class Linear:
+    """A linear problem as lists: biases with labels and scales, chains of epochs, and data."""
+
+    def __init__(self, network, motion, table, fix=()):
+        self.d = len(network.sensors[0].nodes[0].position)
+        fixed = dict(fix) if isinstance(fix, dict) else dict.fromkeys(fix, 0.0)
+        self.scales = {}
+        for placed in network.sensors:
+            for node in placed.nodes:
+                for component, (_, bias) in node.spread.items():
+                    axes = [f"_{a}" for a in AXES[: self.d]] if component == "position" else [""]
+                    for axis in axes:
+                        self.scales[f"{node.name}.{component}{axis}"] = bias.scale
+        for placed in network.sensors:
+            for name, bias in placed.type.biases.items():
+                self.scales[self.owner(placed, bias) + name] = bias.scale
+        self.fixed = fixed
+        for label in fixed:
+            del self.scales[label]
+        self.labels = list(self.scales)
+        targets = table["target"].astype(str) if "target" in table else pd.Series("target", table.index)
+        self.chains = []
+        for name in dict.fromkeys(targets):
+            target = motion[name] if isinstance(motion, dict) else motion
+            times = sorted(set(table["time"][targets == name]))
+            if all(isinstance(part, Static) for part in components(target.motion)):
+                times = times[:1]
+            mean, covariance = start_of(target, self.d)
+            steps = [(np.zeros_like(covariance), mean, covariance)]
+            for before, after in pairwise(times):
+                steps.append(step_of(target.motion, after - before, self.d))
+            self.chains.append(Chain(name, names_of(target.motion, self.d), times, steps))
+        by_name = {placed.name: placed for placed in network.sensors}
+        self.data = []
+        for i in range(len(table)):
+            row = table.iloc[i]
+            k = [chain.target for chain in self.chains].index(targets.iloc[i])
+            chain = self.chains[k]
+            epoch = chain.times.index(row["time"]) if len(chain.times) > 1 else 0
+            self._add(by_name[row["sensor"]], row, k, epoch)
+
+    @staticmethod
+    def owner(placed, bias):
+        return f"{placed.type.name if bias.shared else placed.name}."
+
+    def _evaluate(self, placed, row, chain, x, z):
+        """Predicted channels by scalar name at one state and one z."""
+        value = dict(zip(self.labels, z * np.array(list(self.scales.values())), strict=True)) | self.fixed
+        state = dict(zip(chain.names, x, strict=True))
+        parts = {n: v for n, v in state.items() if n[:-2] not in ("position", "velocity")}
+        for vector in ("position", "velocity"):
+            if f"{vector}_x" in state:
+                parts[vector] = np.array([state[f"{vector}_{a}"] for a in AXES[: self.d]])
+        poses = []
+        for node in placed.nodes:
+            stated = dict(node.components)
+            position = np.array(node.position, float)
+            if node.path is not None:
+                position = np.array([np.interp(row["time"], node.path.time, p) for p in node.path.position.T])
+                stated["heading"] += np.interp(row["time"], node.path.time, node.path.heading)
+            for axis in range(self.d):
+                position[axis] += value.get(f"{node.name}.position_{AXES[axis]}", 0.0)
+            own = {n: v + value.get(f"{node.name}.{n}", 0.0) for n, v in stated.items()}
+            poses.append(Pose(position=position, **own))
+        biases = {n: b.nominal + value[self.owner(placed, b) + n] for n, b in placed.type.biases.items()}
+        predicted = {}
+        for name, part in placed.type.function(SimpleNamespace(**parts), *poses, **biases).items():
+            if placed.type.channels[name].per_axis:
+                predicted |= {f"{name}_{AXES[axis]}": float(part[axis]) for axis in range(self.d)}
+            else:
+                predicted[name] = float(part)
+        return predicted
+
+    def _add(self, placed, row, k, epoch):
+        chain, M = self.chains[k], len(self.labels)
+        n = len(chain.names)
+        offset = self._evaluate(placed, row, chain, np.zeros(n), np.zeros(M))
+        by_x = [self._evaluate(placed, row, chain, unit, np.zeros(M)) for unit in np.eye(n)]
+        by_z = [self._evaluate(placed, row, chain, np.zeros(n), unit) for unit in np.eye(M)]
+        far = self._evaluate(placed, row, chain, np.full(n, 7.0), np.full(M, 3.0))
+        for name in offset:
+            if name not in row or np.isnan(row[name]):
+                continue
+            H = np.array([v[name] - offset[name] for v in by_x])
+            G = np.array([v[name] - offset[name] for v in by_z])
+            assert np.isclose(far[name], offset[name] + 7 * H.sum() + 3 * G.sum()), "the sensor is not linear"
+            channel = placed.type.channels[name if name in placed.type.channels else name[:-2]]
+            std = row.get(f"{name}_std", np.nan)
+            std = channel.std if np.isnan(std) else std
+            self.data.append(Datum(k, epoch, H, G, offset[name], row[name], std))
+
+
+@dataclass
+class Posterior:
+    """Exact moments of z and of all states (chains one after the other, epoch by epoch)."""
+
+    evidence: float
+    mean: np.ndarray
+    covariance: np.ndarray
+    biases: int
+
+    @property
+    def z(self):
+        return self.mean[: self.biases], self.covariance[: self.biases, : self.biases]
+
+    @property
+    def states(self):
+        return self.mean[self.biases :], np.sqrt(np.diag(self.covariance)[self.biases :])
+
+
+def log_normal(residual, S):
+    sign, logdet = np.linalg.slogdet(S)
+    assert sign > 0
+    return -0.5 * (residual @ np.linalg.solve(S, residual) + logdet + len(residual) * np.log(2 * np.pi))
+
+
+def dense(problem, alpha, hold=None):
+    """Condition the joint Gaussian of z and all states on all data; `hold` keeps z at a value instead.
+
+    Covariances only (no inverse of a prior), so that a singular process noise does not matter.
+    """
+    M, sizes = len(problem.labels), [len(c.names) * len(c.times) for c in problem.chains]
+    total = M + sum(sizes)
+    mean, C = np.zeros(total), np.zeros((total, total))
+    if hold is None:
+        C[:M, :M] = np.diag(1.0 / np.asarray(alpha))
+    else:
+        mean[:M] = hold
+    where, offset = [], M
+    for chain, size in zip(problem.chains, sizes, strict=True):
+        n = len(chain.names)
+        where.append([slice(offset + n * e, offset + n * (e + 1)) for e in range(len(chain.times))])
+        for e, (F, c, Q) in enumerate(chain.steps):
+            here = where[-1][e]
+            if e == 0:
+                mean[here], C[here, here] = c, Q
+                continue
+            before = where[-1][e - 1]
+            mean[here] = F @ mean[before] + c
+            past = slice(offset, here.start)
+            C[here, past] = F @ C[before, past]
+            C[past, here] = C[here, past].T
+            C[here, here] = F @ C[before, before] @ F.T + Q
+        offset += size
+    A, y, noise = np.zeros((len(problem.data), total)), [], []
+    for row, datum in zip(A, problem.data, strict=True):
+        row[:M] = datum.G
+        row[where[datum.chain][datum.epoch]] = datum.H
+        y.append(datum.y - datum.offset)
+        noise.append(datum.std**2)
+    R = np.diag(noise)
+    S = A @ C @ A.T + R
+    residual = np.array(y) - A @ mean
+    K = np.linalg.solve(S, A @ C).T
+    keep = np.eye(total) - K @ A
+    return Posterior(log_normal(residual, S), mean + K @ residual, keep @ C @ keep.T + K @ R @ K.T, M)
+
+
+def kalman(problem, alpha):
+    """Loop Kalman filter and RTS smoother with the biases as constants of the state; missing rows drop out.
+
+    Targets follow each other: a new target keeps the biases and draws its own start. Returns evidence, and
+    the smoothed mean and covariance of (z, x) at every epoch in order.
+    """
+    M = len(problem.labels)
+    m, P = np.zeros(M), np.diag(1.0 / np.asarray(alpha))
+    evidence, filtered, predicted, transitions = 0.0, [], [], []
+    for k, chain in enumerate(problem.chains):
+        n = len(chain.names)
+        for e, (F, c, Q) in enumerate(chain.steps):
+            T = np.zeros((M + n, len(m)))
+            T[:M, :M] = np.eye(M)
+            if e > 0:
+                T[M:, M:] = F
+            m = T @ m + np.concatenate([np.zeros(M), c])
+            P = T @ P @ T.T
+            P[M:, M:] += Q
+            predicted.append((m, P))
+            transitions.append(T)
+            for datum in problem.data:
+                if (datum.chain, datum.epoch) == (k, e):
+                    h = np.concatenate([datum.G, datum.H])
+                    s = h @ P @ h + datum.std**2
+                    r = datum.y - datum.offset - h @ m
+                    evidence += log_normal(np.array([r]), np.array([[s]]))
+                    gain = P @ h / s
+                    m = m + gain * r
+                    keep = np.eye(len(m)) - np.outer(gain, h)
+                    P = keep @ P @ keep.T + datum.std**2 * np.outer(gain, gain)
+            filtered.append((m, P))
+    smoothed = [filtered[-1]]
+    for k in range(len(filtered) - 2, -1, -1):
+        (m, P), (ahead, P_ahead) = filtered[k], predicted[k + 1]
+        gain = np.linalg.solve(P_ahead, transitions[k + 1] @ P).T
+        later, P_later = smoothed[0]
+        smoothed.insert(0, (m + gain @ (later - ahead), P + gain @ (P_later - P_ahead) @ gain.T))
+    return evidence, smoothed

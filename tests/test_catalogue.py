@@ -1,0 +1,190 @@
+"""Contract of everything public: every sensor x dimension, motion, method and model file works end to end.
+
+To cover a new sensor, motion or method, add it to the lists here; a type of the catalogue that is missing fails.
+"""
+
+import importlib.util
+from pathlib import Path as File
+
+import jax
+import numpy as np
+import pytest
+
+import probcal
+from probcal import (
+    EA,
+    EM,
+    EMEA,
+    MAP,
+    ConstantVelocity,
+    Network,
+    Node,
+    Path,
+    Problem,
+    RandomWalk,
+    SensorType,
+    Static,
+    Target,
+    White,
+    fit,
+    sensors,
+    simulate,
+)
+
+CV = ConstantVelocity(0.5)
+POWER = RandomWalk("power", "dB", 0.2, (60.0, 5.0))
+EMISSION = White("emission", "m", 200.0)
+EXTRAS = {"toa": EMISSION, "rss": POWER}
+DIMENSIONS = {"ranger": (2, 3), "toa": (2, 3), "tdoa": (2, 3), "doa": (2, 3), "doa_3d": (3,), "radar": (2, 3),
+              "radar_3d": (3,), "rss": (2, 3), "presence": (2, 3), "position": (2, 3)}  # fmt: skip
+CASES = [(name, d) for name, dimensions in DIMENSIONS.items() for d in dimensions]
+METHODS = [EA(), EMEA(), EM(), MAP()]
+CORNERS = {
+    2: [(0, 0), (60, 0), (60, 60), (0, 60), (30, -10), (75, 30)],
+    3: [(0, 0, 0), (60, 0, 12), (60, 60, 1), (0, 60, 15), (30, -10, 6), (75, 30, 20)],
+}
+
+
+def catalogue():
+    return {name: kind for name, kind in vars(sensors).items() if isinstance(kind, SensorType)}
+
+
+def path(d, K=25, phase=0.0):
+    u = np.linspace(0, 1, K)
+    track = [10 + 40 * u, 30 + 18 * np.sin(5 * u + phase), 8 + 5 * np.cos(4 * u)]
+    return np.stack(track[:d], 1)
+
+
+def place(kind, d):
+    """A network of one type: two anchored nodes, the others to be calibrated."""
+    own = {"position": 1.0} | ({"heading": 0.05} if "heading" in kind.pose_components else {})
+    own |= {"clock": 2.0} if "clock" in kind.pose_components else {}
+    nodes = [Node(f"node_{k}", p, scale=own if k >= 2 else None) for k, p in enumerate(CORNERS[d])]
+    if kind.arity == 2:
+        return Network([kind.on(nodes[0], node) for node in nodes[1:]])
+    return Network([kind.on(node) for node in nodes])
+
+
+def check_tree(tree, problem):
+    """Schema, finiteness and honesty of a result."""
+    assert set(tree.children) >= {"posterior", "calibration", "track", "observed_data", "residual", "constant_data"}
+    assert tree["posterior"]["bias"].dims == ("chain", "draw", "bias_label")
+    assert tree["posterior"].sizes["chain"] == 4
+    assert tuple(tree["calibration"]["bias_label"].values) == problem.labels
+    for node in tree.subtree:
+        for name, variable in node.data_vars.items():
+            assert isinstance(variable.values, np.ndarray)
+            if variable.dtype.kind == "f":
+                assert variable.dtype == np.float64, name
+                assert np.isfinite(variable.values).all(), (node.path, name)
+    gamma = tree["calibration"]["gamma"].values
+    assert ((gamma >= 0) & (gamma <= 1)).all()
+    assert tree.attrs["status"] in ("converged", "not converged", "at bound", "diverged")
+
+
+def test_every_type_of_the_catalogue_is_listed():
+    assert set(catalogue()) == set(DIMENSIONS)
+
+
+@pytest.mark.parametrize(("name", "d"), CASES)
+def test_every_sensor_simulates_and_fits(name, d):
+    kind = catalogue()[name]
+    network = place(kind, d)
+    motion = CV + EXTRAS[name] if name in EXTRAS else CV
+    run = simulate(network, motion, np.arange(25.0), 1, share=0.5, missing=0.1, tracks={"target": path(d)})
+    problem = Problem(network, motion, run.table)
+    tree = fit(problem, MAP(), predictive_draws=True)
+    check_tree(tree, problem)
+    found = probcal.scores(tree, run.truth)
+    informative = name != "presence" and not (name == "doa" and d == 3)
+    if informative:  # the track is found, from the data alone
+        assert found["position_rmse_after"] < 4.0
+        z = np.array([run.truth.biases[label] for label in problem.labels]) / problem.scales
+        error = tree["calibration"]["mean"].values / problem.scales - z
+        sd = tree["calibration"]["sd"].values / problem.scales
+        # share 0.5 of N(0, 1) under a N(0, 1) prior: the mean squared score is below 1; 2 fails in < 0.1 % of seeds
+        assert np.mean((error / sd) ** 2) < 2.0
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+@pytest.mark.parametrize("d", [2, 3])
+def test_every_method_on_a_mixed_network(method, d):
+    """Mixed sensors, two targets of different motions, a static one, asynchronous and missing rows, a moving node."""
+    walk = Path([0.0, 30.0], [CORNERS[d][0], CORNERS[d][5]], [0.0, 0.5])
+    nodes = [Node(f"node_{k}", p, scale={"position": 1.0, "heading": 0.05} if k == 3 else {"heading": 0.05})
+             for k, p in enumerate(CORNERS[d])]  # fmt: skip
+    pole = [Node(f"pole_{k}", np.array(p) + 3.0, survey=0.1) for k, p in enumerate(CORNERS[d][:4])]
+    network = Network(
+        [sensors.radar.on(node) for node in nodes[:4]]
+        + [sensors.ranger.on(nodes[4]), sensors.doa.on(nodes[4], name="node_4_doa")]
+        + [sensors.tdoa.on(a, b) for a, b in zip(pole[:-1], pole[1:], strict=True)]
+        + [sensors.position.on(Node("gnss", np.zeros(d)))]
+        + [sensors.radar.on(Node("robot", path=walk))]
+    )
+    motions = {"car": Target(CV), "van": CV + POWER, "mast": Static()}
+    tracks = {"car": path(d), "van": path(d, phase=2.0), "mast": path(d)[:1]}
+    run = simulate(network, motions, np.arange(25.0), 5, tracks=tracks, missing=0.2, outliers=0.0)
+    late = run.table["sensor"].str.startswith("pole") & (run.table["target"] != "mast")
+    table = run.table.drop(run.table[late & (run.table["time"] % 2 == 1)].index)
+    problem = Problem(network, motions, table)
+    tree = fit(problem, method, predictive_draws=True)
+    check_tree(tree, problem)
+    assert probcal.scores(tree, run.truth)["position_rmse_after"] < 3.0
+    if isinstance(method, EA):
+        assert tree.attrs["status"] == "converged"
+        kept = tree["calibration"]["gamma"].values > 0.05
+        z = tree["calibration"]["mean"].values / problem.scales
+        alpha = tree["calibration"]["precision"].values
+        # MacKay's fixed point, gamma = alpha z^2, up to the stopping rule
+        learnt = kept & ~problem.surveyed
+        np.testing.assert_allclose(alpha[learnt] * z[learnt] ** 2, tree["calibration"]["gamma"].values[learnt], rtol=0.1)
+
+
+@pytest.mark.parametrize("motion", [
+    ConstantVelocity(0.5), ConstantVelocity(0.5, singular=True), RandomWalk("position", "m", 3.0, (30.0, 100.0), per_axis=True),
+    White("position", "m", 50.0, mean=30.0, per_axis=True), CV + White("emission", "m", 100.0), CV + POWER,
+], ids=lambda m: str(type(m).__name__))  # fmt: skip
+@pytest.mark.parametrize("d", [2, 3])
+def test_every_motion_tracks(motion, d):
+    network = place(sensors.ranger, d)
+    run = simulate(network, motion, np.arange(25.0), 2, share=0.0, tracks={"target": path(d)})
+    problem = Problem(network, motion, run.table)
+    tree = fit(problem, MAP(), predictive_draws=False)
+    check_tree(tree, problem)
+    assert probcal.scores(tree, run.truth)["position_rmse_after"] < 3.0
+
+
+@pytest.mark.parametrize("file", sorted((File(__file__).parents[1] / "models").glob("*.py")), ids=lambda p: p.stem)
+def test_every_model_file_declares_a_problem(file, monkeypatch):
+    monkeypatch.syspath_prepend(file.parent)
+    spec = importlib.util.spec_from_file_location(f"model_{file.stem}", file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    problem = module.problem()
+    assert problem.labels
+    if hasattr(module, "truth"):
+        assert set(module.truth().biases) <= set(problem.labels)
+    if hasattr(module, "scenario"):
+        one, same, other = module.scenario(1), module.scenario(1), module.scenario(2)
+        assert one.table.equals(same.table)
+        assert not one.table.equals(other.table)
+        assert module.problem(other.table).labels == problem.labels
+
+
+def test_gradients_are_finite_where_a_target_stands_on_a_node():
+    from probcal import rows
+
+    with jax.enable_x64(True):
+        for name, d in CASES:
+            kind = catalogue()[name]
+            network = place(kind, d)
+            motion = CV + EXTRAS[name] if name in EXTRAS else CV
+            run = simulate(network, motion, np.arange(3.0), 1, tracks={"target": path(d, 3)})
+            problem = Problem(network, motion, run.table)
+            states = np.zeros((3, problem.system.recursions[0].drift.shape[1]))
+            for p in CORNERS[d]:
+                states[:, :d] = p
+                for block, data in zip(problem.spec.blocks, problem.system.rows, strict=True):
+                    z, levels = np.zeros(len(problem.labels)), np.zeros(0)
+                    lin = rows.linearise(block, data, jax.numpy.asarray(states), jax.numpy.asarray(z), jax.numpy.asarray(levels), expected=True)
+                    assert all(np.isfinite(np.asarray(part)).all() for part in lin), name

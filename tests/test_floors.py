@@ -1,0 +1,185 @@
+"""The floors of the design: a module imports from its own floor or a lower one; only `linalg` factorises."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import probcal
+
+ROOT = Path(probcal.__file__).parent
+FLOORS = {
+    0: ("linalg", "geometry", "types"),
+    1: ("sensor", "motion", "priors", "noise"),
+    2: ("sensors", "roads"),
+    3: ("network", "table", "rows"),
+    4: ("problem", "simulate", "tree"),
+    5: ("smoothing",),
+    6: ("inference", "analysis", "selfcal"),
+    7: ("cli", "report", "plots", "diagnostics"),
+}
+FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
+METHODS = ("inference.ea", "inference.em")  # algorithms: they share what lies below, never each other
+LOW = {"jax", "numpy"}  # third parties of floor 0, besides the standard library
+FACTORISE = {
+    "cho_factor", "cho_solve", "cholesky", "eigh", "eig", "eigvalsh", "inv", "lu", "lu_factor", "lu_solve",
+    "lstsq", "matrix_rank", "pinv", "qr", "slogdet", "svd", "solve_triangular", "triangular_solve",
+}  # fmt: skip
+FILES = sorted(path for path in ROOT.rglob("*.py") if "__pycache__" not in path.parts)
+
+
+def dotted(path):
+    """Module name inside the package: `smoothing.mode`, `inference`, or empty for the package itself."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {dotted(path): path for path in FILES}
+
+
+def imports(tree, module, package):
+    """Absolute names of everything imported anywhere in a module, with `name` of `from ... import name`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                here = ["probcal", *(module.split(".") if module else [])]
+                here = here if package else here[:-1]
+                base = ".".join([*here[: len(here) - node.level + 1], *([base] if base else [])])
+            yield from ((f"{base}.{alias.name}", node.lineno) for alias in node.names)
+
+
+def own(module, path):
+    """Modules of probcal that a module imports, with the line."""
+    for name, line in imports(ast.parse(path.read_text()), module, path.name == "__init__.py"):
+        if name.split(".")[0] != "probcal":
+            continue
+        parts = name.split(".")[1:]
+        while len(parts) > 1 and ".".join(parts) not in MODULES:
+            parts = parts[:-1]
+        known = parts and (".".join(parts) in MODULES or parts[0] in FLOOR)  # else a name of probcal/__init__
+        yield ".".join(parts) if known else "", line
+
+
+def floor(module):
+    return FLOOR.get(module.split(".")[0])
+
+
+def test_the_walk_finds_the_package():
+    assert {"linalg", "rows", "smoothing.mode", "inference.fit", "inference"} <= set(MODULES)
+    found = {name for name, _ in own("smoothing.mode", MODULES["smoothing.mode"])}
+    assert {"linalg", "problem", "smoothing.recursion"} <= found
+
+
+def test_imports_inside_functions_and_relative_ones_are_seen():
+    text = "def f():\n    from ..problem import Spec\n    import probcal.cli\n    from . import mode\n"
+    found = [name for name, _ in imports(ast.parse(text), "smoothing.start", False)]
+    assert found == ["probcal.problem.Spec", "probcal.cli", "probcal.smoothing.mode"]
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if m], ids=str)
+def test_every_module_has_a_floor(module):
+    assert floor(module) is not None, (
+        f"probcal/{module.replace('.', '/')} is on no floor:"
+        " add it to FLOORS in tests/test_floors.py (design, section 4)"
+    )
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if m], ids=str)
+def test_imports_keep_the_floors(module):
+    high = [
+        f"line {line}: imports {name or 'probcal itself'} (floor {floor(name) if name else 'of everything'})"
+        for name, line in own(module, MODULES[module])
+        if not name or (floor(name) is not None and floor(name) > floor(module))
+    ]
+    assert not high, f"{module} is on floor {floor(module)}, {'; '.join(high)}"
+
+
+@pytest.mark.parametrize("module", METHODS)
+def test_algorithms_do_not_import_each_other(module):
+    others = [name for name, _ in own(module, MODULES[module]) if name in METHODS and name != module]
+    assert not others, f"{module} imports {others}: move what they share to inference/run.py or below"
+
+
+@pytest.mark.parametrize("module", FLOORS[0])
+def test_the_ground_floor_needs_jax_and_numpy_only(module):
+    roots = {name.split(".")[0] for name, _ in imports(ast.parse(MODULES[module].read_text()), module, False)}
+    third = {root for root in roots if (Path(ast.__file__).parent / root).exists() is False}
+    third -= {root for root in roots if (Path(ast.__file__).parent / f"{root}.py").exists()}
+    assert third <= LOW | {"probcal"}
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if m], ids=str)
+def test_models_are_never_imported(module):
+    names = [name for name, _ in imports(ast.parse(MODULES[module].read_text()), module, False)]
+    assert not [name for name in names if name.split(".")[0] in ("models", "tests", "benchmarks")]
+
+
+def test_the_catalogue_uses_the_public_declaration_only():
+    assert {name for name, _ in own("sensors", MODULES["sensors"])} <= {"sensor", "geometry", "noise"}
+
+
+def chain(node):
+    """`a.b.c` of nested attributes, or an empty text."""
+    if isinstance(node, ast.Name):
+        return node.id
+    if isinstance(node, ast.Attribute):
+        before = chain(node.value)
+        return f"{before}.{node.attr}" if before else ""
+    return ""
+
+
+def factorisations(text):
+    """Uses of a jax factorisation: `jnp.linalg.*`, `jax.scipy.linalg.*`, `lax.linalg.*`, by any alias."""
+    tree = ast.parse(text)
+    aliases = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                root = alias.name.split(".")[0]
+                aliases[alias.asname or root] = alias.name if alias.asname else root
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            aliases |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jax"):
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}"
+                if "linalg" in name:
+                    found.add((name, node.lineno))
+        elif isinstance(node, ast.Attribute):
+            head, _, rest = chain(node).partition(".")
+            name = f"{aliases.get(head, head)}.{rest}"
+            if name.startswith("jax") and (".linalg." in name or name.split(".")[-1] in FACTORISE):
+                found.add((name, node.lineno))
+    return sorted(found, key=lambda pair: pair[1])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import jax.numpy as jnp\nx = jnp.linalg.solve(a, b)",
+        "import jax\nx = jax.scipy.linalg.cho_solve(a, b)",
+        "from jax.scipy.linalg import solve_triangular",
+        "from jax.numpy import linalg as la\nx = la.qr(a)",
+        "def f():\n    from jax import numpy as n\n    return n.linalg.qr(a)",
+        "from jax.lax import linalg",
+    ],
+)
+def test_the_search_for_factorisations_sees(text):
+    assert factorisations(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["import numpy as np\nnp.linalg.eigh(a)", "from probcal import linalg\nlinalg.factor(a)"]
+)
+def test_the_search_for_factorisations_spares(text):
+    assert not factorisations(text)
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if m != "linalg"], ids=lambda m: m or "probcal")
+def test_only_linalg_factorises(module):
+    found = [f"line {line}: {name}" for name, line in factorisations(MODULES[module].read_text())]
+    assert not found, f"{module}: {'; '.join(found)}: factorisations belong into linalg.py"
