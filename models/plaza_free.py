@@ -6,6 +6,7 @@ an answer.
 """
 
 from plaza import HERE, network, truth
+
 from probcal import ConstantVelocity, Problem
 
 __all__ = ["problem", "truth"]

@@ -80,7 +80,9 @@ def _call(module: ModuleType, path: Path, name: str, *arguments: Any) -> Any:
     """Call a function of a model file; its own failures become one sentence."""
     function = getattr(module, name, None)
     if not callable(function):
-        raise InputError(f"{path.name} defines no {name}(); a model file defines problem(data=None) and, to simulate, scenario(key)")
+        raise InputError(
+            f"{path.name} defines no {name}(); a model file defines problem(data=None) and, to simulate, scenario(key)"
+        )
     try:
         return function(*arguments)
     except (InputError, FitError):
@@ -95,7 +97,9 @@ def _problem(model: Path, data: Path | None, fix: list[str] = [], *, idle: bool 
         raise InputError(f"{data}: no such file")
     problem = _call(module, model, "problem", data)
     if not isinstance(problem, Problem):
-        raise InputError(f"{model.name}: problem() returned {type(problem).__name__}; return a probcal.Problem with a network")
+        raise InputError(
+            f"{model.name}: problem() returned {type(problem).__name__}; return a probcal.Problem with a network"
+        )
     if fix or idle:
         problem = problem.rebuild(fix=problem.fixed | dict.fromkeys(fix, 0.0), idle=idle)
     return module, problem
@@ -259,7 +263,9 @@ def track_command(
         raise InputError("track needs --calibration DIR, the folder of a fit")
     known = load(calibration)
     if known.attrs.get("status") in ("at bound", "diverged"):
-        raise InputError(f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first")
+        raise InputError(
+            f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first"
+        )
     _folder(out.parent)
     module, problem = _problem(model, data, idle=True)
     tree = track(problem, known)
@@ -277,7 +283,10 @@ def track_table(tree: xr.DataTree) -> pd.DataFrame:
     group, parts = tree["track"].to_dataset(), []
     for name in (str(n) for n in group.data_vars if str(n).startswith("mean")):
         s = name.removeprefix("mean")
-        columns: dict[str, np.ndarray] = {"time": group[f"epoch_time{s}"].values, "target": group[f"epoch_target{s}"].values}
+        columns: dict[str, np.ndarray] = {
+            "time": group[f"epoch_time{s}"].values,
+            "target": group[f"epoch_target{s}"].values,
+        }
         for component in group[f"component{s}"].values:
             columns[str(component)] = group[name].sel({f"component{s}": component}).values
             columns[f"{component}_sd"] = group[f"sd{s}"].sel({f"component{s}": component}).values

@@ -135,9 +135,7 @@ def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
             label=_plain(name),
         )
     if len(labels) <= NAMED:
-        ax.set_xticks(
-            np.arange(len(labels)), [_plain(label) for label in labels[order]], rotation=90, fontsize=7
-        )
+        ax.set_xticks(np.arange(len(labels)), [_plain(label) for label in labels[order]], rotation=90, fontsize=7)
     else:
         ax.set_xlabel("bias, sorted by gamma")
     ax.set(ylim=(-0.04, 1.04), ylabel="gamma")
@@ -187,9 +185,7 @@ def _tracks(tree: xr.DataTree) -> Iterator[_Track]:
         axes = ["position_x", "position_y"]
         if not np.isin(axes, group[f"component{s}"].values).all():
             continue
-        before, after = (
-            group[f"{kind}{s}"].sel({f"component{s}": axes}).values for kind in ("before", "mean")
-        )
+        before, after = (group[f"{kind}{s}"].sel({f"component{s}": axes}).values for kind in ("before", "mean"))
         times, owners = group[f"epoch_time{s}"].values, group[f"epoch_target{s}"].values
         for target in dict.fromkeys(owners.tolist()):
             mine = np.nonzero(owners == target)[0]
@@ -219,12 +215,8 @@ def _draw_tracks(ax: Axes, tracks: list[_Track]) -> list[Line2D]:
     if len(tracks) > 12:
         return [*keys, Line2D([], [], color=_colour(0), label=f"{len(tracks)} targets, after")]
     for k, track in enumerate(tracks):
-        style: dict[str, Any] = (
-            {"marker": "o", "linestyle": ""} if len(track.after) == 1 else {"linestyle": "-"}
-        )
-        keys.append(
-            Line2D([], [], color=_colour(k), markersize=5, label=f"{_plain(track.target)}, after", **style)
-        )
+        style: dict[str, Any] = {"marker": "o", "linestyle": ""} if len(track.after) == 1 else {"linestyle": "-"}
+        keys.append(Line2D([], [], color=_colour(k), markersize=5, label=f"{_plain(track.target)}, after", **style))
     return keys
 
 
@@ -289,9 +281,7 @@ def _draw_shift(ax: Axes, tree: xr.DataTree, name: str, start: np.ndarray, end: 
         return
     if np.linalg.norm(end - start) > 0.01 * np.ptp(ax.get_xlim()):
         style: dict[str, Any] = {"arrowstyle": "->", "mutation_scale": 10.0, "shrinkA": 0.0, "shrinkB": 0.0}
-        ax.add_patch(
-            FancyArrowPatch(tuple(start), tuple(end), color="black", linewidth=0.9, zorder=5, **style)
-        )
+        ax.add_patch(FancyArrowPatch(tuple(start), tuple(end), color="black", linewidth=0.9, zorder=5, **style))
     covariance = _position_covariance(tree, name)
     if not np.isfinite(covariance).all():
         return
@@ -408,9 +398,7 @@ def _mark_status(ax: Axes, status: np.ndarray, size: float) -> None:
     for row, text in enumerate(status.tolist()):
         if text in (*INVALID, "pruned"):
             colour = "0.4" if text == "pruned" else "#b00000"
-            ax.text(
-                1.01, row, text, transform=ax.get_yaxis_transform(), va="center", fontsize=size, color=colour
-            )
+            ax.text(1.01, row, text, transform=ax.get_yaxis_transform(), va="center", fontsize=size, color=colour)
 
 
 def _scale_axis(ax: Axes, values: np.ndarray) -> None:

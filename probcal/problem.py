@@ -117,9 +117,7 @@ class Problem:
     @property
     def node_positions(self) -> np.ndarray:
         """Stated positions of all nodes (a path's points for a moving one), shape (points, d)."""
-        return np.concatenate(
-            [n.position[None] if n.path is None else n.path.position for n in self.network.nodes]
-        )
+        return np.concatenate([n.position[None] if n.path is None else n.path.position for n in self.network.nodes])
 
     def rebuild(self, data: Any = None, **changes: Any) -> "Problem":
         """The same problem with other data, fixed biases or idle rule."""
@@ -234,7 +232,9 @@ class Problem:
         means, stds = [], []
         for part, per_axis in component.names():
             if part not in given:
-                raise InputError(f'target "{name}": give the start of "{part}", as in Target(motion, start={{"{part}": (mean, std)}})')
+                raise InputError(
+                    f'target "{name}": give the start of "{part}", as in Target(motion, start={{"{part}": (mean, std)}})'
+                )
             width = d if per_axis else 1
             mean, std = given[part]
             try:
@@ -312,7 +312,11 @@ def _channel_levels(kind: Any, dimension: int, levels: _Levels) -> list[int]:
     """Level number of each scalar channel of a type; a channel declared per axis has one level."""
     numbers = []
     for name, channel in kind.channels.items():
-        level = -1 if isinstance(channel.noise, Bernoulli) else levels.of(channel.std, f"{kind.name}.{name}_std", channel.unit)
+        level = (
+            -1
+            if isinstance(channel.noise, Bernoulli)
+            else levels.of(channel.std, f"{kind.name}.{name}_std", channel.unit)
+        )
         numbers += [level] * (dimension if channel.per_axis else 1)
     return numbers
 
@@ -341,4 +345,6 @@ def _check_rows(data: Measurements, network: Network, idle: bool) -> None:
     seen = set(data.sensor[measured])
     for k, placed in enumerate(network.sensors):
         if k not in seen and not idle:
-            raise InputError(f'{source} has no row of sensor "{placed.name}"; add its rows or take it out of the network')
+            raise InputError(
+                f'{source} has no row of sensor "{placed.name}"; add its rows or take it out of the network'
+            )

@@ -261,9 +261,7 @@ def _pictures(tree: xr.DataTree) -> list[dict[str, str]]:
     ]  # fmt: skip
     present = set(tree.children)
     return [
-        {"title": title, "alt": alt, "source": _embed(draw())}
-        for title, alt, needs, draw in found
-        if needs <= present
+        {"title": title, "alt": alt, "source": _embed(draw())} for title, alt, needs, draw in found if needs <= present
     ]
 
 

@@ -67,7 +67,7 @@ def make_block(network: Network, kind: SensorType, layout: Layout) -> Block:
     missing = sorted(kind.target_components - set(known) - {"velocity", "acceleration"})
     if missing:
         raise InputError(
-            f'sensor {kind.name} reads target.{missing[0]}, which the motion does not have{nearest(missing[0], known)};'
+            f"sensor {kind.name} reads target.{missing[0]}, which the motion does not have{nearest(missing[0], known)};"
             f' add it, as in motion + White("{missing[0]}", unit, std)'
         )
     used = tuple(sorted(i for name in asked for i in range(*known[name])))

@@ -31,9 +31,11 @@ class Bias:
 
     def __post_init__(self):
         if not isinstance(self.unit, str):
-            raise InputError(f"Bias({self.unit!r}, ...): the first argument is the unit, a string such as \"m\"")
+            raise InputError(f'Bias({self.unit!r}, ...): the first argument is the unit, a string such as "m"')
         if not (np.isfinite(self.scale) and self.scale > 0):
-            raise InputError(f"Bias({self.unit!r}, scale={self.scale}): the scale must be positive; to fix a bias use fix=")
+            raise InputError(
+                f"Bias({self.unit!r}, scale={self.scale}): the scale must be positive; to fix a bias use fix="
+            )
         if not np.isfinite(self.nominal):
             raise InputError(f"Bias({self.unit!r}, nominal={self.nominal}): the nominal value must be finite")
         if self.shared not in (None, "type"):
@@ -56,7 +58,7 @@ class Channel:
 
     def __post_init__(self):
         if not isinstance(self.unit, str):
-            raise InputError(f"Channel({self.unit!r}, ...): the first argument is the unit, a string such as \"m\"")
+            raise InputError(f'Channel({self.unit!r}, ...): the first argument is the unit, a string such as "m"')
         if not isinstance(self.noise, Bernoulli):
             check_level(self.std, f"Channel({self.unit!r}): std")
         if self.wrap and self.unit not in PERIODS:
@@ -174,7 +176,7 @@ def sensor(**channels: Channel) -> Callable[[Callable[..., Mapping[str, Any]]], 
         if not isinstance(channel, Channel):
             raise InputError(f"sensor channel {name}={channel!r}: give Channel(unit, std=...)")
     if not channels:
-        raise InputError("sensor() needs at least one channel, such as @sensor(range=Channel(\"m\", std=1.0))")
+        raise InputError('sensor() needs at least one channel, such as @sensor(range=Channel("m", std=1.0))')
 
     def declare(function: Callable[..., Mapping[str, Any]]) -> SensorType:
         label = function.__name__
@@ -199,12 +201,15 @@ def sensor(**channels: Channel) -> Callable[[Callable[..., Mapping[str, Any]]], 
             found = sorted(returned) if isinstance(returned, Mapping) else type(returned).__name__
             wrong = next((n for n in found if n not in channels), None) if isinstance(returned, Mapping) else None
             hint = nearest(wrong, channels) if wrong else ""
-            raise InputError(
-                f"sensor {label}: returns {found}, but the declared channels are {sorted(channels)}{hint}"
-            )
+            raise InputError(f"sensor {label}: returns {found}, but the declared channels are {sorted(channels)}{hint}")
         return SensorType(
-            name=label, function=function, channels=dict(channels), biases=biases, arity=arity,
-            target_components=frozenset(target_asked), pose_components=frozenset(pose_asked),
+            name=label,
+            function=function,
+            channels=dict(channels),
+            biases=biases,
+            arity=arity,
+            target_components=frozenset(target_asked),
+            pose_components=frozenset(pose_asked),
         )
 
     return declare

@@ -75,7 +75,9 @@ class Simulation:
         path = Path(path)
         tracks, biases = _beside(path)
         tables = [(path, self.table), (tracks, self.truth.tracks)]
-        tables.append((biases, pd.DataFrame({"bias": list(self.truth.biases), "value": list(self.truth.biases.values())})))
+        tables.append(
+            (biases, pd.DataFrame({"bias": list(self.truth.biases), "value": list(self.truth.biases.values())}))
+        )
         for target, frame in tables:
             frame.to_csv(target, index=False)
         return [target for target, _ in tables]
@@ -87,7 +89,9 @@ def truth_beside(path: str | PathLike[str]) -> Truth | None:
     if not tracks.exists() and not biases.exists():
         return None
     values = _read(biases) if biases.exists() else pd.DataFrame({"bias": [], "value": []})
-    return Truth(tracks if tracks.exists() else None, dict(zip(values["bias"], values["value"].astype(float), strict=True)))
+    return Truth(
+        tracks if tracks.exists() else None, dict(zip(values["bias"], values["value"].astype(float), strict=True))
+    )
 
 
 def _beside(path: Path) -> tuple[Path, Path]:
@@ -223,7 +227,9 @@ def _frame(track: Any, dimension: int, epochs: int, name: str) -> pd.DataFrame:
     return track
 
 
-def _spoil(block: rows.Block, data: rows.Rows, value: np.ndarray, share: float, scale: float, key: jax.Array) -> np.ndarray:
+def _spoil(
+    block: rows.Block, data: rows.Rows, value: np.ndarray, share: float, scale: float, key: jax.Array
+) -> np.ndarray:
     """Put outliers on a share of the data: more noise, or the wrong answer of a yes-or-no channel."""
     pick, size = jax.random.split(key)
     hit = np.asarray(jax.random.uniform(pick, value.shape)) < share

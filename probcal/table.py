@@ -4,13 +4,12 @@ import re
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from probcal.noise import Bernoulli
 from probcal.network import Network
+from probcal.noise import Bernoulli
 from probcal.types import InputError, nearest
 
 # unit -> (quantity, factor to its base); offsets do not occur
@@ -134,10 +133,14 @@ def _numbers(table: Table, column: pd.Series, name: str) -> tuple[np.ndarray, np
     numbers = pd.to_numeric(column, errors="coerce").to_numpy(float, na_value=np.nan)
     text = np.flatnonzero(np.isnan(numbers) & column.notna().to_numpy())
     if len(text):
-        raise InputError(f'{table.where(text[0])} column "{name}": "{column.iloc[text[0]]}" is not a number; leave it blank where nothing was measured')
+        raise InputError(
+            f'{table.where(text[0])} column "{name}": "{column.iloc[text[0]]}" is not a number; leave it blank where nothing was measured'
+        )
     infinite = np.flatnonzero(np.isinf(numbers))
     if len(infinite):
-        raise InputError(f'{table.where(infinite[0])} column "{name}": the value is infinite; leave it blank where nothing was measured')
+        raise InputError(
+            f'{table.where(infinite[0])} column "{name}": the value is infinite; leave it blank where nothing was measured'
+        )
     there = ~np.isnan(numbers)
     return np.where(there, numbers, 0.0), there
 
@@ -152,7 +155,9 @@ def _times(table: Table, column: pd.Series, unit: str | None) -> np.ndarray:
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         given = column.iloc[bad[0]]
-        raise InputError(f'{table.where(bad[0])} column "time": {given} is not a finite time; give seconds or ISO dates')
+        raise InputError(
+            f'{table.where(bad[0])} column "time": {given} is not a finite time; give seconds or ISO dates'
+        )
     quantity, factor = UNITS[unit or "s"]
     if quantity != "time":
         raise InputError(f'{table.source} column "time": unit "{unit}" is not a time; use s, ms, us, ns, min or h')
@@ -210,9 +215,7 @@ def _to_channel(
         if isinstance(channel.noise, Bernoulli):
             wrong = np.flatnonzero(rows & ~channel.noise.check(value[:, j]))
             if len(wrong):
-                raise InputError(
-                    f'{table.where(wrong[0])} column "{name}": {value[wrong[0], j]:g} is not 0 or 1'
-                )
+                raise InputError(f'{table.where(wrong[0])} column "{name}": {value[wrong[0], j]:g} is not 0 or 1')
 
 
 def _factor(table: Table, name: str, unit: str | None, wanted: str) -> float:
@@ -222,7 +225,9 @@ def _factor(table: Table, name: str, unit: str | None, wanted: str) -> float:
         raise InputError(f'{table.source} column "{name}": unit "{unit}", but the channel is in "{wanted}"')
     quantity, factor = UNITS[unit]
     if quantity != UNITS[wanted][0]:
-        raise InputError(f'{table.source} column "{name}": unit "{unit}" is no {UNITS[wanted][0]}; the channel is in {wanted}')
+        raise InputError(
+            f'{table.source} column "{name}": unit "{unit}" is no {UNITS[wanted][0]}; the channel is in {wanted}'
+        )
     return factor / UNITS[wanted][1]
 
 
@@ -234,7 +239,11 @@ def _check_duplicates(data: Measurements, network: Network) -> None:
         repeated = np.flatnonzero(frame.duplicated().to_numpy())
         if len(repeated):
             again = rows[repeated[0]]
-            same = (data.time == data.time[again]) & (data.sensor == data.sensor[again]) & (data.target == data.target[again])
+            same = (
+                (data.time == data.time[again])
+                & (data.sensor == data.sensor[again])
+                & (data.target == data.target[again])
+            )
             first = int(np.flatnonzero(same & data.measured[:, j])[0])
             raise InputError(
                 f'{data.table.where(again)}: sensor "{network.sensors[data.sensor[again]].name}" has a second '

@@ -87,7 +87,9 @@ def _datum(problem: Problem) -> tuple[dict[str, Any], list[tuple[np.ndarray, np.
 
 def _gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """Measured data of all blocks, last axis datum, from arrays (..., N, C)."""
-    return np.concatenate([np.asarray(p)[..., rows, channels] for p, (rows, channels) in zip(parts, picks, strict=True)], -1)
+    return np.concatenate(
+        [np.asarray(p)[..., rows, channels] for p, (rows, channels) in zip(parts, picks, strict=True)], -1
+    )
 
 
 def build(problem: Problem, result: Result) -> xr.DataTree:
@@ -135,7 +137,9 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         "constant_data": _constant(problem),
     }
     if (result.precision > 0).all():
-        groups["log_prior"] = xr.Dataset({"bias": ((*sample, "bias_label"), log_prior)}, coords={**base, "bias_label": z})
+        groups["log_prior"] = xr.Dataset(
+            {"bias": ((*sample, "bias_label"), log_prior)}, coords={**base, "bias_label": z}
+        )
     for name, parts in (("log_likelihood", result.log_likelihood), ("posterior_predictive", result.replicas)):
         if parts is not None:
             groups[name] = xr.Dataset({"y": ((*sample, "datum"), _gather(parts, picks))}, coords={**base, **coords})
@@ -249,5 +253,3 @@ def load(path: str | PathLike[str]) -> xr.DataTree:
     if "calibration" not in tree.children:
         raise InputError(f"{path} is not a fit written by probcal: it has no group calibration")
     return tree
-
-

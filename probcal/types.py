@@ -58,9 +58,7 @@ class View:
         try:
             return self._components[name]
         except KeyError:
-            raise InputError(
-                f'{self._owner} has no component "{name}"{nearest(name, self._components)}'
-            ) from None
+            raise InputError(f'{self._owner} has no component "{name}"{nearest(name, self._components)}') from None
 
 
 class TargetView(View):

@@ -1,4 +1,12 @@
-"""Severe numerics for every test: rank promotion raises, warnings are errors; x64 stays off as for a user."""
+"""Severe numerics for every test: rank promotion raises, warnings are errors; x64 stays off as for a user.
+
+The tests compile hundreds of small kernels and run each once: they ask XLA for quick compilation, and drop
+compiled kernels after each file.
+"""
+
+import os
+
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
 
 import jax
 import pytest
@@ -15,3 +23,9 @@ def severe_numerics():
     assert not jax.config.jax_enable_x64, "tests run as a user would: the package enters float64 by itself"
     yield
     jax.config.update("jax_numpy_rank_promotion", before)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_kernels():
+    yield
+    jax.clear_caches()

@@ -45,6 +45,12 @@ CORNERS = {
 }
 
 
+@pytest.fixture(autouse=True)
+def few_kernels_a_test():
+    yield
+    jax.clear_caches()
+
+
 def catalogue():
     return {name: kind for name, kind in vars(sensors).items() if isinstance(kind, SensorType)}
 
@@ -95,10 +101,16 @@ def test_every_sensor_simulates_and_fits(name, d):
     problem = Problem(network, motion, run.table)
     tree = fit(problem, MAP(), predictive_draws=True)
     check_tree(tree, problem)
-    found = probcal.scores(tree, run.truth)
     informative = name != "presence" and not (name == "doa" and d == 3)
-    if informative:  # the track is found, from the data alone
-        assert found["position_rmse_after"] < 4.0
+    if informative:  # the track is found, from the data alone: its error is as large as its sd says
+        track = tree["track"].to_dataset()
+        axes = [f"position_{axis}" for axis in "xyz"[:d]]
+        error = track["mean"].sel(component=axes).values - run.truth.positions(
+            track["epoch_time"].values, track["epoch_target"].values, d
+        )
+        score = np.mean((error / track["sd"].sel(component=axes).values) ** 2)
+        # squares of standard normals along a smooth track, at least 4 of them independent: 5 fails in < 0.1 % of seeds
+        assert score < 5.0
         z = np.array([run.truth.biases[label] for label in problem.labels]) / problem.scales
         error = tree["calibration"]["mean"].values / problem.scales - z
         sd = tree["calibration"]["sd"].values / problem.scales
@@ -137,7 +149,9 @@ def test_every_method_on_a_mixed_network(method, d):
         alpha = tree["calibration"]["precision"].values
         # MacKay's fixed point, gamma = alpha z^2, up to the stopping rule
         learnt = kept & ~problem.surveyed
-        np.testing.assert_allclose(alpha[learnt] * z[learnt] ** 2, tree["calibration"]["gamma"].values[learnt], rtol=0.1)
+        np.testing.assert_allclose(
+            alpha[learnt] * z[learnt] ** 2, tree["calibration"]["gamma"].values[learnt], rtol=0.1
+        )
 
 
 @pytest.mark.parametrize("motion", [
@@ -186,5 +200,12 @@ def test_gradients_are_finite_where_a_target_stands_on_a_node():
                 states[:, :d] = p
                 for block, data in zip(problem.spec.blocks, problem.system.rows, strict=True):
                     z, levels = np.zeros(len(problem.labels)), np.zeros(0)
-                    lin = rows.linearise(block, data, jax.numpy.asarray(states), jax.numpy.asarray(z), jax.numpy.asarray(levels), expected=True)
+                    lin = rows.linearise(
+                        block,
+                        data,
+                        jax.numpy.asarray(states),
+                        jax.numpy.asarray(z),
+                        jax.numpy.asarray(levels),
+                        expected=True,
+                    )
                     assert all(np.isfinite(np.asarray(part)).all() for part in lin), name

@@ -96,7 +96,13 @@ def test_freed_beacons_end_at_bound_and_name_the_dilation():
     done = run("fit", ROOT / "models" / "plaza_free.py")
     assert done.returncode == 1
     assert "at bound" in done.stdout
-    for word in ("estimate is invalid", "beacon_5.range_scale", "dilation", "translation", "anchor the positions of two nodes"):
+    for word in (
+        "estimate is invalid",
+        "beacon_5.range_scale",
+        "dilation",
+        "translation",
+        "anchor the positions of two nodes",
+    ):
         assert word in done.stderr
 
 

@@ -2,7 +2,6 @@
 
 Stated tolerance: 1e-10 of the largest entry of a quantity (means, sds, covariances) and of the log evidence.
 """
-# ruff: noqa: B008 (a sensor declares its biases as defaults)
 
 from functools import cache
 

@@ -3,7 +3,6 @@
 Estimates are compared in z (units of the prior scale) to 1e-6, where sds are of order 0.1 to 1. The biases
 compared are checked not to be near zero, and the mode is searched from the start prior alone.
 """
-# ruff: noqa: B008 (a sensor declares its biases as defaults)
 
 import copy
 from dataclasses import dataclass, field, replace

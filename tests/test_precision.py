@@ -123,9 +123,7 @@ def test_results_are_numpy_in_double_precision(processes):
     assert not [name for name, (_, dtype) in kinds.items() if dtype in ("float32", "float16", "int32")]
 
 
-@pytest.mark.parametrize(
-    "name", ["mean", "covariance", "precision", "track", "track_sd", "draws", "evidence"]
-)
+@pytest.mark.parametrize("name", ["mean", "covariance", "precision", "track", "track_sd", "draws", "evidence"])
 def test_results_equal_those_of_an_x64_process(processes, name):
     """The same kernels in the same precision: equal to the last bits (1e-12; float32 would leave 1e-7)."""
     plain, double = (np.array(processes[mode][name]) for mode in ("plain", "x64"))

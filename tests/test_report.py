@@ -73,9 +73,7 @@ def make(dimension=2, nodes=("north", "south"), status="converged", recursions=1
     states[1] = "pruned"
     if status in ("at bound", "diverged"):
         states[0] = status
-    tracks = [
-        track(dimension, np.where(np.arange(EPOCHS) % 2, "car", "lorry"), "" if recursions == 1 else "_0")
-    ]
+    tracks = [track(dimension, np.where(np.arange(EPOCHS) % 2, "car", "lorry"), "" if recursions == 1 else "_0")]
     tracks += [track(dimension, np.array(["tree_a", "tree_b"]), "_1")] if recursions == 2 else []
     position = 40.0 * np.random.default_rng(3).normal(size=(len(nodes), dimension))
     groups = {
@@ -99,9 +97,7 @@ def make(dimension=2, nodes=("north", "south"), status="converged", recursions=1
 def add_extras(tree):
     """Truth of some biases, a weak direction, a noise level, a fixed bias, scores."""
     labels = tree["calibration"]["bias_label"].values
-    tree["truth"] = xr.DataTree(
-        xr.Dataset({"bias": ("bias_label", [4.321, -1.0])}, coords={"bias_label": labels[:2]})
-    )
+    tree["truth"] = xr.DataTree(xr.Dataset({"bias": ("bias_label", [4.321, -1.0])}, coords={"bias_label": labels[:2]}))
     tree["direction"] = xr.DataTree(
         xr.Dataset(
             {
@@ -115,9 +111,7 @@ def add_extras(tree):
         )
     )
     tree["level"] = xr.DataTree(
-        xr.Dataset(
-            {"std": ("level", [1.25]), "guess": ("level", [1.0])}, coords={"level": ["radar.range_std"]}
-        )
+        xr.Dataset({"std": ("level", [1.25]), "guess": ("level", [1.0])}, coords={"level": ["radar.range_std"]})
     )
     nodes = tree["constant_data"].to_dataset()
     nodes["fixed"] = ("fixed_label", [0.25])

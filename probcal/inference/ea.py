@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from probcal.inference.run import CHUNK, Outcome, Progress, finish, first_precisions, run_chunks
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Prior
 from probcal.problem import Problem, Spec, System
-from probcal.smoothing.information import laplace, update_levels
+from probcal.smoothing.information import Laplace, laplace, update_levels
 from probcal.smoothing.mode import Point, find_mode
 
 MODE_STEPS = 30  # Gauss-Newton steps between two updates of the precisions
@@ -20,10 +20,8 @@ MODE_STEPS = 30  # Gauss-Newton steps between two updates of the precisions
 class _State(NamedTuple):
     point: Point
     alpha: jax.Array  # precisions at which the point is the mode, once done
-    evidence: jax.Array
-    gamma: jax.Array
+    found: Laplace
     done: jax.Array
-    settled: jax.Array  # the last search for the mode converged
 
 
 @partial(jax.jit, static_argnames=("spec", "prior"))
@@ -35,9 +33,9 @@ def _chunk(
     def iterate(state: _State) -> _State:
         mode = find_mode(spec, system, state.point, state.alpha, MODE_STEPS, 1e-2 * tolerance)
         found = laplace(spec, system, mode.point, state.alpha)
-        gain = jnp.abs(found.evidence - state.evidence)
+        still = jnp.abs(found.evidence - state.found.evidence) < tolerance
         learning = isinstance(prior, ARD) or mode.point.levels.shape[0] > 0
-        done = (gain < tolerance) & mode.converged if learning else mode.converged | (found.evidence == state.evidence)
+        done = still & mode.converged if learning else mode.converged
         point, alpha = mode.point, state.alpha
         if isinstance(prior, ARD):
             learnt = jnp.clip(prior.mackay(found.gamma, point.z), *PRECISION_BOUNDS)
@@ -45,28 +43,27 @@ def _chunk(
         if point.levels.shape[0]:
             moved = update_levels(spec, system, point, found.covariance)
             point = jax.tree.map(lambda new, old: jnp.where(done, old, new), moved, point)
-        return _State(point, alpha, found.evidence, found.gamma, done, mode.converged)
+        return _State(point, alpha, found, done)
 
     def body(state: _State, _):
         after = jax.lax.cond(state.done, lambda s: s, iterate, state)
-        return after, (after.evidence, state.done)
+        return after, (after.found.evidence, state.done)
 
     return jax.lax.scan(body, state, length=CHUNK)
 
 
-def _maximise(
-    method: "EA | MAP", problem: Problem, prior: Prior, start: Point, progress: Progress | None
-) -> Outcome:
+def _maximise(method: "EA | MAP", problem: Problem, prior: Prior, start: Point, progress: Progress | None) -> Outcome:
     alpha = first_precisions(problem, prior)
-    blank = jnp.zeros_like(alpha)
-    state = _State(start, alpha, jnp.asarray(-jnp.inf), blank, jnp.asarray(False), jnp.asarray(False))
+    M = len(problem.labels)
+    blank = Laplace(jnp.zeros((M, M)), jnp.zeros((M, M)), jnp.zeros(M), jnp.full((), -jnp.inf, float))
+    state = _State(start, alpha, blank, jnp.zeros((), bool))
     surveyed = jnp.asarray(problem.surveyed)
 
     def step(state: _State):
         return _chunk(problem.spec, prior, problem.system, state, surveyed, method.tolerance)
 
     state, trace = run_chunks(step, state, method.iterations, method.name, progress)
-    return finish(problem, prior, state.point, state.alpha, bool(state.done & state.settled), trace)
+    return finish(problem, prior, state.point, state.alpha, state.found, bool(state.done), trace)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from probcal import linalg
 from probcal.inference.run import CHUNK, Outcome, Progress, finish, first_precisions, run_chunks
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Prior
 from probcal.problem import Problem, Spec, System
-from probcal.smoothing.information import update_levels
+from probcal.smoothing.information import laplace, update_levels
 from probcal.smoothing.mode import Point, cost, find_mode, linearise, of_biases
 
 HALVINGS = 8
@@ -73,18 +73,17 @@ def _chunk(
     return jax.lax.scan(body, state, length=CHUNK)
 
 
-def _maximise(
-    method: "EM | EMEA", problem: Problem, prior: Prior, start: Point, progress: Progress | None
-) -> Outcome:
+def _maximise(method: "EM | EMEA", problem: Problem, prior: Prior, start: Point, progress: Progress | None) -> Outcome:
     alpha = first_precisions(problem, prior)
-    state = _State(start, alpha, jnp.asarray(jnp.inf), jnp.asarray(False))
+    state = _State(start, alpha, jnp.full((), jnp.inf, float), jnp.zeros((), bool))
     surveyed = jnp.asarray(problem.surveyed)
 
     def step(state: _State):
         return _chunk(problem.spec, prior, problem.system, state, surveyed, method.tolerance, method.inner)
 
     state, trace = run_chunks(step, state, method.iterations, method.name, progress)
-    return finish(problem, prior, state.point, state.alpha, bool(state.done) or method.tolerance == 0.0, trace)
+    found = laplace(problem.spec, problem.system, state.point, state.alpha)
+    return finish(problem, prior, state.point, state.alpha, found, bool(state.done) or method.tolerance == 0.0, trace)
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def _result(
     if not bool(jnp.isfinite(found.covariance).all()):  # a flat prior on a singular problem: no interval exists
         raise FitError(outcome.message)
     keys = jax.random.split(key, 2)
-    z, states = draw(spec, system, point, found.covariance, keys[0], CHAINS * DRAWS)
+    z, states, spread = draw(spec, system, point, found.covariance, keys[0], CHAINS * DRAWS)
     data = sum(int(np.asarray(r.mask).size) for r in system.rows) * CHAINS * DRAWS
     size = sum(s.size for s in states)
     by_datum = data <= tree.LARGEST if wanted is None else wanted
@@ -94,7 +94,6 @@ def _result(
     def split(a: jax.Array) -> np.ndarray:
         return np.asarray(a).reshape(*shape, *a.shape[1:])
 
-    spread = moments(spec, system, point, found.covariance)
     old, new = residuals(spec, system, before), residuals(spec, system, point)
     return tree.Result(
         method=method.name, prior=type(prior).__name__, seed=seed, approximate="Laplace",

@@ -9,7 +9,7 @@ import numpy as np
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.smoothing.directions import Direction, weak_directions
-from probcal.smoothing.information import Laplace, laplace
+from probcal.smoothing.information import Laplace
 from probcal.smoothing.mode import Point
 
 CHUNK = 5  # outer iterations between two reports of progress
@@ -32,11 +32,16 @@ class Outcome(NamedTuple):
 
 def first_precisions(problem: Problem, prior: Prior) -> jnp.ndarray:
     """Precisions of z to start from: one scale (0 if flat), and one survey where surveyed."""
-    return jnp.where(jnp.asarray(problem.surveyed), 1.0, 0.0 if isinstance(prior, Flat) else 1.0)
+    governed = np.zeros(len(problem.labels)) if isinstance(prior, Flat) else np.ones(len(problem.labels))
+    return jnp.asarray(np.where(problem.surveyed, 1.0, governed))
 
 
 def run_chunks(
-    step: Callable[[Any], tuple[Any, tuple[Any, Any]]], state: Any, iterations: int, name: str, progress: Progress | None
+    step: Callable[[Any], tuple[Any, tuple[Any, Any]]],
+    state: Any,
+    iterations: int,
+    name: str,
+    progress: Progress | None,
 ) -> tuple[Any, np.ndarray]:
     """Step a jitted chunk until it is done or the iterations are spent; returns the state and the trace."""
     trace: list[float] = []
@@ -49,13 +54,16 @@ def run_chunks(
 
 
 def finish(
-    problem: Problem, prior: Prior, point: Point, alpha: jnp.ndarray, converged: bool, trace: np.ndarray
+    problem: Problem, prior: Prior, point: Point, alpha: jnp.ndarray, found: Laplace, converged: bool, trace: np.ndarray
 ) -> Outcome:
-    """Evaluate the Laplace approximation where a method ended and say in words what it is worth."""
-    found = laplace(problem.spec, problem.system, point, alpha)
+    """Say in words what the point and the Laplace approximation are worth where a method ended."""
     alpha, z = np.asarray(alpha), np.asarray(point.z)
     weak = weak_directions(problem, np.asarray(found.information), z)
-    low = (alpha <= PRECISION_BOUNDS[0] * (1 + 1e-9)) & ~problem.surveyed if isinstance(prior, ARD) else np.zeros(len(z), bool)
+    low = (
+        (alpha <= PRECISION_BOUNDS[0] * (1 + 1e-9)) & ~problem.surveyed
+        if isinstance(prior, ARD)
+        else np.zeros(len(z), bool)
+    )
     far = (np.abs(z) > FAR) & ~problem.surveyed if isinstance(prior, Flat) else np.zeros(len(z), bool)
     sound = all(np.isfinite(np.asarray(part)).all() for part in (found.covariance, found.evidence, point.z))
     status = "converged" if converged else "not converged"
@@ -64,7 +72,15 @@ def finish(
     if far.any() or not sound:
         status = "diverged"
     bias_status = tuple(
-        "survey" if s else "at bound" if b else "diverged" if f else "pruned" if g < 1e-2 and isinstance(prior, ARD) else "estimated"
+        "survey"
+        if s
+        else "at bound"
+        if b
+        else "diverged"
+        if f
+        else "pruned"
+        if g < 1e-2 and isinstance(prior, ARD)
+        else "estimated"
         for s, b, f, g in zip(problem.surveyed, low, far, np.asarray(found.gamma), strict=True)
     )
     message = _message(problem, status, low, far, weak, len(trace))
@@ -82,7 +98,11 @@ def _message(
     if status == "at bound":
         return f"The precision of {listed(low)} stands at its lower bound: the estimate is invalid.{advice}"
     if status == "diverged":
-        where = f"{listed(far)} lie more than {FAR:g} scales from the stated value" if far.any() else "the information matrix is singular"
+        where = (
+            f"{listed(far)} lie more than {FAR:g} scales from the stated value"
+            if far.any()
+            else "the information matrix is singular"
+        )
         return f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases.{advice}"
     if status == "not converged":
         return f"The fit did not converge in {iterations} iterations: raise `iterations`, or fix what the data do not determine.{advice}"

@@ -8,14 +8,15 @@ import jax.numpy as jnp
 from probcal import linalg, rows
 from probcal.problem import Spec, System
 from probcal.smoothing import recursion as rec
+from probcal.smoothing.information import Moments, moments_of
 from probcal.smoothing.mode import Point, factors, linearise, of_both, of_states
 
 
 @partial(jax.jit, static_argnames=("spec", "count"))
 def draw(
     spec: Spec, system: System, point: Point, covariance: jax.Array, key: jax.Array, count: int
-) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-    """`count` joint draws: z (D, M) and states (D, E, n) of each recursion.
+) -> tuple[jax.Array, tuple[jax.Array, ...], list[Moments]]:
+    """`count` joint draws, z (D, M) and states (D, E, n) of each recursion, and the exact moments behind them.
 
     Trajectories given z come from the simulation smoother (draw from the prior, subtract its smoothed
     self): all draws are columns of one pass. The response of the trajectory to z is linear.
@@ -26,7 +27,7 @@ def draw(
     dz = jax.random.normal(keys[0], (count, M)) @ root.T
     lins = linearise(spec, system, point, expected=True)
     compressed, crosses = of_states(spec, system, lins, point.states), of_both(spec, system, lins, point.states)
-    trajectories = []
+    trajectories, found = [], []
     for r, (part, (J, _), cross) in enumerate(zip(system.recursions, compressed, crosses, strict=True)):
         E, n = part.drift.shape
         L = factors(part, point.levels)
@@ -37,10 +38,15 @@ def draw(
         half = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
         measured = J @ prior + half @ noise[1]
         columns = jnp.concatenate([measured, cross], 2)
-        smooth = rec.smooth(part.F, L, J, gain, columns).states
-        free = prior - smooth[:, :, :count] - smooth[:, :, count:] @ dz.T
+        smooth = rec.smooth(part.F, L, J, gain, columns)
+        free = prior - smooth.states[:, :, :count] - smooth.states[:, :, count:] @ dz.T
         trajectories.append(jnp.moveaxis(point.states[r][:, :, None] + free, 2, 0))
-    return point.z[None, :] + dz, tuple(trajectories)
+        found.append(
+            moments_of(
+                part, L, J, gain, rec.Smoothed(smooth.states[:, :, count:], smooth.noises[:, :, count:]), covariance
+            )
+        )
+    return point.z[None, :] + dz, tuple(trajectories), found
 
 
 @partial(jax.jit, static_argnames="spec")

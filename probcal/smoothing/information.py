@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg, rows
-from probcal.problem import Spec, System
+from probcal.problem import Recursion, Spec, System
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Point, eliminate, factors, linearise, log_likelihood, of_both, of_states
 
@@ -59,11 +59,18 @@ def moments(spec: Spec, system: System, point: Point, covariance: jax.Array) -> 
     for part, (J, _), cross in parts:
         L = factors(part, point.levels)
         gain = rec.gains(part.F, L, J)
-        smooth = rec.smooth(part.F, L, J, gain, cross)
-        states, noises = rec.covariances(part.F, L, J, gain)
-        spread = jnp.einsum("eni,ij,enj->en", smooth.noises, covariance, smooth.noises)
-        found.append(Moments(-smooth.states, states, jnp.diagonal(noises, axis1=1, axis2=2) + spread))
+        response = rec.smooth(part.F, L, J, gain, cross)
+        found.append(moments_of(part, L, J, gain, response, covariance))
     return found
+
+
+def moments_of(
+    part: Recursion, L: jax.Array, J: jax.Array, gain: rec.Gains, response: rec.Smoothed, covariance: jax.Array
+) -> Moments:
+    """Moments of one recursion from its smoothed response to the biases."""
+    states, noises = rec.covariances(part.F, L, J, gain)
+    spread = jnp.einsum("eni,ij,enj->en", response.noises, covariance, response.noises)
+    return Moments(-response.states, states, jnp.diagonal(noises, axis1=1, axis2=2) + spread)
 
 
 @partial(jax.jit, static_argnames="spec")

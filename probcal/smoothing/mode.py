@@ -94,9 +94,7 @@ def of_biases(spec: Spec, system: System, lins: list[Linearised]) -> tuple[jax.A
     return G[:M, :M], g[:M]
 
 
-def of_both(
-    spec: Spec, system: System, lins: list[Linearised], states: tuple[jax.Array, ...]
-) -> list[jax.Array]:
+def of_both(spec: Spec, system: System, lins: list[Linearised], states: tuple[jax.Array, ...]) -> list[jax.Array]:
     """Cross information of states and biases, (E, n, M) of each recursion."""
     M = spec.biases
     parts = [jnp.zeros((*x.shape, M)) for x in states]
@@ -217,7 +215,12 @@ def find_mode(
         return _Search(point, jnp.where(better, value, s.cost), damping, change, s.iteration + 1, done)
 
     first = _Search(
-        start, cost(spec, system, start, alpha), jnp.zeros(()), jnp.full((), jnp.inf), jnp.zeros((), int), jnp.zeros((), bool)
+        start,
+        cost(spec, system, start, alpha),
+        jnp.zeros(()),
+        jnp.full((), jnp.inf, float),
+        jnp.zeros((), int),
+        jnp.zeros((), bool),
     )
     last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations), body, first)
     return Mode(last.point, last.cost, last.iteration, last.done & (last.change < tolerance))

@@ -51,14 +51,18 @@ def _widened(lin: rows.Linearised) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames=("spec", "r", "span"))
-def _profile(spec: Spec, system: System, r: int, span: tuple[int, int], place: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _profile(
+    spec: Spec, system: System, r: int, span: tuple[int, int], place: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Loss (E,) and states (E, n) of recursion r with the position at `place` (E, d), other components profiled."""
     part = system.recursions[r]
     E, n = part.drift.shape
     z, levels = jnp.zeros(spec.biases), jnp.zeros(system.level_spread.shape)
     resting = jax.lax.scan(lambda x, k: ((y := k[0] @ x + k[1]), y), jnp.zeros(n), (part.F, part.drift))[1]
     states = resting.at[:, span[0] : span[1]].set(place)
-    mine = [(block, data) for block, data, own in zip(spec.blocks, system.rows, spec.recursion, strict=True) if own == r]
+    mine = [
+        (block, data) for block, data, own in zip(spec.blocks, system.rows, spec.recursion, strict=True) if own == r
+    ]
     held = np.zeros(n, bool)
     for name, start, stop, _ in mine[0][0].layout if mine else ():
         held[start:stop] = name in ("position", "velocity", "acceleration")
@@ -118,7 +122,9 @@ def _path(problem: Problem, time: np.ndarray, loss: np.ndarray, places: np.ndarr
     centre = np.array([time[w].mean() for w in windows])
     inside = np.stack([loss[:, w].sum(1) for w in windows])
     squared = ((places[:, None] - places[None]) ** 2).sum(-1)
-    spacing = np.sqrt(np.partition(squared[: INNER[problem.network.dimension] ** problem.network.dimension], 1, 1)[:, 1].max())
+    spacing = np.sqrt(
+        np.partition(squared[: INNER[problem.network.dimension] ** problem.network.dimension], 1, 1)[:, 1].max()
+    )
     span = np.linalg.norm(np.ptp(problem.node_positions, axis=0)) or problem.extent
     pace = 3 * span / max(float(np.ptp(time)), 1e-9)
     path = places[_viterbi(inside, squared, 1.5 * spacing + pace * np.diff(centre))]
@@ -126,7 +132,9 @@ def _path(problem: Problem, time: np.ndarray, loss: np.ndarray, places: np.ndarr
 
 
 @jax.jit
-def _consistent(part: Recursion, states: jax.Array, weight: jax.Array, levels: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _consistent(
+    part: Recursion, states: jax.Array, weight: jax.Array, levels: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Smooth pseudo-measured states (E, n) of precision `weight` (E, n) into a trajectory of the motion model."""
     L = factors(part, levels)
     J = jax.vmap(jnp.diag)(weight)
