@@ -197,7 +197,7 @@ def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
     print(f"{attrs['method']} ({attrs['prior']}): {attrs['status']} after {iterations} iterations, {seconds:.1f} s")
     print(f"intervals are {attrs['interval_probability']:.0%}; {attrs['intervals']}")
     if "level" in tree.children:
-        for label, std in zip(tree["level"]["level"].values, tree["level"]["std"].values, strict=True):
+        for label, std in tree["level"].to_dataset()["std"].to_series().items():
             print(f"estimated {label} = {std:.4g}")
     if "position_rmse_after" in attrs:
         print(f"position RMSE before {attrs['position_rmse_before']:.3f} m, after {attrs['position_rmse_after']:.3f} m")

@@ -69,12 +69,14 @@ class Node:
             raise InputError(f'node "{name}": position must be 2 or 3 finite numbers, got {position!r}')
         self.position = stated
         self.components = {"heading": heading, "pitch": 0.0, "roll": 0.0, "clock": 0.0} | components
-        for component, value in self.components.items():
-            if not np.isfinite(value):
-                raise InputError(f'node "{name}": {component} must be a finite number, got {value!r}')
+        for component, stated_value in self.components.items():
+            if not np.isfinite(stated_value):
+                raise InputError(f'node "{name}": {component} must be a finite number, got {stated_value!r}')
         self.spread: dict[str, tuple[str, Bias]] = {}
         for kind, given in (("survey", survey), ("scale", scale)):
-            entries = given if isinstance(given, Mapping) else {} if given is None else {"position": given}
+            entries: Mapping[str, Spread] = (
+                given if isinstance(given, Mapping) else {} if given is None else {"position": given}
+            )
             for component, value in entries.items():
                 self._add(kind, component, value)
 

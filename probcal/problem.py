@@ -121,7 +121,7 @@ class Problem:
 
     def rebuild(self, data: Any = None, **changes: Any) -> "Problem":
         """The same problem with other data, fixed biases or idle rule."""
-        settings = {"fix": self.fixed, "idle": self.idle} | changes
+        settings: dict[str, Any] = {"fix": self.fixed, "idle": self.idle} | changes
         return Problem(self.network, self.motion, self.measurements.table if data is None else data, **settings)
 
     def _target(self, name: str) -> Target:
@@ -143,11 +143,13 @@ class Problem:
         layouts: dict[Layout, list[str]] = {}
         for name, motion in motions.items():
             layouts.setdefault(motion.layout(self.network.dimension), []).append(name)
-        recursions, self.epochs = [], []
+        recursions: list[Any] = []
+        self.epochs: list[Epochs] = []
         epoch_of = np.zeros(len(data.time), int)
         recursion_of = np.zeros(len(data.time), int)
         for r, (layout, names) in enumerate(layouts.items()):
-            parts, offset = [], 0
+            parts: list[Any] = []
+            offset = 0
             times, owners = [], []
             for name in names:
                 rows = data.target == data.target_names.index(name)
@@ -162,10 +164,13 @@ class Problem:
                 parts.append(self._chain(name, targets[name], motions[name], time, levels))
                 times.append(time)
                 owners.append(np.full(len(time), name))
-            recursions.append(Recursion(*(np.concatenate(column) for column in zip(*parts, strict=True))))
+            columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
+            recursions.append(Recursion(*columns))
             components = motions[names[0]].labels(self.network.dimension)
             self.epochs.append(Epochs(np.concatenate(times), np.concatenate(owners), layout, components))
-        blocks, rows_of, recursion_index = [], [], []
+        blocks: list[Block] = []
+        rows_of: list[Any] = []
+        recursion_index: list[int] = []
         self.row_index: list[np.ndarray] = []  # rows of the table behind each block
         for kind in self.network.types:
             channel_levels = _channel_levels(kind, self.network.dimension, levels)
@@ -174,12 +179,12 @@ class Problem:
                 chosen = self._rows_of(kind, recursion_of == r)
                 if len(chosen):
                     blocks.append(block)
-                    rows_of.append(self._rows(block, chosen, epoch_of[chosen], channel_levels))
+                    rows_of.append(Rows(**self._rows(block, chosen, epoch_of[chosen], channel_levels)))
                     recursion_index.append(r)
                     self.row_index.append(chosen)
         self.levels = tuple(levels.records)
         self.spec = Spec(tuple(blocks), tuple(recursion_index), len(self.biases))
-        spread = np.array([np.log(level.factor) for level in self.levels])
+        spread: Any = np.array([np.log(level.factor) for level in self.levels])
         recursions = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in recursions]
         rows_of = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in rows_of]
         self.system = jax.tree.map(jnp.asarray, System(tuple(recursions), tuple(rows_of), spread))
@@ -233,7 +238,7 @@ class Problem:
         for part, per_axis in component.names():
             if part not in given:
                 raise InputError(
-                    f'target "{name}": give the start of "{part}", as in Target(motion, start={{"{part}": (mean, std)}})'
+                    f'target "{name}": state the start of "{part}", Target(motion, start={{"{part}": (mean, std)}})'
                 )
             width = d if per_axis else 1
             mean, std = given[part]
@@ -244,7 +249,8 @@ class Problem:
             stds.append(np.full(width, float(std)))
         return np.concatenate(means), np.concatenate(stds)
 
-    def _rows(self, block: Block, chosen: np.ndarray, epoch: np.ndarray, channel_levels: list[int]) -> Rows:
+    def _rows(self, block: Block, chosen: np.ndarray, epoch: np.ndarray, channel_levels: list[int]) -> dict[str, Any]:
+        """Numbers of a block of rows, by the names of `Rows`."""
         data, network = self.measurements, self.network
         ours = [k for k, placed in enumerate(network.sensors) if placed.type is block.type]
         sensor = np.searchsorted(ours, data.sensor[chosen])
@@ -260,15 +266,15 @@ class Problem:
         pick = np.ix_(chosen, columns)
         declared = np.array([1.0 if isinstance(c.noise, Bernoulli) else guess_of(c.std) for c in block.channels])
         own = data.has_std[pick]
-        return Rows(
-            epoch=epoch, sensor=sensor, pose=pose, index=index, scale=scale, base=base,
+        return dict(
+            epoch=epoch, sensor=sensor, pose=pose, bias=index, scale=scale, base=base,
             y=np.where(data.measured[pick], data.value[pick], 0.0),
             mask=data.measured[pick].astype(float),
             std=np.where(own, data.std[pick], declared),
             level=np.where(own, -1, np.asarray(channel_levels)),
         )  # fmt: skip
 
-    def _local(self, block: Block, ours: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _local(self, block: Block, ours: list[int]) -> tuple[np.ndarray, ...]:
         """Which biases the sensors of a block read: index, scale, fixed part, each (S, p)."""
         records = {(b.owner, b.component, b.axis): b for b in self.network.biases}
         number = {label: m for m, label in enumerate(self.labels)}
@@ -284,9 +290,9 @@ class Problem:
             scale.append([b.scale if f and b else 0.0 for b, f in zip(found, free, strict=True)])
             base.append([b.nominal + self.fixed.get(b.label, 0.0) if b else 0.0 for b in found])
         shape = (len(ours), len(block.free) + len(block.type.biases))
-        return (
-            np.array(index, int).reshape(shape), np.array(scale, float).reshape(shape), np.array(base, float).reshape(shape)
-        )  # fmt: skip
+        return tuple(
+            np.array(part, kind).reshape(shape) for part, kind in ((index, int), (scale, float), (base, float))
+        )
 
 
 class _Levels:

@@ -42,7 +42,7 @@ class Rows(NamedTuple):
     epoch: jax.Array  # (N,) epoch of the recursion
     sensor: jax.Array  # (N,) sensor within the block
     pose: jax.Array  # (N, nodes, P) stated poses
-    index: jax.Array  # (S, p) which bias, M where fixed
+    bias: jax.Array  # (S, p) which bias, M where fixed
     scale: jax.Array  # (S, p) scale of z, 0 where fixed
     base: jax.Array  # (S, p) fixed part: nominal value of a sensor bias, value of a fixed bias
     y: jax.Array  # (N, C) measured, 0 where missing
@@ -111,7 +111,7 @@ def pose_vector(node: Node, extras: tuple[str, ...], time: np.ndarray) -> np.nda
 def _local(block: Block, rows: Rows, z: jax.Array) -> jax.Array:
     """Biases of each row, in their units, shape (N, p)."""
     padded = jnp.concatenate([z, jnp.zeros(1, z.dtype)])
-    return (rows.base + rows.scale * padded[rows.index])[rows.sensor]
+    return (rows.base + rows.scale * padded[rows.bias])[rows.sensor]
 
 
 def _one(block: Block, state: jax.Array, pose: jax.Array, local: jax.Array) -> jax.Array:

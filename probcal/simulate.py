@@ -74,7 +74,7 @@ class Simulation:
         """Write PATH and, beside it, PATH's `.tracks.csv` and `.biases.csv`; returns the files."""
         path = Path(path)
         tracks, biases = _beside(path)
-        tables = [(path, self.table), (tracks, self.truth.tracks)]
+        tables: list[tuple[Path, Any]] = [(path, self.table), (tracks, self.truth.tracks)]
         tables.append(
             (biases, pd.DataFrame({"bias": list(self.truth.biases), "value": list(self.truth.biases.values())}))
         )
@@ -142,11 +142,11 @@ def simulate(
     for b, (block, data, r, index) in enumerate(pieces):
         predicted = rows.predict(block, data, jnp.asarray(states[r]), jnp.asarray(z))
         seed = jax.random.split(jax.random.fold_in(keys[2], b), 3)
-        value = np.array(rows.sample(block, data, predicted, levels, seed[0]))
-        value = _spoil(block, data, value, outliers, outlier_scale, seed[1])
-        gone = np.asarray(jax.random.uniform(seed[2], value.shape)) < missing
+        drawn = np.array(rows.sample(block, data, predicted, levels, seed[0]))
+        drawn = _spoil(block, data, drawn, outliers, outlier_scale, seed[1])
+        gone = np.asarray(jax.random.uniform(seed[2], drawn.shape)) < missing
         for c, (name, _) in enumerate(block.type.expand(network.dimension)):
-            columns[name][index] = np.where(gone[:, c], np.nan, value[:, c])
+            columns[name][index] = np.where(gone[:, c], np.nan, drawn[:, c])
     table = plan[["time", "sensor", *(["target"] if "target" in plan else [])]].assign(**columns)
     table = table[~table[list(columns)].isna().all(axis=1)].reset_index(drop=True)
     parts = [

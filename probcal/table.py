@@ -134,13 +134,11 @@ def _numbers(table: Table, column: pd.Series, name: str) -> tuple[np.ndarray, np
     text = np.flatnonzero(np.isnan(numbers) & column.notna().to_numpy())
     if len(text):
         raise InputError(
-            f'{table.where(text[0])} column "{name}": "{column.iloc[text[0]]}" is not a number; leave it blank where nothing was measured'
+            f'{table.where(text[0])} column "{name}": "{column.iloc[text[0]]}" is no number; leave it blank'
         )
     infinite = np.flatnonzero(np.isinf(numbers))
     if len(infinite):
-        raise InputError(
-            f'{table.where(infinite[0])} column "{name}": the value is infinite; leave it blank where nothing was measured'
-        )
+        raise InputError(f'{table.where(infinite[0])} column "{name}": the value is infinite; leave it blank')
     there = ~np.isnan(numbers)
     return np.where(there, numbers, 0.0), there
 

@@ -64,10 +64,11 @@ def _suffix(problem: Problem, r: int) -> str:
     return "" if len(problem.epochs) == 1 else f"_{r}"
 
 
-def _datum(problem: Problem) -> tuple[dict[str, Any], list[tuple[np.ndarray, np.ndarray]]]:
+def _datum(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
     """Coordinates of the measured data, and where each block keeps them (rows, channels)."""
     data, network = problem.measurements, problem.network
-    picks, columns = [], []
+    picks: list[Any] = []
+    columns = []
     for block, index, numbers in zip(problem.spec.blocks, problem.row_index, problem.system.rows, strict=True):
         where = np.nonzero(np.asarray(numbers.mask))
         picks.append(where)
@@ -201,6 +202,7 @@ def _constant(problem: Problem) -> xr.Dataset:
     d, nodes = problem.network.dimension, problem.network.nodes
     values = {
         "node_position": (("node", "axis"), np.stack([n.position for n in nodes])),
+        "node_heading": ("node", np.array([float(n.components["heading"]) for n in nodes])),
         "moving": ("node", np.array([n.path is not None for n in nodes])),
     }
     coords = {"node": [n.name for n in nodes], "axis": ["x", "y", "z"][:d]}
@@ -235,10 +237,18 @@ def save(tree: xr.DataTree, path: str | PathLike[str]) -> Path:
     os.close(handle)
     try:
         tree.to_netcdf(draft, engine="h5netcdf")
+        os.chmod(draft, 0o666 & ~_umask())
         os.replace(draft, path)
     finally:
         Path(draft).unlink(missing_ok=True)
     return path
+
+
+def _umask() -> int:
+    """The process's mask of file modes, which `mkstemp` does not follow."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
 
 
 def load(path: str | PathLike[str]) -> xr.DataTree:

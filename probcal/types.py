@@ -24,7 +24,7 @@ class FitError(RuntimeError):
     """A fit that left nothing to report: the text says why and what to do."""
 
 
-def float64(function: Callable[P, R]) -> Callable[P, R]:
+def float64[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Run a public entry point in double precision without touching the global configuration of jax."""
 
     @functools.wraps(function)

@@ -146,7 +146,7 @@ BAD = {
     "nan time": (lambda t: cell(t, 4, 0, ""), 'bad.csv row 4 column "time": nan is not a finite time'),
     "infinite time": (lambda t: cell(t, 4, 0, "inf"), 'bad.csv row 4 column "time": inf is not a finite time'),
     "infinite measurement": (lambda t: cell(t, 6, 2, "inf"), 'bad.csv row 6 column "range": the value is infinite'),
-    "text in a channel": (lambda t: cell(t, 6, 2, "abc"), 'bad.csv row 6 column "range": "abc" is not a number'),
+    "text in a channel": (lambda t: cell(t, 6, 2, "abc"), 'bad.csv row 6 column "range": "abc" is no number'),
     "unknown unit": (lambda t: t.replace("range", "range [mm2]", 1), 'bad.csv column "range": unit "mm2" is not known; did you mean "mm"?'),
     "wrong unit": (lambda t: t.replace("range", "range [deg]", 1), 'bad.csv column "range": unit "deg" is no length'),
     "duplicate row": (lambda t: t + t.splitlines()[1] + "\n", 'has a second "range" at time 0 (first in row 2); keep one'),

@@ -45,7 +45,7 @@ def _chunk(
             point = jax.tree.map(lambda new, old: jnp.where(done, old, new), moved, point)
         return _State(point, alpha, found, done)
 
-    def body(state: _State, _):
+    def body(state: _State, _: None) -> tuple[_State, tuple[jax.Array, jax.Array]]:
         after = jax.lax.cond(state.done, lambda s: s, iterate, state)
         return after, (after.found.evidence, state.done)
 
@@ -59,7 +59,7 @@ def _maximise(method: "EA | MAP", problem: Problem, prior: Prior, start: Point, 
     state = _State(start, alpha, blank, jnp.zeros((), bool))
     surveyed = jnp.asarray(problem.surveyed)
 
-    def step(state: _State):
+    def step(state: _State) -> tuple[_State, tuple[jax.Array, jax.Array]]:
         return _chunk(problem.spec, prior, problem.system, state, surveyed, method.tolerance)
 
     state, trace = run_chunks(step, state, method.iterations, method.name, progress)
@@ -86,7 +86,7 @@ class EA:
 
 @dataclass(frozen=True)
 class MAP:
-    """Joint mode of trajectories and biases under a given prior (maximum likelihood with `Flat`), with its Laplace covariance."""
+    """Joint mode of trajectories and biases under a given prior (`Flat` is maximum likelihood), Laplace covariance."""
 
     iterations: int = 100
     tolerance: float = 1e-6

@@ -66,7 +66,7 @@ def _chunk(
         value = cost(spec, system, point, alpha) - 0.5 * jnp.sum(jnp.log(jnp.where(alpha > 0, alpha, 1.0)))
         return _State(point, alpha, value, jnp.abs(value - state.cost) < tolerance)
 
-    def body(state: _State, _):
+    def body(state: _State, _: None) -> tuple[_State, tuple[jax.Array, jax.Array]]:
         after = jax.lax.cond(state.done, lambda s: s, iterate, state)
         return after, (-after.cost, state.done)
 
@@ -78,7 +78,7 @@ def _maximise(method: "EM | EMEA", problem: Problem, prior: Prior, start: Point,
     state = _State(start, alpha, jnp.full((), jnp.inf, float), jnp.zeros((), bool))
     surveyed = jnp.asarray(problem.surveyed)
 
-    def step(state: _State):
+    def step(state: _State) -> tuple[_State, tuple[jax.Array, jax.Array]]:
         return _chunk(problem.spec, prior, problem.system, state, surveyed, method.tolerance, method.inner)
 
     state, trace = run_chunks(step, state, method.iterations, method.name, progress)

@@ -137,8 +137,8 @@ def track(problem: Problem, calibration: xr.DataTree) -> xr.DataTree:
             raise InputError(f'the calibration has no bias "{label}"; fit the same network, or fix that bias')
     chosen = group.sel(bias_label=list(problem.labels))
     z = jnp.asarray(chosen["mean"].values / problem.scales)
-    covariance = group["covariance"].sel(bias_label=list(problem.labels), bias_label_other=list(problem.labels)).values
-    covariance = jnp.asarray(covariance / np.outer(problem.scales, problem.scales))
+    spread_of = group["covariance"].sel(bias_label=list(problem.labels), bias_label_other=list(problem.labels)).values
+    covariance = jnp.asarray(spread_of / np.outer(problem.scales, problem.scales))
     start = automatic_start(problem)
     before = track_mode(problem, _uncalibrated(start))
     after = track_mode(problem, start._replace(z=z))

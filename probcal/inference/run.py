@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -30,7 +31,7 @@ class Outcome(NamedTuple):
     weak: tuple[Direction, ...]
 
 
-def first_precisions(problem: Problem, prior: Prior) -> jnp.ndarray:
+def first_precisions(problem: Problem, prior: Prior) -> jax.Array:
     """Precisions of z to start from: one scale (0 if flat), and one survey where surveyed."""
     governed = np.zeros(len(problem.labels)) if isinstance(prior, Flat) else np.ones(len(problem.labels))
     return jnp.asarray(np.where(problem.surveyed, 1.0, governed))
@@ -54,10 +55,16 @@ def run_chunks(
 
 
 def finish(
-    problem: Problem, prior: Prior, point: Point, alpha: jnp.ndarray, found: Laplace, converged: bool, trace: np.ndarray
+    problem: Problem,
+    prior: Prior,
+    point: Point,
+    precisions: jax.Array,
+    found: Laplace,
+    converged: bool,
+    trace: np.ndarray,
 ) -> Outcome:
     """Say in words what the point and the Laplace approximation are worth where a method ended."""
-    alpha, z = np.asarray(alpha), np.asarray(point.z)
+    alpha, z = np.asarray(precisions), np.asarray(point.z)
     weak = weak_directions(problem, np.asarray(found.information), z)
     low = (
         (alpha <= PRECISION_BOUNDS[0] * (1 + 1e-9)) & ~problem.surveyed
@@ -105,5 +112,7 @@ def _message(
         )
         return f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases.{advice}"
     if status == "not converged":
-        return f"The fit did not converge in {iterations} iterations: raise `iterations`, or fix what the data do not determine.{advice}"
+        return (
+            f"The fit did not converge in {iterations} iterations: allow more, or fix what the data leave open.{advice}"
+        )
     return f"Weakly determined, left to the prior: {'; '.join(d.sentence for d in weak[:4])}." if weak else ""

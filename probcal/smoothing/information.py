@@ -1,4 +1,4 @@
-"""The Laplace approximation at a point: marginal information of the biases, gamma, evidence, and what noise levels learn."""
+"""The Laplace approximation at a point: information of the biases, gamma, evidence, noise levels."""
 
 from functools import partial
 from typing import NamedTuple
@@ -86,7 +86,7 @@ def predicted_variances(
         N, C, p = lin.bias.shape
         columns = jnp.einsum("ncu,num->ncm", lin.state, found[r].response[:, used][data.epoch])
         columns = jnp.concatenate([columns, jnp.zeros((N, C, 1))], 2)
-        index = jnp.broadcast_to(data.index[data.sensor][:, None, :], (N, C, p))
+        index = jnp.broadcast_to(data.bias[data.sensor][:, None, :], (N, C, p))
         columns = columns.at[jnp.arange(N)[:, None, None], jnp.arange(C)[None, :, None], index].add(lin.bias)[:, :, :-1]
         own = jnp.einsum("ncu,nuv,ncv->nc", lin.state, P, lin.state)
         variances.append(own + jnp.einsum("ncm,ml,ncl->nc", columns, covariance, columns))

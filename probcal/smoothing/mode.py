@@ -86,11 +86,11 @@ def of_biases(spec: Spec, system: System, lins: list[Linearised]) -> tuple[jax.A
     M = spec.biases
     G, g = jnp.zeros((M + 1, M + 1)), jnp.zeros(M + 1)
     for data, lin in zip(system.rows, lins, strict=True):
-        S = data.index.shape[0]
+        S = data.bias.shape[0]
         own = jax.ops.segment_sum(jnp.einsum("ncp,nc,ncq->npq", lin.bias, lin.weight, lin.bias), data.sensor, S)
         pull = jax.ops.segment_sum(jnp.einsum("ncp,nc->np", lin.bias, lin.score), data.sensor, S)
-        G = G.at[data.index[:, :, None], data.index[:, None, :]].add(own)
-        g = g.at[data.index].add(pull)
+        G = G.at[data.bias[:, :, None], data.bias[:, None, :]].add(own)
+        g = g.at[data.bias].add(pull)
     return G[:M, :M], g[:M]
 
 
@@ -101,7 +101,7 @@ def of_both(spec: Spec, system: System, lins: list[Linearised], states: tuple[ja
     for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
         weighted = jnp.einsum("ncp,nc,ncu->npu", lin.bias, lin.weight, lin.state)
         summed = jnp.zeros((states[r].shape[0], M + 1, len(block.used)))
-        summed = summed.at[data.epoch[:, None], data.index[data.sensor]].add(weighted)
+        summed = summed.at[data.epoch[:, None], data.bias[data.sensor]].add(weighted)
         parts[r] = parts[r].at[:, jnp.asarray(block.used, int)].add(summed[:, :M].mT)
     return parts
 

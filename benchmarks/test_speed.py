@@ -1,0 +1,92 @@
+"""Benchmarks: run time of compiled kernels, and scaling; compile time apart. Not part of the tests.
+
+    uv run --group bench pytest benchmarks --benchmark-only
+
+Peers are measured beside them with their own scripts (`stonesoup_eks.py`, `gtsam_map.py 10 100`) in the same
+session on the same machine: quote ratios.
+"""
+
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+
+from probcal import ARD, EMEA, ConstantVelocity, Network, Node, Problem, fit
+from probcal.inference.em import _chunk, _State
+from probcal.sensors import radar
+from probcal.smoothing.information import laplace
+from probcal.smoothing.mode import Point, find_mode
+from probcal.smoothing.start import automatic_start, project, track_mode
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
+import radars
+
+
+def network(N, K, seed=0):
+    """N radars and K scans of the C1 path, as in the GTSAM peer script; the start follows the true path."""
+    rng = np.random.default_rng(seed)
+    stated = rng.uniform(size=(N, 2)) * 500
+    u = np.linspace(0, 1, K)
+    position = np.stack([50 + 400 * u, 250 + 150 * np.sin(3 * np.pi * u)], 1)
+    scale = {"position": 10.0, "heading": np.deg2rad(10.0)}
+    placed = Network([radar.on(Node(f"radar_{n}", p, scale=scale)) for n, p in enumerate(stated)])
+    line = position[:, None] - stated[None]
+    time_, name = np.repeat(np.arange(K), N), [f"radar_{n}" for n in range(N)] * K
+    table = pd.DataFrame({"time": time_.astype(float), "sensor": name})
+    table["range"] = (np.hypot(line[..., 0], line[..., 1]) + 10 * rng.normal(size=(K, N))).ravel()
+    table["azimuth"] = (np.arctan2(line[..., 1], line[..., 0]) + 0.17 * rng.normal(size=(K, N))).ravel()
+    problem = Problem(placed, ConstantVelocity(1.0), table)
+    states = np.hstack([position, np.gradient(position, axis=0)])
+    with jax.enable_x64(True):
+        return problem, project(problem, [states], [np.full_like(states, 1e2)])
+
+
+def mode_and_marginals(problem, start):
+    """Joint MAP and the marginal covariances of all biases."""
+    alpha = jnp.ones(len(problem.labels))
+    mode = find_mode(problem.spec, problem.system, start, alpha, 50, 1e-5)
+    return jax.block_until_ready(laplace(problem.spec, problem.system, mode.point, alpha).covariance)
+
+
+@pytest.mark.parametrize(("N", "K"), [(10, 100), (10, 200), (10, 400), (20, 100), (40, 100)])
+def test_joint_map_with_all_bias_marginals(benchmark, N, K):
+    problem, start = network(N, K)
+    with jax.enable_x64(True):
+        began = time.perf_counter()
+        mode_and_marginals(problem, start)
+        benchmark.extra_info["compile_s"] = time.perf_counter() - began
+        benchmark(mode_and_marginals, problem, start)
+
+
+def test_fifty_em_ea_iterations_of_c1(benchmark):
+    problem, _ = radars.setting(0, 0.3, "C1")
+    with jax.enable_x64(True):
+        start = automatic_start(problem)
+        alpha, free = jnp.ones(len(problem.labels)), jnp.asarray(problem.surveyed)
+
+        def run():
+            state = _State(start, alpha, jnp.full((), jnp.inf, float), jnp.zeros((), bool))
+            for _ in range(10):  # chunks of 5
+                state, _ = _chunk(problem.spec, ARD(), problem.system, state, free, 0.0, 1)
+            return jax.block_until_ready(state.point.z)
+
+        benchmark(run)
+
+
+def test_one_smoothing_pass_of_c1(benchmark):
+    problem, _ = radars.setting(0, 0.3, "C1")
+    with jax.enable_x64(True):
+        start: Point = track_mode(problem, automatic_start(problem))
+        alpha = jnp.ones(len(problem.labels))
+        arguments = (problem.spec, problem.system, start, alpha, 1, 0.0)
+        benchmark(lambda: jax.block_until_ready(find_mode(*arguments, joint=False).cost))
+
+
+def test_whole_fit_of_c1(benchmark):
+    problem, _ = radars.setting(0, 0.3, "C1")
+    benchmark(lambda: fit(problem, EMEA(), predictive_draws=False))
