@@ -63,6 +63,14 @@ def test_joint_map_with_all_bias_marginals(benchmark, N, K):
         benchmark(mode_and_marginals, problem, start)
 
 
+@pytest.mark.parametrize("K", [200, 400, 800, 1600])
+def test_one_elimination_grows_with_epochs_and_rows(benchmark, K):
+    problem, start = network(10, K)
+    with jax.enable_x64(True):
+        alpha = jnp.ones(len(problem.labels))
+        benchmark(lambda: jax.block_until_ready(laplace(problem.spec, problem.system, start, alpha).covariance))
+
+
 def test_fifty_em_ea_iterations_of_c1(benchmark):
     problem, _ = radars.setting(0, 0.3, "C1")
     with jax.enable_x64(True):
