@@ -3,17 +3,12 @@
 import functools
 from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-Array = jax.Array | np.ndarray
 AXES = ("x", "y", "z")
-
-P = ParamSpec("P")
-R = TypeVar("R")
 
 
 class InputError(ValueError):

@@ -65,7 +65,8 @@ def finish(
 ) -> Outcome:
     """Say in words what the point and the Laplace approximation are worth where a method ended."""
     alpha, z = np.asarray(precisions), np.asarray(point.z)
-    weak = weak_directions(problem, np.asarray(found.information), z)
+    information = np.asarray(found.information)
+    weak = weak_directions(problem, information, z) if np.isfinite(information).all() else ()
     low = (
         (alpha <= PRECISION_BOUNDS[0] * (1 + 1e-9)) & ~problem.surveyed
         if isinstance(prior, ARD)
@@ -115,4 +116,4 @@ def _message(
         return (
             f"The fit did not converge in {iterations} iterations: allow more, or fix what the data leave open.{advice}"
         )
-    return f"Weakly determined, left to the prior: {'; '.join(d.sentence for d in weak[:4])}." if weak else ""
+    return f"Weakly determined by the data: {'; '.join(d.sentence for d in weak[:4])}." if weak else ""
