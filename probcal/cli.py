@@ -91,7 +91,7 @@ def _call(module: ModuleType, path: Path, name: str, *arguments: Any) -> Any:
         raise InputError(f"{path.name}: {name}() failed with {type(error).__name__}: {_one_line(error)}") from None
 
 
-def _problem(model: Path, data: Path | None, fix: list[str] = [], *, idle: bool = False) -> tuple[ModuleType, Problem]:  # noqa: B006
+def _problem(model: Path, data: Path | None, fix: list[str] = []) -> tuple[ModuleType, Problem]:  # noqa: B006
     module = load_model(model)
     if data is not None and not data.exists():
         raise InputError(f"{data}: no such file")
@@ -100,8 +100,8 @@ def _problem(model: Path, data: Path | None, fix: list[str] = [], *, idle: bool 
         raise InputError(
             f"{model.name}: problem() returned {type(problem).__name__}; return a probcal.Problem with a network"
         )
-    if fix or idle:
-        problem = problem.rebuild(fix=problem.fixed | dict.fromkeys(fix, 0.0), idle=idle)
+    if fix:
+        problem = problem.rebuild(fix=problem.fixed | dict.fromkeys(fix, 0.0))
     return module, problem
 
 
@@ -267,7 +267,7 @@ def track_command(
             f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first"
         )
     _folder(out.parent)
-    module, problem = _problem(model, data, idle=True)
+    module, problem = _problem(model, data)
     tree = track(problem, known)
     frame = track_table(tree)
     _write_csv(frame, out)

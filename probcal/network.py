@@ -44,9 +44,9 @@ class Node:
     """A mast, a box in the grass, a robot: a stated pose and further components (`clock`, ...), some biased.
 
     position (d,) in m, heading (pitch, roll) in rad, or a known `path`; extras such as `clock=0.0` are numbers.
-    `survey` and `scale` give standard deviations by component (a bare number means the position; a `Bias`
-    carries another unit): `survey` is how well the stated value is known, `scale` is governed by the prior
-    chosen at the fit, neither means known. Raises `InputError` naming node and component.
+    `survey` and `scale` give standard deviations by component (a bare number means the position; a `Bias` may
+    carry the unit of a clock or an extra): `survey` is how well the stated value is known, `scale` is governed by
+    the prior chosen at the fit, neither means known. Raises `InputError` naming node and component.
     """
 
     def __init__(
@@ -96,6 +96,11 @@ class Node:
                     f" leave it out where the stated value is known"
                 )
             value = Bias(POSE_UNITS.get(component, "1"), number)
+        unit = POSE_UNITS.get(component)
+        if component != "clock" and unit is not None and value.unit != unit:
+            raise InputError(f'node "{self.name}": {kind} of {component} is in "{value.unit}"; give it in {unit}')
+        if value.nominal or value.shared:
+            raise InputError(f'node "{self.name}": {component} takes no nominal or shared; state the value instead')
         self.spread[component] = (kind, value)
 
     @property
@@ -180,6 +185,8 @@ class Network:
             if users and node not in users[0].nodes:
                 raise InputError(f'"{node.name}" is the name of a node and of a sensor elsewhere; rename one')
         for kind in self.types:
+            if [other.name for other in self.types].count(kind.name) > 1:
+                raise InputError(f'two sensor types are called "{kind.name}"; rename one of the functions')
             if kind.name in seen or kind.name in {node.name for node in self.nodes}:
                 raise InputError(f'"{kind.name}" is the name of a sensor type; rename the node or sensor')
 

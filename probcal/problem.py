@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from probcal.motion import Motion, Target, as_motion
-from probcal.network import BiasRecord, Network
+from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, Level, Unknown, guess_of
 from probcal.rows import Block, Layout, Rows, make_block, pose_entries, pose_vector
 from probcal.table import Measurements, Table, measure, read_table
@@ -72,7 +72,8 @@ class Problem:
 
     `motion` is one motion for all targets, or a mapping from target name to motion or `Target`. `data` is a
     path or a DataFrame. `fix` holds biases at a value: labels or patterns (`"beacon_0.*"`) at 0, or a mapping
-    to values. `idle` allows sensors without rows. Raises `InputError` naming what is wrong.
+    to values. `silent` names the sensors without rows: `fit` refuses them, `track` does not. Raises `InputError`
+    naming what is wrong.
     """
 
     @float64
@@ -83,17 +84,15 @@ class Problem:
         data: str | PathLike[str] | pd.DataFrame | Table,
         *,
         fix: Mapping[str, float] | Iterable[str] = (),
-        idle: bool = False,
     ):
         self.network = network
-        self.motion = motion
+        self.motion = {str(name): value for name, value in motion.items()} if isinstance(motion, Mapping) else motion
         self.fixed = _fixed(network, fix)
-        self.idle = idle
         self.biases: tuple[BiasRecord, ...] = tuple(b for b in network.biases if b.label not in self.fixed)
         self.scales = np.array([bias.scale for bias in self.biases])
         self.surveyed = np.array([bias.kind == "survey" for bias in self.biases], bool)
         self.measurements = measure(read_table(data), network)
-        _check_rows(self.measurements, network, idle)
+        self.silent = _check_rows(self.measurements, network)
         self.levels: tuple[LevelRecord, ...]
         self._compile()
 
@@ -120,8 +119,8 @@ class Problem:
         return np.concatenate([n.position[None] if n.path is None else n.path.position for n in self.network.nodes])
 
     def rebuild(self, data: Any = None, **changes: Any) -> "Problem":
-        """The same problem with other data, fixed biases or idle rule."""
-        settings: dict[str, Any] = {"fix": self.fixed, "idle": self.idle} | changes
+        """The same problem with other data or fixed biases."""
+        settings: dict[str, Any] = {"fix": self.fixed} | changes
         return Problem(self.network, self.motion, self.measurements.table if data is None else data, **settings)
 
     def _target(self, name: str) -> Target:
@@ -175,9 +174,9 @@ class Problem:
         for kind in self.network.types:
             channel_levels = _channel_levels(kind, self.network.dimension, levels)
             for r, epochs in enumerate(self.epochs):
-                block = make_block(self.network, kind, epochs.layout)
                 chosen = self._rows_of(kind, recursion_of == r)
                 if len(chosen):
+                    block = make_block(self.network, kind, epochs.layout)
                     blocks.append(block)
                     rows_of.append(Rows(**self._rows(block, chosen, epoch_of[chosen], channel_levels)))
                     recursion_index.append(r)
@@ -259,6 +258,7 @@ class Problem:
         pose = np.zeros((len(chosen), block.type.arity, len(entries)))
         for s, pair in enumerate(nodes):
             for a, node in enumerate(pair):
+                self._check_path(node, chosen[sensor == s])
                 pose[sensor == s, a] = pose_vector(node, block.extras, data.time[chosen][sensor == s])
         index, scale, base = self._local(block, ours)
         names = [name for name, _ in block.type.expand(network.dimension)]
@@ -273,6 +273,16 @@ class Problem:
             std=np.where(own, data.std[pick], declared),
             level=np.where(own, -1, np.asarray(channel_levels)),
         )  # fmt: skip
+
+    def _check_path(self, node: Node, rows: np.ndarray) -> None:
+        """Raise `InputError` for a row at a time outside the path of a moving node."""
+        if node.path is None:
+            return
+        time = self.measurements.time[rows]
+        outside = np.flatnonzero((time < node.path.time[0] - 1e-9) | (time > node.path.time[-1] + 1e-9))
+        if len(outside):
+            where = self.measurements.table.where(rows[outside[0]])
+            raise InputError(f'{where}: time {time[outside[0]]:g} is outside the path of node "{node.name}"')
 
     def _local(self, block: Block, ours: list[int]) -> tuple[np.ndarray, ...]:
         """Which biases the sensors of a block read: index, scale, fixed part, each (S, p)."""
@@ -332,7 +342,8 @@ def _fixed(network: Network, fix: Mapping[str, float] | Iterable[str]) -> dict[s
     given = dict(fix) if isinstance(fix, Mapping) else dict.fromkeys([fix] if isinstance(fix, str) else fix, 0.0)
     fixed: dict[str, float] = {}
     for pattern, value in given.items():
-        found = [label for label in network.labels if fnmatchcase(label, pattern)]
+        exact = [pattern] if pattern in network.labels else []
+        found = exact or [label for label in network.labels if fnmatchcase(label, pattern)]
         if not found:
             raise InputError(f'fix: no bias is called "{pattern}"{nearest(pattern, network.labels)}')
         if not np.isfinite(value):
@@ -341,7 +352,8 @@ def _fixed(network: Network, fix: Mapping[str, float] | Iterable[str]) -> dict[s
     return fixed
 
 
-def _check_rows(data: Measurements, network: Network, idle: bool) -> None:
+def _check_rows(data: Measurements, network: Network) -> tuple[str, ...]:
+    """Raise `InputError` where there is nothing to fit; returns the names of the sensors without rows."""
     source = data.table.source
     measured = data.measured.any(1)
     if measured.sum() == 0:
@@ -349,8 +361,4 @@ def _check_rows(data: Measurements, network: Network, idle: bool) -> None:
     if measured.sum() == 1:
         raise InputError(f"{source} has one measured row only; a fit needs at least two")
     seen = set(data.sensor[measured])
-    for k, placed in enumerate(network.sensors):
-        if k not in seen and not idle:
-            raise InputError(
-                f'{source} has no row of sensor "{placed.name}"; add its rows or take it out of the network'
-            )
+    return tuple(placed.name for k, placed in enumerate(network.sensors) if k not in seen)

@@ -130,10 +130,13 @@ def simulate(
         if not 0 <= value <= 1:
             raise InputError(f"simulate: {name}={value} must lie between 0 and 1")
     time = np.asarray(time, float)
+    if time.ndim != 1 or not (np.diff(time) > 0).all():
+        raise InputError("simulate: time must be one increasing column")
+    tracks = {str(name): track for name, track in (tracks or {}).items()}
     keys = jax.random.split(as_key(key), 6)
-    targets = list(tracks) if tracks else list(motion) if isinstance(motion, Mapping) else ["target"]
+    targets = list(tracks) if tracks else [str(name) for name in motion] if isinstance(motion, Mapping) else ["target"]
     plan = _plan(network, time, targets) if schedule is None else schedule.reset_index(drop=True)
-    problem = Problem(network, motion, _blank(network, plan), idle=True)
+    problem = Problem(network, motion, _blank(network, plan))
     z = _biases(problem, share, biases, keys[0])
     states = [_states(problem, r, tracks, keys[1]) for r in range(len(problem.epochs))]
     columns = {name: np.full(len(plan), np.nan) for name in network.channel_names}
@@ -192,7 +195,7 @@ def _biases(problem: Problem, share: float, given: Mapping[str, float] | None, k
     return z
 
 
-def _states(problem: Problem, r: int, tracks: Mapping[str, Any] | None, key: jax.Array) -> np.ndarray:
+def _states(problem: Problem, r: int, tracks: Mapping[str, Any], key: jax.Array) -> np.ndarray:
     """States (E, n) of one recursion: drawn from the motion, given components put over."""
     part, epochs = problem.system.recursions[r], problem.epochs[r]
     noise = np.asarray(jax.random.normal(jax.random.fold_in(key, r), part.drift.shape))
@@ -202,7 +205,7 @@ def _states(problem: Problem, r: int, tracks: Mapping[str, Any] | None, key: jax
     for e in range(len(noise)):
         previous = F[e] @ previous + drift[e] + L[e] @ noise[e]
         states[e] = previous
-    for name, track in (tracks or {}).items():
+    for name, track in tracks.items():
         mine = np.flatnonzero(epochs.target == name)
         if not len(mine):
             continue
@@ -210,8 +213,7 @@ def _states(problem: Problem, r: int, tracks: Mapping[str, Any] | None, key: jax
         for j, component in enumerate(epochs.components):
             if component in frame:
                 states[mine, j] = frame[component].to_numpy(float)
-            elif component.startswith("velocity") and len(mine) > 1:
-                position = component.replace("velocity", "position")
+            elif (position := component.replace("velocity", "position")) in frame and len(mine) > 1:
                 states[mine, j] = np.gradient(frame[position].to_numpy(float), epochs.time[mine])
     return states
 

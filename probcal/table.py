@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -144,11 +145,15 @@ def _numbers(table: Table, column: pd.Series, name: str) -> tuple[np.ndarray, np
 
 
 def _times(table: Table, column: pd.Series, unit: str | None) -> np.ndarray:
-    numeric = pd.to_numeric(column, errors="coerce")
+    dates = pd.api.types.is_datetime64_any_dtype(column)
+    if pd.api.types.is_timedelta64_dtype(column):
+        column = column.dt.total_seconds()
+    numeric = pd.Series(np.nan, column.index) if dates else pd.to_numeric(column, errors="coerce")
     if numeric.isna().all() and column.notna().any():  # a column of dates: seconds since the first one
-        stamps = pd.to_datetime(column, errors="coerce", utc=True, format="ISO8601")
+        stamps = pd.to_datetime(column, errors="coerce", utc=True, format=None if dates else "ISO8601")
         if stamps.notna().any():
             numeric = (stamps - stamps.min()).dt.total_seconds()
+            unit = "s"
     values = numeric.to_numpy(float, na_value=np.nan)
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
@@ -162,9 +167,14 @@ def _times(table: Table, column: pd.Series, unit: str | None) -> np.ndarray:
     return values * factor
 
 
+def _name(value: Any) -> str:
+    """A sensor or target name as text: 1, 1.0 and " 1" are one name."""
+    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value).strip()
+
+
 def _sensors(table: Table, column: pd.Series, network: Network) -> np.ndarray:
     number = {placed.name: k for k, placed in enumerate(network.sensors)}
-    text = column.map(lambda v: str(int(v)) if isinstance(v, float) and v.is_integer() else str(v).strip())
+    text = column.map(_name)
     found = text.map(number)
     unknown = np.flatnonzero(found.isna().to_numpy())
     if len(unknown):
@@ -181,8 +191,8 @@ def _targets(table: Table, column: pd.Series | None, rows: int) -> tuple[tuple[s
     blank = np.flatnonzero(column.isna().to_numpy())
     if len(blank):
         raise InputError(f'{table.where(blank[0])} column "target" is blank; name the target or drop the column')
-    codes, names = pd.factorize(column)
-    return tuple(str(name) for name in names), codes
+    codes, names = pd.factorize(column.map(_name))
+    return tuple(names), codes
 
 
 def _check_stds(table: Table, name: str, std: np.ndarray, given: np.ndarray) -> None:

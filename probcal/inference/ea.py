@@ -12,7 +12,7 @@ from probcal.inference.run import CHUNK, Outcome, Progress, finish, first_precis
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.smoothing.information import Laplace, laplace, update_levels
-from probcal.smoothing.mode import Point, find_mode
+from probcal.smoothing.mode import Point, cost, find_mode
 
 MODE_STEPS = 30  # Gauss-Newton steps between two updates of the precisions
 
@@ -35,7 +35,9 @@ def _chunk(
         found = laplace(spec, system, mode.point, state.alpha)
         still = jnp.abs(found.evidence - state.found.evidence) < tolerance
         learning = isinstance(prior, ARD) or mode.point.levels.shape[0] > 0
-        done = still & mode.converged if learning else mode.converged
+        # where a target grazes a sensor the density has a cusp: no step lowers the cost, and none is needed
+        settled = mode.converged | (cost(spec, system, state.point, state.alpha) - mode.cost < tolerance)
+        done = still & settled if learning else mode.converged
         point, alpha = mode.point, state.alpha
         if isinstance(prior, ARD):
             learnt = jnp.clip(prior.mackay(found.gamma, point.z), *PRECISION_BOUNDS)

@@ -15,7 +15,7 @@ from probcal.priors import PRIORS, Flat, Prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
 from probcal.smoothing.draws import draw, predictive, residuals
-from probcal.smoothing.information import moments
+from probcal.smoothing.information import at_levels, moments
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start, track_mode
 from probcal.types import FitError, InputError, float64
@@ -67,6 +67,9 @@ def fit(
     prior = choose_prior(method, prior)
     if not problem.labels:
         raise InputError("the problem has no free bias; declare a Bias, a survey or a scale, or use track()")
+    if problem.silent:
+        source = problem.measurements.table.source
+        raise InputError(f'{source} has no row of sensor "{problem.silent[0]}"; add rows or take it out of the network')
     start = automatic_start(problem) if start is None else start
     outcome = method.maximise(problem, prior, start, progress)
     seed = int(key) if isinstance(key, (int, np.integer)) else -1
@@ -130,6 +133,7 @@ def track(problem: Problem, calibration: xr.DataTree) -> xr.DataTree:
     The biases are held at the calibrated means; the sd carries their covariance. Biases are matched by label;
     raises `InputError` if the calibration lacks one.
     """
+    problem = _with_fixed(problem, calibration)
     group = calibration["calibration"].to_dataset()
     known = [str(label) for label in group["bias_label"].values]
     for label in problem.labels:
@@ -139,8 +143,27 @@ def track(problem: Problem, calibration: xr.DataTree) -> xr.DataTree:
     z = jnp.asarray(chosen["mean"].values / problem.scales)
     spread_of = group["covariance"].sel(bias_label=list(problem.labels), bias_label_other=list(problem.labels)).values
     covariance = jnp.asarray(spread_of / np.outer(problem.scales, problem.scales))
-    start = automatic_start(problem)
+    start = _with_levels(problem, automatic_start(problem), calibration)
     before = track_mode(problem, _uncalibrated(start))
     after = track_mode(problem, start._replace(z=z))
     spread = moments(problem.spec, problem.system, after, covariance)
     return tree.build_tracks(problem, _tracks(after, before, spread, covariance))
+
+
+def _with_fixed(problem: Problem, calibration: xr.DataTree) -> Problem:
+    """The problem with the biases held that the fit held."""
+    constant = calibration["constant_data"].to_dataset()
+    if "fixed" not in constant:
+        return problem
+    held = {str(label): float(value) for label, value in constant["fixed"].to_series().items()}
+    held = {label: value for label, value in held.items() if label in problem.labels}
+    return problem.rebuild(fix=problem.fixed | held) if held else problem
+
+
+def _with_levels(problem: Problem, point: Point, calibration: xr.DataTree) -> Point:
+    """The point at the noise levels that the fit estimated; its states stay, its whitened noises are rescaled."""
+    if not problem.levels or "level" not in calibration.children:
+        return point
+    found = calibration["level"].to_dataset()["std"].to_series()
+    levels = jnp.asarray([np.log(found.get(record.label, record.guess) / record.guess) for record in problem.levels])
+    return at_levels(problem.system, point, levels)

@@ -120,7 +120,11 @@ def update_levels(spec: Spec, system: System, point: Point, covariance: jax.Arra
         pull = square[:H] * jnp.exp(-2 * step)
         gradient = -free + pull - (point.levels + step) / system.level_spread**2
         step = step + gradient / (2 * pull + 1 / system.level_spread**2)
-    levels = point.levels + jnp.clip(step, -1.0, 1.0)
+    return at_levels(system, point, point.levels + jnp.clip(step, -1.0, 1.0))
+
+
+def at_levels(system: System, point: Point, levels: jax.Array) -> Point:
+    """The same trajectories and biases at other noise levels: the whitened noises are rescaled."""
     ratio = jnp.concatenate([jnp.exp(point.levels - levels), jnp.ones(1)])
     noises = tuple(u * ratio[part.level] for part, u in zip(system.recursions, point.noises, strict=True))
     return point._replace(levels=levels, noises=noises)
