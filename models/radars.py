@@ -58,7 +58,7 @@ def target(scenario="C1", seed=0):
 
 @float64
 def recording(positions, seed=0, share=SHARE, scenario="C1"):
-    """Table and truth of one run, with the draws of the trial that `papers/README.md` reports (its seeds 0-7)."""
+    """Table and truth of one run, with the draws of the trial behind its reference figures (seeds 0-7)."""
     _, choose, size, noise = jax.random.split(jax.random.PRNGKey(seed), 4)
     present = np.asarray(jax.random.uniform(choose, (RADARS, 4))) < share
     biases = SIGNS * np.asarray(jax.random.normal(size, (RADARS, 4))) * present * np.array(list(SCALES.values()))

@@ -8,7 +8,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import radars
 
-# mean normalised RMS over runs 0-7: EM-EA, EA (papers/README.md)
+# mean normalised RMS over runs 0-7: EM-EA, EA
 TRIAL = {
     ("C1", 0.1): (0.089, 0.091),
     ("C1", 0.3): (0.153, 0.142),

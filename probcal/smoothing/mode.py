@@ -1,7 +1,7 @@
 """The joint mode of trajectories and biases: an arrowhead Gauss-Newton system, each trajectory eliminated first.
 
 With every trajectory marginalised, the biases have information G - B' X, X the smoothed response of the
-trajectories to each bias (`../shared/papers` standard form: H'R^-1 H - H'R^-1 H_x W^-1 H_x'R^-1 H).
+trajectories to each bias: Paper B (17) with the covariance of whole trajectories in the place of R-bar.
 """
 
 from functools import partial
