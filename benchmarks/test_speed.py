@@ -48,7 +48,7 @@ def network(N, K, seed=0):
 
 def mode_and_marginals(problem, start):
     """Joint MAP and the marginal covariances of all biases."""
-    alpha = jnp.ones(len(problem.labels))
+    alpha = Precision.single(jnp.ones(len(problem.labels)))
     mode = find_mode(problem.spec, problem.system, start, alpha, 50, 1e-5)
     return jax.block_until_ready(laplace(problem.spec, problem.system, mode.point, alpha).covariance)
 
@@ -67,7 +67,7 @@ def test_joint_map_with_all_bias_marginals(benchmark, N, K):
 def test_one_elimination_grows_with_epochs_and_rows(benchmark, K):
     problem, start = network(10, K)
     with jax.enable_x64(True):
-        alpha = jnp.ones(len(problem.labels))
+        alpha = Precision.single(jnp.ones(len(problem.labels)))
         benchmark(lambda: jax.block_until_ready(laplace(problem.spec, problem.system, start, alpha).covariance))
 
 
@@ -90,7 +90,7 @@ def test_one_smoothing_pass_of_c1(benchmark):
     problem, _ = radars.setting(0, 0.3, "C1")
     with jax.enable_x64(True):
         start: Point = track_mode(problem, automatic_start(problem))
-        alpha = jnp.ones(len(problem.labels))
+        alpha = Precision.single(jnp.ones(len(problem.labels)))
         arguments = (problem.spec, problem.system, start, alpha, 1, 0.0)
         benchmark(lambda: jax.block_until_ready(find_mode(*arguments, joint=False).cost))
 

@@ -2,21 +2,22 @@
 
 from probcal import noise, priors, sensors
 from probcal.diagnostics import scores
-from probcal.inference import EA, EM, EMEA, MAP, fit, track
+from probcal.inference import EA, EM, EMEA, MAP, LeastSquares, fit, track
 from probcal.motion import ConstantVelocity, Motion, RandomWalk, Static, Target, White
 from probcal.network import Network, Node, Path
-from probcal.noise import Bernoulli, StudentT, Unknown
-from probcal.priors import ARD, Flat
+from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
+from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
 from probcal.problem import Problem
 from probcal.sensor import Bias, Channel, Sensor, SensorType, sensor
 from probcal.simulate import Simulation, Truth, simulate
 from probcal.table import read_table
-from probcal.tree import load, save, summary
+from probcal.tree import load, outliers, save, summary
 from probcal.types import FitError, InputError
 
 __all__ = [
     "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantVelocity", "FitError", "Flat",
-    "InputError", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation",
-    "Static", "StudentT", "Target", "Truth", "Unknown", "White", "fit", "load", "noise", "priors", "read_table",
-    "save", "scores", "sensor", "sensors", "simulate", "summary", "track",
+    "Gaussian", "Horseshoe", "InputError", "Laplace", "LeastSquares", "Mixture", "Motion", "Network", "Node", "Path",
+    "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown",
+    "White", "fit", "load", "noise", "outliers", "priors", "read_table", "save", "scores", "sensor", "sensors",
+    "simulate", "summary", "track",
 ]  # fmt: skip

@@ -164,6 +164,7 @@ def fit_command(
     method: Annotated[str, typer.Option(help=" | ".join(METHODS))] = "ea",
     prior: Annotated[str | None, typer.Option(help=" | ".join(PRIORS) + "; the method's own if left out")] = None,
     fix: Annotated[list[str], typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = [],  # noqa: B006
+    starts: Annotated[int, typer.Option(min=1, help="starts of the search; the best optimum is reported")] = 1,
     seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(help="folder for fit.nc, summary.csv, report.html")] = None,
 ) -> None:
@@ -172,15 +173,15 @@ def fit_command(
         raise InputError(f'--method "{method}" is not known{nearest(method, METHODS)}')
     if prior is not None and prior not in PRIORS:
         raise InputError(f'--prior "{prior}" is not known{nearest(prior, PRIORS)}')
-    kind, implied = METHODS[method]
-    chosen = PRIORS[prior]() if prior is not None else implied
+    value, implied = METHODS[method]
+    chosen = PRIORS[prior] if prior is not None else implied
     if out is not None:
         _folder(out)
     began = time.perf_counter()
     module, problem = _problem(model, data, fix)
     truth = _truth(module, model, data)
     with _progress() as progress:
-        tree = fit(problem, kind(), prior=chosen, key=seed, progress=progress)
+        tree = fit(problem, value, prior=chosen, key=seed, starts=starts, progress=progress)
     tree.attrs["model"] = model.stem
     if truth is not None:
         add_scores(tree, scores(tree, truth), truth.biases)

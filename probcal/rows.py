@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.geometry import wrap
 from probcal.motion import view
 from probcal.network import Network, Node
 from probcal.sensor import Channel, SensorType
@@ -199,10 +200,29 @@ def linearise(
     jacobian = jax.jacrev if len(block.channels) < inputs else jax.jacfwd
     by_state, by_bias = jax.vmap(jacobian(one, argnums=(0, 3)))(reached[:, used], reached, rows.pose, local)
     predicted = jax.vmap(one)(reached[:, used], reached, rows.pose, local)
-    std = noise_std(rows, levels)
+    score, weight = weigh(block, rows, predicted, noise_std(rows, levels), expected=expected)
+    return Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])
+
+
+def weigh(
+    block: Block, rows: Rows, predicted: jax.Array, std: jax.Array, *, expected: bool
+) -> tuple[jax.Array, jax.Array]:
+    """Score and step weight (or expected information) of every datum, zero where missing, both (N, C)."""
     score = rows.mask * _by_channel(block, "score", rows.y, predicted, std)
     if expected:
-        weight = rows.mask * _by_channel(block, "information", predicted, std, period=False)
-    else:
-        weight = rows.mask * _by_channel(block, "weight", rows.y, predicted, std)
-    return Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])
+        return score, rows.mask * _by_channel(block, "information", predicted, std, period=False)
+    return score, rows.mask * _by_channel(block, "weight", rows.y, predicted, std)
+
+
+def reliance(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
+    """How much each datum counts against one that fits: 1 inlying, towards 0 outlying, (N, C)."""
+    return rows.mask * _by_channel(block, "reliance", rows.y, predicted, noise_std(rows, levels))
+
+
+def difference(block: Block, value: jax.Array, other: jax.Array) -> jax.Array:
+    """Value minus other of the channels on the last axis, wrapped."""
+    parts = [
+        value[..., c] - other[..., c] if channel.period is None else wrap(value[..., c] - other[..., c], channel.period)
+        for c, channel in enumerate(block.channels)
+    ]
+    return jnp.stack(parts, -1)

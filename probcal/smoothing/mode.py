@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg, rows
+from probcal.priors import Precision
 from probcal.problem import Recursion, Spec, System
 from probcal.rows import Linearised
 from probcal.smoothing import recursion as rec
@@ -53,10 +54,10 @@ def log_likelihood(spec: Spec, system: System, point: Point) -> jax.Array:
     return total
 
 
-def cost(spec: Spec, system: System, point: Point, alpha: jax.Array) -> jax.Array:
+def cost(spec: Spec, system: System, point: Point, prior: Precision) -> jax.Array:
     """Negative log joint density of data, trajectories and biases, up to normalising constants."""
-    prior = sum(jnp.sum(u**2) for u in point.noises) + jnp.sum(alpha * point.z**2)
-    return 0.5 * prior - log_likelihood(spec, system, point)
+    squares = sum(jnp.sum(u**2) for u in point.noises) + prior.square(point.z)
+    return 0.5 * squares - log_likelihood(spec, system, point)
 
 
 def linearise(spec: Spec, system: System, point: Point, *, expected: bool) -> list[Linearised]:
@@ -108,7 +109,13 @@ def of_both(spec: Spec, system: System, lins: list[Linearised], states: tuple[ja
 
 def eliminate(spec: Spec, system: System, point: Point, *, expected: bool, joint: bool = True) -> Eliminated:
     """Linearise at a point and eliminate every trajectory; without `joint` the biases are held."""
-    lins = linearise(spec, system, point, expected=expected)
+    return eliminate_rows(spec, system, point, linearise(spec, system, point, expected=expected), joint=joint)
+
+
+def eliminate_rows(
+    spec: Spec, system: System, point: Point, lins: list[Linearised], *, joint: bool = True
+) -> Eliminated:
+    """Eliminate every trajectory from rows linearised around a point by any rule."""
     compressed = of_states(spec, system, lins, point.states)
     if joint:
         information, score = of_biases(spec, system, lins)
@@ -145,13 +152,18 @@ def _reduction(cross: jax.Array, J: jax.Array, smooth: rec.Smoothed) -> jax.Arra
     return jnp.einsum("eni,enj->ij", left, right)
 
 
-def _proposal(spec: Spec, system: System, point: Point, alpha: jax.Array, damping: jax.Array, joint: bool) -> Point:
+def _proposal(spec: Spec, system: System, point: Point, prior: Precision, damping: jax.Array, joint: bool) -> Point:
     """Full Gauss-Newton step from a point."""
     solved = eliminate(spec, system, point, expected=False, joint=joint)
     dz = jnp.zeros_like(point.z)
     if joint and spec.biases:  # an arrowhead: the tip first, then the trajectories follow
-        matrix = solved.information + jnp.diag(alpha + damping)
-        dz = linalg.solve_positive(matrix, solved.score - alpha * point.z)
+        matrix = solved.information + prior.matrix() + damping * jnp.eye(spec.biases)
+        dz = linalg.solve_positive(matrix, solved.score - prior.pull(point.z))
+    return follow(point, solved, dz)
+
+
+def follow(point: Point, solved: Eliminated, dz: jax.Array) -> Point:
+    """Move the biases by dz (M,) and every trajectory to its smoothed response."""
     move = jnp.concatenate([jnp.ones(1), -dz[: solved.states[0].shape[2] - 1]])
     return point._replace(
         states=tuple(s @ move for s in solved.states),
@@ -160,7 +172,7 @@ def _proposal(spec: Spec, system: System, point: Point, alpha: jax.Array, dampin
     )
 
 
-def _between(a: Point, b: Point, t: jax.Array) -> Point:
+def between(a: Point, b: Point, t: jax.Array) -> Point:
     """Point a + t (b - a); consistent trajectories stay consistent."""
     return jax.tree.map(lambda p, q: p + t * (q - p), a, b)
 
@@ -185,7 +197,7 @@ class Mode(NamedTuple):
 
 @partial(jax.jit, static_argnames=("spec", "joint"))
 def find_mode(
-    spec: Spec, system: System, start: Point, alpha: jax.Array, iterations: int, tolerance: float, *, joint: bool = True
+    spec: Spec, system: System, start: Point, prior: Precision, iterations: int, tolerance: float, *, joint: bool = True
 ) -> Mode:
     """Damped Gauss-Newton (iterated EKS, with the biases if `joint`) until the cost changes by less than `tolerance`.
 
@@ -194,12 +206,12 @@ def find_mode(
     """
 
     def body(s: _Search) -> _Search:
-        proposal = _proposal(spec, system, s.point, alpha, s.damping, joint)
+        proposal = _proposal(spec, system, s.point, prior, s.damping, joint)
 
         def shorter(state):
             t, _, tries = state
             t = jnp.where(tries == 0, 1.0, 0.5 * t)
-            return t, cost(spec, system, _between(s.point, proposal, t), alpha), tries + 1
+            return t, cost(spec, system, between(s.point, proposal, t), prior), tries + 1
 
         def worse(state):
             _, value, tries = state
@@ -207,7 +219,7 @@ def find_mode(
 
         t, value, tries = jax.lax.while_loop(worse, shorter, (jnp.ones(()), s.cost, 0))
         better = value <= s.cost
-        point = jax.tree.map(lambda new, old: jnp.where(better, new, old), _between(s.point, proposal, t), s.point)
+        point = jax.tree.map(lambda new, old: jnp.where(better, new, old), between(s.point, proposal, t), s.point)
         damping = jnp.where(better & (tries <= 2), s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
         damping = jnp.where(damping < 1e-6, 0.0, damping)
         change = jnp.where(better, s.cost - value, jnp.inf)
@@ -216,7 +228,7 @@ def find_mode(
 
     first = _Search(
         start,
-        cost(spec, system, start, alpha),
+        cost(spec, system, start, prior),
         jnp.zeros(()),
         jnp.full((), jnp.inf, float),
         jnp.zeros((), int),
@@ -224,3 +236,9 @@ def find_mode(
     )
     last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations), body, first)
     return Mode(last.point, last.cost, last.iteration, last.done & (last.change < tolerance))
+
+
+def track(spec: Spec, system: System, point: Point, iterations: int = 20) -> Point:
+    """Trajectories at the point's biases: iterated EKS."""
+    flat = Precision.single(jnp.zeros_like(point.z))
+    return find_mode(spec, system, point, flat, iterations, 1e-6, joint=False).point

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg, rows
+from probcal.priors import Precision
 from probcal.problem import Problem, Recursion, Spec, System
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Point, factors, find_mode
+from probcal.smoothing.mode import Point, factors, find_mode, track
 
 WINDOWS = 60  # at most so many windows a target
 INNER = {2: 24, 3: 10}  # grid points an axis inside the network
@@ -180,10 +181,11 @@ def automatic_start(problem: Problem, iterations: int = 30) -> Point:
         precisions.append(precision)
     point = project(problem, tracks, precisions)
     tracked = track_mode(problem, point, iterations)
-    return find_mode(problem.spec, problem.system, tracked, jnp.ones(problem.spec.biases), iterations, 1e-3).point
+    return find_mode(
+        problem.spec, problem.system, tracked, Precision.single(jnp.ones(problem.spec.biases)), iterations, 1e-3
+    ).point
 
 
 def track_mode(problem: Problem, point: Point, iterations: int = 100) -> Point:
     """Trajectories at held biases: iterated EKS from a point."""
-    alpha = jnp.zeros(problem.spec.biases)
-    return find_mode(problem.spec, problem.system, point, alpha, iterations, 1e-6, joint=False).point
+    return track(problem.spec, problem.system, point, iterations)
