@@ -3,7 +3,7 @@
 from probcal import noise, priors, sensors
 from probcal.diagnostics import scores
 from probcal.inference import EA, EM, EMEA, MAP, LeastSquares, fit, track
-from probcal.motion import ConstantVelocity, Motion, RandomWalk, Static, Target, White
+from probcal.motion import ConstantVelocity, Known, Motion, RandomWalk, Static, Target, White
 from probcal.network import Network, Node, Path
 from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
@@ -16,7 +16,7 @@ from probcal.types import FitError, InputError
 
 __all__ = [
     "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantVelocity", "FitError", "Flat",
-    "Gaussian", "Horseshoe", "InputError", "Laplace", "LeastSquares", "Mixture", "Motion", "Network", "Node", "Path",
+    "Gaussian", "Horseshoe", "InputError", "Known", "Laplace", "LeastSquares", "Mixture", "Motion", "Network", "Node", "Path",
     "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown",
     "White", "fit", "load", "noise", "outliers", "priors", "read_table", "save", "scores", "sensor", "sensors",
     "simulate", "summary", "track",

@@ -239,8 +239,11 @@ class Problem:
             here, noise = slice(row, row + size), slice(column, column + width)
             F[:, here, here] = transition
             L[:, here, noise] = factor * guess_of(component.std)
-            level[:, noise] = levels.of(component.std, f"motion.{component.names()[-1][0]}_std", "")
-            drift[:, here] = component.mean
+            level[:, noise] = levels.of(component.std, f"motion.{component.driven}_std", "")
+            try:
+                drift[:, here] = component.means(time, d)
+            except InputError as error:
+                raise InputError(f'target "{name}": {error}') from None
             if not component.memoryless:
                 F[0, here, here], drift[0, here] = 0.0, 0.0
                 L[0, here, :], level[0, noise] = 0.0, -1

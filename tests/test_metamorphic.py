@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 import probcal
 from probcal import Bias, Channel, ConstantVelocity, Network, Node, RandomWalk, Target, White, sensor, sensors
 from probcal.geometry import norm
-from probcal.smoothing.information import laplace, moments
 from probcal.priors import Precision
+from probcal.smoothing.information import laplace, moments
 from probcal.smoothing.mode import Point, find_mode
 
 TOLERANCE = 1e-6  # in z, and in metres for tracks of sd near one metre
