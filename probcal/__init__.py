@@ -16,8 +16,8 @@ from probcal.types import FitError, InputError
 
 __all__ = [
     "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantVelocity", "FitError", "Flat",
-    "Gaussian", "Horseshoe", "InputError", "Known", "Laplace", "LeastSquares", "Mixture", "Motion", "Network", "Node", "Path",
-    "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown",
-    "White", "fit", "load", "noise", "outliers", "priors", "read_table", "save", "scores", "sensor", "sensors",
-    "simulate", "summary", "track",
+    "Gaussian", "Horseshoe", "InputError", "Known", "Laplace", "LeastSquares", "Mixture", "Motion", "Network", "Node",
+    "Path", "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth",
+    "Unknown", "White", "fit", "load", "noise", "outliers", "priors", "read_table", "save", "scores", "sensor",
+    "sensors", "simulate", "summary", "track",
 ]  # fmt: skip

@@ -41,7 +41,9 @@ def _inner(spec: Spec, system: System, point: Point, prior: Precision, rule: str
     else:
         spread = sigma.state_covariances(spec, system, point)
         lins = sigma.regress(spec, system, point, spread, rule)
-        smoothed = follow(point, eliminate_rows(spec, system, point, lins, joint=False), jnp.zeros_like(point.z))
+        smoothed = follow(
+            system, point, eliminate_rows(spec, system, point, lins, joint=False), jnp.zeros_like(point.z)
+        )
         # the mean of a density lies off its mode, by half a unit of cost a dimension at most in the Gaussian case
         slack = 0.5 * sum(u.size for u in point.noises)
         point = _shorten(spec, system, point, smoothed, prior, slack)

@@ -1,7 +1,7 @@
 """The joint mode of trajectories and biases: an arrowhead Gauss-Newton system, each trajectory eliminated first.
 
-With every trajectory marginalised, the biases have information G - B' X, X the smoothed response of the
-trajectories to each bias: Paper B (17) with the covariance of whole trajectories in the place of R-bar.
+With every trajectory marginalised, the biases have information G - B' W^-1 B, W the precision of the
+trajectories: Paper B (17) with the covariance of whole trajectories in the place of R-bar.
 """
 
 from functools import partial
@@ -34,9 +34,17 @@ class Eliminated(NamedTuple):
 
     information: jax.Array  # (M, M) of the biases
     score: jax.Array  # (M,)
-    states: tuple[jax.Array, ...]  # (E, n, 1 + M): new states at fixed z, response to each bias
-    noises: tuple[jax.Array, ...]  # (E, n, 1 + M)
     logdet: jax.Array  # log det of the posterior precision of all whitened noises
+    parts: tuple["Kept", ...]  # of each recursion, what a step of its states needs
+
+
+class Kept(NamedTuple):
+    """What elimination keeps of one recursion."""
+
+    J: jax.Array  # (E, n, n) information of the rows about the states
+    pull: jax.Array  # (E, n) their score
+    cross: jax.Array  # (E, n, M) cross information with the biases
+    gain: rec.Gains
 
 
 def factors(part: Recursion, levels: jax.Array) -> jax.Array:
@@ -115,7 +123,10 @@ def eliminate(spec: Spec, system: System, point: Point, *, expected: bool, joint
 def eliminate_rows(
     spec: Spec, system: System, point: Point, lins: list[Linearised], *, joint: bool = True
 ) -> Eliminated:
-    """Eliminate every trajectory from rows linearised around a point by any rule."""
+    """Eliminate every trajectory from rows linearised around a point by any rule.
+
+    The biases keep information G - B'W^-1 B: Paper B (17) with the covariance of whole trajectories for R-bar.
+    """
     compressed = of_states(spec, system, lins, point.states)
     if joint:
         information, score = of_biases(spec, system, lins)
@@ -123,33 +134,26 @@ def eliminate_rows(
     else:
         information, score = jnp.zeros((0, 0)), jnp.zeros(0)
         crosses = [jnp.zeros((*x.shape, 0)) for x in point.states]
-    states, noises, logdet = [], [], jnp.zeros(())
-    parts = zip(system.recursions, compressed, crosses, point.states, point.noises, strict=True)
-    for part, (J, pull), cross, x, u in parts:
+    kept, logdet = [], jnp.zeros(())
+    parts = zip(system.recursions, compressed, crosses, point.noises, strict=True)
+    for r, (part, (J, pull), cross, u) in enumerate(parts):
         L = factors(part, point.levels)
         gain = rec.gains(part.F, L, J)
-        columns = jnp.concatenate([pull[:, :, None], cross], 2)
-        drift = jnp.zeros_like(columns).at[:, :, 0].set(-(L @ u[:, :, None])[:, :, 0])
-        smooth = rec.smooth(part.F, L, J, gain, columns, drift)
-        information = information + _reduction(cross, J, smooth)
-        score = score - jnp.einsum("eni,en->i", cross, smooth.states[:, :, 0])
-        states.append(smooth.states.at[:, :, 0].add(x))
-        noises.append(smooth.noises)
+        used = tuple(
+            sorted({i for b, own in zip(spec.blocks, spec.recursion, strict=True) if own == r for i in b.used})
+        )
+        if joint and used:
+            columns = jnp.concatenate([pull[:, :, None], cross], 2)
+            drift = jnp.zeros_like(columns).at[:, :, 0].set(-(L @ u[:, :, None])[:, :, 0])
+            alone, new = (c.reshape(-1, c.shape[2]) for c in rec.innovate(part.F, J, gain, columns, drift, used))
+            rows_ = jnp.concatenate([alone, new])
+            signed = jnp.concatenate([-alone, new])
+            information = information + linalg.gram(rows_[:, 1:], signed[:, 1:])
+            score = score + signed[:, 1:].T @ rows_[:, 0]
+        kept.append(Kept(J, pull, cross, gain))
         logdet = logdet + gain.logdet
     information = 0.5 * (information + information.T)
-    return Eliminated(information, score, tuple(states), tuple(noises), logdet)
-
-
-def _reduction(cross: jax.Array, J: jax.Array, smooth: rec.Smoothed) -> jax.Array:
-    """What eliminating one recursion takes from the information of the biases, -B'W^-1 B, shape (M, M).
-
-    Written as the least-squares cost at the smoothed response X with noises U, -B'X - X'(B - JX) + U'U: an
-    error of X enters squared, so that a row with huge derivatives (a target passing a sensor) does no harm.
-    """
-    X, U = smooth.states[:, :, 1:], smooth.noises[:, :, 1:]
-    left = jnp.concatenate([cross, X, U], 1)
-    right = jnp.concatenate([-X, J @ X - cross, U], 1)
-    return jnp.einsum("eni,enj->ij", left, right)
+    return Eliminated(information, score, logdet, tuple(kept))
 
 
 def _proposal(spec: Spec, system: System, point: Point, prior: Precision, damping: jax.Array, joint: bool) -> Point:
@@ -159,17 +163,19 @@ def _proposal(spec: Spec, system: System, point: Point, prior: Precision, dampin
     if joint and spec.biases:  # an arrowhead: the tip first, then the trajectories follow
         matrix = solved.information + prior.matrix() + damping * jnp.eye(spec.biases)
         dz = linalg.solve_positive(matrix, solved.score - prior.pull(point.z))
-    return follow(point, solved, dz)
+    return follow(system, point, solved, dz)
 
 
-def follow(point: Point, solved: Eliminated, dz: jax.Array) -> Point:
+def follow(system: System, point: Point, solved: Eliminated, dz: jax.Array) -> Point:
     """Move the biases by dz (M,) and every trajectory to its smoothed response."""
-    move = jnp.concatenate([jnp.ones(1), -dz[: solved.states[0].shape[2] - 1]])
-    return point._replace(
-        states=tuple(s @ move for s in solved.states),
-        noises=tuple(s @ move for s in solved.noises),
-        z=point.z + dz,
-    )
+    states, noises = [], []
+    for part, kept, x, u in zip(system.recursions, solved.parts, point.states, point.noises, strict=True):
+        L = factors(part, point.levels)
+        column = kept.pull - kept.cross @ dz[: kept.cross.shape[2]]
+        smooth = rec.smooth(part.F, L, kept.J, kept.gain, column[:, :, None], -(L @ u[:, :, None]))
+        states.append(x + smooth.states[:, :, 0])
+        noises.append(smooth.noises[:, :, 0])
+    return point._replace(states=tuple(states), noises=tuple(noises), z=point.z + dz)
 
 
 def between(a: Point, b: Point, t: jax.Array) -> Point:
