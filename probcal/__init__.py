@@ -2,7 +2,7 @@
 
 from probcal import noise, priors, sensors
 from probcal.diagnostics import scores
-from probcal.inference import EA, EM, EMEA, MAP, LeastSquares, fit, track
+from probcal.inference import EA, EM, EMEA, MAP, LeastSquares, fit, study, track
 from probcal.motion import ConstantVelocity, Known, Motion, RandomWalk, Static, Target, White
 from probcal.network import Network, Node, Path
 from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
@@ -19,5 +19,5 @@ __all__ = [
     "Gaussian", "Horseshoe", "InputError", "Known", "Laplace", "LeastSquares", "Mixture", "Motion", "Network", "Node",
     "Path", "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth",
     "Unknown", "White", "fit", "load", "noise", "outliers", "priors", "read_table", "save", "scores", "sensor",
-    "sensors", "simulate", "summary", "track",
+    "sensors", "simulate", "study", "summary", "track",
 ]  # fmt: skip

@@ -2,5 +2,6 @@
 
 from probcal.inference.fit import fit, track
 from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, LeastSquares, Method, table
+from probcal.inference.study import ORACLE, study
 
-__all__ = ["EA", "EM", "EMEA", "MAP", "METHODS", "LeastSquares", "Method", "fit", "table", "track"]
+__all__ = ["EA", "EM", "EMEA", "MAP", "METHODS", "ORACLE", "LeastSquares", "Method", "fit", "study", "table", "track"]
