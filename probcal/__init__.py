@@ -3,7 +3,17 @@
 from probcal import noise, priors, sensors
 from probcal.diagnostics import scores
 from probcal.inference import EA, EM, EMEA, MAP, LeastSquares, fit, study, track
-from probcal.motion import ConstantVelocity, Known, Motion, RandomWalk, Static, Target, White
+from probcal.motion import (
+    ConstantAcceleration,
+    ConstantVelocity,
+    CoordinatedTurn,
+    Known,
+    Motion,
+    RandomWalk,
+    Static,
+    Target,
+    White,
+)
 from probcal.network import Network, Node, Path
 from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
@@ -15,9 +25,9 @@ from probcal.tree import load, outliers, save, summary
 from probcal.types import FitError, InputError
 
 __all__ = [
-    "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantVelocity", "FitError", "Flat",
-    "Gaussian", "Horseshoe", "InputError", "Known", "Laplace", "LeastSquares", "Mixture", "Motion", "Network", "Node",
-    "Path", "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth",
-    "Unknown", "White", "fit", "load", "noise", "outliers", "priors", "read_table", "save", "scores", "sensor",
-    "sensors", "simulate", "study", "summary", "track",
+    "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantAcceleration", "ConstantVelocity",
+    "CoordinatedTurn", "FitError", "Flat", "Gaussian", "Horseshoe", "InputError", "Known", "Laplace",
+    "LeastSquares", "Mixture", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType",
+    "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown", "White", "fit", "load", "noise", "outliers",
+    "priors", "read_table", "save", "scores", "sensor", "sensors", "simulate", "study", "summary", "track",
 ]  # fmt: skip

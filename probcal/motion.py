@@ -4,6 +4,7 @@ A component knows its names, its transition over a time step and its noise facto
 To add one, write a frozen dataclass with the members of `Component` and compose it.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
@@ -11,6 +12,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import pandas as pd
 
+from probcal.geometry import slopes
 from probcal.noise import Level, check_level
 from probcal.types import AXES, InputError, TargetView, nearest
 
@@ -93,6 +95,112 @@ class ConstantVelocity(_Composable):
     def start(self) -> dict[str, tuple[Any, float]]:
         """No default: position and velocity start wide, from the extent of network and recording."""
         return {}
+
+
+@dataclass(frozen=True)
+class ConstantAcceleration(_Composable):
+    """Constant acceleration in 2-D or 3-D (Bar-Shalom, Li, Kirubarajan 2001, 6.2.3 and 6.3.3).
+
+    Full rank: white jerk, `std` in m s^-5/2 with covariance std^2 times
+    [[T^5/20, T^4/8, T^3/6], [T^4/8, T^3/3, T^2/2], [T^3/6, T^2/2, T]] an axis. `singular=True`: `std` in m s^-2 is
+    the change of acceleration from epoch to epoch, G = [T^2/2, T, 1].
+    """
+
+    std: Level
+    singular: bool = False
+
+    def __post_init__(self):
+        check_level(self.std, "ConstantAcceleration: std", zero=True)
+
+    def names(self) -> tuple[tuple[str, bool], ...]:
+        """State components and whether each has one value an axis."""
+        return (("position", True), ("velocity", True), ("acceleration", True))
+
+    def transition(self, dt: np.ndarray, dimension: int) -> np.ndarray:
+        """Transition matrices, shape (E, 3d, 3d)."""
+        return _blocks([[1.0, dt, dt**2 / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]], dimension, dt)
+
+    def noise_factor(self, dt: np.ndarray, dimension: int) -> np.ndarray:
+        """Noise factors for unit std, shape (E, 3d, d) or (E, 3d, 3d): the Cholesky factor written out."""
+        if self.singular:
+            return _blocks([[dt**2 / 2], [dt], [1.0]], dimension, dt)
+        root = np.sqrt(dt)
+        jerk = [
+            [dt**2 / np.sqrt(20), 0.0, 0.0],
+            [dt * np.sqrt(5) / 4, dt / np.sqrt(48), 0.0],
+            [np.sqrt(5) / 3, 1 / np.sqrt(3), 1 / 3],
+        ]
+        return _blocks([[root * entry for entry in row] for row in jerk], dimension, dt)
+
+    def start(self) -> dict[str, tuple[Any, float]]:
+        """No default: all start wide, from the extent of network and recording."""
+        return {}
+
+
+@dataclass(frozen=True)
+class CoordinatedTurn(_Composable):
+    """Turn of known `rate` in rad/s (left positive) in the x-y plane (Bar-Shalom, Li, Kirubarajan 2001, 11.7.1).
+
+    `std` in m s^-3/2: white acceleration as in `ConstantVelocity`, here carried along the turn; a rate of 0, and
+    the z axis, are constant velocity.
+    """
+
+    std: Level
+    rate: float
+
+    def __post_init__(self):
+        check_level(self.std, "CoordinatedTurn: std", zero=True)
+        if not np.isfinite(self.rate):
+            raise InputError(f"CoordinatedTurn: rate is {self.rate!r}: give a finite number in rad/s")
+
+    def names(self) -> tuple[tuple[str, bool], ...]:
+        """State components and whether each has one value an axis."""
+        return (("position", True), ("velocity", True))
+
+    def transition(self, dt: np.ndarray, dimension: int) -> np.ndarray:
+        """Transition matrices, shape (E, 2d, 2d); x + iy has velocity exp(i rate T)."""
+        angle = self.rate * dt
+        moved = dt * np.exp(0.5j * angle) * np.sinc(angle / (2 * np.pi))
+        return self._turned([[1.0, moved], [0.0, np.exp(1j * angle)]], [[1.0, dt], [0.0, 1.0]], dimension, dt)
+
+    def noise_factor(self, dt: np.ndarray, dimension: int) -> np.ndarray:
+        """Noise factors for unit std, shape (E, 2d, 2d).
+
+        Of x + iy: position variance T^3 g, covariance with the conjugate velocity T^2 c, velocity variance T, with
+        g = 2 (a - sin a) / a^3 and c = (1 - cos a) / a^2 - i a g / 2 at the angle a = rate T.
+        """
+        angle, root = self.rate * dt, np.sqrt(dt)
+        g = _turn_variance(angle)
+        c = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 - 0.5j * angle * g
+        along = c.conj() / np.sqrt(g)
+        rest = np.sqrt(np.maximum(1.0 - np.abs(along) ** 2, 0.0))
+        straight = ConstantVelocity(1.0).noise_factor(dt, 1)
+        rows = [[straight[:, r, k] for k in range(2)] for r in range(2)]
+        turned = [[dt * root * np.sqrt(g), 0.0], [root * along, root * rest]]
+        return self._turned(turned, rows, dimension, dt)
+
+    def start(self) -> dict[str, tuple[Any, float]]:
+        """No default: position and velocity start wide, from the extent of network and recording."""
+        return {}
+
+    @staticmethod
+    def _turned(plane: list[list[Any]], up: list[list[Any]], dimension: int, dt: np.ndarray) -> np.ndarray:
+        """Stack complex entries that act on x + iy, and real ones that act on z, into (E, 2d, 2d) matrices."""
+        full = _blocks(up, dimension, dt)
+        for r, row in enumerate(plane):
+            for k, entry in enumerate(row):
+                x, y, u, v = r * dimension, r * dimension + 1, k * dimension, k * dimension + 1
+                full[:, x, u] = full[:, y, v] = np.real(entry)
+                full[:, y, u], full[:, x, v] = np.imag(entry), -np.imag(entry)
+        return full
+
+
+def _turn_variance(angle: np.ndarray) -> np.ndarray:
+    """2 (a - sin a) / a^3, by its series where the difference would cancel."""
+    small = np.abs(angle) < 0.5
+    series = sum(2 * (-1) ** k * angle ** (2 * k) / math.factorial(2 * k + 3) for k in range(6))
+    a = np.where(small, 1.0, angle)
+    return np.where(small, series, 2 * (a - np.sin(a)) / a**3)
 
 
 @dataclass(frozen=True)
@@ -212,7 +320,7 @@ class Known(_Composable):
         if not len(time) or not (np.diff(time) > 0).all():
             raise InputError("Known: time must increase; give one track a target, sorted by time")
         if velocity is None:
-            velocity = np.gradient(position, time, axis=0) if len(time) > 1 else np.zeros_like(position)
+            velocity = slopes(time, position)
         state = np.concatenate([position, velocity], 1)
         if not (np.isfinite(time).all() and np.isfinite(state).all()):
             raise InputError("Known: time, position and velocity must be finite; drop the gaps")

@@ -260,11 +260,12 @@ class Problem:
         """Start mean and standard deviation of a component: declared, its own, or wide."""
         d, extent = self.network.dimension, self.extent
         duration = float(np.ptp(time)) or 1.0
-        speed = DIFFUSE * extent / duration + guess_of(component.std) * np.sqrt(duration)
+        pace, wander = DIFFUSE * extent / duration, guess_of(component.std) * np.sqrt(duration)
+        bent = component.driven == "acceleration"
         wide = {
             "position": (self.node_positions.mean(0), DIFFUSE * extent),
-            "velocity": (0.0, speed),
-            "acceleration": (0.0, speed / duration),
+            "velocity": (0.0, pace + wander * (duration if bent else 1.0)),
+            "acceleration": (0.0, pace / duration + wander),
         }
         given = wide | component.start() | dict(target.start)
         means, stds = [], []
