@@ -43,13 +43,13 @@ def scores(tree: xr.DataTree, truth: Truth) -> dict[str, float]:
 
 def grid_of(study: xr.Dataset) -> list[str]:
     """Names of the settings of a study."""
-    return [str(name) for name in study["bias_rmse"].dims if name not in ("method", "run")]
+    return [str(name) for name in study["bias_rmse"].dims if name not in ("estimator", "run")]
 
 
 def study_table(study: xr.Dataset) -> pd.DataFrame:
     """One row a setting and method: mean, sd, median and worst bias error, position error, coverage, statuses."""
     frame = study[[name for name in study.data_vars if "bias_label" not in study[name].dims]].to_dataframe()
-    groups = frame.reset_index().groupby([*grid_of(study), "method"], sort=False)
+    groups = frame.reset_index().groupby([*grid_of(study), "estimator"], sort=False)
     table = groups["bias_rmse"].agg(mean="mean", sd="std", median="median", worst="max")
     if "position_rmse" in frame:
         table["position"] = groups["position_rmse"].mean()
@@ -57,5 +57,5 @@ def study_table(study: xr.Dataset) -> pd.DataFrame:
     table["runs"] = groups.size()
     for status in ("converged", "not converged", "at bound", "diverged"):
         frame[status] = frame["status"] == status
-        table[status] = frame.reset_index().groupby([*grid_of(study), "method"], sort=False)[status].sum()
-    return table.reset_index().fillna({"sd": 0.0})
+        table[status] = frame.reset_index().groupby([*grid_of(study), "estimator"], sort=False)[status].sum()
+    return table.reset_index().rename(columns={"estimator": "method"}).fillna({"sd": 0.0})

@@ -151,7 +151,7 @@ def plot_study(study: xr.Dataset, variable: str = "bias_rmse", axes: Sequence[Ax
 
     `variable` is `bias_rmse`, `position_rmse` or `coverage`; the upper half of the band is drawn, as in Papers B, C.
     """
-    grid = [name for name in study[variable].dims if name not in ("method", "run")]
+    grid = [name for name in study[variable].dims if name not in ("estimator", "run")]
     along = next(name for name in grid if np.issubdtype(study[name].dtype, np.number))
     others = [name for name in grid if name != along]
     facets = study[variable].stack(facet=others) if others else study[variable].expand_dims(facet=[()])
@@ -161,8 +161,8 @@ def plot_study(study: xr.Dataset, variable: str = "bias_rmse", axes: Sequence[Ax
         axes = list(figure.subplots(1, count, squeeze=False)[0])
     for k, ax in enumerate(axes):
         chosen = facets.isel(facet=k)
-        for m, method in enumerate(study["method"].values):
-            values = chosen.sel(method=method)
+        for m, method in enumerate(study["estimator"].values):
+            values = chosen.sel(estimator=method)
             mean, sd = values.mean("run").values, values.std("run").values
             ax.plot(study[along], mean, "o-", color=_colour(m), markersize=3.5, label=_plain(method))
             ax.fill_between(study[along], mean, mean + sd, color=_colour(m), alpha=0.15, linewidth=0)

@@ -31,18 +31,18 @@ def check(scenario, shares, runs):
     mean = found["bias_rmse"].mean("run").sel(scenario=scenario)
     for share in shares:
         for method, figure in zip(("em-ea", "ea", "oracle"), TRIAL[scenario, share], strict=True):
-            assert mean.sel(share=share, method=method) < 1.15 * figure, (scenario, share, method)
-            assert mean.sel(share=share, method="ml") > 2 * mean.sel(share=share, method=method)
+            assert mean.sel(share=share, estimator=method) < 1.15 * figure, (scenario, share, method)
+            assert mean.sel(share=share, estimator="ml") > 2 * mean.sel(share=share, estimator=method)
     return found
 
 
 def test_c1_at_one_share_reproduces_the_trial_and_equals_single_fits():
     found = check("C1", (0.3,), 8)
-    assert (found["status"].sel(method=["ea", "em-ea", "oracle"]) != "at bound").all()
+    assert (found["status"].sel(estimator=["ea", "em-ea", "oracle"]) != "at bound").all()
     problem, truth = radars.setting(5, share=0.3, scenario="C1")
     for name, method, prior in (("ea", EA(), None), ("em-ea", EMEA(), None), ("ml", MAP(), Flat())):
         tree = probcal.fit(problem, method, prior=prior, predictive_draws=False)
-        one = found.sel(scenario="C1", share=0.3, method=name, run=5)
+        one = found.sel(scenario="C1", share=0.3, estimator=name, run=5)
         group = tree["calibration"].to_dataset()
         z = group["mean"].values / problem.scales
         np.testing.assert_allclose(one["error"].values + one["true"].values, z, atol=1e-6)
@@ -92,5 +92,5 @@ def test_errors_of_studies():
 def test_trial_is_reproduced_at_three_shares(scenario):
     found = check(scenario, (0.1, 0.3, 0.6), 8)
     if scenario == "C2":  # where ML runs away it says so
-        ml = found.sel(method="ml")
+        ml = found.sel(estimator="ml")
         assert (ml["status"].values[ml["bias_rmse"].values > 5] == "diverged").all()

@@ -178,10 +178,11 @@ def study(
 
     `setting(run, **point)` returns a problem and its truth for a run (its seed) and a point of the `grid`, a
     mapping from argument to values. `methods` are names of the command line or a mapping to (method, prior).
-    Returned variables, dims (the grid's, method, run): `bias_rmse` (root mean square of the errors over their
-    scales), `position_rmse` in m, `coverage` of the intervals, `status`, `iterations`; with `bias_label`: `error`,
-    `true`, `sd` (all over their scales) and `gamma`. Raises `InputError` for an unknown method or settings whose
-    biases differ. Runs are solved in batches by compiled kernels, on as many threads as there are processors.
+    Variables have the grid's dims, `estimator` (the method; xarray keeps that word for itself) and `run`:
+    `bias_rmse` (root mean square of the errors over their scales), `position_rmse` in m, `coverage` of the
+    intervals, `status`, `iterations`; with `bias_label`: `error`, `true`, `sd` (all over their scales) and `gamma`.
+    Raises `InputError` for an unknown method or settings whose biases differ. Runs are solved in batches by
+    compiled kernels, on as many threads as there are processors.
     """
     chosen = dict(methods) if isinstance(methods, Mapping) else choose_methods(methods)
     numbers = list(range(runs)) if isinstance(runs, int) else list(runs)
@@ -212,7 +213,7 @@ def _dataset(
     labels = records[0]["labels"]
     if any(record["labels"] != labels for record in records):
         raise InputError("study: the settings have different biases; make one study for each network")
-    dims = (*axes, "method", "run")
+    dims = (*axes, "estimator", "run")
     shape = (*(len(values) for values in axes.values()), len(methods), len(runs))
     scalars: dict[str, Any] = {name: np.full(shape, np.nan) for name in ("bias_rmse", "coverage", "position_rmse")}
     scalars |= {"status": np.full(shape, "", "<U13"), "iterations": np.zeros(shape, int)}
@@ -229,6 +230,6 @@ def _dataset(
     return xr.Dataset(
         {name: (dims, values) for name, values in scalars.items()}
         | {name: ((*dims, "bias_label"), values) for name, values in vectors.items()},
-        coords={**axes, "method": methods, "run": runs, "bias_label": list(labels)},
+        coords={**axes, "estimator": methods, "run": runs, "bias_label": list(labels)},
         attrs={"interval_probability": INTERVAL},
     )
