@@ -28,7 +28,7 @@ from probcal.inference.study import choose_methods
 from probcal.priors import PRIORS
 from probcal.problem import Problem
 from probcal.simulate import Simulation, Truth, truth_beside
-from probcal.tree import add_scores, load, save, summary
+from probcal.tree import add_scores, load, outliers, save, summary
 from probcal.types import FitError, InputError, nearest
 
 app = typer.Typer(
@@ -205,6 +205,16 @@ def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
     if "level" in tree.children:
         for label, std in tree["level"].to_dataset()["std"].to_series().items():
             print(f"estimated {label} = {std:.4g}")
+    listed = outliers(tree)
+    if len(listed):
+        total = tree["residual"].sizes["datum"]
+        first = listed.iloc[0]
+        print(f"{len(listed)} of {total} data count less than half; the least: row {first['row']}, {first['sensor']}")
+    if "optimum" in tree.children:
+        optima = tree["optimum"].to_dataset()
+        score = optima["log_evidence" if "log_evidence" in optima else "objective"]
+        pairs = zip(optima["start"].values, optima["status"].values, score.values, strict=True)
+        print(f"{score.name} by start: " + ", ".join(f"{k}: {value:.2f} ({status})" for k, status, value in pairs))
     if "position_rmse_after" in attrs:
         print(f"position RMSE before {attrs['position_rmse_before']:.3f} m, after {attrs['position_rmse_after']:.3f} m")
     if attrs["message"]:
@@ -216,8 +226,14 @@ def _write(tree: xr.DataTree, out: Path) -> None:
         save(tree, out / "fit.nc")
     except OSError as error:
         raise InputError(f"{out} cannot be written: {error.strerror}") from None
-    _write_csv(summary(tree), out / "summary.csv")
-    print(f"written: {out / 'fit.nc'}, {out / 'summary.csv'}" + (f", {_report(tree, out)}" if _can_plot() else ""))
+    files = [out / "fit.nc", out / "summary.csv"]
+    _write_csv(summary(tree), files[1])
+    if (tree["residual"]["weight"] < 1).any():  # some noise has heavy tails
+        files.append(out / "outliers.csv")
+        _write_csv(outliers(tree), files[2])
+    if _can_plot():
+        files.append(_report(tree, out))
+    print(f"written: {', '.join(str(path) for path in files)}")
     if not _can_plot():
         print('report.html is left out: pip install "probcal[plot]"')
 

@@ -99,6 +99,29 @@ def plot_residuals(tree: xr.DataTree, axes: Sequence[Axes] | None = None) -> lis
     return list(axes)
 
 
+def plot_outliers(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw residual/std of every datum over time; crosses in the sensor's colour count less than half."""
+    group = tree["residual"].to_dataset()
+    ax = _axes(ax, 9.0, 3.4)
+    time, ratio = group["time"].values, group["after"].values / group["std"].values
+    weight = group["weight"].values if "weight" in group else np.ones(len(time))
+    out, sensors = weight < 0.5, group["sensor"].values
+    shown = np.flatnonzero(~out)[:: max(1, int((~out).sum()) // ALL_POINTS + 1)]
+    ax.plot(time[shown], ratio[shown], ".", color=BEFORE, markersize=2, rasterized=True, label="inlying")
+    for k, name in enumerate(dict.fromkeys(sensors[out].tolist())):
+        mine = out & (sensors == name)
+        label = _plain(name) if k < 10 else None
+        ax.plot(time[mine], ratio[mine], "x", color=_colour(k), markersize=4, label=label)
+    linear = max(LINEAR, float(np.quantile(np.abs(ratio), 0.9)))
+    if np.abs(ratio).max() > 2 * linear:
+        ax.set_yscale("symlog", linthresh=linear)
+    ax.set(xlabel="time in s", ylabel="residual/std")
+    ax.grid(color="0.9")
+    ax.set_title(f"Residuals over time: {int(out.sum())} of {len(out)} count less than half", loc="left")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
+    return ax
+
+
 def plot_objective(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw the objective over the iterations."""
     ax = _axes(ax, 6.0, 3.4)
