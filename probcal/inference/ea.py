@@ -114,7 +114,7 @@ class MAP:
     `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood.
     """
 
-    iterations: int = 100
+    iterations: int = 500
     tolerance: float = 1e-6
 
     name: ClassVar[str] = "MAP"

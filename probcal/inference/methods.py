@@ -31,7 +31,7 @@ def choose_prior(method: Method, prior: Prior | None) -> Prior:
     if prior is None:
         return method.priors[0]()
     if not isinstance(prior, method.priors):
-        allowed = ", ".join(kind.__name__ for kind in method.priors)
+        allowed = ", ".join(name for name, known in PRIORS.items() if isinstance(known, method.priors))
         raise InputError(f"{method.name} does not take the prior {type(prior).__name__}; it takes: {allowed}")
     return prior
 
