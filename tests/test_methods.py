@@ -1,15 +1,19 @@
 """Every classical method against what defines it: exact posteriors, stationarity, fixed points; noise families."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 import reference
+from test_catalogue import check_tree
 from test_exact import CASES, close, plane, resting, table_of
 
 import probcal
 from probcal import ARD, EA, EM, EMEA, MAP, Flat, Gaussian, Laplace, Mixture, StudentT
-from probcal.inference import METHODS
+from probcal.inference import METHODS, table
 from probcal.noise import Gaussian as Normal
 from probcal.priors import PRIORS
 from probcal.types import InputError
@@ -259,14 +263,61 @@ def test_outlying_rows_are_listed(noise, method):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_pair_of_prior_and_method_fits_or_says_so(name):
+    """The contract of results for every prior a method takes (groups of ARD apart), one sentence for the others."""
     method, _ = METHODS[name]
-    network, motion, table = shifted()
-    problem = probcal.Problem(network, motion, table)
     for prior in PRIORS.values():
-        if isinstance(prior, method.priors):
-            continue
-        with pytest.raises(InputError, match=f"does not take the prior {type(prior).__name__}; it takes: "):
-            probcal.fit(problem, method, prior=prior)
+        if not isinstance(prior, method.priors):
+            with pytest.raises(InputError, match=f"does not take the prior {type(prior).__name__}; it takes: "):
+                solve(method, prior)
+        elif getattr(prior, "by", None) is None:
+            _, problem, tree = solve(method, prior)
+            check_tree(tree, problem)
+            assert tree.attrs["prior"] == type(prior).__name__
+            assert tree.attrs["status"] == "converged" or name == "paper-b"  # 25 iterations, as in the paper
+
+
+def test_the_table_of_pairs_is_that_of_the_readme():
+    text = (Path(__file__).parents[1] / "README.md").read_text()
+    for name, row in table().iterrows():
+        cells = " | ".join(row)
+        assert f"| `{name}()` | {cells} |" in text
+
+
+def test_least_squares_with_known_targets_is_the_closed_form():
+    """Known targets: the normal equations; with an unknown target beside them, its states are free at every epoch."""
+    kind = probcal.sensors.position
+    nodes = [probcal.Node("a", (0.0, 0.0), scale=5.0), probcal.Node("b", (9.0, 1.0), scale=5.0)]
+    network = probcal.Network([kind.on(node) for node in nodes])
+    time = np.arange(12.0)
+    path = pd.DataFrame({"time": time, "position_x": 3 * time, "position_y": 5 - time})
+    motion = {"car": probcal.Known(path), "bird": probcal.ConstantVelocity(0.1)}
+    random, rows = np.random.default_rng(2), []
+    for target, at in (("car", path[["position_x", "position_y"]].to_numpy()), ("bird", np.zeros((12, 2)))):
+        for t, p in zip(time, at, strict=True):
+            for node in nodes:
+                x, y = p - node.position + 3 * random.standard_normal(2)
+                rows.append((t, node.name, target, x, y))
+    data = pd.DataFrame(rows, columns=["time", "sensor", "target", "position_x", "position_y"])
+    for chosen in (data[data["target"] == "car"], data):
+        problem = probcal.Problem(network, motion, chosen)
+        tree = probcal.fit(problem, probcal.LeastSquares(), predictive_draws=False)
+        known = chosen[chosen["target"] == "car"].reset_index(drop=True)
+        stated = known["sensor"].map({"a": 0, "b": 1}).to_numpy()
+        truth = path[["position_x", "position_y"]].to_numpy()[known["time"].astype(int)]
+        offset = truth - np.stack([n.position for n in nodes])[stated] - known[["position_x", "position_y"]].to_numpy()
+        pull, count = np.zeros((2, 2)), np.zeros(2)
+        for n in range(2):
+            pull[n], count[n] = offset[stated == n].sum(0), (stated == n).sum()
+        information = np.diag(count)
+        if len(chosen) == len(data):  # a free position seen by both ties the two nodes together: half an epoch each
+            free = chosen[chosen["target"] == "bird"]
+            sides = [free[free["sensor"] == name][["position_x", "position_y"]].to_numpy() for name in "ab"]
+            apart = (sides[0] + nodes[0].position - sides[1] - nodes[1].position).sum(0) / 2
+            information = information + 6 * np.array([[1, -1], [-1, 1]])
+            pull = pull + np.stack([-apart, apart])
+        expected = np.linalg.solve(information, pull).ravel()
+        assert tree.attrs["status"] == "converged"
+        np.testing.assert_allclose(tree["calibration"]["mean"].values, expected, atol=2e-3)
 
 
 ERRORS = [
