@@ -1,6 +1,6 @@
 """Benchmarks: run time of compiled kernels, and scaling; compile time apart. Not part of the tests.
 
-    uv run --group bench pytest benchmarks --benchmark-only
+    uv run --group bench pytest benchmarks --benchmark-only -n 0
 
 Peers are measured beside them with their own scripts (`stonesoup_eks.py`, `gtsam_map.py 10 100`) in the same
 session on the same machine: quote ratios.
