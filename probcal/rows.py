@@ -111,7 +111,8 @@ def pose_vector(node: Node, extras: tuple[str, ...], time: np.ndarray) -> np.nda
     if node.path is not None:
         moving = node.path.at(time)
         stated |= {name: value + stated[name] if name in ANGLES else value for name, value in moving.items()}
-    return np.concatenate([stated[name].reshape(len(time), -1) for name in ("position", *extras)], 1).astype(float)
+    columns = [stated[name].reshape(len(time), np.size(still[name])) for name in ("position", *extras)]
+    return np.concatenate(columns, 1).astype(float)
 
 
 def _local(block: Block, rows: Rows, z: jax.Array) -> jax.Array:
