@@ -5,6 +5,7 @@ from probcal.diagnostics import scores
 from probcal.inference import EA, EM, EMEA, MAP, fit, track
 from probcal.motion import ConstantVelocity, Motion, RandomWalk, Static, Target, White
 from probcal.network import Network, Node, Path
+from probcal.nodes import LocalFrame, read_nodes, write_nodes
 from probcal.noise import Bernoulli, StudentT, Unknown
 from probcal.priors import ARD, Flat
 from probcal.problem import Problem
@@ -16,7 +17,7 @@ from probcal.types import FitError, InputError
 
 __all__ = [
     "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantVelocity", "FitError", "Flat",
-    "InputError", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation",
-    "Static", "StudentT", "Target", "Truth", "Unknown", "White", "fit", "load", "noise", "priors", "read_table",
-    "save", "scores", "sensor", "sensors", "simulate", "summary", "track",
+    "InputError", "LocalFrame", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType",
+    "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown", "White", "fit", "load", "noise", "priors",
+    "read_nodes", "read_table", "save", "scores", "sensor", "sensors", "simulate", "summary", "track", "write_nodes",
 ]  # fmt: skip

@@ -198,14 +198,20 @@ def build_tracks(problem: Problem, tracks: Sequence[Tracks]) -> xr.DataTree:
 
 
 def _constant(problem: Problem) -> xr.Dataset:
-    """Stated positions of the nodes, their calibrated shift by label, and the fixed biases."""
+    """Stated values of the nodes (positions, headings, every component), which of them move, and the fixed biases."""
     d, nodes = problem.network.dimension, problem.network.nodes
+    stated = [(n.name, component, float(value)) for n in nodes for component, value in n.components.items()]
+    owners, components, numbers = zip(*stated, strict=True)
     values = {
         "node_position": (("node", "axis"), np.stack([n.position for n in nodes])),
         "node_heading": ("node", np.array([float(n.components["heading"]) for n in nodes])),
         "moving": ("node", np.array([n.path is not None for n in nodes])),
+        "stated": ("value", np.array(numbers)),
     }
-    coords = {"node": [n.name for n in nodes], "axis": ["x", "y", "z"][:d]}
+    coords: dict[str, Any] = {
+        "node": [n.name for n in nodes], "axis": ["x", "y", "z"][:d],
+        "stated_node": ("value", np.array(owners)), "stated_component": ("value", np.array(components)),
+    }  # fmt: skip
     if problem.fixed:
         values["fixed"] = ("fixed_label", np.array(list(problem.fixed.values())))
         coords["fixed_label"] = list(problem.fixed)
