@@ -1,6 +1,8 @@
 """The long table of rows, `time, sensor, [target], <a column a channel>`, checked at the door."""
 
+import warnings
 from dataclasses import dataclass
+from numbers import Number
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -69,23 +71,36 @@ def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
     if not isinstance(source, (str, PathLike)):
         raise InputError(f"data must be a path or a DataFrame, got {type(source).__name__}")
     path = Path(source)
-    form: dict[str, Any] = {"skip_blank_lines": False, "encoding": "utf-8-sig", "low_memory": False}
+    form: dict[str, Any] = dict(index_col=False, skip_blank_lines=False, encoding="utf-8-sig", low_memory=False)
     try:
-        columns = list(pd.read_csv(path, nrows=0, **form))
-        names = [column for column in columns if split_header(column)[0] in NAMES]
-        blank = dict.fromkeys(columns, BLANK) | dict.fromkeys(names, ("",))
-        frame = pd.read_csv(path, dtype=dict.fromkeys(names, str), na_values=blank, keep_default_na=False, **form)
+        first = pd.read_csv(path, header=None, nrows=1, dtype=str, keep_default_na=False, **form)
+        columns = _once(path, first.iloc[0].tolist())
+        text = [column for column in columns if split_header(column)[0] in NAMES]
+        form |= {"na_values": dict.fromkeys(columns, BLANK) | dict.fromkeys(text, ("",)), "keep_default_na": False}
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            frame = pd.read_csv(path, names=columns, header=0, dtype=dict.fromkeys(text, str), **form)
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except pd.errors.ParserWarning:
+        raise InputError(f"{path.name} has rows with more cells than its header; give every column a name") from None
     except Exception as error:  # whatever pandas and the packages that unpack files say of foreign bytes
         raise InputError(f"{path.name} is not a CSV table with a header line: {error}") from None
-    if not isinstance(frame.index, pd.RangeIndex):
-        raise InputError(f"{path.name} has rows with more cells than the header line; give every column a name")
     lines = np.arange(2, len(frame) + 2)
     filled = frame.notna().any(axis=1).to_numpy()
     return Table(frame[filled].reset_index(drop=True), path.name, lines[filled])
+
+
+def _once(path: Path, columns: list[str]) -> list[str]:
+    """Headers of a file, each once."""
+    for column in columns:
+        if columns.count(column) > 1:
+            raise InputError(f'{path.name} has the column "{column}" twice')
+    return columns
 
 
 def measure(table: Table, network: Network) -> Measurements:
@@ -205,6 +220,8 @@ def _seconds(column: pd.Series) -> np.ndarray:
     """A column of durations in seconds, or of dates in seconds since the first one; NaN where it is neither."""
     if column.dtype.kind == "m":
         return column.dt.total_seconds().to_numpy(float)
+    if column.dtype == object:  # a number among dates is none
+        column = column.map(lambda cell: None if isinstance(cell, Number) else cell)
     try:
         stamps = pd.to_datetime(
             column, errors="coerce", utc=True, format=None if column.dtype.kind == "M" else "ISO8601"

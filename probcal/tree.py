@@ -260,12 +260,12 @@ def _umask() -> int:
 def load(path: str | PathLike[str]) -> xr.DataTree:
     """Read a fit back from its file, or from the folder that holds `fit.nc`."""
     path = Path(path)
-    path = path / "fit.nc" if path.is_dir() else path
     try:
+        path = path / "fit.nc" if path.is_dir() else path
         with xr.open_datatree(path, engine="h5netcdf") as tree:
             tree = tree.load()
-    except (OSError, ValueError) as error:
+    except Exception as error:  # whatever the netCDF and HDF5 libraries say of foreign bytes
         raise InputError(f"{path} is not a fit written by probcal ({type(error).__name__}: {error})") from None
-    if "calibration" not in tree.children:
-        raise InputError(f"{path} is not a fit written by probcal: it has no group calibration")
+    if "calibration" not in tree.children or not set(SUMMARY[1:]) <= set(tree["calibration"].data_vars):
+        raise InputError(f"{path} is not a fit written by probcal: its group calibration is missing or incomplete")
     return tree
