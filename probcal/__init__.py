@@ -2,22 +2,34 @@
 
 from probcal import noise, priors, sensors
 from probcal.diagnostics import scores
-from probcal.inference import EA, EM, EMEA, MAP, fit, track
-from probcal.motion import ConstantVelocity, Motion, RandomWalk, Static, Target, White
+from probcal.inference import EA, EM, EMEA, MAP, LeastSquares, fit, study, track
+from probcal.motion import (
+    ConstantAcceleration,
+    ConstantVelocity,
+    CoordinatedTurn,
+    Known,
+    Motion,
+    RandomWalk,
+    Static,
+    Target,
+    White,
+)
 from probcal.network import Network, Node, Path
 from probcal.nodes import LocalFrame, read_nodes, write_nodes
-from probcal.noise import Bernoulli, StudentT, Unknown
-from probcal.priors import ARD, Flat
+from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
+from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
 from probcal.problem import Problem
 from probcal.sensor import Bias, Channel, Sensor, SensorType, sensor
 from probcal.simulate import Simulation, Truth, simulate
 from probcal.table import read_table
-from probcal.tree import load, save, summary
+from probcal.tree import load, outliers, save, summary
 from probcal.types import FitError, InputError
 
 __all__ = [
-    "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantVelocity", "FitError", "Flat",
-    "InputError", "LocalFrame", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType",
-    "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown", "White", "fit", "load", "noise", "priors",
-    "read_nodes", "read_table", "save", "scores", "sensor", "sensors", "simulate", "summary", "track", "write_nodes",
+    "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantAcceleration", "ConstantVelocity",
+    "CoordinatedTurn", "FitError", "Flat", "Gaussian", "Horseshoe", "InputError", "Known", "Laplace", "LeastSquares",
+    "LocalFrame", "Mixture", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType",
+    "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown", "White", "fit", "load", "noise", "outliers",
+    "priors", "read_nodes", "read_table", "save", "scores", "sensor", "sensors", "simulate", "study", "summary",
+    "track", "write_nodes",
 ]  # fmt: skip

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from probcal.motion import Motion, Target, as_motion
+from probcal.motion import Motion, Static, Target, White, as_motion
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, Level, Unknown, guess_of
 from probcal.rows import Block, Layout, Rows, make_block, pose_entries, pose_vector
@@ -100,6 +100,37 @@ class Problem:
     def labels(self) -> tuple[str, ...]:
         """Labels of the free biases, in the order of every bias array."""
         return tuple(bias.label for bias in self.biases)
+
+    @property
+    def members(self) -> list[dict[str, str]]:
+        """What each free bias belongs to: its owner, node(s), sensor type(s) and component."""
+        found = []
+        for bias in self.biases:
+            users = [s for s in self.network.sensors if bias.owner in (s.name, s.type.name, *(n.name for n in s.nodes))]
+            nodes = {n.name for s in users for n in s.nodes}
+            node = bias.owner if bias.owner in nodes else "-".join(sorted(nodes))
+            types = "-".join(sorted({s.type.name for s in users}))
+            found.append({"owner": bias.owner, "node": node, "type": types, "component": bias.component})
+        return found
+
+    def unlinked(self) -> "Problem":
+        """The same problem without motion: the state of every epoch is free, but for known and static targets."""
+        names = self.measurements.target_names
+        motion = {name: self._unlinked(self._target(name)) for name in names}
+        return Problem(self.network, motion, self.measurements.table, fix=self.fixed)
+
+    def _unlinked(self, target: Target) -> Motion:
+        """Each component that links epochs replaced by one drawn anew, with a wide start."""
+        free: list[Any] = []
+        starts = {name: pair for c in as_motion(target.motion).components for name, pair in c.start().items()}
+        for component in as_motion(target.motion).components:
+            if component.memoryless or isinstance(component, Static):
+                free.append(component)
+                continue
+            for name, per_axis in component.names():
+                mean, std = starts.get(name, (0.0, DIFFUSE * self.extent))
+                free.append(White(name, "", std, mean, per_axis))
+        return Motion(tuple(free))
 
     @property
     def extent(self) -> float:
@@ -208,8 +239,11 @@ class Problem:
             here, noise = slice(row, row + size), slice(column, column + width)
             F[:, here, here] = transition
             L[:, here, noise] = factor * guess_of(component.std)
-            level[:, noise] = levels.of(component.std, f"motion.{component.names()[-1][0]}_std", "")
-            drift[:, here] = component.mean
+            level[:, noise] = levels.of(component.std, f"motion.{component.driven}_std", "")
+            try:
+                drift[:, here] = component.means(time, d)
+            except InputError as error:
+                raise InputError(f'target "{name}": {error}') from None
             if not component.memoryless:
                 F[0, here, here], drift[0, here] = 0.0, 0.0
                 L[0, here, :], level[0, noise] = 0.0, -1
@@ -226,11 +260,12 @@ class Problem:
         """Start mean and standard deviation of a component: declared, its own, or wide."""
         d, extent = self.network.dimension, self.extent
         duration = float(np.ptp(time)) or 1.0
-        speed = DIFFUSE * extent / duration + guess_of(component.std) * np.sqrt(duration)
+        pace, wander = DIFFUSE * extent / duration, guess_of(component.std) * np.sqrt(duration)
+        bent = component.driven == "acceleration"
         wide = {
             "position": (self.node_positions.mean(0), DIFFUSE * extent),
-            "velocity": (0.0, speed),
-            "acceleration": (0.0, speed / duration),
+            "velocity": (0.0, pace + wander * (duration if bent else 1.0)),
+            "acceleration": (0.0, pace / duration + wander),
         }
         given = wide | component.start() | dict(target.start)
         means, stds = [], []
