@@ -58,27 +58,47 @@ def _say(text: object) -> None:
 
 
 def load_model(path: Path) -> ModuleType:
-    """Import a model file; raises `InputError` if it is missing, fails, or defines no problem."""
-    if not path.is_file():
+    """Import a model file; raises `InputError` if it is missing or fails."""
+    if not _exists(path) or not path.is_file():
         raise InputError(f"{path}: no such model file")
     spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None:
+    if path.suffix != ".py" or spec is None or spec.loader is None:
         raise InputError(f"{path} is not a Python file; a model file defines problem(data=None)")
     module = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(path.parent.resolve()))
+    folder = str(path.parent.resolve())
+    sys.path.insert(0, folder)
     try:
-        spec.loader.exec_module(module)
-    except InputError as error:
-        raise InputError(f"{path.name}: {error}") from None
-    except Exception as error:  # whatever the user's file raises is told in one sentence
-        raise InputError(f"{path.name} cannot be loaded: {type(error).__name__}: {_one_line(error)}") from None
+        with _told(f"{path.name} cannot be loaded:", f"{path.name}: "):
+            spec.loader.exec_module(module)
     finally:
-        sys.path.pop(0)
+        if folder in sys.path:
+            sys.path.remove(folder)
     return module
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+@contextmanager
+def _told(what: str, prefix: str = "") -> Iterator[None]:
+    """Whatever a user's file raises, `sys.exit()` included, becomes one sentence; Ctrl-C stays what it is."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{prefix}{error}") from None
+    except (FitError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        try:
+            reason = str(error)
+        except Exception:  # an exception of the user's own that cannot be printed
+            reason = "no text"
+        raise InputError(f"{what} {type(error).__name__}: {reason}") from None
+
+
+def _exists(path: Path) -> bool:
+    """Whether a file or folder is there; a name that no file can have is not."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
 
 
 def _call(module: ModuleType, path: Path, name: str, *arguments: Any, **options: Any) -> Any:
@@ -88,17 +108,13 @@ def _call(module: ModuleType, path: Path, name: str, *arguments: Any, **options:
         raise InputError(
             f"{path.name} defines no {name}(); a model file defines problem(data=None) and, to simulate, scenario(key)"
         )
-    try:
+    with _told(f"{path.name}: {name}() failed with"):
         return function(*arguments, **options)
-    except (InputError, FitError):
-        raise
-    except Exception as error:
-        raise InputError(f"{path.name}: {name}() failed with {type(error).__name__}: {_one_line(error)}") from None
 
 
 def _problem(model: Path, data: Path | None, fix: list[str] = []) -> tuple[ModuleType, Problem]:  # noqa: B006
     module = load_model(model)
-    if data is not None and not data.exists():
+    if data is not None and not _exists(data):
         raise InputError(f"{data}: no such file")
     problem = _call(module, model, "problem", data)
     if not isinstance(problem, Problem):
@@ -110,11 +126,16 @@ def _problem(model: Path, data: Path | None, fix: list[str] = []) -> tuple[Modul
     return module, problem
 
 
-def _truth(module: ModuleType, model: Path, data: Path | None) -> Truth | None:
-    beside = truth_beside(data) if data is not None else None
-    if beside is not None or not hasattr(module, "truth"):
-        return beside
-    return _call(module, model, "truth", data)
+def _truth(module: ModuleType, model: Path, data: Path | None, problem: Problem) -> Truth | None:
+    """The truth beside the data, else the model's own; checked before a fit rather than at its scores."""
+    truth = truth_beside(data) if data is not None else None
+    if truth is None and hasattr(module, "truth"):
+        truth = _call(module, model, "truth", data)
+        if not isinstance(truth, Truth | None):
+            raise InputError(f"{model.name}: truth() returned {type(truth).__name__}; return a probcal.Truth or None")
+    if truth is not None:
+        truth.positions(np.zeros(0), np.zeros(0, str), problem.network.dimension)
+    return truth
 
 
 @contextmanager
@@ -184,7 +205,7 @@ def fit_command(
         _folder(out)
     began = time.perf_counter()
     module, problem = _problem(model, data, fix)
-    truth = _truth(module, model, data)
+    truth = _truth(module, model, data, problem)
     with _progress() as progress:
         tree = fit(problem, value, prior=chosen, key=seed, starts=starts, progress=progress)
     tree.attrs["model"] = model.stem
@@ -290,10 +311,10 @@ def track_command(
         )
     _folder(out.parent)
     module, problem = _problem(model, data)
+    truth = _truth(module, model, data, problem)
     tree = track(problem, known)
     frame = track_table(tree)
     _write_csv(frame, out)
-    truth = _truth(module, model, data)
     found = scores(tree, truth) if truth is not None else {}
     if "position_rmse_after" in found:
         print(f"position RMSE before {found['position_rmse_before']:.3f} m, after {found['position_rmse_after']:.3f} m")
