@@ -17,11 +17,10 @@ from probcal.simulate import Key, as_key
 from probcal.smoothing.draws import draw, predictive, residuals
 from probcal.smoothing.information import at_levels, moments
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import automatic_start, track_mode
+from probcal.smoothing.start import automatic_start, further_starts, track_mode
 from probcal.types import FitError, InputError, float64
 
 CHAINS, DRAWS = 4, 250
-SPARSE = 0.3  # share of biases that a further start moves
 
 
 @float64
@@ -40,8 +39,8 @@ def fit(
 
     `method` is a value (`EA()` by default); `prior` defaults to the method's own; `key` is a seed or jax key
     of the draws and of further starts; `start` replaces the automatic start. `starts` runs the method from so many
-    starts, the further ones with a share of the biases drawn from their scales: the best optimum is reported, all
-    of them with their evidence in the group `optimum`. `predictive_draws` forces or forbids the groups of
+    starts, the further ones with two nodes swapped or a share of the biases drawn: the best optimum is reported,
+    all of them with their evidence in the group `optimum`. `predictive_draws` forces or forbids the groups of
     draws by datum and of trajectories, by default written up to 2e7 values each. The attributes `status` and
     `message` say what the fit is worth. Raises `InputError` for a prior that the method does not take and
     `FitError` where a flat prior leaves a singular problem without any interval.
@@ -60,23 +59,12 @@ def fit(
     problem = method.prepare(problem)
     keys = jax.random.split(as_key(key), 3)
     first = automatic_start(problem) if start is None else start
-    points = [first, *_further_starts(problem, first, starts - 1, keys[2])]
+    points = [first, *further_starts(problem, starts - 1, keys[2])]
     outcomes = [maximise(method, problem, prior, point, progress) for point in points]
     best = max(range(starts), key=lambda k: _rank(prior, outcomes[k]))
     seed = int(key) if isinstance(key, (int, np.integer)) else -1
     tree_ = tree.build(problem, _result(problem, method, prior, outcomes[best], keys, seed, predictive_draws))
     return tree.add_optima(tree_, problem, outcomes, best) if starts > 1 else tree_
-
-
-def _further_starts(problem: Problem, first: Point, count: int, key: jax.Array) -> list[Point]:
-    """Starts with a share of the biases drawn from their scales, each with the track that suits them."""
-    points = []
-    for k in range(count):
-        pick, size = jax.random.split(jax.random.fold_in(key, k))
-        moved = jax.random.uniform(pick, first.z.shape) < SPARSE
-        z = jnp.where(moved, 2.0 * jax.random.normal(size, first.z.shape), 0.0)
-        points.append(track_mode(problem, first._replace(z=z)))
-    return points
 
 
 def _rank(prior: Prior, outcome: Outcome) -> tuple[bool, bool, float]:
