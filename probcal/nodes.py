@@ -15,7 +15,7 @@ import pandas as pd
 import pyproj
 import xarray as xr
 
-from probcal.network import POSE_UNITS, Node
+from probcal.network import ANGLES, POSE_UNITS, Node
 from probcal.sensor import Bias
 from probcal.table import Table, factor, header, name_of, numbers, read_table
 from probcal.types import AXES, InputError, nearest
@@ -23,8 +23,7 @@ from probcal.types import AXES, InputError, nearest
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563  # WGS84: radius in m
 LOCAL, GEODETIC = ("x", "y", "z"), ("latitude", "longitude", "height")
 PLACE_UNITS = dict.fromkeys((*LOCAL, "height"), "m") | dict.fromkeys(GEODETIC[:2], "deg")
-ANGLES = ("heading", "pitch", "roll")
-OWN = (*ANGLES, "clock")  # components that every node has
+OWN = tuple(name for name in POSE_UNITS if name != "position")  # components that every node has
 KINDS = ("survey", "scale")
 RESERVED = ("position", "path", "self", *KINDS)  # arguments of Node that are no column
 KNOWN = (*OWN, "position", *(f"{kind}_{name}" for kind in KINDS for name in ("position", *OWN)))
@@ -138,9 +137,9 @@ def read_nodes(
     """Nodes by name from CSV, GeoJSON (Point features, the columns as properties) or a DataFrame.
 
     Columns: `node` (or `name`); `x, y[, z]` in m or `latitude, longitude[, height]` in degrees and m; optional
-    `heading`, `pitch`, `roll` in rad, `clock`, `survey_<component>` and `scale_<component>` as of `Node`, and extra
-    components as numbers. A header may carry a unit (`heading [deg]`); clock and extras keep theirs. A blank cell
-    leaves its component out; columns `sd_...` (of `write_nodes`) are not read.
+    `heading`, `pitch`, `roll` in rad, `clock`, `time_offset` in s, `survey_<component>` and `scale_<component>` as of
+    `Node`, and extra components as numbers. A header may carry a unit (`heading [deg]`); clock and extras keep theirs.
+    A blank cell leaves its component out; columns `sd_...` (of `write_nodes`) are not read.
 
     Latitude and longitude become metres in a `LocalFrame` about `origin` (latitude, longitude[, height]; the mean of
     the nodes by default), kept as `.frame`. The heading counts from the node's own east, counter-clockwise (a compass
@@ -287,7 +286,7 @@ def _columns(table: Table, cells: pd.DataFrame, units: Mapping[str, str | None])
         default = POSE_UNITS.get(component, "1")
         unit = units[name] or default
         values, there = numbers(table, cells[name], name)
-        if component in (*ANGLES, "position"):
+        if component in POSE_UNITS and component != "clock":
             values = values * factor(table, name, unit, default)
             unit = default
         other = first.setdefault(component, (name, unit))

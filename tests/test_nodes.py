@@ -85,21 +85,23 @@ def csv(tmp_path, text, name="masts.csv"):
     return path
 
 
+def components(**stated):
+    return Node("n", (0, 0), **stated).components
+
+
 def test_columns_in_metres_make_the_nodes_that_a_person_would_write(tmp_path):
-    text = """node,x [km],y,heading [deg],clock [us],survey_position,scale_heading [deg],scale_clock [us],gain
-    01,0.5,20,90,3,0.05,5,2,1.5
-    NA,1,-4,,,,2,,-2
-    """
-    first, second = read_nodes(csv(tmp_path, text.replace("    ", ""))).values()
+    header = "node,x [km],y,heading [deg],clock [us],survey_position,scale_heading [deg],scale_clock [us],gain"
+    text = f"{header},time_offset [ms]\n01,0.5,20,90,3,0.05,5,2,1.5,2\nNA,1,-4,,,,2,,-2,\n"
+    first, second = read_nodes(csv(tmp_path, text)).values()
     assert (first.name, second.name) == ("01", "NA")
     np.testing.assert_array_equal([first.position, second.position], [[500.0, 20.0], [1000.0, -4.0]])
-    assert first.components == {"heading": np.pi / 2, "pitch": 0.0, "roll": 0.0, "clock": 3.0, "gain": 1.5}
+    assert first.components == components(heading=np.pi / 2, clock=3.0, gain=1.5, time_offset=0.002)
     assert first.spread == {
         "position": ("survey", Bias("m", 0.05)),
         "heading": ("scale", Bias("rad", np.deg2rad(5))),
         "clock": ("scale", Bias("us", 2.0)),
     }
-    assert second.components == {"heading": 0.0, "pitch": 0.0, "roll": 0.0, "clock": 0.0, "gain": -2.0}
+    assert second.components == components(gain=-2.0)
     assert second.spread == {"heading": ("scale", Bias("rad", np.deg2rad(2)))}
 
 
