@@ -101,7 +101,7 @@ def _exists(path: Path) -> bool:
         return False
 
 
-def _call(module: ModuleType, path: Path, name: str, *arguments: Any, **options: Any) -> Any:
+def _call(module: ModuleType, path: Path, name: str, /, *arguments: Any, **options: Any) -> Any:
     """Call a function of a model file; its own failures become one sentence."""
     function = getattr(module, name, None)
     if not callable(function):
@@ -252,6 +252,8 @@ def _write(tree: xr.DataTree, out: Path) -> None:
     if (tree["residual"]["weight"] < 1).any():  # some noise has heavy tails
         files.append(out / "outliers.csv")
         _write_csv(outliers(tree), files[2])
+    else:
+        (out / "outliers.csv").unlink(missing_ok=True)  # of an earlier fit
     if _can_plot():
         files.append(_report(tree, out))
     print(f"written: {', '.join(str(path) for path in files)}")
@@ -348,7 +350,7 @@ def parse_values(text: str) -> tuple[str, list[Any]]:
         numbers = [_number(piece) for piece in part.split(":")]
         if len(numbers) == 3 and all(isinstance(number, (int, float)) for number in numbers):
             first, last, step = numbers
-            if not step or (last - first) / step < 0:
+            if not all(np.isfinite(numbers)) or not step or (last - first) / step < 0:
                 raise InputError(f'--set "{text}": the step does not lead from {first} to {last}')
             count = int(np.floor((last - first) / step + 1e-9)) + 1
             found += [round(first + k * step, 12) for k in range(count)]
@@ -380,7 +382,9 @@ def study_command(
 ) -> None:
     """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
     chosen = choose_methods([name.strip() for name in methods.split(",")])
-    grid = dict(parse_values(text) for text in setting)
+    grid: dict[str, list[Any]] = {}
+    for name, values in map(parse_values, setting):
+        grid[name] = grid.get(name, []) + values
     if out is not None:
         _folder(out)
     module = load_model(model)
@@ -394,9 +398,12 @@ def study_command(
     print(table.to_string(index=False, float_format=lambda value: f"{value:.4g}"))
     print(f"{found['status'].size} fits in {time.perf_counter() - began:.1f} s")
     if out is not None:
-        save(xr.DataTree(found), out / "study.nc")
         _write_csv(table, out / "study.csv")
-        print(f"written: {', '.join(str(path) for path in _study_files(found, out))}")
+        try:
+            save(xr.DataTree(found), out / "study.nc")
+            print(f"written: {', '.join(str(path) for path in _study_files(found, out))}")
+        except OSError as error:
+            raise InputError(f"{out} cannot be written: {error.strerror}") from None
 
 
 def _study_files(found: xr.Dataset, out: Path) -> list[Path]:

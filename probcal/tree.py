@@ -51,6 +51,7 @@ class Result:
     seed: int
     approximate: str
     intervals: str
+    settings: str
     status: str
     message: str
     z: np.ndarray  # (M,)
@@ -170,8 +171,8 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         )
     attrs = {
         "method": result.method, "prior": result.prior, "seed": result.seed, "approximate": result.approximate,
-        "intervals": result.intervals, "interval_probability": INTERVAL, "status": result.status,
-        "message": result.message, "data": problem.measurements.table.source,
+        "intervals": result.intervals, "settings": result.settings, "interval_probability": INTERVAL,
+        "status": result.status, "message": result.message, "data": problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
     }  # fmt: skip
     if result.evidence is not None:
