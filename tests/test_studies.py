@@ -92,7 +92,7 @@ ERRORS = [
     (lambda: study(small, {"size": []}, ["ea"]), "give at least one run, one method and one value"),
     (lambda: study(small, {"size": "12"}, ["ea"]), "the values of size are '12'; give a list of values"),
     (lambda: study(small, {"size": 2}, ["ea"]), "the values of size are 2; give a list of values"),
-    (lambda: study(small, {"size": [1, 1]}, ["ea"]), "a value of size is given twice"),
+    (lambda: study(small, {"size": [1, 1]}, ["ea"]), "a value of size is given twice; give every value once"),
     (lambda: study(small, {"size": [(1, 2)]}, ["ea"]), "the values of size must be numbers or texts"),
     (lambda: study(small, {"sd": [1]}, ["ea"]), 'a setting cannot be called "sd"'),
     (lambda: study(small, {}, ["ea"], runs=[1, 1]), "a run is given twice"),
