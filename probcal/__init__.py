@@ -3,7 +3,17 @@
 from probcal import noise, priors, sensors
 from probcal.diagnostics import scores
 from probcal.inference import EA, EM, EMEA, MAP, fit, track
-from probcal.motion import ConstantVelocity, Motion, RandomWalk, Static, Target, White
+from probcal.motion import (
+    ConstantAcceleration,
+    ConstantVelocity,
+    CoordinatedTurn,
+    Known,
+    Motion,
+    RandomWalk,
+    Static,
+    Target,
+    White,
+)
 from probcal.network import Network, Node, Path
 from probcal.noise import Bernoulli, StudentT, Unknown
 from probcal.priors import ARD, Flat
@@ -15,8 +25,9 @@ from probcal.tree import load, save, summary
 from probcal.types import FitError, InputError
 
 __all__ = [
-    "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantVelocity", "FitError", "Flat",
-    "InputError", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation",
-    "Static", "StudentT", "Target", "Truth", "Unknown", "White", "fit", "load", "noise", "priors", "read_table",
-    "save", "scores", "sensor", "sensors", "simulate", "summary", "track",
+    "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantAcceleration", "ConstantVelocity",
+    "CoordinatedTurn", "FitError", "Flat", "InputError", "Known", "Motion", "Network", "Node", "Path", "Problem",
+    "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown", "White",
+    "fit", "load", "noise", "priors", "read_table", "save", "scores", "sensor", "sensors", "simulate", "summary",
+    "track",
 ]  # fmt: skip

@@ -26,6 +26,11 @@ def elevation(line: Any) -> jax.Array:
     return bearing(jnp.stack([norm(line[:2]), line[2]]))
 
 
+def slopes(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Derivative (T, d) of values (T, d) at times (T,) by differences; zero for a single time."""
+    return np.gradient(values, time, axis=0) if len(time) > 1 else np.zeros_like(values)
+
+
 def wrap(angle: Any, period: float = 2 * np.pi) -> jax.Array:
     """The angle shifted by whole periods into [-period/2, period/2]."""
     return angle - period * jnp.round(angle / period)

@@ -6,44 +6,58 @@ from typing import Any
 
 import numpy as np
 
-from probcal.sensor import Bias, Sensor, SensorType
+from probcal.geometry import slopes
+from probcal.sensor import VECTORS, Bias, Sensor, SensorType
 from probcal.types import AXES, InputError, nearest
 
-POSE_UNITS = {"position": "m", "heading": "rad", "pitch": "rad", "roll": "rad", "clock": "m"}
+POSE_UNITS = {"position": "m", "heading": "rad", "pitch": "rad", "roll": "rad", "clock": "m", "time_offset": "s"}
+ANGLES = ("heading", "pitch", "roll")
 Spread = float | Bias
 
 
 @dataclass(frozen=True)
 class Path:
-    """Known path of a moving node: times (T,) in s, positions (T, d) in m, headings (T,) in rad (interpolated)."""
+    """Known path of a moving node, interpolated: times (T,) in s, positions (T, d) in m, angles (T,) in rad."""
 
     time: Any
     position: Any
     heading: Any = None
+    pitch: Any = None
+    roll: Any = None
 
     def __post_init__(self):
         time = np.asarray(self.time, float)
         position = np.asarray(self.position, float)
-        heading = np.zeros(len(time)) if self.heading is None else np.unwrap(np.asarray(self.heading, float))
-        if time.ndim != 1 or position.shape[:1] != time.shape or position.ndim != 2 or heading.shape != time.shape:
-            raise InputError("Path: time has shape (T,), position (T, 2 or 3), heading (T,)")
-        if not (np.isfinite(time).all() and np.isfinite(position).all() and np.isfinite(heading).all()):
+        given = {name: getattr(self, name) for name in ANGLES}
+        angles = {
+            name: np.zeros(len(time)) if value is None else np.unwrap(np.asarray(value, float))
+            for name, value in given.items()
+        }
+        fits = [value.shape == time.shape for value in angles.values()]
+        if time.ndim != 1 or position.shape[:1] != time.shape or position.ndim != 2 or not all(fits):
+            raise InputError("Path: time has shape (T,), position (T, 2 or 3), heading, pitch and roll (T,)")
+        if not all(np.isfinite(value).all() for value in (time, position, *angles.values())):
             raise InputError("Path: time, position and heading must be finite; drop the gaps")
         if not (np.diff(time) > 0).all():
             raise InputError("Path: time must increase")
-        for name, value in (("time", time), ("position", position), ("heading", heading)):
+        for name, value in {"time": time, "position": position, **angles}.items():
             object.__setattr__(self, name, value)
 
-    def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, d) and headings (N,) at times (N,)."""
-        columns = [np.interp(time, self.time, column) for column in self.position.T]
-        return np.stack(columns, -1), np.interp(time, self.time, self.heading)
+    def at(self, time: np.ndarray) -> dict[str, np.ndarray]:
+        """Position and velocity (N, d), heading, pitch and roll (N,) at times (N,)."""
+
+        def between(values: np.ndarray) -> np.ndarray:
+            return np.stack([np.interp(time, self.time, column) for column in values.T], -1)
+
+        moving = {"position": between(self.position), "velocity": between(slopes(self.time, self.position))}
+        return moving | {name: np.interp(time, self.time, getattr(self, name)) for name in ANGLES}
 
 
 class Node:
     """A mast, a box in the grass, a robot: a stated pose and further components (`clock`, ...), some biased.
 
-    position (d,) in m, heading (pitch, roll) in rad, or a known `path`; extras such as `clock=0.0` are numbers.
+    position (d,) in m, heading (pitch, roll) in rad, or a known `path`; extras such as `gain=0.0` are numbers. `clock`
+    is in m (time times speed), `time_offset` in s: the node's rows were measured so much after their stated time.
     `survey` and `scale` give standard deviations by component (a bare number means the position; a `Bias` may
     carry the unit of a clock or an extra): `survey` is how well the stated value is known, `scale` is governed by
     the prior chosen at the fit, neither means known. Raises `InputError` naming node and component.
@@ -68,7 +82,13 @@ class Node:
         if stated.shape not in ((2,), (3,)) or not np.isfinite(stated).all():
             raise InputError(f'node "{name}": position must be 2 or 3 finite numbers, got {position!r}')
         self.position = stated
-        self.components = {"heading": heading, "pitch": 0.0, "roll": 0.0, "clock": 0.0} | components
+        self.components = dict.fromkeys(("heading", "pitch", "roll", "clock", "time_offset"), 0.0) | components
+        self.components["heading"] = heading
+        for vector in set(VECTORS) & set(components):
+            raise InputError(
+                f'node "{name}": {vector} cannot be stated, extras are numbers;'
+                " a moving node takes its velocity from path=Path(...)"
+            )
         for component, stated_value in self.components.items():
             if not np.isfinite(stated_value):
                 raise InputError(f'node "{name}": {component} must be a finite number, got {stated_value!r}')
@@ -144,6 +164,11 @@ class Network:
             if node.dimension != self.dimension:
                 raise InputError(
                     f'node "{node.name}" is {node.dimension}-D, node "{self.nodes[0].name}" {self.dimension}-D'
+                )
+        for kind in self.types:
+            if self.dimension not in kind.dimensions:
+                raise InputError(
+                    f"sensor {kind.name} works in {kind.dimensions[0]}-D only, the network is {self.dimension}-D"
                 )
         self.biases = tuple(self._node_biases() + self._sensor_biases())
         self._check_labels()

@@ -208,8 +208,11 @@ class Problem:
             here, noise = slice(row, row + size), slice(column, column + width)
             F[:, here, here] = transition
             L[:, here, noise] = factor * guess_of(component.std)
-            level[:, noise] = levels.of(component.std, f"motion.{component.names()[-1][0]}_std", "")
-            drift[:, here] = component.mean
+            level[:, noise] = levels.of(component.std, f"motion.{component.driven}_std", "")
+            try:
+                drift[:, here] = component.means(time, d)
+            except InputError as error:
+                raise InputError(f'target "{name}": {error}') from None
             if not component.memoryless:
                 F[0, here, here], drift[0, here] = 0.0, 0.0
                 L[0, here, :], level[0, noise] = 0.0, -1
@@ -226,11 +229,12 @@ class Problem:
         """Start mean and standard deviation of a component: declared, its own, or wide."""
         d, extent = self.network.dimension, self.extent
         duration = float(np.ptp(time)) or 1.0
-        speed = DIFFUSE * extent / duration + guess_of(component.std) * np.sqrt(duration)
+        pace, wander = DIFFUSE * extent / duration, guess_of(component.std) * np.sqrt(duration)
+        bent = component.driven == "acceleration"
         wide = {
             "position": (self.node_positions.mean(0), DIFFUSE * extent),
-            "velocity": (0.0, speed),
-            "acceleration": (0.0, speed / duration),
+            "velocity": (0.0, pace + wander * (duration if bent else 1.0)),
+            "acceleration": (0.0, pace / duration + wander),
         }
         given = wide | component.start() | dict(target.start)
         means, stds = [], []

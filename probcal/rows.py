@@ -5,15 +5,15 @@ Labels stay above; here are a static `Block` (what to compute) and a pytree `Row
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from probcal.motion import view
-from probcal.network import Network, Node
-from probcal.sensor import Channel, SensorType
+from probcal.network import ANGLES, Network, Node
+from probcal.sensor import VECTORS, Channel, SensorType
 from probcal.types import InputError, PoseView, nearest
 
 Layout = tuple[tuple[str, int, int, bool], ...]
@@ -63,20 +63,27 @@ class Linearised(NamedTuple):
 def make_block(network: Network, kind: SensorType, layout: Layout) -> Block:
     """Static part for the sensors of one type; raises `InputError` for a component nobody states."""
     known = {name: (start, stop) for name, start, stop, _ in layout}
-    asked = {name for name in kind.target_components if name in known}
-    missing = sorted(kind.target_components - set(known) - {"velocity", "acceleration"})
+    asked = set(kind.target_components) & set(known)
+    if "at" in kind.target_components:  # extrapolates along what there is
+        asked |= {"velocity", "acceleration"} & set(known)
+    missing = sorted(kind.target_components - set(known) - {"at"})
     if missing:
+        name, vector = missing[0], ", per_axis=True" if missing[0] in VECTORS else ""
+        remedy = {"velocity": "use ConstantVelocity(std)", "acceleration": "use ConstantAcceleration(std)"}
         raise InputError(
-            f"sensor {kind.name} reads target.{missing[0]}, which the motion does not have{nearest(missing[0], known)};"
-            f' add it, as in motion + White("{missing[0]}", unit, std)'
+            f"sensor {kind.name} reads target.{name}, which the motion does not have{nearest(name, known)};"
+            f" {remedy.get(name, f'add it, as in motion + White("{name}", unit, std{vector})')}"
         )
+    for name, _, _, per_axis in layout:
+        if name in asked and name in VECTORS and not per_axis:
+            raise InputError(f"sensor {kind.name} reads target.{name} as a vector; declare it with per_axis=True")
     used = tuple(sorted(i for name in asked for i in range(*known[name])))
     placed = [s for s in network.sensors if s.type is kind]
     extras = tuple(sorted(kind.pose_components - {"position"}))
     for sensor in placed:
         for node in sensor.nodes:
             for name in extras:
-                if name not in node.components:
+                if name != "velocity" and name not in node.components:
                     raise InputError(
                         f'sensor {kind.name} reads pose.{name}, which node "{node.name}" does not have'
                         f"{nearest(name, node.components)}; state it, as in Node(..., {name}=0.0)"
@@ -93,19 +100,18 @@ def make_block(network: Network, kind: SensorType, layout: Layout) -> Block:
 
 def pose_entries(dimension: int, extras: tuple[str, ...]) -> list[tuple[str, int]]:
     """Entries of a pose vector as (component, axis)."""
-    return [("position", axis) for axis in range(dimension)] + [(name, 0) for name in extras]
+    parts = ("position", *extras)
+    return [(name, axis) for name in parts for axis in range(dimension if name in VECTORS else 1)]
 
 
 def pose_vector(node: Node, extras: tuple[str, ...], time: np.ndarray) -> np.ndarray:
-    """Stated pose of a node at times (N,), shape (N, P)."""
-    if node.path is None:
-        position = np.broadcast_to(node.position, (len(time), node.dimension))
-        heading = np.full(len(time), float(node.components["heading"]))
-    else:
-        position, heading = node.path.at(time)
-        heading = heading + node.components["heading"]
-    others = [heading if name == "heading" else np.full(len(time), float(node.components[name])) for name in extras]
-    return np.concatenate([position, *(column[:, None] for column in others)], 1)
+    """Stated pose of a node at times (N,), shape (N, P); angles of a path add to those of the node."""
+    still = {"position": node.position, "velocity": np.zeros(node.dimension)} | node.components
+    stated = {name: np.broadcast_to(value, (len(time), *np.shape(value))) for name, value in still.items()}
+    if node.path is not None:
+        moving = node.path.at(time)
+        stated |= {name: value + stated[name] if name in ANGLES else value for name, value in moving.items()}
+    return np.concatenate([stated[name].reshape(len(time), -1) for name in ("position", *extras)], 1).astype(float)
 
 
 def _local(block: Block, rows: Rows, z: jax.Array) -> jax.Array:
@@ -114,19 +120,22 @@ def _local(block: Block, rows: Rows, z: jax.Array) -> jax.Array:
     return (rows.base + rows.scale * padded[rows.bias])[rows.sensor]
 
 
+def _view(block: Block, pose: jax.Array) -> PoseView:
+    """Read a pose vector (P,) by component name."""
+    parts: dict[str, Any] = dict.fromkeys(ANGLES, 0.0)
+    entries = [name for name, _ in pose_entries(block.dimension, block.extras)]
+    for name in dict.fromkeys(entries):
+        start = entries.index(name)
+        parts[name] = pose[start : start + block.dimension] if name in VECTORS else pose[start]
+    return PoseView("the node", parts)
+
+
 def _one(block: Block, state: jax.Array, pose: jax.Array, local: jax.Array) -> jax.Array:
     """Predicted channels (C,) of one row from its state (n,), poses (nodes, P) and biases (p,)."""
     if block.free:
         where = np.asarray(block.free)
         pose = pose.at[where[:, 0], where[:, 1]].add(local[: len(where)])
-    poses = [
-        PoseView(
-            "the node",
-            {"position": pose[a, : block.dimension], "heading": 0.0, "pitch": 0.0, "roll": 0.0}
-            | {name: pose[a, block.dimension + k] for k, name in enumerate(block.extras)},
-        )
-        for a in range(block.type.arity)
-    ]
+    poses = [_view(block, pose[a]) for a in range(block.type.arity)]
     biases = dict(zip(block.type.biases, local[len(block.free) :], strict=True))
     return block.type.evaluate(view(block.layout, state), poses, biases)
 

@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ import numpy as np
 from probcal.noise import Bernoulli, Family, Gaussian, Level, check_level
 from probcal.types import AXES, InputError, PoseView, TargetView, nearest
 
-VECTORS = ("position", "velocity", "acceleration")
+VECTORS = ("position", "velocity", "acceleration", "moment")  # components with one value an axis
 PERIODS = {"rad": 2 * np.pi, "deg": 360.0}
 
 
@@ -79,8 +80,9 @@ class SensorType:
     channels: Mapping[str, Channel]
     biases: Mapping[str, Bias]
     arity: int
-    target_components: frozenset[str]
+    target_components: frozenset[str]  # what the function reads; "at" where it extrapolates
     pose_components: frozenset[str]
+    dimensions: tuple[int, ...]  # those in which the function works
 
     def on(self, *nodes: Any, name: str | None = None) -> "Sensor":
         """Place a sensor of this type on its node(s); the name defaults to that of the node(s)."""
@@ -120,50 +122,71 @@ class Sensor:
 
 
 class _Probe:
-    """Stands for a target or a pose at decoration: answers any component and records what is asked for."""
+    """Stands for a target or a pose at decoration: answers any component and records what is asked for.
 
-    def __init__(self, dimension: int, asked: set[str]):
+    `strict` answers NumPy vectors, which complain where a jax array clamps the index of an axis it lacks.
+    """
+
+    def __init__(self, dimension: int, asked: set[str], strict: bool = False):
         self._dimension = dimension
         self._asked = asked
+        self._ones = np.ones if strict else jnp.ones
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
         self._asked.add(name)
-        return jnp.ones(self._dimension) if name in VECTORS else jnp.ones(())
+        return self._ones(self._dimension if name in VECTORS else ())
 
     def at(self, dt: Any) -> "_Probe":
-        self._asked |= set(VECTORS)
+        self._asked |= {"position", "at"}
         return self
 
-    def local(self, point: Any) -> jax.Array:
-        self._asked |= {"position", "heading"} | ({"pitch", "roll"} if self._dimension == 3 else set())
-        return point - jnp.ones(self._dimension)
+    def turn(self, vector: Any) -> Any:
+        self._asked |= {"heading"} | ({"pitch", "roll"} if self._dimension == 3 else set())
+        return vector - self._ones(self._dimension)
+
+    def local(self, point: Any) -> Any:
+        self._asked.add("position")
+        return self.turn(point)
 
 
-def _probe(function: Callable, arity: int, biases: Mapping[str, Bias]) -> tuple[Any, set[str], set[str]]:
-    """Call the function on probes in 2-D, then 3-D: its channels and the components it asks for."""
+def _probe(function: Callable, arity: int, biases: Mapping[str, Bias]) -> tuple[Any, set[str], set[str], list[int]]:
+    """Call the function on probes in 2-D, then 3-D: its channels, what it asks for, and where it works."""
     failure: Exception | None = None
     returned: Any = None
     target_asked: set[str] = set()
     pose_asked: set[str] = set()
+    dimensions = []
     for dimension in (2, 3):
         target: set[str] = set()
         pose: set[str] = set()
 
-        def call(dimension: int = dimension, target: set[str] = target, pose: set[str] = pose) -> Any:
-            poses = [_Probe(dimension, pose) for _ in range(arity)]
-            return function(_Probe(dimension, target), *poses, **{name: jnp.ones(()) for name in biases})
+        def call(
+            strict: bool, dimension: int = dimension, target: set[str] = target, pose: set[str] = pose
+        ) -> Mapping[str, Any]:
+            poses = [_Probe(dimension, pose, strict) for _ in range(arity)]
+            return function(_Probe(dimension, target, strict), *poses, **{name: jnp.ones(()) for name in biases})
 
         try:
-            returned = jax.eval_shape(call)
-            target_asked |= target
-            pose_asked |= pose
+            found = jax.eval_shape(partial(call, False))
         except Exception as error:  # whatever the user's function raises is reported with its name
             failure = error
+            continue
+        try:
+            jax.eval_shape(partial(call, True))
+        except IndexError as error:
+            failure = error
+            continue
+        except Exception:  # a function that cannot work on NumPy vectors has passed on those of jax
+            pass
+        returned = found
+        target_asked |= target
+        pose_asked |= pose
+        dimensions.append(dimension)
     if returned is None:
         raise InputError(f"sensor {function.__name__}: the function failed on a trial call: {failure}") from failure
-    return returned, target_asked, pose_asked
+    return returned, target_asked, pose_asked, dimensions
 
 
 def sensor(**channels: Channel) -> Callable[[Callable[..., Mapping[str, Any]]], SensorType]:
@@ -196,7 +219,7 @@ def sensor(**channels: Channel) -> Callable[[Callable[..., Mapping[str, Any]]], 
                 f"sensor {label}: the arguments are (target, pose, *, biases) or (target, pose_a, pose_b, *, biases),"
                 f" found ({', '.join(positional)})"
             )
-        returned, target_asked, pose_asked = _probe(function, arity, biases)
+        returned, target_asked, pose_asked, dimensions = _probe(function, arity, biases)
         if not isinstance(returned, Mapping) or set(returned) != set(channels):
             found = sorted(returned) if isinstance(returned, Mapping) else type(returned).__name__
             wrong = next((n for n in found if n not in channels), None) if isinstance(returned, Mapping) else None
@@ -210,6 +233,7 @@ def sensor(**channels: Channel) -> Callable[[Callable[..., Mapping[str, Any]]], 
             arity=arity,
             target_components=frozenset(target_asked),
             pose_components=frozenset(pose_asked),
+            dimensions=tuple(dimensions),
         )
 
     return declare

@@ -21,7 +21,8 @@ UNITS = {
     "s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6), "ns": ("time", 1e-9), "min": ("time", 60.0),
     "h": ("time", 3600.0), "m/s": ("speed", 1.0), "km/h": ("speed", 1 / 3.6), "Hz": ("frequency", 1.0),
     "kHz": ("frequency", 1e3), "dB": ("level", 1.0), "dBm": ("power level", 1.0), "1": ("ratio", 1.0),
-    "%": ("ratio", 1e-2),
+    "%": ("ratio", 1e-2), "T": ("magnetic field", 1.0), "uT": ("magnetic field", 1e-6),
+    "nT": ("magnetic field", 1e-9),
 }  # fmt: skip
 HEADER = re.compile(r"^\s*(?P<name>[^\[\]]+?)\s*(\[\s*(?P<unit>[^\]]*?)\s*\])?\s*$")
 

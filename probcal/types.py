@@ -72,21 +72,25 @@ class TargetView(View):
 
 
 class PoseView(View):
-    """One node at one instant, already corrected for its biases: position, heading and what it owns."""
+    """One node at one instant, already corrected for its biases: position, velocity, heading and what it owns."""
 
     def local(self, point: Any) -> jax.Array:
-        """Turn a point from the common frame into the node's own axes (x ahead, y left, z up).
+        """A point of the common frame in the node's own axes (x ahead, y left, z up), from the node."""
+        return self.turn(point - self.position)
 
-        Rotation is heading about z, then pitch (nose up), then roll, all in radians; in 2-D heading alone.
+    def turn(self, vector: Any) -> jax.Array:
+        """Turn a vector from the common frame into the node's own axes.
+
+        Rotation is heading about z, then pitch (nose up), then roll (left side up), all in radians; in 2-D heading
+        alone.
         """
-        offset = point - self.position
         c, s = jnp.cos(self.heading), jnp.sin(self.heading)
-        ahead = c * offset[0] + s * offset[1]
-        left = -s * offset[0] + c * offset[1]
-        if offset.shape[0] == 2:
+        ahead = c * vector[0] + s * vector[1]
+        left = -s * vector[0] + c * vector[1]
+        if vector.shape[0] == 2:
             return jnp.stack([ahead, left])
         cp, sp = jnp.cos(self.pitch), jnp.sin(self.pitch)
         cr, sr = jnp.cos(self.roll), jnp.sin(self.roll)
-        forward = cp * ahead + sp * offset[2]
-        above = -sp * ahead + cp * offset[2]
+        forward = cp * ahead + sp * vector[2]
+        above = -sp * ahead + cp * vector[2]
         return jnp.stack([forward, cr * left + sr * above, -sr * left + cr * above])

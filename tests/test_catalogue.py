@@ -9,7 +9,9 @@ from pathlib import Path as File
 
 import jax
 import numpy as np
+import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
 import probcal
 from probcal import (
@@ -17,7 +19,12 @@ from probcal import (
     EM,
     EMEA,
     MAP,
+    Bias,
+    ConstantAcceleration,
     ConstantVelocity,
+    CoordinatedTurn,
+    InputError,
+    Known,
     Network,
     Node,
     Path,
@@ -26,18 +33,30 @@ from probcal import (
     SensorType,
     Static,
     Target,
+    Unknown,
     White,
     fit,
+    rows,
     sensors,
     simulate,
 )
 
+PREDICT = jax.jit(rows.predict, static_argnums=0)
+LINEARISE = jax.jit(rows.linearise, static_argnums=0, static_argnames="expected")
 CV = ConstantVelocity(0.5)
 POWER = RandomWalk("power", "dB", 0.2, (60.0, 5.0))
 EMISSION = White("emission", "m", 200.0)
-EXTRAS = {"toa": EMISSION, "rss": POWER}
-DIMENSIONS = {"ranger": (2, 3), "toa": (2, 3), "tdoa": (2, 3), "doa": (2, 3), "doa_3d": (3,), "radar": (2, 3),
-              "radar_3d": (3,), "rss": (2, 3), "presence": (2, 3), "position": (2, 3)}  # fmt: skip
+MOMENT = RandomWalk("moment", "A m2", 200.0, (0.0, 5000.0), per_axis=True)
+EXTRAS = {"toa": EMISSION, "rss": POWER, "rss_slope": POWER, "sound": POWER, "magnetometer": MOMENT,
+          "magnetometer_3d": MOMENT, "microphone": RandomWalk("sound_power", "dB", 0.2, (60.0, 5.0)),
+          "geophone": RandomWalk("ground_power", "dB", 0.2, (60.0, 5.0))}  # fmt: skip
+DIMENSIONS = {"ranger": (2, 3), "flight_time": (2, 3), "doppler": (2, 3), "toa": (2, 3), "tdoa": (2, 3), "doa": (2, 3),
+              "doa_3d": (3,), "radar": (2, 3), "radar_3d": (3,), "rss": (2, 3), "rss_slope": (2, 3),
+              "rss_difference": (2, 3), "sound": (2, 3), "microphone": (2, 3), "geophone": (2, 3),
+              "magnetometer": (2,), "magnetometer_3d": (3,), "camera": (2, 3), "camera_3d": (3,), "presence": (2, 3),
+              "position": (2, 3), "cross_track": (2, 3), "altitude": (3,)}  # fmt: skip
+# types that see too little of a target by themselves: their nodes carry ranges too
+HELPED = ("doppler", "cross_track", "altitude")
 CASES = [(name, d) for name, dimensions in DIMENSIONS.items() for d in dimensions]
 CORNERS = {
     2: [(0, 0), (60, 0), (60, 60), (0, 60), (30, -10), (75, 30)],
@@ -62,10 +81,19 @@ def path(d, K=25, phase=0.0):
 
 
 def place(kind, d):
-    """A network of one type: two anchored nodes, the others to be calibrated."""
-    own = {"position": 1.0} | ({"heading": 0.05} if "heading" in kind.pose_components else {})
-    own |= {"clock": 2.0} if "clock" in kind.pose_components else {}
-    nodes = [Node(f"node_{k}", p, scale=own if k >= 2 else None) for k, p in enumerate(CORNERS[d])]
+    """A network of one type: two anchored nodes, the others to be calibrated; all look at the middle."""
+    scale = {"heading": 0.05, "clock": 2.0, "gain": Bias("dB", 3.0), "time_offset": 0.3}
+    own = {"position": 1.0} | {name: value for name, value in scale.items() if name in kind.pose_components}
+    if d == 3 and "pitch" in kind.pose_components:
+        own |= {"pitch": 0.03, "roll": 0.03}
+    ahead = [np.arctan2(30 - p[1], 30 - p[0]) for p in CORNERS[d]]
+    nodes = [
+        Node(f"node_{k}", p, heading, gain=0.0, scale=own if k >= 2 else None)
+        for k, (p, heading) in enumerate(zip(CORNERS[d], ahead, strict=True))
+    ]
+    if kind.name in HELPED:
+        rangers = [sensors.ranger.on(node, name=f"{node.name}_range") for node in nodes]
+        return Network([*rangers, *(kind.on(node) for node in nodes)])
     if kind.arity == 2:
         return Network([kind.on(nodes[0], node) for node in nodes[1:]])
     return Network([kind.on(node) for node in nodes])
@@ -162,6 +190,9 @@ MOTIONS = [
     (White("position", "m", 50.0, mean=30.0, per_axis=True), 2),
     (CV + White("emission", "m", 100.0), 3),
     (CV + POWER, 2),
+    (ConstantAcceleration(0.1), 3),
+    (ConstantAcceleration(0.5, singular=True), 2),
+    (CoordinatedTurn(0.5, 0.1), 3),
 ]
 
 
@@ -174,6 +205,123 @@ def test_every_motion_tracks(motion, d):
     check_tree(tree, problem)
     # six ranges of std 1 m from 60 m around: about 1 m in the plane, 3 m upwards without a motion to help
     assert probcal.scores(tree, run.truth)["position_rmse_after"] < 5.0
+
+
+def frame(d, K=25):
+    """A true path as a table with columns time, position_x, ..."""
+    return pd.DataFrame(path(d, K), columns=[f"position_{axis}" for axis in "xyz"[:d]]).assign(time=np.arange(float(K)))
+
+
+@pytest.mark.parametrize(("d", "std"), [(2, 0.0), (3, 4.0), (2, Unknown(1.0))], ids=str)
+def test_a_known_track_calibrates(d, std):
+    """A reported target, one known at one instant only and a free one share a recursion; the biases are found."""
+    network = place(sensors.ranger, d)
+    tap = Known((np.array([3.0]), path(d)[3:4]))
+    drawn = {"plane": Known(frame(d), 4.0 if std else 0.0), "tap": tap, "car": CV}
+    seen = {"plane": np.arange(25.0), "tap": [3.0], "car": np.arange(25.0)}
+    plan = [(t, node.name, target) for target, times in seen.items() for t in times for node in network.nodes]
+    schedule = pd.DataFrame(plan, columns=["time", "sensor", "target"])
+    tracks = {"car": path(d, phase=2.0)}
+    run = simulate(network, drawn, np.arange(25.0), 4, share=0.5, tracks=tracks, schedule=schedule)
+    problem = Problem(network, drawn | {"plane": Known(frame(d), std)}, run.table)
+    assert len(problem.epochs) == 1
+    tree = fit(problem, MAP(), predictive_draws=False)
+    check_tree(tree, problem)
+    track = tree["track"].to_dataset()
+    mine = track["epoch_target"].values == "plane"
+    axes = [f"position_{axis}" for axis in "xyz"[:d]]
+    error = track["mean"].sel(component=axes).values[mine] - run.truth.positions(
+        track["epoch_time"].values[mine], track["epoch_target"].values[mine], d
+    )
+    # exact, or better than the report: an error of 3 m is far from the 4 m reported by six ranges of 1 m an epoch
+    assert np.abs(error).max() == 0 if std == 0.0 else np.sqrt(np.mean(error**2)) < 3.0
+    z = np.array([run.truth.biases[label] for label in problem.labels])
+    score = (tree["calibration"]["mean"].values - z) / tree["calibration"]["sd"].values
+    assert np.mean(score**2) < 2.0  # as in test_every_sensor_simulates_and_fits
+    if isinstance(std, Unknown):
+        found = tree["level"].to_dataset()["std"].sel(level="motion.position_std")
+        assert 2.8 < float(found) < 5.2  # 50 values: three standard errors from 4.0
+
+
+def test_a_known_track_is_interpolated_and_needs_no_other_motion():
+    """Reported velocities count; a clock bias moves the target along them."""
+    track = pd.DataFrame({"time": [0.0, 10.0], "position_x": [0.0, 30.0], "position_y": 5.0, "velocity_x": [3.0, 5.0],
+                          "velocity_y": 0.0})  # fmt: skip
+    known = Known(track, 2.0) + White("emission", "m", 1e3)
+    assert known.labels(2) == ("position_x", "position_y", "velocity_x", "velocity_y", "emission")
+    np.testing.assert_allclose(known.components[0].means(np.array([5.0]), 2), [[15.0, 5.0, 4.0, 0.0]])
+    np.testing.assert_allclose(
+        Known((track["time"], track[["position_x", "position_y"]])).means(np.array([5.0]), 2), [[15.0, 5.0, 3.0, 0.0]]
+    )
+
+
+TRACK = frame(2, 4)
+
+
+@pytest.mark.parametrize(
+    ("declare", "text"),
+    [
+        (lambda: Known(TRACK, -1.0), "Known: std is -1: it must be positive"),
+        (lambda: Known(TRACK.drop(columns="position_y")), 'Known: the track has no column "position_y"; did you mean'),
+        (lambda: Known(TRACK.assign(velocity_x=0.0)), 'Known: the track has no column "velocity_y"; did you mean'),
+        (lambda: Known(TRACK.assign(position_x="here")), "Known: the columns time, position_x, position_y of"),
+        (lambda: Known(TRACK[::-1]), "Known: time must increase; give one track a target, sorted by time"),
+        (lambda: Known(TRACK.assign(position_x=np.nan)), "Known: time, position and velocity must be finite; drop the"),
+        (lambda: Known("walk.csv"), "Known: give a DataFrame with the columns time, position_x, position_y, or a pair"),
+        (lambda: Known((np.arange(3), np.zeros((2, 2)))), r"Known: time has shape \(3,\) and position \(2, 2\); give"),
+        (lambda: Target(Known(TRACK), {"position": (0.0, 1.0)}), 'Target start: "position" is drawn anew at every'),
+        (lambda: CoordinatedTurn(1.0, np.nan), "CoordinatedTurn: rate is nan: give a finite number in rad/s"),
+        (lambda: CoordinatedTurn(-1.0, 0.1), "CoordinatedTurn: std is -1: it must be positive"),
+        (lambda: ConstantAcceleration("much"), "ConstantAcceleration: std is 'much': give a number or Unknown"),
+        (lambda: tracked(Known(TRACK)), 'target "target": time 4 is outside its known track, which runs from 0 to 3;'),
+        (lambda: tracked(Known(frame(3))), 'target "target": the known track is 3-D, the network 2-D'),
+    ],
+)  # fmt: skip
+def test_a_wrong_motion_says_what_to_do(declare, text):
+    with pytest.raises(InputError, match=text):
+        declare()
+
+
+def tracked(motion):
+    """A problem with five epochs, 0 to 4 s."""
+    return simulate(place(sensors.ranger, 2), {"target": motion}, np.arange(5.0))
+
+
+@pytest.mark.parametrize(
+    ("declare", "text"),
+    [
+        (lambda: Node("a", (0, 0), velocity=1.0), 'node "a": velocity cannot be stated, extras are numbers; a moving'),
+        (
+            lambda: Path([0, 1], [(0, 0), (1, 1)], pitch=[0.0]),
+            r"Path: time has shape \(T,\), position .* pitch and roll",
+        ),
+        (lambda: place(sensors.doa_3d, 2), "sensor doa_3d works in 3-D only, the network is 2-D"),
+        (lambda: place(sensors.altitude, 2), "sensor altitude works in 3-D only, the network is 2-D"),
+        (lambda: place(sensors.magnetometer, 3), "sensor magnetometer works in 2-D only, the network is 3-D"),
+        (lambda: seen(sensors.doppler, Static()), "reads target.velocity, .* use ConstantVelocity"),
+        (
+            lambda: seen(sensors.magnetometer, CV),
+            r'add it, as in motion \+ White\("moment", unit, std, per_axis=True\)',
+        ),
+        (
+            lambda: seen(sensors.magnetometer, CV + White("moment", "A m2", 1.0)),
+            "target.moment as a vector; declare it",
+        ),
+        (lambda: seen(sensors.rss_difference, CV, gain=False), r'pose.gain, which node "a" does not have.*gain=0.0\)'),
+    ],
+)
+def test_a_sensor_where_it_cannot_work_says_what_to_do(declare, text):
+    with pytest.raises(InputError, match=text):
+        declare()
+
+
+def seen(kind, motion, gain=True):
+    """A problem of one sensor in the plane."""
+    extras = {"gain": 0.0} if gain else {}
+    nodes = [Node(name, (k, 0), **extras) for k, name in enumerate("ab")]
+    channels = dict.fromkeys((name for name, _ in kind.expand(2)), 1.0)
+    table = pd.DataFrame({"time": [0.0, 1.0], "sensor": "it", **channels})
+    return Problem(Network([kind.on(*nodes[: kind.arity], name="it")]), motion, table)
 
 
 @pytest.mark.parametrize("file", sorted((File(__file__).parents[1] / "models").glob("*.py")), ids=lambda p: p.stem)
@@ -193,27 +341,231 @@ def test_every_model_file_declares_a_problem(file, monkeypatch):
         assert module.problem(other.table).labels == problem.labels
 
 
-def test_gradients_are_finite_where_a_target_stands_on_a_node():
-    from probcal import rows
+def one_row(kind, nodes, state, time=5.0):
+    """A problem of one sensor called "it" that sees one target at one time, and the state vector."""
+    network = Network([kind.on(*nodes, name="it")])
+    values = dict.fromkeys((name for name, _ in kind.expand(network.dimension)), 1.0)
+    table = pd.DataFrame({"time": [time, time + 1.0], "sensor": "it", **values})
+    motion = CV
+    for name, value in state.items():
+        if name not in ("position", "velocity"):
+            motion = motion + White(name, "1", 1.0, per_axis=np.ndim(value) > 0)
+    problem = Problem(network, motion, table)
+    return problem, np.concatenate([np.ravel(state[name]) for name, *_ in problem.epochs[0].layout])
 
+
+def predicted(kind, nodes, state, biases, time=5.0):
+    """Channels of one row at given biases by label, along the whole path: table, pose, bias, function."""
+    problem, x = one_row(kind, nodes, state, time)
+    assert set(biases) <= set(problem.labels)
+    z = np.array([biases.get(label, 0.0) for label in problem.labels]) / problem.scales
     with jax.enable_x64(True):
-        for name, d in CASES:
-            kind = catalogue()[name]
-            network = place(kind, d)
-            motion = CV + EXTRAS[name] if name in EXTRAS else CV
-            run = simulate(network, motion, np.arange(3.0), 1, tracks={"target": path(d, 3)})
-            problem = Problem(network, motion, run.table)
-            states = np.zeros((3, problem.system.recursions[0].drift.shape[1]))
-            for p in CORNERS[d]:
-                states[:, :d] = p
-                for block, data in zip(problem.spec.blocks, problem.system.rows, strict=True):
-                    z, levels = np.zeros(len(problem.labels)), np.zeros(0)
-                    lin = rows.linearise(
-                        block,
-                        data,
-                        jax.numpy.asarray(states),
-                        jax.numpy.asarray(z),
-                        jax.numpy.asarray(levels),
-                        expected=True,
-                    )
-                    assert all(np.isfinite(np.asarray(part)).all() for part in lin), name
+        block, data = problem.spec.blocks[0], problem.system.rows[0]
+        return np.asarray(PREDICT(block, data, jax.numpy.asarray([x, x]), jax.numpy.asarray(z)))[0]
+
+
+FREE = {"position": 1.0, "heading": 0.1, "clock": 1.0, "gain": Bias("dB", 1.0), "time_offset": 1.0, "pitch": 0.1,
+        "roll": 0.1}  # fmt: skip
+SHIFT = {"a.position_x": 1.0}  # the node stands 1 m east of where it is stated to
+P, V = {2: (33, 44), 3: (33, 44, 20)}, {2: (3, -1), 3: (3, -1, 2)}
+LINE = {d: np.array(P[d]) - (3, 4, -1)[:d] for d in (2, 3)}  # from the node, where it stands, to the target
+FAR = {d: np.linalg.norm(LINE[d]) for d in (2, 3)}  # 50 m in the plane
+AXES = Rotation.from_euler("ZYX", [0.9, -0.25, -0.1])  # heading 0.9, nose up by 0.25, left side down by 0.1
+ROBOT = Path([0, 10], [(0, 0, 0), (20, 10, 4)], heading=[0.0, 0.4], pitch=[0.0, 0.3], roll=[0.1, 0.1])
+CENTIMETRE = 1e-2 * np.eye(3)
+
+
+def node(kind, d, **stated):
+    """The first node, its position and what else the type reads free to be biased."""
+    free = {name: FREE[name] for name in FREE if name in kind.pose_components and (d == 3 or name not in TILT)}
+    return Node("a", (2, 4, -1)[:d], gain=0.5, scale=free, **stated)
+
+
+TILT = ("pitch", "roll")
+
+
+def other(d):
+    """The second node of a pair, 30 m south of the target."""
+    return Node("b", (33, 14, 20)[:d], clock=4.0, gain=0.25)
+
+
+def level(power, exponent, distance):
+    return power - 10 * exponent * np.log10(distance)
+
+
+def angles(line):
+    return [np.arctan2(line[1], line[0]), np.arctan2(line[2], np.hypot(line[0], line[1]))]
+
+
+def dipole(line, moment):
+    """Minus the gradient of the potential 100 m'r / r^3, by central differences."""
+    line, moment = np.append(line, 0.0)[:3], np.append(moment, 0.0)[:3]
+
+    def potential(r):
+        return 100 * moment @ r / np.linalg.norm(r) ** 3
+
+    return [(potential(line - step) - potential(line + step)) / 2e-2 for step in CENTIMETRE]
+
+
+def local(d, heading=0.9):
+    """The line in the node's axes: numpy in the plane, scipy's rotations in space."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, s], [-s, c]]) @ LINE[2] if d == 2 else AXES.inv().apply(LINE[3])
+
+
+STATED = {"heading": 0.8, "pitch": 0.2, "roll": -0.1}
+TURNED = {"a.heading": 0.1, "a.pitch": 0.05}
+FORMULAS = {
+    "ranger": (2, {}, {}, {"it.range_offset": 2.0, "it.range_scale": 0.1}, lambda: [1.1 * 50 + 2]),
+    "flight_time": (3, {"clock": 5.0}, {}, {"a.clock": 1.5, "it.range_offset": 2.0}, lambda: [FAR[3] + 6.5 + 2]),
+    "toa": (2, {"clock": 5.0}, {"emission": 100.0}, {"a.clock": 1.5}, lambda: [50 + 100 + 6.5]),
+    "tdoa": (2, {"clock": 5.0}, {}, {"it.difference_offset": 1.0, "a.clock": 1.5}, lambda: [30 - 50 + 4 - 6.5 + 1]),
+    "doppler": (3, {}, {}, {"it.rate_offset": 0.4}, lambda: [LINE[3] @ V[3] / FAR[3] + 0.4]),
+    "doa": (2, {"heading": 0.2}, {}, {"a.heading": 0.1}, lambda: [np.arctan2(40, 30) - 0.3]),
+    "doa_3d": (3, STATED, {}, TURNED, lambda: angles(local(3))),
+    "radar": (2, {"heading": 0.2}, {}, {"a.heading": 0.1, "it.range_offset": 2.0},
+              lambda: [52, np.arctan2(40, 30) - 0.3]),
+    "radar_3d": (3, STATED, {}, TURNED | {"a.time_offset": 0.5, "it.range_scale": 0.01, "it.range_offset": 2.0},
+                 lambda: [1.01 * np.linalg.norm(LINE[3] + 0.5 * np.array(V[3])) + 2,
+                          *angles(AXES.inv().apply(LINE[3] + 0.5 * np.array(V[3])))]),
+    "rss": (2, {}, {"power": 60.0}, {"it.gain": 1.5, "rss.exponent": 0.5}, lambda: [level(61.5, 2.5, 50)]),
+    "rss_slope": (2, {}, {"power": 60.0}, {"it.gain": 0.1, "rss_slope.exponent": 0.5}, lambda: [level(54, 2.5, 50)]),
+    "rss_difference": (2, {}, {}, {"a.gain": 1.0, "rss_difference.exponent": 0.5},
+                       lambda: [0.25 - 1.5 + level(0, 2.5, 30) - level(0, 2.5, 50)]),
+    "sound": (2, {}, {"power": 100.0}, {"it.gain": 0.05}, lambda: [95 + 10 * np.log10(1 / (4 * np.pi * 50**2))]),
+    "microphone": (3, {}, {"sound_power": 80.0}, {"it.gain": -2.0, "microphone.exponent": 0.1},
+                   lambda: [level(78, 2.7, FAR[3])]),
+    "geophone": (2, {}, {"ground_power": 70.0}, {"it.gain": 1.0, "geophone.exponent": -0.2},
+                 lambda: [level(71, 2.8, 50)]),
+    "magnetometer": (2, {"heading": 0.8}, {"moment": (1e4, 5e3)}, {"a.heading": 0.1, "it.offset_x": 3.0},
+                     lambda: np.add(Rotation.from_euler("z", -0.9).apply(dipole(LINE[2], (1e4, 5e3)))[:2], [3, 0])),
+    "magnetometer_3d": (3, STATED, {"moment": (1e4, 5e3, -8e3)}, TURNED | {"it.offset_y": 3.0, "it.offset_z": -2.0},
+                        lambda: np.add(AXES.inv().apply(dipole(LINE[3], (1e4, 5e3, -8e3))), [0, 3, -2])),
+    "camera": (2, {"heading": 0.8}, {}, {"a.heading": 0.1, "it.focal_scale": 0.02, "it.principal": 0.01},
+               lambda: [1.02 * np.tan(0.9 - np.arctan2(4, 3)) + 0.01]),
+    "camera_3d": (3, STATED, {}, TURNED | {"it.focal_scale": 0.02, "it.principal_column": 0.01},
+                  lambda: 1.02 * -local(3)[1:] / local(3)[0] + [0.01, 0]),
+    "presence": (2, {}, {}, {"it.radius": 1.0, "it.width": 0.5}, lambda: [(11 - 50) / 2.5]),
+    "position": (3, STATED, {}, TURNED, lambda: local(3)),
+    "cross_track": (2, {"heading": 0.8}, {}, {"a.heading": 0.1}, lambda: [40 * np.cos(0.9) - 30 * np.sin(0.9)]),
+    "altitude": (3, {}, {}, {}, lambda: [21.0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DIMENSIONS)
+def test_every_formula_is_that_of_its_source(name):
+    """Values and signs: true = stated + bias in the whole path, against numpy and scipy."""
+    d, stated, extra, biases, expected = FORMULAS[name]
+    kind = catalogue()[name]
+    nodes = [node(kind, d, **stated)] + [other(d)] * (kind.arity - 1)
+    found = predicted(kind, nodes, {"position": P[d], "velocity": V[d]} | extra, SHIFT | biases)
+    np.testing.assert_allclose(found, expected(), rtol=2e-6)
+
+
+def test_a_moving_node_carries_its_velocity_and_its_angles():
+    """At 5 s the robot is at (10, 5, 2) with (2, 1, 0.4) m/s; its own angles add to those of the path."""
+    state = {"position": P[3], "velocity": V[3]}
+    robot = Node("a", heading=0.1, path=ROBOT)
+    line = np.array(P[3]) - (10, 5, 2)
+    rate = line @ (np.array(V[3]) - (2, 1, 0.4)) / np.linalg.norm(line)
+    np.testing.assert_allclose(predicted(sensors.doppler, [robot], state, {}), [rate])
+    axes = Rotation.from_euler("ZYX", [0.3, -0.15, 0.1]).inv()
+    np.testing.assert_allclose(predicted(sensors.doa_3d, [robot], state, {}), angles(axes.apply(line)))
+    late = Node("a", heading=0.1, path=ROBOT, scale={"time_offset": 1.0})  # both have moved on half a second later
+    line = line + 0.5 * (np.array(V[3]) - (2, 1, 0.4))
+    found = predicted(sensors.radar_3d, [late], state, {"a.time_offset": 0.5})
+    np.testing.assert_allclose(found, [np.linalg.norm(line), *angles(axes.apply(line))])
+    assert (Path([5.0], [(10, 5, 2)]).at(np.array([5.0]))["velocity"] == 0).all()
+
+
+def test_a_camera_sees_nothing_behind_it():
+    """The image goes on growing with the angle off the axis, up to exactly behind."""
+    kind, eye = sensors.camera, [Node("a", (0, 0))]
+    turns = np.deg2rad([70, 79.9, 80.1, 100, 179])
+    seen = [
+        predicted(kind, eye, {"position": (9 * np.cos(a), -9 * np.sin(a)), "velocity": (0, 0)}, {})[0] for a in turns
+    ]
+    assert (np.diff(seen) > 0).all()
+    np.testing.assert_allclose(seen[:2], np.tan(turns[:2]))
+    assert seen[3] > 10
+
+
+def test_a_microphone_and_a_geophone_share_the_displacement_of_their_node():
+    nodes = [Node(f"node_{k}", p, scale={"position": 5.0} if k == 3 else None) for k, p in enumerate(CORNERS[2])]
+    network = Network(
+        [sensors.microphone.on(node, name=f"mic_{node.name}") for node in nodes]
+        + [sensors.geophone.on(node, name=f"geo_{node.name}") for node in nodes]
+    )
+    assert [label for label in network.labels if "position" in label] == ["node_3.position_x", "node_3.position_y"]
+    motion = CV + EXTRAS["microphone"] + EXTRAS["geophone"]
+    moved = {"node_3.position_x": 6.0, "node_3.position_y": -4.0}
+    tracks = {"target": path(2)}
+    run = simulate(network, motion, np.arange(25.0), 3, tracks=tracks, biases=moved)
+
+    def sds(table):
+        """Displacement over its sd, and the sd."""
+        problem = Problem(network, motion, table, fix=["*.gain", "*.exponent"])
+        found = fit(problem, MAP(), predictive_draws=False)["calibration"].to_dataset()
+        return (found["mean"].values - list(moved.values())) / found["sd"].values, found["sd"].values
+
+    score, both = sds(run.table)
+    assert np.abs(score).max() < 3.5  # two standard normals: 0.1 % of seeds
+    blank = run.table.copy()
+    blank.loc[blank["sensor"].str.startswith("geo") & (blank.index > 11), "ground_level"] = np.nan
+    assert (both < 0.9 * sds(blank)[1]).all()  # what both hear counts twice
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        ConstantVelocity(2.0),
+        ConstantAcceleration(2.0),
+        CoordinatedTurn(2.0, 0.4),
+        CoordinatedTurn(2.0, -1e-3),
+        CoordinatedTurn(2.0, 0.0),
+        RandomWalk("position", "m", 2.0, (0.0, 1.0), per_axis=True),
+    ],
+    ids=str,
+)
+def test_two_steps_are_one_long_step(motion):
+    """Transition and covariance of 0.7 s and 1.6 s make those of 2.3 s: an epoch without data changes nothing."""
+    d = 3
+    F1, F2, F = motion.transition(np.array([0.7, 1.6, 2.3]), d)
+    Q1, Q2, Q = (L @ L.T for L in motion.noise_factor(np.array([0.7, 1.6, 2.3]), d))
+    np.testing.assert_allclose(F2 @ F1, F, atol=1e-12)
+    np.testing.assert_allclose(F2 @ Q1 @ F2.T + Q2, Q, atol=1e-12)
+
+
+def test_motions_move_as_their_sources_say():
+    T = np.array([2.0])
+    circle = CoordinatedTurn(1.0, 0.3)  # radius v / rate = 20 m about (0, 20)
+    end = circle.transition(T, 3)[0] @ [0, 0, 1, 6, 0, 2]
+    np.testing.assert_allclose(end, [20 * np.sin(0.6), 20 - 20 * np.cos(0.6), 5, 6 * np.cos(0.6), 6 * np.sin(0.6), 2])
+    L = ConstantAcceleration(1.0).noise_factor(T, 2)[0]
+    jerk = np.array([[2**5 / 20, 2**4 / 8, 2**3 / 6], [2**4 / 8, 2**3 / 3, 2**2 / 2], [2**3 / 6, 2**2 / 2, 2]])
+    np.testing.assert_allclose(L @ L.T, np.kron(jerk, np.eye(2)), atol=1e-12)
+    G = ConstantAcceleration(1.0, singular=True).noise_factor(T, 2)[0]
+    np.testing.assert_allclose(G, np.kron([[2.0], [2.0], [1.0]], np.eye(2)))
+    straight = CoordinatedTurn(1.0, 0.0)
+    np.testing.assert_allclose(straight.transition(T, 2), ConstantVelocity(1.0).transition(T, 2))
+    np.testing.assert_allclose(straight.noise_factor(T, 2), ConstantVelocity(1.0).noise_factor(T, 2))
+
+
+def test_gradients_are_finite_where_a_target_stands_on_a_node():
+    """One epoch on every node: beside, before or behind the others."""
+    for name, d in CASES:
+        kind = catalogue()[name]
+        network = place(kind, d)
+        plan = [
+            {"time": float(k), "sensor": placed.name} | dict.fromkeys((c for c, _ in placed.type.expand(d)), 1.0)
+            for k in range(len(CORNERS[d]))
+            for placed in network.sensors
+        ]
+        problem = Problem(network, CV + EXTRAS[name] if name in EXTRAS else CV, pd.DataFrame(plan))
+        states = np.full(problem.system.recursions[0].drift.shape, 60.0)
+        states[:, :d] = CORNERS[d]
+        b = [block.type for block in problem.spec.blocks].index(kind)
+        with jax.enable_x64(True):
+            arrays = (jax.numpy.asarray(states), jax.numpy.zeros(len(problem.labels)), jax.numpy.zeros(0))
+            lin = LINEARISE(problem.spec.blocks[b], problem.system.rows[b], *arrays, expected=True)
+        assert all(np.isfinite(np.asarray(part)).all() for part in lin), name

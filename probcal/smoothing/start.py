@@ -21,6 +21,7 @@ WINDOWS = 60  # at most so many windows a target
 INNER = {2: 24, 3: 10}  # grid points an axis inside the network
 OUTER = {2: 48, 3: 60}  # directions of the outer rings
 RINGS = (0.8, 1.2, 1.8, 2.8, 5.0, 9.0)  # their radii in extents
+NEAR = 0.05  # error of a position found on the grid, in extents
 ROBUST = 4.0  # degrees of freedom of the start's Student-t loss
 
 
@@ -131,6 +132,14 @@ def _path(problem: Problem, time: np.ndarray, loss: np.ndarray, places: np.ndarr
     return np.stack([np.interp(time, centre, column) for column in path.T], -1)
 
 
+def _known(problem: Problem, r: int, span: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean positions (E, d) by the motion alone, and the epochs (E,) where they are better than the grid's."""
+    part, place = problem.system.recursions[r], slice(*span)
+    memory = np.asarray(part.F)[:, place].any((1, 2))
+    std = np.linalg.norm(np.asarray(part.L)[:, place], axis=2).max(1)
+    return np.array(part.drift)[:, place], ~memory & (std < NEAR * problem.extent)
+
+
 @jax.jit
 def _consistent(
     part: Recursion, states: jax.Array, weight: jax.Array, levels: jax.Array
@@ -162,9 +171,11 @@ def automatic_start(problem: Problem, iterations: int = 30) -> Point:
     tracks, precisions = [], []
     for r, epochs in enumerate(problem.epochs):
         span = next((start, stop) for name, start, stop, _ in epochs.layout if name == "position")
-        loss = np.asarray(_losses(problem.spec, problem.system, r, span, jnp.asarray(places)))
-        track = np.zeros((len(epochs.time), span[1] - span[0]))
-        for name in dict.fromkeys(epochs.target):
+        track, known = _known(problem, r, span)
+        unknown = [name for name in dict.fromkeys(epochs.target) if not known[epochs.target == name].all()]
+        if unknown:
+            loss = np.asarray(_losses(problem.spec, problem.system, r, span, jnp.asarray(places)))
+        for name in unknown:
             mine = epochs.target == name
             track[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)
         _, states = _profile(problem.spec, problem.system, r, span, jnp.asarray(track))
@@ -173,7 +184,7 @@ def automatic_start(problem: Problem, iterations: int = 30) -> Point:
         precision = np.where(spread > 0, 1e4 / np.maximum(spread, 1e-300), 1e-9)
         for name, start, stop, _ in epochs.layout:
             if name == "position":
-                precision[:, start:stop] = 1.0 / (0.05 * problem.extent) ** 2
+                precision[:, start:stop] = 1.0 / (NEAR * problem.extent) ** 2
             elif name in ("velocity", "acceleration"):
                 precision[:, start:stop] = 0.0
         tracks.append(states)
