@@ -17,7 +17,8 @@ import pandas as pd
 import pytest
 
 from probcal import ARD, EMEA, ConstantVelocity, Network, Node, Problem, fit
-from probcal.inference.em import _chunk, _State
+from probcal.inference.run import maximise
+from probcal.priors import Precision
 from probcal.sensors import radar
 from probcal.smoothing.information import laplace
 from probcal.smoothing.mode import Point, find_mode
@@ -48,7 +49,7 @@ def network(N, K, seed=0):
 
 def mode_and_marginals(problem, start):
     """Joint MAP and the marginal covariances of all biases."""
-    alpha = jnp.ones(len(problem.labels))
+    alpha = Precision.single(jnp.ones(len(problem.labels)))
     mode = find_mode(problem.spec, problem.system, start, alpha, 50, 1e-5)
     return jax.block_until_ready(laplace(problem.spec, problem.system, mode.point, alpha).covariance)
 
@@ -67,7 +68,7 @@ def test_joint_map_with_all_bias_marginals(benchmark, N, K):
 def test_one_elimination_grows_with_epochs_and_rows(benchmark, K):
     problem, start = network(10, K)
     with jax.enable_x64(True):
-        alpha = jnp.ones(len(problem.labels))
+        alpha = Precision.single(jnp.ones(len(problem.labels)))
         benchmark(lambda: jax.block_until_ready(laplace(problem.spec, problem.system, start, alpha).covariance))
 
 
@@ -75,22 +76,15 @@ def test_fifty_em_ea_iterations_of_c1(benchmark):
     problem, _ = radars.setting(0, 0.3, "C1")
     with jax.enable_x64(True):
         start = automatic_start(problem)
-        alpha, free = jnp.ones(len(problem.labels)), jnp.asarray(problem.surveyed)
-
-        def run():
-            state = _State(start, alpha, jnp.full((), jnp.inf, float), jnp.zeros((), bool))
-            for _ in range(10):  # chunks of 5
-                state, _ = _chunk(problem.spec, ARD(), problem.system, state, free, 0.0, 1)
-            return jax.block_until_ready(state.point.z)
-
-        benchmark(run)
+        method = EMEA(iterations=50)
+        benchmark(lambda: jax.block_until_ready(maximise(method, problem, ARD(), start, None).point.z))
 
 
 def test_one_smoothing_pass_of_c1(benchmark):
     problem, _ = radars.setting(0, 0.3, "C1")
     with jax.enable_x64(True):
         start: Point = track_mode(problem, automatic_start(problem))
-        alpha = jnp.ones(len(problem.labels))
+        alpha = Precision.single(jnp.ones(len(problem.labels)))
         arguments = (problem.spec, problem.system, start, alpha, 1, 0.0)
         benchmark(lambda: jax.block_until_ready(find_mode(*arguments, joint=False).cost))
 

@@ -2,7 +2,7 @@
 
 from probcal import noise, priors, sensors
 from probcal.diagnostics import scores
-from probcal.inference import EA, EM, EMEA, MAP, fit, track
+from probcal.inference import EA, EM, EMEA, MAP, LeastSquares, fit, study, track
 from probcal.motion import (
     ConstantAcceleration,
     ConstantVelocity,
@@ -15,19 +15,19 @@ from probcal.motion import (
     White,
 )
 from probcal.network import Network, Node, Path
-from probcal.noise import Bernoulli, StudentT, Unknown
-from probcal.priors import ARD, Flat
+from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
+from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
 from probcal.problem import Problem
 from probcal.sensor import Bias, Channel, Sensor, SensorType, sensor
 from probcal.simulate import Simulation, Truth, simulate
 from probcal.table import read_table
-from probcal.tree import load, save, summary
+from probcal.tree import load, outliers, save, summary
 from probcal.types import FitError, InputError
 
 __all__ = [
     "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantAcceleration", "ConstantVelocity",
-    "CoordinatedTurn", "FitError", "Flat", "InputError", "Known", "Motion", "Network", "Node", "Path", "Problem",
-    "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown", "White",
-    "fit", "load", "noise", "priors", "read_table", "save", "scores", "sensor", "sensors", "simulate", "summary",
-    "track",
+    "CoordinatedTurn", "FitError", "Flat", "Gaussian", "Horseshoe", "InputError", "Known", "Laplace",
+    "LeastSquares", "Mixture", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType",
+    "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown", "White", "fit", "load", "noise", "outliers",
+    "priors", "read_table", "save", "scores", "sensor", "sensors", "simulate", "study", "summary", "track",
 ]  # fmt: skip

@@ -1,11 +1,14 @@
-"""The command line: simulate, fit, track, report. Bad input ends with exit code 2, a fit that is no answer with 1."""
+"""The command line: simulate, fit, track, study, report.
+
+Bad input ends with exit code 2, a fit that is no answer with 1.
+"""
 
 import importlib.util
 import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -16,14 +19,16 @@ import pandas as pd
 import typer
 import xarray as xr
 from rich.console import Console
+from rich.progress import Progress as RichProgress
 
-from probcal.diagnostics import scores
-from probcal.inference import METHODS, fit, track
+from probcal.diagnostics import grid_of, scores, study_table
+from probcal.inference import METHODS, ORACLE, fit, study, track
 from probcal.inference.run import Progress
+from probcal.inference.study import choose_methods
 from probcal.priors import PRIORS
 from probcal.problem import Problem
 from probcal.simulate import Simulation, Truth, truth_beside
-from probcal.tree import add_scores, load, save, summary
+from probcal.tree import add_scores, load, outliers, save, summary
 from probcal.types import FitError, InputError, nearest
 
 app = typer.Typer(
@@ -76,7 +81,7 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def _call(module: ModuleType, path: Path, name: str, *arguments: Any) -> Any:
+def _call(module: ModuleType, path: Path, name: str, *arguments: Any, **options: Any) -> Any:
     """Call a function of a model file; its own failures become one sentence."""
     function = getattr(module, name, None)
     if not callable(function):
@@ -84,7 +89,7 @@ def _call(module: ModuleType, path: Path, name: str, *arguments: Any) -> Any:
             f"{path.name} defines no {name}(); a model file defines problem(data=None) and, to simulate, scenario(key)"
         )
     try:
-        return function(*arguments)
+        return function(*arguments, **options)
     except (InputError, FitError):
         raise
     except Exception as error:
@@ -164,6 +169,7 @@ def fit_command(
     method: Annotated[str, typer.Option(help=" | ".join(METHODS))] = "ea",
     prior: Annotated[str | None, typer.Option(help=" | ".join(PRIORS) + "; the method's own if left out")] = None,
     fix: Annotated[list[str], typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = [],  # noqa: B006
+    starts: Annotated[int, typer.Option(min=1, help="starts of the search; the best optimum is reported")] = 1,
     seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(help="folder for fit.nc, summary.csv, report.html")] = None,
 ) -> None:
@@ -172,15 +178,15 @@ def fit_command(
         raise InputError(f'--method "{method}" is not known{nearest(method, METHODS)}')
     if prior is not None and prior not in PRIORS:
         raise InputError(f'--prior "{prior}" is not known{nearest(prior, PRIORS)}')
-    kind, implied = METHODS[method]
-    chosen = PRIORS[prior]() if prior is not None else implied
+    value, implied = METHODS[method]
+    chosen = PRIORS[prior] if prior is not None else implied
     if out is not None:
         _folder(out)
     began = time.perf_counter()
     module, problem = _problem(model, data, fix)
     truth = _truth(module, model, data)
     with _progress() as progress:
-        tree = fit(problem, kind(), prior=chosen, key=seed, progress=progress)
+        tree = fit(problem, value, prior=chosen, key=seed, starts=starts, progress=progress)
     tree.attrs["model"] = model.stem
     if truth is not None:
         add_scores(tree, scores(tree, truth), truth.biases)
@@ -199,6 +205,16 @@ def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
     if "level" in tree.children:
         for label, std in tree["level"].to_dataset()["std"].to_series().items():
             print(f"estimated {label} = {std:.4g}")
+    listed = outliers(tree)
+    if len(listed):
+        total = tree["residual"].sizes["datum"]
+        first = listed.iloc[0]
+        print(f"{len(listed)} of {total} data count less than half; the least: row {first['row']}, {first['sensor']}")
+    if "optimum" in tree.children:
+        optima = tree["optimum"].to_dataset()
+        score = optima["log_evidence" if "log_evidence" in optima else "objective"]
+        pairs = zip(optima["start"].values, optima["status"].values, score.values, strict=True)
+        print(f"{score.name} by start: " + ", ".join(f"{k}: {value:.2f} ({status})" for k, status, value in pairs))
     if "position_rmse_after" in attrs:
         print(f"position RMSE before {attrs['position_rmse_before']:.3f} m, after {attrs['position_rmse_after']:.3f} m")
     if attrs["message"]:
@@ -210,8 +226,14 @@ def _write(tree: xr.DataTree, out: Path) -> None:
         save(tree, out / "fit.nc")
     except OSError as error:
         raise InputError(f"{out} cannot be written: {error.strerror}") from None
-    _write_csv(summary(tree), out / "summary.csv")
-    print(f"written: {out / 'fit.nc'}, {out / 'summary.csv'}" + (f", {_report(tree, out)}" if _can_plot() else ""))
+    files = [out / "fit.nc", out / "summary.csv"]
+    _write_csv(summary(tree), files[1])
+    if (tree["residual"]["weight"] < 1).any():  # some noise has heavy tails
+        files.append(out / "outliers.csv")
+        _write_csv(outliers(tree), files[2])
+    if _can_plot():
+        files.append(_report(tree, out))
+    print(f"written: {', '.join(str(path) for path in files)}")
     if not _can_plot():
         print('report.html is left out: pip install "probcal[plot]"')
 
@@ -292,6 +314,87 @@ def track_table(tree: xr.DataTree) -> pd.DataFrame:
             columns[f"{component}_sd"] = group[f"sd{s}"].sel({f"component{s}": component}).values
         parts.append(pd.DataFrame(columns))
     return pd.concat(parts, ignore_index=True)
+
+
+def parse_values(text: str) -> tuple[str, list[Any]]:
+    """`name=a,b,c` or `name=first:last:step` as a name and its values; numbers where they are numbers."""
+    name, equals, values = text.partition("=")
+    parts = [part.strip() for part in values.split(",")]
+    if not equals or not name.strip() or not all(parts):
+        raise InputError(f'--set "{text}": write name=value,value,... or name=first:last:step')
+    found: list[Any] = []
+    for part in parts:
+        numbers = [_number(piece) for piece in part.split(":")]
+        if len(numbers) == 3 and all(isinstance(number, (int, float)) for number in numbers):
+            first, last, step = numbers
+            if not step or (last - first) / step < 0:
+                raise InputError(f'--set "{text}": the step does not lead from {first} to {last}')
+            count = int(np.floor((last - first) / step + 1e-9)) + 1
+            found += [round(first + k * step, 12) for k in range(count)]
+        else:
+            found.append(_number(part))
+    return name.strip(), found
+
+
+def _number(text: str) -> Any:
+    """An integer or a float where the text is one, else the text."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+@app.command(name="study")
+def study_command(
+    model: Model,
+    setting: Annotated[
+        list[str], typer.Option("--set", help="values of an argument of setting(): share=0:1:0.1, scenario=C1,C2")
+    ] = [],  # noqa: B006
+    methods: Annotated[str, typer.Option(help=", ".join([*METHODS, ORACLE]))] = f"ml,em-ea,ea,{ORACLE}",
+    runs: Annotated[int, typer.Option(min=1, help="simulated runs of every setting")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="number of the first run")] = 0,
+    out: Annotated[Path | None, typer.Option(help="folder for study.nc, study.csv, study.png")] = None,
+) -> None:
+    """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
+    chosen = choose_methods([name.strip() for name in methods.split(",")])
+    grid = dict(parse_values(text) for text in setting)
+    if out is not None:
+        _folder(out)
+    module = load_model(model)
+    began = time.perf_counter()
+    with _bar() as advance:
+        found = study(
+            lambda run, **point: _call(module, model, "setting", run, **point),
+            grid, chosen, range(seed, seed + runs), progress=advance,
+        )  # fmt: skip
+    table = study_table(found)
+    print(table.to_string(index=False, float_format=lambda value: f"{value:.4g}"))
+    print(f"{found['status'].size} fits in {time.perf_counter() - began:.1f} s")
+    if out is not None:
+        save(xr.DataTree(found), out / "study.nc")
+        _write_csv(table, out / "study.csv")
+        print(f"written: {', '.join(str(path) for path in _study_files(found, out))}")
+
+
+def _study_files(found: xr.Dataset, out: Path) -> list[Path]:
+    files = [out / "study.nc", out / "study.csv"]
+    if _can_plot() and any(np.issubdtype(found[name].dtype, np.number) for name in grid_of(found)):
+        from probcal.plots import draw_study  # the plot packages are an extra
+
+        draw_study(found, out / "study.png")
+        files.append(out / "study.png")
+    return files
+
+
+@contextmanager
+def _bar() -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on a terminal; nothing where stderr is a file."""
+    console = Console(stderr=True)
+    with RichProgress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("fits", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 @app.command(name="report")

@@ -1,6 +1,7 @@
-"""What a truth says of a saved fit: position error before and after, bias error, coverage."""
+"""What a truth says of a saved fit or study: position error, bias error, coverage."""
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from probcal.simulate import Truth
@@ -38,3 +39,23 @@ def scores(tree: xr.DataTree, truth: Truth) -> dict[str, float]:
             inside = (chosen["lower"].values <= true) & (true <= chosen["upper"].values)
             found |= {"bias_rmse": float(np.sqrt(np.mean(error**2))), "coverage": float(inside.mean())}
     return found
+
+
+def grid_of(study: xr.Dataset) -> list[str]:
+    """Names of the settings of a study."""
+    return [str(name) for name in study["bias_rmse"].dims if name not in ("estimator", "run")]
+
+
+def study_table(study: xr.Dataset) -> pd.DataFrame:
+    """One row a setting and method: mean, sd, median and worst bias error, position error, coverage, statuses."""
+    frame = study[[name for name in study.data_vars if "bias_label" not in study[name].dims]].to_dataframe()
+    groups = frame.reset_index().groupby([*grid_of(study), "estimator"], sort=False)
+    table = groups["bias_rmse"].agg(mean="mean", sd="std", median="median", worst="max")
+    if "position_rmse" in frame:
+        table["position"] = groups["position_rmse"].mean()
+    table["coverage"] = groups["coverage"].mean()
+    table["runs"] = groups.size()
+    for status in ("converged", "not converged", "at bound", "diverged"):
+        frame[status] = frame["status"] == status
+        table[status] = frame.reset_index().groupby([*grid_of(study), "estimator"], sort=False)[status].sum()
+    return table.reset_index().rename(columns={"estimator": "method"}).fillna({"sd": 0.0})

@@ -6,6 +6,8 @@ from jax.scipy.linalg import solve_triangular
 
 UNROLL = 12  # largest matrix whose factors are written out instead of calling LAPACK
 BASE = 16  # largest block that a dense factorisation hands to LAPACK
+RANK = 1e-14  # share of its diagonal below which a pivot counts as zero
+SYMMETRIC = 96  # widest symmetric product that is formed whole
 NARROW = 64  # most columns for which a product is written as a sum: inside a scan a small dot costs more
 
 
@@ -48,6 +50,37 @@ def inverse_cholesky(matrix: jax.Array) -> jax.Array:
         left = left - jnp.where(below > j, pivot[:n], 0.0)[:, None] * pivot[None, :]
         rows.append(pivot[n:])
     return jnp.stack(rows)
+
+
+def semi_cholesky(matrices: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Lower roots (E, n, n) of positive semi-definite matrices of any rank, and the y with root y = right (E, n, m).
+
+    The right-hand sides must lie in the range of the matrices; a pivot that is lost in rounding counts as zero.
+    """
+    n = matrices.shape[-1]
+    least = RANK * jnp.diagonal(matrices, axis1=1, axis2=2)
+    left, rest, columns, solved = matrices, right, [], []
+    for j in range(n):
+        there = left[:, j, j] > least[:, j]
+        root = jnp.sqrt(jnp.where(there, left[:, j, j], 1.0))
+        column = jnp.where((jnp.arange(n) >= j)[None] & there[:, None], left[:, :, j] / root[:, None], 0.0)
+        y = jnp.where(there[:, None], rest[:, j] / root[:, None], 0.0)
+        left = left - column[:, :, None] * column[:, None, :]
+        rest = rest - column[:, :, None] * y[:, None, :]
+        columns.append(column)
+        solved.append(y)
+    return jnp.stack(columns, 2), jnp.stack(solved, 1)
+
+
+def gram(rows: jax.Array, signed: jax.Array) -> jax.Array:
+    """Symmetric product signed' rows of (k, m) rows and the same rows with signs, by halves: one triangle is formed."""
+    m = rows.shape[1]
+    if m <= SYMMETRIC:
+        return signed.T @ rows
+    h = m // 2
+    below = signed[:, h:].T @ rows[:, :h]
+    first, last = gram(rows[:, :h], signed[:, :h]), gram(rows[:, h:], signed[:, h:])
+    return jnp.block([[first, below.T], [below, last]])
 
 
 def factor_and_inverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:

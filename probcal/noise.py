@@ -6,6 +6,7 @@ To add a family, write a frozen dataclass with the methods of `Gaussian`.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import jax
@@ -60,6 +61,7 @@ class Family(Protocol):
     def weight(self, y, predicted, std, period: float | None): ...
     def information(self, predicted, std): ...
     def level_score(self, y, predicted, std, period: float | None): ...
+    def reliance(self, y, predicted, std, period: float | None): ...
     def sample(self, key, predicted, std): ...
     def check(self, y: np.ndarray) -> np.ndarray: ...
 
@@ -99,6 +101,10 @@ class Gaussian(_Location):
         """One plus the derivative of the log density by log std (the mean square of a whitened residual)."""
         return (self.innovation(y, predicted, period) / std) ** 2
 
+    def reliance(self, y, predicted, std, period):
+        """One: every datum counts alike."""
+        return jnp.ones_like(predicted)
+
     def sample(self, key, predicted, std):
         """Draw measured values around the predicted ones."""
         return predicted + std * jax.random.normal(key, predicted.shape, predicted.dtype)
@@ -137,9 +143,90 @@ class StudentT(_Location):
         r2 = self.innovation(y, predicted, period) ** 2
         return self.weight(y, predicted, std, period) * r2
 
+    def reliance(self, y, predicted, std, period):
+        """Weight of each datum over that of one without residual."""
+        return 1.0 / (1.0 + (self.innovation(y, predicted, period) / std) ** 2 / self.df)
+
     def sample(self, key, predicted, std):
         """Draw measured values around the predicted ones."""
         return predicted + std * jax.random.t(key, self.df, predicted.shape, predicted.dtype)
+
+
+@dataclass(frozen=True)
+class Mixture(_Location):
+    """Inliers of standard deviation `std`, and a `share` of echoes: `scale` times wider, `delay` stds later.
+
+    An echo of sound or radio comes late: with a positive `delay` the second component is centred there.
+    """
+
+    share: float = 0.1
+    scale: float = 10.0
+    delay: float = 0.0
+
+    def __post_init__(self):
+        if not 0 < self.share < 1:
+            raise InputError(f"Mixture(share={self.share}): the share of echoes must lie between 0 and 1")
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise InputError(f"Mixture(scale={self.scale}): the scale of echoes must be positive")
+        if not np.isfinite(self.delay) or (self.delay == 0 and self.scale == 1):
+            raise InputError(f"Mixture(scale={self.scale}, delay={self.delay}): an echo must differ from an inlier")
+
+    def _parts(self, r):
+        """Whitened residuals and log densities (without std) of the two components."""
+        late = (r - self.delay) / self.scale
+        inlier = np.log1p(-self.share) - 0.5 * r**2 - 0.5 * np.log(2 * np.pi)
+        echo = np.log(self.share / self.scale) - 0.5 * late**2 - 0.5 * np.log(2 * np.pi)
+        return late, inlier, echo
+
+    def _slopes(self, r):
+        """Probability of an inlier, and the derivative of the negative log density by the whitened residual."""
+        late, inlier, echo = self._parts(r)
+        kept = jax.nn.sigmoid(inlier - echo)
+        return kept, kept * r + (1 - kept) * late / self.scale
+
+    @cached_property
+    def _unit_information(self) -> float:
+        """Expected information at std 1, by the trapezoidal rule."""
+        reach = 12.0 * max(1.0, self.scale) + abs(self.delay)
+        r = np.linspace(-reach, reach, 200_001)
+        late, inlier, echo = self._parts(r)
+        kept = 1.0 / (1.0 + np.exp(np.clip(echo - inlier, -700.0, 700.0)))
+        slope = kept * r + (1 - kept) * late / self.scale
+        return float(np.trapezoid(slope**2 * (np.exp(inlier) + np.exp(echo)), r))
+
+    def log_likelihood(self, y, predicted, std, period):
+        """Log density of each datum."""
+        _, inlier, echo = self._parts(self.innovation(y, predicted, period) / std)
+        return jnp.logaddexp(inlier, echo) - jnp.log(std)
+
+    def score(self, y, predicted, std, period):
+        """Derivative of the log density by the predicted value."""
+        return self._slopes(self.innovation(y, predicted, period) / std)[1] / std
+
+    def weight(self, y, predicted, std, period):
+        """Positive curvature used by a step: that of the two components, each by its probability."""
+        kept = self.reliance(y, predicted, std, period)
+        return (kept + (1 - kept) / self.scale**2) / std**2
+
+    def information(self, predicted, std):
+        """Expected information about the predicted value."""
+        return self._unit_information * jnp.ones_like(predicted) / std**2
+
+    def level_score(self, y, predicted, std, period):
+        """One plus the derivative of the log density by log std."""
+        r = self.innovation(y, predicted, period) / std
+        return r * self._slopes(r)[1]
+
+    def reliance(self, y, predicted, std, period):
+        """Probability that a datum is no echo."""
+        return self._slopes(self.innovation(y, predicted, period) / std)[0]
+
+    def sample(self, key, predicted, std):
+        """Draw measured values around the predicted ones."""
+        pick, size = jax.random.split(key)
+        late = jax.random.uniform(pick, predicted.shape) < self.share
+        normal = jax.random.normal(size, predicted.shape, predicted.dtype)
+        return predicted + std * jnp.where(late, self.delay + self.scale * normal, normal)
 
 
 @dataclass(frozen=True)
@@ -168,6 +255,10 @@ class Bernoulli:
 
     def level_score(self, y, predicted, std, period):
         """There is no level: one, so that nothing is learnt of it."""
+        return jnp.ones_like(predicted)
+
+    def reliance(self, y, predicted, std, period):
+        """One: every datum counts alike."""
         return jnp.ones_like(predicted)
 
     def sample(self, key, predicted, std):

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -98,6 +99,29 @@ def plot_residuals(tree: xr.DataTree, axes: Sequence[Axes] | None = None) -> lis
     return list(axes)
 
 
+def plot_outliers(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw residual/std of every datum over time; crosses in the sensor's colour count less than half."""
+    group = tree["residual"].to_dataset()
+    ax = _axes(ax, 9.0, 3.4)
+    time, ratio = group["time"].values, group["after"].values / group["std"].values
+    weight = group["weight"].values if "weight" in group else np.ones(len(time))
+    out, sensors = weight < 0.5, group["sensor"].values
+    shown = np.flatnonzero(~out)[:: max(1, int((~out).sum()) // ALL_POINTS + 1)]
+    ax.plot(time[shown], ratio[shown], ".", color=BEFORE, markersize=2, rasterized=True, label="inlying")
+    for k, name in enumerate(dict.fromkeys(sensors[out].tolist())):
+        mine = out & (sensors == name)
+        label = _plain(name) if k < 10 else None
+        ax.plot(time[mine], ratio[mine], "x", color=_colour(k), markersize=4, label=label)
+    linear = max(LINEAR, float(np.quantile(np.abs(ratio), 0.9)))
+    if np.abs(ratio).max() > 2 * linear:
+        ax.set_yscale("symlog", linthresh=linear)
+    ax.set(xlabel="time in s", ylabel="residual/std")
+    ax.grid(color="0.9")
+    ax.set_title(f"Residuals over time: {int(out.sum())} of {len(out)} count less than half", loc="left")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
+    return ax
+
+
 def plot_objective(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw the objective over the iterations."""
     ax = _axes(ax, 6.0, 3.4)
@@ -143,6 +167,44 @@ def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     ax.set_title(f"How well the data determine {len(labels)} biases (0 prior only, 1 data only)", loc="left")
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
     return ax
+
+
+def plot_study(study: xr.Dataset, variable: str = "bias_rmse", axes: Sequence[Axes] | None = None) -> list[Axes]:
+    """Draw mean and one sd of a study's errors over its first numeric setting, one axes a value of the others.
+
+    `variable` is `bias_rmse`, `position_rmse` or `coverage`; the upper half of the band is drawn, as in Papers B, C.
+    """
+    grid = [name for name in study[variable].dims if name not in ("estimator", "run")]
+    along = next(name for name in grid if np.issubdtype(study[name].dtype, np.number))
+    others = [name for name in grid if name != along]
+    facets = study[variable].stack(facet=others) if others else study[variable].expand_dims(facet=[()])
+    count = facets.sizes["facet"]
+    if axes is None:
+        figure = Figure(figsize=(1.2 + 4.6 * count, 3.8), layout="constrained")
+        axes = list(figure.subplots(1, count, squeeze=False)[0])
+    for k, ax in enumerate(axes):
+        chosen = facets.isel(facet=k)
+        for m, method in enumerate(study["estimator"].values):
+            values = chosen.sel(estimator=method)
+            mean, sd = values.mean("run").values, values.std("run").values
+            ax.plot(study[along], mean, "o-", color=_colour(m), markersize=3.5, label=_plain(method))
+            ax.fill_between(study[along], mean, mean + sd, color=_colour(m), alpha=0.15, linewidth=0)
+        top = chosen.mean("run").max().item()
+        ax.set(xlabel=_plain(along), ylim=(0.0, 1.25 * top if np.isfinite(top) else None))
+        names = facets["facet"].values[k] if others else ()
+        ax.set_title(", ".join(f"{name} {value}" for name, value in zip(others, np.atleast_1d(names), strict=True)))
+        ax.grid(color="0.9")
+    axes[0].set_ylabel({"bias_rmse": "bias error over its scale (rms)", "position_rmse": "position error in m"}.get(
+        variable, variable))  # fmt: skip
+    axes[-1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
+    return list(axes)
+
+
+def draw_study(study: xr.Dataset, path: str | PathLike[str]) -> None:
+    """Write the picture of a study to a file."""
+    figure = plot_study(study)[0].get_figure(root=True)
+    assert isinstance(figure, Figure)
+    figure.savefig(path, dpi=150)
 
 
 # What all pictures share

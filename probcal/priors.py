@@ -1,49 +1,224 @@
 """Priors of the biases, as data chosen at the fit; every bias is taken as z = bias / scale.
 
-A bias with a `survey` keeps its Gaussian of known standard deviation under every prior.
+A bias with a `survey` keeps its Gaussian of known standard deviation under every prior. Every prior takes
+`correlation`: label patterns with the correlation of the Gaussian biases they match, for survey errors that
+nodes share. Which methods take which prior is the table `inference.fit.TABLE`.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any, ClassVar, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from scipy import stats
 
-from probcal.types import InputError
+from probcal import linalg
+from probcal.types import InputError, nearest
 
 PRECISION_BOUNDS = (1e-2, 1e8)  # of z; a fit with a bias at the lower bound is not an answer
+GROUPS = ("owner", "node", "type", "component")
+Members = Sequence[Mapping[str, str]]  # of each bias: what it belongs to, by the names in GROUPS
+
+
+class Precision(NamedTuple):
+    """Gaussian prior of z with precision diag(alpha) + coupling; `logdet` is the coupling's share of log |.|."""
+
+    alpha: jax.Array  # (M,) precision of each bias alone, 0 where flat
+    coupling: jax.Array  # (M, M) what correlations add to diag(alpha)
+    logdet: jax.Array  # ()
+
+    @staticmethod
+    def single(alpha: jax.Array) -> "Precision":
+        """Independent biases of precisions alpha (M,)."""
+        return Precision(alpha, jnp.zeros((alpha.shape[0], alpha.shape[0])), jnp.zeros(()))
+
+    def matrix(self) -> jax.Array:
+        """The precision matrix (M, M)."""
+        return jnp.diag(self.alpha) + self.coupling
+
+    def pull(self, z: jax.Array) -> jax.Array:
+        """Precision times z, (M,)."""
+        return self.alpha * z + self.coupling @ z
+
+    def square(self, z: jax.Array) -> jax.Array:
+        """z' (precision) z."""
+        return z @ self.pull(z)
+
+    def log_determinant(self) -> jax.Array:
+        """Log determinant, a flat bias counted as one."""
+        return jnp.sum(jnp.log(jnp.where(self.alpha > 0, self.alpha, 1.0))) + self.logdet
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Prior:
+    """What all priors share; `learns` those whose precisions follow the data, `proper` those with an evidence."""
+
+    correlation: Any = ()
+
+    learns: ClassVar[bool] = False
+    proper: ClassVar[bool] = True
+    first: ClassVar[float] = 1.0  # precision to start from
+
+    def __post_init__(self):
+        given = self.correlation.items() if isinstance(self.correlation, Mapping) else self.correlation
+        pairs = tuple((str(pattern), float(value)) for pattern, value in given)
+        for pattern, value in pairs:
+            if not -1 < value < 1:
+                raise InputError(f'correlation "{pattern}" is {value:g}: it must lie between -1 and 1')
+        object.__setattr__(self, "correlation", pairs)
+
+    def precision(self, labels: Sequence[str], surveyed: np.ndarray) -> Precision:
+        """First precision of biases by label; those in `surveyed` (M,) have their own Gaussian."""
+        M = len(labels)
+        matrix, coupled = np.eye(M), np.zeros(M, bool)
+        for pattern, value in self.correlation:
+            members = [m for m, label in enumerate(labels) if fnmatchcase(label, pattern)]
+            if len(members) < 2:
+                raise InputError(f'correlation "{pattern}" reaches {len(members)} bias(es){nearest(pattern, labels)}')
+            for m in members:
+                if not (surveyed[m] or isinstance(self, Gaussian)):
+                    raise InputError(
+                        f'correlation "{pattern}" reaches {labels[m]}, which has no survey: give it one, '
+                        f"or use the prior Gaussian"
+                    )
+                if coupled[m]:
+                    raise InputError(f'correlation "{pattern}" reaches {labels[m]}, which another pattern has taken')
+            coupled[members] = True
+            matrix[np.ix_(members, members)] = np.where(np.eye(len(members)) > 0, 1.0, value)
+            if 1 + (len(members) - 1) * value <= 0:
+                raise InputError(f'correlation "{pattern}" is {value:g}: too negative for {len(members)} biases')
+        alpha = jnp.asarray(np.where(surveyed, 1.0, self.first))
+        inverse, logdet = linalg.inverse_and_logdet(jnp.asarray(matrix))
+        return Precision(alpha, inverse - jnp.eye(M), -logdet)
+
+    def groups(self, members: Members) -> np.ndarray:
+        """Which precision governs each bias, (M,)."""
+        return np.arange(len(members))
+
+    def penalty(self, z: Any, alpha: Any) -> Any:
+        """Negative log density of each z whose precision this prior governs, up to a constant, (M,)."""
+        return 0.5 * alpha * z**2
+
+    def log_density(self, z: np.ndarray, precision: np.ndarray) -> np.ndarray:
+        """Log density of draws z (..., M)."""
+        return stats.norm.logpdf(z, 0.0, 1 / np.sqrt(np.maximum(precision, 1e-300)))
 
 
 @dataclass(frozen=True)
-class Flat:
+class Flat(_Prior):
     """No prior: maximum likelihood."""
 
-
-@dataclass(frozen=True)
-class Gaussian:
-    """Zero-mean Gaussian with the declared scale of each bias as its standard deviation."""
+    proper: ClassVar[bool] = False
+    first: ClassVar[float] = 0.0
 
 
 @dataclass(frozen=True)
-class ARD:
+class Gaussian(_Prior):
+    """Zero-mean Gaussian with the declared scale of each bias as its standard deviation (l2, thesis 4.14a).
+
+    `correlation={"mic_*.position_x": 0.9}` correlates the biases that a pattern matches, surveyed or not.
+    """
+
+
+@dataclass(frozen=True)
+class Laplace(_Prior):
+    """Zero-mean Laplace density with the declared scale as its standard deviation: l1 (thesis 4.14b, lambda 2/beta).
+
+    Its mode is found as a Gaussian scale mixture: precision sqrt(2) / |z|, renewed at every iteration.
+    """
+
+    learns: ClassVar[bool] = True
+    proper: ClassVar[bool] = False  # what Laplace's method gives at a corner is no evidence
+    rate: ClassVar[float] = float(np.sqrt(2.0))
+
+    def learn(self, gamma: jax.Array, variance: jax.Array, z: jax.Array, group: jax.Array, rule: str) -> jax.Array:
+        """Precision of the Gaussian that touches the density at z."""
+        return self.rate / jnp.maximum(jnp.abs(z), 1e-300)
+
+    def penalty(self, z: Any, alpha: Any) -> Any:
+        """Negative log density of each z, up to a constant."""
+        return self.rate * abs(z)
+
+    def log_density(self, z: np.ndarray, precision: np.ndarray) -> np.ndarray:
+        """Log density of draws z (..., M)."""
+        return stats.laplace.logpdf(z, 0.0, 1 / self.rate)
+
+
+@dataclass(frozen=True)
+class ARD(_Prior):
     """Automatic relevance determination: one precision a bias, with a Gamma(shape, rate) hyper-prior.
 
-    The default, shape 1 and rate 0, is the flat hyper-prior of the papers (Paper B 11, Paper C 18).
+    The default, shape 1 and rate 0, is the flat hyper-prior of the papers (Paper B 11, Paper C 18). `by` shares a
+    precision among the biases of one "node", "owner" (sensor or node), sensor "type", or "component" (all headings).
     """
 
     shape: float = 1.0
     rate: float = 0.0
+    by: str | None = None
+
+    learns: ClassVar[bool] = True
 
     def __post_init__(self):
+        super().__post_init__()
         if not (np.isfinite(self.shape) and self.shape > 0 and np.isfinite(self.rate) and self.rate >= 0):
             raise InputError(f"ARD(shape={self.shape}, rate={self.rate}): shape must be positive, rate not negative")
+        if self.by is not None and self.by not in GROUPS:
+            raise InputError(f'ARD(by="{self.by}"): give one of {", ".join(GROUPS)}{nearest(self.by, GROUPS)}')
 
-    def mackay(self, gamma, z):
-        """Precision that solves the evidence equation for a given gamma (Paper B 25)."""
-        return (gamma + 2 * (self.shape - 1)) / (z**2 + 2 * self.rate + 1e-300)
+    def groups(self, members: Members) -> np.ndarray:
+        """Which precision governs each bias, (M,)."""
+        if self.by is None:
+            return np.arange(len(members))
+        names = [member[self.by] for member in members]
+        order = {name: k for k, name in enumerate(dict.fromkeys(names))}
+        return np.array([order[name] for name in names], int)
 
-    def expectation(self, variance, z):
-        """Precision that maximises the expected log prior (Paper C 40)."""
-        return (1 + 2 * (self.shape - 1)) / (z**2 + variance + 2 * self.rate)
+    def learn(self, gamma: jax.Array, variance: jax.Array, z: jax.Array, group: jax.Array, rule: str) -> jax.Array:
+        """New precisions (M,): `mackay` solves gamma = alpha z^2 (Paper B 25), `em` the expectation (Paper C 40)."""
+        M = z.shape[0]
+
+        def total(values: jax.Array) -> jax.Array:
+            return jax.ops.segment_sum(values, group, M)[group]
+
+        if rule == "mackay":
+            return (total(gamma) + 2 * (self.shape - 1)) / (total(z**2) + 2 * self.rate + 1e-300)
+        return (total(jnp.ones(M)) + 2 * (self.shape - 1)) / (total(z**2 + variance) + 2 * self.rate)
 
 
-Prior = Flat | Gaussian | ARD
-PRIORS: dict[str, type[Prior]] = {"flat": Flat, "gaussian": Gaussian, "ard": ARD}
+@dataclass(frozen=True)
+class Horseshoe(_Prior):
+    """Regularised horseshoe, for samplers: half-Cauchy global and local scales, a slab of inverse-Gamma variance.
+
+    `expected` is the share of biases expected to be non-zero, `slab_scale` (in declared scales) and `slab_df` bound
+    the large ones (Piironen, Vehtari 2017).
+    """
+
+    expected: float = 0.2
+    slab_scale: float = 2.0
+    slab_df: float = 4.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 0 < self.expected < 1:
+            raise InputError(f"Horseshoe(expected={self.expected}): the share must lie between 0 and 1")
+        for name in ("slab_scale", "slab_df"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InputError(f"Horseshoe({name}={getattr(self, name)}): it must be positive")
+
+
+Prior = Flat | Gaussian | Laplace | ARD | Horseshoe
+# names on the command line
+PRIORS: dict[str, Prior] = {
+    "flat": Flat(),
+    "gaussian": Gaussian(),
+    "laplace": Laplace(),
+    "ard": ARD(),
+    "ard-node": ARD(by="node"),
+    "ard-owner": ARD(by="owner"),
+    "ard-type": ARD(by="type"),
+    "ard-component": ARD(by="component"),
+    "horseshoe": Horseshoe(),
+}

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from probcal.motion import Motion, Target, as_motion
+from probcal.motion import Motion, Static, Target, White, as_motion
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, Level, Unknown, guess_of
 from probcal.rows import Block, Layout, Rows, make_block, pose_entries, pose_vector
@@ -100,6 +100,37 @@ class Problem:
     def labels(self) -> tuple[str, ...]:
         """Labels of the free biases, in the order of every bias array."""
         return tuple(bias.label for bias in self.biases)
+
+    @property
+    def members(self) -> list[dict[str, str]]:
+        """What each free bias belongs to: its owner, node(s), sensor type(s) and component."""
+        found = []
+        for bias in self.biases:
+            users = [s for s in self.network.sensors if bias.owner in (s.name, s.type.name, *(n.name for n in s.nodes))]
+            nodes = {n.name for s in users for n in s.nodes}
+            node = bias.owner if bias.owner in nodes else "-".join(sorted(nodes))
+            types = "-".join(sorted({s.type.name for s in users}))
+            found.append({"owner": bias.owner, "node": node, "type": types, "component": bias.component})
+        return found
+
+    def unlinked(self) -> "Problem":
+        """The same problem without motion: the state of every epoch is free, but for known and static targets."""
+        names = self.measurements.target_names
+        motion = {name: self._unlinked(self._target(name)) for name in names}
+        return Problem(self.network, motion, self.measurements.table, fix=self.fixed)
+
+    def _unlinked(self, target: Target) -> Motion:
+        """Each component that links epochs replaced by one drawn anew, with a wide start."""
+        free: list[Any] = []
+        starts = {name: pair for c in as_motion(target.motion).components for name, pair in c.start().items()}
+        for component in as_motion(target.motion).components:
+            if component.memoryless or isinstance(component, Static):
+                free.append(component)
+                continue
+            for name, per_axis in component.names():
+                mean, std = starts.get(name, (0.0, DIFFUSE * self.extent))
+                free.append(White(name, "", std, mean, per_axis))
+        return Motion(tuple(free))
 
     @property
     def extent(self) -> float:

@@ -16,9 +16,11 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from probcal import plots
+from probcal.tree import outliers
 
 NONE = "–"  # where there is no finite number
 EXTRA = {"r_hat": "r_hat", "ess_bulk": "ess bulk", "ess_tail": "ess tail", "ess": "ess"}  # of samplers
+LISTED = 20  # outlying data in the table
 COLOURS = {"converged": "good", "not converged": "warn", "at bound": "bad", "diverged": "bad"}
 
 PAGE = """<!DOCTYPE html>
@@ -142,7 +144,7 @@ def _render(tree: xr.DataTree) -> str:
         probability=f"{float(attrs.get('interval_probability', plots.INTERVAL)):.0%}",
         columns=columns,
         rows=rows,
-        tables=[table for table in (_levels(tree), _fixed(tree)) if table],
+        tables=[table for table in (_levels(tree), _fixed(tree), _optima(tree), _outliers(tree)) if table],
         directions=_directions(tree),
         pictures=_pictures(tree),
         versions=_versions(attrs),
@@ -235,6 +237,51 @@ def _fixed(tree: xr.DataTree) -> dict[str, Any] | None:
     }
 
 
+def _optima(tree: xr.DataTree) -> dict[str, Any] | None:
+    """Table of the optima that several starts led to, the reported one first."""
+    if "optimum" not in tree.children:
+        return None
+    group = tree["optimum"].to_dataset()
+    scale = tree["calibration"].to_dataset()["scale"].values
+    apart = np.abs((group["bias"].values - group["bias"].values[0]) / scale).max(1)
+    score = "log_evidence" if "log_evidence" in group else "objective"
+    rows = [
+        [str(start), str(status), _number(value, 7), _number(far)]
+        for start, status, value, far in zip(
+            group["start"].values, group["status"].values, group[score].values, apart, strict=True
+        )
+    ]
+    columns = ["start", "status", score.replace("_", " "), "largest difference, in scales"]
+    return {"title": "Optima of several starts", "columns": columns, "rows": rows}
+
+
+def _weighted(tree: xr.DataTree) -> bool:
+    """Whether some data count less than others."""
+    group = tree["residual"].to_dataset() if "residual" in tree.children else xr.Dataset()
+    return "weight" in group and bool((group["weight"] < 1).any())
+
+
+def _outliers(tree: xr.DataTree) -> dict[str, Any] | None:
+    """Table of the data that count least, where the noise has heavy tails."""
+    if not _weighted(tree) or not len(listed := outliers(tree)):
+        return None
+    names = ["row", "sensor", "target", "channel"]
+    rows = [
+        [*texts, *(_number(value, 6) for value in numbers)]
+        for texts, numbers in zip(
+            listed[names].head(LISTED).astype(str).to_numpy().tolist(),
+            listed[["time", "residual/std", "weight"]].head(LISTED).to_numpy(float),
+            strict=True,
+        )
+    ]
+    count, total = len(listed), tree["residual"].sizes["datum"]
+    title = f"Outlying data: {count} of {total} count less than half" + (
+        f", the first {LISTED}" if count > LISTED else ""
+    )
+    columns = [*names, "time", "residual/std", "weight"]
+    return {"title": title, "columns": columns, "rows": rows}
+
+
 def _directions(tree: xr.DataTree) -> list[str]:
     """Sentences of the weak directions."""
     if "direction" not in tree.children:
@@ -259,6 +306,9 @@ def _pictures(tree: xr.DataTree) -> list[dict[str, str]]:
         ("Objective", "Objective over the iterations", {"optimisation"},
          lambda: plots.plot_objective(tree)),
     ]  # fmt: skip
+    if _weighted(tree):
+        text = "Residuals over time, those that count less than half marked"
+        found.insert(3, ("Residuals over time", text, {"residual"}, lambda: plots.plot_outliers(tree)))
     present = set(tree.children)
     return [
         {"title": title, "alt": alt, "source": _embed(draw())} for title, alt, needs, draw in found if needs <= present

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.geometry import wrap
 from probcal.motion import view
 from probcal.network import ANGLES, Network, Node
 from probcal.sensor import VECTORS, Channel, SensorType
@@ -111,7 +112,8 @@ def pose_vector(node: Node, extras: tuple[str, ...], time: np.ndarray) -> np.nda
     if node.path is not None:
         moving = node.path.at(time)
         stated |= {name: value + stated[name] if name in ANGLES else value for name, value in moving.items()}
-    return np.concatenate([stated[name].reshape(len(time), -1) for name in ("position", *extras)], 1).astype(float)
+    columns = [values[:, None] if (values := stated[name]).ndim == 1 else values for name in ("position", *extras)]
+    return np.concatenate(columns, 1).astype(float)
 
 
 def _local(block: Block, rows: Rows, z: jax.Array) -> jax.Array:
@@ -208,10 +210,29 @@ def linearise(
     jacobian = jax.jacrev if len(block.channels) < inputs else jax.jacfwd
     by_state, by_bias = jax.vmap(jacobian(one, argnums=(0, 3)))(reached[:, used], reached, rows.pose, local)
     predicted = jax.vmap(one)(reached[:, used], reached, rows.pose, local)
-    std = noise_std(rows, levels)
+    score, weight = weigh(block, rows, predicted, noise_std(rows, levels), expected=expected)
+    return Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])
+
+
+def weigh(
+    block: Block, rows: Rows, predicted: jax.Array, std: jax.Array, *, expected: bool
+) -> tuple[jax.Array, jax.Array]:
+    """Score and step weight (or expected information) of every datum, zero where missing, both (N, C)."""
     score = rows.mask * _by_channel(block, "score", rows.y, predicted, std)
     if expected:
-        weight = rows.mask * _by_channel(block, "information", predicted, std, period=False)
-    else:
-        weight = rows.mask * _by_channel(block, "weight", rows.y, predicted, std)
-    return Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])
+        return score, rows.mask * _by_channel(block, "information", predicted, std, period=False)
+    return score, rows.mask * _by_channel(block, "weight", rows.y, predicted, std)
+
+
+def reliance(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
+    """How much each datum counts against one that fits: 1 inlying, towards 0 outlying, (N, C)."""
+    return rows.mask * _by_channel(block, "reliance", rows.y, predicted, noise_std(rows, levels))
+
+
+def difference(block: Block, value: jax.Array, other: jax.Array) -> jax.Array:
+    """Value minus other of the channels on the last axis, wrapped."""
+    parts = [
+        value[..., c] - other[..., c] if channel.period is None else wrap(value[..., c] - other[..., c], channel.period)
+        for c, channel in enumerate(block.channels)
+    ]
+    return jnp.stack(parts, -1)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from scipy import stats
 
@@ -29,6 +30,16 @@ class Tracks:
     mean: np.ndarray
     sd: np.ndarray
     before: np.ndarray
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Of each block (N, C): innovation without and with calibration, noise level, and how much a datum counts."""
+
+    before: Sequence[np.ndarray]
+    after: Sequence[np.ndarray]
+    std: Sequence[np.ndarray]
+    weight: Sequence[np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -53,11 +64,12 @@ class Result:
     levels: np.ndarray  # (H,) log factors
     directions: Sequence[Any]  # name, information, vector, sentence
     draws: np.ndarray  # (chain, draw, M) of z
+    log_prior: np.ndarray | None  # (chain, draw, M) where the biases are independent
     states: Sequence[np.ndarray] | None  # (chain, draw, E, n) of each recursion
     log_likelihood: Sequence[np.ndarray] | None  # (chain, draw, N, C) of each block
     replicas: Sequence[np.ndarray] | None
     tracks: Sequence[Tracks]
-    residuals: tuple[Sequence[np.ndarray], Sequence[np.ndarray], Sequence[np.ndarray]]  # before, after, std
+    residuals: Residuals
 
 
 def _suffix(problem: Problem, r: int) -> str:
@@ -117,8 +129,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         "status": np.array(result.bias_status, str), "unit": np.array([b.unit for b in problem.biases], str),
         "kind": np.array([b.kind for b in problem.biases], str),
     }  # fmt: skip
-    log_prior = stats.norm.logpdf(result.draws, 0.0, 1 / np.sqrt(np.maximum(result.precision, 1e-300)))
-    before, after, std = (_gather(parts, picks) for parts in result.residuals)
+    residual = {name: ("datum", _gather(parts, picks)) for name, parts in vars(result.residuals).items()}
     groups: dict[str, xr.Dataset] = {
         "posterior": xr.Dataset(posterior, coords={**base, "bias_label": z, **track.coords}),
         "calibration": xr.Dataset(
@@ -131,15 +142,13 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         ),
         "track": track,
         "observed_data": xr.Dataset({"y": ("datum", datum["y"])}, coords=coords),
-        "residual": xr.Dataset(
-            {"before": ("datum", before), "after": ("datum", after), "std": ("datum", std)}, coords=coords
-        ),
+        "residual": xr.Dataset(residual, coords=coords),
         "optimisation": xr.Dataset({"objective": ("iteration", result.objective)}),
         "constant_data": _constant(problem),
     }
-    if (result.precision > 0).all():
+    if result.log_prior is not None:
         groups["log_prior"] = xr.Dataset(
-            {"bias": ((*sample, "bias_label"), log_prior)}, coords={**base, "bias_label": z}
+            {"bias": ((*sample, "bias_label"), result.log_prior)}, coords={**base, "bias_label": z}
         )
     for name, parts in (("log_likelihood", result.log_likelihood), ("posterior_predictive", result.replicas)):
         if parts is not None:
@@ -210,6 +219,34 @@ def _constant(problem: Problem) -> xr.Dataset:
         values["fixed"] = ("fixed_label", np.array(list(problem.fixed.values())))
         coords["fixed_label"] = list(problem.fixed)
     return xr.Dataset(values, coords=coords)
+
+
+def add_optima(tree: xr.DataTree, problem: Problem, outcomes: Sequence[Any], best: int) -> xr.DataTree:
+    """Add the optima found from several starts, the reported one first: biases, evidence, objective, status."""
+    order = [best, *(k for k in range(len(outcomes)) if k != best)]
+    chosen = [outcomes[k] for k in order]
+    values: dict[str, Any] = {
+        "bias": (("optimum", "bias_label"), np.stack([np.asarray(o.point.z) * problem.scales for o in chosen])),
+        "objective": ("optimum", np.array([float(o.trace[-1]) for o in chosen])),
+        "status": ("optimum", np.array([o.status for o in chosen])),
+        "start": ("optimum", np.array(order)),
+    }
+    evidence = np.array([float(o.laplace.evidence) for o in chosen])
+    if "log_evidence" in tree.attrs and np.isfinite(evidence).all():
+        values["log_evidence"] = ("optimum", evidence)
+    tree["optimum"] = xr.DataTree(xr.Dataset(values, coords={"bias_label": list(problem.labels)}))
+    return tree
+
+
+def outliers(tree: xr.DataTree, below: float = 0.5) -> pd.DataFrame:
+    """Data that count less than `below` (heavy-tailed noise), the least first: row, time, sensor, residual, weight.
+
+    The weight is that of a Student-t over its largest, or the probability that a datum is no echo of a mixture.
+    """
+    frame = tree["residual"].to_dataset().to_dataframe().reset_index(drop=True)
+    frame["residual/std"] = frame["after"] / frame["std"]
+    columns = ["row", "time", "sensor", "target", "channel", "after", "residual/std", "weight"]
+    return frame[frame["weight"] < below].sort_values("weight", kind="stable")[columns].reset_index(drop=True)
 
 
 def add_scores(tree: xr.DataTree, scores: Mapping[str, float], biases: Mapping[str, float]) -> xr.DataTree:

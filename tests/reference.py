@@ -237,13 +237,15 @@ def log_normal(residual, S):
 def dense(problem, alpha, hold=None):
     """Condition the joint Gaussian of z and all states on all data; `hold` keeps z at a value instead.
 
+    `alpha` are precisions (M,), or a prior covariance (M, M).
+
     Covariances only (no inverse of a prior), so that a singular process noise does not matter.
     """
     M, sizes = len(problem.labels), [len(c.names) * len(c.times) for c in problem.chains]
     total = M + sum(sizes)
     mean, C = np.zeros(total), np.zeros((total, total))
     if hold is None:
-        C[:M, :M] = np.diag(1.0 / np.asarray(alpha))
+        C[:M, :M] = np.diag(1.0 / np.asarray(alpha)) if np.ndim(alpha) == 1 else alpha
     else:
         mean[:M] = hold
     where, offset = [], M

@@ -27,6 +27,7 @@ from probcal import (
     White,
     sensor,
 )
+from probcal.priors import Precision
 from probcal.smoothing.mode import Point, find_mode
 
 TOLERANCE = 1e-10
@@ -260,7 +261,7 @@ def test_iterating_changes_nothing(name):
     """On a linear model one step reaches the mode and thirty leave it there: a datum counts once."""
     _, exact, problem, _ = solved(name)
     with jax.enable_x64(True):
-        alpha = jnp.ones(len(problem.labels))
+        alpha = Precision.single(jnp.ones(len(problem.labels)))
         start = jax.tree.map(jnp.asarray, resting(problem))
         one = find_mode(problem.spec, problem.system, start, alpha, 1, 0.0)
         many = find_mode(problem.spec, problem.system, start, alpha, 30, 0.0)

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 import probcal
 from probcal import Bias, Channel, ConstantVelocity, Network, Node, RandomWalk, Target, White, sensor, sensors
 from probcal.geometry import norm
+from probcal.priors import Precision
 from probcal.smoothing.information import laplace, moments
 from probcal.smoothing.mode import Point, find_mode
 
@@ -157,10 +158,10 @@ def estimate(problem):
             states.append(jnp.asarray(np.array(track)))
         M = len(problem.labels)
         start = Point(tuple(states), tuple(jnp.zeros_like(x) for x in states), jnp.zeros(M), jnp.zeros(0))
-        mode = find_mode(problem.spec, problem.system, start, jnp.ones(M), 500, 1e-11)
+        mode = find_mode(problem.spec, problem.system, start, Precision.single(jnp.ones(M)), 500, 1e-11)
         assert bool(mode.converged)
         point = mode.point
-        found = laplace(problem.spec, problem.system, point, jnp.ones(M))
+        found = laplace(problem.spec, problem.system, point, Precision.single(jnp.ones(M)))
         spread = moments(problem.spec, problem.system, point, found.covariance)
         value, sd = {}, {}
         for x, moment, epochs in zip(point.states, spread, problem.epochs, strict=True):

@@ -1,7 +1,7 @@
-"""Inference: `fit(problem, method)` for every method, `track(problem, calibration)` for other data."""
+"""Inference: `fit(problem, method)` for every method, `track` for other data, `study` over runs."""
 
-from probcal.inference.ea import EA, MAP
-from probcal.inference.em import EM, EMEA
-from probcal.inference.fit import METHODS, Method, fit, track
+from probcal.inference.fit import fit, track
+from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, LeastSquares, Method, table
+from probcal.inference.study import ORACLE, study
 
-__all__ = ["EA", "EM", "EMEA", "MAP", "METHODS", "Method", "fit", "track"]
+__all__ = ["EA", "EM", "EMEA", "MAP", "METHODS", "ORACLE", "LeastSquares", "Method", "fit", "study", "table", "track"]

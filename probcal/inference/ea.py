@@ -1,99 +1,150 @@
-"""Evidence approximation and MAP: the joint Laplace evidence with every trajectory marginalised."""
+"""Joint mode and evidence: EA, MAP and weighted least squares, with every trajectory marginalised."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from probcal.inference.run import CHUNK, Outcome, Progress, finish, first_precisions, run_chunks
-from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Prior
+from probcal.inference.run import Given, State, learn
+from probcal.priors import ARD, Flat, Gaussian, Laplace, Prior
 from probcal.problem import Problem, Spec, System
-from probcal.smoothing.information import Laplace, laplace, update_levels
-from probcal.smoothing.mode import Point, cost, find_mode
+from probcal.smoothing.information import laplace, paper_b, update_levels
+from probcal.smoothing.mode import Point, between, cost, find_mode, track
+from probcal.types import InputError
 
 MODE_STEPS = 30  # Gauss-Newton steps between two updates of the precisions
+RULES = ("mackay", "em")
+TRAJECTORIES = ("exact", "smoothed")
 
 
-class _State(NamedTuple):
-    point: Point
-    alpha: jax.Array  # precisions at which the point is the mode, once done
-    found: Laplace
-    done: jax.Array
+def _iterate(spec: Spec, system: System, prior: Prior, given: Given, state: State, rule: str) -> State:
+    """Mode, evidence at that mode, then new precisions and levels; nothing moves once it is done."""
+    now = given.prior._replace(alpha=state.alpha)
+    mode = find_mode(spec, system, state.point, now, MODE_STEPS, 1e-2 * given.tolerance)
+    found = laplace(spec, system, mode.point, now)
+    objective = found.evidence if prior.proper or not prior.learns else _density(spec, system, prior, given, mode.point)
+    still = jnp.abs(objective - state.objective) < given.tolerance
+    # where a target grazes a sensor the density has a cusp: no step lowers the cost, and none is needed
+    settled = mode.converged | (cost(spec, system, state.point, now) - mode.cost < given.tolerance)
+    point = mode.point
+    done = still & settled if prior.learns or point.levels.shape[0] else mode.converged
+    learnt = learn(prior, given, state.alpha, found.gamma, jnp.diagonal(found.covariance), point.z, rule)
+    alpha = jnp.where(done, state.alpha, learnt)
+    return State(_levels(spec, system, point, found.covariance, done), alpha, found, objective, done)
 
 
-@partial(jax.jit, static_argnames=("spec", "prior"))
-def _chunk(
-    spec: Spec, prior: Prior, system: System, state: _State, surveyed: jax.Array, tolerance: float
-) -> tuple[_State, tuple[jax.Array, jax.Array]]:
-    """A few outer iterations: mode, evidence at that mode, then new precisions and levels; stops when done."""
-
-    def iterate(state: _State) -> _State:
-        mode = find_mode(spec, system, state.point, state.alpha, MODE_STEPS, 1e-2 * tolerance)
-        found = laplace(spec, system, mode.point, state.alpha)
-        still = jnp.abs(found.evidence - state.found.evidence) < tolerance
-        learning = isinstance(prior, ARD) or mode.point.levels.shape[0] > 0
-        # where a target grazes a sensor the density has a cusp: no step lowers the cost, and none is needed
-        settled = mode.converged | (cost(spec, system, state.point, state.alpha) - mode.cost < tolerance)
-        done = still & settled if learning else mode.converged
-        point, alpha = mode.point, state.alpha
-        if isinstance(prior, ARD):
-            learnt = jnp.clip(prior.mackay(found.gamma, point.z), *PRECISION_BOUNDS)
-            alpha = jnp.where(done | surveyed, alpha, learnt)
-        if point.levels.shape[0]:
-            moved = update_levels(spec, system, point, found.covariance)
-            point = jax.tree.map(lambda new, old: jnp.where(done, old, new), moved, point)
-        return _State(point, alpha, found, done)
-
-    def body(state: _State, _: None) -> tuple[_State, tuple[jax.Array, jax.Array]]:
-        after = jax.lax.cond(state.done, lambda s: s, iterate, state)
-        return after, (after.found.evidence, state.done)
-
-    return jax.lax.scan(body, state, length=CHUNK)
+def _density(spec: Spec, system: System, prior: Prior, given: Given, point: Point) -> jax.Array:
+    """Log joint density with the prior's own penalty."""
+    held = given.prior._replace(alpha=jnp.where(given.surveyed, given.prior.alpha, 0.0))
+    penalty = jnp.where(given.surveyed, 0.0, prior.penalty(point.z, 0.0))
+    return -cost(spec, system, point, held) - jnp.sum(penalty)
 
 
-def _maximise(method: "EA | MAP", problem: Problem, prior: Prior, start: Point, progress: Progress | None) -> Outcome:
-    alpha = first_precisions(problem, prior)
-    M = len(problem.labels)
-    blank = Laplace(jnp.zeros((M, M)), jnp.zeros((M, M)), jnp.zeros(M), jnp.full((), -jnp.inf, float))
-    state = _State(start, alpha, blank, jnp.zeros((), bool))
-    surveyed = jnp.asarray(problem.surveyed)
+def _levels(spec: Spec, system: System, point: Point, covariance: jax.Array, done: jax.Array) -> Point:
+    """The point with its unknown noise levels renewed, unless done."""
+    if not point.levels.shape[0]:
+        return point
+    moved = update_levels(spec, system, point, covariance)
+    return between(moved, point, jnp.where(done, 1.0, 0.0))
 
-    def step(state: _State) -> tuple[_State, tuple[jax.Array, jax.Array]]:
-        return _chunk(problem.spec, prior, problem.system, state, surveyed, method.tolerance)
 
-    state, trace = run_chunks(step, state, method.iterations, method.name, progress)
-    return finish(problem, prior, state.point, state.alpha, state.found, bool(state.done), trace)
+def _iterate_paper_b(spec: Spec, system: System, prior: Prior, given: Given, state: State, rule: str) -> State:
+    """Smooth at the current biases, then one update of biases (16)-(17) and precisions (25) of Paper B."""
+    now = given.prior._replace(alpha=state.alpha)
+    point = track(spec, system, state.point)
+    found, step = paper_b(spec, system, point, now)
+    step = jnp.where(jnp.isfinite(step), jnp.clip(step, -1.0, 1.0), 0.0)
+    still = (jnp.abs(found.evidence - state.objective) < given.tolerance) & (jnp.max(jnp.abs(step)) < 1e-3)
+    moved = point._replace(z=point.z + jnp.where(still, 0.0, step))
+    learnt = learn(prior, given, state.alpha, found.gamma, jnp.diagonal(found.covariance), moved.z, rule)
+    alpha = jnp.where(still, state.alpha, learnt)
+    return State(_levels(spec, system, moved, found.covariance, still), alpha, found, found.evidence, still)
 
 
 @dataclass(frozen=True)
 class EA:
-    """Evidence approximation (MacKay updates of Paper B 25, trajectories marginalised exactly): the default.
+    """Evidence approximation with trajectories marginalised exactly: the default.
 
-    `tolerance` is the change of log evidence, in nats, at which it stops; `iterations` caps the outer loop.
+    `update` of the precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed points, slower).
+    `trajectory="smoothed"` is Paper B as printed: the smoothed density of each epoch alone stands for the
+    trajectory (R-bar, 10-17), so that the data count twice. `tolerance` is the change of log evidence, in nats,
+    at which it stops; `iterations` caps the outer loop. Raises `InputError` for another update or trajectory.
     """
 
     iterations: int = 200
     tolerance: float = 1e-3
+    update: str = "mackay"
+    trajectory: str = "exact"
 
     name: ClassVar[str] = "EA"
     priors: ClassVar[tuple[type, ...]] = (ARD,)
-    intervals: ClassVar[str] = (
-        "plug-in: the precisions (and unknown levels) are taken as known, so the intervals are too narrow"
-    )
-    maximise: ClassVar[Callable[..., Outcome]] = _maximise
+
+    def __post_init__(self):
+        for field, known in (("update", RULES), ("trajectory", TRAJECTORIES)):
+            if getattr(self, field) not in known:
+                raise InputError(f'EA({field}="{getattr(self, field)}"): give one of {", ".join(known)}')
+
+    @property
+    def intervals(self) -> str:
+        """What the intervals are worth."""
+        twice = " and the data count twice (Paper B as printed)" if self.trajectory == "smoothed" else ""
+        return (
+            f"plug-in: the precisions (and unknown levels) are taken as known{twice}, so the intervals are too narrow"
+        )
+
+    def prepare(self, problem: Problem) -> Problem:
+        """The problem as it is."""
+        return problem
+
+    def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
+        """Mode (or smoothed trajectory), evidence, new precisions."""
+        step = _iterate if self.trajectory == "exact" else _iterate_paper_b
+        return step(spec, system, prior, given, state, self.update)
+
+    def close(self, spec: Spec, system: System, given: Given, state: State) -> State:
+        """Nothing is left to do."""
+        return state
 
 
 @dataclass(frozen=True)
 class MAP:
-    """Joint mode of trajectories and biases under a given prior (`Flat` is maximum likelihood), Laplace covariance."""
+    """Joint mode of trajectories and biases under a given prior, Laplace covariance.
 
-    iterations: int = 100
+    `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood.
+    """
+
+    iterations: int = 500
     tolerance: float = 1e-6
 
     name: ClassVar[str] = "MAP"
-    priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat)
-    intervals: ClassVar[str] = "Laplace: exact for the given prior where the problem is linear and Gaussian"
-    maximise: ClassVar[Callable[..., Outcome]] = _maximise
+    priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat, Laplace)
+    intervals: ClassVar[str] = "Laplace: exact for a Gaussian or flat prior where the problem is linear and Gaussian"
+
+    def prepare(self, problem: Problem) -> Problem:
+        """The problem as it is."""
+        return problem
+
+    def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
+        """Mode and its covariance."""
+        return _iterate(spec, system, prior, given, state, "mackay")
+
+    def close(self, spec: Spec, system: System, given: Given, state: State) -> State:
+        """Nothing is left to do."""
+        return state
+
+
+@dataclass(frozen=True)
+class LeastSquares(MAP):
+    """Weighted non-linear least squares of biases and target states, without prior or motion (thesis 4.1-4.8).
+
+    Known targets (`Known`) stay known; the state of an unknown target is free at every epoch. Weights are those
+    of the declared noise. Take it where targets are known; `MAP` with `Flat` adds the motion.
+    """
+
+    name: ClassVar[str] = "least squares"
+    priors: ClassVar[tuple[type, ...]] = (Flat,)
+
+    def prepare(self, problem: Problem) -> Problem:
+        """The problem without motion."""
+        return problem.unlinked()

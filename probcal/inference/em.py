@@ -1,122 +1,132 @@
 """Expectation maximisation: EM (ML and MAP) and the double loop EM-EA of Paper C."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from probcal import linalg
-from probcal.inference.run import CHUNK, Outcome, Progress, finish, first_precisions, run_chunks
-from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Prior
+from probcal.inference.run import Given, State, learn
+from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
 from probcal.problem import Problem, Spec, System
+from probcal.smoothing import sigma
 from probcal.smoothing.information import laplace, update_levels
-from probcal.smoothing.mode import Point, cost, find_mode, linearise, of_biases
+from probcal.smoothing.mode import Point, between, cost, eliminate_rows, find_mode, follow, linearise, of_biases
+from probcal.types import InputError
 
 HALVINGS = 8
+LINEARISATIONS = ("extended", "unscented", "cubature")
 
 
-class _State(NamedTuple):
-    point: Point
-    alpha: jax.Array
-    cost: jax.Array
-    done: jax.Array
-
-
-def _maximisation(spec: Spec, system: System, point: Point, alpha: jax.Array) -> tuple[Point, jax.Array]:
-    """M step: biases at the smoothed trajectory (Paper A 21, Paper C 35), shortened while the joint density falls.
-
-    Returns the point and the variances of z at a fixed trajectory (diagonal of Paper C 36).
-    """
-    information, score = of_biases(spec, system, linearise(spec, system, point, expected=False))
-    matrix = information + jnp.diag(alpha + 1e-12)
-    step = linalg.solve_positive(matrix, score - alpha * point.z)
-    step = jnp.where(jnp.isfinite(step), step, 0.0)
-    before = cost(spec, system, point, alpha)
+def _shorten(spec: Spec, system: System, point: Point, proposal: Point, prior: Precision, slack: float) -> Point:
+    """The longest of the halved steps that leaves the cost finite and at most `slack` above the old one."""
+    bound = cost(spec, system, point, prior) + slack
 
     def worse(state):
         t, tries = state
-        return ~(cost(spec, system, point._replace(z=point.z + t * step), alpha) <= before) & (tries < HALVINGS)
+        return ~(cost(spec, system, between(point, proposal, t), prior) <= bound) & (tries < HALVINGS)
 
     t, tries = jax.lax.while_loop(worse, lambda s: (0.5 * s[0], s[1] + 1), (jnp.ones(()), 0))
-    z = point.z + jnp.where(tries < HALVINGS, t, 0.0) * step
-    return point._replace(z=z), linalg.inverse_diagonal(matrix)
+    found = between(point, proposal, jnp.where(tries < HALVINGS, t, 0.0))
+    return jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), found, point)
 
 
-@partial(jax.jit, static_argnames=("spec", "prior", "inner"))
-def _chunk(
-    spec: Spec, prior: Prior, system: System, state: _State, surveyed: jax.Array, tolerance: float, inner: int
-) -> tuple[_State, tuple[jax.Array, jax.Array]]:
-    """A few outer iterations of `inner` E and M steps each, with the update of the precisions (Paper C 40)."""
-
-    def iterate(state: _State) -> _State:
-        point, variance = state.point, jnp.zeros_like(state.alpha)
-        for _ in range(inner):
-            # E step: one damped pass of the extended smoother, linearised at the last trajectory (Paper C, 2c)
-            point = find_mode(spec, system, point, state.alpha, 1, 0.0, joint=False).point
-            point, variance = _maximisation(spec, system, point, state.alpha)
-        alpha = state.alpha
-        if isinstance(prior, ARD):
-            learnt = jnp.clip(prior.expectation(variance, point.z), *PRECISION_BOUNDS)
-            alpha = jnp.where(surveyed, alpha, learnt)
-        if point.levels.shape[0]:
-            point = update_levels(spec, system, point, jnp.diag(variance))
-        value = cost(spec, system, point, alpha) - 0.5 * jnp.sum(jnp.log(jnp.where(alpha > 0, alpha, 1.0)))
-        return _State(point, alpha, value, jnp.abs(value - state.cost) < tolerance)
-
-    def body(state: _State, _: None) -> tuple[_State, tuple[jax.Array, jax.Array]]:
-        after = jax.lax.cond(state.done, lambda s: s, iterate, state)
-        return after, (-after.cost, state.done)
-
-    return jax.lax.scan(body, state, length=CHUNK)
+def _inner(spec: Spec, system: System, point: Point, prior: Precision, rule: str) -> tuple[Point, jax.Array]:
+    """One E and one M step (Paper A 15-21, Paper C 2c and 35); also the variances of z at fixed trajectories (36)."""
+    slack = 0.0
+    if rule == "extended":  # one damped pass of the extended smoother, linearised at the last trajectory
+        point = find_mode(spec, system, point, prior, 1, 0.0, joint=False).point
+        information, score = of_biases(spec, system, linearise(spec, system, point, expected=False))
+    else:
+        spread = sigma.state_covariances(spec, system, point)
+        lins = sigma.regress(spec, system, point, spread, rule)
+        smoothed = follow(
+            system, point, eliminate_rows(spec, system, point, lins, joint=False), jnp.zeros_like(point.z)
+        )
+        # the mean of a density lies off its mode, by half a unit of cost a dimension at most in the Gaussian case
+        slack = 0.5 * sum(u.size for u in point.noises)
+        point = _shorten(spec, system, point, smoothed, prior, slack)
+        spread = sigma.state_covariances(spec, system, point)
+        information, score = sigma.expect_biases(spec, system, point, spread, rule)
+    matrix = information + prior.matrix() + 1e-12 * jnp.eye(spec.biases)
+    step = linalg.solve_positive(matrix, score - prior.pull(point.z))
+    step = jnp.where(jnp.isfinite(step), step, 0.0)
+    return _shorten(spec, system, point, point._replace(z=point.z + step), prior, slack), linalg.inverse_diagonal(
+        matrix
+    )
 
 
-def _maximise(method: "EM | EMEA", problem: Problem, prior: Prior, start: Point, progress: Progress | None) -> Outcome:
-    alpha = first_precisions(problem, prior)
-    state = _State(start, alpha, jnp.full((), jnp.inf, float), jnp.zeros((), bool))
-    surveyed = jnp.asarray(problem.surveyed)
-
-    def step(state: _State) -> tuple[_State, tuple[jax.Array, jax.Array]]:
-        return _chunk(problem.spec, prior, problem.system, state, surveyed, method.tolerance, method.inner)
-
-    state, trace = run_chunks(step, state, method.iterations, method.name, progress)
-    found = laplace(problem.spec, problem.system, state.point, state.alpha)
-    return finish(problem, prior, state.point, state.alpha, found, bool(state.done) or method.tolerance == 0.0, trace)
+def _iterate(
+    spec: Spec, system: System, prior: Prior, given: Given, state: State, inner: int, linearisation: str
+) -> State:
+    """`inner` E and M steps, then the update of the precisions (Paper C 40) and of the levels."""
+    now = given.prior._replace(alpha=state.alpha)
+    point, variance = state.point, jnp.zeros_like(state.alpha)
+    for _ in range(inner):
+        point, variance = _inner(spec, system, point, now, linearisation)
+    alpha = learn(prior, given, state.alpha, jnp.zeros_like(variance), variance, point.z, "em")
+    if point.levels.shape[0]:
+        point = update_levels(spec, system, point, jnp.diag(variance))
+    after = given.prior._replace(alpha=alpha)
+    free = jnp.where(given.surveyed, 0.0, prior.penalty(point.z, alpha) - 0.5 * alpha * point.z**2)
+    value = -cost(spec, system, point, after) - jnp.sum(free)
+    if prior.proper:
+        value = value + 0.5 * after.log_determinant()
+    return State(point, alpha, state.found, value, jnp.abs(value - state.objective) < given.tolerance)
 
 
 @dataclass(frozen=True)
 class EM:
     """Expectation maximisation of the biases: ML with `Flat`, MAP with `Gaussian` (Paper A 15-21, Paper C 27-36).
 
-    It stops when the joint log density changes by less than `tolerance`; 0 runs all `iterations` and counts
-    as converged, as the papers do.
+    `linearisation` of the E-step is "extended" or, by sigma points, "unscented" or "cubature". It stops when the
+    joint log density changes by less than `tolerance`; 0 runs all `iterations` and counts as converged, as the
+    papers do. Raises `InputError` for another linearisation.
     """
 
     iterations: int = 500
     tolerance: float = 1e-5
     inner: int = 1
+    linearisation: str = "extended"
 
     name: ClassVar[str] = "EM"
-    priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat)
-    intervals: ClassVar[str] = "Laplace: exact for the given prior where the problem is linear and Gaussian"
-    maximise: ClassVar[Callable[..., Outcome]] = _maximise
+    priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat, Laplace)
+    intervals: ClassVar[str] = "Laplace: exact for a Gaussian or flat prior where the problem is linear and Gaussian"
+
+    def __post_init__(self):
+        if self.linearisation not in LINEARISATIONS:
+            raise InputError(
+                f'{self.name}(linearisation="{self.linearisation}"): give one of {", ".join(LINEARISATIONS)}'
+            )
+        if self.inner < 1:
+            raise InputError(f"{self.name}(inner={self.inner}): at least one inner iteration is needed")
+
+    def prepare(self, problem: Problem) -> Problem:
+        """The problem as it is."""
+        return problem
+
+    def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
+        """Inner EM steps, then new precisions."""
+        return _iterate(spec, system, prior, given, state, self.inner, self.linearisation)
+
+    def close(self, spec: Spec, system: System, given: Given, state: State) -> State:
+        """Covariance and evidence at the point, trajectories marginalised."""
+        return state._replace(found=laplace(spec, system, state.point, given.prior._replace(alpha=state.alpha)))
 
 
 @dataclass(frozen=True)
-class EMEA:
+class EMEA(EM):
     """The double loop of Paper C (Algorithm 1): `inner` EM steps, then precisions by update (40).
 
-    By default 50 outer iterations are run as in the paper (`tolerance` 0); the reported covariance is
-    marginalised over the trajectories, unlike the paper's (36), whose intervals are narrower still.
+    By default 50 outer iterations are run as in the paper (`tolerance` 0); `linearisation` as in `EM`. The
+    reported covariance is marginalised over the trajectories, unlike the paper's (36), whose intervals are
+    narrower still.
     """
 
     iterations: int = 50
     tolerance: float = 0.0
-    inner: int = 1
 
     name: ClassVar[str] = "EM-EA"
     priors: ClassVar[tuple[type, ...]] = (ARD,)
     intervals: ClassVar[str] = "plug-in: the precisions are taken as known, so the intervals are too narrow"
-    maximise: ClassVar[Callable[..., Outcome]] = _maximise

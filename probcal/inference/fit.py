@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from scipy import stats
 
 from probcal import tree
-from probcal.inference.ea import EA, MAP
-from probcal.inference.em import EM, EMEA
-from probcal.inference.run import Outcome, Progress
-from probcal.priors import PRIORS, Flat, Prior
-from probcal.problem import Problem
+from probcal.inference.methods import EA, Method, choose_prior
+from probcal.inference.run import Outcome, Progress, maximise
+from probcal.priors import Flat, Prior
+from probcal.problem import Problem, Spec, System
 from probcal.simulate import Key, as_key
 from probcal.smoothing.draws import draw, predictive, residuals
 from probcal.smoothing.information import at_levels, moments
@@ -20,26 +20,8 @@ from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start, track_mode
 from probcal.types import FitError, InputError, float64
 
-Method = EA | EMEA | EM | MAP
 CHAINS, DRAWS = 4, 250
-# names on the command line: method, and the prior it means where that is not the method's first
-METHODS: dict[str, tuple[type[Method], Prior | None]] = {
-    "ea": (EA, None),
-    "em-ea": (EMEA, None),
-    "em": (EM, None),
-    "map": (MAP, None),
-    "ml": (MAP, Flat()),
-}
-
-
-def choose_prior(method: Method, prior: Prior | None) -> Prior:
-    """The prior of a fit: the given one if the method takes it, else the method's first."""
-    if prior is None:
-        return method.priors[0]()
-    if not isinstance(prior, method.priors):
-        allowed = ", ".join(name for name, kind in PRIORS.items() if kind in method.priors)
-        raise InputError(f"{method.name} does not take the prior {type(prior).__name__}; it takes: {allowed}")
-    return prior
+SPARSE = 0.3  # share of biases that a further start moves
 
 
 @float64
@@ -50,13 +32,16 @@ def fit(
     prior: Prior | None = None,
     key: Key = 0,
     start: Point | None = None,
+    starts: int = 1,
     progress: Progress | None = None,
     predictive_draws: bool | None = None,
 ) -> xr.DataTree:
     """Calibrate: estimate the biases of a problem and the tracks of its targets.
 
     `method` is a value (`EA()` by default); `prior` defaults to the method's own; `key` is a seed or jax key
-    of the draws; `start` replaces the automatic start. `predictive_draws` forces or forbids the groups of
+    of the draws and of further starts; `start` replaces the automatic start. `starts` runs the method from so many
+    starts, the further ones with a share of the biases drawn from their scales: the best optimum is reported, all
+    of them with their evidence in the group `optimum`. `predictive_draws` forces or forbids the groups of
     draws by datum and of trajectories, by default written up to 2e7 values each. The attributes `status` and
     `message` say what the fit is worth. Raises `InputError` for a prior that the method does not take and
     `FitError` where a flat prior leaves a singular problem without any interval.
@@ -70,20 +55,44 @@ def fit(
     if problem.silent:
         source = problem.measurements.table.source
         raise InputError(f'{source} has no row of sensor "{problem.silent[0]}"; add rows or take it out of the network')
-    start = automatic_start(problem) if start is None else start
-    outcome = method.maximise(problem, prior, start, progress)
+    if starts < 1:
+        raise InputError(f"starts={starts}: at least one start is needed")
+    problem = method.prepare(problem)
+    keys = jax.random.split(as_key(key), 3)
+    first = automatic_start(problem) if start is None else start
+    points = [first, *_further_starts(problem, first, starts - 1, keys[2])]
+    outcomes = [maximise(method, problem, prior, point, progress) for point in points]
+    best = max(range(starts), key=lambda k: _rank(prior, outcomes[k]))
     seed = int(key) if isinstance(key, (int, np.integer)) else -1
-    return tree.build(problem, _result(problem, method, prior, outcome, as_key(key), seed, predictive_draws))
+    tree_ = tree.build(problem, _result(problem, method, prior, outcomes[best], keys, seed, predictive_draws))
+    return tree.add_optima(tree_, problem, outcomes, best) if starts > 1 else tree_
+
+
+def _further_starts(problem: Problem, first: Point, count: int, key: jax.Array) -> list[Point]:
+    """Starts with a share of the biases drawn from their scales, each with the track that suits them."""
+    points = []
+    for k in range(count):
+        pick, size = jax.random.split(jax.random.fold_in(key, k))
+        moved = jax.random.uniform(pick, first.z.shape) < SPARSE
+        z = jnp.where(moved, 2.0 * jax.random.normal(size, first.z.shape), 0.0)
+        points.append(track_mode(problem, first._replace(z=z)))
+    return points
+
+
+def _rank(prior: Prior, outcome: Outcome) -> tuple[bool, bool, float]:
+    """Order of optima: an answer before none, a converged one before others, then evidence (density if flat)."""
+    value = float(outcome.laplace.evidence) if prior.proper else float(outcome.trace[-1])
+    sound = outcome.status not in ("diverged", "at bound") and np.isfinite(value)
+    return sound, outcome.status == "converged", value if np.isfinite(value) else -np.inf
 
 
 def _result(
-    problem: Problem, method: Method, prior: Prior, outcome: Outcome, key: jax.Array, seed: int, wanted: bool | None
+    problem: Problem, method: Method, prior: Prior, outcome: Outcome, keys: jax.Array, seed: int, wanted: bool | None
 ) -> tree.Result:
     spec, system, point = problem.spec, problem.system, outcome.point
     found = outcome.laplace
     if not bool(jnp.isfinite(found.covariance).all()):  # a flat prior on a singular problem: no interval exists
         raise FitError(outcome.message)
-    keys = jax.random.split(key, 2)
     z, states, spread = draw(spec, system, point, found.covariance, keys[0], CHAINS * DRAWS)
     data = sum(int(np.asarray(r.mask).size) for r in system.rows) * CHAINS * DRAWS
     size = sum(s.size for s in states)
@@ -97,20 +106,33 @@ def _result(
     def split(a: jax.Array) -> np.ndarray:
         return np.asarray(a).reshape(*shape, *a.shape[1:])
 
-    old, new = residuals(spec, system, before), residuals(spec, system, point)
+    alpha, draws = np.asarray(outcome.alpha), split(z)
+    own = np.where(problem.surveyed, stats.norm.logpdf(draws), prior.log_density(draws, alpha))
+    independent = not isinstance(prior, Flat) and not prior.correlation
     return tree.Result(
         method=method.name, prior=type(prior).__name__, seed=seed, approximate="Laplace",
         intervals=method.intervals, status=outcome.status, message=outcome.message, z=np.asarray(point.z),
-        covariance=np.asarray(found.covariance), precision=np.asarray(outcome.alpha), gamma=np.asarray(found.gamma),
+        covariance=np.asarray(found.covariance), precision=alpha, gamma=np.asarray(found.gamma),
         bias_status=outcome.bias_status, information=np.asarray(found.information),
-        evidence=None if isinstance(prior, Flat) else float(found.evidence), objective=outcome.trace,
-        levels=np.asarray(point.levels), directions=outcome.weak, draws=split(z),
+        evidence=float(found.evidence) if prior.proper else None, objective=outcome.trace,
+        levels=np.asarray(point.levels), directions=outcome.weak, draws=draws,
+        log_prior=own if independent else None,
         states=[split(s) for s in states] if (size <= tree.LARGEST if wanted is None else wanted) else None,
         log_likelihood=[split(a) for a in log_likelihood] if log_likelihood is not None else None,
         replicas=[split(a) for a in replicas] if replicas is not None else None,
         tracks=_tracks(point, before, spread, found.covariance),
-        residuals=([np.asarray(r) for r, _ in old], [np.asarray(r) for r, _ in new], [np.asarray(s) for _, s in new]),
+        residuals=_residuals(spec, system, before, point),
     )  # fmt: skip
+
+
+def _residuals(spec: Spec, system: System, before: Point, after: Point) -> tree.Residuals:
+    old, new = residuals(spec, system, before), residuals(spec, system, after)
+    return tree.Residuals(
+        before=[np.asarray(r.innovation) for r in old],
+        after=[np.asarray(r.innovation) for r in new],
+        std=[np.asarray(r.std) for r in new],
+        weight=[np.asarray(r.reliance) for r in new],
+    )
 
 
 def _uncalibrated(point: Point) -> Point:

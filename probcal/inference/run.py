@@ -1,14 +1,21 @@
-"""What all methods share: first precisions, jitted chunks with progress, the verdict on where a fit ended."""
+"""What all methods share: the outer loop in jitted chunks with progress, and the verdict on where a fit ended.
+
+A method is a frozen dataclass with `iterate`, a pure step of its outer loop, and `close`, what it computes at the
+end of a chunk; `maximise` drives one fit and `inference.study` many at once.
+"""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import replace
+from functools import partial
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
-from probcal.problem import Problem
+from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Precision, Prior
+from probcal.priors import Laplace as LaplacePrior
+from probcal.problem import Problem, Spec, System
 from probcal.smoothing.directions import Direction, weak_directions
 from probcal.smoothing.information import Laplace
 from probcal.smoothing.mode import Point
@@ -16,6 +23,59 @@ from probcal.smoothing.mode import Point
 CHUNK = 5  # outer iterations between two reports of progress
 FAR = 10.0  # scales from the stated value beyond which a bias without prior has diverged
 Progress = Callable[[str, int, float], None]  # method, iterations done, current objective
+
+
+class Given(NamedTuple):
+    """What stays the same during the outer loop."""
+
+    prior: Precision  # first precisions, and the couplings of correlated biases
+    surveyed: jax.Array  # (M,) biases whose precision is never learnt
+    group: jax.Array  # (M,) which learnt precision governs each bias
+    tolerance: jax.Array  # ()
+
+
+class State(NamedTuple):
+    """Where the outer loop stands: `found` belongs to `point` and `alpha` once it is done."""
+
+    point: Point
+    alpha: jax.Array  # (M,)
+    found: Laplace
+    objective: jax.Array  # ()
+    done: jax.Array  # ()
+
+
+class Method(Protocol):
+    """A method as a value; all of its fields are static."""
+
+    name: ClassVar[str]
+    priors: ClassVar[tuple[type, ...]]
+
+    @property
+    def iterations(self) -> int:
+        """Most outer iterations."""
+        ...
+
+    @property
+    def tolerance(self) -> float:
+        """Change of the objective at which it stops."""
+        ...
+
+    @property
+    def intervals(self) -> str:
+        """What the intervals are worth."""
+        ...
+
+    def prepare(self, problem: Problem) -> Problem:
+        """The problem that is solved in the place of the given one."""
+        ...
+
+    def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
+        """One outer iteration."""
+        ...
+
+    def close(self, spec: Spec, system: System, given: Given, state: State) -> State:
+        """What is computed once a chunk."""
+        ...
 
 
 class Outcome(NamedTuple):
@@ -31,27 +91,62 @@ class Outcome(NamedTuple):
     weak: tuple[Direction, ...]
 
 
-def first_precisions(problem: Problem, prior: Prior) -> jax.Array:
-    """Precisions of z to start from: one scale (0 if flat), and one survey where surveyed."""
-    governed = np.zeros(len(problem.labels)) if isinstance(prior, Flat) else np.ones(len(problem.labels))
-    return jnp.asarray(np.where(problem.surveyed, 1.0, governed))
+def kernel(method: Any) -> Any:
+    """The method without what does not change its kernels, so that these are compiled once."""
+    return replace(method, iterations=0, tolerance=0.0)
 
 
-def run_chunks(
-    step: Callable[[Any], tuple[Any, tuple[Any, Any]]],
-    state: Any,
-    iterations: int,
-    name: str,
-    progress: Progress | None,
-) -> tuple[Any, np.ndarray]:
-    """Step a jitted chunk until it is done or the iterations are spent; returns the state and the trace."""
-    trace: list[float] = []
-    while len(trace) < iterations and not bool(state.done):
-        state, (objective, idle) = step(state)
-        trace += [float(value) for value in np.asarray(objective)[~np.asarray(idle)]]
+def given_of(method: Method, problem: Problem, prior: Prior) -> Given:
+    """Arrays of a prior and of the stopping rule for a problem."""
+    group = prior.groups(problem.members)
+    group = np.where(problem.surveyed, len(group) + np.arange(len(group)), group)  # surveyed biases share none
+    group = np.unique(group, return_inverse=True)[1]
+    first = prior.precision(problem.labels, problem.surveyed)
+    return Given(first, jnp.asarray(problem.surveyed), jnp.asarray(group), jnp.asarray(float(method.tolerance)))
+
+
+def first_state(given: Given, start: Point) -> State:
+    """State before the first iteration."""
+    alpha, low = given.prior.alpha, jnp.full((), -jnp.inf, float)
+    M = alpha.shape[0]
+    return State(
+        start, alpha, Laplace(jnp.zeros((M, M)), jnp.zeros((M, M)), jnp.zeros(M), low), low, jnp.zeros((), bool)
+    )
+
+
+def learn(prior: Prior, given: Given, alpha: jax.Array, gamma: Any, variance: Any, z: jax.Array, rule: str) -> Any:
+    """Precisions after one update of the prior, within their bounds; surveyed biases keep theirs."""
+    if not isinstance(prior, ARD | LaplacePrior):
+        return alpha
+    learnt = jnp.clip(prior.learn(gamma, variance, z, given.group, rule), *PRECISION_BOUNDS)
+    return jnp.where(given.surveyed, alpha, learnt)
+
+
+@partial(jax.jit, static_argnames=("method", "spec", "prior"))
+def chunk(
+    method: Any, spec: Spec, prior: Prior, system: System, given: Given, state: State
+) -> tuple[State, tuple[jax.Array, jax.Array]]:
+    """A few outer iterations; stops when done."""
+
+    def body(state: State, _: None) -> tuple[State, tuple[jax.Array, jax.Array]]:
+        after = jax.lax.cond(state.done, lambda s: s, lambda s: method.iterate(spec, system, prior, given, s), state)
+        return after, (after.objective, state.done)
+
+    state, trace = jax.lax.scan(body, state, length=CHUNK)
+    return method.close(spec, system, given, state), trace
+
+
+def maximise(method: Method, problem: Problem, prior: Prior, start: Point, progress: Progress | None) -> Outcome:
+    """Run a method from a start until it is done or its iterations are spent."""
+    given = given_of(method, problem, prior)
+    state, trace = first_state(given, start), np.zeros(0)
+    while len(trace) < method.iterations and not bool(state.done):
+        state, (objective, idle) = chunk(kernel(method), problem.spec, prior, problem.system, given, state)
+        trace = np.concatenate([trace, np.asarray(objective)[~np.asarray(idle)]])
         if progress is not None:
-            progress(name, len(trace), trace[-1])
-    return state, np.array(trace[:iterations])
+            progress(method.name, len(trace), float(trace[-1]))
+    converged = bool(state.done) or method.tolerance == 0.0
+    return finish(problem, prior, state.point, state.alpha, state.found, converged, trace[: method.iterations])
 
 
 def finish(
@@ -67,18 +162,9 @@ def finish(
     alpha, z = np.asarray(precisions), np.asarray(point.z)
     information = np.asarray(found.information)
     weak = weak_directions(problem, information, z) if np.isfinite(information).all() else ()
-    low = (
-        (alpha <= PRECISION_BOUNDS[0] * (1 + 1e-9)) & ~problem.surveyed
-        if isinstance(prior, ARD)
-        else np.zeros(len(z), bool)
-    )
-    far = (np.abs(z) > FAR) & ~problem.surveyed if isinstance(prior, Flat) else np.zeros(len(z), bool)
+    low, far = low_and_far(prior, alpha, z, problem.surveyed)
     sound = all(np.isfinite(np.asarray(part)).all() for part in (found.covariance, found.evidence, point.z))
-    status = "converged" if converged else "not converged"
-    if low.any():
-        status = "at bound"
-    if far.any() or not sound:
-        status = "diverged"
+    status = verdict(converged, bool(low.any()), bool(far.any()) or not sound)
     bias_status = tuple(
         "survey"
         if s
@@ -87,12 +173,25 @@ def finish(
         else "diverged"
         if f
         else "pruned"
-        if g < 1e-2 and isinstance(prior, ARD)
+        if g < 1e-2 and prior.learns
         else "estimated"
         for s, b, f, g in zip(problem.surveyed, low, far, np.asarray(found.gamma), strict=True)
     )
     message = _message(problem, status, low, far, weak, len(trace))
     return Outcome(point, alpha, found, trace, status, message, bias_status, weak)
+
+
+def low_and_far(prior: Prior, alpha: np.ndarray, z: np.ndarray, surveyed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which biases (..., M) stand at the lower bound of their precision, and which ran away without a prior."""
+    none = np.zeros(z.shape, bool)
+    low = (alpha <= PRECISION_BOUNDS[0] * (1 + 1e-9)) & ~surveyed if isinstance(prior, ARD) else none
+    far = (np.abs(z) > FAR) & ~surveyed if isinstance(prior, Flat) else none
+    return low, far
+
+
+def verdict(converged: bool, low: bool, lost: bool) -> str:
+    """Status of a fit in words."""
+    return "diverged" if lost else "at bound" if low else "converged" if converged else "not converged"
 
 
 def _message(

@@ -1,6 +1,7 @@
 """Independent draws of biases and trajectories from the Laplace approximation at a point."""
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -67,11 +68,25 @@ def predictive(
     return jax.lax.map(one, (z, states, jax.random.split(key, z.shape[0])))
 
 
+class Residuals(NamedTuple):
+    """What is left of every datum of a block at a point, each (N, C), zero where missing."""
+
+    innovation: jax.Array
+    std: jax.Array  # noise level
+    reliance: jax.Array  # 1 inlying, towards 0 outlying
+
+
 @partial(jax.jit, static_argnames="spec")
-def residuals(spec: Spec, system: System, point: Point) -> list[tuple[jax.Array, jax.Array]]:
-    """Innovation and noise level (N, C) of every datum of each block at a point."""
+def residuals(spec: Spec, system: System, point: Point) -> list[Residuals]:
+    """Innovation, noise level and reliance of every datum of each block at a point."""
     found = []
     for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True):
         predicted = rows.predict(block, data, point.states[r], point.z)
-        found.append((rows.innovation(block, data, predicted), rows.noise_std(data, point.levels)))
+        found.append(
+            Residuals(
+                rows.innovation(block, data, predicted),
+                rows.noise_std(data, point.levels),
+                rows.reliance(block, data, predicted, point.levels),
+            )
+        )
     return found

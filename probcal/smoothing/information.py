@@ -7,9 +7,19 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg, rows
+from probcal.priors import Precision
 from probcal.problem import Recursion, Spec, System
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Point, eliminate, factors, linearise, log_likelihood, of_both, of_states
+from probcal.smoothing.mode import (
+    Point,
+    eliminate,
+    factors,
+    linearise,
+    log_likelihood,
+    of_biases,
+    of_both,
+    of_states,
+)
 
 
 class Laplace(NamedTuple):
@@ -22,19 +32,57 @@ class Laplace(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="spec")
-def laplace(spec: Spec, system: System, point: Point, alpha: jax.Array) -> Laplace:
-    """Evidence and covariance with every trajectory marginalised exactly, at the mode for alpha (M,).
+def laplace(spec: Spec, system: System, point: Point, prior: Precision) -> Laplace:
+    """Evidence and covariance with every trajectory marginalised exactly, at the mode for a prior.
 
-    An alpha of 0 is a flat prior: its density counts as one. The expected information is used throughout.
+    A precision of 0 is a flat prior: its density counts as one. The expected information is used throughout.
     """
     solved = eliminate(spec, system, point, expected=True)
-    covariance, logdet = linalg.inverse_and_logdet(solved.information + jnp.diag(alpha))
+    covariance, logdet = linalg.inverse_and_logdet(solved.information + prior.matrix())
     fit = log_likelihood(spec, system, point) - 0.5 * sum(jnp.sum(u**2) for u in point.noises)
-    prior = 0.5 * jnp.sum(jnp.log(jnp.where(alpha > 0, alpha, 1.0))) - 0.5 * jnp.sum(alpha * point.z**2)
+    own = 0.5 * prior.log_determinant() - 0.5 * prior.square(point.z)
     spread = -0.5 * jnp.sum((point.levels / system.level_spread) ** 2)
-    evidence = fit + prior + spread - 0.5 * (solved.logdet + logdet)
-    gamma = jnp.clip(1.0 - alpha * jnp.diagonal(covariance), 0.0, 1.0)
+    evidence = fit + own + spread - 0.5 * (solved.logdet + logdet)
+    gamma = jnp.clip(1.0 - prior.alpha * jnp.diagonal(covariance), 0.0, 1.0)
     return Laplace(solved.information, covariance, gamma, evidence)
+
+
+def paper_b(spec: Spec, system: System, point: Point, prior: Precision) -> tuple[Laplace, jax.Array]:
+    """Paper B (10)-(17), (22)-(23) at smoothed trajectories: the posterior of z, and the step to its mean.
+
+    The smoothed density of each epoch alone is taken as the prior of its state, R-bar = R + H_x P H_x'; what
+    epochs share is dropped and the data count twice. By Woodbury no matrix of the size of the data is formed.
+    """
+    lins = linearise(spec, system, point, expected=False)
+    information, score = of_biases(spec, system, lins)
+    likelihood, logdet = log_likelihood(spec, system, point), jnp.zeros(())
+    parts = zip(
+        system.recursions,
+        of_states(spec, system, lins, point.states),
+        of_both(spec, system, lins, point.states),
+        strict=True,
+    )
+    for part, (J, pull), cross in parts:
+        L = factors(part, point.levels)
+        P, _ = rec.covariances(part.F, L, J, rec.gains(part.F, L, J))
+        values, vectors = linalg.spectrum(P)
+        half = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
+        inner = jnp.eye(P.shape[-1])[None] + half.mT @ J @ half
+        inverse = jax.vmap(linalg.inverse_cholesky)(inner)
+        seen, pulled = inverse @ (half.mT @ cross), (inverse @ (half.mT @ pull[:, :, None]))[:, :, 0]
+        information = information - jnp.einsum("eni,enj->ij", seen, seen)
+        score = score - jnp.einsum("eni,en->i", seen, pulled)
+        likelihood = likelihood + 0.5 * jnp.sum(pulled**2)
+        logdet = logdet - 2.0 * jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=1, axis2=2)))
+    information = 0.5 * (information + information.T)
+    covariance, spread = linalg.inverse_and_logdet(information + prior.matrix())
+    slope = score - prior.pull(point.z)
+    step = covariance @ slope
+    own = 0.5 * prior.log_determinant() - 0.5 * prior.square(point.z)
+    evidence = likelihood + own + 0.5 * slope @ step - 0.5 * (logdet + spread)
+    evidence = evidence - 0.5 * jnp.sum((point.levels / system.level_spread) ** 2)
+    gamma = jnp.clip(1.0 - prior.alpha * jnp.diagonal(covariance), 0.0, 1.0)
+    return Laplace(information, covariance, gamma, evidence), step
 
 
 class Moments(NamedTuple):

@@ -1,7 +1,7 @@
 """The joint mode of trajectories and biases: an arrowhead Gauss-Newton system, each trajectory eliminated first.
 
-With every trajectory marginalised, the biases have information G - B' X, X the smoothed response of the
-trajectories to each bias: Paper B (17) with the covariance of whole trajectories in the place of R-bar.
+With every trajectory marginalised, the biases have information G - B' W^-1 B, W the precision of the
+trajectories: Paper B (17) with the covariance of whole trajectories in the place of R-bar.
 """
 
 from functools import partial
@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg, rows
+from probcal.priors import Precision
 from probcal.problem import Recursion, Spec, System
 from probcal.rows import Linearised
 from probcal.smoothing import recursion as rec
@@ -33,9 +34,17 @@ class Eliminated(NamedTuple):
 
     information: jax.Array  # (M, M) of the biases
     score: jax.Array  # (M,)
-    states: tuple[jax.Array, ...]  # (E, n, 1 + M): new states at fixed z, response to each bias
-    noises: tuple[jax.Array, ...]  # (E, n, 1 + M)
     logdet: jax.Array  # log det of the posterior precision of all whitened noises
+    parts: tuple["Kept", ...]  # of each recursion, what a step of its states needs
+
+
+class Kept(NamedTuple):
+    """What elimination keeps of one recursion."""
+
+    J: jax.Array  # (E, n, n) information of the rows about the states
+    pull: jax.Array  # (E, n) their score
+    cross: jax.Array  # (E, n, M) cross information with the biases
+    gain: rec.Gains
 
 
 def factors(part: Recursion, levels: jax.Array) -> jax.Array:
@@ -53,10 +62,10 @@ def log_likelihood(spec: Spec, system: System, point: Point) -> jax.Array:
     return total
 
 
-def cost(spec: Spec, system: System, point: Point, alpha: jax.Array) -> jax.Array:
+def cost(spec: Spec, system: System, point: Point, prior: Precision) -> jax.Array:
     """Negative log joint density of data, trajectories and biases, up to normalising constants."""
-    prior = sum(jnp.sum(u**2) for u in point.noises) + jnp.sum(alpha * point.z**2)
-    return 0.5 * prior - log_likelihood(spec, system, point)
+    squares = sum(jnp.sum(u**2) for u in point.noises) + prior.square(point.z)
+    return 0.5 * squares - log_likelihood(spec, system, point)
 
 
 def linearise(spec: Spec, system: System, point: Point, *, expected: bool) -> list[Linearised]:
@@ -108,7 +117,16 @@ def of_both(spec: Spec, system: System, lins: list[Linearised], states: tuple[ja
 
 def eliminate(spec: Spec, system: System, point: Point, *, expected: bool, joint: bool = True) -> Eliminated:
     """Linearise at a point and eliminate every trajectory; without `joint` the biases are held."""
-    lins = linearise(spec, system, point, expected=expected)
+    return eliminate_rows(spec, system, point, linearise(spec, system, point, expected=expected), joint=joint)
+
+
+def eliminate_rows(
+    spec: Spec, system: System, point: Point, lins: list[Linearised], *, joint: bool = True
+) -> Eliminated:
+    """Eliminate every trajectory from rows linearised around a point by any rule.
+
+    The biases keep information G - B'W^-1 B: Paper B (17) with the covariance of whole trajectories for R-bar.
+    """
     compressed = of_states(spec, system, lins, point.states)
     if joint:
         information, score = of_biases(spec, system, lins)
@@ -116,51 +134,51 @@ def eliminate(spec: Spec, system: System, point: Point, *, expected: bool, joint
     else:
         information, score = jnp.zeros((0, 0)), jnp.zeros(0)
         crosses = [jnp.zeros((*x.shape, 0)) for x in point.states]
-    states, noises, logdet = [], [], jnp.zeros(())
-    parts = zip(system.recursions, compressed, crosses, point.states, point.noises, strict=True)
-    for part, (J, pull), cross, x, u in parts:
+    kept, logdet = [], jnp.zeros(())
+    parts = zip(system.recursions, compressed, crosses, point.noises, strict=True)
+    for r, (part, (J, pull), cross, u) in enumerate(parts):
         L = factors(part, point.levels)
         gain = rec.gains(part.F, L, J)
-        columns = jnp.concatenate([pull[:, :, None], cross], 2)
-        drift = jnp.zeros_like(columns).at[:, :, 0].set(-(L @ u[:, :, None])[:, :, 0])
-        smooth = rec.smooth(part.F, L, J, gain, columns, drift)
-        information = information + _reduction(cross, J, smooth)
-        score = score - jnp.einsum("eni,en->i", cross, smooth.states[:, :, 0])
-        states.append(smooth.states.at[:, :, 0].add(x))
-        noises.append(smooth.noises)
+        used = tuple(
+            sorted({i for b, own in zip(spec.blocks, spec.recursion, strict=True) if own == r for i in b.used})
+        )
+        if joint and used:
+            columns = jnp.concatenate([pull[:, :, None], cross], 2)
+            drift = jnp.zeros_like(columns).at[:, :, 0].set(-(L @ u[:, :, None])[:, :, 0])
+            alone, new = (c.reshape(-1, c.shape[2]) for c in rec.innovate(part.F, J, gain, columns, drift, used))
+            rows_ = jnp.concatenate([alone, new])
+            signed = jnp.concatenate([-alone, new])
+            information = information + linalg.gram(rows_[:, 1:], signed[:, 1:])
+            score = score + signed[:, 1:].T @ rows_[:, 0]
+        kept.append(Kept(J, pull, cross, gain))
         logdet = logdet + gain.logdet
     information = 0.5 * (information + information.T)
-    return Eliminated(information, score, tuple(states), tuple(noises), logdet)
+    return Eliminated(information, score, logdet, tuple(kept))
 
 
-def _reduction(cross: jax.Array, J: jax.Array, smooth: rec.Smoothed) -> jax.Array:
-    """What eliminating one recursion takes from the information of the biases, -B'W^-1 B, shape (M, M).
-
-    Written as the least-squares cost at the smoothed response X with noises U, -B'X - X'(B - JX) + U'U: an
-    error of X enters squared, so that a row with huge derivatives (a target passing a sensor) does no harm.
-    """
-    X, U = smooth.states[:, :, 1:], smooth.noises[:, :, 1:]
-    left = jnp.concatenate([cross, X, U], 1)
-    right = jnp.concatenate([-X, J @ X - cross, U], 1)
-    return jnp.einsum("eni,enj->ij", left, right)
-
-
-def _proposal(spec: Spec, system: System, point: Point, alpha: jax.Array, damping: jax.Array, joint: bool) -> Point:
+def _proposal(spec: Spec, system: System, point: Point, prior: Precision, damping: jax.Array, joint: bool) -> Point:
     """Full Gauss-Newton step from a point."""
     solved = eliminate(spec, system, point, expected=False, joint=joint)
     dz = jnp.zeros_like(point.z)
     if joint and spec.biases:  # an arrowhead: the tip first, then the trajectories follow
-        matrix = solved.information + jnp.diag(alpha + damping)
-        dz = linalg.solve_positive(matrix, solved.score - alpha * point.z)
-    move = jnp.concatenate([jnp.ones(1), -dz[: solved.states[0].shape[2] - 1]])
-    return point._replace(
-        states=tuple(s @ move for s in solved.states),
-        noises=tuple(s @ move for s in solved.noises),
-        z=point.z + dz,
-    )
+        matrix = solved.information + prior.matrix() + damping * jnp.eye(spec.biases)
+        dz = linalg.solve_positive(matrix, solved.score - prior.pull(point.z))
+    return follow(system, point, solved, dz)
 
 
-def _between(a: Point, b: Point, t: jax.Array) -> Point:
+def follow(system: System, point: Point, solved: Eliminated, dz: jax.Array) -> Point:
+    """Move the biases by dz (M,) and every trajectory to its smoothed response."""
+    states, noises = [], []
+    for part, kept, x, u in zip(system.recursions, solved.parts, point.states, point.noises, strict=True):
+        L = factors(part, point.levels)
+        column = kept.pull - kept.cross @ dz[: kept.cross.shape[2]]
+        smooth = rec.smooth(part.F, L, kept.J, kept.gain, column[:, :, None], -(L @ u[:, :, None]))
+        states.append(x + smooth.states[:, :, 0])
+        noises.append(smooth.noises[:, :, 0])
+    return point._replace(states=tuple(states), noises=tuple(noises), z=point.z + dz)
+
+
+def between(a: Point, b: Point, t: jax.Array) -> Point:
     """Point a + t (b - a); consistent trajectories stay consistent."""
     return jax.tree.map(lambda p, q: p + t * (q - p), a, b)
 
@@ -185,7 +203,7 @@ class Mode(NamedTuple):
 
 @partial(jax.jit, static_argnames=("spec", "joint"))
 def find_mode(
-    spec: Spec, system: System, start: Point, alpha: jax.Array, iterations: int, tolerance: float, *, joint: bool = True
+    spec: Spec, system: System, start: Point, prior: Precision, iterations: int, tolerance: float, *, joint: bool = True
 ) -> Mode:
     """Damped Gauss-Newton (iterated EKS, with the biases if `joint`) until the cost changes by less than `tolerance`.
 
@@ -194,12 +212,12 @@ def find_mode(
     """
 
     def body(s: _Search) -> _Search:
-        proposal = _proposal(spec, system, s.point, alpha, s.damping, joint)
+        proposal = _proposal(spec, system, s.point, prior, s.damping, joint)
 
         def shorter(state):
             t, _, tries = state
             t = jnp.where(tries == 0, 1.0, 0.5 * t)
-            return t, cost(spec, system, _between(s.point, proposal, t), alpha), tries + 1
+            return t, cost(spec, system, between(s.point, proposal, t), prior), tries + 1
 
         def worse(state):
             _, value, tries = state
@@ -207,7 +225,7 @@ def find_mode(
 
         t, value, tries = jax.lax.while_loop(worse, shorter, (jnp.ones(()), s.cost, 0))
         better = value <= s.cost
-        point = jax.tree.map(lambda new, old: jnp.where(better, new, old), _between(s.point, proposal, t), s.point)
+        point = jax.tree.map(lambda new, old: jnp.where(better, new, old), between(s.point, proposal, t), s.point)
         damping = jnp.where(better & (tries <= 2), s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
         damping = jnp.where(damping < 1e-6, 0.0, damping)
         change = jnp.where(better, s.cost - value, jnp.inf)
@@ -216,7 +234,7 @@ def find_mode(
 
     first = _Search(
         start,
-        cost(spec, system, start, alpha),
+        cost(spec, system, start, prior),
         jnp.zeros(()),
         jnp.full((), jnp.inf, float),
         jnp.zeros((), int),
@@ -224,3 +242,9 @@ def find_mode(
     )
     last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations), body, first)
     return Mode(last.point, last.cost, last.iteration, last.done & (last.change < tolerance))
+
+
+def track(spec: Spec, system: System, point: Point, iterations: int = 20) -> Point:
+    """Trajectories at the point's biases: iterated EKS."""
+    flat = Precision.single(jnp.zeros_like(point.z))
+    return find_mode(spec, system, point, flat, iterations, 1e-6, joint=False).point

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from probcal.linalg import inverse_cholesky, multiply, tria
+from probcal.linalg import inverse_cholesky, multiply, semi_cholesky, tria
 
 
 class Gains(NamedTuple):
@@ -80,6 +80,35 @@ def smooth(F: jax.Array, L: jax.Array, J: jax.Array, gain: Gains, b: jax.Array, 
     _, (adjoint, following) = jax.lax.scan(backward, carry, (gain.keep.mT @ F_next.mT, pulls), reverse=True)
     states = filtered + (covariance @ F_next.mT) @ following
     return Smoothed(states, L.mT @ adjoint)
+
+
+def innovate(
+    F: jax.Array, J: jax.Array, gain: Gains, b: jax.Array, c: jax.Array, used: tuple[int, ...]
+) -> tuple[jax.Array, jax.Array]:
+    """Columns b (E, n, m) with drifts c (E, n, m) as unit-noise data: alone, and as innovations, both (E, u, m).
+
+    With J_k = G G' on the `used` state entries, `alone` solves G alone = b, and the innovation alone - G' x
+    against the predicted x is whitened by its covariance I + G'PG. The sum of squares of the innovations, less that
+    of `alone`, is -b'W^-1 b, W the precision of the whole trajectory: a forward pass is enough to eliminate it,
+    and an error of x enters squared, so that a target grazing a sensor does no harm.
+    """
+    entries = jnp.asarray(used, int)
+    root, alone = semi_cholesky(J[:, entries[:, None], entries[None, :]], b[:, entries])
+    covariance = gain.updated @ gain.updated.mT
+    source = covariance[:, :, entries] @ b[:, entries] + gain.keep @ c
+
+    def forward(x, epoch):
+        T_k, s_k = epoch
+        x = multiply(T_k, x) + s_k
+        return x, x
+
+    carry = jnp.zeros_like(b[0])
+    _, filtered = jax.lax.scan(forward, carry, (gain.keep @ F, source))
+    before = jnp.concatenate([carry[None], filtered[:-1]])
+    predicted = F[:, entries] @ before + c[:, entries]
+    spread = gain.predicted[:, entries]
+    S = jnp.eye(len(used), dtype=J.dtype)[None] + root.mT @ (spread @ spread.mT) @ root
+    return alone, jax.vmap(inverse_cholesky)(S) @ (alone - root.mT @ predicted)
 
 
 def covariances(F: jax.Array, L: jax.Array, J: jax.Array, gain: Gains) -> tuple[jax.Array, jax.Array]:

@@ -13,15 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg, rows
+from probcal.priors import Precision
 from probcal.problem import Problem, Recursion, Spec, System
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Point, factors, find_mode
+from probcal.smoothing.mode import Point, factors, find_mode, track
 
 WINDOWS = 60  # at most so many windows a target
 INNER = {2: 24, 3: 10}  # grid points an axis inside the network
 OUTER = {2: 48, 3: 60}  # directions of the outer rings
 RINGS = (0.8, 1.2, 1.8, 2.8, 5.0, 9.0)  # their radii in extents
 NEAR = 0.05  # error of a position found on the grid, in extents
+BEAM = 200  # candidates a window that the path may pass
 ROBUST = 4.0  # degrees of freedom of the start's Student-t loss
 
 
@@ -103,18 +105,25 @@ def _losses(spec: Spec, system: System, r: int, span: tuple[int, int], places: j
     return jax.lax.map(lambda c: _profile(spec, system, r, span, jnp.broadcast_to(c, (E, width)))[0], places)
 
 
-def _viterbi(loss: np.ndarray, squared: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Cheapest path: losses (windows, candidates), squared distances, expected step between windows."""
-    total, back = loss[0], []
+def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Cheapest path: losses (windows, candidates), places (candidates, d), expected step between windows.
+
+    Only the `BEAM` best candidates of each window are tried.
+    """
+    beam = min(BEAM, loss.shape[1])
+    kept = np.argpartition(loss, beam - 1, axis=1)[:, :beam]
+    total, back = loss[0, kept[0]], []
     for k in range(1, len(loss)):
+        a, b = places[kept[k - 1]], places[kept[k]]
+        squared = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
         through = total[:, None] + 0.5 * squared / steps[k - 1] ** 2
         best = through.argmin(0)
-        total = through[best, np.arange(len(best))] + loss[k]
+        total = through[best, np.arange(beam)] + loss[k, kept[k]]
         back.append(best)
     path = [int(total.argmin())]
     for best in reversed(back):
         path.append(int(best[path[-1]]))
-    return np.array(path[::-1])
+    return kept[np.arange(len(loss)), path[::-1]]
 
 
 def _path(problem: Problem, time: np.ndarray, loss: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -122,13 +131,11 @@ def _path(problem: Problem, time: np.ndarray, loss: np.ndarray, places: np.ndarr
     windows = np.array_split(np.arange(len(time)), min(WINDOWS, len(time)))
     centre = np.array([time[w].mean() for w in windows])
     inside = np.stack([loss[:, w].sum(1) for w in windows])
-    squared = ((places[:, None] - places[None]) ** 2).sum(-1)
-    spacing = np.sqrt(
-        np.partition(squared[: INNER[problem.network.dimension] ** problem.network.dimension], 1, 1)[:, 1].max()
-    )
+    d = problem.network.dimension
+    spacing = max(np.linalg.norm(places[INNER[d] ** axis] - places[0]) for axis in range(d))  # of the inner grid
     span = np.linalg.norm(np.ptp(problem.node_positions, axis=0)) or problem.extent
     pace = 3 * span / max(float(np.ptp(time)), 1e-9)
-    path = places[_viterbi(inside, squared, 1.5 * spacing + pace * np.diff(centre))]
+    path = places[_viterbi(inside, places, 1.5 * spacing + pace * np.diff(centre))]
     return np.stack([np.interp(time, centre, column) for column in path.T], -1)
 
 
@@ -191,10 +198,11 @@ def automatic_start(problem: Problem, iterations: int = 30) -> Point:
         precisions.append(precision)
     point = project(problem, tracks, precisions)
     tracked = track_mode(problem, point, iterations)
-    return find_mode(problem.spec, problem.system, tracked, jnp.ones(problem.spec.biases), iterations, 1e-3).point
+    return find_mode(
+        problem.spec, problem.system, tracked, Precision.single(jnp.ones(problem.spec.biases)), iterations, 1e-3
+    ).point
 
 
 def track_mode(problem: Problem, point: Point, iterations: int = 100) -> Point:
     """Trajectories at held biases: iterated EKS from a point."""
-    alpha = jnp.zeros(problem.spec.biases)
-    return find_mode(problem.spec, problem.system, point, alpha, iterations, 1e-6, joint=False).point
+    return track(problem.spec, problem.system, point, iterations)

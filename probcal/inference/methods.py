@@ -1,0 +1,46 @@
+"""The methods as values, their names on the command line, and which priors each takes.
+
+To add one: a module beside this one with a frozen dataclass that answers `inference.run.Method`, entered here.
+"""
+
+import pandas as pd
+
+from probcal.inference.ea import EA, MAP, LeastSquares
+from probcal.inference.em import EM, EMEA
+from probcal.priors import PRIORS, Flat, Laplace, Prior
+from probcal.types import InputError
+
+Method = EA | EM | EMEA | MAP | LeastSquares
+# names on the command line: method, and the prior it means where that is not the method's first
+METHODS: dict[str, tuple[Method, Prior | None]] = {
+    "ea": (EA(), None),
+    "ea-em": (EA(update="em", iterations=2000), None),
+    "paper-b": (EA(trajectory="smoothed", iterations=25), None),
+    "em-ea": (EMEA(), None),
+    "em": (EM(), None),
+    "em-ml": (EM(), Flat()),
+    "map": (MAP(), None),
+    "map-l1": (MAP(), Laplace()),
+    "ml": (MAP(), Flat()),
+    "nls": (LeastSquares(), None),
+}
+
+
+def choose_prior(method: Method, prior: Prior | None) -> Prior:
+    """The prior of a fit: the given one if the method takes it, else the method's first."""
+    if prior is None:
+        return method.priors[0]()
+    if not isinstance(prior, method.priors):
+        allowed = ", ".join(name for name, known in PRIORS.items() if isinstance(known, method.priors))
+        raise InputError(f"{method.name} does not take the prior {type(prior).__name__}; it takes: {allowed}")
+    return prior
+
+
+def table() -> pd.DataFrame:
+    """Which method (rows, by class) takes which prior (columns, by name on the command line)."""
+    classes = {type(method).__name__: type(method) for method, _ in METHODS.values()}
+    rows = {
+        name: ["yes" if isinstance(prior, kind.priors) else "" for prior in PRIORS.values()]
+        for name, kind in classes.items()
+    }
+    return pd.DataFrame.from_dict(rows, orient="index", columns=list(PRIORS))

@@ -1,0 +1,235 @@
+"""Studies: methods side by side over settings and simulated runs, many fits in one compiled kernel."""
+
+import itertools
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from probcal.inference.methods import METHODS, Method, choose_prior
+from probcal.inference.run import Given, State, first_state, given_of, kernel, low_and_far, verdict
+from probcal.priors import PRECISION_BOUNDS, Prior
+from probcal.problem import Problem, Spec, System
+from probcal.simulate import Truth
+from probcal.smoothing.mode import Point
+from probcal.smoothing.start import automatic_start
+from probcal.tree import INTERVAL
+from probcal.types import InputError, nearest
+
+BATCH = 10  # runs that one compiled call solves
+ORACLE = "oracle"  # MAP whose prior knows which biases are zero
+Setting = Callable[..., tuple[Problem, Truth]]
+Advance = Callable[[int, int], None]  # fits done, fits in all
+
+
+class _Solved(NamedTuple):
+    """Where each run of a batch ended."""
+
+    z: jax.Array  # (runs, M)
+    sd: jax.Array  # (runs, M)
+    gamma: jax.Array  # (runs, M)
+    alpha: jax.Array  # (runs, M)
+    states: tuple[jax.Array, ...]  # (runs, E, n) of each recursion
+    done: jax.Array  # (runs,)
+    iterations: jax.Array  # (runs,)
+
+
+@partial(jax.jit, static_argnames=("method", "spec", "prior"))
+def _solve(
+    method: Any, spec: Spec, prior: Prior, iterations: int, systems: System, givens: Given, starts: Point
+) -> _Solved:
+    """Run a method on many problems of one form: one after the other on a CPU, together on an accelerator."""
+
+    def one(pieces: tuple[System, Given, Point]) -> _Solved:
+        system, given, start = pieces
+
+        def step(carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
+            state, count = carry
+            return method.iterate(spec, system, prior, given, state), count + 1
+
+        def on(carry: tuple[State, jax.Array]) -> jax.Array:
+            return ~carry[0].done & (carry[1] < iterations)
+
+        state, count = jax.lax.while_loop(on, step, (first_state(given, start), jnp.zeros((), int)))
+        state = method.close(spec, system, given, state)
+        sd = jnp.sqrt(jnp.diagonal(state.found.covariance))
+        done = state.done | (given.tolerance == 0.0)
+        return _Solved(state.point.z, sd, state.found.gamma, state.alpha, state.point.states, done, count)
+
+    pieces = (systems, givens, starts)
+    return jax.lax.map(one, pieces) if jax.default_backend() == "cpu" else jax.vmap(one)(pieces)
+
+
+class _Run(NamedTuple):
+    """One simulated problem, its truth and start."""
+
+    problem: Problem
+    truth: Truth
+    start: Point
+
+
+def _given(method: Method, prior: Prior, run: _Run, oracle: bool) -> Given:
+    given = given_of(method, run.problem, prior)
+    if not oracle:
+        return given
+    zero = np.array([run.truth.biases.get(label, 0.0) == 0.0 for label in run.problem.labels])
+    alpha = jnp.where(zero & ~run.problem.surveyed, PRECISION_BOUNDS[1], given.prior.alpha)
+    return given._replace(prior=given.prior._replace(alpha=alpha))
+
+
+def _position_rmse(run: _Run, states: Sequence[np.ndarray]) -> float:
+    """Root mean square position error in m over the epochs that the truth covers, NaN if it covers none."""
+    squares = []
+    d = run.problem.network.dimension
+    for epochs, x in zip(run.problem.epochs, states, strict=True):
+        span = next(slice(start, stop) for name, start, stop, _ in epochs.layout if name == "position")
+        true = run.truth.positions(epochs.time, epochs.target, d)
+        known = np.isfinite(true).all(1)
+        squares.append(((x[:, span] - true)[known] ** 2).sum(1))
+    joined = np.concatenate(squares)
+    return float(np.sqrt(joined.mean())) if len(joined) else np.nan
+
+
+def _form(run: _Run) -> tuple[Any, ...]:
+    """Runs of one form are solved by one kernel: the same static part and the same shapes."""
+    return (run.problem.spec, *(leaf.shape for leaf in jax.tree.leaves(run.problem.system)))
+
+
+def _batch(
+    setting: Setting, cases: Sequence[tuple[dict[str, Any], int]], methods: Mapping[str, tuple[Method, Prior]]
+) -> list[dict[str, Any]]:
+    """Records of all methods on some cases (grid point, run)."""
+    with jax.enable_x64(True):
+        built = [setting(run, **point) for point, run in cases]
+        whole = [_Run(problem, truth, automatic_start(problem)) for problem, truth in built]
+        found = []
+        for name, (method, prior) in methods.items():
+            runs = [_prepared(method, run) for run in whole]
+            groups: dict[tuple[Any, ...], list[int]] = {}
+            for k, run in enumerate(runs):
+                groups.setdefault(_form(run), []).append(k)
+            for members in groups.values():
+                chosen = [runs[k] for k in members]
+                stacked = [
+                    jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
+                    for parts in (
+                        [run.problem.system for run in chosen],
+                        [_given(method, prior, run, name == ORACLE) for run in chosen],
+                        [run.start for run in chosen],
+                    )
+                ]
+                solved = _solve(kernel(method), chosen[0].problem.spec, prior, method.iterations, *stacked)
+                solved = jax.tree.map(np.asarray, solved)
+                for j, k in enumerate(members):
+                    one = jax.tree.map(lambda leaf, j=j: leaf[j], solved)
+                    found.append({"case": cases[k], "method": name} | _record(chosen[j], prior, one))
+        return found
+
+
+def _prepared(method: Method, run: _Run) -> _Run:
+    problem = method.prepare(run.problem)
+    return run if problem is run.problem else _Run(problem, run.truth, automatic_start(problem))
+
+
+def _record(run: _Run, prior: Prior, one: Any) -> dict[str, Any]:
+    problem = run.problem
+    true = np.array([run.truth.biases.get(label, np.nan) for label in problem.labels]) / problem.scales
+    error = one.z - true
+    low, far = low_and_far(prior, one.alpha, one.z, problem.surveyed)
+    sound = bool(np.isfinite(one.z).all() and np.isfinite(one.sd).all())
+    half = stats.norm.ppf(0.5 + INTERVAL / 2)
+    return {
+        "bias_rmse": float(np.sqrt(np.nanmean(error**2))),
+        "coverage": float((np.abs(error) <= half * one.sd)[np.isfinite(error)].mean()),
+        "position_rmse": _position_rmse(run, one.states),
+        "status": verdict(bool(one.done), bool(low.any()), bool(far.any()) or not sound),
+        "iterations": int(one.iterations),
+        "error": error, "true": true, "gamma": one.gamma, "sd": one.sd, "labels": problem.labels,
+    }  # fmt: skip
+
+
+def choose_methods(names: Sequence[str]) -> dict[str, tuple[Method, Prior]]:
+    """Methods by their names on the command line; "oracle" is MAP that knows which biases are zero."""
+    chosen = {}
+    for name in names:
+        if name not in METHODS and name != ORACLE:
+            raise InputError(f'method "{name}" is not known{nearest(name, [*METHODS, ORACLE])}')
+        method, prior = METHODS["map"] if name == ORACLE else METHODS[name]
+        chosen[name] = (method, choose_prior(method, prior))
+    return chosen
+
+
+def study(
+    setting: Setting,
+    grid: Mapping[str, Sequence[Any]],
+    methods: Sequence[str] | Mapping[str, tuple[Method, Prior]] = ("ml", "em-ea", "ea", ORACLE),
+    runs: int | Sequence[int] = 20,
+    *,
+    progress: Advance | None = None,
+) -> xr.Dataset:
+    """Fit every run of every setting by every method: errors, coverage and status by setting, method and run.
+
+    `setting(run, **point)` returns a problem and its truth for a run (its seed) and a point of the `grid`, a
+    mapping from argument to values. `methods` are names of the command line or a mapping to (method, prior).
+    Variables have the grid's dims, `estimator` (the method; xarray keeps that word for itself) and `run`:
+    `bias_rmse` (root mean square of the errors over their scales), `position_rmse` in m, `coverage` of the
+    intervals, `status`, `iterations`; with `bias_label`: `error`, `true`, `sd` (all over their scales) and `gamma`.
+    Raises `InputError` for an unknown method or settings whose biases differ. Runs are solved in batches by
+    compiled kernels, on as many threads as there are processors.
+    """
+    chosen = dict(methods) if isinstance(methods, Mapping) else choose_methods(methods)
+    numbers = list(range(runs)) if isinstance(runs, int) else list(runs)
+    axes = {name: list(values) for name, values in grid.items()}
+    if not numbers or not chosen or not all(axes.values()):
+        raise InputError("study: give at least one run, one method and one value of every setting")
+    points = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+    batches = [
+        [(point, run) for run in numbers[k : k + BATCH]] for point in points for k in range(0, len(numbers), BATCH)
+    ]
+    total, records = len(points) * len(numbers) * len(chosen), []
+
+    def take(found: list[dict[str, Any]]) -> None:
+        records.extend(found)
+        if progress is not None:
+            progress(len(records), total)
+
+    take(_batch(setting, batches[0], chosen))  # compiles
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for found in pool.map(lambda cases: _batch(setting, cases, chosen), batches[1:]):
+            take(found)
+    return _dataset(records, axes, list(chosen), numbers)
+
+
+def _dataset(
+    records: list[dict[str, Any]], axes: Mapping[str, list[Any]], methods: list[str], runs: list[int]
+) -> xr.Dataset:
+    labels = records[0]["labels"]
+    if any(record["labels"] != labels for record in records):
+        raise InputError("study: the settings have different biases; make one study for each network")
+    dims = (*axes, "estimator", "run")
+    shape = (*(len(values) for values in axes.values()), len(methods), len(runs))
+    scalars: dict[str, Any] = {name: np.full(shape, np.nan) for name in ("bias_rmse", "coverage", "position_rmse")}
+    scalars |= {"status": np.full(shape, "", "<U13"), "iterations": np.zeros(shape, int)}
+    vectors = {name: np.full((*shape, len(labels)), np.nan) for name in ("error", "true", "sd", "gamma")}
+    for record in records:
+        point, run = record["case"]
+        where = (
+            *(axes[name].index(point[name]) for name in axes), methods.index(record["method"]), runs.index(run),
+        )  # fmt: skip
+        for name, values in (scalars | vectors).items():
+            values[where] = record[name]
+    if np.isnan(scalars["position_rmse"]).all():
+        del scalars["position_rmse"]
+    return xr.Dataset(
+        {name: (dims, values) for name, values in scalars.items()}
+        | {name: ((*dims, "bias_label"), values) for name, values in vectors.items()},
+        coords={**axes, "estimator": methods, "run": runs, "bias_label": list(labels)},
+        attrs={"interval_probability": INTERVAL},
+    )

@@ -1,0 +1,101 @@
+"""Statistical linearisation by sigma points: the unscented and the cubature choice of the E-step.
+
+Each row is regressed on the state over the smoothed density of its epoch (posterior linearisation, Garcia-Fernandez
+et al. 2015; the unscented transform of Julier and Uhlmann, the cubature rule of Arasaratnam and Haykin 2009).
+Where a sensor is linear the result is that of the extended smoother.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg, rows
+from probcal.problem import Spec, System
+from probcal.rows import Block, Linearised, Rows
+from probcal.smoothing import recursion as rec
+from probcal.smoothing.mode import Point, factors, linearise, of_biases, of_states
+
+FLOOR = 1e-10  # least variance along an axis of the sigma points
+
+
+class _Points(NamedTuple):
+    states: jax.Array  # (S, E, n), only the entries that the block reads are moved
+    unit: jax.Array  # (S, u) the same points for unit covariance
+    weight: jax.Array  # (S,)
+    whiten: jax.Array  # (E, u, u) from state entries to unit covariance
+
+
+def state_covariances(spec: Spec, system: System, point: Point) -> list[jax.Array]:
+    """Covariances (E, n, n) of every smoothed state at held biases, linearised at a point."""
+    compressed = of_states(spec, system, linearise(spec, system, point, expected=True), point.states)
+    found = []
+    for part, (J, _) in zip(system.recursions, compressed, strict=True):
+        L = factors(part, point.levels)
+        found.append(rec.covariances(part.F, L, J, rec.gains(part.F, L, J))[0])
+    return found
+
+
+def _points(block: Block, states: jax.Array, covariance: jax.Array, rule: str) -> _Points:
+    used = np.asarray(block.used, int)
+    u = len(used)
+    kappa = 0.0 if rule == "cubature" else max(3.0 - u, 1.0)
+    axes = np.concatenate([np.eye(u), -np.eye(u)]) * np.sqrt(u + kappa)
+    unit = np.concatenate([np.zeros((1, u)), axes]) if kappa else axes
+    centre = [kappa / (u + kappa)] if kappa else []
+    weight = np.concatenate([centre, np.full(2 * u, 0.5 / (u + kappa))])
+    values, vectors = linalg.spectrum(covariance[:, used[:, None], used[None, :]])
+    root = jnp.sqrt(jnp.maximum(values, FLOOR))
+    shift = jnp.einsum("euv,ev,sv->seu", vectors, root, jnp.asarray(unit))
+    moved = jnp.broadcast_to(states, (len(weight), *states.shape)).at[:, :, used].add(shift)
+    return _Points(moved, jnp.asarray(unit), jnp.asarray(weight), vectors.mT / root[:, :, None])
+
+
+def _block(block: Block, data: Rows, point: Point, states: jax.Array, covariance: jax.Array, rule: str) -> Linearised:
+    if not block.used:
+        return rows.linearise(block, data, states, point.z, point.levels, expected=False)
+    points = _points(block, states, covariance, rule)
+    centre = rows.predict(block, data, states, point.z)
+    values = jax.lax.map(lambda x: rows.predict(block, data, x, point.z), points.states)
+    moved = rows.difference(block, values, centre[None])
+    mean = jnp.einsum("s,snc->nc", points.weight, moved)
+    slope = jnp.einsum("s,snc,su->ncu", points.weight, moved - mean[None], points.unit)
+    left = jnp.einsum("s,snc->nc", points.weight, (moved - mean[None]) ** 2) - jnp.sum(slope**2, -1)
+    std = jnp.sqrt(rows.noise_std(data, point.levels) ** 2 + jnp.maximum(left, 0.0))
+    score, weight = rows.weigh(block, data, centre + mean, std, expected=False)
+    by_bias = jax.lax.map(
+        lambda x: rows.linearise(block, data, x, point.z, point.levels, expected=False).bias, points.states
+    )
+    by_state = jnp.einsum("ncu,nuv->ncv", slope, points.whiten[data.epoch])
+    return Linearised(score, weight, by_state, jnp.einsum("s,sncp->ncp", points.weight, by_bias))
+
+
+def regress(spec: Spec, system: System, point: Point, covariances: list[jax.Array], rule: str) -> list[Linearised]:
+    """Every block regressed on the states over their smoothed densities; what is left over widens the noise."""
+    return [
+        _block(block, data, point, point.states[r], covariances[r], rule)
+        for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True)
+    ]
+
+
+def expect_biases(
+    spec: Spec, system: System, point: Point, covariances: list[jax.Array], rule: str
+) -> tuple[jax.Array, jax.Array]:
+    """Information (M, M) and score (M,) of the biases, expected over the smoothed states (Paper A 15-21)."""
+    M = spec.biases
+    information, score = jnp.zeros((M, M)), jnp.zeros(M)
+    for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True):
+        alone = system._replace(rows=(data,))
+
+        def at(x: jax.Array, block: Block = block, data: Rows = data, alone: System = alone) -> tuple:
+            return of_biases(spec, alone, [rows.linearise(block, data, x, point.z, point.levels, expected=False)])
+
+        if not block.used:
+            G, g = at(point.states[r])
+        else:
+            points = _points(block, point.states[r], covariances[r], rule)
+            each = jax.lax.map(at, points.states)
+            G, g = (jnp.einsum("s,s...->...", points.weight, part) for part in each)
+        information, score = information + G, score + g
+    return information, score
