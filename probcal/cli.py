@@ -188,7 +188,9 @@ def fit_command(
     model: Model,
     data: Data = None,
     method: Annotated[str, typer.Option(help=" | ".join(METHODS))] = "ea",
-    prior: Annotated[str | None, typer.Option(help=" | ".join(PRIORS) + "; the method's own if left out")] = None,
+    prior: Annotated[
+        str | None, typer.Option(help=" | ".join(PRIORS) + "; the model's or the method's own if left out")
+    ] = None,
     fix: Annotated[list[str], typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = [],  # noqa: B006
     starts: Annotated[int, typer.Option(min=1, help="starts of the search; the best optimum is reported")] = 1,
     seed: Seed = 0,
