@@ -24,7 +24,7 @@ ROWS = 20  # a receiver with fewer rows is left out
 EMISSION = 1e3  # m, spread of the emission ranges about what the loader takes off
 
 
-@sensor(arrival=Channel("m", std=Unknown(15.0), noise=StudentT(4)))
+@sensor(arrival=Channel("m", std=Unknown(20.0), noise=StudentT(2)))
 def receiver(target, pose, *, delay=Bias("m", 30.0)):
     """Arrival time of a message times the propagation speed, with the delay of the receiver's electronics."""
     return dict(arrival=norm(target.position - pose.position) + target.emission + delay)

@@ -4,9 +4,9 @@ UTIAS MRCLAM data set 6 (K. Leung, Y. Halpern, T. Barfoot, H. Liu, "The UTIAS mu
 and mapping dataset", International Journal of Robotics Research 2011, http://asrl.utias.utoronto.ca/datasets/mrclam),
 free for research with citation, no formal licence: not shipped, give the folder of its files.
 
-The poses of the robots come from motion capture and are known; unknown are, a robot, its range offset and its
-heading (the bearing bias of its camera is minus that), and the place of every landmark. Landmarks are surveyed
-too, for scoring only. Noise is heavy-tailed (up to 4 % gross outliers) and of unknown level.
+The poses of the robots come from motion capture and are known. Unknown are the range offset of each robot, its
+heading (its camera points off; a bearing bias is minus the heading bias), and the place of every landmark. The
+landmarks were surveyed too, for scoring only. Noise is heavy-tailed (up to 4 % gross outliers), its level unknown.
 """
 
 from pathlib import Path as File
@@ -49,7 +49,7 @@ def read(data, name):
 def robot(data, number, turn=0.0):
     """A robot on its known path, its heading stated wrong by `turn` (rad)."""
     time, x, y, heading = read(data, f"Robot{number}_Groundtruth").T
-    kept = np.unique(np.searchsorted(time, np.arange(time[0], time[-1], 1 / HZ)))
+    kept = np.unique(np.searchsorted(time, [*np.arange(time[0], time[-1], 1 / HZ), time[-1]]))
     path = Path(time[kept], np.stack([x, y], 1)[kept], np.unwrap(heading)[kept])
     return Node(f"robot_{number}", path=path, heading=turn, scale={"heading": HEADING})
 
@@ -74,7 +74,7 @@ def problem(data=None, turn=None):
 
 
 def truth(data=None, turn=None):
-    """Surveyed landmarks, and each robot's biases as medians over its rows given those landmarks."""
+    """Surveyed landmarks, and the biases of each robot: medians over its rows, given those landmarks."""
     landmarks = {int(row[0]): row[1:3] for row in read(data, "Landmark_Groundtruth")}
     tracks = [{"time": 0.0, "target": f"landmark_{n}", "position_x": x, "position_y": y}
               for n, (x, y) in landmarks.items()]  # fmt: skip
