@@ -82,7 +82,8 @@ def truth(data=None, turn=None):
     place = {f"landmark_{n}": xy for n, xy in landmarks.items()}
     for n in ROBOTS:
         mine = rows[rows["sensor"] == f"robot_{n}"]
-        position, heading = robot(data, n).path.at(mine["time"].to_numpy())
+        path = robot(data, n).path.at(mine["time"].to_numpy())
+        position, heading = path["position"], path["heading"]
         line = np.stack(mine["target"].map(place)) - position
         azimuth = mine["azimuth"] - np.arctan2(line[:, 1], line[:, 0]) + heading
         biases[f"robot_{n}.range_offset"] = float(np.median(mine["range"] - np.hypot(*line.T)))
