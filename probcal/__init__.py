@@ -15,6 +15,7 @@ from probcal.motion import (
     White,
 )
 from probcal.network import Network, Node, Path
+from probcal.nodes import LocalFrame, read_nodes, write_nodes
 from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
 from probcal.problem import Problem
@@ -26,8 +27,9 @@ from probcal.types import FitError, InputError
 
 __all__ = [
     "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantAcceleration", "ConstantVelocity",
-    "CoordinatedTurn", "FitError", "Flat", "Gaussian", "Horseshoe", "InputError", "Known", "Laplace",
-    "LeastSquares", "Mixture", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType",
+    "CoordinatedTurn", "FitError", "Flat", "Gaussian", "Horseshoe", "InputError", "Known", "Laplace", "LeastSquares",
+    "LocalFrame", "Mixture", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType",
     "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown", "White", "fit", "load", "noise", "outliers",
-    "priors", "read_table", "save", "scores", "sensor", "sensors", "simulate", "study", "summary", "track",
+    "priors", "read_nodes", "read_table", "save", "scores", "sensor", "sensors", "simulate", "study", "summary",
+    "track", "write_nodes",
 ]  # fmt: skip

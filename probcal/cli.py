@@ -58,47 +58,63 @@ def _say(text: object) -> None:
 
 
 def load_model(path: Path) -> ModuleType:
-    """Import a model file; raises `InputError` if it is missing, fails, or defines no problem."""
-    if not path.is_file():
+    """Import a model file; raises `InputError` if it is missing or fails."""
+    if not _exists(path) or not path.is_file():
         raise InputError(f"{path}: no such model file")
     spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None:
+    if path.suffix != ".py" or spec is None or spec.loader is None:
         raise InputError(f"{path} is not a Python file; a model file defines problem(data=None)")
     module = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(path.parent.resolve()))
+    folder = str(path.parent.resolve())
+    sys.path.insert(0, folder)
     try:
-        spec.loader.exec_module(module)
-    except InputError as error:
-        raise InputError(f"{path.name}: {error}") from None
-    except Exception as error:  # whatever the user's file raises is told in one sentence
-        raise InputError(f"{path.name} cannot be loaded: {type(error).__name__}: {_one_line(error)}") from None
+        with _told(f"{path.name} cannot be loaded:", f"{path.name}: "):
+            spec.loader.exec_module(module)
     finally:
-        sys.path.pop(0)
+        if folder in sys.path:
+            sys.path.remove(folder)
     return module
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+@contextmanager
+def _told(what: str, prefix: str = "") -> Iterator[None]:
+    """Whatever a user's file raises, `sys.exit()` included, becomes one sentence; Ctrl-C stays what it is."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{prefix}{error}") from None
+    except (FitError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        try:
+            reason = str(error)
+        except Exception:  # an exception of the user's own that cannot be printed
+            reason = "no text"
+        raise InputError(f"{what} {type(error).__name__}: {reason}") from None
 
 
-def _call(module: ModuleType, path: Path, name: str, *arguments: Any, **options: Any) -> Any:
+def _exists(path: Path) -> bool:
+    """Whether a file or folder is there; a name that no file can have is not."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def _call(module: ModuleType, path: Path, name: str, /, *arguments: Any, **options: Any) -> Any:
     """Call a function of a model file; its own failures become one sentence."""
     function = getattr(module, name, None)
     if not callable(function):
         raise InputError(
             f"{path.name} defines no {name}(); a model file defines problem(data=None) and, to simulate, scenario(key)"
         )
-    try:
+    with _told(f"{path.name}: {name}() failed with"):
         return function(*arguments, **options)
-    except (InputError, FitError):
-        raise
-    except Exception as error:
-        raise InputError(f"{path.name}: {name}() failed with {type(error).__name__}: {_one_line(error)}") from None
 
 
 def _problem(model: Path, data: Path | None, fix: list[str] = []) -> tuple[ModuleType, Problem]:  # noqa: B006
     module = load_model(model)
-    if data is not None and not data.exists():
+    if data is not None and not _exists(data):
         raise InputError(f"{data}: no such file")
     problem = _call(module, model, "problem", data)
     if not isinstance(problem, Problem):
@@ -110,11 +126,16 @@ def _problem(model: Path, data: Path | None, fix: list[str] = []) -> tuple[Modul
     return module, problem
 
 
-def _truth(module: ModuleType, model: Path, data: Path | None) -> Truth | None:
-    beside = truth_beside(data) if data is not None else None
-    if beside is not None or not hasattr(module, "truth"):
-        return beside
-    return _call(module, model, "truth", data)
+def _truth(module: ModuleType, model: Path, data: Path | None, problem: Problem) -> Truth | None:
+    """The truth beside the data, else the model's own; checked before a fit rather than at its scores."""
+    truth = truth_beside(data) if data is not None else None
+    if truth is None and hasattr(module, "truth"):
+        truth = _call(module, model, "truth", data)
+        if not isinstance(truth, Truth | None):
+            raise InputError(f"{model.name}: truth() returned {type(truth).__name__}; return a probcal.Truth or None")
+    if truth is not None:
+        truth.positions(np.zeros(0), np.zeros(0, str), problem.network.dimension)
+    return truth
 
 
 @contextmanager
@@ -167,7 +188,9 @@ def fit_command(
     model: Model,
     data: Data = None,
     method: Annotated[str, typer.Option(help=" | ".join(METHODS))] = "ea",
-    prior: Annotated[str | None, typer.Option(help=" | ".join(PRIORS) + "; the method's own if left out")] = None,
+    prior: Annotated[
+        str | None, typer.Option(help=" | ".join(PRIORS) + "; the model's or the method's own if left out")
+    ] = None,
     fix: Annotated[list[str], typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = [],  # noqa: B006
     starts: Annotated[int, typer.Option(min=1, help="starts of the search; the best optimum is reported")] = 1,
     seed: Seed = 0,
@@ -184,7 +207,7 @@ def fit_command(
         _folder(out)
     began = time.perf_counter()
     module, problem = _problem(model, data, fix)
-    truth = _truth(module, model, data)
+    truth = _truth(module, model, data, problem)
     with _progress() as progress:
         tree = fit(problem, value, prior=chosen, key=seed, starts=starts, progress=progress)
     tree.attrs["model"] = model.stem
@@ -231,6 +254,8 @@ def _write(tree: xr.DataTree, out: Path) -> None:
     if (tree["residual"]["weight"] < 1).any():  # some noise has heavy tails
         files.append(out / "outliers.csv")
         _write_csv(outliers(tree), files[2])
+    else:
+        (out / "outliers.csv").unlink(missing_ok=True)  # of an earlier fit
     if _can_plot():
         files.append(_report(tree, out))
     print(f"written: {', '.join(str(path) for path in files)}")
@@ -290,10 +315,10 @@ def track_command(
         )
     _folder(out.parent)
     module, problem = _problem(model, data)
+    truth = _truth(module, model, data, problem)
     tree = track(problem, known)
     frame = track_table(tree)
     _write_csv(frame, out)
-    truth = _truth(module, model, data)
     found = scores(tree, truth) if truth is not None else {}
     if "position_rmse_after" in found:
         print(f"position RMSE before {found['position_rmse_before']:.3f} m, after {found['position_rmse_after']:.3f} m")
@@ -327,7 +352,7 @@ def parse_values(text: str) -> tuple[str, list[Any]]:
         numbers = [_number(piece) for piece in part.split(":")]
         if len(numbers) == 3 and all(isinstance(number, (int, float)) for number in numbers):
             first, last, step = numbers
-            if not step or (last - first) / step < 0:
+            if not all(np.isfinite(numbers)) or not step or (last - first) / step < 0:
                 raise InputError(f'--set "{text}": the step does not lead from {first} to {last}')
             count = int(np.floor((last - first) / step + 1e-9)) + 1
             found += [round(first + k * step, 12) for k in range(count)]
@@ -359,7 +384,9 @@ def study_command(
 ) -> None:
     """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
     chosen = choose_methods([name.strip() for name in methods.split(",")])
-    grid = dict(parse_values(text) for text in setting)
+    grid: dict[str, list[Any]] = {}
+    for name, values in map(parse_values, setting):
+        grid[name] = grid.get(name, []) + values
     if out is not None:
         _folder(out)
     module = load_model(model)
@@ -373,9 +400,12 @@ def study_command(
     print(table.to_string(index=False, float_format=lambda value: f"{value:.4g}"))
     print(f"{found['status'].size} fits in {time.perf_counter() - began:.1f} s")
     if out is not None:
-        save(xr.DataTree(found), out / "study.nc")
         _write_csv(table, out / "study.csv")
-        print(f"written: {', '.join(str(path) for path in _study_files(found, out))}")
+        try:
+            save(xr.DataTree(found), out / "study.nc")
+            print(f"written: {', '.join(str(path) for path in _study_files(found, out))}")
+        except OSError as error:
+            raise InputError(f"{out} cannot be written: {error.strerror}") from None
 
 
 def _study_files(found: xr.Dataset, out: Path) -> list[Path]:

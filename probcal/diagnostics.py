@@ -58,4 +58,4 @@ def study_table(study: xr.Dataset) -> pd.DataFrame:
     for status in ("converged", "not converged", "at bound", "diverged"):
         frame[status] = frame["status"] == status
         table[status] = frame.reset_index().groupby([*grid_of(study), "estimator"], sort=False)[status].sum()
-    return table.reset_index().rename(columns={"estimator": "method"}).fillna({"sd": 0.0})
+    return table.reset_index().rename(columns={"estimator": "method"}).dropna(axis=1, how="all")  # no sd of one run

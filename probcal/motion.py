@@ -259,14 +259,14 @@ class RandomWalk(_Composable):
 
 @dataclass(frozen=True)
 class White(_Composable):
-    """A component drawn anew at every epoch (an unknown emission range, say): mean `mean`, `std` in its unit."""
+    """A component drawn anew at every epoch (an unknown emission range, say): `mean` (one or one an axis), `std`."""
 
     memoryless: ClassVar[bool] = True
 
     name: str
     unit: str
     std: Level
-    mean: float = 0.0
+    mean: Any = 0.0
     per_axis: bool = False
 
     def __post_init__(self):

@@ -234,8 +234,5 @@ class Network:
             for name, bias in placed.type.biases.items():
                 owner = placed.type.name if bias.shared else placed.name
                 label = f"{owner}.{name}"
-                record = BiasRecord(label, bias.unit, bias.scale, bias.nominal, "scale", owner, name)
-                if label in records and not bias.shared:
-                    raise InputError(f'two biases are called "{label}"')
-                records[label] = record
+                records[label] = BiasRecord(label, bias.unit, bias.scale, bias.nominal, "scale", owner, name)
         return list(records.values())

@@ -166,10 +166,13 @@ class Mixture(_Location):
     def __post_init__(self):
         if not 0 < self.share < 1:
             raise InputError(f"Mixture(share={self.share}): the share of echoes must lie between 0 and 1")
-        if not (np.isfinite(self.scale) and self.scale > 0):
-            raise InputError(f"Mixture(scale={self.scale}): the scale of echoes must be positive")
-        if not np.isfinite(self.delay) or (self.delay == 0 and self.scale == 1):
-            raise InputError(f"Mixture(scale={self.scale}, delay={self.delay}): an echo must differ from an inlier")
+        if not 1e-3 <= self.scale <= 1e3:
+            raise InputError(f"Mixture(scale={self.scale}): the scale of echoes must lie between 0.001 and 1000 stds")
+        if not abs(self.delay) <= 1e3 or (self.delay == 0 and self.scale == 1):
+            raise InputError(
+                f"Mixture(scale={self.scale}, delay={self.delay}): an echo must differ from an inlier, by at most "
+                f"1000 stds of delay"
+            )
 
     def _parts(self, r):
         """Whitened residuals and log densities (without std) of the two components."""
@@ -187,8 +190,8 @@ class Mixture(_Location):
     @cached_property
     def _unit_information(self) -> float:
         """Expected information at std 1, by the trapezoidal rule."""
-        reach = 12.0 * max(1.0, self.scale) + abs(self.delay)
-        r = np.linspace(-reach, reach, 200_001)
+        inner = np.linspace(-12.0, 12.0, 20_001)
+        r = np.union1d(inner, self.delay + self.scale * inner)
         late, inlier, echo = self._parts(r)
         kept = 1.0 / (1.0 + np.exp(np.clip(echo - inlier, -700.0, 700.0)))
         slope = kept * r + (1 - kept) * late / self.scale

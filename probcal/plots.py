@@ -15,6 +15,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, FancyArrowPatch
 from matplotlib.ticker import MaxNLocator
 
+from probcal.types import InputError
+
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#5d3a9b")
 BEFORE = "#a6a6a6"
 GAMMA = "viridis_r"  # light: prior only, dark: data only
@@ -175,7 +177,9 @@ def plot_study(study: xr.Dataset, variable: str = "bias_rmse", axes: Sequence[Ax
     `variable` is `bias_rmse`, `position_rmse` or `coverage`; the upper half of the band is drawn, as in Papers B, C.
     """
     grid = [name for name in study[variable].dims if name not in ("estimator", "run")]
-    along = next(name for name in grid if np.issubdtype(study[name].dtype, np.number))
+    along = next((name for name in grid if np.issubdtype(study[name].dtype, np.number)), None)
+    if along is None:
+        raise InputError("plot_study: no setting of the study is a number; there is nothing to draw along")
     others = [name for name in grid if name != along]
     facets = study[variable].stack(facet=others) if others else study[variable].expand_dims(facet=[()])
     count = facets.sizes["facet"]

@@ -2,7 +2,7 @@
 
 A bias with a `survey` keeps its Gaussian of known standard deviation under every prior. Every prior takes
 `correlation`: label patterns with the correlation of the Gaussian biases they match, for survey errors that
-nodes share. Which methods take which prior is the table `inference.fit.TABLE`.
+nodes share. `inference.table()` says which method takes which prior.
 """
 
 from collections.abc import Mapping, Sequence
@@ -61,6 +61,7 @@ class _Prior:
     learns: ClassVar[bool] = False
     proper: ClassVar[bool] = True
     first: ClassVar[float] = 1.0  # precision to start from
+    note: ClassVar[str] = ""  # what the intervals of every method are worth, where the prior decides it
 
     def __post_init__(self):
         given = self.correlation.items() if isinstance(self.correlation, Mapping) else self.correlation
@@ -133,6 +134,7 @@ class Laplace(_Prior):
     learns: ClassVar[bool] = True
     proper: ClassVar[bool] = False  # what Laplace's method gives at a corner is no evidence
     rate: ClassVar[float] = float(np.sqrt(2.0))
+    note: ClassVar[str] = "l1: given the scale mixture at the mode, no posterior intervals"
 
     def learn(self, gamma: jax.Array, variance: jax.Array, z: jax.Array, group: jax.Array, rule: str) -> jax.Array:
         """Precision of the Gaussian that touches the density at z."""
@@ -163,8 +165,11 @@ class ARD(_Prior):
 
     def __post_init__(self):
         super().__post_init__()
-        if not (np.isfinite(self.shape) and self.shape > 0 and np.isfinite(self.rate) and self.rate >= 0):
-            raise InputError(f"ARD(shape={self.shape}, rate={self.rate}): shape must be positive, rate not negative")
+        if not (np.isfinite(self.shape) and self.shape >= 1 and np.isfinite(self.rate) and self.rate >= 0):
+            raise InputError(
+                f"ARD(shape={self.shape}, rate={self.rate}): shape must be 1 or more (1 is flat, more is sparser), "
+                f"rate not negative"
+            )
         if self.by is not None and self.by not in GROUPS:
             raise InputError(f'ARD(by="{self.by}"): give one of {", ".join(GROUPS)}{nearest(self.by, GROUPS)}')
 

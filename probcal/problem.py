@@ -15,6 +15,7 @@ from probcal.motion import Motion, Static, Target, White, as_motion
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, Level, Unknown, guess_of
 from probcal.rows import Block, Layout, Rows, make_block, pose_entries, pose_vector
+from probcal.sensor import VECTORS
 from probcal.table import Measurements, Table, measure, read_table
 from probcal.types import InputError, float64, nearest
 
@@ -116,21 +117,28 @@ class Problem:
     def unlinked(self) -> "Problem":
         """The same problem without motion: the state of every epoch is free, but for known and static targets."""
         names = self.measurements.target_names
-        motion = {name: self._unlinked(self._target(name)) for name in names}
+        motion = {name: self._unlinked(name, self._target(name)) for name in names}
         return Problem(self.network, motion, self.measurements.table, fix=self.fixed)
 
-    def _unlinked(self, target: Target) -> Motion:
-        """Each component that links epochs replaced by one drawn anew, with a wide start."""
+    def _unlinked(self, name: str, target: Target) -> Target:
+        """Each component that links epochs replaced by one drawn anew, as wide as an undeclared start."""
+        time = self.measurements.time[self.measurements.target == self.measurements.target_names.index(name)]
         free: list[Any] = []
-        starts = {name: pair for c in as_motion(target.motion).components for name, pair in c.start().items()}
-        for component in as_motion(target.motion).components:
+        motion = as_motion(target.motion)
+        for component in motion.components:
             if component.memoryless or isinstance(component, Static):
                 free.append(component)
                 continue
-            for name, per_axis in component.names():
-                mean, std = starts.get(name, (0.0, DIFFUSE * self.extent))
-                free.append(White(name, "", std, mean, per_axis))
-        return Motion(tuple(free))
+            mean, std = self._start(name, component, Target(motion), motion, time)
+            row = 0
+            for part, per_axis in component.names():
+                width = self.network.dimension if per_axis else 1
+                wide = max(std[row], guess_of(component.std) * np.sqrt(np.ptp(time)))
+                wide = wide if part in VECTORS else DIFFUSE * wide
+                free.append(White(part, "", wide, mean[row : row + width] if per_axis else mean[row], per_axis))
+                row += width
+        kept = {part for c in free if isinstance(c, Static) for part, _ in c.names()}
+        return Target(Motion(tuple(free)), {part: pair for part, pair in target.start.items() if part in kept})
 
     @property
     def extent(self) -> float:
@@ -350,13 +358,13 @@ class _Levels:
         """Number of the level, -1 where it is known."""
         if not isinstance(level, Unknown):
             return -1
-        record = LevelRecord(label, unit, level.guess, level.factor)
-        if record not in self.records:
-            twins = sum(other.label.split("#")[0] == label for other in self.records)
-            if twins:
-                record = LevelRecord(f"{label}#{twins + 1}", unit, level.guess, level.factor)
-            self.records.append(record)
-        return self.records.index(record)
+        twins = [other for other in self.records if other.label.split("#")[0] == label]
+        for k, other in enumerate(twins):
+            if (other.guess, other.factor) == (level.guess, level.factor):
+                return self.records.index(twins[k])
+        name = f"{label}#{len(twins) + 1}" if twins else label
+        self.records.append(LevelRecord(name, unit, level.guess, level.factor))
+        return len(self.records) - 1
 
 
 def _channel_levels(kind: Any, dimension: int, levels: _Levels) -> list[int]:

@@ -60,6 +60,11 @@ class Channel:
     def __post_init__(self):
         if not isinstance(self.unit, str):
             raise InputError(f'Channel({self.unit!r}, ...): the first argument is the unit, a string such as "m"')
+        if not hasattr(self.noise, "log_likelihood"):
+            raise InputError(
+                f"Channel({self.unit!r}, noise={self.noise!r}): give a noise family such as StudentT(4), Mixture(), "
+                f"Bernoulli() or probcal.noise.Gaussian(); probcal.Gaussian is a prior"
+            )
         if not isinstance(self.noise, Bernoulli):
             check_level(self.std, f"Channel({self.unit!r}): std")
         if self.wrap and self.unit not in PERIODS:

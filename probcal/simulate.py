@@ -15,6 +15,7 @@ from probcal import rows
 from probcal.network import Network
 from probcal.noise import Bernoulli
 from probcal.problem import Problem
+from probcal.table import Table, factor, header, name_of, numbers, read_table
 from probcal.types import AXES, InputError, float64, nearest
 
 Key = int | jax.Array
@@ -27,26 +28,33 @@ def as_key(key: Key) -> jax.Array:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is known of the truth: tracks (columns time, [target], position_x, ...) and biases by label."""
+    """What is known of the truth: tracks (columns time, [target], position_x, ...) and biases by label.
+
+    `tracks` is a path or a DataFrame, in s and m where its headers state no unit. Raises `InputError` naming file, row
+    and column.
+    """
 
     tracks: pd.DataFrame | str | PathLike[str] | None = None
     biases: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self):
-        if self.tracks is not None and not isinstance(self.tracks, pd.DataFrame):
-            object.__setattr__(self, "tracks", _read(Path(self.tracks)))
-        if isinstance(self.tracks, pd.DataFrame):
-            for column in ("time", "position_x", "position_y"):
-                if column not in self.tracks.columns:
-                    raise InputError(f'truth: the tracks have no column "{column}"')
+        if self.tracks is not None:
+            object.__setattr__(self, "tracks", _tracks(read_table(self.tracks)))
+        if not isinstance(self.biases, Mapping):
+            raise InputError(f"truth: biases is {type(self.biases).__name__}; give a mapping from label to value")
+        for label, value in self.biases.items():
+            if not isinstance(value, (int, float, np.number)) or not np.isfinite(value):
+                raise InputError(f'truth: bias "{label}" is {value!r}; give a finite number')
 
     def positions(self, time: np.ndarray, target: np.ndarray, dimension: int) -> np.ndarray:
         """True positions (E, d) at times and targets (E,), interpolated; NaN outside the recorded track."""
         found = np.full((len(time), dimension), np.nan)
         if not isinstance(self.tracks, pd.DataFrame):
             return found
-        owner = self.tracks["target"].astype(str) if "target" in self.tracks else None
+        owner = self.tracks["target"].map(name_of) if "target" in self.tracks else None
         columns = [f"position_{axis}" for axis in AXES[:dimension]]
+        if columns[-1] not in self.tracks:
+            raise InputError(f'truth: the tracks have no column "{columns[-1]}", the network is {dimension}-D')
         for name in np.unique(target):
             track = self.tracks if owner is None else self.tracks[owner == name]
             if not len(track):
@@ -88,21 +96,41 @@ def truth_beside(path: str | PathLike[str]) -> Truth | None:
     tracks, biases = _beside(Path(path))
     if not tracks.exists() and not biases.exists():
         return None
-    values = _read(biases) if biases.exists() else pd.DataFrame({"bias": [], "value": []})
-    return Truth(
-        tracks if tracks.exists() else None, dict(zip(values["bias"], values["value"].astype(float), strict=True))
-    )
+    values = _biases_of(read_table(biases)) if biases.exists() else {}
+    return Truth(tracks if tracks.exists() else None, values)
 
 
 def _beside(path: Path) -> tuple[Path, Path]:
     return path.with_suffix(".tracks.csv"), path.with_suffix(".biases.csv")
 
 
-def _read(path: Path) -> pd.DataFrame:
-    try:
-        return pd.read_csv(path)
-    except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
-        raise InputError(f"truth {path}: cannot be read as CSV ({error})") from None
+def _columns(table: Table, **wanted: str) -> pd.DataFrame:
+    """A truth with the wanted columns as floats in the wanted units, without gaps."""
+    names, units = header(table)
+    frame = table.frame.set_axis(names, axis=1)
+    for name, unit in wanted.items():
+        if name not in names:
+            raise InputError(f'truth {table.source} has no column "{name}"{nearest(name, names)}')
+        values, there = numbers(table, frame[name], name)
+        blank = np.flatnonzero(~there)
+        if len(blank):
+            raise InputError(f'truth {table.where(blank[0])} column "{name}" is blank; drop the row')
+        frame = frame.assign(**{name: values * factor(table, name, units[name], unit)})
+    return frame
+
+
+def _tracks(table: Table) -> pd.DataFrame:
+    """True tracks with times in s and positions in m."""
+    third = {"position_z": "m"} if "position_z" in header(table)[0] else {}
+    return _columns(table, time="s", position_x="m", position_y="m", **third)
+
+
+def _biases_of(table: Table) -> dict[str, float]:
+    """True biases by label, from columns bias and value."""
+    frame = _columns(table, value="1")
+    if "bias" not in frame:
+        raise InputError(f'truth {table.source} has no column "bias"{nearest("bias", frame.columns)}')
+    return dict(zip(frame["bias"].astype(str), frame["value"].tolist(), strict=True))
 
 
 @float64

@@ -1,7 +1,8 @@
 """The long table of rows, `time, sensor, [target], <a column a channel>`, checked at the door."""
 
-import re
+import warnings
 from dataclasses import dataclass
+from numbers import Number
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -24,20 +25,23 @@ UNITS = {
     "%": ("ratio", 1e-2), "T": ("magnetic field", 1.0), "uT": ("magnetic field", 1e-6),
     "nT": ("magnetic field", 1e-9),
 }  # fmt: skip
-HEADER = re.compile(r"^\s*(?P<name>[^\[\]]+?)\s*(\[\s*(?P<unit>[^\]]*?)\s*\])?\s*$")
+BLANK = ("", "nan", "NaN", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None", "-nan")  # cells without a number
+LARGEST = 1e100  # of a cell: what is computed from it, squares included, stays finite
+NAMES = ("sensor", "target", "node", "name")  # columns whose cells are read as text: 01 stays 01, NA is a name
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A table as read, not yet checked against a network: the frame, its name, and the line of each row."""
+    """A table as read, not yet checked: the frame, its name, the line of each row and what a row is called."""
 
     frame: pd.DataFrame
     source: str
     lines: np.ndarray
+    word: str = "row"
 
     def where(self, row: int) -> str:
         """Name of a row in complaints: the line of the file (the header is line 1), or the index of a frame."""
-        return f"{self.source} row {self.lines[row]}"
+        return f"{self.source} {self.word} {self.lines[row]}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,23 +72,41 @@ def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
     if not isinstance(source, (str, PathLike)):
         raise InputError(f"data must be a path or a DataFrame, got {type(source).__name__}")
     path = Path(source)
+    form: dict[str, Any] = dict(index_col=False, skip_blank_lines=False, encoding="utf-8-sig", low_memory=False)
     try:
-        frame = pd.read_csv(path, skip_blank_lines=False, encoding="utf-8-sig", low_memory=False)
+        first = pd.read_csv(path, header=None, nrows=1, dtype=str, keep_default_na=False, **form)
+        columns = _once(path, first.iloc[0].tolist())
+        text = [column for column in columns if split_header(column)[0] in NAMES]
+        form |= {"na_values": dict.fromkeys(columns, BLANK) | dict.fromkeys(text, ("",)), "keep_default_na": False}
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            frame = pd.read_csv(path, names=columns, header=0, dtype=dict.fromkeys(text, str), **form)
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path.name} is not a CSV table with a header line: {reason}") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except pd.errors.ParserWarning:
+        raise InputError(f"{path.name} has rows with more cells than its header; give every column a name") from None
+    except Exception as error:  # whatever pandas and the packages that unpack files say of foreign bytes
+        raise InputError(f"{path.name} is not a CSV table with a header line: {error}") from None
     lines = np.arange(2, len(frame) + 2)
-    blank = frame.isna().all(axis=1).to_numpy()
-    return Table(frame[~blank].reset_index(drop=True), path.name, lines[~blank])
+    filled = frame.notna().any(axis=1).to_numpy()
+    return Table(frame[filled].reset_index(drop=True), path.name, lines[filled])
+
+
+def _once(path: Path, columns: list[str]) -> list[str]:
+    """Headers of a file, each once."""
+    for column in columns:
+        if columns.count(column) > 1:
+            raise InputError(f'{path.name} has the column "{column}" twice')
+    return columns
 
 
 def measure(table: Table, network: Network) -> Measurements:
     """Check a table against a network; every complaint names file, row and column and says what to do."""
-    names, units = _header(table)
+    names, units = header(table)
     frame = table.frame.set_axis(names, axis=1)
     for column in ("time", "sensor"):
         if column not in names:
@@ -104,9 +126,9 @@ def measure(table: Table, network: Network) -> Measurements:
     measured, has_std = np.zeros(shape, bool), np.zeros(shape, bool)
     for j, name in enumerate(channels):
         if name in names:
-            value[:, j], measured[:, j] = _numbers(table, frame[name], name)
+            value[:, j], measured[:, j] = numbers(table, frame[name], name)
         if f"{name}_std" in names:
-            std[:, j], has_std[:, j] = _numbers(table, frame[f"{name}_std"], f"{name}_std")
+            std[:, j], has_std[:, j] = numbers(table, frame[f"{name}_std"], f"{name}_std")
         _check_stds(table, f"{name}_std", std[:, j], has_std[:, j])
         _to_channel(table, network, name, j, sensor, units, value, std, measured)
     result = Measurements(time, sensor, target, target_names, channels, value, measured, std, has_std & measured, table)
@@ -114,13 +136,23 @@ def measure(table: Table, network: Network) -> Measurements:
     return result
 
 
-def _header(table: Table) -> tuple[list[str], dict[str, str | None]]:
-    names, units = [], {}
+def split_header(column: object) -> tuple[str, str | None]:
+    """Name and unit of a header such as `azimuth [deg]`; the name is empty where it cannot be read."""
+    text, unit = str(column).strip(), None
+    if text.endswith("]"):
+        text, _, unit = text[:-1].partition("[")
+        unit = unit.strip()
+    return ("" if set("[]") & set(text + (unit or "")) else text.strip()), unit
+
+
+def header(table: Table) -> tuple[list[str], dict[str, str | None]]:
+    """Names of the columns in order, and the unit (or None) of each; raises `InputError` naming the column."""
+    names: list[str] = []
+    units: dict[str, str | None] = {}
     for column in table.frame.columns:
-        found = HEADER.match(str(column))
-        if found is None:
+        name, unit = split_header(column)
+        if not name:
             raise InputError(f'{table.source} column "{column}": write the header as name or name [unit]')
-        name, unit = found["name"], found["unit"]
         if name in units:
             raise InputError(f'{table.source} has the column "{name}" twice')
         if unit is not None and unit not in UNITS:
@@ -130,33 +162,50 @@ def _header(table: Table) -> tuple[list[str], dict[str, str | None]]:
     return names, units
 
 
-def _numbers(table: Table, column: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Values with zeros where blank, and which are there."""
-    numbers = pd.to_numeric(column, errors="coerce").to_numpy(float, na_value=np.nan)
-    text = np.flatnonzero(np.isnan(numbers) & column.notna().to_numpy())
+def _floats(column: pd.Series) -> np.ndarray:
+    """Cells as floats, NaN where a cell is blank or no number."""
+    if column.dtype.kind in "mMc" or isinstance(column.dtype, pd.PeriodDtype):  # pandas would count their ticks
+        return np.full(len(column), np.nan)
+    with np.errstate(over="ignore"):
+        try:
+            found = pd.to_numeric(column, errors="coerce")
+            if found.dtype.kind != "c":
+                return found.to_numpy(float, na_value=np.nan)
+        except OverflowError:
+            pass
+        return np.array([_float(cell) for cell in column])
+
+
+def _float(cell: Any) -> float:
+    try:
+        return float(cell)
+    except (TypeError, ValueError, OverflowError):
+        return np.nan
+
+
+def numbers(table: Table, column: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Values (N,) with zeros where blank, and which are there; raises `InputError` naming row and column."""
+    found = _floats(column)
+    text = np.flatnonzero(np.isnan(found) & column.notna().to_numpy())
     if len(text):
         raise InputError(
             f'{table.where(text[0])} column "{name}": "{column.iloc[text[0]]}" is no number; leave it blank'
         )
-    infinite = np.flatnonzero(np.isinf(numbers))
+    infinite = np.flatnonzero(np.isinf(found))
     if len(infinite):
         raise InputError(f'{table.where(infinite[0])} column "{name}": the value is infinite; leave it blank')
-    there = ~np.isnan(numbers)
-    return np.where(there, numbers, 0.0), there
+    large = np.flatnonzero(np.abs(found) > LARGEST)
+    if len(large):
+        raise InputError(f'{table.where(large[0])} column "{name}": {found[large[0]]:g} is too large; leave it blank')
+    there = ~np.isnan(found)
+    return np.where(there, found, 0.0), there
 
 
 def _times(table: Table, column: pd.Series, unit: str | None) -> np.ndarray:
-    dates = pd.api.types.is_datetime64_any_dtype(column)
-    if pd.api.types.is_timedelta64_dtype(column):
-        column = column.dt.total_seconds()
-    numeric = pd.Series(np.nan, column.index) if dates else pd.to_numeric(column, errors="coerce")
-    if numeric.isna().all() and column.notna().any():  # a column of dates: seconds since the first one
-        stamps = pd.to_datetime(column, errors="coerce", utc=True, format=None if dates else "ISO8601")
-        if stamps.notna().any():
-            numeric = (stamps - stamps.min()).dt.total_seconds()
-            unit = "s"
-    values = numeric.to_numpy(float, na_value=np.nan)
-    bad = np.flatnonzero(~np.isfinite(values))
+    values = _floats(column)
+    if np.isnan(values).all() and column.notna().any():  # durations or dates
+        values, unit = _seconds(column), None
+    bad = np.flatnonzero(~(np.abs(values) <= LARGEST))
     if len(bad):
         given = column.iloc[bad[0]]
         raise InputError(
@@ -168,38 +217,57 @@ def _times(table: Table, column: pd.Series, unit: str | None) -> np.ndarray:
     return values * factor
 
 
-def _name(value: Any) -> str:
-    """A sensor or target name as text: 1, 1.0 and " 1" are one name."""
-    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value).strip()
+def _seconds(column: pd.Series) -> np.ndarray:
+    """A column of durations in seconds, or of dates in seconds since the first one; NaN where it is neither."""
+    if column.dtype.kind == "m":
+        return column.dt.total_seconds().to_numpy(float)
+    if column.dtype == object:  # a number among dates is none
+        column = column.map(lambda cell: None if isinstance(cell, Number) else cell)
+    try:
+        stamps = pd.to_datetime(
+            column, errors="coerce", utc=True, format=None if column.dtype.kind == "M" else "ISO8601"
+        )
+        return (stamps - stamps.min()).dt.total_seconds().to_numpy(float)
+    except (TypeError, ValueError, OverflowError):  # objects that are no dates, or dates too far apart
+        return np.full(len(column), np.nan)
+
+
+def name_of(value: Any) -> str:
+    """A sensor, target or node name as text: 1, 1.0 and " 1" are one name, 01 is another."""
+    text = str(value).strip()
+    whole, _, rest = text.partition(".")
+    return whole if rest and not rest.strip("0") and whole.lstrip("-").isdigit() else text
 
 
 def _sensors(table: Table, column: pd.Series, network: Network) -> np.ndarray:
-    number = {placed.name: k for k, placed in enumerate(network.sensors)}
-    text = column.map(_name)
-    found = text.map(number)
-    unknown = np.flatnonzero(found.isna().to_numpy())
+    number = {name_of(placed.name): k for k, placed in enumerate(network.sensors)}
+    text = [name_of(value) for value in column]
+    blank = column.isna().to_numpy()
+    found = np.array([-1 if gone else number.get(name, -1) for name, gone in zip(text, blank, strict=True)], int)
+    unknown = np.flatnonzero(found < 0)
     if len(unknown):
-        name = "blank" if pd.isna(column.iloc[unknown[0]]) else f'"{text.iloc[unknown[0]]}"'
-        raise InputError(
-            f"{table.where(unknown[0])}: sensor {name} is not in the network{nearest(text.iloc[unknown[0]], number)}"
-        )
-    return found.to_numpy(int)
+        row = unknown[0]
+        name = "blank" if blank[row] else f'"{text[row]}"'
+        raise InputError(f"{table.where(row)}: sensor {name} is not in the network{nearest(text[row], number)}")
+    return found
 
 
 def _targets(table: Table, column: pd.Series | None, rows: int) -> tuple[tuple[str, ...], np.ndarray]:
     if column is None:
         return ("target",), np.zeros(rows, int)
-    blank = np.flatnonzero(column.isna().to_numpy())
+    text = pd.Series([name_of(value) for value in column], dtype=object)
+    blank = np.flatnonzero(column.isna().to_numpy() | (text == "").to_numpy())
     if len(blank):
         raise InputError(f'{table.where(blank[0])} column "target" is blank; name the target or drop the column')
-    codes, names = pd.factorize(column.map(_name))
+    codes, names = pd.factorize(text)
     return tuple(names), codes
 
 
 def _check_stds(table: Table, name: str, std: np.ndarray, given: np.ndarray) -> None:
-    bad = np.flatnonzero(given & (std <= 0))
+    bad = np.flatnonzero(given & (std < 1 / LARGEST))
     if len(bad):
-        raise InputError(f'{table.where(bad[0])} column "{name}": std is {std[bad[0]]:g}; it must be positive')
+        value = f"{std[bad[0]]:g}"
+        raise InputError(f'{table.where(bad[0])} column "{name}": std is {value}; it must be positive, 1e-100 or more')
 
 
 def _to_channel(
@@ -220,24 +288,23 @@ def _to_channel(
                 )
             continue
         for column, array in ((name, value), (f"{name}_std", std)):
-            array[sensor == k, j] *= _factor(table, column, units.get(column), channel.unit)
+            array[sensor == k, j] *= factor(table, column, units.get(column), channel.unit)
         if isinstance(channel.noise, Bernoulli):
             wrong = np.flatnonzero(rows & ~channel.noise.check(value[:, j]))
             if len(wrong):
                 raise InputError(f'{table.where(wrong[0])} column "{name}": {value[wrong[0], j]:g} is not 0 or 1')
 
 
-def _factor(table: Table, name: str, unit: str | None, wanted: str) -> float:
+def factor(table: Table, name: str, unit: str | None, wanted: str) -> float:
+    """What takes a column from its unit (None: already there) to the wanted one; raises `InputError`."""
     if unit is None or unit == wanted:
         return 1.0
     if wanted not in UNITS:
         raise InputError(f'{table.source} column "{name}": unit "{unit}", but the channel is in "{wanted}"')
-    quantity, factor = UNITS[unit]
+    quantity, size = UNITS[unit]
     if quantity != UNITS[wanted][0]:
-        raise InputError(
-            f'{table.source} column "{name}": unit "{unit}" is no {UNITS[wanted][0]}; the channel is in {wanted}'
-        )
-    return factor / UNITS[wanted][1]
+        raise InputError(f'{table.source} column "{name}": unit "{unit}" is no {UNITS[wanted][0]}; give it in {wanted}')
+    return size / UNITS[wanted][1]
 
 
 def _check_duplicates(data: Measurements, network: Network) -> None:

@@ -51,6 +51,7 @@ class Result:
     seed: int
     approximate: str
     intervals: str
+    settings: str
     status: str
     message: str
     z: np.ndarray  # (M,)
@@ -170,8 +171,8 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         )
     attrs = {
         "method": result.method, "prior": result.prior, "seed": result.seed, "approximate": result.approximate,
-        "intervals": result.intervals, "interval_probability": INTERVAL, "status": result.status,
-        "message": result.message, "data": problem.measurements.table.source,
+        "intervals": result.intervals, "settings": result.settings, "interval_probability": INTERVAL,
+        "status": result.status, "message": result.message, "data": problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
     }  # fmt: skip
     if result.evidence is not None:
@@ -207,14 +208,20 @@ def build_tracks(problem: Problem, tracks: Sequence[Tracks]) -> xr.DataTree:
 
 
 def _constant(problem: Problem) -> xr.Dataset:
-    """Stated positions of the nodes, their calibrated shift by label, and the fixed biases."""
+    """Stated values of the nodes (positions, headings, every component), which of them move, and the fixed biases."""
     d, nodes = problem.network.dimension, problem.network.nodes
+    stated = [(n.name, component, float(value)) for n in nodes for component, value in n.components.items()]
+    owners, components, numbers = zip(*stated, strict=True)
     values = {
         "node_position": (("node", "axis"), np.stack([n.position for n in nodes])),
         "node_heading": ("node", np.array([float(n.components["heading"]) for n in nodes])),
         "moving": ("node", np.array([n.path is not None for n in nodes])),
+        "stated": ("value", np.array(numbers)),
     }
-    coords = {"node": [n.name for n in nodes], "axis": ["x", "y", "z"][:d]}
+    coords: dict[str, Any] = {
+        "node": [n.name for n in nodes], "axis": ["x", "y", "z"][:d],
+        "stated_node": ("value", np.array(owners)), "stated_component": ("value", np.array(components)),
+    }  # fmt: skip
     if problem.fixed:
         values["fixed"] = ("fixed_label", np.array(list(problem.fixed.values())))
         coords["fixed_label"] = list(problem.fixed)
@@ -291,12 +298,12 @@ def _umask() -> int:
 def load(path: str | PathLike[str]) -> xr.DataTree:
     """Read a fit back from its file, or from the folder that holds `fit.nc`."""
     path = Path(path)
-    path = path / "fit.nc" if path.is_dir() else path
     try:
+        path = path / "fit.nc" if path.is_dir() else path
         with xr.open_datatree(path, engine="h5netcdf") as tree:
             tree = tree.load()
-    except (OSError, ValueError) as error:
+    except Exception as error:  # whatever the netCDF and HDF5 libraries say of foreign bytes
         raise InputError(f"{path} is not a fit written by probcal ({type(error).__name__}: {error})") from None
-    if "calibration" not in tree.children:
-        raise InputError(f"{path} is not a fit written by probcal: it has no group calibration")
+    if "calibration" not in tree.children or not set(SUMMARY[1:]) <= set(tree["calibration"].data_vars):
+        raise InputError(f"{path} is not a fit written by probcal: its group calibration is missing or incomplete")
     return tree

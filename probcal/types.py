@@ -12,7 +12,10 @@ AXES = ("x", "y", "z")
 
 
 class InputError(ValueError):
-    """A declaration, table or argument that cannot be used; the text says what to do about it."""
+    """A declaration, table or argument that cannot be used; the text, one line, says what to do about it."""
+
+    def __init__(self, text: object):
+        super().__init__(one_line(text))
 
 
 class FitError(RuntimeError):
@@ -38,6 +41,14 @@ def nearest(name: str, known: Iterable[str]) -> str:
         return f'; did you mean "{close[0]}"?'
     shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
     return f"; known: {shown}" if names else ""
+
+
+def one_line(text: object, width: int = 800) -> str:
+    """Text on one line that can be printed, its middle cut out where it is longer than `width`."""
+    line = " ".join(str(text).split())
+    if len(line) > width:
+        line = f"{line[: width // 2]} ... {line[-width // 2 :]}"
+    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in line)
 
 
 class View:

@@ -46,7 +46,7 @@ LINEARISE = jax.jit(rows.linearise, static_argnums=0, static_argnames="expected"
 CV = ConstantVelocity(0.5)
 POWER = RandomWalk("power", "dB", 0.2, (60.0, 5.0))
 EMISSION = White("emission", "m", 200.0)
-MOMENT = RandomWalk("moment", "A m2", 200.0, (0.0, 5000.0), per_axis=True)
+MOMENT = RandomWalk("moment", "A m2", 20.0, (0.0, 5000.0), per_axis=True)
 EXTRAS = {"toa": EMISSION, "rss": POWER, "rss_slope": POWER, "sound": POWER, "magnetometer": MOMENT,
           "magnetometer_3d": MOMENT, "microphone": RandomWalk("sound_power", "dB", 0.2, (60.0, 5.0)),
           "geophone": RandomWalk("ground_power", "dB", 0.2, (60.0, 5.0))}  # fmt: skip
@@ -55,9 +55,17 @@ DIMENSIONS = {"ranger": (2, 3), "flight_time": (2, 3), "doppler": (2, 3), "toa":
               "rss_difference": (2, 3), "sound": (2, 3), "microphone": (2, 3), "geophone": (2, 3),
               "magnetometer": (2,), "magnetometer_3d": (3,), "camera": (2, 3), "camera_3d": (3,), "presence": (2, 3),
               "position": (2, 3), "cross_track": (2, 3), "altitude": (3,)}  # fmt: skip
-# types that see too little of a target by themselves: their nodes carry ranges too
-HELPED = ("doppler", "cross_track", "altitude")
+# Types that see too little of a target by themselves: their nodes carry ranges too. A dipole in space falls off so
+# steeply that the automatic start from magnetometers alone misses the track in 2 of 8 seeds.
+HELPED = ("doppler", "cross_track", "altitude", "magnetometer_3d")
 CASES = [(name, d) for name, dimensions in DIMENSIONS.items() for d in dimensions]
+FLAT = ("doa", "camera")  # they see angles in the plane alone
+# every type is fitted in one dimension by default, 2-D and 3-D in turns, and in the other among the slow tests
+FITS = [
+    pytest.param(name, d, marks=[] if d == dimensions[0 if name in FLAT else k % len(dimensions)] else pytest.mark.slow)
+    for k, (name, dimensions) in enumerate(DIMENSIONS.items())
+    for d in dimensions
+]
 CORNERS = {
     2: [(0, 0), (60, 0), (60, 60), (0, 60), (30, -10), (75, 30)],
     3: [(0, 0, 0), (60, 0, 12), (60, 60, 1), (0, 60, 15), (30, -10, 6), (75, 30, 20)],
@@ -120,7 +128,7 @@ def test_every_type_of_the_catalogue_is_listed():
     assert set(catalogue()) == set(DIMENSIONS)
 
 
-@pytest.mark.parametrize(("name", "d"), CASES)
+@pytest.mark.parametrize(("name", "d"), FITS)
 def test_every_sensor_simulates_and_fits(name, d):
     kind = catalogue()[name]
     network = place(kind, d)
@@ -129,7 +137,8 @@ def test_every_sensor_simulates_and_fits(name, d):
     problem = Problem(network, motion, run.table)
     tree = fit(problem, MAP(), predictive_draws=True)
     check_tree(tree, problem)
-    informative = name != "presence" and not (name == "doa" and d == 3)
+    # a presence is coarse, and angles in the plane tell no height
+    informative = name != "presence" and not (name in FLAT and d == 3)
     if informative:  # the track is found, from the data alone: its error is as large as its sd says
         track = tree["track"].to_dataset()
         axes = [f"position_{axis}" for axis in "xyz"[:d]]
@@ -324,16 +333,27 @@ def seen(kind, motion, gain=True):
     return Problem(Network([kind.on(*nodes[: kind.arity], name="it")]), motion, table)
 
 
+RECORDINGS = {"sflab": "sflab_mic_toa/dataset_1_exp2.mat", "robots": "mrclam/MRCLAM_Dataset6",
+              "receivers": "mlat_locards/set_1.csv", "tdoa_flight": "uwb_tdoa"}  # fmt: skip
+
+
 @pytest.mark.parametrize("file", sorted((File(__file__).parents[1] / "models").glob("*.py")), ids=lambda p: p.stem)
 def test_every_model_file_declares_a_problem(file, monkeypatch):
     monkeypatch.syspath_prepend(file.parent)
     spec = importlib.util.spec_from_file_location(f"model_{file.stem}", file)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    problem = module.problem()
+    data = None
+    if file.stem in RECORDINGS:
+        with pytest.raises(InputError, match="needs "):
+            module.problem()
+        data = File(__file__).parents[2] / "shared" / "data" / RECORDINGS[file.stem]
+        if not data.exists():
+            pytest.skip(f"the recording {RECORDINGS[file.stem]} is not here")
+    problem = module.problem(data)
     assert problem.labels
     if hasattr(module, "truth"):
-        assert set(module.truth().biases) <= set(problem.labels)
+        assert set(module.truth(data).biases) <= {*problem.labels, *problem.fixed}
     if hasattr(module, "scenario"):
         one, same, other = module.scenario(1), module.scenario(1), module.scenario(2)
         assert one.table.equals(same.table)
@@ -510,9 +530,8 @@ def test_a_microphone_and_a_geophone_share_the_displacement_of_their_node():
 
     score, both = sds(run.table)
     assert np.abs(score).max() < 3.5  # two standard normals: 0.1 % of seeds
-    blank = run.table.copy()
-    blank.loc[blank["sensor"].str.startswith("geo") & (blank.index > 11), "ground_level"] = np.nan
-    assert (both < 0.9 * sds(blank)[1]).all()  # what both hear counts twice
+    deaf = sds(run.table.assign(ground_level_std=1e3))[1]  # geophones that hear nothing but noise
+    assert (both < 0.9 * deaf).all()
 
 
 @pytest.mark.parametrize(

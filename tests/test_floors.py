@@ -12,7 +12,7 @@ FLOORS = {
     0: ("linalg", "geometry", "types"),
     1: ("sensor", "motion", "priors", "noise"),
     2: ("sensors", "roads"),
-    3: ("network", "table", "rows"),
+    3: ("network", "table", "nodes", "rows"),
     4: ("problem", "simulate", "tree"),
     5: ("smoothing",),
     6: ("inference", "analysis", "selfcal"),

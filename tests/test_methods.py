@@ -1,15 +1,19 @@
 """Every classical method against what defines it: exact posteriors, stationarity, fixed points; noise families."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 import reference
+from test_catalogue import check_tree
 from test_exact import CASES, close, plane, resting, table_of
 
 import probcal
 from probcal import ARD, EA, EM, EMEA, MAP, Flat, Gaussian, Laplace, Mixture, StudentT
-from probcal.inference import METHODS
+from probcal.inference import METHODS, table
 from probcal.noise import Gaussian as Normal
 from probcal.priors import PRIORS
 from probcal.types import InputError
@@ -72,7 +76,8 @@ def test_l1_is_stationary(method):
     np.testing.assert_allclose(slope[~free], z[~free], atol=1e-4)
     assert (group["status"].values[gone] == "pruned").all()
     assert "log_evidence" not in tree.attrs
-    assert np.isfinite(tree["log_prior"]["bias"].values).all()
+    assert "log_prior" not in tree.children, "the draws are not of that density"
+    assert tree.attrs["intervals"].startswith("l1")
 
 
 @pytest.mark.parametrize("by", ["node", "owner", "type", "component"])
@@ -100,6 +105,39 @@ def test_mackay_and_em_updates_share_fixed_points():
     assert len(fast["optimisation"]["objective"]) < len(slow["optimisation"]["objective"])
     trace = slow["optimisation"]["objective"].values
     assert (np.diff(trace) > -1e-8).all(), "EM never lowers the evidence"
+
+
+@pytest.mark.parametrize(
+    "method", [EA(iterations=3), EMEA(iterations=3), EA(iterations=3, trajectory="smoothed")], ids=repr
+)
+def test_iterations_are_a_cap_and_what_is_reported_belongs_together(method):
+    linear, problem, tree = solve(method)
+    _, group = z_of(tree, linear)
+    assert tree["optimisation"].sizes["iteration"] == 3
+    information = tree["calibration"]["information"].values
+    covariance = np.linalg.inv(information + np.diag(tree["calibration"]["precision"].values))
+    sd = tree["calibration"]["sd"].values / problem.scales
+    close(sd, np.sqrt(np.diag(covariance)), 1e-9)
+    gamma = 1 - group["precision"] * (group["sd"] / group["scale"]) ** 2
+    np.testing.assert_allclose(group["gamma"], np.clip(gamma, 0, 1), atol=1e-9)
+    if isinstance(method, EMEA):
+        assert tree.attrs["message"].startswith("All 3 iterations were run, as asked; the last moved the objective by")
+
+
+def test_least_squares_does_not_know_the_origin():
+    """Shifting the world to a map's northings moves nothing: the free positions are centred on the nodes."""
+    kind, found = probcal.sensors.ranger, []
+    corners = np.array([(0, 0), (60, 0), (60, 60), (0, 60)], float)
+    path = np.stack([np.linspace(5, 55, 12), 30 + 20 * np.sin(np.linspace(0, 6, 12))], 1)
+    for shift in (0.0, 4e6):
+        nodes = [probcal.Node(f"n{k}", p + shift) for k, p in enumerate(corners)]
+        network = probcal.Network([kind.on(node) for node in nodes])
+        run = probcal.simulate(network, probcal.ConstantVelocity(0.5), np.arange(12.0), 1, biases={},
+                               tracks={"target": path + shift})  # fmt: skip
+        problem = probcal.Problem(network, probcal.ConstantVelocity(0.5), run.table, fix=["*.range_scale"])
+        found.append(probcal.fit(problem, probcal.LeastSquares(), predictive_draws=False))
+    means = [tree["calibration"]["mean"].values for tree in found]
+    np.testing.assert_allclose(means[1], means[0], atol=1e-3)
 
 
 def test_em_reaches_the_mode_and_the_maximum_likelihood():
@@ -259,26 +297,76 @@ def test_outlying_rows_are_listed(noise, method):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_pair_of_prior_and_method_fits_or_says_so(name):
+    """The contract of results for every prior a method takes (groups of ARD apart), one sentence for the others."""
     method, _ = METHODS[name]
-    network, motion, table = shifted()
-    problem = probcal.Problem(network, motion, table)
     for prior in PRIORS.values():
-        if isinstance(prior, method.priors):
-            continue
-        with pytest.raises(InputError, match=f"does not take the prior {type(prior).__name__}; it takes: "):
-            probcal.fit(problem, method, prior=prior)
+        if not isinstance(prior, method.priors):
+            with pytest.raises(InputError, match=f"does not take the prior {type(prior).__name__}; it takes: "):
+                solve(method, prior)
+        elif getattr(prior, "by", None) is None:
+            _, problem, tree = solve(method, prior)
+            check_tree(tree, problem)
+            assert tree.attrs["prior"] == type(prior).__name__
+            assert tree.attrs["status"] == "converged" or name == "paper-b"  # 25 iterations, as in the paper
+
+
+def test_the_table_of_pairs_is_that_of_the_readme():
+    text = (Path(__file__).parents[1] / "README.md").read_text()
+    for name, row in table().iterrows():
+        cells = " | ".join(row)
+        assert f"| `{name}()` | {cells} |" in text
+
+
+def test_least_squares_with_known_targets_is_the_closed_form():
+    """Known targets: the normal equations; with an unknown target beside them, its states are free at every epoch."""
+    kind = probcal.sensors.position
+    nodes = [probcal.Node("a", (0.0, 0.0), scale=5.0), probcal.Node("b", (9.0, 1.0), scale=5.0)]
+    network = probcal.Network([kind.on(node) for node in nodes])
+    time = np.arange(12.0)
+    path = pd.DataFrame({"time": time, "position_x": 3 * time, "position_y": 5 - time})
+    motion = {"car": probcal.Known(path), "bird": probcal.ConstantVelocity(0.1)}
+    random, rows = np.random.default_rng(2), []
+    for target, at in (("car", path[["position_x", "position_y"]].to_numpy()), ("bird", np.zeros((12, 2)))):
+        for t, p in zip(time, at, strict=True):
+            for node in nodes:
+                x, y = p - node.position + 3 * random.standard_normal(2)
+                rows.append((t, node.name, target, x, y))
+    data = pd.DataFrame(rows, columns=["time", "sensor", "target", "position_x", "position_y"])
+    for chosen in (data[data["target"] == "car"], data):
+        problem = probcal.Problem(network, motion, chosen)
+        tree = probcal.fit(problem, probcal.LeastSquares(), predictive_draws=False)
+        known = chosen[chosen["target"] == "car"].reset_index(drop=True)
+        stated = known["sensor"].map({"a": 0, "b": 1}).to_numpy()
+        truth = path[["position_x", "position_y"]].to_numpy()[known["time"].astype(int)]
+        offset = truth - np.stack([n.position for n in nodes])[stated] - known[["position_x", "position_y"]].to_numpy()
+        pull, count = np.zeros((2, 2)), np.zeros(2)
+        for n in range(2):
+            pull[n], count[n] = offset[stated == n].sum(0), (stated == n).sum()
+        information = np.diag(count)
+        if len(chosen) == len(data):  # a free position seen by both ties the two nodes together: half an epoch each
+            free = chosen[chosen["target"] == "bird"]
+            sides = [free[free["sensor"] == name][["position_x", "position_y"]].to_numpy() for name in "ab"]
+            apart = (sides[0] + nodes[0].position - sides[1] - nodes[1].position).sum(0) / 2
+            information = information + 6 * np.array([[1, -1], [-1, 1]])
+            pull = pull + np.stack([-apart, apart])
+        expected = np.linalg.solve(information, pull).ravel()
+        assert tree.attrs["status"] == "converged"
+        np.testing.assert_allclose(tree["calibration"]["mean"].values, expected, atol=2e-3)
 
 
 ERRORS = [
     (lambda: Mixture(1.2), "the share of echoes must lie between 0 and 1"),
-    (lambda: Mixture(0.1, -1.0), "the scale of echoes must be positive"),
+    (lambda: Mixture(0.1, -1.0), "the scale of echoes must lie between 0.001 and 1000 stds"),
     (lambda: Mixture(0.1, 1.0), "an echo must differ from an inlier"),
     (lambda: EA(update="newton"), 'EA\\(update="newton"\\): give one of mackay, em'),
     (lambda: EA(trajectory="none"), 'EA\\(trajectory="none"\\): give one of exact, smoothed'),
     (lambda: EM(linearisation="none"), 'EM\\(linearisation="none"\\): give one of extended, unscented, cubature'),
     (lambda: EMEA(inner=0), "EM-EA\\(inner=0\\): at least one inner iteration is needed"),
     (lambda: ARD(by="nod"), 'ARD\\(by="nod"\\): give one of owner, node, type, component; did you mean "node"?'),
-    (lambda: ARD(shape=-1.0), "shape must be positive"),
+    (lambda: ARD(shape=0.5), "shape must be 1 or more"),
+    (lambda: solve(EA(iterations=0)), "EA\\(iterations=0\\): at least one iteration is needed"),
+    (lambda: solve(MAP(tolerance=float("nan"))), "MAP\\(tolerance=nan\\): give a finite number that is not negative"),
+    (lambda: probcal.Channel("m", noise=Gaussian()), "give a noise family such as StudentT"),
     (lambda: Gaussian(correlation={"a": 1.5}), 'correlation "a" is 1.5: it must lie between -1 and 1'),
     (lambda: probcal.Horseshoe(expected=2.0), "the share must lie between 0 and 1"),
     (lambda: probcal.Horseshoe(slab_scale=0.0), "slab_scale=0.0\\): it must be positive"),

@@ -13,7 +13,7 @@ import pytest
 
 import probcal
 from probcal import ConstantVelocity, Network, Node, Target
-from probcal.inference import ea
+from probcal.inference import run
 
 SCRIPT = """
 import json
@@ -139,13 +139,13 @@ def test_results_carry_more_digits_than_float32(processes):
 def test_other_data_of_the_same_shape_compile_nothing():
     """A kernel takes data as arguments: new numbers, and a network of the same form, reuse every trace."""
     _, first = fitted(table())
-    traces = ea._chunk._cache_size()
+    traces = run.chunk._cache_size()
     assert traces > 0
     with pytest.raises(AssertionError, match="compilations"), NoCompile():
         jax.jit(lambda x: x + traces)(1.0)
     with NoCompile():
         _, second = fitted(table(1))
-    assert ea._chunk._cache_size() == traces
+    assert run.chunk._cache_size() == traces
     assert not np.allclose(first["calibration"]["mean"], second["calibration"]["mean"])
 
 

@@ -10,6 +10,7 @@ import probcal
 from probcal import EA, EMEA, MAP, Flat, study
 from probcal.cli import parse_values
 from probcal.diagnostics import study_table
+from probcal.plots import plot_study
 from probcal.types import InputError
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
@@ -68,23 +69,53 @@ def test_values_of_settings():
         ("share=1,,2", "write name=value"),
         ("share=1:0:0.1", "the step does not lead from 1 to 0"),
         ("share=0:1:0", "the step does not lead"),
+        ("share=0:inf:1", "the step does not lead"),
     ):
         with pytest.raises(InputError, match=wanted):
             parse_values(text)
 
 
-def test_errors_of_studies():
-    with pytest.raises(InputError, match='method "eaa" is not known; did you mean "ea"'):
-        study(radars.setting, {"share": [0.1]}, ["eaa"])
-    with pytest.raises(InputError, match="give at least one run, one method and one value"):
-        study(radars.setting, {"share": []}, ["ea"])
+@probcal.sensor(height=probcal.Channel("m", std=1.0))
+def gauge(target, pose, *, shift=probcal.Bias("m", 1.0)):
+    return {"height": target.position[1] - pose.position[1] + shift}
 
-    def growing(run, size):
-        problem, truth = radars.setting(run)
-        return (problem if size == 1 else problem.rebuild(fix=["radar_0.heading"])), truth
 
-    with pytest.raises(InputError, match="the settings have different biases"):
-        study(growing, {"size": [1, 2]}, ["em"], runs=1)
+def small(run, size=2):
+    """A problem of `size` gauges and its truth, without any fit."""
+    network = probcal.Network([gauge.on(probcal.Node(f"n{k}", (0.0, float(k)))) for k in range(size)])
+    drawn = probcal.simulate(network, probcal.ConstantVelocity(1.0), np.arange(4.0), run)
+    return probcal.Problem(network, probcal.ConstantVelocity(1.0), drawn.table), drawn.truth
+
+
+ERRORS = [
+    (lambda: study(small, {}, ["eaa"]), 'method "eaa" is not known; did you mean "ea"'),
+    (lambda: study(small, {"size": []}, ["ea"]), "give at least one run, one method and one value"),
+    (lambda: study(small, {"size": "12"}, ["ea"]), "the values of size are '12'; give a list of values"),
+    (lambda: study(small, {"size": 2}, ["ea"]), "the values of size are 2; give a list of values"),
+    (lambda: study(small, {"size": [1, 1]}, ["ea"]), "a value of size is given twice; give every value once"),
+    (lambda: study(small, {"size": [(1, 2)]}, ["ea"]), "the values of size must be numbers or texts"),
+    (lambda: study(small, {"sd": [1]}, ["ea"]), 'a setting cannot be called "sd"'),
+    (lambda: study(small, {}, ["ea"], runs=[1, 1]), "a run is given twice"),
+    (lambda: study(small, {}, {"a": "ea"}), "study: method \"a\" is 'ea'; give a method such as EA()"),
+    (lambda: study(small, {}, {"a": (MAP(), probcal.Horseshoe())}), "MAP does not take the prior Horseshoe"),
+    (lambda: study(lambda run: small(run)[0], {}, ["ea"]), "must return a pair, the Problem and its Truth"),
+    (lambda: study(lambda run: (small(run)[0], probcal.Truth()), {}, ["ea"]), 'does not name the bias "n0.shift"'),
+    (lambda: study(small, {"size": [1, 2]}, ["em"], runs=1), "the settings have different biases"),
+]
+
+
+@pytest.mark.parametrize(("call", "text"), ERRORS, ids=[text[:40] for _, text in ERRORS])
+def test_errors_of_studies(call, text):
+    with pytest.raises(InputError) as error:
+        call()
+    assert text in str(error.value)
+
+
+def test_a_study_without_a_number_has_no_picture():
+    found = study(small, {}, ["em"], runs=2)
+    with pytest.raises(InputError, match="no setting of the study is a number"):
+        plot_study(found)
+    assert "sd" not in study_table(found.isel(run=[0]))
 
 
 @pytest.mark.slow

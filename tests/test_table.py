@@ -17,12 +17,14 @@ from probcal import (
     Unknown,
     White,
     fit,
+    read_table,
     sensor,
     sensors,
     simulate,
     track,
 )
 from probcal.geometry import norm
+from probcal.table import measure
 
 CORNERS = [(0, 0), (60, 0), (60, 60), (0, 60)]
 PATH = np.stack([np.linspace(5, 55, 20), 30 + 20 * np.sin(np.linspace(0, 6, 20))], 1)
@@ -115,3 +117,35 @@ def test_track_follows_the_fit_in_fixed_biases_levels_and_with_sensors_missing()
 def test_a_bad_declaration_is_told_by_name(build, text):
     with pytest.raises(InputError, match=text):
         build()
+
+
+def test_names_in_a_file_are_text(tmp_path):
+    path = tmp_path / "rows.csv"
+    path.write_text("time,sensor,target,range\n0,01,NA,5\n1,NA,NA,6\n2,nan,NA,7\n3,7.0,NA,8\n")
+    data = measure(read_table(path), network(names=("01", "NA", "nan", "7")))
+    np.testing.assert_array_equal(data.sensor, [0, 1, 2, 3])
+    assert data.target_names == ("NA",)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (dict(range="2024-01-01"), 'row 0 column "range": "2024-01-01" is no number'),
+        (dict(range=pd.Timestamp("2024-01-01")), 'row 0 column "range": "2024-01-01 00:00:00" is no number'),
+        (dict(range=1e300), 'row 0 column "range": 1e[+]300 is too large; leave it blank'),
+        (dict(range_std=1e-300), 'row 0 column "range_std": std is 1e-300; it must be positive, 1e-100 or more'),
+        (dict(time=1e300), 'row 0 column "time": 1e[+]300 is not a finite time'),
+    ],
+)
+def test_a_cell_from_which_no_finite_number_follows_is_refused(change, text):
+    with pytest.raises(InputError, match=text):
+        measure(read_table(recorded().assign(**change)), network())
+
+
+def test_rows_with_more_cells_than_the_header_are_refused(tmp_path):
+    path = tmp_path / "rows.csv"
+    path.write_text("time,sensor,range\n0,a,5,\n1,a,6,\n")  # a spreadsheet's empty last column
+    assert measure(read_table(path), network()).value.tolist() == [[5.0], [6.0]]
+    path.write_text("time,sensor,range\n0,a,5,1\n1,a,6,1\n")
+    with pytest.raises(InputError, match="has rows with more cells than its header; give every column a name"):
+        read_table(path)

@@ -18,8 +18,22 @@ RULES = ("mackay", "em")
 TRAJECTORIES = ("exact", "smoothed")
 
 
+def _learnt(spec: Spec, system: System, prior: Prior, given: Given, state: State, rule: str) -> State:
+    """The state with precisions and levels that follow from what the last iteration found, if there was one."""
+    fresh = jnp.isneginf(state.objective)
+    alpha = learn(
+        prior, given, state.alpha, state.found.gamma, jnp.diagonal(state.found.covariance), state.point.z, rule
+    )
+    point = state.point
+    if point.levels.shape[0]:
+        moved = update_levels(spec, system, point, state.found.covariance)
+        point = between(moved, point, jnp.where(fresh, 1.0, 0.0))
+    return state._replace(point=point, alpha=jnp.where(fresh, state.alpha, alpha))
+
+
 def _iterate(spec: Spec, system: System, prior: Prior, given: Given, state: State, rule: str) -> State:
-    """Mode, evidence at that mode, then new precisions and levels; nothing moves once it is done."""
+    """New precisions and levels, then the mode and the evidence at that mode: all of one state belongs together."""
+    state = _learnt(spec, system, prior, given, state, rule)
     now = given.prior._replace(alpha=state.alpha)
     mode = find_mode(spec, system, state.point, now, MODE_STEPS, 1e-2 * given.tolerance)
     found = laplace(spec, system, mode.point, now)
@@ -27,11 +41,8 @@ def _iterate(spec: Spec, system: System, prior: Prior, given: Given, state: Stat
     still = jnp.abs(objective - state.objective) < given.tolerance
     # where a target grazes a sensor the density has a cusp: no step lowers the cost, and none is needed
     settled = mode.converged | (cost(spec, system, state.point, now) - mode.cost < given.tolerance)
-    point = mode.point
-    done = still & settled if prior.learns or point.levels.shape[0] else mode.converged
-    learnt = learn(prior, given, state.alpha, found.gamma, jnp.diagonal(found.covariance), point.z, rule)
-    alpha = jnp.where(done, state.alpha, learnt)
-    return State(_levels(spec, system, point, found.covariance, done), alpha, found, objective, done)
+    done = still & settled if prior.learns or mode.point.levels.shape[0] else mode.converged
+    return State(mode.point, state.alpha, found, objective, done)
 
 
 def _density(spec: Spec, system: System, prior: Prior, given: Given, point: Point) -> jax.Array:
@@ -41,25 +52,14 @@ def _density(spec: Spec, system: System, prior: Prior, given: Given, point: Poin
     return -cost(spec, system, point, held) - jnp.sum(penalty)
 
 
-def _levels(spec: Spec, system: System, point: Point, covariance: jax.Array, done: jax.Array) -> Point:
-    """The point with its unknown noise levels renewed, unless done."""
-    if not point.levels.shape[0]:
-        return point
-    moved = update_levels(spec, system, point, covariance)
-    return between(moved, point, jnp.where(done, 1.0, 0.0))
-
-
 def _iterate_paper_b(spec: Spec, system: System, prior: Prior, given: Given, state: State, rule: str) -> State:
-    """Smooth at the current biases, then one update of biases (16)-(17) and precisions (25) of Paper B."""
-    now = given.prior._replace(alpha=state.alpha)
+    """Smooth at the current biases, then their posterior (16)-(17) for the precisions (25) of Paper B."""
+    state = _learnt(spec, system, prior, given, state, rule)
     point = track(spec, system, state.point)
-    found, step = paper_b(spec, system, point, now)
+    found, step = paper_b(spec, system, point, given.prior._replace(alpha=state.alpha))
     step = jnp.where(jnp.isfinite(step), jnp.clip(step, -1.0, 1.0), 0.0)
-    still = (jnp.abs(found.evidence - state.objective) < given.tolerance) & (jnp.max(jnp.abs(step)) < 1e-3)
-    moved = point._replace(z=point.z + jnp.where(still, 0.0, step))
-    learnt = learn(prior, given, state.alpha, found.gamma, jnp.diagonal(found.covariance), moved.z, rule)
-    alpha = jnp.where(still, state.alpha, learnt)
-    return State(_levels(spec, system, moved, found.covariance, still), alpha, found, found.evidence, still)
+    done = (jnp.abs(found.evidence - state.objective) < given.tolerance) & (jnp.max(jnp.abs(step)) < 1e-3)
+    return State(point._replace(z=point.z + step), state.alpha, found, found.evidence, done)
 
 
 @dataclass(frozen=True)

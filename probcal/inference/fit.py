@@ -9,19 +9,18 @@ import xarray as xr
 from scipy import stats
 
 from probcal import tree
-from probcal.inference.methods import EA, Method, choose_prior
+from probcal.inference.methods import EA, Method, check_problem, choose_prior
 from probcal.inference.run import Outcome, Progress, maximise
-from probcal.priors import Flat, Prior
+from probcal.priors import Flat, Laplace, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import Key, as_key
 from probcal.smoothing.draws import draw, predictive, residuals
 from probcal.smoothing.information import at_levels, moments
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import automatic_start, track_mode
+from probcal.smoothing.start import automatic_start, further_starts, project, track_mode
 from probcal.types import FitError, InputError, float64
 
 CHAINS, DRAWS = 4, 250
-SPARSE = 0.3  # share of biases that a further start moves
 
 
 @float64
@@ -40,8 +39,8 @@ def fit(
 
     `method` is a value (`EA()` by default); `prior` defaults to the method's own; `key` is a seed or jax key
     of the draws and of further starts; `start` replaces the automatic start. `starts` runs the method from so many
-    starts, the further ones with a share of the biases drawn from their scales: the best optimum is reported, all
-    of them with their evidence in the group `optimum`. `predictive_draws` forces or forbids the groups of
+    starts, the further ones with two nodes swapped or a share of the biases drawn: the best optimum is reported,
+    all of them with their evidence in the group `optimum`. `predictive_draws` forces or forbids the groups of
     draws by datum and of trajectories, by default written up to 2e7 values each. The attributes `status` and
     `message` say what the fit is worth. Raises `InputError` for a prior that the method does not take and
     `FitError` where a flat prior leaves a singular problem without any interval.
@@ -50,17 +49,13 @@ def fit(
     if not isinstance(method, Method):
         raise InputError(f"method must be a value such as EA() or MAP(), got {method!r}")
     prior = choose_prior(method, prior)
-    if not problem.labels:
-        raise InputError("the problem has no free bias; declare a Bias, a survey or a scale, or use track()")
-    if problem.silent:
-        source = problem.measurements.table.source
-        raise InputError(f'{source} has no row of sensor "{problem.silent[0]}"; add rows or take it out of the network')
+    check_problem(problem)
     if starts < 1:
         raise InputError(f"starts={starts}: at least one start is needed")
-    problem = method.prepare(problem)
+    given, problem = problem, method.prepare(problem)
     keys = jax.random.split(as_key(key), 3)
-    first = automatic_start(problem) if start is None else start
-    points = [first, *_further_starts(problem, first, starts - 1, keys[2])]
+    first = automatic_start(problem) if start is None else _suited(given, problem, start)
+    points = [first, *further_starts(problem, starts - 1, keys[2])]
     outcomes = [maximise(method, problem, prior, point, progress) for point in points]
     best = max(range(starts), key=lambda k: _rank(prior, outcomes[k]))
     seed = int(key) if isinstance(key, (int, np.integer)) else -1
@@ -68,15 +63,12 @@ def fit(
     return tree.add_optima(tree_, problem, outcomes, best) if starts > 1 else tree_
 
 
-def _further_starts(problem: Problem, first: Point, count: int, key: jax.Array) -> list[Point]:
-    """Starts with a share of the biases drawn from their scales, each with the track that suits them."""
-    points = []
-    for k in range(count):
-        pick, size = jax.random.split(jax.random.fold_in(key, k))
-        moved = jax.random.uniform(pick, first.z.shape) < SPARSE
-        z = jnp.where(moved, 2.0 * jax.random.normal(size, first.z.shape), 0.0)
-        points.append(track_mode(problem, first._replace(z=z)))
-    return points
+def _suited(given: Problem, problem: Problem, start: Point) -> Point:
+    """A start for the problem that a method solves in the place of the given one."""
+    if problem is given:
+        return start
+    states = [np.asarray(x) for x in start.states]
+    return project(problem, states, [np.full_like(x, 1e6) for x in states])._replace(z=start.z)
 
 
 def _rank(prior: Prior, outcome: Outcome) -> tuple[bool, bool, float]:
@@ -108,10 +100,11 @@ def _result(
 
     alpha, draws = np.asarray(outcome.alpha), split(z)
     own = np.where(problem.surveyed, stats.norm.logpdf(draws), prior.log_density(draws, alpha))
-    independent = not isinstance(prior, Flat) and not prior.correlation
+    independent = not isinstance(prior, Flat | Laplace) and not prior.correlation
     return tree.Result(
         method=method.name, prior=type(prior).__name__, seed=seed, approximate="Laplace",
-        intervals=method.intervals, status=outcome.status, message=outcome.message, z=np.asarray(point.z),
+        intervals=prior.note or method.intervals, settings=f"{method!r}, {prior!r}",
+        status=outcome.status, message=outcome.message, z=np.asarray(point.z),
         covariance=np.asarray(found.covariance), precision=alpha, gamma=np.asarray(found.gamma),
         bias_status=outcome.bias_status, information=np.asarray(found.information),
         evidence=float(found.evidence) if prior.proper else None, objective=outcome.trace,

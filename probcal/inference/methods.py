@@ -8,6 +8,7 @@ import pandas as pd
 from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
 from probcal.priors import PRIORS, Flat, Laplace, Prior
+from probcal.problem import Problem
 from probcal.types import InputError
 
 Method = EA | EM | EMEA | MAP | LeastSquares
@@ -34,6 +35,15 @@ def choose_prior(method: Method, prior: Prior | None) -> Prior:
         allowed = ", ".join(name for name, known in PRIORS.items() if isinstance(known, method.priors))
         raise InputError(f"{method.name} does not take the prior {type(prior).__name__}; it takes: {allowed}")
     return prior
+
+
+def check_problem(problem: Problem) -> None:
+    """Raise `InputError` for a problem without free biases or with sensors that have no rows."""
+    if not problem.labels:
+        raise InputError("the problem has no free bias; declare a Bias, a survey or a scale, or use track()")
+    if problem.silent:
+        source = problem.measurements.table.source
+        raise InputError(f'{source} has no row of sensor "{problem.silent[0]}"; add rows or take it out of the network')
 
 
 def table() -> pd.DataFrame:

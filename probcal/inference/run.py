@@ -19,6 +19,7 @@ from probcal.problem import Problem, Spec, System
 from probcal.smoothing.directions import Direction, weak_directions
 from probcal.smoothing.information import Laplace
 from probcal.smoothing.mode import Point
+from probcal.types import InputError
 
 CHUNK = 5  # outer iterations between two reports of progress
 FAR = 10.0  # scales from the stated value beyond which a bias without prior has diverged
@@ -35,7 +36,7 @@ class Given(NamedTuple):
 
 
 class State(NamedTuple):
-    """Where the outer loop stands: `found` belongs to `point` and `alpha` once it is done."""
+    """Where the outer loop stands: `found` belongs to `point` and `alpha`; an objective of -inf: nothing found yet."""
 
     point: Point
     alpha: jax.Array  # (M,)
@@ -96,6 +97,14 @@ def kernel(method: Any) -> Any:
     return replace(method, iterations=0, tolerance=0.0)
 
 
+def check_method(method: Method) -> None:
+    """Raise `InputError` where a method would run no iteration or never know when to stop."""
+    if method.iterations < 1:
+        raise InputError(f"{method.name}(iterations={method.iterations}): at least one iteration is needed")
+    if not (np.isfinite(method.tolerance) and method.tolerance >= 0):
+        raise InputError(f"{method.name}(tolerance={method.tolerance}): give a finite number that is not negative")
+
+
 def given_of(method: Method, problem: Problem, prior: Prior) -> Given:
     """Arrays of a prior and of the stopping rule for a problem."""
     group = prior.groups(problem.members)
@@ -124,29 +133,38 @@ def learn(prior: Prior, given: Given, alpha: jax.Array, gamma: Any, variance: An
 
 @partial(jax.jit, static_argnames=("method", "spec", "prior"))
 def chunk(
-    method: Any, spec: Spec, prior: Prior, system: System, given: Given, state: State
+    method: Any, spec: Spec, prior: Prior, system: System, given: Given, state: State, left: int
 ) -> tuple[State, tuple[jax.Array, jax.Array]]:
-    """A few outer iterations; stops when done."""
+    """A few outer iterations, at most `left`; stops when done. Returns objectives and which steps were idle."""
 
-    def body(state: State, _: None) -> tuple[State, tuple[jax.Array, jax.Array]]:
-        after = jax.lax.cond(state.done, lambda s: s, lambda s: method.iterate(spec, system, prior, given, s), state)
-        return after, (after.objective, state.done)
+    def body(state: State, k: jax.Array) -> tuple[State, tuple[jax.Array, jax.Array]]:
+        idle = state.done | (k >= left)
+        after = jax.lax.cond(idle, lambda s: s, lambda s: method.iterate(spec, system, prior, given, s), state)
+        return after, (after.objective, idle)
 
-    state, trace = jax.lax.scan(body, state, length=CHUNK)
+    state, trace = jax.lax.scan(body, state, jnp.arange(CHUNK))
     return method.close(spec, system, given, state), trace
 
 
 def maximise(method: Method, problem: Problem, prior: Prior, start: Point, progress: Progress | None) -> Outcome:
     """Run a method from a start until it is done or its iterations are spent."""
+    check_method(method)
     given = given_of(method, problem, prior)
     state, trace = first_state(given, start), np.zeros(0)
     while len(trace) < method.iterations and not bool(state.done):
-        state, (objective, idle) = chunk(kernel(method), problem.spec, prior, problem.system, given, state)
+        left = method.iterations - len(trace)
+        state, (objective, idle) = chunk(kernel(method), problem.spec, prior, problem.system, given, state, left)
         trace = np.concatenate([trace, np.asarray(objective)[~np.asarray(idle)]])
         if progress is not None:
             progress(method.name, len(trace), float(trace[-1]))
     converged = bool(state.done) or method.tolerance == 0.0
-    return finish(problem, prior, state.point, state.alpha, state.found, converged, trace[: method.iterations])
+    outcome = finish(problem, prior, state.point, state.alpha, state.found, converged, trace)
+    if method.tolerance > 0.0 or outcome.status != "converged" or len(trace) < 2:
+        return outcome
+    note = (
+        f"All {len(trace)} iterations were run, as asked; the last moved the objective by {trace[-1] - trace[-2]:.2g}."
+    )
+    return outcome._replace(message=f"{note} {outcome.message}".strip())
 
 
 def finish(

@@ -13,8 +13,8 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from probcal.inference.methods import METHODS, Method, choose_prior
-from probcal.inference.run import Given, State, first_state, given_of, kernel, low_and_far, verdict
+from probcal.inference.methods import METHODS, Method, check_problem, choose_prior
+from probcal.inference.run import Given, State, check_method, first_state, given_of, kernel, low_and_far, verdict
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import Truth
@@ -24,6 +24,8 @@ from probcal.tree import INTERVAL
 from probcal.types import InputError, nearest
 
 BATCH = 10  # runs that one compiled call solves
+RESERVED = ("run", "estimator", "method", "bias_label", "bias_rmse", "coverage", "position_rmse", "status",
+            "iterations", "error", "true", "sd", "gamma", "mean", "median", "worst", "position", "runs")  # fmt: skip
 ORACLE = "oracle"  # MAP whose prior knows which biases are zero
 Setting = Callable[..., tuple[Problem, Truth]]
 Advance = Callable[[int, int], None]  # fits done, fits in all
@@ -79,7 +81,7 @@ def _given(method: Method, prior: Prior, run: _Run, oracle: bool) -> Given:
     given = given_of(method, run.problem, prior)
     if not oracle:
         return given
-    zero = np.array([run.truth.biases.get(label, 0.0) == 0.0 for label in run.problem.labels])
+    zero = np.array([run.truth.biases[label] == 0.0 for label in run.problem.labels])
     alpha = jnp.where(zero & ~run.problem.surveyed, PRECISION_BOUNDS[1], given.prior.alpha)
     return given._replace(prior=given.prior._replace(alpha=alpha))
 
@@ -107,8 +109,7 @@ def _batch(
 ) -> list[dict[str, Any]]:
     """Records of all methods on some cases (grid point, run)."""
     with jax.enable_x64(True):
-        built = [setting(run, **point) for point, run in cases]
-        whole = [_Run(problem, truth, automatic_start(problem)) for problem, truth in built]
+        whole = [_simulated(setting, point, run) for point, run in cases]
         found = []
         for name, (method, prior) in methods.items():
             runs = [_prepared(method, run) for run in whole]
@@ -133,6 +134,19 @@ def _batch(
         return found
 
 
+def _simulated(setting: Setting, point: dict[str, Any], number: int) -> _Run:
+    """One problem with its start; raises `InputError` where a setting does not return what a study needs."""
+    made = setting(number, **point)
+    if not (isinstance(made, tuple) and len(made) == 2 and isinstance(made[0], Problem) and isinstance(made[1], Truth)):
+        raise InputError("study: setting(run, ...) must return a pair, the Problem and its Truth")
+    problem, truth = made
+    check_problem(problem)
+    unknown = [label for label in problem.labels if label not in truth.biases]
+    if unknown:
+        raise InputError(f'study: the truth of setting(run, ...) does not name the bias "{unknown[0]}"; give its value')
+    return _Run(problem, truth, automatic_start(problem))
+
+
 def _prepared(method: Method, run: _Run) -> _Run:
     problem = method.prepare(run.problem)
     return run if problem is run.problem else _Run(problem, run.truth, automatic_start(problem))
@@ -140,14 +154,14 @@ def _prepared(method: Method, run: _Run) -> _Run:
 
 def _record(run: _Run, prior: Prior, one: Any) -> dict[str, Any]:
     problem = run.problem
-    true = np.array([run.truth.biases.get(label, np.nan) for label in problem.labels]) / problem.scales
+    true = np.array([run.truth.biases[label] for label in problem.labels]) / problem.scales
     error = one.z - true
     low, far = low_and_far(prior, one.alpha, one.z, problem.surveyed)
     sound = bool(np.isfinite(one.z).all() and np.isfinite(one.sd).all())
     half = stats.norm.ppf(0.5 + INTERVAL / 2)
     return {
-        "bias_rmse": float(np.sqrt(np.nanmean(error**2))),
-        "coverage": float((np.abs(error) <= half * one.sd)[np.isfinite(error)].mean()),
+        "bias_rmse": float(np.sqrt(np.mean(error**2))),
+        "coverage": float((np.abs(error) <= half * one.sd).mean()),
         "position_rmse": _position_rmse(run, one.states),
         "status": verdict(bool(one.done), bool(low.any()), bool(far.any()) or not sound),
         "iterations": int(one.iterations),
@@ -166,10 +180,36 @@ def choose_methods(names: Sequence[str]) -> dict[str, tuple[Method, Prior]]:
     return chosen
 
 
+def _pairs(methods: Mapping[str, Any]) -> dict[str, tuple[Method, Prior]]:
+    """Methods and their priors from a mapping to methods or pairs, checked as `fit` checks them."""
+    found = {}
+    for name, value in methods.items():
+        method, prior = value if isinstance(value, tuple) and len(value) == 2 else (value, None)
+        if not isinstance(method, Method):
+            raise InputError(f'study: method "{name}" is {value!r}; give a method such as EA(), or (EA(), ARD())')
+        check_method(method)
+        found[name] = (method, choose_prior(method, prior))
+    return found
+
+
+def _values(name: str, values: Any) -> list[Any]:
+    """Values of one setting, checked before any work is done."""
+    if name in RESERVED:
+        raise InputError(f'study: a setting cannot be called "{name}", the results use that name; rename the argument')
+    if isinstance(values, str) or not hasattr(values, "__iter__"):
+        raise InputError(f"study: the values of {name} are {values!r}; give a list of values")
+    found = [value.item() if isinstance(value, np.generic) else value for value in values]
+    if any(not isinstance(value, (int, float, str, bool)) for value in found):
+        raise InputError(f"study: the values of {name} must be numbers or texts")
+    if len(set(found)) < len(found):
+        raise InputError(f"study: a value of {name} is given twice; give every value once")
+    return found
+
+
 def study(
     setting: Setting,
     grid: Mapping[str, Sequence[Any]],
-    methods: Sequence[str] | Mapping[str, tuple[Method, Prior]] = ("ml", "em-ea", "ea", ORACLE),
+    methods: Sequence[str] | Mapping[str, Any] = ("ml", "em-ea", "ea", ORACLE),
     runs: int | Sequence[int] = 20,
     *,
     progress: Advance | None = None,
@@ -177,18 +217,21 @@ def study(
     """Fit every run of every setting by every method: errors, coverage and status by setting, method and run.
 
     `setting(run, **point)` returns a problem and its truth for a run (its seed) and a point of the `grid`, a
-    mapping from argument to values. `methods` are names of the command line or a mapping to (method, prior).
+    mapping from argument to values. `methods` are names of the command line, or a mapping to a method or a pair of
+    method and prior.
     Variables have the grid's dims, `estimator` (the method; xarray keeps that word for itself) and `run`:
     `bias_rmse` (root mean square of the errors over their scales), `position_rmse` in m, `coverage` of the
     intervals, `status`, `iterations`; with `bias_label`: `error`, `true`, `sd` (all over their scales) and `gamma`.
     Raises `InputError` for an unknown method or settings whose biases differ. Runs are solved in batches by
     compiled kernels, on as many threads as there are processors.
     """
-    chosen = dict(methods) if isinstance(methods, Mapping) else choose_methods(methods)
-    numbers = list(range(runs)) if isinstance(runs, int) else list(runs)
-    axes = {name: list(values) for name, values in grid.items()}
+    chosen = _pairs(methods) if isinstance(methods, Mapping) else choose_methods(methods)
+    numbers = list(range(int(runs))) if isinstance(runs, (int, np.integer)) else [int(number) for number in runs]
+    axes = {name: _values(name, values) for name, values in grid.items()}
     if not numbers or not chosen or not all(axes.values()):
         raise InputError("study: give at least one run, one method and one value of every setting")
+    if len(set(numbers)) < len(numbers):
+        raise InputError("study: a run is given twice; give every run once")
     points = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
     batches = [
         [(point, run) for run in numbers[k : k + BATCH]] for point in points for k in range(0, len(numbers), BATCH)

@@ -53,7 +53,7 @@ def paper_b(spec: Spec, system: System, point: Point, prior: Precision) -> tuple
     The smoothed density of each epoch alone is taken as the prior of its state, R-bar = R + H_x P H_x'; what
     epochs share is dropped and the data count twice. By Woodbury no matrix of the size of the data is formed.
     """
-    lins = linearise(spec, system, point, expected=False)
+    lins = linearise(spec, system, point, expected=True)
     information, score = of_biases(spec, system, lins)
     likelihood, logdet = log_likelihood(spec, system, point), jnp.zeros(())
     parts = zip(

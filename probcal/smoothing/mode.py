@@ -63,9 +63,12 @@ def log_likelihood(spec: Spec, system: System, point: Point) -> jax.Array:
 
 
 def cost(spec: Spec, system: System, point: Point, prior: Precision) -> jax.Array:
-    """Negative log joint density of data, trajectories and biases, up to normalising constants."""
+    """Negative log joint density of data, trajectories, biases and unknown levels, up to constants."""
     squares = sum(jnp.sum(u**2) for u in point.noises) + prior.square(point.z)
-    return 0.5 * squares - log_likelihood(spec, system, point)
+    squares = squares + jnp.sum((point.levels / system.level_spread) ** 2)
+    levels = jnp.concatenate([point.levels, jnp.zeros(1, point.levels.dtype)])
+    widened = sum(jnp.sum(jnp.any(part.L != 0, 1) * levels[part.level]) for part in system.recursions)
+    return 0.5 * squares + widened - log_likelihood(spec, system, point)
 
 
 def linearise(spec: Spec, system: System, point: Point, *, expected: bool) -> list[Linearised]:

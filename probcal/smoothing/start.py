@@ -6,6 +6,7 @@ biases. The best path through the grid (Viterbi, over windows of epochs) is then
 into a consistent trajectory.
 """
 
+import itertools
 from functools import partial
 
 import jax
@@ -16,7 +17,7 @@ from probcal import linalg, rows
 from probcal.priors import Precision
 from probcal.problem import Problem, Recursion, Spec, System
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Point, factors, find_mode, track
+from probcal.smoothing.mode import Point, cost, factors, find_mode, track
 
 WINDOWS = 60  # at most so many windows a target
 INNER = {2: 24, 3: 10}  # grid points an axis inside the network
@@ -24,6 +25,9 @@ OUTER = {2: 48, 3: 60}  # directions of the outer rings
 RINGS = (0.8, 1.2, 1.8, 2.8, 5.0, 9.0)  # their radii in extents
 NEAR = 0.05  # error of a position found on the grid, in extents
 BEAM = 200  # candidates a window that the path may pass
+TRIED = 60  # swaps of two nodes that are tried for further starts
+DRAWN = 3  # draws of the biases that are tried for one further start
+SPARSE = 0.3  # share of the biases that a draw moves
 ROBUST = 4.0  # degrees of freedom of the start's Student-t loss
 
 
@@ -55,12 +59,12 @@ def _widened(lin: rows.Linearised) -> jax.Array:
 
 @partial(jax.jit, static_argnames=("spec", "r", "span"))
 def _profile(
-    spec: Spec, system: System, r: int, span: tuple[int, int], place: jax.Array
+    spec: Spec, system: System, r: int, span: tuple[int, int], z: jax.Array, place: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Loss (E,) and states (E, n) of recursion r with the position at `place` (E, d), other components profiled."""
     part = system.recursions[r]
     E, n = part.drift.shape
-    z, levels = jnp.zeros(spec.biases), jnp.zeros(system.level_spread.shape)
+    levels = jnp.zeros(system.level_spread.shape)
     resting = jax.lax.scan(lambda x, k: ((y := k[0] @ x + k[1]), y), jnp.zeros(n), (part.F, part.drift))[1]
     states = resting.at[:, span[0] : span[1]].set(place)
     mine = [
@@ -98,11 +102,11 @@ def _profile(
 
 
 @partial(jax.jit, static_argnames=("spec", "r", "span"))
-def _losses(spec: Spec, system: System, r: int, span: tuple[int, int], places: jax.Array) -> jax.Array:
+def _losses(spec: Spec, system: System, r: int, span: tuple[int, int], z: jax.Array, places: jax.Array) -> jax.Array:
     """Loss of every candidate at every epoch, (candidates, E)."""
     E = system.recursions[r].drift.shape[0]
     width = span[1] - span[0]
-    return jax.lax.map(lambda c: _profile(spec, system, r, span, jnp.broadcast_to(c, (E, width)))[0], places)
+    return jax.lax.map(lambda c: _profile(spec, system, r, span, z, jnp.broadcast_to(c, (E, width)))[0], places)
 
 
 def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -169,23 +173,20 @@ def project(problem: Problem, tracks: list[np.ndarray], precision: list[np.ndarr
     return Point(tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), jnp.zeros(problem.spec.biases), levels)
 
 
-def automatic_start(problem: Problem, iterations: int = 30) -> Point:
-    """Trajectories and biases from the data alone, near the joint mode at the declared scales.
-
-    Grid, Viterbi path, motion model, iterated EKS at zero biases, then a few joint steps.
-    """
+def _grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
+    """Trajectories from the data alone at biases z (M,): grid, Viterbi path, motion model, iterated EKS."""
     places = candidates(problem)
     tracks, precisions = [], []
     for r, epochs in enumerate(problem.epochs):
         span = next((start, stop) for name, start, stop, _ in epochs.layout if name == "position")
-        track, known = _known(problem, r, span)
+        path, known = _known(problem, r, span)
         unknown = [name for name in dict.fromkeys(epochs.target) if not known[epochs.target == name].all()]
         if unknown:
-            loss = np.asarray(_losses(problem.spec, problem.system, r, span, jnp.asarray(places)))
+            loss = np.asarray(_losses(problem.spec, problem.system, r, span, z, jnp.asarray(places)))
         for name in unknown:
             mine = epochs.target == name
-            track[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)
-        _, states = _profile(problem.spec, problem.system, r, span, jnp.asarray(track))
+            path[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)
+        _, states = _profile(problem.spec, problem.system, r, span, z, jnp.asarray(path))
         states = np.array(states)
         spread = np.asarray(jnp.sum(problem.system.recursions[r].L ** 2, 2))
         precision = np.where(spread > 0, 1e4 / np.maximum(spread, 1e-300), 1e-9)
@@ -196,13 +197,61 @@ def automatic_start(problem: Problem, iterations: int = 30) -> Point:
                 precision[:, start:stop] = 0.0
         tracks.append(states)
         precisions.append(precision)
-    point = project(problem, tracks, precisions)
-    tracked = track_mode(problem, point, iterations)
-    return find_mode(
-        problem.spec, problem.system, tracked, Precision.single(jnp.ones(problem.spec.biases)), iterations, 1e-3
-    ).point
+    return track_mode(problem, project(problem, tracks, precisions)._replace(z=z), iterations)
+
+
+def automatic_start(problem: Problem, iterations: int = 30) -> Point:
+    """Trajectories and biases from the data alone, near the joint mode at the declared scales.
+
+    Grid, Viterbi path, motion model, iterated EKS at zero biases, then a few joint steps.
+    """
+    tracked = _grid_start(problem, jnp.zeros(problem.spec.biases), iterations)
+    prior = Precision.single(jnp.ones(problem.spec.biases))
+    return find_mode(problem.spec, problem.system, tracked, prior, iterations, 1e-3).point
 
 
 def track_mode(problem: Problem, point: Point, iterations: int = 100) -> Point:
     """Trajectories at held biases: iterated EKS from a point."""
     return track(problem.spec, problem.system, point, iterations)
+
+
+def _swaps(problem: Problem) -> np.ndarray:
+    """Biases (swaps, M) that exchange the places of two nodes, for every pair of fixed ones with free positions."""
+    place: dict[str, list[int]] = {}
+    for m, bias in enumerate(problem.biases):
+        if bias.component == "position" and bias.kind == "scale":
+            place.setdefault(bias.owner, []).append(m)
+    d = problem.network.dimension
+    free = [n for n in problem.network.nodes if n.path is None and len(place.get(n.name, ())) == d]
+    found = []
+    for a, b in itertools.combinations(free, 2):
+        z = np.zeros(len(problem.labels))
+        z[place[a.name]], z[place[b.name]] = b.position - a.position, a.position - b.position
+        found.append(z / problem.scales)
+    return np.array(found).reshape(-1, len(problem.labels))
+
+
+def further_starts(problem: Problem, count: int, key: jax.Array) -> list[Point]:
+    """`count` other starts: of swapped pairs of nodes and of sparse draws of the biases, those that fit best.
+
+    A swap is the field's commonest gross error, and no local search finds it; draws move a share of the biases by
+    two scales. Each comes with the track that suits it; half of the starts are swaps where there are any.
+    """
+    if not count:
+        return []
+    seeds = jax.random.split(key, 3)
+    swaps = _swaps(problem)
+    swaps = swaps[np.sort(np.asarray(jax.random.permutation(seeds[0], len(swaps)))[:TRIED])]
+    shape = (DRAWN * count, len(problem.labels))
+    moved = np.asarray(jax.random.uniform(seeds[1], shape)) < SPARSE
+    drawn = np.where(moved, 2.0 * np.asarray(jax.random.normal(seeds[2], shape)), 0.0)
+    points = [_grid_start(problem, jnp.asarray(z), 30) for z in np.concatenate([swaps, drawn])]
+    flat = Precision.single(jnp.zeros(len(problem.labels)))
+    costs = [float(_cost(problem.spec, problem.system, point, flat)) for point in points]
+    value = np.nan_to_num(costs, nan=np.inf)
+    pairs, others = np.argsort(value[: len(swaps)]), len(swaps) + np.argsort(value[len(swaps) :])
+    half = min(len(pairs), (count + 1) // 2)
+    return [points[k] for k in (*pairs[:half], *others[: count - half])]
+
+
+_cost = jax.jit(cost, static_argnames="spec")

@@ -1,0 +1,449 @@
+"""Nodes from and to files (CSV, GeoJSON), and the local frame of places given by latitude and longitude."""
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import pyproj
+import xarray as xr
+
+from probcal.network import ANGLES, POSE_UNITS, Node
+from probcal.sensor import Bias
+from probcal.table import Table, factor, header, name_of, numbers, read_table
+from probcal.types import AXES, InputError, nearest
+
+EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563  # WGS84: radius in m
+LOCAL, GEODETIC = ("x", "y", "z"), ("latitude", "longitude", "height")
+PLACE_UNITS = dict.fromkeys((*LOCAL, "height"), "m") | dict.fromkeys(GEODETIC[:2], "deg")
+OWN = tuple(name for name in POSE_UNITS if name != "position")  # components that every node has
+KINDS = ("survey", "scale")
+RESERVED = ("position", "path", "self", *KINDS)  # arguments of Node that are no column
+KNOWN = (*OWN, "position", *(f"{kind}_{name}" for kind in KINDS for name in ("position", *OWN)))
+GEOJSON = (".geojson", ".json")
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """Local frame in m: x east, y north of an origin in degrees (WGS84), `height` in m above the ellipsoid.
+
+    With heights it is the topocentric frame of the origin, z up: exact in space, so that a line of sight is straight
+    over any distance. Without, it is the azimuthal equidistant map at the origin's height: distances from the origin
+    are true, those across it grow by (d / R)^2 / 6, which is 4 cm a km at d = 100 km.
+    """
+
+    latitude: float
+    longitude: float
+    height: float = 0.0
+
+    def __post_init__(self):
+        _check_place("LocalFrame", self.latitude, self.longitude, self.height)
+        for name in GEODETIC:
+            object.__setattr__(self, name, float(getattr(self, name)))
+
+    @cached_property
+    def _maps(self) -> dict[int, Any]:
+        """Transformers between longitude and latitude (and height) and the frame, by dimension."""
+        a, b = EQUATOR + self.height, EQUATOR * (1 - FLATTENING) + self.height
+        origin = f"+lat_0={self.latitude!r} +lon_0={self.longitude!r}"
+        space = f"+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 {origin} +h_0={self.height!r}"
+        return {
+            2: pyproj.Transformer.from_pipeline(f"+proj=aeqd {origin} +a={a!r} +b={b!r}"),
+            3: pyproj.Transformer.from_pipeline(f"+proj=pipeline {space}"),
+        }
+
+    def to_local(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
+        """Positions in m, shape (..., 2) or with heights (..., 3), of places in degrees and m."""
+        _check_place("LocalFrame.to_local", latitude, longitude, 0.0 if height is None else height)
+        given = (longitude, latitude) if height is None else (longitude, latitude, height)
+        places = np.broadcast_arrays(*(np.array(part, float) for part in given))
+        return np.stack(self._maps[len(places)].transform(*places), -1)
+
+    def to_geodetic(self, position: Any) -> tuple[np.ndarray, ...]:
+        """Latitude and longitude in degrees, of positions (..., 3) also height in m: the inverse of `to_local`."""
+        position = np.array(position, float)
+        if position.shape[-1:] not in ((2,), (3,)) or not np.isfinite(position).all():
+            raise InputError("LocalFrame.to_geodetic: positions must be finite metres of shape (..., 2) or (..., 3)")
+        parts = np.moveaxis(position, -1, 0)
+        found = self._maps[len(parts)].transform(*parts, direction="INVERSE")
+        longitude, latitude, *height = (np.asarray(part) for part in found)
+        return (latitude, longitude, *height)
+
+    def axes(self, latitude: Any, longitude: Any) -> np.ndarray:
+        """Axes east, north and up at places in degrees, as rows in this frame, shape (..., 3, 3).
+
+        `velocity @ axes` takes a velocity (east, north, up) at the place into the frame.
+        """
+        return _axes(latitude, longitude) @ _axes(self.latitude, self.longitude).T
+
+
+class Nodes(dict[str, Node]):
+    """Nodes by name, and the `frame` of their coordinates (None where the file states metres)."""
+
+    frame: LocalFrame | None = None
+
+
+def _check_place(what: str, latitude: Any, longitude: Any, height: Any) -> None:
+    try:
+        phi, lam, h = (np.asarray(part, float) for part in (latitude, longitude, height))
+    except (TypeError, ValueError):
+        raise InputError(f"{what}: latitude, longitude and height must be numbers") from None
+    if not ((np.abs(phi) <= 90).all() and (np.abs(lam) <= 360).all()):
+        raise InputError(f"{what}: latitude must lie between -90 and 90 degrees, longitude between -360 and 360")
+    if not (np.abs(h) <= EQUATOR).all():
+        raise InputError(f"{what}: height must be metres above the ellipsoid, between -{EQUATOR:.0f} and {EQUATOR:.0f}")
+
+
+def _axes(latitude: Any, longitude: Any) -> np.ndarray:
+    """Axes east, north and up at places in degrees, as rows in earth-centred coordinates, shape (..., 3, 3)."""
+    phi, lam = np.broadcast_arrays(np.deg2rad(latitude), np.deg2rad(longitude))
+    east = np.stack([-np.sin(lam), np.cos(lam), np.zeros_like(lam)], -1)
+    north = np.stack([-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)], -1)
+    up = np.stack([np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)], -1)
+    return np.stack([east, north, up], -2)
+
+
+def _reference(frame: LocalFrame, place: np.ndarray) -> np.ndarray:
+    """Axes (N, 3, 3) from which attitudes at places (N, 2 or 3) count; in 2-D the turn in the plane alone."""
+    axes = frame.axes(place[:, 0], place[:, 1])
+    if place.shape[1] == 3:
+        return axes
+    turn = np.arctan2(axes[:, 0, 1], axes[:, 0, 0])
+    c, s, zero, one = np.cos(turn), np.sin(turn), np.zeros_like(turn), np.ones_like(turn)
+    return np.stack([c, s, zero, -s, c, zero, zero, zero, one], -1).reshape(-1, 3, 3)
+
+
+def _turned(components: Mapping[str, float], axes: np.ndarray) -> dict[str, float]:
+    """Components with heading, pitch and roll (the turns of `PoseView.local`) taken from other axes (3, 3)."""
+    turns = [components.get(name, 0.0) for name in ANGLES]
+    (c, cp, cr), (s, sp, sr) = np.cos(turns), np.sin(turns)
+    ahead, level, above = np.array([[cp * c, cp * s, sp], [-s, c, 0.0], [-sp * c, -sp * s, cp]]) @ axes
+    left, up = cr * level + sr * above, cr * above - sr * level
+    heading, roll = np.arctan2([ahead[1], left[2]], [ahead[0], up[2]])
+    turned = (heading, np.arcsin(np.clip(ahead[2], -1.0, 1.0)), roll)
+    return {**components, **{name: float(angle) for name, angle in zip(ANGLES, turned, strict=True)}}
+
+
+def read_nodes(
+    source: str | PathLike[str] | pd.DataFrame, *, origin: Sequence[float] | LocalFrame | None = None
+) -> Nodes:
+    """Nodes by name from CSV, GeoJSON (Point features, the columns as properties) or a DataFrame.
+
+    Columns: `node` (or `name`); `x, y[, z]` in m or `latitude, longitude[, height]` in degrees and m; optional
+    `heading`, `pitch`, `roll` in rad, `clock`, `time_offset` in s, `survey_<component>` and `scale_<component>` as of
+    `Node`, and extra components as numbers. A header may carry a unit (`heading [deg]`); clock and extras keep theirs.
+    A blank cell leaves its component out; columns `sd_...` (of `write_nodes`) are not read.
+
+    Latitude and longitude become metres in a `LocalFrame` about `origin` (latitude, longitude[, height]; the mean of
+    the nodes by default), kept as `.frame`. The heading counts from the node's own east, counter-clockwise (a compass
+    angle c is pi/2 - c), pitch and roll from its own horizon; they are turned into the frame. Raises `InputError`
+    naming file, row and column.
+    """
+    path = Path(source) if isinstance(source, (str, PathLike)) else None
+    table = _features(path) if path is not None and path.suffix.lower() in GEOJSON else read_table(source)
+    names, units = header(table)
+    cells = table.frame.set_axis(names, axis=1)
+    if cells.empty:
+        raise InputError(f"{table.source} has no nodes; write one a row")
+    labels = _labels(table, cells)
+    place = _place_columns(table, cells)
+    position = np.stack([_stated_place(table, cells[c], c, units[c]) for c in place], -1)
+    frame, axes = None, None
+    if place[0] == "latitude":
+        frame, axes, position = _to_frame(table, position, origin)
+    elif origin is not None:
+        raise InputError(f"{table.source} states x and y; an origin goes with latitude and longitude, drop it")
+    columns = _columns(table, cells, units)
+    nodes = Nodes()
+    for row, name in enumerate(labels):
+        own: dict[str, Any] = {
+            kind: {component: value[row] for component, value in found.items() if value[row] is not None}
+            for kind, found in columns.items()
+        }
+        components = own.pop("") if axes is None else _turned(own.pop(""), axes[row])
+        try:
+            nodes[name] = Node(name, position[row], **own, **components)
+        except InputError as error:
+            raise InputError(f"{table.where(row)}: {error}") from None
+    nodes.frame = frame
+    return nodes
+
+
+def _features(path: Path) -> Table:
+    """Point features of a GeoJSON file as a table, one row a feature."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path.name} is not GeoJSON: {error}") from None
+    features = content.get("features") if isinstance(content, dict) else None
+    if not isinstance(features, list):
+        raise InputError(f"{path.name} is not GeoJSON: it holds no FeatureCollection")
+    table = Table(pd.DataFrame(), path.name, np.arange(1, len(features) + 1), "feature")
+    records = []
+    for row, feature in enumerate(features):
+        geometry, properties = (_member(feature, name) for name in ("geometry", "properties"))
+        place: Any = geometry.get("coordinates") if geometry.get("type") == "Point" else None
+        if not isinstance(place, list) or len(place) not in (2, 3) or not {type(v) for v in place} <= {int, float}:
+            raise InputError(f"{table.where(row)} is no Point with coordinates [longitude, latitude] or with a height")
+        records.append(properties | dict(zip(("longitude", "latitude", "height"), place, strict=False)))
+    return replace(table, frame=pd.DataFrame(records))
+
+
+def _member(record: Any, name: str) -> dict[str, Any]:
+    """The object of that name, empty where there is none."""
+    found = record.get(name) if isinstance(record, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def _labels(table: Table, cells: pd.DataFrame) -> list[str]:
+    """Names of the nodes, each once."""
+    found = [column for column in ("node", "name") if column in cells]
+    if len(found) != 1:
+        raise InputError(
+            f'{table.source} has both a column "node" and a column "name"; keep one'
+            if found
+            else f'{table.source} has no column "node"{nearest("node", cells.columns)}'
+        )
+    column = cells[found[0]]
+    labels: list[str] = []
+    for row, (value, blank) in enumerate(zip(column, column.isna(), strict=True)):
+        label = "" if blank else name_of(value)
+        if not label:
+            raise InputError(f'{table.where(row)} column "{found[0]}" is blank; name the node')
+        if label in labels:
+            first = table.lines[labels.index(label)]
+            raise InputError(f'{table.where(row)}: node "{label}" is there already ({table.word} {first}); rename one')
+        labels.append(label)
+    return labels
+
+
+def _place_columns(table: Table, cells: pd.DataFrame) -> tuple[str, ...]:
+    """The columns that state the place: two, or three where a height is stated."""
+    stated = [column for column in (*LOCAL, *GEODETIC) if column in cells]
+    if not stated:
+        raise InputError(
+            f"{table.source} states no place: write x, y and perhaps z in m, or latitude, longitude and perhaps height"
+        )
+    chosen = LOCAL if stated[0] in LOCAL else GEODETIC
+    for column in stated:
+        if column not in chosen:
+            raise InputError(f'{table.source} column "{column}" does not go with "{stated[0]}"; drop one of them')
+    for column in chosen[:2]:
+        if column not in cells:
+            raise InputError(f'{table.source} has no column "{column}"{nearest(column, cells.columns)}')
+    return chosen if chosen[2] in cells and cells[chosen[2]].notna().any() else chosen[:2]
+
+
+def _stated_place(table: Table, column: pd.Series, name: str, unit: str | None) -> np.ndarray:
+    values, there = numbers(table, column, name)
+    blank = np.flatnonzero(~there)
+    if len(blank):
+        raise InputError(f'{table.where(blank[0])} column "{name}" is blank; state it for every node')
+    return values * factor(table, name, unit, PLACE_UNITS[name])
+
+
+def _to_frame(
+    table: Table, place: np.ndarray, origin: Sequence[float] | LocalFrame | None
+) -> tuple[LocalFrame, np.ndarray, np.ndarray]:
+    """Local frame, axes of the attitudes (N, 3, 3) and positions (N, d) of nodes at geodetic places (N, d)."""
+    for row, (latitude, longitude, *height) in enumerate(place):
+        _check_place(table.where(row), latitude, longitude, height[0] if height else 0.0)
+    if isinstance(origin, LocalFrame):
+        frame = origin
+    elif origin is None:  # by the mean of directions, which knows no date line
+        x, y, z = _axes(place[:, 0], place[:, 1])[:, 2].mean(axis=0).tolist()
+        middle = np.rad2deg([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)])
+        frame = LocalFrame(*middle.tolist(), *place[:, 2:].mean(axis=0).tolist())
+    elif isinstance(origin, (Sequence, np.ndarray)) and len(origin) in (2, 3):
+        frame = LocalFrame(*origin)
+    else:
+        raise InputError(f"read_nodes: origin is {origin!r}; give (latitude, longitude) or with a height")
+    return frame, _reference(frame, place), frame.to_local(*place.T)
+
+
+def _columns(table: Table, cells: pd.DataFrame, units: Mapping[str, str | None]) -> dict[str, dict[str, list[Any]]]:
+    """Cells by kind ("" stated, "survey", "scale") and component, None where blank; angles in rad, lengths in m."""
+    found: dict[str, dict[str, list[Any]]] = {"": {}, "survey": {}, "scale": {}}
+    first: dict[str, tuple[str, str]] = {}
+    for name in cells.columns:
+        if name in (*LOCAL, *GEODETIC, "node", "name") or name.startswith("sd_"):
+            continue
+        kind, _, component = name.partition("_")
+        if kind not in KINDS or not component:
+            kind, component = "", name
+            _check_component(table, name)
+        default = POSE_UNITS.get(component, "1")
+        unit = units[name] or default
+        values, there = numbers(table, cells[name], name)
+        if component in POSE_UNITS and component != "clock":
+            values = values * factor(table, name, unit, default)
+            unit = default
+        other = first.setdefault(component, (name, unit))
+        if other[1] != unit:
+            raise InputError(
+                f'{table.source} column "{name}" is in "{unit}", "{other[0]}" in "{other[1]}"; give both one unit'
+            )
+        found[kind][component] = [
+            (float(value) if not kind or unit == default else _bias(table, row, unit, value)) if known else None
+            for row, (value, known) in enumerate(zip(values, there, strict=True))
+        ]
+    return found
+
+
+def _bias(table: Table, row: int, unit: str, scale: float) -> Bias:
+    try:
+        return Bias(unit, float(scale))
+    except InputError as error:
+        raise InputError(f"{table.where(row)}: {error}") from None
+
+
+def _check_component(table: Table, name: str) -> None:
+    """Raise `InputError` for a column that is nearly, but not, the name of one that has a meaning."""
+    if name not in OWN and (name in RESERVED or get_close_matches(name, KNOWN, 1, 0.85)):
+        raise InputError(
+            f'{table.source} column "{name}" cannot be the name of an extra component, rename it{nearest(name, KNOWN)}'
+        )
+
+
+class _Record(NamedTuple):
+    """What is to be written of one node: name, position (d,), components, and spreads or sds by column name."""
+
+    name: str
+    position: np.ndarray
+    components: dict[str, float]
+    further: dict[str, float]
+    units: dict[str, str]  # by component
+
+
+def write_nodes(
+    path: str | PathLike[str],
+    nodes: xr.DataTree | Mapping[str, Node] | Iterable[Node],
+    *,
+    frame: LocalFrame | None = None,
+) -> Path:
+    """Write nodes, or the calibrated nodes of a fit, to CSV or GeoJSON with the columns of `read_nodes`.
+
+    Nodes are written with their `survey_...` and `scale_...`, a fit as stated value + bias (its mean) with columns
+    `sd_<bias>`. With a `frame` (that of `Nodes` from `read_nodes` by default) places are latitude and longitude, and
+    GeoJSON can be written; without, metres. Nodes that move are left out. Raises `InputError`.
+    """
+    path = Path(path)
+    if frame is None and isinstance(nodes, Nodes):
+        frame = nodes.frame
+    geojson = path.suffix.lower() in GEOJSON
+    if geojson and frame is None:
+        raise InputError(f"{path.name}: GeoJSON holds latitude and longitude; give a frame, or write CSV")
+    if isinstance(nodes, xr.DataTree):
+        records = _calibrated(nodes)
+    else:
+        given: Any = nodes.values() if isinstance(nodes, Mapping) else nodes
+        records = _stated(given)
+    if not records:
+        raise InputError(f"{path.name}: there is no node that stands still; nothing is to be written")
+    cells = pd.DataFrame(_rows(records, frame))
+    idle = [c for c in cells.columns if c.split(" ")[0] in OWN and (cells[c].abs() < 1e-12).all()]
+    cells = cells.drop(columns=idle)
+    text = _geojson(cells) if geojson else cells.to_csv(index=False)
+    draft = path.with_name(f".{path.name}.part")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        os.replace(draft, path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from None
+    finally:
+        draft.unlink(missing_ok=True)
+    return path
+
+
+def _stated(nodes: Iterable[Node]) -> list[_Record]:
+    records = []
+    for node in nodes:
+        further = {f"{kind}_{component}": bias.scale for component, (kind, bias) in node.spread.items()}
+        units = {component: bias.unit for component, (_, bias) in node.spread.items()}
+        if node.path is None:
+            records.append(_Record(node.name, node.position, node.components, further, units))
+    return records
+
+
+def _calibrated(tree: xr.DataTree) -> list[_Record]:
+    """Nodes of a fit: stated value + fixed bias or posterior mean, and the posterior sd of each bias."""
+    if not {"constant_data", "calibration"} <= set(tree.children):
+        raise InputError("the tree holds no calibrated nodes; give the result of fit()")
+    constant, found = tree["constant_data"].to_dataset(), tree["calibration"].to_dataset()
+    table = found[["mean", "sd", "unit"]].to_dataframe().to_dict("index")
+    fixed = constant["fixed"].to_series().to_dict() if "fixed" in constant else {}
+    shift = fixed | {label: row["mean"] for label, row in table.items()}
+    stated = zip(*(constant[name].values for name in ("stated_node", "stated_component", "stated")), strict=True)
+    components: dict[str, dict[str, float]] = {}
+    for node, component, value in stated:
+        components.setdefault(str(node), {})[str(component)] = float(value) + shift.get(f"{node}.{component}", 0.0)
+    records = []
+    for node, place, moving in zip(*(constant[n].values for n in ("node", "node_position", "moving")), strict=True):
+        axes = [f"position_{axis}" for axis in AXES[: len(place)]]
+        own = {name: table[f"{node}.{name}"] for name in (*axes, *components[node]) if f"{node}.{name}" in table}
+        position = place + [shift.get(f"{node}.{axis}", 0.0) for axis in axes]
+        further = {f"sd_{name}": row["sd"] for name, row in own.items()}
+        units = {name: row["unit"] for name, row in own.items() if name not in axes}
+        if not moving:
+            records.append(_Record(str(node), position, components[node], further, units))
+    return records
+
+
+def _rows(records: list[_Record], frame: LocalFrame | None) -> list[dict[str, Any]]:
+    """Cells of each record by header: angles in degrees, clock and extras in their unit."""
+    for record in records:
+        if record.position.shape != records[0].position.shape:
+            raise InputError(f'nodes "{records[0].name}" and "{record.name}" differ in dimension; write them apart')
+    position = np.stack([record.position for record in records])
+    place, columns, axes = position, LOCAL, None
+    if frame is not None:
+        place, columns = np.stack(frame.to_geodetic(position), -1), GEODETIC
+        axes = _reference(frame, place).swapaxes(1, 2)
+    units: dict[str, str] = {}
+    for record in records:
+        for component, unit in record.units.items():
+            if units.setdefault(component, unit) != unit:
+                raise InputError(
+                    f'the nodes state "{component}" in "{units[component]}" and in "{unit}"; a file needs one unit'
+                )
+
+    def cell(name: str, value: float) -> tuple[str, float]:
+        component = name.partition("_")[2] if name.startswith(("sd_", "survey_", "scale_")) else name
+        default = POSE_UNITS.get(component, "m" if component.startswith("position") else "1")
+        unit = units.get(component, default)
+        if component in ANGLES:
+            return f"{name} [deg]", round(float(np.rad2deg(value)), 12) + 0.0  # no negative zero
+        return (name if unit == default else f"{name} [{unit}]"), float(value)
+
+    rows = []
+    for k, record in enumerate(records):
+        components = record.components if axes is None else _turned(record.components, axes[k])
+        where = {
+            name: round(float(v), 6 if PLACE_UNITS[name] == "m" else 11)
+            for name, v in zip(columns, place[k], strict=False)
+        }
+        row: dict[str, Any] = {"node": record.name} | where
+        rows.append(row | dict(cell(*item) for item in (components | record.further).items()))
+    return rows
+
+
+def _geojson(cells: pd.DataFrame) -> str:
+    """A FeatureCollection of points, blank properties left out."""
+    features = []
+    for record in cells.to_dict("records"):
+        place = [record.pop(column) for column in ("longitude", "latitude", "height") if column in record]
+        properties = {name: value for name, value in record.items() if value == value}
+        geometry = {"type": "Point", "coordinates": place}
+        features.append({"type": "Feature", "geometry": geometry, "properties": properties})
+    return json.dumps({"type": "FeatureCollection", "features": features}, indent=1, allow_nan=False) + "\n"
