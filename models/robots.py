@@ -37,7 +37,7 @@ def read(data, name):
     """Columns of one file of the data set, plain or compressed."""
     if data is None:
         raise InputError(
-            "robots.py needs a recording: download MRCLAM data set 6 from http://asrl.utias.utoronto.ca/datasets/mrclam "
+            "robots.py needs a recording: download MRCLAM data set 6 (http://asrl.utias.utoronto.ca/datasets/mrclam) "
             "and give the path of its folder, MRCLAM_Dataset6"
         )
     for file in (File(data) / f"{name}.dat", File(data) / f"{name}.dat.gz"):

@@ -1,0 +1,101 @@
+"""Real recordings: what a fit finds against what is known. They lie beside the project and are skipped where not."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import probcal
+from probcal import EA
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
+import receivers  # noqa: E402
+import robots  # noqa: E402
+import sflab  # noqa: E402
+import tdoa_flight  # noqa: E402
+
+
+def recording(name):
+    if not (DATA / name).exists():
+        pytest.skip(f"the recording {name} is not here")
+    return DATA / name
+
+
+def displaced(tree, truth, nodes, axes):
+    """Distance in m of every node's calibrated place from the true one."""
+    mean = tree["calibration"]["mean"].to_series()
+    error = {n: [mean[f"{n}.position_{a}"] - truth.biases.get(f"{n}.position_{a}", 0.0) for a in axes] for n in nodes}
+    return {node: float(np.linalg.norm(e)) for node, e in error.items()}
+
+
+def fit_sflab(swap, starts=1):
+    data = recording("sflab_mic_toa/dataset_1_exp2.mat")
+    tree = probcal.fit(sflab.problem(data, swap), EA(), starts=starts, predictive_draws=False)
+    assert tree.attrs["status"] == "converged"
+    return displaced(tree, sflab.truth(data, swap), [f"mic_{n}" for n in range(1, 9)], "xy"), tree
+
+
+def test_a_swap_of_two_microphones_is_found_and_none_is_made_up():
+    found, _ = fit_sflab((5, 8))
+    assert max(found["mic_5"], found["mic_8"]) < 0.15
+    found, tree = fit_sflab(None)
+    assert max(found.values()) < 0.3
+    listed = probcal.outliers(tree)
+    assert 0.1 < len(listed) / tree["residual"].sizes["datum"] < 0.3, "the echoes: 14 to 24 % of each microphone"
+
+
+@pytest.mark.slow
+def test_a_swap_across_the_room_needs_several_starts():
+    alone, single = fit_sflab((1, 4))
+    found, tree = fit_sflab((1, 4), starts=6)
+    assert alone["mic_1"] > 1.0, "one start ends in another optimum"
+    assert max(found["mic_1"], found["mic_4"]) < 0.35
+    assert tree.attrs["log_evidence"] > single.attrs["log_evidence"] + 10
+
+
+def headings(tree):
+    mean = np.rad2deg(tree["calibration"]["mean"].to_series())
+    return {n: mean[f"robot_{n}.heading"] for n in range(1, 6)}
+
+
+def test_robots_know_their_headings():
+    data = recording("mrclam/MRCLAM_Dataset6")
+    plain = headings(probcal.fit(robots.problem(data), EA(), predictive_draws=False))
+    # regression of the bearings on the motion capture, in deg: the heading bias is minus the bearing bias
+    assert plain[4] == pytest.approx(0.81, abs=0.15)
+    turned = robots.problem(data, turn={"robot_2": np.deg2rad(5.0)})
+    found = headings(probcal.fit(turned, EA(), predictive_draws=False))
+    assert plain[2] - found[2] == pytest.approx(5.0, abs=0.15)
+
+
+def test_delays_of_receivers_repeat_over_sets():
+    """Delays of the larger group of receivers, a shift common to it apart (nobody can know it), set by set."""
+    delays = {}
+    for number in range(1, 5):
+        path = recording(f"mlat_locards/set_{number}.csv")
+        problem = receivers.problem(path)
+        tree = probcal.fit(problem, EA(), predictive_draws=False)
+        assert tree.attrs["status"] == "converged"
+        group = pd.Series(receivers.groups(receivers.messages(path)[0]))
+        members = group.index[group == group.mode()[0]]
+        mean = tree["calibration"]["mean"].to_series().to_dict() | problem.fixed
+        delays[number] = pd.Series({n: mean[f"receiver_{n}.delay"] for n in members if f"receiver_{n}.delay" in mean})
+    for number in (2, 3, 4):
+        apart = (delays[number] - delays[1]).dropna()
+        assert len(apart) >= 10
+        assert np.sqrt(np.mean((apart - apart.mean()) ** 2)) < 10.0
+
+
+def test_swapped_anchors_of_a_flight_are_found():
+    data, swap = recording("uwb_tdoa"), (3, 4)
+    problem = tdoa_flight.problem(data, swap)
+    tree = probcal.fit(problem, EA(), prior=tdoa_flight.PRIOR, predictive_draws=False)
+    assert tree.attrs["status"] == "converged"
+    truth = tdoa_flight.truth(data, swap)
+    found = displaced(tree, truth, [f"anchor_{n}" for n in range(8)], "xyz")
+    assert max(found.values()) < 0.3
+    scores = probcal.scores(tree, truth)
+    assert scores["position_rmse_after"] < 0.5 * scores["position_rmse_before"]
