@@ -31,9 +31,9 @@ def displaced(tree, truth, nodes, axes):
     return {node: float(np.linalg.norm(e)) for node, e in error.items()}
 
 
-def fit_sflab(swap, starts=1):
+def fit_sflab(swap, starts=1, prior=None):
     data = recording("sflab_mic_toa/dataset_1_exp2.mat")
-    tree = probcal.fit(sflab.problem(data, swap), EA(), starts=starts, predictive_draws=False)
+    tree = probcal.fit(sflab.problem(data, swap), EA(), prior=prior, starts=starts, predictive_draws=False)
     assert tree.attrs["status"] == "converged"
     return displaced(tree, sflab.truth(data, swap), [f"mic_{n}" for n in range(1, 9)], "xy"), tree
 
@@ -54,6 +54,13 @@ def test_a_swap_across_the_room_needs_several_starts():
     assert alone["mic_1"] > 1.0, "one start ends in another optimum"
     assert max(found["mic_1"], found["mic_4"]) < 0.35
     assert tree.attrs["log_evidence"] > single.attrs["log_evidence"] + 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("swap", [(1, 5), (1, 4), (2, 3)])
+def test_a_strict_prior_by_node_finds_swaps_across_the_room_and_nothing_else(swap):
+    found, _ = fit_sflab(swap, starts=6, prior=sflab.PRIOR)
+    assert max(found.values()) < 0.2
 
 
 def headings(tree):
