@@ -207,6 +207,9 @@ def fit_command(
         _folder(out)
     began = time.perf_counter()
     module, problem = _problem(model, data, fix)
+    own = getattr(module, "PRIOR", None)
+    if chosen is None and isinstance(own, value.priors):
+        chosen = own
     truth = _truth(module, model, data, problem)
     with _progress() as progress:
         tree = fit(problem, value, prior=chosen, key=seed, starts=starts, progress=progress)

@@ -241,3 +241,12 @@ def _parts(model):
     from probcal.cli import load_model
 
     return load_model(model).network(), probcal.ConstantVelocity(0.5)
+
+
+def test_a_model_may_bring_its_prior(tmp_path, model):
+    model.write_text(model.read_text() + '\nfrom probcal import ARD\nPRIOR = ARD(by="node")\n')
+    assert run("simulate", model, "--out", tmp_path / "rows.csv").returncode == 0
+    for extra, wanted in (((), "by='node'"), (("--prior", "ard"), "by=None"), (("--method", "map"), "Gaussian")):
+        done = run("fit", model, tmp_path / "rows.csv", "--out", tmp_path / "out", *extra)
+        assert done.returncode in (0, 1), done.stderr
+        assert wanted in probcal.load(tmp_path / "out").attrs["settings"]
