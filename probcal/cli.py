@@ -207,7 +207,7 @@ def fit_command(
         _folder(out)
     began = time.perf_counter()
     module, problem = _problem(model, data, fix)
-    own = getattr(module, "PRIOR", None)
+    own: Any = getattr(module, "PRIOR", None)
     if chosen is None and isinstance(own, value.priors):
         chosen = own
     truth = _truth(module, model, data, problem)
