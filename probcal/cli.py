@@ -202,12 +202,12 @@ def fit_command(
     if prior is not None and prior not in PRIORS:
         raise InputError(f'--prior "{prior}" is not known{nearest(prior, PRIORS)}')
     value, implied = METHODS[method]
-    chosen = PRIORS[prior] if prior is not None else implied
+    chosen: Any = PRIORS[prior] if prior is not None else implied
     if out is not None:
         _folder(out)
     began = time.perf_counter()
     module, problem = _problem(model, data, fix)
-    own: Any = getattr(module, "PRIOR", None)
+    own = getattr(module, "PRIOR", None)
     if chosen is None and isinstance(own, value.priors):
         chosen = own
     truth = _truth(module, model, data, problem)
