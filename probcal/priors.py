@@ -13,7 +13,6 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
 
 from probcal import linalg
 from probcal.types import InputError, nearest
@@ -103,10 +102,6 @@ class _Prior:
         """Negative log density of each z whose precision this prior governs, up to a constant, (M,)."""
         return 0.5 * alpha * z**2
 
-    def log_density(self, z: np.ndarray, precision: np.ndarray) -> np.ndarray:
-        """Log density of draws z (..., M)."""
-        return stats.norm.logpdf(z, 0.0, 1 / np.sqrt(np.maximum(precision, 1e-300)))
-
 
 @dataclass(frozen=True)
 class Flat(_Prior):
@@ -143,10 +138,6 @@ class Laplace(_Prior):
     def penalty(self, z: Any, alpha: Any) -> Any:
         """Negative log density of each z, up to a constant."""
         return self.rate * abs(z)
-
-    def log_density(self, z: np.ndarray, precision: np.ndarray) -> np.ndarray:
-        """Log density of draws z (..., M)."""
-        return stats.laplace.logpdf(z, 0.0, 1 / self.rate)
 
 
 @dataclass(frozen=True)

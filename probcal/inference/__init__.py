@@ -1,7 +1,8 @@
 """Inference: `fit(problem, method)` for every method, `track` for other data, `study` over runs."""
 
 from probcal.inference.fit import fit, track
-from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, LeastSquares, Method, table
+from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, LeastSquares, table
+from probcal.inference.run import Method
 from probcal.inference.study import ORACLE, study
 
 __all__ = ["EA", "EM", "EMEA", "MAP", "METHODS", "ORACLE", "LeastSquares", "Method", "fit", "study", "table", "track"]

@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from probcal.inference.run import Given, State, learn
+from probcal.inference.run import Given, Method, State, learn
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.smoothing.information import laplace, paper_b, update_levels
@@ -63,7 +63,7 @@ def _iterate_paper_b(spec: Spec, system: System, prior: Prior, given: Given, sta
 
 
 @dataclass(frozen=True)
-class EA:
+class EA(Method):
     """Evidence approximation with trajectories marginalised exactly: the default.
 
     `update` of the precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed points, slower).
@@ -79,36 +79,28 @@ class EA:
 
     name: ClassVar[str] = "EA"
     priors: ClassVar[tuple[type, ...]] = (ARD,)
+    intervals: ClassVar[str] = (
+        "plug-in: the precisions (and unknown levels) are taken as known, so the intervals are too narrow"
+    )
 
     def __post_init__(self):
         for field, known in (("update", RULES), ("trajectory", TRAJECTORIES)):
             if getattr(self, field) not in known:
                 raise InputError(f'EA({field}="{getattr(self, field)}"): give one of {", ".join(known)}')
 
-    @property
-    def intervals(self) -> str:
-        """What the intervals are worth."""
-        twice = " and the data count twice (Paper B as printed)" if self.trajectory == "smoothed" else ""
-        return (
-            f"plug-in: the precisions (and unknown levels) are taken as known{twice}, so the intervals are too narrow"
-        )
-
-    def prepare(self, problem: Problem) -> Problem:
-        """The problem as it is."""
-        return problem
+    def note(self) -> str:
+        """What the intervals are worth with these settings."""
+        twice = "; the data count twice (Paper B as printed)" if self.trajectory == "smoothed" else ""
+        return self.intervals + twice
 
     def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
         """Mode (or smoothed trajectory), evidence, new precisions."""
         step = _iterate if self.trajectory == "exact" else _iterate_paper_b
         return step(spec, system, prior, given, state, self.update)
 
-    def close(self, spec: Spec, system: System, given: Given, state: State) -> State:
-        """Nothing is left to do."""
-        return state
-
 
 @dataclass(frozen=True)
-class MAP:
+class MAP(Method):
     """Joint mode of trajectories and biases under a given prior, Laplace covariance.
 
     `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood.
@@ -121,17 +113,9 @@ class MAP:
     priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat, Laplace)
     intervals: ClassVar[str] = "Laplace: exact for a Gaussian or flat prior where the problem is linear and Gaussian"
 
-    def prepare(self, problem: Problem) -> Problem:
-        """The problem as it is."""
-        return problem
-
     def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
         """Mode and its covariance."""
         return _iterate(spec, system, prior, given, state, "mackay")
-
-    def close(self, spec: Spec, system: System, given: Given, state: State) -> State:
-        """Nothing is left to do."""
-        return state
 
 
 @dataclass(frozen=True)

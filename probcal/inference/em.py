@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg
-from probcal.inference.run import Given, State, learn
+from probcal.inference.run import Given, Method, State, learn
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
-from probcal.problem import Problem, Spec, System
+from probcal.problem import Spec, System
 from probcal.smoothing import sigma
 from probcal.smoothing.information import laplace, update_levels
 from probcal.smoothing.mode import Point, between, cost, eliminate_rows, find_mode, follow, linearise, of_biases
@@ -77,7 +77,7 @@ def _iterate(
 
 
 @dataclass(frozen=True)
-class EM:
+class EM(Method):
     """Expectation maximisation of the biases: ML with `Flat`, MAP with `Gaussian` (Paper A 15-21, Paper C 27-36).
 
     `linearisation` of the E-step is "extended" or, by sigma points, "unscented" or "cubature". It stops when the
@@ -101,10 +101,6 @@ class EM:
             )
         if self.inner < 1:
             raise InputError(f"{self.name}(inner={self.inner}): at least one inner iteration is needed")
-
-    def prepare(self, problem: Problem) -> Problem:
-        """The problem as it is."""
-        return problem
 
     def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
         """Inner EM steps, then new precisions."""

@@ -9,9 +9,9 @@ import xarray as xr
 from scipy import stats
 
 from probcal import tree
-from probcal.inference.methods import EA, Method, check_problem, choose_prior
-from probcal.inference.run import Outcome, Progress, maximise
-from probcal.priors import Flat, Laplace, Prior
+from probcal.inference.methods import EA, check_problem, choose_prior
+from probcal.inference.run import Method, Outcome, Progress, maximise
+from probcal.priors import Prior
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import Key, as_key
 from probcal.smoothing.draws import draw, predictive, residuals
@@ -99,17 +99,16 @@ def _result(
         return np.asarray(a).reshape(*shape, *a.shape[1:])
 
     alpha, draws = np.asarray(outcome.alpha), split(z)
-    own = np.where(problem.surveyed, stats.norm.logpdf(draws), prior.log_density(draws, alpha))
-    independent = not isinstance(prior, Flat | Laplace) and not prior.correlation
+    independent = prior.proper and not prior.correlation  # else no density of each bias alone, or not that of the draws
     return tree.Result(
         method=method.name, prior=type(prior).__name__, seed=seed, approximate="Laplace",
-        intervals=prior.note or method.intervals, settings=f"{method!r}, {prior!r}",
+        intervals=prior.note or method.note(), settings=f"{method!r}, {prior!r}",
         status=outcome.status, message=outcome.message, z=np.asarray(point.z),
         covariance=np.asarray(found.covariance), precision=alpha, gamma=np.asarray(found.gamma),
         bias_status=outcome.bias_status, information=np.asarray(found.information),
         evidence=float(found.evidence) if prior.proper else None, objective=outcome.trace,
         levels=np.asarray(point.levels), directions=outcome.weak, draws=draws,
-        log_prior=own if independent else None,
+        log_prior=stats.norm.logpdf(draws, 0.0, 1 / np.sqrt(alpha)) if independent else None,
         states=[split(s) for s in states] if (size <= tree.LARGEST if wanted is None else wanted) else None,
         log_likelihood=[split(a) for a in log_likelihood] if log_likelihood is not None else None,
         replicas=[split(a) for a in replicas] if replicas is not None else None,

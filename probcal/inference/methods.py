@@ -1,17 +1,17 @@
 """The methods as values, their names on the command line, and which priors each takes.
 
-To add one: a module beside this one with a frozen dataclass that answers `inference.run.Method`, entered here.
+To add one: a module beside this one with a frozen dataclass that inherits `inference.run.Method`, entered here.
 """
 
 import pandas as pd
 
 from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
+from probcal.inference.run import Method
 from probcal.priors import PRIORS, Flat, Laplace, Prior
 from probcal.problem import Problem
 from probcal.types import InputError
 
-Method = EA | EM | EMEA | MAP | LeastSquares
 # names on the command line: method, and the prior it means where that is not the method's first
 METHODS: dict[str, tuple[Method, Prior | None]] = {
     "ea": (EA(), None),

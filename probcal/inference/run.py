@@ -1,13 +1,13 @@
 """What all methods share: the outer loop in jitted chunks with progress, and the verdict on where a fit ended.
 
-A method is a frozen dataclass with `iterate`, a pure step of its outer loop, and `close`, what it computes at the
-end of a chunk; `maximise` drives one fit and `inference.study` many at once.
+A method is a frozen dataclass that inherits `Method`: `iterate`, a pure step of its outer loop, and where needed
+`close`, what it computes at the end of a chunk; `maximise` drives one fit and `inference.study` many at once.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,38 +45,30 @@ class State(NamedTuple):
     done: jax.Array  # ()
 
 
-class Method(Protocol):
-    """A method as a value; all of its fields are static."""
+class Method:
+    """What every method inherits: a frozen dataclass of static fields, with a pure `iterate`."""
 
+    iterations: int  # most outer iterations
+    tolerance: float  # change of the objective at which it stops
     name: ClassVar[str]
-    priors: ClassVar[tuple[type, ...]]
+    priors: ClassVar[tuple[type, ...]]  # the first is its own
+    intervals: ClassVar[str]  # what the intervals are worth
 
-    @property
-    def iterations(self) -> int:
-        """Most outer iterations."""
-        ...
-
-    @property
-    def tolerance(self) -> float:
-        """Change of the objective at which it stops."""
-        ...
-
-    @property
-    def intervals(self) -> str:
-        """What the intervals are worth."""
-        ...
+    def note(self) -> str:
+        """What the intervals are worth with these settings."""
+        return self.intervals
 
     def prepare(self, problem: Problem) -> Problem:
         """The problem that is solved in the place of the given one."""
-        ...
+        return problem
 
     def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
         """One outer iteration."""
-        ...
+        raise NotImplementedError
 
     def close(self, spec: Spec, system: System, given: Given, state: State) -> State:
         """What is computed once a chunk."""
-        ...
+        return state
 
 
 class Outcome(NamedTuple):

@@ -13,8 +13,18 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from probcal.inference.methods import METHODS, Method, check_problem, choose_prior
-from probcal.inference.run import Given, State, check_method, first_state, given_of, kernel, low_and_far, verdict
+from probcal.inference.methods import METHODS, check_problem, choose_prior
+from probcal.inference.run import (
+    Given,
+    Method,
+    State,
+    check_method,
+    first_state,
+    given_of,
+    kernel,
+    low_and_far,
+    verdict,
+)
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import Truth

@@ -1,5 +1,6 @@
 """The Laplace approximation at a point: information of the biases, gamma, evidence, noise levels."""
 
+from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 from probcal import linalg, rows
 from probcal.priors import Precision
 from probcal.problem import Recursion, Spec, System
+from probcal.rows import Linearised
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import (
     Point,
@@ -47,6 +49,14 @@ def laplace(spec: Spec, system: System, point: Point, prior: Precision) -> Lapla
     return Laplace(solved.information, covariance, gamma, evidence)
 
 
+def _parts(
+    spec: Spec, system: System, lins: list[Linearised], point: Point
+) -> Iterator[tuple[Recursion, tuple[jax.Array, jax.Array], jax.Array]]:
+    """Each recursion with its rows compressed: onto the states (information, score), and across to the biases."""
+    states = of_states(spec, system, lins, point.states)
+    return zip(system.recursions, states, of_both(spec, system, lins, point.states), strict=True)
+
+
 def paper_b(spec: Spec, system: System, point: Point, prior: Precision) -> tuple[Laplace, jax.Array]:
     """Paper B (10)-(17), (22)-(23) at smoothed trajectories: the posterior of z, and the step to its mean.
 
@@ -56,13 +66,7 @@ def paper_b(spec: Spec, system: System, point: Point, prior: Precision) -> tuple
     lins = linearise(spec, system, point, expected=True)
     information, score = of_biases(spec, system, lins)
     likelihood, logdet = log_likelihood(spec, system, point), jnp.zeros(())
-    parts = zip(
-        system.recursions,
-        of_states(spec, system, lins, point.states),
-        of_both(spec, system, lins, point.states),
-        strict=True,
-    )
-    for part, (J, pull), cross in parts:
+    for part, (J, pull), cross in _parts(spec, system, lins, point):
         L = factors(part, point.levels)
         P, _ = rec.covariances(part.F, L, J, rec.gains(part.F, L, J))
         values, vectors = linalg.spectrum(P)
@@ -98,13 +102,7 @@ def moments(spec: Spec, system: System, point: Point, covariance: jax.Array) -> 
     """Trajectory moments of each recursion at a point, for a covariance (M, M) of z."""
     lins = linearise(spec, system, point, expected=True)
     found = []
-    parts = zip(
-        system.recursions,
-        of_states(spec, system, lins, point.states),
-        of_both(spec, system, lins, point.states),
-        strict=True,
-    )
-    for part, (J, _), cross in parts:
+    for part, (J, _), cross in _parts(spec, system, lins, point):
         L = factors(part, point.levels)
         gain = rec.gains(part.F, L, J)
         response = rec.smooth(part.F, L, J, gain, cross)
