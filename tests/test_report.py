@@ -12,7 +12,11 @@ import xarray as xr
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
 from probcal import plots, report
+from probcal.plots import base
 
 AXES = ("x", "y", "z")
 EPOCHS = 5_000
@@ -263,7 +267,7 @@ def test_numbers_are_rounded_to_their_sd(value, sd, text):
 
 def test_map_thins_tracks_and_names_nodes():
     ax = plots.plot_map(make(3, recursions=2))
-    assert max(len(line.get_xdata()) for line in ax.lines) <= plots.POINTS
+    assert max(len(line.get_xdata()) for line in ax.lines) <= base.POINTS
     assert {"north", "south"} <= {text.get_text() for text in ax.texts}
     assert "z not shown" in ax.get_title(loc="left")
     assert ax.get_aspect() == 1.0
@@ -273,7 +277,7 @@ def test_map_thins_tracks_and_names_nodes():
 
 def test_map_ellipse_holds_the_stated_probability():
     tree = make(nodes=("north",))
-    (ellipse,) = [patch for patch in plots.plot_map(tree).patches if isinstance(patch, plots.Ellipse)]
+    (ellipse,) = [patch for patch in plots.plot_map(tree).patches if isinstance(patch, Ellipse)]
     group = tree["calibration"].to_dataset()
     sides = sorted(float(group["sd"].sel(bias_label=f"north.position_{axis}")) for axis in "xy")
     radius = np.sqrt(-2 * np.log(0.11))
@@ -288,7 +292,7 @@ def test_map_ellipse_leans_with_the_correlation():
     covariance = np.diag([1.0, 1.0, 1.0, 1.0])
     covariance[0, 1] = covariance[1, 0] = 0.9
     tree["calibration"]["covariance"][:] = covariance
-    (ellipse,) = [patch for patch in plots.plot_map(tree).patches if isinstance(patch, plots.Ellipse)]
+    (ellipse,) = [patch for patch in plots.plot_map(tree).patches if isinstance(patch, Ellipse)]
     long = ellipse.angle if ellipse.width > ellipse.height else ellipse.angle + 90
     assert long % 180 == pytest.approx(45)
 
@@ -318,7 +322,7 @@ def test_forest_of_many_biases_says_what_it_leaves_out():
     tree = make(nodes=[f"mast_{k}" for k in range(60)], status="at bound")
     tree["calibration"]["status"][120] = "diverged"  # of a small mean
     ax = plots.plot_biases(tree)
-    assert len(ax.get_yticks()) == plots.ROWS
+    assert len(ax.get_yticks()) == base.ROWS
     assert ax.get_title(loc="left").startswith("120 of 240 biases")
     assert "diverged" in [text.get_text() for text in ax.texts]
 
@@ -348,5 +352,5 @@ def test_objective_names_the_evidence():
 
 def test_pictures_draw_into_given_axes():
     for draw in (plots.plot_map, plots.plot_biases, plots.plot_objective, plots.plot_gamma):
-        ax = plots.Figure().subplots()
+        ax = Figure().subplots()
         assert draw(make(), ax) is ax

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -15,18 +14,21 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, FancyArrowPatch
 from matplotlib.ticker import MaxNLocator
 
-from probcal.types import InputError
-
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#5d3a9b")
-BEFORE = "#a6a6a6"
-GAMMA = "viridis_r"  # light: prior only, dark: data only
-INTERVAL = 0.89  # probability of an interval where the tree does not say
-POINTS = 3_000  # of one track
-ALL_POINTS = 40_000  # of all tracks together
-ROWS = 120  # biases in one forest
-NAMED = 60  # nodes, targets or biases above which names are left out
-INVALID = ("at bound", "diverged")  # status of a fit or a bias whose numbers are no estimate
-LINEAR = 12.0  # scales up to which the axis of the forest stays linear
+from probcal.plots.base import (
+    ALL_POINTS,
+    BEFORE,
+    COLOURS,
+    GAMMA,
+    INVALID,
+    LINEAR,
+    NAMED,
+    POINTS,
+    ROWS,
+    colour,
+    new_axes,
+    plain,
+    probability,
+)
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class _Track:
 
 def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw stated and calibrated nodes with their ellipses, and the tracks before and after calibration."""
-    ax = _axes(ax, 9.0, 6.5)
+    ax = new_axes(ax, 9.0, 6.5)
     ax.set_aspect("equal", adjustable="box")
     tracks = list(_tracks(tree))
     _limit(ax, tree, tracks)
@@ -62,7 +64,7 @@ def plot_biases(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     labels, scale, gamma = group["bias_label"].values, group["scale"].values, group["gamma"].values
     mean, lower, upper = (group[name].values / scale for name in ("mean", "lower", "upper"))
     rows = np.arange(len(labels))
-    ax = _axes(ax, 9.0, min(2.0 + 0.24 * len(rows), 24.0))
+    ax = new_axes(ax, 9.0, min(2.0 + 0.24 * len(rows), 24.0))
     ax.axvline(0.0, color="0.3", linewidth=0.8, zorder=1.8)
     ax.hlines(rows, lower, upper, color="0.55", linewidth=2.0, zorder=2)
     dots = ax.scatter(
@@ -73,11 +75,11 @@ def plot_biases(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     if np.isfinite(true).any():
         ax.plot(true, rows, "x", color="#d00000", markersize=6, markeredgewidth=1.6, zorder=4)
     _mark_status(ax, group["status"].values, _text_size(len(rows)))
-    ax.set_yticks(rows, [_plain(label) for label in labels], fontsize=_text_size(len(rows)))
+    ax.set_yticks(rows, [plain(label) for label in labels], fontsize=_text_size(len(rows)))
     ax.set_ylim(len(rows) - 0.3, -0.7)
     ax.grid(axis="x", color="0.9", zorder=0)
     _scale_axis(ax, np.concatenate([lower, upper, true, [-1.0, 1.0]]))
-    ax.set_xlabel(f"bias in units of its scale, {_probability(tree):.0%} interval")
+    ax.set_xlabel(f"bias in units of its scale, {probability(tree):.0%} interval")
     _title_biases(ax, len(rows), total, bool(np.isfinite(true).any()))
     _gamma_bar(ax, dots)
     return ax
@@ -104,7 +106,7 @@ def plot_residuals(tree: xr.DataTree, axes: Sequence[Axes] | None = None) -> lis
 def plot_outliers(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw residual/std of every datum over time; crosses in the sensor's colour count less than half."""
     group = tree["residual"].to_dataset()
-    ax = _axes(ax, 9.0, 3.4)
+    ax = new_axes(ax, 9.0, 3.4)
     time, ratio = group["time"].values, group["after"].values / group["std"].values
     weight = group["weight"].values if "weight" in group else np.ones(len(time))
     out, sensors = weight < 0.5, group["sensor"].values
@@ -112,8 +114,8 @@ def plot_outliers(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     ax.plot(time[shown], ratio[shown], ".", color=BEFORE, markersize=2, rasterized=True, label="inlying")
     for k, name in enumerate(dict.fromkeys(sensors[out].tolist())):
         mine = out & (sensors == name)
-        label = _plain(name) if k < 10 else None
-        ax.plot(time[mine], ratio[mine], "x", color=_colour(k), markersize=4, label=label)
+        label = plain(name) if k < 10 else None
+        ax.plot(time[mine], ratio[mine], "x", color=colour(k), markersize=4, label=label)
     linear = max(LINEAR, float(np.quantile(np.abs(ratio), 0.9)))
     if np.abs(ratio).max() > 2 * linear:
         ax.set_yscale("symlog", linthresh=linear)
@@ -126,7 +128,7 @@ def plot_outliers(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
 
 def plot_objective(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw the objective over the iterations."""
-    ax = _axes(ax, 6.0, 3.4)
+    ax = new_axes(ax, 6.0, 3.4)
     trace = tree["optimisation"].to_dataset()["objective"].values
     steps = np.arange(1, len(trace) + 1)
     known = np.isfinite(trace)
@@ -147,7 +149,7 @@ def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     labels, gamma = group["bias_label"].values.astype(str), np.nan_to_num(group["gamma"].values)
     order = np.argsort(gamma, kind="stable")
     names = np.array([_bias(label) for label in labels[order]])
-    ax = _axes(ax, 9.0, 4.6)
+    ax = new_axes(ax, 9.0, 4.6)
     size = 5.0 if len(labels) <= NAMED else 3.0
     for k, name in enumerate(dict.fromkeys(names.tolist())):
         mine = names == name
@@ -156,12 +158,12 @@ def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
             np.nonzero(mine)[0],
             gamma[order][mine],
             marker,
-            color=_colour(k),
+            color=colour(k),
             markersize=size,
-            label=_plain(name),
+            label=plain(name),
         )
     if len(labels) <= NAMED:
-        ax.set_xticks(np.arange(len(labels)), [_plain(label) for label in labels[order]], rotation=90, fontsize=7)
+        ax.set_xticks(np.arange(len(labels)), [plain(label) for label in labels[order]], rotation=90, fontsize=7)
     else:
         ax.set_xlabel("bias, sorted by gamma")
     ax.set(ylim=(-0.04, 1.04), ylabel="gamma")
@@ -169,68 +171,6 @@ def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     ax.set_title(f"How well the data determine {len(labels)} biases (0 prior only, 1 data only)", loc="left")
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
     return ax
-
-
-def plot_study(study: xr.Dataset, variable: str = "bias_rmse", axes: Sequence[Axes] | None = None) -> list[Axes]:
-    """Draw mean and one sd of a study's errors over its first numeric setting, one axes a value of the others.
-
-    `variable` is `bias_rmse`, `position_rmse` or `coverage`; the upper half of the band is drawn, as in Papers B, C.
-    """
-    grid = [name for name in study[variable].dims if name not in ("estimator", "run")]
-    along = next((name for name in grid if np.issubdtype(study[name].dtype, np.number)), None)
-    if along is None:
-        raise InputError("plot_study: no setting of the study is a number; there is nothing to draw along")
-    others = [name for name in grid if name != along]
-    facets = study[variable].stack(facet=others) if others else study[variable].expand_dims(facet=[()])
-    count = facets.sizes["facet"]
-    if axes is None:
-        figure = Figure(figsize=(1.2 + 4.6 * count, 3.8), layout="constrained")
-        axes = list(figure.subplots(1, count, squeeze=False)[0])
-    for k, ax in enumerate(axes):
-        chosen = facets.isel(facet=k)
-        for m, method in enumerate(study["estimator"].values):
-            values = chosen.sel(estimator=method)
-            mean, sd = values.mean("run").values, values.std("run").values
-            ax.plot(study[along], mean, "o-", color=_colour(m), markersize=3.5, label=_plain(method))
-            ax.fill_between(study[along], mean, mean + sd, color=_colour(m), alpha=0.15, linewidth=0)
-        top = chosen.mean("run").max().item()
-        ax.set(xlabel=_plain(along), ylim=(0.0, 1.25 * top if np.isfinite(top) else None))
-        names = facets["facet"].values[k] if others else ()
-        ax.set_title(", ".join(f"{name} {value}" for name, value in zip(others, np.atleast_1d(names), strict=True)))
-        ax.grid(color="0.9")
-    axes[0].set_ylabel({"bias_rmse": "bias error over its scale (rms)", "position_rmse": "position error in m"}.get(
-        variable, variable))  # fmt: skip
-    axes[-1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
-    return list(axes)
-
-
-def draw_study(study: xr.Dataset, path: str | PathLike[str]) -> None:
-    """Write the picture of a study to a file."""
-    figure = plot_study(study)[0].get_figure(root=True)
-    assert isinstance(figure, Figure)
-    figure.savefig(path, dpi=150)
-
-
-# What all pictures share
-
-
-def _axes(ax: Axes | None, width: float, height: float) -> Axes:
-    return Figure(figsize=(width, height), layout="compressed").subplots() if ax is None else ax
-
-
-def _colour(k: int) -> str:
-    return COLOURS[k % len(COLOURS)]
-
-
-def _plain(text: object, longest: int = 40) -> str:
-    """Text that matplotlib shows as it stands: no formula, no hidden legend entry, not too long."""
-    text = str(text).replace("\n", " ")
-    text = text if len(text) <= longest else text[: longest // 2] + "..." + text[-longest // 2 + 3 :]
-    return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
-
-
-def _probability(tree: xr.DataTree) -> float:
-    return float(tree.attrs.get("interval_probability", INTERVAL))
 
 
 def _bias(label: str) -> str:
@@ -273,16 +213,16 @@ def _draw_tracks(ax: Axes, tracks: list[_Track]) -> list[Line2D]:
         before, after = _thin(track.before, most), _thin(track.after, most)
         if len(after) == 1:
             ax.plot(*before.T, "o", color=BEFORE, markersize=3, zorder=2)
-            ax.plot(*after.T, "o", color=_colour(k), markersize=5, zorder=3)
+            ax.plot(*after.T, "o", color=colour(k), markersize=5, zorder=3)
         else:
             ax.plot(*before.T, "-", color=BEFORE, linewidth=0.7, zorder=2)
-            ax.plot(*after.T, "-", color=_colour(k), linewidth=1.2, zorder=3)
+            ax.plot(*after.T, "-", color=colour(k), linewidth=1.2, zorder=3)
     keys = [Line2D([], [], color=BEFORE, linewidth=0.9, label="before calibration")] if tracks else []
     if len(tracks) > 12:
-        return [*keys, Line2D([], [], color=_colour(0), label=f"{len(tracks)} targets, after")]
+        return [*keys, Line2D([], [], color=colour(0), label=f"{len(tracks)} targets, after")]
     for k, track in enumerate(tracks):
         style: dict[str, Any] = {"marker": "o", "linestyle": ""} if len(track.after) == 1 else {"linestyle": "-"}
-        keys.append(Line2D([], [], color=_colour(k), markersize=5, label=f"{_plain(track.target)}, after", **style))
+        keys.append(Line2D([], [], color=colour(k), markersize=5, label=f"{plain(track.target)}, after", **style))
     return keys
 
 
@@ -328,14 +268,14 @@ def _draw_nodes(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
         ax.plot(*calibrated[free].T, ".", color="black", markersize=6, zorder=6)
         for name, start, end in zip(names[free], stated[free], calibrated[free], strict=True):
             _draw_shift(ax, tree, name, start, end)
-        label = f"calibrated, {_probability(tree):.0%} ellipse"
+        label = f"calibrated, {probability(tree):.0%} ellipse"
         keys.append(Line2D([], [], marker=".", linestyle="", color="black", label=label))
     keys += _draw_headings(ax, tree, calibrated)
     box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8}
     if len(names) <= NAMED:
         for name, place in zip(names, stated, strict=True):
             ax.annotate(
-                _plain(name), place, xytext=(6, 6), textcoords="offset points", zorder=7, bbox=box,
+                plain(name), place, xytext=(6, 6), textcoords="offset points", zorder=7, bbox=box,
                 fontsize=8 if len(names) <= 25 else 6, annotation_clip=True,
             )  # fmt: skip
     return keys
@@ -354,7 +294,7 @@ def _draw_shift(ax: Axes, tree: xr.DataTree, name: str, start: np.ndarray, end: 
     (xx, xy), (_, yy) = covariance
     spread = np.hypot((xx - yy) / 2, xy)
     variances = np.maximum([(xx + yy) / 2 + spread, (xx + yy) / 2 - spread], 0.0)
-    width, height = 2.0 * np.sqrt(-2.0 * np.log1p(-_probability(tree)) * variances)
+    width, height = 2.0 * np.sqrt(-2.0 * np.log1p(-probability(tree)) * variances)
     angle = np.degrees(np.arctan2(2 * xy, xx - yy) / 2)
     ax.add_patch(
         Ellipse(
@@ -513,7 +453,7 @@ def _draw_residuals(ax: Axes, channel: str, group: xr.Dataset) -> None:
         label="standard normal",
     )
     ax.set(xlim=(-limit, limit), xlabel="residual / std", ylabel="density")
-    ax.set_title(f"{_plain(channel)} ({group.sizes['datum']} data)", loc="left", fontsize=10)
+    ax.set_title(f"{plain(channel)} ({group.sizes['datum']} data)", loc="left", fontsize=10)
     ax.set_ylim(0.0, 1.45 * ax.get_ylim()[1])
     ax.legend(fontsize=7, frameon=False, loc="upper right")
 

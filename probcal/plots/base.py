@@ -1,0 +1,38 @@
+"""What all pictures share: colours, limits, plain texts, axes without pyplot."""
+
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#5d3a9b")
+BEFORE = "#a6a6a6"
+GAMMA = "viridis_r"  # light: prior only, dark: data only
+INTERVAL = 0.89  # probability of an interval where the tree does not say
+POINTS = 3_000  # of one track
+ALL_POINTS = 40_000  # of all tracks together
+ROWS = 120  # biases in one forest
+NAMED = 60  # nodes, targets or biases above which names are left out
+INVALID = ("at bound", "diverged")  # status of a fit or a bias whose numbers are no estimate
+LINEAR = 12.0  # scales up to which the axis of the forest stays linear
+
+
+def new_axes(ax: Axes | None, width: float, height: float) -> Axes:
+    """The axes given, or new ones of a size in inches."""
+    return Figure(figsize=(width, height), layout="compressed").subplots() if ax is None else ax
+
+
+def colour(k: int) -> str:
+    """Colour number k, in turn."""
+    return COLOURS[k % len(COLOURS)]
+
+
+def plain(text: object, longest: int = 40) -> str:
+    """Text that matplotlib shows as it stands: no formula, no hidden legend entry, not too long."""
+    text = str(text).replace("\n", " ")
+    text = text if len(text) <= longest else text[: longest // 2] + "..." + text[-longest // 2 + 3 :]
+    return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
+
+
+def probability(tree: xr.DataTree) -> float:
+    """Probability of the intervals of a fit."""
+    return float(tree.attrs.get("interval_probability", INTERVAL))
