@@ -72,6 +72,22 @@ def semi_cholesky(matrices: jax.Array, right: jax.Array) -> tuple[jax.Array, jax
     return jnp.stack(columns, 2), jnp.stack(solved, 1)
 
 
+def semi_solve(matrices: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Solutions x (E, n, m) of positive semi-definite systems (E, n, n) x = right in their range, and the ranks (E,).
+
+    Where a pivot is lost in rounding the entry of x is zero.
+    """
+    root, y = semi_cholesky(matrices, right)
+    n = matrices.shape[-1]
+    pivots = jnp.diagonal(root, axis1=1, axis2=2)
+    there = pivots > 0
+    x = jnp.zeros_like(y)
+    for j in reversed(range(n)):
+        left = y[:, j] - jnp.einsum("ei,eim->em", root[:, :, j], x)
+        x = x.at[:, j].set(jnp.where(there[:, j, None], left / jnp.where(there, pivots, 1.0)[:, j, None], 0.0))
+    return x, jnp.sum(there, 1)
+
+
 def gram(rows: jax.Array, signed: jax.Array) -> jax.Array:
     """Symmetric product signed' rows of (k, m) rows and the same rows with signs, by halves: one triangle is formed."""
     m = rows.shape[1]

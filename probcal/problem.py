@@ -117,7 +117,7 @@ class Problem:
     def unlinked(self) -> "Problem":
         """The same problem without motion: the state of every epoch is free, but for known and static targets."""
         names = self.measurements.target_names
-        motion = {name: self._unlinked(name, self._target(name)) for name in names}
+        motion = {name: self._unlinked(name, self.target(name)) for name in names}
         return Problem(self.network, motion, self.measurements.table, fix=self.fixed)
 
     def _unlinked(self, name: str, target: Target) -> Target:
@@ -162,7 +162,14 @@ class Problem:
         settings: dict[str, Any] = {"fix": self.fixed} | changes
         return Problem(self.network, self.motion, self.measurements.table if data is None else data, **settings)
 
-    def _target(self, name: str) -> Target:
+    def select(self, rows: np.ndarray) -> "Problem":
+        """The same problem with some rows of its table only: a mask or numbers (N,)."""
+        table = self.measurements.table
+        frame = table.frame.iloc[rows].reset_index(drop=True)
+        return self.rebuild(Table(frame, table.source, table.lines[rows], table.word))
+
+    def target(self, name: str) -> Target:
+        """Motion and start of a target by name."""
         declared = self.motion
         if isinstance(declared, Mapping):
             if name not in declared:
@@ -172,7 +179,7 @@ class Problem:
 
     def _compile(self) -> None:
         data = self.measurements
-        targets = {name: self._target(name) for name in data.target_names}
+        targets = {name: self.target(name) for name in data.target_names}
         motions = {name: as_motion(target.motion) for name, target in targets.items()}
         for name, motion in motions.items():
             if "position" not in {component for component, *_ in motion.layout(self.network.dimension)}:

@@ -77,7 +77,7 @@ def _suffix(problem: Problem, r: int) -> str:
     return "" if len(problem.epochs) == 1 else f"_{r}"
 
 
-def _datum(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
+def data_coords(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
     """Coordinates of the measured data, and where each block keeps them (rows, channels)."""
     data, network = problem.measurements, problem.network
     picks: list[Any] = []
@@ -99,7 +99,7 @@ def _datum(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
     return {"coords": coords, "y": np.concatenate([c[2] for c in columns])}, picks
 
 
-def _gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+def gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """Measured data of all blocks, last axis datum, from arrays (..., N, C)."""
     return np.concatenate(
         [np.asarray(p)[..., rows, channels] for p, (rows, channels) in zip(parts, picks, strict=True)], -1
@@ -108,14 +108,14 @@ def _gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarra
 
 def build(problem: Problem, result: Result) -> xr.DataTree:
     """Assemble the DataTree of a fit (groups posterior, calibration, track, observed_data, ...)."""
-    datum, picks = _datum(problem)
+    datum, picks = data_coords(problem)
     coords, labels = datum["coords"], list(problem.labels)
     scales = problem.scales
     sample = ("chain", "draw")
     chains, draws = result.draws.shape[:2]
     base = {"chain": np.arange(chains), "draw": np.arange(draws)}
     posterior: dict[str, Any] = {"bias": ((*sample, "bias_label"), result.draws * scales)}
-    track = _track(problem, result.tracks)
+    track = track_group(problem, result.tracks)
     if result.states is not None:
         for r, states in enumerate(result.states):
             s = _suffix(problem, r)
@@ -130,7 +130,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         "status": np.array(result.bias_status, str), "unit": np.array([b.unit for b in problem.biases], str),
         "kind": np.array([b.kind for b in problem.biases], str),
     }  # fmt: skip
-    residual = {name: ("datum", _gather(parts, picks)) for name, parts in vars(result.residuals).items()}
+    residual = {name: ("datum", gather(parts, picks)) for name, parts in vars(result.residuals).items()}
     groups: dict[str, xr.Dataset] = {
         "posterior": xr.Dataset(posterior, coords={**base, "bias_label": z, **track.coords}),
         "calibration": xr.Dataset(
@@ -145,7 +145,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         "observed_data": xr.Dataset({"y": ("datum", datum["y"])}, coords=coords),
         "residual": xr.Dataset(residual, coords=coords),
         "optimisation": xr.Dataset({"objective": ("iteration", result.objective)}),
-        "constant_data": _constant(problem),
+        "constant_data": constant_group(problem),
     }
     if result.log_prior is not None:
         groups["log_prior"] = xr.Dataset(
@@ -153,7 +153,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         )
     for name, parts in (("log_likelihood", result.log_likelihood), ("posterior_predictive", result.replicas)):
         if parts is not None:
-            groups[name] = xr.Dataset({"y": ((*sample, "datum"), _gather(parts, picks))}, coords={**base, **coords})
+            groups[name] = xr.Dataset({"y": ((*sample, "datum"), gather(parts, picks))}, coords={**base, **coords})
     if problem.levels:
         guess = np.array([level.guess for level in problem.levels])
         groups["level"] = xr.Dataset(
@@ -161,14 +161,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
             coords={"level": [level.label for level in problem.levels]},
         )
     if result.directions:
-        groups["direction"] = xr.Dataset(
-            {
-                "information": ("direction", [d.information for d in result.directions]),
-                "sentence": ("direction", [d.sentence for d in result.directions]),
-                "vector": (("direction", "bias_label"), np.stack([d.vector for d in result.directions])),
-            },
-            coords={"direction": [d.name for d in result.directions], "bias_label": labels},
-        )
+        groups["direction"] = direction_group(labels, result.directions)
     attrs = {
         "method": result.method, "prior": result.prior, "seed": result.seed, "approximate": result.approximate,
         "intervals": result.intervals, "settings": result.settings, "interval_probability": INTERVAL,
@@ -184,7 +177,20 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
     return tree
 
 
-def _track(problem: Problem, tracks: Sequence[Tracks]) -> xr.Dataset:
+def direction_group(labels: Sequence[str], directions: Sequence[Any]) -> xr.Dataset:
+    """Directions that the data do not fix: what moves, how weakly it is known, and the remedy."""
+    texts = {name: [getattr(d, name) for d in directions] for name in ("sentence", "words", "kind", "remedy")}
+    columns = texts | {
+        "information": [d.information for d in directions],
+        "share": [d.share for d in directions],
+        "fix": [" ".join(d.fix) for d in directions],
+    }
+    group = xr.Dataset({name: ("direction", values) for name, values in columns.items()})
+    vectors = (("direction", "bias_label"), np.stack([d.vector for d in directions]))
+    return group.assign(vector=vectors).assign_coords(direction=[d.name for d in directions], bias_label=list(labels))
+
+
+def track_group(problem: Problem, tracks: Sequence[Tracks]) -> xr.Dataset:
     """Mean, sd and uncalibrated mean of every state, with times and targets of the epochs."""
     values: dict[str, Any] = {}
     coords: dict[str, Any] = {}
@@ -202,12 +208,12 @@ def _track(problem: Problem, tracks: Sequence[Tracks]) -> xr.Dataset:
 
 def build_tracks(problem: Problem, tracks: Sequence[Tracks]) -> xr.DataTree:
     """A tree of tracks alone, for data to which a calibration was applied."""
-    tree = xr.DataTree.from_dict({"track": _track(problem, tracks)})
+    tree = xr.DataTree.from_dict({"track": track_group(problem, tracks)})
     tree.attrs["data"] = problem.measurements.table.source
     return tree
 
 
-def _constant(problem: Problem) -> xr.Dataset:
+def constant_group(problem: Problem) -> xr.Dataset:
     """Stated values of the nodes (positions, headings, every component), which of them move, and the fixed biases."""
     d, nodes = problem.network.dimension, problem.network.nodes
     stated = [(n.name, component, float(value)) for n in nodes for component, value in n.components.items()]

@@ -171,7 +171,7 @@ def finish(
     """Say in words what the point and the Laplace approximation are worth where a method ended."""
     alpha, z = np.asarray(precisions), np.asarray(point.z)
     information = np.asarray(found.information)
-    weak = weak_directions(problem, information, z) if np.isfinite(information).all() else ()
+    weak = weak_directions(problem, information, point) if np.isfinite(information).all() else ()
     low, far = low_and_far(prior, alpha, z, problem.surveyed)
     sound = all(np.isfinite(np.asarray(part)).all() for part in (found.covariance, found.evidence, point.z))
     status = verdict(converged, bool(low.any()), bool(far.any()) or not sound)

@@ -1,18 +1,31 @@
-"""Weak directions of the biases by name: what neither data nor survey fix, and what to anchor.
+"""Gauge and weak directions of the biases by name: what data and surveys leave open, and what fixes it.
 
-A direction is weak when its marginal information is below 1 in units of the prior scale.
+A direction is weak when its marginal information lambda is below 1 in units of the prior scale: lambda / (1 + lambda)
+is the share of its answer that the data give. It is a gauge when no row fixes it (`smoothing.gauge`).
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy import linalg as dense
 
 from probcal.problem import Problem
+from probcal.smoothing.gauge import Gauge
+from probcal.smoothing.mode import Point
 from probcal.types import AXES
 
 WEAK = 1.0  # marginal information below which a direction is left to the prior
 RIDGE = 1e-2  # keeps the completion of a pattern from running along other weak directions
 INVOLVED = 0.3  # share of the largest entry above which a bias is named
+APART = 0.5  # part of a unit direction outside those already named that makes it a new one
+MATCH = 1e-3  # how closely a gauge must follow a pattern
+INSIDE = 1e-6  # size outside one sensor below which a gauge is its own
+TRIED = 3  # remedies of one direction that are recomputed
+HALVINGS = 6  # survey stds tried, each half of the one before
+STRAIGHT = 0.03  # width of a path over its length below which it is one line
+TOWARDS = {"x": "east", "y": "north", "z": "up"}
 
 
 @dataclass(frozen=True)
@@ -20,10 +33,19 @@ class Direction:
     """A combination of biases that the data do not fix: its name, information, what it moves and a remedy."""
 
     name: str
-    information: float
+    words: str  # what moves
+    kind: str  # gauge or weak
+    information: float  # marginal, in units of the prior scale
     vector: np.ndarray  # (M,) unit vector in z
-    labels: tuple[str, ...]
+    labels: tuple[str, ...]  # further biases that move along
     remedy: str
+    fix: tuple[str, ...] = ()  # labels whose fixing removes the direction, with those before it; checked by recomputing
+    survey: float | None = None  # survey std of these labels, in their unit, that does as well; checked likewise
+
+    @property
+    def share(self) -> float:
+        """Share of the answer that the data give: lambda / (1 + lambda)."""
+        return self.information / (1.0 + self.information)
 
     @property
     def sentence(self) -> str:
@@ -32,63 +54,299 @@ class Direction:
         return f"{self.name}{others} (information {self.information:.2g}): {self.remedy}"
 
 
-def weak_directions(problem: Problem, information: np.ndarray, z: np.ndarray) -> tuple[Direction, ...]:
-    """Name the directions of marginal information below 1 at biases z (M,), the weakest first.
+class Pattern(NamedTuple):
+    """A candidate direction (F,) in z of the free biases; those that it leaves at 0 may move along."""
 
-    Surveyed biases are marginalised with their survey. Translations, rotations, dilation and common shifts
-    are tried first, each completed by the other biases that move along; what remains is described by its
-    largest entries.
+    name: str
+    words: str
+    vector: np.ndarray
+    remedy: str
+    anchors: tuple[tuple[str, ...], ...]  # groups of labels one of which is to be fixed
+
+
+def weak_directions(
+    problem: Problem, information: np.ndarray, point: Point, gauge: Gauge | None = None
+) -> tuple[Direction, ...]:
+    """Name the directions of marginal information (M, M) below 1 at a point, the weakest first.
+
+    Surveyed biases are marginalised with their survey. Combinations within one sensor, translations, rotations,
+    dilation and common shifts are tried, each completed by the other biases that move along; what remains is
+    described by its largest entries. With a `gauge` its directions are named first, also those that only the start
+    of a target holds. The remedy of each is checked by recomputing, on top of those before it.
     """
     free = ~problem.surveyed
     if not free.any():
         return ()
-    known = _marginal(information, free)
-    values, vectors = np.linalg.eigh(known)
-    missing = int((values < WEAK).sum())
-    if not missing:
-        return ()
-    labels = [label for label, own in zip(problem.labels, free, strict=True) if own]
-    found: list[Direction] = []
-    basis = np.zeros((len(labels), 0))
-    for name, pattern, remedy in _patterns(problem, z):
-        own = pattern[free] != 0
-        if not own.any() or len(found) == missing:
-            continue
-        vector = _complete(known, pattern[free])
-        strength = float(vector @ known @ vector)
-        rest = vector - basis @ (basis.T @ vector)
-        if strength < WEAK and np.linalg.norm(rest) > 0.5:
-            basis = np.concatenate([basis, rest[:, None] / np.linalg.norm(rest)], 1)
-            involved = _involved(labels, np.where(own, 0.0, vector), np.abs(vector).max())
-            found.append(Direction(name, strength, _spread(vector, free), involved, remedy))
-    weak = vectors[:, :missing]
-    left = np.linalg.svd(weak - basis @ (basis.T @ weak))[0][:, : missing - len(found)]
-    for vector in left.T:
-        involved = _involved(labels, vector, np.abs(vector).max())
-        remedy = f"fix or survey {involved[0]}, or add a pass that excites it"
-        strength = float(vector @ known @ vector)
-        found.append(Direction("a combination", strength, _spread(vector, free), involved, remedy))
-    return tuple(sorted(found, key=lambda direction: direction.information))
+    naming = _Naming(problem, free, marginal(information, free), point)
+    if gauge is not None and gauge.countable:
+        naming.name_gauge(gauge.basis[free])
+    naming.name_weak()
+    remedied = _with_remedies(problem, naming.known, naming.found, naming.anchors)
+    return tuple(sorted(remedied, key=lambda direction: direction.information))
 
 
-def _marginal(information: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Information of the free biases with the surveyed ones marginalised."""
+def marginal(information: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Information of the free biases with the surveyed ones (whose survey is 1 in z) marginalised."""
     held = ~free
     inner = information[np.ix_(held, held)] + np.eye(held.sum())
     cross = information[np.ix_(held, free)]
     return information[np.ix_(free, free)] - cross.T @ np.linalg.solve(inner, cross)
 
 
-def _spread(vector: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Vector of the free biases in the order of all."""
-    whole = np.zeros(len(free))
-    whole[free] = vector
-    return whole
+class _Naming:
+    """The directions named so far, and the space (F, k) of the free biases that they span."""
+
+    def __init__(self, problem: Problem, free: np.ndarray, known: np.ndarray, point: Point):
+        self.problem, self.free, self.known = problem, free, known
+        self.cause = _cause(problem, point)
+        self.labels = [label for label, own in zip(problem.labels, free, strict=True) if own]
+        self.found: list[Direction] = []
+        self.anchors: list[tuple[tuple[str, ...], ...]] = []  # of each, groups of labels one of which is to be fixed
+        self.basis = np.zeros((len(self.labels), 0))
+        rigid = [p._replace(vector=p.vector[free]) for p in _rigid(problem, np.asarray(point.z))]
+        common = [p._replace(vector=p.vector[free]) for p in _common(problem)]
+        self.rigid, self.common = ([p for p in group if p.vector.any()] for group in (rigid, common))
+
+    def name_gauge(self, space: np.ndarray) -> None:
+        """Name the null space (F, k) of the rows."""
+        space = _orthonormal(space, 1e-6)
+
+        def follow(pattern: np.ndarray) -> np.ndarray | None:
+            own = pattern != 0
+            mixed, *_ = np.linalg.lstsq(space[own], pattern[own], rcond=1e-9)
+            near = np.linalg.norm(space[own] @ mixed - pattern[own]) <= MATCH * np.linalg.norm(pattern)
+            return space @ mixed if near else None
+
+        def inside(own: np.ndarray) -> np.ndarray:
+            _, sizes, rows = np.linalg.svd(space[~own], full_matrices=True)
+            sizes = np.concatenate([sizes, np.zeros(len(rows) - len(sizes))])
+            return space @ rows[sizes < INSIDE].T
+
+        self._name("gauge", space, follow, inside)
+
+    def name_weak(self) -> None:
+        """Name what else the data leave weak."""
+        values, vectors = np.linalg.eigh(self.known)
+
+        def follow(pattern: np.ndarray) -> np.ndarray | None:
+            vector = _complete(self.known, pattern)
+            return vector if vector @ self.known @ vector < WEAK else None
+
+        def inside(own: np.ndarray) -> np.ndarray:
+            values, vectors = np.linalg.eigh(self.known[np.ix_(own, own)])
+            whole = np.zeros((len(own), int((values < WEAK).sum())))
+            whole[own] = vectors[:, values < WEAK]
+            return whole
+
+        self._name("weak", vectors[:, values < WEAK], follow, inside)
+
+    def _name(
+        self,
+        kind: str,
+        space: np.ndarray,
+        follow: Callable[[np.ndarray], np.ndarray | None],
+        inside: Callable[[np.ndarray], np.ndarray],
+    ) -> None:
+        """Name the part of a space (F, k) that has no name yet.
+
+        `follow` completes a pattern to a direction, or refuses; `inside` spans the directions of one owner's biases.
+        """
+        left = self._outside(space)
+        groups = [inside(own) for own in self._owners()] if left.shape[1] else []
+        groups = [group for group in groups if group.shape[1]]
+        owned = [self._combination(vector) for group in groups for vector in _readable(group)]
+        candidates = [*owned, *self.rigid] if len(groups) > 1 else [*self.rigid, *owned]
+        for pattern in (*candidates, *self.common):
+            if not left.shape[1]:
+                return
+            vector = pattern.vector if any(pattern is own for own in owned) else follow(pattern.vector)
+            if vector is None:
+                continue
+            vector = vector / np.linalg.norm(vector)
+            if np.linalg.norm(left.T @ vector) > APART:
+                self._add(kind, pattern, vector)
+                left = self._outside(space)
+        for vector in _readable(left):
+            self._add(kind, self._combination(vector), vector)
+
+    def _owners(self) -> list[np.ndarray]:
+        """Masks (F,) of the biases of each node with its sensors."""
+        nodes = [m["node"] for m, own in zip(self.problem.members, self.free, strict=True) if own]
+        names = np.array(nodes)
+        return [names == name for name in dict.fromkeys(nodes)] if len(set(nodes)) > 1 else []
+
+    def _outside(self, space: np.ndarray) -> np.ndarray:
+        """Orthonormal basis of what of a space lies outside the directions named so far."""
+        return _orthonormal(space - self.basis @ (self.basis.T @ space), APART)
+
+    def _add(self, kind: str, pattern: Pattern, vector: np.ndarray) -> None:
+        strength = max(float(vector @ self.known @ vector), 0.0)
+        rest = vector - self.basis @ (self.basis.T @ vector)
+        self.basis = np.concatenate([self.basis, rest[:, None] / np.linalg.norm(rest)], 1)
+        whole = np.zeros(len(self.free))
+        whole[self.free] = vector
+        along = np.where(pattern.vector != 0, 0.0, vector)
+        others = _involved(self.labels, along, np.abs(vector).max())
+        words = pattern.words + ("; only the start of the motion holds it" if strength >= WEAK else "")
+        self.found.append(Direction(pattern.name, words, kind, strength, whole, others, pattern.remedy))
+        self.anchors.append(pattern.anchors)
+
+    def _combination(self, vector: np.ndarray) -> Pattern:
+        """A direction without a pattern, in words: its largest bias against the next ones."""
+        problem, labels = self.problem, _involved(self.labels, vector, np.abs(vector).max())
+        first = labels[0]
+        alone = tuple((label,) for label in labels)
+        if len(labels) == 1:
+            return Pattern(f"{_of(first)} alone", f"the data hardly depend on it{self.cause}", vector, "", alone)
+        one = len({_owner(label) for label in labels[:3]}) == 1
+        others = " and ".join(_name(label) if one else _of(label) for label in labels[1:3])
+        more = f" and {len(labels) - 3} more" if len(labels) > 3 else ""
+        amounts = ", ".join(_amount(problem, label, vector[self.labels.index(label)]) for label in labels[:3])
+        name = f"{_of(first)} against {'its ' if one else ''}{others}{more}"
+        return Pattern(name, f"{amounts} together hardly change the data{self.cause}", vector, "", (*alone, labels[:2]))
+
+
+# Remedies
+
+
+def _with_remedies(
+    problem: Problem, known: np.ndarray, found: list[Direction], anchors: list[tuple[tuple[str, ...], ...]]
+) -> Iterator[Direction]:
+    """The directions with the biases whose fixing, or survey, removes each, together with those before it.
+
+    A remedy is kept only if the information (F, F) recomputed with it has a weak direction less.
+    """
+    labels = [label for label, surveyed in zip(problem.labels, problem.surveyed, strict=True) if not surveyed]
+    scales = problem.scales[~problem.surveyed]
+    done: list[int] = []
+    fixed: tuple[str, ...] = ()
+    left = _count(known, done)  # weak directions still to be removed
+    for direction, groups in zip(found, anchors, strict=True):
+        general = direction.remedy or f"fix or survey {groups[0][0]}"
+        if direction.information >= WEAK:
+            yield replace(direction, remedy=general)
+            continue
+        left -= 1
+        if _count(known, done) <= left:
+            yield replace(direction, fix=fixed, remedy=f"{general}: the same anchors do")
+            continue
+        chosen = _anchor(known, done, [[labels.index(name) for name in group] for group in groups], left)
+        if not chosen:
+            yield replace(direction, remedy=general)
+            continue
+        fixed = tuple(labels[m] for m in chosen)
+        std = _survey(known, done, chosen, left, scales, direction.vector[~problem.surveyed])
+        units = {problem.biases[problem.labels.index(label)].unit for label in fixed}
+        std = std if len(units) == 1 else None
+        survey = f", or survey it to {std:g} {units.pop()}".rstrip() if std is not None else ""
+        before = f"{direction.remedy}: " if direction.remedy else ""
+        yield replace(direction, fix=fixed, survey=std, remedy=f"{before}fix {_together(fixed)}{survey}")
+        done += chosen
+
+
+def _together(labels: tuple[str, ...]) -> str:
+    """Labels as `--fix` takes them: the position of a node as one pattern."""
+    owners = {_owner(label) for label in labels}
+    whole = len(owners) == 1 and len(labels) > 1 and all(_name(label).startswith("position_") for label in labels)
+    return f"{owners.pop()}.position_*" if whole else " and ".join(labels)
+
+
+def _spectrum(known: np.ndarray, done: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues and vectors (F, F - fixed) of the information with some biases fixed."""
+    stay = np.setdiff1d(np.arange(len(known)), list(done))
+    values, vectors = np.linalg.eigh(known[np.ix_(stay, stay)])
+    whole = np.zeros((len(known), len(stay)))
+    whole[stay] = vectors
+    return values, whole
+
+
+def _count(known: np.ndarray, done: Iterable[int]) -> int:
+    """Number of weak directions with some biases fixed."""
+    return int((_spectrum(known, done)[0] < WEAK).sum())
+
+
+def _anchor(known: np.ndarray, done: list[int], groups: list[list[int]], left: int) -> list[int]:
+    """The group of biases that leaves at most `left` weak directions when fixed, and the fewest; empty if none does.
+
+    Tried are those that hold most of the weak space.
+    """
+    values, vectors = _spectrum(known, done)
+    hold = (vectors[:, values < WEAK] ** 2).sum(1)
+    best: tuple[int, float] = (left + 1, 0.0)
+    chosen: list[int] = []
+    for group in sorted(groups, key=lambda group: -hold[group].sum() / len(group))[:TRIED]:
+        values, _ = _spectrum(known, [*done, *group])
+        rank = (int((values < WEAK).sum()), -float(values.min(initial=np.inf)))
+        if rank < best:
+            best, chosen = rank, [m for m in group if m not in done]
+    return chosen
+
+
+def _survey(
+    known: np.ndarray, done: list[int], chosen: list[int], left: int, scales: np.ndarray, vector: np.ndarray
+) -> float | None:
+    """A survey std of the chosen biases that leaves at most `left` weak directions, found by recomputing."""
+    largest = scales[chosen] * np.abs(vector[chosen])
+    for halving in range(HALVINGS if largest.max() > 0 else 0):
+        std = _round_down(float(largest.max()) / 2**halving)
+        inner = known[np.ix_(chosen, chosen)] + np.diag((scales[chosen] / std) ** 2)
+        rest = known - known[:, chosen] @ np.linalg.solve(inner, known[chosen])
+        if _count(rest, [*done, *chosen]) <= left:
+            return std
+    return None
+
+
+def _round_down(value: float) -> float:
+    """One significant digit, towards zero."""
+    step = 10.0 ** np.floor(np.log10(value))
+    return float(f"{np.floor(value / step) * step:.1g}")
+
+
+# Words
+
+
+def _owner(label: str) -> str:
+    return label.rsplit(".", 1)[0]
+
+
+def _name(label: str) -> str:
+    return label.rsplit(".", 1)[-1]
+
+
+def _of(label: str) -> str:
+    """A bias in words: `range_offset of mic_3`."""
+    owner, name = label.rsplit(".", 1)
+    return f"{name} of {owner}"
+
+
+def _amount(problem: Problem, label: str, size: float) -> str:
+    m = problem.labels.index(label)
+    return f"{label} {size * problem.scales[m]:+.2g} {problem.biases[m].unit}"
 
 
 def _involved(labels: list[str], vector: np.ndarray, largest: float) -> tuple[str, ...]:
-    order = np.argsort(-np.abs(vector))
+    order = np.argsort(-np.abs(vector), kind="stable")
     return tuple(labels[m] for m in order if abs(vector[m]) > INVOLVED * largest)
+
+
+# Spaces
+
+
+def _orthonormal(space: np.ndarray, least: float) -> np.ndarray:
+    """Orthonormal basis of the columns (F, k), without directions of singular value at most `least`."""
+    if not space.shape[1]:
+        return space
+    left, sizes, _ = np.linalg.svd(space, full_matrices=False)
+    return left[:, sizes > least]
+
+
+def _readable(space: np.ndarray) -> Iterator[np.ndarray]:
+    """Unit vectors that span a space (F, k), each with a bias of its own that the others leave alone."""
+    if not space.shape[1]:
+        return
+    pivots = dense.qr(space.T, mode="r", pivoting=True)[1][: space.shape[1]]
+    for vector in np.linalg.solve(space[pivots].T, space.T):
+        yield vector / np.linalg.norm(vector)
 
 
 def _complete(information: np.ndarray, pattern: np.ndarray) -> np.ndarray:
@@ -102,19 +360,24 @@ def _complete(information: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     return unit / np.linalg.norm(unit)
 
 
-def _patterns(problem: Problem, z: np.ndarray) -> list[tuple[str, np.ndarray, str]]:
-    """Candidate directions in z, in the order in which names are preferred: rigid motions, dilation, common shifts."""
-    found = [*_rigid(problem, z)]
+# Patterns
+
+
+def _common(problem: Problem) -> list[Pattern]:
+    """One component of all owners shifted together, by the same amount."""
+    found = []
     for component in dict.fromkeys(b.component for b in problem.biases if b.component != "position"):
         members = [m for m, b in enumerate(problem.biases) if b.component == component]
         if len(members) > 1:
-            pattern = np.zeros(len(z))
-            pattern[members] = 1.0 / problem.scales[members]
-            found.append((f"a common {component} of all", pattern, f"fix the {component} of one of them"))
+            vector = np.zeros(len(problem.biases))
+            vector[members] = 1.0 / problem.scales[members]
+            anchors = tuple((problem.labels[m],) for m in members)
+            words = f"{component} of all grows by the same amount"
+            found.append(Pattern(f"a common {component} of all", words, vector, f"anchor one {component}", anchors))
     return found
 
 
-def _rigid(problem: Problem, z: np.ndarray) -> list[tuple[str, np.ndarray, str]]:
+def _rigid(problem: Problem, z: np.ndarray) -> list[Pattern]:
     """Translation, rotation and dilation of all nodes; about the anchor where one node is anchored."""
     d = problem.network.dimension
     place = {
@@ -129,7 +392,7 @@ def _rigid(problem: Problem, z: np.ndarray) -> list[tuple[str, np.ndarray, str]]
     for (owner, axis), m in place.items():
         at[owner][axis] += shift[m]
     centre = anchors[0] if anchors else np.mean(list(at.values()), 0)
-    about = " about the anchor" if anchors else ""
+    about, who = (" about the anchor", "all nodes but the anchor") if anchors else ("", "all nodes")
 
     def pattern(move: np.ndarray) -> np.ndarray:
         """Velocities move @ (position - centre) of all free positions, in z."""
@@ -138,15 +401,20 @@ def _rigid(problem: Problem, z: np.ndarray) -> list[tuple[str, np.ndarray, str]]
             vector[m] = move[axis] @ (at[owner] - centre) / problem.scales[m]
         return vector
 
+    nodes = tuple(
+        tuple(problem.labels[m] for (other, _), m in place.items() if other == owner) for owner in dict.fromkeys(at)
+    )
     found = []
     if not anchors:
         for axis in range(d):
             vector = np.zeros(len(z))
             for (_, a), m in place.items():
                 vector[m] = (a == axis) / problem.scales[m]
-            remedy = "anchor the position of one node (fix it, or give it a survey)"
-            found.append((f"translation of all nodes along {AXES[axis]}", vector, remedy))
-    headed = ", or one heading" if any(b.component == "heading" for b in problem.biases) else ""
+            words = f"{who} move 1 m {TOWARDS[AXES[axis]]} together"
+            name = f"translation of all nodes along {AXES[axis]}"
+            found.append(Pattern(name, words, vector, "anchor the position of one node", nodes))
+    turned = tuple((b.label,) for b in problem.biases if b.component == "heading")
+    headed = ", or one heading" if turned else ""
     for a, b in [(0, 1)] if d == 2 else [(0, 1), (1, 2), (2, 0)]:
         turn = np.zeros((d, d))
         turn[a, b], turn[b, a] = -1.0, 1.0
@@ -154,8 +422,35 @@ def _rigid(problem: Problem, z: np.ndarray) -> list[tuple[str, np.ndarray, str]]
         for m, bias in enumerate(problem.biases):
             if bias.component == "heading" and (a, b) == (0, 1):
                 vector[m] = 1.0 / problem.scales[m]
-        name = "rotation" if d == 2 else f"rotation around {AXES[3 - a - b]}"
-        found.append((name + about, vector, f"anchor the position of one more node{headed}"))
-    remedy = "anchor the positions of two nodes, or fix one range scale"
-    found.append((f"dilation: all positions grow or shrink together{about}", pattern(np.eye(d)), remedy))
+        name = ("rotation" if d == 2 else f"rotation around {AXES[3 - a - b]}") + about
+        words = f"{who} turn{about or ' about their centre'} together" + (
+            f", around {AXES[3 - a - b]}" if d > 2 else ""
+        )
+        remedy = f"anchor the position of one more node{headed}"
+        found.append(Pattern(name, words, vector, remedy, (*nodes, *turned)))
+    scaled = tuple((b.label,) for b in problem.biases if "scale" in b.component)
+    name = f"dilation: all positions grow or shrink together{about}"
+    along = " and the range scales with them" if scaled else ""
+    words = f"distances{about or ' from the centre'} grow together{along}"
+    remedy = "anchor the positions of two nodes" + (", or fix one range scale" if scaled else "")
+    found.append(Pattern(name, words, pattern(np.eye(d)), remedy, (*nodes, *scaled)))
     return found
+
+
+def _cause(problem: Problem, point: Point) -> str:
+    """Why a combination may be weak: all targets pass along one direction, each on one line, where that is so."""
+    d, lines = problem.network.dimension, []
+    for epochs, states in zip(problem.epochs, point.states, strict=True):
+        start = next(start for name, start, *_ in epochs.layout if name == "position")
+        places = np.asarray(states)[:, start : start + d]
+        for name in dict.fromkeys(epochs.target):
+            path = places[epochs.target == name]
+            if len(path) < 3:
+                return ""
+            _, sizes, along = np.linalg.svd(path - path.mean(0), full_matrices=False)
+            if sizes[1] > STRAIGHT * sizes[0]:
+                return ""
+            lines.append(along[0])
+    if np.abs(np.array(lines) @ lines[0]).min() < 1 - STRAIGHT:
+        return ""
+    return ": the target passed on one line" if len(lines) == 1 else ": the targets passed along parallel lines"

@@ -23,6 +23,8 @@ from probcal.smoothing.mode import (
     of_states,
 )
 
+BATCH = 512  # rows whose leverage is formed at once
+
 
 class Laplace(NamedTuple):
     """Gaussian approximation of the posterior of z at one consistent point, trajectories marginalised."""
@@ -137,6 +139,29 @@ def predicted_variances(
         own = jnp.einsum("ncu,nuv,ncv->nc", lin.state, P, lin.state)
         variances.append(own + jnp.einsum("ncm,ml,ncl->nc", columns, covariance, columns))
     return variances
+
+
+@partial(jax.jit, static_argnames="spec")
+def leverages(spec: Spec, system: System, point: Point, covariance: jax.Array) -> list[jax.Array]:
+    """What every datum (N, C) of each block tells about the biases at a point, trajectories marginalised.
+
+    The leverage is w c' Sigma c, c the derivative of the predicted value by z with the trajectory following. Those of
+    all data and a rest, what the motion tells, add up to tr(Sigma G), the number of biases that are determined.
+    """
+    lins = linearise(spec, system, point, expected=True)
+    found = moments(spec, system, point, covariance)
+    root = jnp.concatenate([linalg.factor(covariance), jnp.zeros((1, spec.biases))])
+    told = []
+    for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
+        following = (found[r].response @ root[:-1])[:, jnp.asarray(block.used, int)]
+
+        def one(row: tuple[jax.Array, ...], following: jax.Array = following) -> jax.Array:
+            by_bias, by_state, weight, index, epoch = row
+            return weight * jnp.sum((by_bias @ root[index] + by_state @ following[epoch]) ** 2, 1)
+
+        columns = (lin.bias, lin.state, lin.weight, data.bias[data.sensor], data.epoch)
+        told.append(jax.lax.map(one, columns, batch_size=BATCH))
+    return told
 
 
 def update_levels(spec: Spec, system: System, point: Point, covariance: jax.Array) -> Point:

@@ -1,0 +1,143 @@
+"""What the data of a problem can and cannot determine: information of all biases, trajectories marginalised."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from probcal import linalg, tree
+from probcal.problem import Problem
+from probcal.smoothing.directions import WEAK, Direction, weak_directions
+from probcal.smoothing.gauge import NULL, gauge
+from probcal.smoothing.information import leverages, moments
+from probcal.smoothing.mode import Point, eliminate
+from probcal.smoothing.start import automatic_start
+from probcal.types import InputError, float64
+
+RULE = (
+    f"gauge: with the state of every epoch free, rows leave less than {NULL:g} of the information that known states "
+    f"would give; weak: information below {WEAK:g} in units of the prior scale, trajectories marginalised"
+)
+NONE = 0.05  # share of an answer that comes from the data below which they say nothing of a bias
+HALF = 0.5  # share below which a bias is weak
+
+_eliminate = jax.jit(eliminate, static_argnames=("spec", "expected", "joint"))
+
+
+@float64
+def observability(problem: Problem, *, point: Point | None = None) -> xr.DataTree:
+    """What data and surveys determine, before any fit: a tree whose directions, biases and sensors bear names.
+
+    The information of the biases has every trajectory marginalised (papers README, standard forms) and is in units of
+    the prior scale; it is taken at `point`, by default the automatic start. Groups: `bias` (share of each answer that
+    the data give under a prior of one scale, the bound on its sd, the information matrix), `spectrum`, `direction`
+    (gauge and weak ones with words and remedies), `datum`, `sensor` and `target` (how many biases each determines:
+    their leverages, which add up with what the motion tells), `track`. Attributes: `status` (determined, weak, gauge),
+    `rule`, counts. Raises `InputError` for a problem without free biases.
+    """
+    if not problem.labels:
+        raise InputError("observability: the problem has no free bias; declare a Bias, a survey or a scale")
+    point = automatic_start(problem) if point is None else point
+    found = _information(problem, point)
+    null = gauge(problem, point)
+    directions = weak_directions(problem, found.information, point, null)
+    groups = {
+        "bias": _biases(problem, found),
+        "spectrum": _spectrum(found.information),
+        **_leverage_groups(problem, point, found),
+        "track": _tracks(problem, point, found.covariance),
+        "constant_data": tree.constant_group(problem),
+    }
+    if directions:
+        groups["direction"] = tree.direction_group(problem.labels, directions)
+    result = xr.DataTree.from_dict(groups)
+    result.attrs.update(
+        status=_status(directions), rule=RULE, countable=int(null.countable), data=problem.measurements.table.source,
+        gauge=null.basis.shape[1] if null.countable else 0,
+        weak=sum(direction.information < WEAK for direction in directions),
+    )  # fmt: skip
+    return result
+
+
+class Information:
+    """Information (M, M) of the data about z, and the covariance (M, M) under a prior of one scale (or the survey)."""
+
+    def __init__(self, information: jax.Array):
+        self.information = np.asarray(information)
+        self.covariance = np.asarray(linalg.inverse_and_logdet(information + jnp.eye(information.shape[0]))[0])
+
+    @property
+    def share(self) -> np.ndarray:
+        """Share of each answer (M,) that the data give."""
+        return np.clip(1.0 - np.diag(self.covariance), 0.0, 1.0)
+
+
+def _information(problem: Problem, point: Point) -> Information:
+    found = Information(_eliminate(problem.spec, problem.system, point, expected=True).information)
+    if not np.isfinite(found.covariance).all():
+        raise InputError(
+            "observability: the rows have no finite derivatives at the start; is a target at the place of a sensor?"
+        )
+    return found
+
+
+def _status(directions: Sequence[Direction]) -> str:
+    left = [direction.kind for direction in directions if direction.information < WEAK]
+    return "gauge" if "gauge" in left else "weak" if left else "determined"
+
+
+def verdict_of(share: float) -> str:
+    """Determined, weak or prior only, from the share of an answer that the data give."""
+    return "prior only" if share < NONE else "weak" if share < HALF else "determined"
+
+
+def _biases(problem: Problem, found: Information) -> xr.Dataset:
+    scales, labels = problem.scales, list(problem.labels)
+    columns = {
+        "unit": np.array([b.unit for b in problem.biases], str),
+        "scale": scales,
+        "kind": np.array([b.kind for b in problem.biases], str),
+        "share": found.share,
+        "sd": np.sqrt(np.diag(found.covariance)) * scales,
+        "verdict": np.array([verdict_of(share) for share in found.share]),
+    }
+    group = xr.Dataset({k: ("bias_label", v) for k, v in columns.items()}, coords={"bias_label": labels})
+    matrix = (("bias_label", "bias_label_other"), found.information)
+    return group.assign(information=matrix).assign_coords(bias_label_other=labels)
+
+
+def _spectrum(information: np.ndarray) -> xr.Dataset:
+    """Eigenvalues of the information in z, ascending, and their shares."""
+    values = np.maximum(np.linalg.eigvalsh(information), 0.0)
+    return xr.Dataset({"information": ("eigenvalue", values), "share": ("eigenvalue", values / (1.0 + values))})
+
+
+def _leverage_groups(problem: Problem, point: Point, found: Information) -> dict[str, xr.Dataset]:
+    """How many biases each datum, sensor and target determines; the motion tells the rest."""
+    parts = leverages(problem.spec, problem.system, point, jnp.asarray(found.covariance))
+    datum, picks = tree.data_coords(problem)
+    values = tree.gather([np.asarray(part) for part in parts], picks)
+    each = xr.Dataset({"leverage": ("datum", values)}, coords=datum["coords"])
+    groups = {"datum": each}
+    for name in ("sensor", "target"):
+        frame = each.to_dataframe().groupby(name, sort=False)["leverage"].agg(["sum", "size"])
+        groups[name] = xr.Dataset(
+            {"leverage": (name, frame["sum"].to_numpy()), "data": (name, frame["size"].to_numpy())},
+            coords={name: frame.index.to_numpy(str)},
+        )
+    groups["target"].attrs["motion"] = max(float(found.share.sum() - values.sum()), 0.0)
+    return groups
+
+
+def _tracks(problem: Problem, point: Point, covariance: np.ndarray) -> xr.Dataset:
+    """The trajectories at the point and the bound on their sd, biases marginalised."""
+    spread = moments(problem.spec, problem.system, point, jnp.asarray(covariance))
+    parts = []
+    for states, moment in zip(point.states, spread, strict=True):
+        variance = jnp.diagonal(moment.states, axis1=1, axis2=2)
+        variance = variance + jnp.einsum("eni,ij,enj->en", moment.response, covariance, moment.response)
+        mean = np.asarray(states)
+        parts.append(tree.Tracks(mean, np.sqrt(np.maximum(np.asarray(variance), 0.0)), mean))
+    return tree.track_group(problem, parts)

@@ -1,0 +1,282 @@
+"""What to measure next: the expected information gain of another pass, a survey or a further sensor.
+
+A gain is 1/2 log det of the information of all biases with the addition over that without it, in nats, under a
+prior of one scale (or the survey), trajectories marginalised (Lindley 1956).
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from probcal.network import Network, Node
+from probcal.problem import Epochs, Problem, Spec, System
+from probcal.sensor import SensorType
+from probcal.smoothing.directions import WEAK, marginal
+from probcal.smoothing.mode import Point, eliminate
+from probcal.smoothing.start import automatic_start
+from probcal.table import Table, header
+from probcal.types import AXES, InputError, float64
+
+LONGEST = 300  # epochs of the pass that stands as a pattern
+HEADINGS, LANES = 8, (-0.5, 0.0, 0.5)  # candidate lines: directions, and distances from the centre in radii
+GRID = 5  # candidate places an axis
+SURVEY = 0.1  # std of a survey over the scale of its bias
+MARGIN = 0.2  # of the area around nodes and tracks
+
+
+@float64
+def next_passes(problem: Problem, *, point: Point | None = None, passes: Any = None) -> xr.Dataset:
+    """What one more pass of a target would tell, and where: gain (nats) and weak directions left, the best first.
+
+    A pass is seen by the sensors, at the instants and with the noise that saw the target with most rows (its first
+    300 epochs). Candidates are `passes` (P, 2 or more, d), polylines in m travelled evenly, by default straight
+    lines through the area in eight directions; places on a grid for static targets. Raises `InputError` for the shape.
+    """
+    point = automatic_start(problem) if point is None else point
+    name, part = _pattern(problem)
+    epochs, start = part.epochs[0], np.asarray(_states_of(problem, point, name))[: len(part.epochs[0].time)]
+    paths = _candidates(problem, point, start, len(epochs.time)) if passes is None else _travelled(passes, epochs.time)
+    if paths.ndim != 3 or paths.shape[2] != problem.network.dimension:
+        raise InputError(f"passes has shape {np.shape(passes)}; give (passes, points, {problem.network.dimension})")
+    states = jnp.asarray(np.stack([_state(epochs, start, path) for path in paths]))
+    added = np.asarray(_of_states(part.spec, part.system, states, point.z, _levels(problem, part, point)))
+    known = _information(problem, point)
+    gains, left = _gains(problem, known, known + added)
+    order = np.argsort(-gains, kind="stable")
+    ends = np.linspace(0, paths.shape[1] - 1, min(paths.shape[1], 20)).round().astype(int)
+    return xr.Dataset(
+        {"gain": ("pass", gains[order]), "weak": ("pass", left[order]),
+         "path": (("pass", "point", "axis"), paths[order][:, ends])},
+        coords={"pass": np.arange(len(order)), "axis": list(AXES[: paths.shape[2]])},
+        attrs={"pattern": name, "weak_before": _weak(problem, known)},
+    )  # fmt: skip
+
+
+@float64
+def next_anchors(problem: Problem, *, point: Point | None = None, survey: float = SURVEY) -> xr.Dataset:
+    """What a survey of each bias, and of each node's position, would tell: gain (nats) and weak directions left.
+
+    `survey` is its std over the scale of the bias (over its first survey where it has one). Best first. Raises
+    `InputError` unless it is positive.
+    """
+    if not (np.isfinite(survey) and survey > 0):
+        raise InputError(f"next_anchors: survey={survey} must be positive, a std over the scale of a bias")
+    point = automatic_start(problem) if point is None else point
+    known = _information(problem, point)
+    groups = {label: [m] for m, label in enumerate(problem.labels)}
+    for m, bias in enumerate(problem.biases):
+        if bias.component == "position":
+            groups.setdefault(f"{bias.owner}.position_*", []).append(m)
+    matrices = []
+    for members in groups.values():
+        matrix = known.copy()
+        matrix[members, members] += survey**-2
+        matrices.append(matrix)
+    gains, left = _gains(problem, known, np.stack(matrices))
+    order = np.argsort(-gains, kind="stable")
+    return xr.Dataset(
+        {"gain": ("anchor", gains[order]), "weak": ("anchor", left[order])},
+        coords={"anchor": np.array(list(groups))[order]},
+        attrs={"survey": survey, "weak_before": _weak(problem, known)},
+    )
+
+
+@float64
+def next_sensors(problem: Problem, *, point: Point | None = None, places: Any = None) -> xr.Dataset:
+    """What one more sensor of each type, its pose known, would tell about the biases that there are: gain (nats).
+
+    It sees every target at every epoch; its own biases are free. `places` (P, d) in m are by default a grid over the
+    area; the second node of a two-node type is its first one. Best first. Raises `InputError` for the shape.
+    """
+    point = automatic_start(problem) if point is None else point
+    d = problem.network.dimension
+    places = _grid(problem, point) if places is None else np.asarray(places, float)
+    if places.ndim != 2 or places.shape[1] != d:
+        raise InputError(f"places has shape {places.shape}; give (places, {d})")
+    known = _information(problem, point)
+    M = len(problem.labels)
+    found = []
+    for kind in problem.network.types:
+        wider, block, mine = _with_sensor(problem, kind)
+        z = jnp.concatenate([point.z, jnp.zeros(len(wider.labels) - M)])
+        there = _levels(problem, wider, point)
+        moved = point._replace(z=z, levels=there)
+        matrices = np.asarray(_of_places(wider.spec, wider.system, moved, jnp.asarray(places), block, mine))
+        inner = matrices[:, M:, M:] + np.eye(matrices.shape[1] - M)
+        cross = matrices[:, M:, :M]
+        gains, _ = _gains(problem, known, matrices[:, :M, :M] - cross.mT @ np.linalg.solve(inner, cross))
+        found += [(kind.name, gain, place) for gain, place in zip(gains, places, strict=True)]
+    found.sort(key=lambda row: -row[1])
+    return xr.Dataset(
+        {"gain": ("candidate", [gain for _, gain, _ in found]), "type": ("candidate", [name for name, *_ in found]),
+         "place": (("candidate", "axis"), np.stack([place for *_, place in found]))},
+        coords={"axis": list(AXES[:d])},
+    )  # fmt: skip
+
+
+# Information
+
+
+@partial(jax.jit, static_argnames="spec")
+def _of_point(spec: Spec, system: System, point: Point) -> jax.Array:
+    """Information (M, M) of the biases at a point."""
+    return eliminate(spec, system, point, expected=True).information
+
+
+@partial(jax.jit, static_argnames="spec")
+def _of_states(spec: Spec, system: System, states: jax.Array, z: jax.Array, levels: jax.Array) -> jax.Array:
+    """Information (C, M, M) of one target along each of the states (C, E, n)."""
+    return jax.lax.map(lambda x: _of_point(spec, system, Point((x,), (jnp.zeros_like(x),), z, levels)), states)
+
+
+@partial(jax.jit, static_argnames=("spec", "block"))
+def _of_places(spec: Spec, system: System, point: Point, places: jax.Array, block: int, mine: jax.Array) -> jax.Array:
+    """Information (C, M, M) with the first node of the rows `mine` (N,) of a block at each of the places (C, d)."""
+    data = system.rows[block]
+    d = places.shape[1]
+
+    def one(place: jax.Array) -> jax.Array:
+        first = jnp.where(mine[:, None], place[None], data.pose[:, 0, :d])
+        moved = data._replace(pose=data.pose.at[:, 0, :d].set(first))
+        changed = tuple(moved if b == block else other for b, other in enumerate(system.rows))
+        return _of_point(spec, system._replace(rows=changed), point)
+
+    return jax.lax.map(one, places)
+
+
+def _information(problem: Problem, point: Point) -> np.ndarray:
+    return np.asarray(_of_point(problem.spec, problem.system, point))
+
+
+def _gains(problem: Problem, known: np.ndarray, with_it: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gains (C,) of information matrices (C, M, M) over a known one, and the weak directions that each leaves."""
+    eye = np.eye(len(known))
+    gains = 0.5 * (np.linalg.slogdet(with_it + eye)[1] - np.linalg.slogdet(known + eye)[1])
+    return gains, np.array([_weak(problem, matrix) for matrix in with_it])
+
+
+def _weak(problem: Problem, information: np.ndarray) -> int:
+    """Number of weak directions, surveyed biases marginalised."""
+    free = ~problem.surveyed
+    return int((np.linalg.eigvalsh(marginal(information, free)) < WEAK).sum()) if free.any() else 0
+
+
+def _levels(problem: Problem, other: Problem, point: Point) -> jax.Array:
+    """The point's log levels in the order of another problem of the same network; those it lacks at their guess."""
+    known = dict(zip([level.label for level in problem.levels], np.asarray(point.levels), strict=True))
+    return jnp.asarray([float(known.get(level.label, 0.0)) for level in other.levels])
+
+
+# Candidates
+
+
+def _pattern(problem: Problem) -> tuple[str, Problem]:
+    """The target with most rows, and the problem of its first epochs alone."""
+    data = problem.measurements
+    counts = np.bincount(data.target, minlength=len(data.target_names))
+    mine = data.target == int(counts.argmax())
+    times = np.unique(data.time[mine])
+    kept = np.flatnonzero(mine & (data.time <= times[min(LONGEST, len(times)) - 1]))
+    return data.target_names[int(counts.argmax())], problem.select(kept)
+
+
+def _states_of(problem: Problem, point: Point, name: str) -> np.ndarray:
+    """States (E, n) of one target at a point."""
+    for epochs, states in zip(problem.epochs, point.states, strict=True):
+        if (epochs.target == name).any():
+            return np.asarray(states)[epochs.target == name]
+    raise KeyError(name)
+
+
+def _state(epochs: Epochs, like: np.ndarray, path: np.ndarray) -> np.ndarray:
+    """States (E, n) along a path (E, d); what is neither position nor its derivatives has the mean of a recording."""
+    state = np.broadcast_to(like.mean(0), like.shape).copy()
+    for name, first, stop, _ in epochs.layout:
+        if name == "position":
+            state[:, first:stop] = path
+        elif name == "velocity":
+            state[:, first:stop] = np.gradient(path, epochs.time, axis=0) if len(path) > 1 else 0.0
+        elif name == "acceleration":
+            state[:, first:stop] = 0.0
+    return state
+
+
+def _area(problem: Problem, point: Point) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner (d,) of nodes and tracks with a margin; in 3-D the height is that of the tracks."""
+    d = problem.network.dimension
+    places = [problem.node_positions]
+    for epochs, states in zip(problem.epochs, point.states, strict=True):
+        first = next(first for name, first, *_ in epochs.layout if name == "position")
+        places.append(np.asarray(states)[:, first : first + d])
+    low, high = (np.concatenate(places).min(0), np.concatenate(places).max(0))
+    margin = MARGIN * max(float((high - low)[:2].max()), 1.0)
+    low, high = low - margin, high + margin
+    if d == 3:
+        low[2] = high[2] = np.concatenate(places[1:])[:, 2].mean()
+    return low, high
+
+
+def _grid(problem: Problem, point: Point) -> np.ndarray:
+    """Places (P, d) on a grid over the area."""
+    low, high = _area(problem, point)
+    axes = [np.linspace(a, b, GRID) for a, b in zip(low[:2], high[:2], strict=True)]
+    flat = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    return np.concatenate([flat, np.broadcast_to(low[2:], (len(flat), len(low) - 2))], 1)
+
+
+def _candidates(problem: Problem, point: Point, like: np.ndarray, epochs: int) -> np.ndarray:
+    """Paths (P, E, d): straight lines through the area, or places of a static target."""
+    if epochs == 1:
+        return _grid(problem, point)[:, None]
+    low, high = _area(problem, point)
+    centre, radius = (low + high) / 2, float(np.linalg.norm((high - low)[:2])) / 2
+    along = np.linspace(-radius, radius, epochs)
+    paths = []
+    for angle in np.pi * np.arange(HEADINGS) / HEADINGS:
+        ahead, left = np.zeros(len(low)), np.zeros(len(low))
+        ahead[:2], left[:2] = (np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))
+        paths += [centre + lane * radius * left + along[:, None] * ahead for lane in LANES]
+    return np.stack(paths)
+
+
+def _travelled(passes: Any, time: np.ndarray) -> np.ndarray:
+    """Polylines (P, points, d) as paths (P, E, d) travelled at an even pace."""
+    lines = np.asarray(passes, float)
+    if lines.ndim != 3:
+        return lines
+    share = (time - time[0]) / max(float(np.ptp(time)), 1e-9)
+    paths = []
+    for line in lines:
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        paths.append(np.stack([np.interp(share * length[-1], length, axis) for axis in line.T], -1))
+    return np.stack(paths)
+
+
+def _with_sensor(problem: Problem, kind: SensorType) -> tuple[Problem, int, jax.Array]:
+    """The problem with one more sensor of a type that sees every epoch; its block, and which rows (N,) are its own."""
+    network, data = problem.network, problem.measurements
+    like = next(placed for placed in network.sensors if placed.type is kind)
+    taken = {placed.name for placed in network.sensors} | {node.name for node in network.nodes}
+    name = next(f"new_{k}" for k in range(len(taken) + 1) if f"new_{k}" not in taken)
+    stated = {k: v for k, v in like.nodes[0].components.items() if k != "heading"}
+    node = Node(name, like.nodes[0].position, like.nodes[0].components["heading"], **stated)
+    placed = kind.on(node, *like.nodes[1:], name=name)
+    frame = data.table.frame
+    columns = dict(zip(header(data.table)[0], frame.columns, strict=True))
+    seen = frame.drop_duplicates([columns[c] for c in ("time", "target") if c in columns])
+    own = {columns[c]: 0.0 for c, _ in kind.expand(network.dimension) if c in columns}
+    blank = {column: np.nan for c, column in columns.items() if c not in ("time", "target", "sensor")}
+    rows = seen.assign(**blank).assign(**own, **{columns["sensor"]: name})
+    table = Table(pd.concat([frame, rows], ignore_index=True), data.table.source, np.arange(len(frame) + len(rows)))
+    wider = Problem(Network([*network.sensors, placed]), problem.motion, table, fix=problem.fixed)
+    number = len(wider.network.sensors) - 1
+    for block, index in enumerate(wider.row_index):
+        mine = wider.measurements.sensor[index] == number
+        if mine.any():
+            return wider, block, jnp.asarray(mine)
+    raise KeyError(name)

@@ -1,0 +1,127 @@
+"""Gauge directions: combinations of biases that no row can tell where the state of every epoch is free.
+
+The rule of rank is free of scales: a direction is a gauge where freeing the states leaves less than `NULL` of the
+information that known states would give about it.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.motion import Known, as_motion
+from probcal.problem import Problem, Spec, System
+from probcal.smoothing.mode import Point, linearise, of_biases, of_both, of_states
+
+NULL = 1e-10  # share of information left below which a direction is a gauge
+CLOSE = 1e-6  # share below which a direction is looked at again, without cancellation
+HELD = 1e30  # precision of a state that is known
+ENOUGH = 0.5  # share of the data in epochs with more data than unknowns from which on a gauge can be counted
+
+
+class Free(NamedTuple):
+    """Information (M, M) of the biases with the states of every epoch free, and with them known; ranks by epoch."""
+
+    information: jax.Array
+    known: jax.Array
+    ranks: tuple[jax.Array, ...]  # (E,) unknowns that the data of an epoch fix
+
+
+class Gauge(NamedTuple):
+    """The gauge directions of a problem at a point."""
+
+    basis: np.ndarray  # (M, k) in z, orthonormal
+    information: np.ndarray  # (M, M) of the biases with free states, surveys included
+    known: np.ndarray  # (M,) information of each bias alone with known states
+    countable: bool  # whether enough epochs have more data than unknowns
+
+
+@partial(jax.jit, static_argnames="spec")
+def free_states(spec: Spec, system: System, point: Point, hold: tuple[jax.Array, ...]) -> Free:
+    """Information about the biases with the state of every epoch free but for the precisions `hold` (E, n)."""
+    lins = linearise(spec, system, point, expected=True)
+    known, _ = of_biases(spec, system, lins)
+    information, ranks = known, []
+    crosses = of_both(spec, system, lins, point.states)
+    for (J, _), cross, precision in zip(of_states(spec, system, lins, point.states), crosses, hold, strict=True):
+        root, y = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision), cross)
+        flat = y.reshape(-1, y.shape[2])
+        information = information - linalg.gram(flat, flat)
+        ranks.append(jnp.sum((jnp.diagonal(root, axis1=1, axis2=2) > 0) & (precision < HELD), 1))
+    return Free(information, known, tuple(ranks))
+
+
+@partial(jax.jit, static_argnames="spec")
+def within(spec: Spec, system: System, point: Point, hold: tuple[jax.Array, ...], basis: jax.Array) -> jax.Array:
+    """Information (k, k) of combinations (M, k) with free states, from the residuals of rows: no cancellation."""
+    lins = linearise(spec, system, point, expected=True)
+    crosses = of_both(spec, system, lins, point.states)
+    k = basis.shape[1]
+    padded = jnp.concatenate([basis, jnp.zeros((1, k), basis.dtype)])
+    moved = [
+        linalg.semi_solve(J + jax.vmap(jnp.diag)(precision), cross @ basis)[0]
+        for (J, _), cross, precision in zip(of_states(spec, system, lins, point.states), crosses, hold, strict=True)
+    ]
+    total = jnp.zeros((k, k))
+    for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
+        own = jnp.einsum("ncp,npk->nck", lin.bias, padded[data.bias[data.sensor]])
+        left = own - jnp.einsum("ncu,nuk->nck", lin.state, moved[r][:, jnp.asarray(block.used, int)][data.epoch])
+        total = total + jnp.einsum("nck,nc,ncl->kl", left, lin.weight, left)
+    for x, precision in zip(moved, hold, strict=True):
+        total = total + jnp.einsum("enk,en,enl->kl", x, precision, x)
+    return total
+
+
+def held_states(problem: Problem) -> tuple[jax.Array, ...]:
+    """Precision (E, n) of the states that are known beforehand: those of `Known` targets."""
+    found = []
+    for epochs, part in zip(problem.epochs, problem.system.recursions, strict=True):
+        precision = np.zeros(part.drift.shape)
+        spread = np.asarray(jnp.sum(part.L**2, 2))
+        for name in dict.fromkeys(epochs.target):
+            mine = epochs.target == name
+            row = 0
+            for component in as_motion(problem.target(str(name)).motion).components:
+                d = problem.network.dimension
+                size = sum(d if per_axis else 1 for _, per_axis in component.names())
+                if isinstance(component, Known):
+                    here = np.ix_(mine, np.arange(row, row + size))
+                    precision[here] = np.minimum(1 / np.maximum(spread[here], 1 / HELD), HELD)
+                row += size
+        found.append(jnp.asarray(precision))
+    return tuple(found)
+
+
+def gauge(problem: Problem, point: Point) -> Gauge:
+    """Directions that no row fixes: the null space of the Jacobian of the rows with the states free at each epoch.
+
+    Surveys count as rows. The count is exact where the epochs have more data than unknowns; where most have not,
+    as with one range at a time, `countable` is False: what is fixed there hangs on the motion.
+    """
+    spec, system, hold = problem.spec, problem.system, held_states(problem)
+    free = free_states(spec, system, point, hold)
+    survey = problem.surveyed.astype(float)
+    information = np.asarray(free.information) + np.diag(survey)
+    alone = np.diag(np.asarray(free.known)) + survey
+    unit = 1 / np.sqrt(np.where(alone > 0, alone, 1.0))
+    values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
+    near = unit[:, None] * vectors[:, values < CLOSE]
+    exact = np.asarray(within(spec, system, point, hold, jnp.asarray(near))) + near.T @ (survey[:, None] * near)
+    values, turned = np.linalg.eigh(0.5 * (exact + exact.T))
+    basis, _ = np.linalg.qr(near @ turned[:, values < NULL])
+    return Gauge(basis, information, alone, _countable(problem, free))
+
+
+def _countable(problem: Problem, free: Free) -> bool:
+    """Whether at least half of the data stand in epochs with more data than unknowns."""
+    inside = total = 0.0
+    counts = [np.zeros(len(epochs.time)) for epochs in problem.epochs]
+    for rows, r in zip(problem.system.rows, problem.spec.recursion, strict=True):
+        np.add.at(counts[r], np.asarray(rows.epoch), np.asarray(rows.mask).sum(1))
+    for count, rank in zip(counts, free.ranks, strict=True):
+        inside += count[count > np.asarray(rank)].sum()
+        total += count.sum()
+    return inside >= ENOUGH * total
