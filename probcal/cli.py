@@ -1,6 +1,6 @@
-"""The command line: simulate, fit, track, study, report.
+"""The command line: simulate, check, fit, track, study, report.
 
-Bad input ends with exit code 2, a fit that is no answer with 1.
+Bad input ends with exit code 2, a fit that is no answer, or a problem that can have none, with 1.
 """
 
 import importlib.util
@@ -21,6 +21,7 @@ import xarray as xr
 from rich.console import Console
 from rich.progress import Progress as RichProgress
 
+from probcal.analysis import next_anchors, next_passes, next_sensors, observability
 from probcal.diagnostics import grid_of, scores, study_table
 from probcal.inference import METHODS, ORACLE, fit, study, track
 from probcal.inference.run import Progress
@@ -28,6 +29,7 @@ from probcal.inference.study import choose_methods
 from probcal.priors import PRIORS
 from probcal.problem import Problem
 from probcal.simulate import Simulation, Truth, truth_beside
+from probcal.smoothing.start import automatic_start
 from probcal.tree import add_scores, load, outliers, save, summary
 from probcal.types import FitError, InputError, nearest
 
@@ -299,6 +301,101 @@ def simulate_command(
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror}") from None
     print(f"written: {', '.join(str(p) for p in written)} ({len(simulation.table)} rows)")
+
+
+@app.command(name="check")
+def check_command(
+    model: Model,
+    data: Data = None,
+    fix: Annotated[list[str], typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = [],  # noqa: B006
+    out: Annotated[Path | None, typer.Option(help="folder for check.nc, check.csv, check.png")] = None,
+) -> None:
+    """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
+    if out is not None:
+        _folder(out)
+    _, problem = _problem(model, data, fix)
+    with _progress() as progress:
+        if progress is not None:
+            progress("check", 0, 0.0)
+        start = automatic_start(problem)
+        tree = observability(problem, point=start)
+        passes = next_passes(problem, point=start)
+        plans = (passes, next_anchors(problem, point=start), next_sensors(problem, point=start))
+    tree.attrs["model"] = model.stem
+    _print_check(problem, tree, plans)
+    if out is not None:
+        _write_check(tree, passes, out)
+    raise typer.Exit(1 if tree.attrs["status"] == "open" else 0)
+
+
+def _print_check(problem: Problem, tree: xr.DataTree, plans: tuple[xr.Dataset, xr.Dataset, xr.Dataset]) -> None:
+    data = problem.measurements
+    print(
+        f"{data.table.source}: {len(data.time)} rows of {len(set(data.sensor))} sensors, {len(data.target_names)} "
+        f"target(s), {sum(len(e.time) for e in problem.epochs)} epochs over {np.ptp(data.time):g} s"
+    )
+    for name in problem.silent:
+        print(f'sensor "{name}" has no row: a fit refuses it; add rows or take it out of the network')
+    print(check_table(tree).to_string(index=False, justify="right"))
+    print("share: how much of the answer the data give under a prior of one scale; sd: the bound that goes with it")
+    sensors = tree["sensor"].to_dataset().to_dataframe().sort_values("leverage")
+    print("biases that the rows of each sensor determine: " + _listed(sensors["leverage"]))
+    print(f"the motion determines {tree['target'].attrs['motion']:.2g}, targets " + _listed(
+        tree["target"].to_dataset()["leverage"].to_series().sort_values()))  # fmt: skip
+    print(_directions_text(tree))
+    passes, anchors, sensors_ = plans
+    print(f"weak directions now: {passes.attrs['weak_before']}. What would tell most (nats; weak directions left):")
+    path = passes["path"].values[0]
+    ends = " to ".join("(" + ", ".join(f"{v:.4g}" for v in place) + ")" for place in path[[0, -1]][: len(path)])
+    print(f"  another pass, {ends} m: {passes['gain'].values[0]:.2f} ({passes['weak'].values[0]})")
+    print(f"  a survey of {anchors['anchor'].values[0]} to {anchors.attrs['survey']:g} of its scale: "
+          f"{anchors['gain'].values[0]:.2f} ({anchors['weak'].values[0]})")  # fmt: skip
+    place = ", ".join(f"{v:.4g}" for v in sensors_["place"].values[0])
+    print(f"  one more {sensors_['type'].values[0]} at ({place}) m: {sensors_['gain'].values[0]:.2f}")
+
+
+def _directions_text(tree: xr.DataTree) -> str:
+    """The directions that the data leave open, in words, each with its remedy."""
+    if "direction" not in tree.children:
+        return "the data determine every direction of the biases"
+    group = tree["direction"].to_dataset()
+    lines = [f"{group.sizes['direction']} directions of the biases that the data hardly determine:"]
+    for k in range(group.sizes["direction"]):
+        kind, share, words = (group[name].values[k] for name in ("kind", "share", "words"))
+        lines.append(f"  {k + 1}. {group['direction'].values[k]} ({kind}, the data give {share:.2g} of the answer)")
+        lines += [f"     {words}", f"     {group['remedy'].values[k]}"]
+    return "\n".join([*lines, tree.attrs["rule"]])
+
+
+def _listed(values: pd.Series, most: int = 8) -> str:
+    """Names and numbers of a series in one line, the first and the last where there are many."""
+    pairs = [f"{name} {value:.2f}" for name, value in values.items()]
+    return ", ".join(pairs if len(pairs) <= most else [*pairs[: most // 2], "...", *pairs[-most // 2 :]])
+
+
+def check_table(tree: xr.DataTree) -> pd.DataFrame:
+    """The biases of a check: bias, unit, scale, sd (bound), share, verdict."""
+    frame = tree["bias"].to_dataset()[["unit", "scale", "sd", "share", "verdict"]].to_dataframe().reset_index()
+    frame = frame[["bias_label", "unit", "scale", "sd", "share", "verdict"]].rename(columns={"bias_label": "bias"})
+    shown = {"scale": "{:.4g}", "sd": "{:.4g}", "share": "{:.3f}"}
+    return frame.assign(**{name: [form.format(v) for v in frame[name]] for name, form in shown.items()})
+
+
+def _write_check(tree: xr.DataTree, passes: xr.Dataset, out: Path) -> None:
+    files = [out / "check.nc", out / "check.csv"]
+    try:
+        save(tree, files[0])
+        columns = ["unit", "scale", "kind", "sd", "share", "verdict"]
+        frame = tree["bias"].to_dataset()[columns].to_dataframe().reset_index().rename(columns={"bias_label": "bias"})
+        _write_csv(frame[["bias", *columns]], files[1])
+        if _can_plot():
+            from probcal.plots import draw_check  # the plot packages are an extra
+
+            files.append(out / "check.png")
+            draw_check(tree, passes, files[-1])
+    except OSError as error:
+        raise InputError(f"{out} cannot be written: {error.strerror}") from None
+    print(f"written: {', '.join(str(path) for path in files)}")
 
 
 @app.command(name="track")

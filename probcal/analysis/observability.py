@@ -11,8 +11,8 @@ from probcal import linalg, tree
 from probcal.problem import Problem
 from probcal.smoothing.directions import WEAK, Direction, weak_directions
 from probcal.smoothing.gauge import NULL, gauge
-from probcal.smoothing.information import leverages, moments
-from probcal.smoothing.mode import Point, eliminate
+from probcal.smoothing.information import leverages, marginal_information, moments
+from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start
 from probcal.types import InputError, float64
 
@@ -23,8 +23,6 @@ RULE = (
 NONE = 0.05  # share of an answer that comes from the data below which they say nothing of a bias
 HALF = 0.5  # share below which a bias is weak
 
-_eliminate = jax.jit(eliminate, static_argnames=("spec", "expected", "joint"))
-
 
 @float64
 def observability(problem: Problem, *, point: Point | None = None) -> xr.DataTree:
@@ -34,8 +32,8 @@ def observability(problem: Problem, *, point: Point | None = None) -> xr.DataTre
     the prior scale; it is taken at `point`, by default the automatic start. Groups: `bias` (share of each answer that
     the data give under a prior of one scale, the bound on its sd, the information matrix), `spectrum`, `direction`
     (gauge and weak ones with words and remedies), `datum`, `sensor` and `target` (how many biases each determines:
-    their leverages, which add up with what the motion tells), `track`. Attributes: `status` (determined, weak, gauge),
-    `rule`, counts. Raises `InputError` for a problem without free biases.
+    their leverages, which add up with what the motion tells), `track`. Attributes: `status` (determined; weak; open,
+    where the data say next to nothing of a direction), `rule`, counts. Raises `InputError` for a problem without free biases.
     """
     if not problem.labels:
         raise InputError("observability: the problem has no free bias; declare a Bias, a survey or a scale")
@@ -75,7 +73,7 @@ class Information:
 
 
 def _information(problem: Problem, point: Point) -> Information:
-    found = Information(_eliminate(problem.spec, problem.system, point, expected=True).information)
+    found = Information(marginal_information(problem.spec, problem.system, point))
     if not np.isfinite(found.covariance).all():
         raise InputError(
             "observability: the rows have no finite derivatives at the start; is a target at the place of a sensor?"
@@ -84,13 +82,15 @@ def _information(problem: Problem, point: Point) -> Information:
 
 
 def _status(directions: Sequence[Direction]) -> str:
-    left = [direction.kind for direction in directions if direction.information < WEAK]
-    return "gauge" if "gauge" in left else "weak" if left else "determined"
+    least = min((direction.share for direction in directions), default=1.0)
+    return "open" if least < NONE else "weak" if least < HALF else "determined"
 
 
-def verdict_of(share: float) -> str:
-    """Determined, weak or prior only, from the share of an answer that the data give."""
-    return "prior only" if share < NONE else "weak" if share < HALF else "determined"
+def _verdict(share: float, kind: str) -> str:
+    """What data can say of a bias, from their share of the answer; a survey stands where they say little."""
+    if share >= HALF:
+        return "determined"
+    return "survey" if kind == "survey" else "prior only" if share < NONE else "weak"
 
 
 def _biases(problem: Problem, found: Information) -> xr.Dataset:
@@ -101,7 +101,7 @@ def _biases(problem: Problem, found: Information) -> xr.Dataset:
         "kind": np.array([b.kind for b in problem.biases], str),
         "share": found.share,
         "sd": np.sqrt(np.diag(found.covariance)) * scales,
-        "verdict": np.array([verdict_of(share) for share in found.share]),
+        "verdict": np.array([_verdict(share, b.kind) for share, b in zip(found.share, problem.biases, strict=True)]),
     }
     group = xr.Dataset({k: ("bias_label", v) for k, v in columns.items()}, coords={"bias_label": labels})
     matrix = (("bias_label", "bias_label_other"), found.information)

@@ -17,7 +17,8 @@ from probcal.network import Network, Node
 from probcal.problem import Epochs, Problem, Spec, System
 from probcal.sensor import SensorType
 from probcal.smoothing.directions import WEAK, marginal
-from probcal.smoothing.mode import Point, eliminate
+from probcal.smoothing.information import marginal_information
+from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start
 from probcal.table import Table, header
 from probcal.types import AXES, InputError, float64
@@ -123,15 +124,11 @@ def next_sensors(problem: Problem, *, point: Point | None = None, places: Any = 
 
 
 @partial(jax.jit, static_argnames="spec")
-def _of_point(spec: Spec, system: System, point: Point) -> jax.Array:
-    """Information (M, M) of the biases at a point."""
-    return eliminate(spec, system, point, expected=True).information
-
-
-@partial(jax.jit, static_argnames="spec")
 def _of_states(spec: Spec, system: System, states: jax.Array, z: jax.Array, levels: jax.Array) -> jax.Array:
     """Information (C, M, M) of one target along each of the states (C, E, n)."""
-    return jax.lax.map(lambda x: _of_point(spec, system, Point((x,), (jnp.zeros_like(x),), z, levels)), states)
+    return jax.lax.map(
+        lambda x: marginal_information(spec, system, Point((x,), (jnp.zeros_like(x),), z, levels)), states
+    )
 
 
 @partial(jax.jit, static_argnames=("spec", "block"))
@@ -144,13 +141,13 @@ def _of_places(spec: Spec, system: System, point: Point, places: jax.Array, bloc
         first = jnp.where(mine[:, None], place[None], data.pose[:, 0, :d])
         moved = data._replace(pose=data.pose.at[:, 0, :d].set(first))
         changed = tuple(moved if b == block else other for b, other in enumerate(system.rows))
-        return _of_point(spec, system._replace(rows=changed), point)
+        return marginal_information(spec, system._replace(rows=changed), point)
 
     return jax.lax.map(one, places)
 
 
 def _information(problem: Problem, point: Point) -> np.ndarray:
-    return np.asarray(_of_point(problem.spec, problem.system, point))
+    return np.asarray(marginal_information(problem.spec, problem.system, point))
 
 
 def _gains(problem: Problem, known: np.ndarray, with_it: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -67,7 +67,7 @@ class Pattern(NamedTuple):
 def weak_directions(
     problem: Problem, information: np.ndarray, point: Point, gauge: Gauge | None = None
 ) -> tuple[Direction, ...]:
-    """Name the directions of marginal information (M, M) below 1 at a point, the weakest first.
+    """Name the directions of marginal information (M, M) below 1 at a point, in an order in which remedies add up.
 
     Surveyed biases are marginalised with their survey. Combinations within one sensor, translations, rotations,
     dilation and common shifts are tried, each completed by the other biases that move along; what remains is
@@ -81,8 +81,7 @@ def weak_directions(
     if gauge is not None and gauge.countable:
         naming.name_gauge(gauge.basis[free])
     naming.name_weak()
-    remedied = _with_remedies(problem, naming.known, naming.found, naming.anchors)
-    return tuple(sorted(remedied, key=lambda direction: direction.information))
+    return tuple(_with_remedies(problem, naming.known, naming.found, naming.anchors))
 
 
 def marginal(information: np.ndarray, free: np.ndarray) -> np.ndarray:
@@ -228,7 +227,7 @@ def _with_remedies(
             continue
         left -= 1
         if _count(known, done) <= left:
-            yield replace(direction, fix=fixed, remedy=f"{general}: the same anchors do")
+            yield replace(direction, fix=fixed, remedy=f"{general}: {_together(fixed)} does both")
             continue
         chosen = _anchor(known, done, [[labels.index(name) for name in group] for group in groups], left)
         if not chosen:
@@ -238,7 +237,7 @@ def _with_remedies(
         std = _survey(known, done, chosen, left, scales, direction.vector[~problem.surveyed])
         units = {problem.biases[problem.labels.index(label)].unit for label in fixed}
         std = std if len(units) == 1 else None
-        survey = f", or survey it to {std:g} {units.pop()}".rstrip() if std is not None else ""
+        survey = f", or survey it to {std:g} {units.pop().strip('1')}".rstrip() if std is not None else ""
         before = f"{direction.remedy}: " if direction.remedy else ""
         yield replace(direction, fix=fixed, survey=std, remedy=f"{before}fix {_together(fixed)}{survey}")
         done += chosen

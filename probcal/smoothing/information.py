@@ -36,6 +36,12 @@ class Laplace(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="spec")
+def marginal_information(spec: Spec, system: System, point: Point) -> jax.Array:
+    """Expected information (M, M) of the data about the biases at a point, trajectories marginalised."""
+    return eliminate(spec, system, point, expected=True).information
+
+
+@partial(jax.jit, static_argnames="spec")
 def laplace(spec: Spec, system: System, point: Point, prior: Precision) -> Laplace:
     """Evidence and covariance with every trajectory marginalised exactly, at the mode for a prior.
 

@@ -18,6 +18,7 @@ from probcal.priors import Precision
 from probcal.problem import Problem, Recursion, Spec, System
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Point, cost, factors, find_mode, track
+from probcal.types import float64
 
 WINDOWS = 60  # at most so many windows a target
 INNER = {2: 24, 3: 10}  # grid points an axis inside the network
@@ -200,6 +201,7 @@ def _grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
     return track_mode(problem, project(problem, tracks, precisions)._replace(z=z), iterations)
 
 
+@float64
 def automatic_start(problem: Problem, iterations: int = 30) -> Point:
     """Trajectories and biases from the data alone, near the joint mode at the declared scales.
 

@@ -1,0 +1,134 @@
+"""Pictures of what data can determine: spectrum of the information, weak directions and next passes on the map."""
+
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, new_axes, plain
+
+REACH = 0.12  # longest arrow of a direction, in widths of the map
+SHOWN = 6  # directions on one map
+LOWEST = 1e-10  # information below which the spectrum is cut
+
+
+def plot_spectrum(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw the eigenvalues of the information in units of the prior scale; those below 1 are weak."""
+    ax = new_axes(ax, 6.0, 3.6)
+    values = tree["spectrum"].to_dataset()["information"].values
+    shown = np.maximum(values, LOWEST)
+    number = np.arange(1, len(values) + 1)
+    weak = values < 1.0
+    ax.semilogy(number[~weak], shown[~weak], "o", color=colour(0), markersize=4, label="determined by the data")
+    ax.semilogy(number[weak], shown[weak], "v", color=colour(1), markersize=5, label="weak: left to prior and survey")
+    ax.axhline(1.0, color="0.3", linewidth=0.8)
+    ax.set(xlabel="eigenvalue", ylabel="information in prior scales")
+    ax.grid(color="0.9")
+    ax.set_title(f"{int(weak.sum())} of {len(values)} directions are weak", loc="left")
+    ax.legend(frameon=False, fontsize=8)
+    return ax
+
+
+def plot_directions(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw each weak direction as arrows of the nodes it moves; a turning heading is a stroke across its arrow."""
+    ax = new_axes(ax, 9.0, 6.0)
+    ax.set_aspect("equal", adjustable="datalim")
+    keys = _draw_scene(ax, tree)
+    if "direction" in tree.children:
+        group = tree["direction"].to_dataset()
+        width = float(np.ptp(np.concatenate([ax.get_xlim()])))
+        for k in range(min(SHOWN, group.sizes["direction"])):
+            chosen = group.isel(direction=k)
+            _draw_direction(ax, tree, chosen["vector"].to_series(), width, colour(k))
+            text = f"{plain(chosen['direction'].item(), 60)} ({chosen['information'].item():.1g})"
+            keys.append(Line2D([], [], color=colour(k), label=text))
+        left = group.sizes["direction"] - SHOWN
+        title = f"Directions that the data hardly determine{f', {left} more not shown' if left > 0 else ''}"
+    else:
+        title = "The data determine every direction"
+    ax.set_title(title, loc="left")
+    ax.legend(handles=keys, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
+    return ax
+
+
+def plot_passes(tree: xr.DataTree, passes: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw candidate passes on the map, coloured by what each would tell (nats), the best one bold."""
+    ax = new_axes(ax, 8.0, 6.0)
+    ax.set_aspect("equal", adjustable="datalim")
+    keys = _draw_scene(ax, tree)
+    gain = passes["gain"].values
+    shade = ax.scatter([], [], c=[], cmap=GAMMA, vmin=float(gain.min()), vmax=float(gain.max()))
+    for k in reversed(range(len(gain))):
+        path = passes["path"].values[k][:, :2]
+        style: dict[str, Any] = {"color": shade.to_rgba(gain[k]), "linewidth": 3.0 if k == 0 else 1.2, "zorder": 3}
+        ax.plot(*path.T, "o" if len(path) == 1 else "-", **style)
+    ax.figure.colorbar(shade, ax=ax, label="information gain in nats", shrink=0.8)
+    ax.set_title("What one more pass would tell about the biases", loc="left")
+    ax.legend(handles=keys, loc="upper left", frameon=True, fontsize=8)
+    return ax
+
+
+def draw_check(tree: xr.DataTree, passes: xr.Dataset, path: str | PathLike[str]) -> None:
+    """Write the pictures of a check to one file: directions, spectrum, next passes."""
+    figure = Figure(figsize=(13.0, 11.0), layout="constrained")
+    upper, lower = figure.subfigures(2, 1)
+    plot_directions(tree, upper.subplots())
+    left, right = lower.subplots(1, 2)
+    plot_spectrum(tree, left)
+    plot_passes(tree, passes, right)
+    figure.savefig(path, dpi=110)
+
+
+def _draw_scene(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
+    """Draw nodes and tracks, and return their legend entries."""
+    nodes, track = tree["constant_data"].to_dataset(), tree["track"].to_dataset()
+    for name in (str(n) for n in track.data_vars if str(n).startswith("mean")):
+        s = name.removeprefix("mean")
+        places = track[name].sel({f"component{s}": ["position_x", "position_y"]}).values
+        owners = track[f"epoch_target{s}"].values
+        for target in dict.fromkeys(owners.tolist()):
+            mine = owners == target
+            ax.plot(*places[mine].T, "." if mine.sum() == 1 else "-", color=BEFORE, linewidth=1.0, zorder=1)
+    stated = nodes["node_position"].values[:, :2]
+    style: dict[str, Any] = {"color": "black", "markerfacecolor": "none", "markersize": 6}
+    ax.plot(*stated.T, "s", zorder=5, **style)
+    if len(stated) <= NAMED:
+        for name, place in zip(nodes["node"].values, stated, strict=True):
+            ax.annotate(plain(name), place, xytext=(6, 6), textcoords="offset points", fontsize=7, zorder=6)
+    ax.set(xlabel="x in m", ylabel="y in m")
+    return [
+        Line2D([], [], marker="s", linestyle="", label="stated position", **style),
+        Line2D([], [], color=BEFORE, label="target"),
+    ]
+
+
+def _draw_direction(ax: Axes, tree: xr.DataTree, vector: pd.Series, width: float, shade: str) -> None:
+    """Draw how a direction moves the nodes (arrows) and turns them (strokes); the longest arrow has a fixed length."""
+    nodes = tree["constant_data"].to_dataset()
+    scale = tree["bias"].to_dataset()["scale"].to_series()
+    names, stated = nodes["node"].values.astype(str), nodes["node_position"].values[:, :2]
+    moved = {str(label): float(amount) for label, amount in (vector * scale).items()}
+    limits = {str(label): 0.3 * float(size) * float(vector.abs().max()) for label, size in scale.items()}
+    shift = np.array([[moved.get(f"{name}.position_{axis}", 0.0) for axis in "xy"] for name in names])
+    turn = np.array([moved.get(f"{name}.heading", 0.0) for name in names])
+    longest = np.linalg.norm(shift, axis=1).max()
+    if longest > 0:
+        arrows = shift / longest * REACH * width
+        some = np.linalg.norm(arrows, axis=1) > 0.02 * REACH * width
+        x, y, u, v = *stated[some].T, *arrows[some].T
+        ax.quiver(x, y, u, v, color=shade, angles="xy", scale_units="xy", scale=1.0, width=0.0035, zorder=4)
+    if np.abs(turn).max() > 0:
+        size = 60.0 * np.abs(turn) / np.abs(turn).max()
+        ax.scatter(*stated.T, s=size, marker="$\\circlearrowleft$", color=shade, zorder=4)
+    others = [label for label, amount in moved.items() if abs(amount) > limits[label]]
+    rest = [label for label in others if "position" not in label and "heading" not in label]
+    for name, place in zip(names, stated, strict=True):
+        mine = [label for label in rest if label.rsplit(".", 1)[0] == name]
+        if mine and len(names) <= NAMED:
+            text = ", ".join(plain(label.rsplit(".", 1)[-1], 16) for label in mine[:2])
+            ax.annotate(text, place, xytext=(6, -10), textcoords="offset points", fontsize=6, color=shade, zorder=6)
