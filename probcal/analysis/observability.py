@@ -2,16 +2,15 @@
 
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal import linalg, tree
+from probcal import tree
 from probcal.problem import Problem
 from probcal.smoothing.directions import WEAK, Direction, weak_directions
 from probcal.smoothing.gauge import NULL, gauge
-from probcal.smoothing.information import leverages, marginal_information, moments
+from probcal.smoothing.information import Moments, leverages, marginal_information, moments
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start
 from probcal.types import InputError, float64
@@ -33,7 +32,7 @@ def observability(problem: Problem, *, point: Point | None = None) -> xr.DataTre
     the data give under a prior of one scale, the bound on its sd, the information matrix), `spectrum`, `direction`
     (gauge and weak ones with words and remedies), `datum`, `sensor` and `target` (how many biases each determines:
     their leverages, which add up with what the motion tells), `track`. Attributes: `status` (determined; weak; open,
-    where the data say next to nothing of a direction), `rule`, counts. Raises `InputError` for a problem without free biases.
+    where the data say next to nothing of a direction), `rule`, counts. Raises `InputError` where no bias is free.
     """
     if not problem.labels:
         raise InputError("observability: the problem has no free bias; declare a Bias, a survey or a scale")
@@ -41,11 +40,12 @@ def observability(problem: Problem, *, point: Point | None = None) -> xr.DataTre
     found = _information(problem, point)
     null = gauge(problem, point)
     directions = weak_directions(problem, found.information, point, null)
+    spread = moments(problem.spec, problem.system, point, jnp.asarray(found.covariance))
     groups = {
         "bias": _biases(problem, found),
         "spectrum": _spectrum(found.information),
-        **_leverage_groups(problem, point, found),
-        "track": _tracks(problem, point, found.covariance),
+        **_leverage_groups(problem, point, found, spread),
+        "track": _tracks(problem, point, found.covariance, spread),
         "constant_data": tree.constant_group(problem),
     }
     if directions:
@@ -62,9 +62,9 @@ def observability(problem: Problem, *, point: Point | None = None) -> xr.DataTre
 class Information:
     """Information (M, M) of the data about z, and the covariance (M, M) under a prior of one scale (or the survey)."""
 
-    def __init__(self, information: jax.Array):
-        self.information = np.asarray(information)
-        self.covariance = np.asarray(linalg.inverse_and_logdet(information + jnp.eye(information.shape[0]))[0])
+    def __init__(self, information: np.ndarray):
+        self.information = information
+        self.covariance = np.linalg.inv(information + np.eye(len(information)))
 
     @property
     def share(self) -> np.ndarray:
@@ -73,12 +73,12 @@ class Information:
 
 
 def _information(problem: Problem, point: Point) -> Information:
-    found = Information(marginal_information(problem.spec, problem.system, point))
-    if not np.isfinite(found.covariance).all():
+    information = np.asarray(marginal_information(problem.spec, problem.system, point))
+    if not np.isfinite(information).all():
         raise InputError(
             "observability: the rows have no finite derivatives at the start; is a target at the place of a sensor?"
         )
-    return found
+    return Information(information)
 
 
 def _status(directions: Sequence[Direction]) -> str:
@@ -114,9 +114,11 @@ def _spectrum(information: np.ndarray) -> xr.Dataset:
     return xr.Dataset({"information": ("eigenvalue", values), "share": ("eigenvalue", values / (1.0 + values))})
 
 
-def _leverage_groups(problem: Problem, point: Point, found: Information) -> dict[str, xr.Dataset]:
+def _leverage_groups(
+    problem: Problem, point: Point, found: Information, spread: list[Moments]
+) -> dict[str, xr.Dataset]:
     """How many biases each datum, sensor and target determines; the motion tells the rest."""
-    parts = leverages(problem.spec, problem.system, point, jnp.asarray(found.covariance))
+    parts = leverages(problem.spec, problem.system, point, jnp.asarray(found.covariance), spread)
     datum, picks = tree.data_coords(problem)
     values = tree.gather([np.asarray(part) for part in parts], picks)
     each = xr.Dataset({"leverage": ("datum", values)}, coords=datum["coords"])
@@ -131,9 +133,8 @@ def _leverage_groups(problem: Problem, point: Point, found: Information) -> dict
     return groups
 
 
-def _tracks(problem: Problem, point: Point, covariance: np.ndarray) -> xr.Dataset:
+def _tracks(problem: Problem, point: Point, covariance: np.ndarray, spread: list[Moments]) -> xr.Dataset:
     """The trajectories at the point and the bound on their sd, biases marginalised."""
-    spread = moments(problem.spec, problem.system, point, jnp.asarray(covariance))
     parts = []
     for states, moment in zip(point.states, spread, strict=True):
         variance = jnp.diagonal(moment.states, axis1=1, axis2=2)

@@ -41,7 +41,8 @@ def plot_directions(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     keys = _draw_scene(ax, tree)
     if "direction" in tree.children:
         group = tree["direction"].to_dataset()
-        width = float(np.ptp(np.concatenate([ax.get_xlim()])))
+        ax.margins(0.2)
+        width = float(np.ptp(np.asarray(ax.get_xlim())))
         for k in range(min(SHOWN, group.sizes["direction"])):
             chosen = group.isel(direction=k)
             _draw_direction(ax, tree, chosen["vector"].to_series(), width, colour(k))
@@ -76,11 +77,10 @@ def plot_passes(tree: xr.DataTree, passes: xr.Dataset, ax: Axes | None = None) -
 def draw_check(tree: xr.DataTree, passes: xr.Dataset, path: str | PathLike[str]) -> None:
     """Write the pictures of a check to one file: directions, spectrum, next passes."""
     figure = Figure(figsize=(13.0, 11.0), layout="constrained")
-    upper, lower = figure.subfigures(2, 1)
-    plot_directions(tree, upper.subplots())
-    left, right = lower.subplots(1, 2)
-    plot_spectrum(tree, left)
-    plot_passes(tree, passes, right)
+    places = figure.subplot_mosaic([["map", "map"], ["spectrum", "passes"]])
+    plot_directions(tree, places["map"])
+    plot_spectrum(tree, places["spectrum"])
+    plot_passes(tree, passes, places["passes"])
     figure.savefig(path, dpi=110)
 
 
@@ -120,11 +120,11 @@ def _draw_direction(ax: Axes, tree: xr.DataTree, vector: pd.Series, width: float
     if longest > 0:
         arrows = shift / longest * REACH * width
         some = np.linalg.norm(arrows, axis=1) > 0.02 * REACH * width
-        x, y, u, v = *stated[some].T, *arrows[some].T
+        (x, y), (u, v) = stated[some].T, arrows[some].T
         ax.quiver(x, y, u, v, color=shade, angles="xy", scale_units="xy", scale=1.0, width=0.0035, zorder=4)
     if np.abs(turn).max() > 0:
         size = 60.0 * np.abs(turn) / np.abs(turn).max()
-        ax.scatter(*stated.T, s=size, marker="$\\circlearrowleft$", color=shade, zorder=4)
+        ax.scatter(stated[:, 0], stated[:, 1], s=size, marker="$\\circlearrowleft$", color=shade, zorder=4)
     others = [label for label, amount in moved.items() if abs(amount) > limits[label]]
     rest = [label for label in others if "position" not in label and "heading" not in label]
     for name, place in zip(names, stated, strict=True):

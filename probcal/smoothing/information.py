@@ -148,14 +148,13 @@ def predicted_variances(
 
 
 @partial(jax.jit, static_argnames="spec")
-def leverages(spec: Spec, system: System, point: Point, covariance: jax.Array) -> list[jax.Array]:
+def leverages(spec: Spec, system: System, point: Point, covariance: jax.Array, found: list[Moments]) -> list[jax.Array]:
     """What every datum (N, C) of each block tells about the biases at a point, trajectories marginalised.
 
     The leverage is w c' Sigma c, c the derivative of the predicted value by z with the trajectory following. Those of
     all data and a rest, what the motion tells, add up to tr(Sigma G), the number of biases that are determined.
     """
     lins = linearise(spec, system, point, expected=True)
-    found = moments(spec, system, point, covariance)
     root = jnp.concatenate([linalg.factor(covariance), jnp.zeros((1, spec.biases))])
     told = []
     for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
