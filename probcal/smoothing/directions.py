@@ -22,7 +22,7 @@ INVOLVED = 0.3  # share of the largest entry above which a bias is named
 APART = 0.5  # part of a unit direction outside those already named that makes it a new one
 MATCH = 1e-3  # how closely a gauge must follow a pattern
 INSIDE = 1e-6  # size outside one sensor below which a gauge is its own
-TRIED = 3  # remedies of one direction that are recomputed
+TRIED = 12  # remedies of one direction that are recomputed
 HALVINGS = 6  # survey stds tried, each half of the one before
 STRAIGHT = 0.03  # width of a path over its length below which it is one line
 TOWARDS = {"x": "east", "y": "north", "z": "up"}
@@ -265,15 +265,15 @@ def _count(known: np.ndarray, done: Iterable[int]) -> int:
 
 
 def _anchor(known: np.ndarray, done: list[int], groups: list[list[int]], left: int) -> list[int]:
-    """The group of biases that leaves at most `left` weak directions when fixed, and the fewest; empty if none does.
+    """The group of biases that leaves at most `left` weak directions when fixed, and the strongest; empty if none does.
 
-    Tried are those that hold most of the weak space.
+    Tried are those that hold most of the weak space; the fewest weak directions count first, then the weakest left.
     """
     values, vectors = _spectrum(known, done)
     hold = (vectors[:, values < WEAK] ** 2).sum(1)
     best: tuple[int, float] = (left + 1, 0.0)
     chosen: list[int] = []
-    for group in sorted(groups, key=lambda group: -hold[group].sum() / len(group))[:TRIED]:
+    for group in sorted(groups, key=lambda group: -hold[group].sum())[:TRIED]:
         values, _ = _spectrum(known, [*done, *group])
         rank = (int((values < WEAK).sum()), -float(values.min(initial=np.inf)))
         if rank < best:
