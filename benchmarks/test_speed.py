@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 
 from probcal import ARD, EMEA, ConstantVelocity, Network, Node, Problem, fit, study
+from probcal.analysis import next_passes, observability
 from probcal.inference.run import maximise
 from probcal.priors import Precision
 from probcal.sensors import radar
@@ -81,6 +82,16 @@ def test_one_elimination_grows_with_epochs_and_rows(benchmark, K):
     with jax.enable_x64(True):
         alpha = Precision.single(jnp.ones(len(problem.labels)))
         benchmark(lambda: jax.block_until_ready(laplace(problem.spec, problem.system, start, alpha).covariance))
+
+
+@pytest.mark.parametrize("plan", [observability, next_passes], ids=lambda plan: plan.__name__)
+@pytest.mark.parametrize(("N", "K"), [(10, 100), (100, 1000)])
+def test_check(benchmark, N, K, plan):
+    problem, start = network(N, K)
+    began = time.perf_counter()
+    plan(problem, point=start)
+    benchmark.extra_info["compile_s"] = time.perf_counter() - began
+    benchmark.pedantic(plan, (problem,), {"point": start}, rounds=3, warmup_rounds=0)
 
 
 def test_fifty_em_ea_iterations_of_c1(benchmark):

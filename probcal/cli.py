@@ -340,14 +340,15 @@ def _print_check(problem: Problem, tree: xr.DataTree, plans: tuple[xr.Dataset, x
     print("share: how much of the answer the data give under a prior of one scale; sd: the bound that goes with it")
     sensors = tree["sensor"].to_dataset().to_dataframe().sort_values("leverage")
     print("biases that the rows of each sensor determine: " + _listed(sensors["leverage"]))
-    print(f"the motion determines {tree['target'].attrs['motion']:.2g}, targets " + _listed(
-        tree["target"].to_dataset()["leverage"].to_series().sort_values()))  # fmt: skip
+    targets = tree["target"].to_dataset()["leverage"].to_series().sort_values()
+    print(f"of each target: {_listed(targets)}; of the motion: {tree['target'].attrs['motion']:.2f}")
     print(_directions_text(tree))
     passes, anchors, sensors_ = plans
     print(f"weak directions now: {passes.attrs['weak_before']}. What would tell most (nats; weak directions left):")
     path = passes["path"].values[0]
     ends = " to ".join("(" + ", ".join(f"{v:.4g}" for v in place) + ")" for place in path[[0, -1]][: len(path)])
-    print(f"  another pass, {ends} m: {passes['gain'].values[0]:.2f} ({passes['weak'].values[0]})")
+    what = "another pass" if len(path) > 1 else "another target"
+    print(f"  {what}, {ends} m: {passes['gain'].values[0]:.2f} ({passes['weak'].values[0]})")
     print(f"  a survey of {anchors['anchor'].values[0]} to {anchors.attrs['survey']:g} of its scale: "
           f"{anchors['gain'].values[0]:.2f} ({anchors['weak'].values[0]})")  # fmt: skip
     place = ", ".join(f"{v:.4g}" for v in sensors_["place"].values[0])
@@ -359,7 +360,7 @@ def _directions_text(tree: xr.DataTree) -> str:
     if "direction" not in tree.children:
         return "the data determine every direction of the biases"
     group = tree["direction"].to_dataset()
-    lines = [f"{group.sizes['direction']} directions of the biases that the data hardly determine:"]
+    lines = [f"{group.sizes['direction']} directions of the biases that the data hardly determine; remedies add up:"]
     for k in range(group.sizes["direction"]):
         kind, share, words = (group[name].values[k] for name in ("kind", "share", "words"))
         lines.append(f"  {k + 1}. {group['direction'].values[k]} ({kind}, the data give {share:.2g} of the answer)")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 import probcal
 
@@ -104,6 +105,36 @@ def test_freed_beacons_end_at_bound_and_name_the_dilation():
         "anchor the positions of two nodes",
     ):
         assert word in done.stderr
+
+
+def test_check_names_what_freed_beacons_leave_open(tmp_path):
+    done = run("check", ROOT / "models" / "plaza_free.py", "--out", tmp_path / "check")
+    assert done.returncode == 1, done.stderr
+    for words in (
+        "translation of all nodes along x",
+        "all nodes move 1 m north together",
+        "dilation: all positions grow or shrink together",
+        "distances from the centre grow together and the range scales with them",
+        "rotation",
+        "another pass",
+    ):
+        assert words in done.stdout
+    frame = pd.read_csv(tmp_path / "check" / "check.csv")
+    assert list(frame.columns) == ["bias", "unit", "scale", "kind", "sd", "share", "verdict"]
+    assert len(frame) == 16
+    assert (tmp_path / "check" / "check.png").stat().st_size > 10_000
+    tree = xr.open_datatree(tmp_path / "check" / "check.nc", engine="h5netcdf")
+    assert tree.attrs["status"] == "open"
+    tree.close()
+
+
+def test_check_of_what_is_only_weak_ends_with_0(model, rows, monkeypatch, capsys):
+    code, out, _ = call(monkeypatch, capsys, "check", model, rows)
+    assert code == 0
+    assert "hardly determine" in out
+    code, out, _ = call(monkeypatch, capsys, "check", model, rows, "--fix", "gauge_0.range_offset")
+    assert code == 0
+    assert "gauge_0.range_offset" not in out
 
 
 def test_simulate_fit_track_report_of_a_small_model(model, rows, tmp_path, monkeypatch, capsys):

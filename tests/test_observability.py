@@ -1,5 +1,7 @@
 """What data can determine: gauge directions counted against dense ranks, named, anchored; what to measure next."""
 
+from fnmatch import fnmatch
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -341,6 +343,10 @@ def test_the_gain_of_an_anchor_has_a_closed_form():
     gain = found["gain"].sel(anchor="node_3.heading").item()
     np.testing.assert_allclose(gain, 0.5 * np.log1p(covariance[m, m] / 0.01), rtol=1e-9)
     assert (np.diff(found["gain"].values) <= 1e-12).all()
+    for anchor in ("node_3.position_*", "node_0.heading", "node_1.position_x"):
+        stays = [fnmatch(label, anchor) for label in problem.labels]
+        held = spectrum(problem, point) + np.diag(100.0 * np.array(stays))
+        assert found["weak"].sel(anchor=anchor).item() == (np.linalg.eigvalsh(held) < 1).sum()
     assert found["weak"].sel(anchor="node_3.position_*").item() < found.attrs["weak_before"]
 
 

@@ -16,7 +16,7 @@ import xarray as xr
 from probcal.network import Network, Node
 from probcal.problem import Epochs, Problem, Spec, System
 from probcal.sensor import SensorType
-from probcal.smoothing.directions import WEAK, marginal
+from probcal.smoothing.directions import WEAK
 from probcal.smoothing.information import marginal_information
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start
@@ -73,17 +73,21 @@ def next_anchors(problem: Problem, *, point: Point | None = None, survey: float 
     for m, bias in enumerate(problem.biases):
         if bias.component == "position":
             groups.setdefault(f"{bias.owner}.position_*", []).append(m)
-    matrices = []
-    for members in groups.values():
-        matrix = known.copy()
-        matrix[members, members] += survey**-2
-        matrices.append(matrix)
-    gains, left = _gains(problem, known, np.stack(matrices))
+    covariance = np.linalg.inv(known + np.eye(len(known)))
+    apart = np.linalg.inv(_less_one(problem, known))
+    before = _weak(problem, known)
+    found = []
+    for g in groups.values():
+        eye = np.eye(len(g))
+        gain = 0.5 * np.linalg.slogdet(eye + covariance[np.ix_(g, g)] / survey**2)[1]
+        inner = np.linalg.eigvalsh(-eye - apart[np.ix_(g, g)] / survey**2)  # inertia of the sum (Haynsworth 1968)
+        found.append((gain, before + int((inner < 0).sum()) - len(g)))
+    gains, left = (np.array(column) for column in zip(*found, strict=True))
     order = np.argsort(-gains, kind="stable")
     return xr.Dataset(
         {"gain": ("anchor", gains[order]), "weak": ("anchor", left[order])},
         coords={"anchor": np.array(list(groups))[order]},
-        attrs={"survey": survey, "weak_before": _weak(problem, known)},
+        attrs={"survey": survey, "weak_before": before},
     )
 
 
@@ -158,9 +162,13 @@ def _gains(problem: Problem, known: np.ndarray, with_it: np.ndarray) -> tuple[np
 
 
 def _weak(problem: Problem, information: np.ndarray) -> int:
-    """Number of weak directions, surveyed biases marginalised."""
-    free = ~problem.surveyed
-    return int((np.linalg.eigvalsh(marginal(information, free)) < WEAK).sum()) if free.any() else 0
+    """Number of weak directions of an information (M, M), surveyed biases marginalised."""
+    return int((np.linalg.eigvalsh(_less_one(problem, information)) < 0).sum())
+
+
+def _less_one(problem: Problem, information: np.ndarray) -> np.ndarray:
+    """A matrix (M, M) with a negative eigenvalue for each weak direction, those of its Schur complement."""
+    return information + np.diag(np.where(problem.surveyed, 1.0, -WEAK))
 
 
 def _levels(problem: Problem, other: Problem, point: Point) -> jax.Array:
