@@ -25,6 +25,7 @@ INNER = {2: 24, 3: 10}  # grid points an axis inside the network
 OUTER = {2: 48, 3: 60}  # directions of the outer rings
 RINGS = (0.8, 1.2, 1.8, 2.8, 5.0, 9.0)  # their radii in extents
 NEAR = 0.05  # error of a position found on the grid, in extents
+WINDOW_ROWS = 60  # rows of a window that are looked at, where there are more
 BEAM = 200  # candidates a window that the path may pass
 TRIED = 60  # swaps of two nodes that are tried for further starts
 DRAWN = 3  # draws of the biases that are tried for one further start
@@ -77,7 +78,8 @@ def _profile(
     first = part.F[:, 0, 0] == 0
     precision = 1.0 / jnp.maximum(jnp.sum(factors(part, levels) ** 2, 2), 1e-12)
     precision = jnp.where(held[None, :], 1e12, jnp.where(first[:, None], precision, jnp.min(precision, 0)[None, :]))
-    for _ in range(2):
+    loose = jnp.asarray(np.flatnonzero(~held), int)
+    for _ in range(2 if len(loose) else 0):
         A, b = jax.vmap(jnp.diag)(precision), precision * (resting - states) * ~held[None, :]
         for block, data in mine:
             lin = rows.linearise(block, data, states, z, levels, expected=False)
@@ -88,10 +90,8 @@ def _profile(
                 jax.ops.segment_sum(jnp.einsum("ncu,nc,ncv->nuv", lin.state, weight, lin.state), data.epoch, E)
             )
             b = b.at[:, used].add(jax.ops.segment_sum(jnp.einsum("ncu,nc->nu", lin.state, pull), data.epoch, E))
-        loose = jnp.asarray(np.flatnonzero(~held), int)
-        if len(loose):
-            step = linalg.solve_batched(A[:, loose[:, None], loose[None, :]], b[:, loose])
-            states = states.at[:, loose].add(step)
+        step = linalg.solve_batched(A[:, loose[:, None], loose[None, :]], b[:, loose])
+        states = states.at[:, loose].add(step)
     loss = jnp.zeros(E)
     for block, data in mine:
         lin = rows.linearise(block, data, states, z, levels, expected=False)
@@ -131,9 +131,39 @@ def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndar
     return kept[np.arange(len(loss)), path[::-1]]
 
 
+def _thinned(problem: Problem, r: int) -> System:
+    """The system with enough rows of every window of recursion r for a place, evenly spaced over its epochs."""
+    epochs, counts = problem.epochs[r], np.zeros(len(problem.epochs[r].time))
+    for rows_, own in zip(problem.system.rows, problem.spec.recursion, strict=True):
+        if own == r:
+            np.add.at(counts, np.asarray(rows_.epoch), np.asarray(rows_.mask).any(1))
+    kept = np.zeros(len(counts), bool)
+    for name in dict.fromkeys(epochs.target):
+        for window in _windows(np.flatnonzero(epochs.target == name)):
+            stride = max(1, int(min(counts[window].sum() / WINDOW_ROWS, len(window) / 2)))
+            kept[window[::stride]] = True
+    thin = tuple(
+        _some(data, kept) if own == r else data
+        for data, own in zip(problem.system.rows, problem.spec.recursion, strict=True)
+    )
+    return problem.system._replace(rows=thin)
+
+
+def _some(data: rows.Rows, kept: np.ndarray) -> rows.Rows:
+    """The rows of the epochs that are kept (E,)."""
+    mine = np.flatnonzero(kept[np.asarray(data.epoch)])
+    by_row = {name: getattr(data, name)[mine] for name in ("epoch", "sensor", "pose", "y", "mask", "std", "level")}
+    return data._replace(**by_row)
+
+
+def _windows(epochs: np.ndarray) -> list[np.ndarray]:
+    """Epochs of one target (E,) in windows that each get one place."""
+    return np.array_split(epochs, min(WINDOWS, len(epochs)))
+
+
 def _path(problem: Problem, time: np.ndarray, loss: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Positions (E, d) of one target along the cheapest path through the candidates."""
-    windows = np.array_split(np.arange(len(time)), min(WINDOWS, len(time)))
+    windows = _windows(np.arange(len(time)))
     centre = np.array([time[w].mean() for w in windows])
     inside = np.stack([loss[:, w].sum(1) for w in windows])
     d = problem.network.dimension
@@ -183,7 +213,7 @@ def _grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
         path, known = _known(problem, r, span)
         unknown = [name for name in dict.fromkeys(epochs.target) if not known[epochs.target == name].all()]
         if unknown:
-            loss = np.asarray(_losses(problem.spec, problem.system, r, span, z, jnp.asarray(places)))
+            loss = np.asarray(_losses(problem.spec, _thinned(problem, r), r, span, z, jnp.asarray(places)))
         for name in unknown:
             mine = epochs.target == name
             path[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)
