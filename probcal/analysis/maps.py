@@ -66,7 +66,7 @@ def bound_map(
     values = np.asarray(_spectra(at.spec, at.system, span, point, jnp.asarray(root), jnp.asarray(places)))
     with np.errstate(divide="ignore"):
         rmse = np.sqrt((1.0 / values).sum(1))
-    largest = float(np.hypot(np.ptp(x), np.ptp(y)))
+    largest = float(np.hypot(*np.ptp(np.asarray(area, float), axis=1)))
     variables = {
         "rmse": np.minimum(rmse, largest), "determined": rmse < largest,
         "trace": values.sum(1), "smallest": values[:, 0],
