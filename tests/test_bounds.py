@@ -293,7 +293,7 @@ def test_posterior_bound_of_c1_against_500_runs():
     each = squares.mean(0) / bound
     print(f"mse {error:.4f} +- {spread:.4f}, bound {bound.mean():.4f}, by bias {each.min():.2f} to {each.max():.2f}")
     assert bound.mean() < error + 3 * spread
-    assert error < 1.5 * bound.mean()
+    assert error < 1.2 * bound.mean()
 
 
 # maps
@@ -432,6 +432,9 @@ def test_a_map_in_space_at_a_height_with_a_moving_node():
     problem = Problem(network, motion, first.assign(target="plane"))
     low, high = (bound_map(problem, AREA, 4, z=z, target="post") for z in (30.0, 300.0))
     np.testing.assert_allclose(low["node_position"].sel(node="mover"), [40.0, 0.0, 5.0])
+    late = bound_map(problem, AREA, 4, z=30.0, target="post", time=10.0)
+    np.testing.assert_allclose(late["node_position"].sel(node="mover"), [80.0, 0.0, 5.0])
+    assert abs(late["rmse"] / low["rmse"] - 1).max() > 0.05
     assert (low["rmse"] < high["rmse"]).all()
     assert float(low["z"]) == 30.0
     assert low.attrs["target"] == "post"

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal import linalg
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import Key, Truth, as_key, on_tracks
 from probcal.smoothing import recursion as rec
@@ -175,7 +174,7 @@ def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.n
     if not len(alone):
         return np.zeros((0, 0)), np.zeros(0, bool)
     size = np.sqrt(np.where(alone > 0, alone, 1.0))
-    values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(information / np.outer(size, size))))
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
     lost = values <= LOST
     bounded = np.abs(vectors[:, lost]).max(1, initial=0.0) <= INVOLVED
     inverse = (vectors[:, ~lost] / values[~lost]) @ vectors[:, ~lost].T
