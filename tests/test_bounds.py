@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_exact import CASES
+from test_metamorphic import plane, space, waves
 
 import probcal
 from probcal import (
@@ -270,6 +271,31 @@ def test_errors_of_maximum_likelihood_at_low_noise_reach_the_parametric_bound():
         found = np.asarray(likeliest(problem.spec, problem.system, point, precision, keys))
     ratio = np.sqrt(((found - z) ** 2).mean(0)) * problem.scales / tree["bias"]["sd"].values
     assert np.abs(ratio - 1).max() < 0.05, dict(zip(problem.labels, ratio.round(3), strict=True))
+
+
+@pytest.mark.parametrize("world", [plane(), waves(), space()], ids=["plane", "waves", "space"])
+def test_a_turned_and_moved_world_has_the_same_bounds(world):
+    """Radars, finders, ranges, time differences, levels and presence, in 2-D and 3-D; places as rms over their axes."""
+    angle, d = 0.7, len(world.nodes[0]["position"])
+    shift, axes = np.array([40.0, -15.0, 6.0])[:d], [f"position_{a}" for a in "xyz"[:d]]
+    time, found = np.array(world.time), []
+    table = probcal.simulate(world.network(), world.motion(), time, key=3).table
+    for moved in (world, world.moved(angle, shift)):
+        frames = [
+            pd.DataFrame(np.array(p) + time[:, None] * np.array(v), columns=axes).assign(time=time, target=name)
+            for name, (p, v) in moved.starts.items()
+        ]
+        tree = bounds(moved.problem(table), "parametric", truth=Truth(pd.concat(frames)))
+        groups = {}
+        for label, sd in tree["bias"]["sd"].to_series().items():
+            groups.setdefault(label.split("_x")[0].split("_y")[0].split("_z")[0], []).append(sd**2)
+        found.append((tree, {name: sum(squares) for name, squares in groups.items()}))
+    (before, one), (after, two) = found
+    assert before.attrs == after.attrs
+    assert set(one) == set(two)
+    np.testing.assert_allclose([one[k] for k in one], [two[k] for k in one], rtol=1e-6)
+    np.testing.assert_allclose(after["track"]["position_rmse"], before["track"]["position_rmse"], rtol=1e-6)
+    assert (before["track"]["position_rmse"] > 0).all()
 
 
 @pytest.mark.slow
