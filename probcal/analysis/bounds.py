@@ -47,7 +47,8 @@ def bounds(
     Groups: `bias` (`sd` and `covariance` in the unit of the bias, `unit`, `scale`, dim `bias_label`) and `track` (`sd`
     by `epoch` and `component`, `position_rmse` in m). A bias has no bound where it takes part in a direction of which
     the elimination leaves less than 1e-12 of the information that its biases would have with all else known; such
-    biases are left out of `bias`, listed in the group `unbounded` and named in the attribute `message`.
+    biases are left out of `bias`, listed in the group `unbounded` and named in the attribute `message`, which also
+    names those whose bound exceeds their scale.
     Raises `InputError` for an unknown kind or label, tracks with gaps, and draws at which a sensor is not finite.
     """
     if kind not in KINDS:
@@ -78,7 +79,7 @@ def true_biases(problem: Problem, truth: Truth) -> jax.Array:
     for label in truth.biases:
         if label not in problem.network.labels:
             raise InputError(
-                f'the truth names the bias "{label}", which the network lacks{nearest(label, problem.labels)}'
+                f'the truth names the bias "{label}", which the network lacks{nearest(label, problem.network.labels)}'
             )
     return jnp.asarray([truth.biases.get(b.label, 0.0) / b.scale for b in problem.biases], float)
 
@@ -205,12 +206,25 @@ def _tree(
         for epochs, v in zip(problem.epochs, variances, strict=True)
     ]
     groups = {"bias": bias, "track": by_epoch(problem, {"sd": [np.sqrt(v) for v in variances], "position_rmse": place})}
-    message = "Every bias is bounded."
+    message = _message(labels, bounded, np.sqrt(np.diag(covariance)) > problem.scales[bounded])
     if not bounded.all():
-        open_ = labels[~bounded]
-        groups["unbounded"] = xr.Dataset({"unit": ("bias_label", units[~bounded])}, coords={"bias_label": open_})
-        shown = ", ".join(open_[:12]) + (f" and {len(open_) - 12} more" if len(open_) > 12 else "")
-        message = f"Unbounded: the data say nothing of some combination of {shown}; survey or fix some of them."
+        own = {"unit": ("bias_label", units[~bounded])}
+        groups["unbounded"] = xr.Dataset(own, coords={"bias_label": labels[~bounded]})
     tree = xr.DataTree.from_dict(groups)
     tree.attrs.update(kind=kind, draws=count, message=message, data=problem.measurements.table.source)
     return tree
+
+
+def _message(labels: np.ndarray, bounded: np.ndarray, loose: np.ndarray) -> str:
+    """What has no bound, and which of the bounded (M',) have one beyond their scale, in words."""
+
+    def listed(names: np.ndarray) -> str:
+        return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
+
+    found = []
+    if not bounded.all():
+        open_ = listed(labels[~bounded])
+        found.append(f"Unbounded: the data say nothing of some combination of {open_}; survey or fix some of them.")
+    if loose.any():
+        found.append(f"Bounded beyond their scale, the data leave them to a prior: {listed(labels[bounded][loose])}.")
+    return " ".join(found) or "Every bias has a bound within its scale."
