@@ -21,7 +21,7 @@ def plot_bound_map(found: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax.set_facecolor("0.75")
     values = np.ma.masked_array(found["rmse"].values, ~found["determined"].values)
     if values.count():
-        _surface(ax, found["x"].values, found["y"].values, values, "position bound in m")
+        _surface(ax, found["x"].values, found["y"].values, values, "position bound in m", WIDE)
     nodes = found["node_position"].values[:, :2]
     ax.plot(*nodes.T, "s", color="black", markerfacecolor="white", markersize=6, zorder=4)
     if len(nodes) <= NAMED:
@@ -30,6 +30,9 @@ def plot_bound_map(found: xr.Dataset, ax: Axes | None = None) -> Axes:
                 plain(name), place, xytext=(6, 6), textcoords="offset points", zorder=5, fontsize=8,
                 annotation_clip=True, bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8},
             )  # fmt: skip
+    for values, limit in ((found["x"].values, ax.set_xlim), (found["y"].values, ax.set_ylim)):
+        half = np.ptp(values) / (2 * (len(values) - 1)) if len(values) > 1 else 0.5
+        limit(values.min() - half, values.max() + half)
     height = f" at z = {float(found['z']):g} m" if "z" in found.coords else ""
     ax.set(xlabel="x in m", ylabel="y in m")
     ax.set_title(f"Least position error{height}, biases {plain(found.attrs['biases'])}", loc="left")
@@ -55,16 +58,16 @@ def plot_sensitivity(found: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax = new_axes(ax, 6.5, 5.0)
     down, across = dims
     values = np.ma.masked_array(found["rmse"].values)
-    _surface(ax, found[across].values, found[down].values, values, "RMS position error in m")
+    _surface(ax, found[across].values, found[down].values, values, "RMS position error in m", np.inf)
     ax.set(xlabel=f"std of {plain(across)}", ylabel=f"std of {plain(down)}")
     ax.set_title("Tracks that ignore the biases", loc="left")
     return ax
 
 
-def _surface(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, label: str) -> None:
-    """Heat map of values (y, x) with its colour bar, and labelled contours where the grid has room for them."""
+def _surface(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, label: str, most: float) -> None:
+    """Heat map of values (y, x) with its colour bar and contours; logarithmic where they span more than a ratio."""
     low, high = float(values.min()), float(values.max())
-    wide = low > 0 and high > WIDE * low
+    wide = low > 0 and high > most * low
     norm: Any = LogNorm(low, high) if wide else Normalize(low, high)
     drawn = ax.pcolormesh(x, y, values, cmap=SURFACE, norm=norm, shading="nearest", rasterized=True)
     figure = ax.get_figure()
