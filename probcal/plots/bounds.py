@@ -30,9 +30,9 @@ def plot_bound_map(found: xr.Dataset, ax: Axes | None = None) -> Axes:
                 plain(name), place, xytext=(6, 6), textcoords="offset points", zorder=5, fontsize=8,
                 annotation_clip=True, bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8},
             )  # fmt: skip
-    for values, limit in ((found["x"].values, ax.set_xlim), (found["y"].values, ax.set_ylim)):
-        half = np.ptp(values) / (2 * (len(values) - 1)) if len(values) > 1 else 0.5
-        limit(values.min() - half, values.max() + half)
+    for side, limit in ((found["x"].values, ax.set_xlim), (found["y"].values, ax.set_ylim)):
+        half = np.ptp(side) / (2 * (len(side) - 1)) if len(side) > 1 else 0.5
+        limit(side.min() - half, side.max() + half)
     height = f" at z = {float(found['z']):g} m" if "z" in found.coords else ""
     ax.set(xlabel="x in m", ylabel="y in m")
     ax.set_title(f"Least position error{height}, biases {plain(found.attrs['biases'])}", loc="left")
