@@ -403,12 +403,9 @@ def _fixed(network: Network, fix: Mapping[str, float] | Iterable[str]) -> dict[s
 
 
 def _check_rows(data: Measurements, network: Network) -> tuple[str, ...]:
-    """Raise `InputError` where there is nothing to fit; returns the names of the sensors without rows."""
-    source = data.table.source
+    """Raise `InputError` where nothing was measured; returns the names of the sensors without rows."""
     measured = data.measured.any(1)
-    if measured.sum() == 0:
-        raise InputError(f"{source} has no measured value; fill the channel columns")
-    if measured.sum() == 1:
-        raise InputError(f"{source} has one measured row only; a fit needs at least two")
+    if not measured.any():
+        raise InputError(f"{data.table.source} has no measured value; fill the channel columns")
     seen = set(data.sensor[measured])
     return tuple(placed.name for k, placed in enumerate(network.sensors) if k not in seen)

@@ -14,7 +14,7 @@ import pandas as pd
 from probcal import rows
 from probcal.network import Network
 from probcal.noise import Bernoulli
-from probcal.problem import Problem
+from probcal.problem import Epochs, Problem
 from probcal.table import Table, factor, header, name_of, numbers, read_table
 from probcal.types import AXES, InputError, float64, nearest
 
@@ -51,24 +51,37 @@ class Truth:
         found = np.full((len(time), dimension), np.nan)
         if not isinstance(self.tracks, pd.DataFrame):
             return found
-        owner = self.tracks["target"].map(name_of) if "target" in self.tracks else None
         columns = [f"position_{axis}" for axis in AXES[:dimension]]
         if columns[-1] not in self.tracks:
             raise InputError(f'truth: the tracks have no column "{columns[-1]}", the network is {dimension}-D')
         for name in np.unique(target):
-            track = self.tracks if owner is None else self.tracks[owner == name]
-            if not len(track):
-                continue
-            track = track.sort_values("time")
             mine = target == name
-            known, at = track["time"].to_numpy(float), time[mine]
-            if len(known) == 1:
+            track = self.track(name, time[mine])
+            if track is not None:
                 found[mine] = track[columns].to_numpy(float)
-                continue
-            inside = (at >= known[0] - 1e-9) & (at <= known[-1] + 1e-9)
-            values = np.stack([np.interp(at, known, track[c].to_numpy(float)) for c in columns], -1)
-            found[mine] = np.where(inside[:, None], values, np.nan)
         return found
+
+    def track(self, target: str, time: np.ndarray) -> pd.DataFrame | None:
+        """State of a target at times (E,), interpolated, one column a component; NaN outside its track, None without.
+
+        A track of a single row is that of a target which does not move.
+        """
+        if not isinstance(self.tracks, pd.DataFrame):
+            return None
+        track = self.tracks
+        if "target" in track:
+            track = track[track["target"].map(name_of) == target]
+        if not len(track):
+            return None
+        track = track.sort_values("time")
+        values = track.drop(columns=["time", "target"], errors="ignore").apply(pd.to_numeric, errors="coerce")
+        values = values.dropna(axis=1)
+        known = track["time"].to_numpy(float)
+        if len(known) == 1:
+            return values.loc[values.index.repeat(len(time))].reset_index(drop=True)
+        inside = (time >= known[0] - 1e-9) & (time <= known[-1] + 1e-9)
+        columns = {n: np.interp(time, known, column.to_numpy(float)) for n, column in values.items()}
+        return pd.DataFrame({n: np.where(inside, column, np.nan) for n, column in columns.items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +177,7 @@ def simulate(
     keys = jax.random.split(as_key(key), 6)
     targets = list(tracks) if tracks else [str(name) for name in motion] if isinstance(motion, Mapping) else ["target"]
     plan = _plan(network, time, targets) if schedule is None else schedule.reset_index(drop=True)
-    problem = Problem(network, motion, _blank(network, plan))
+    problem = Problem(network, motion, blank(network, plan))
     z = _biases(problem, share, biases, keys[0])
     states = [_states(problem, r, tracks, keys[1]) for r in range(len(problem.epochs))]
     columns = {name: np.full(len(plan), np.nan) for name in network.channel_names}
@@ -197,7 +210,7 @@ def _plan(network: Network, time: np.ndarray, targets: list[str]) -> pd.DataFram
     return plan if targets != ["target"] else plan.drop(columns="target")
 
 
-def _blank(network: Network, plan: pd.DataFrame) -> pd.DataFrame:
+def blank(network: Network, plan: pd.DataFrame) -> pd.DataFrame:
     """The plan with every channel of its sensors filled with 0, so that all rows exist."""
     own = {s.name: {name for name, _ in s.type.expand(network.dimension)} for s in network.sensors}
     filled = {
@@ -233,11 +246,23 @@ def _states(problem: Problem, r: int, tracks: Mapping[str, Any], key: jax.Array)
     for e in range(len(noise)):
         previous = F[e] @ previous + drift[e] + L[e] @ noise[e]
         states[e] = previous
-    for name, track in tracks.items():
+    count = {name: int((epochs.target == name).sum()) for name in tracks}
+    frames = {
+        name: _frame(track, problem.network.dimension, count[name], name)
+        for name, track in tracks.items()
+        if count[name]
+    }
+    return on_tracks(epochs, states, frames)
+
+
+def on_tracks(epochs: Epochs, states: np.ndarray, tracks: Mapping[str, pd.DataFrame]) -> np.ndarray:
+    """States (E, n) with the tracks put over them: by target, a frame of state columns with one row an epoch.
+
+    A velocity that a track does not state is the difference of its positions; what it leaves out stays.
+    """
+    states = states.copy()
+    for name, frame in tracks.items():
         mine = np.flatnonzero(epochs.target == name)
-        if not len(mine):
-            continue
-        frame = _frame(track, problem.network.dimension, len(mine), name)
         for j, component in enumerate(epochs.components):
             if component in frame:
                 states[mine, j] = frame[component].to_numpy(float)

@@ -192,17 +192,25 @@ def direction_group(labels: Sequence[str], directions: Sequence[Any]) -> xr.Data
 
 def track_group(problem: Problem, tracks: Sequence[Tracks]) -> xr.Dataset:
     """Mean, sd and uncalibrated mean of every state, with times and targets of the epochs."""
+    return by_epoch(problem, {name: [getattr(t, name) for t in tracks] for name in ("mean", "sd", "before")})
+
+
+def by_epoch(problem: Problem, variables: Mapping[str, Sequence[np.ndarray]]) -> xr.Dataset:
+    """Variables of each recursion, (E, n) by state component or (E,), with times and targets of the epochs.
+
+    Their names and dimensions carry a suffix where a problem has several recursions.
+    """
     values: dict[str, Any] = {}
     coords: dict[str, Any] = {}
-    for r, (epochs, moments) in enumerate(zip(problem.epochs, tracks, strict=True)):
+    for r, epochs in enumerate(problem.epochs):
         s = _suffix(problem, r)
         coords |= {
             f"component{s}": list(epochs.components),
             f"epoch_time{s}": (f"epoch{s}", epochs.time),
             f"epoch_target{s}": (f"epoch{s}", np.asarray(epochs.target, str)),
         }
-        for name, value in (("mean", moments.mean), ("sd", moments.sd), ("before", moments.before)):
-            values[f"{name}{s}"] = ((f"epoch{s}", f"component{s}"), value)
+        for name, parts in variables.items():
+            values[f"{name}{s}"] = ((f"epoch{s}", f"component{s}")[: parts[r].ndim], parts[r])
     return xr.Dataset(values, coords=coords)
 
 
@@ -211,6 +219,40 @@ def build_tracks(problem: Problem, tracks: Sequence[Tracks]) -> xr.DataTree:
     tree = xr.DataTree.from_dict({"track": track_group(problem, tracks)})
     tree.attrs["data"] = problem.measurements.table.source
     return tree
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibration in the numbers of a problem: the problem with the same biases held, z, its covariance, levels."""
+
+    problem: Problem
+    z: np.ndarray  # (M,)
+    covariance: np.ndarray  # (M, M)
+    levels: np.ndarray  # (H,) log factors
+
+
+def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
+    """What a fit found, for another problem of its network; biases and levels are matched by label.
+
+    Biases that the fit held are held; a level that it did not estimate stays at its guess. Raises `InputError` if the
+    calibration lacks a bias.
+    """
+    constant = calibration["constant_data"].to_dataset()
+    held = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
+    held = {label: value for label, value in held.items() if label in problem.labels}
+    problem = problem.rebuild(fix=problem.fixed | held) if held else problem
+    group, labels = calibration["calibration"].to_dataset(), list(problem.labels)
+    known = [str(label) for label in group["bias_label"].values]
+    for label in labels:
+        if label not in known:
+            raise InputError(f'the calibration has no bias "{label}"; fit the same network, or fix that bias')
+    mean = group["mean"].sel(bias_label=labels).values
+    spread = group["covariance"].sel(bias_label=labels, bias_label_other=labels).values
+    levels = np.zeros(len(problem.levels))
+    if problem.levels and "level" in calibration.children:
+        found = calibration["level"].to_dataset()["std"].to_series()
+        levels = np.array([np.log(found.get(r.label, r.guess) / r.guess) for r in problem.levels])
+    return Calibrated(problem, mean / problem.scales, spread / np.outer(problem.scales, problem.scales), levels)
 
 
 def constant_group(problem: Problem) -> xr.Dataset:

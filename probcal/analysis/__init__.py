@@ -1,6 +1,9 @@
 """Before and after a fit: observability, the next pass or sensor, bounds, and whether a result can be trusted."""
 
+from probcal.analysis.bounds import bounds
+from probcal.analysis.maps import bound_map
 from probcal.analysis.observability import observability
 from probcal.analysis.planning import next_anchors, next_passes, next_sensors
+from probcal.analysis.sensitivity import sensitivity
 
-__all__ = ["next_anchors", "next_passes", "next_sensors", "observability"]
+__all__ = ["bound_map", "bounds", "next_anchors", "next_passes", "next_sensors", "observability", "sensitivity"]

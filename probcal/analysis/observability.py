@@ -7,12 +7,13 @@ import numpy as np
 import xarray as xr
 
 from probcal import tree
+from probcal.analysis.standpoint import standpoint
 from probcal.problem import Problem
+from probcal.simulate import Truth
 from probcal.smoothing.directions import WEAK, Direction, weak_directions
 from probcal.smoothing.gauge import NULL, gauge
 from probcal.smoothing.information import Moments, leverages, marginal_information, moments
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import automatic_start
 from probcal.types import InputError, float64
 
 RULE = (
@@ -24,19 +25,20 @@ HALF = 0.5  # share below which a bias is weak
 
 
 @float64
-def observability(problem: Problem, *, point: Point | None = None) -> xr.DataTree:
+def observability(problem: Problem, *, point: Point | None = None, truth: Truth | None = None) -> xr.DataTree:
     """What data and surveys determine, before any fit: a tree whose directions, biases and sensors bear names.
 
     The information of the biases has every trajectory marginalised (papers README, standard forms) and is in units of
-    the prior scale; it is taken at `point`, by default the automatic start. Groups: `bias` (share of each answer that
-    the data give under a prior of one scale, the bound on its sd, the information matrix), `spectrum`, `direction`
-    (gauge and weak ones with words and remedies), `datum`, `sensor` and `target` (how many biases each determines:
-    their leverages, which add up with what the motion tells), `track`. Attributes: `status` (determined; weak; open,
-    where the data say next to nothing of a direction), `rule`, counts. Raises `InputError` where no bias is free.
+    the prior scale. It is taken at the automatic start, at a `truth` (tracks and biases: to plan before there are
+    data), or at a `point`. Groups: `bias` (share of each answer that the data give under a prior of one scale, the
+    bound on its sd, the information matrix), `spectrum`, `direction` (gauge and weak ones with words and remedies),
+    `datum`, `sensor` and `target` (how many biases each determines: their leverages, which add up with what the motion
+    tells), `track`. Attributes: `status` (determined; weak; open, where the data say next to nothing of a direction),
+    `rule`, counts. Raises `InputError` where no bias is free.
     """
     if not problem.labels:
         raise InputError("observability: the problem has no free bias; declare a Bias, a survey or a scale")
-    point = automatic_start(problem) if point is None else point
+    point = standpoint(problem, point, truth)
     found = _information(problem, point)
     null = gauge(problem, point)
     directions = weak_directions(problem, found.information, point, null)

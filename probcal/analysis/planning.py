@@ -13,13 +13,14 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from probcal.analysis.standpoint import standpoint
 from probcal.network import Network, Node
 from probcal.problem import Epochs, Problem, Spec, System
 from probcal.sensor import SensorType
+from probcal.simulate import Truth
 from probcal.smoothing.directions import WEAK
 from probcal.smoothing.information import marginal_information
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import automatic_start
 from probcal.table import Table, header
 from probcal.types import AXES, InputError, float64
 
@@ -31,14 +32,17 @@ MARGIN = 0.2  # of the area around nodes and tracks
 
 
 @float64
-def next_passes(problem: Problem, *, point: Point | None = None, passes: Any = None) -> xr.Dataset:
+def next_passes(
+    problem: Problem, *, point: Point | None = None, truth: Truth | None = None, passes: Any = None
+) -> xr.Dataset:
     """What one more pass of a target would tell, and where: gain (nats) and weak directions left, the best first.
 
     A pass is seen by the sensors, at the instants and with the noise that saw the target with most rows (its first
     300 epochs). Candidates are `passes` (P, 2 or more, d), polylines in m travelled evenly, by default straight
-    lines through the area in eight directions; places on a grid for static targets. Raises `InputError` for the shape.
+    lines through the area in eight directions; places on a grid for static targets. All is taken at the automatic
+    start, a `truth` or a `point`. Raises `InputError` for the shape.
     """
-    point = automatic_start(problem) if point is None else point
+    point = standpoint(problem, point, truth)
     name, part = _pattern(problem)
     epochs, start = part.epochs[0], np.asarray(_states_of(problem, point, name))[: len(part.epochs[0].time)]
     paths = _candidates(problem, point, start, len(epochs.time)) if passes is None else _travelled(passes, epochs.time)
@@ -59,7 +63,9 @@ def next_passes(problem: Problem, *, point: Point | None = None, passes: Any = N
 
 
 @float64
-def next_anchors(problem: Problem, *, point: Point | None = None, survey: float = SURVEY) -> xr.Dataset:
+def next_anchors(
+    problem: Problem, *, point: Point | None = None, truth: Truth | None = None, survey: float = SURVEY
+) -> xr.Dataset:
     """What a survey of each bias, and of each node's position, would tell: gain (nats) and weak directions left.
 
     `survey` is its std over the scale of the bias (over its first survey where it has one). Best first. Raises
@@ -67,7 +73,7 @@ def next_anchors(problem: Problem, *, point: Point | None = None, survey: float 
     """
     if not (np.isfinite(survey) and survey > 0):
         raise InputError(f"next_anchors: survey={survey} must be positive, a std over the scale of a bias")
-    point = automatic_start(problem) if point is None else point
+    point = standpoint(problem, point, truth)
     known = _information(problem, point)
     groups = {label: [m] for m, label in enumerate(problem.labels)}
     for m, bias in enumerate(problem.biases):
@@ -92,13 +98,15 @@ def next_anchors(problem: Problem, *, point: Point | None = None, survey: float 
 
 
 @float64
-def next_sensors(problem: Problem, *, point: Point | None = None, places: Any = None) -> xr.Dataset:
+def next_sensors(
+    problem: Problem, *, point: Point | None = None, truth: Truth | None = None, places: Any = None
+) -> xr.Dataset:
     """What one more sensor of each type, its pose known, would tell about the biases that there are: gain (nats).
 
     It sees every target at every epoch; its own biases are free. `places` (P, d) in m are by default a grid over the
     area; the second node of a two-node type is its first one. Best first. Raises `InputError` for the shape.
     """
-    point = automatic_start(problem) if point is None else point
+    point = standpoint(problem, point, truth)
     d = problem.network.dimension
     places = _grid(problem, point) if places is None else np.asarray(places, float)
     if places.ndim != 2 or places.shape[1] != d:

@@ -147,37 +147,10 @@ def track(problem: Problem, calibration: xr.DataTree) -> xr.DataTree:
     The biases are held at the calibrated means; the sd carries their covariance. Biases are matched by label;
     raises `InputError` if the calibration lacks one.
     """
-    problem = _with_fixed(problem, calibration)
-    group = calibration["calibration"].to_dataset()
-    known = [str(label) for label in group["bias_label"].values]
-    for label in problem.labels:
-        if label not in known:
-            raise InputError(f'the calibration has no bias "{label}"; fit the same network, or fix that bias')
-    chosen = group.sel(bias_label=list(problem.labels))
-    z = jnp.asarray(chosen["mean"].values / problem.scales)
-    spread_of = group["covariance"].sel(bias_label=list(problem.labels), bias_label_other=list(problem.labels)).values
-    covariance = jnp.asarray(spread_of / np.outer(problem.scales, problem.scales))
-    start = _with_levels(problem, automatic_start(problem), calibration)
+    found = tree.apply(problem, calibration)
+    problem, covariance = found.problem, jnp.asarray(found.covariance)
+    start = at_levels(problem.system, automatic_start(problem), jnp.asarray(found.levels))
     before = track_mode(problem, _uncalibrated(start))
-    after = track_mode(problem, start._replace(z=z))
+    after = track_mode(problem, start._replace(z=jnp.asarray(found.z)))
     spread = moments(problem.spec, problem.system, after, covariance)
     return tree.build_tracks(problem, _tracks(after, before, spread, covariance))
-
-
-def _with_fixed(problem: Problem, calibration: xr.DataTree) -> Problem:
-    """The problem with the biases held that the fit held."""
-    constant = calibration["constant_data"].to_dataset()
-    if "fixed" not in constant:
-        return problem
-    held = {str(label): float(value) for label, value in constant["fixed"].to_series().items()}
-    held = {label: value for label, value in held.items() if label in problem.labels}
-    return problem.rebuild(fix=problem.fixed | held) if held else problem
-
-
-def _with_levels(problem: Problem, point: Point, calibration: xr.DataTree) -> Point:
-    """The point at the noise levels that the fit estimated; its states stay, its whitened noises are rescaled."""
-    if not problem.levels or "level" not in calibration.children:
-        return point
-    found = calibration["level"].to_dataset()["std"].to_series()
-    levels = jnp.asarray([np.log(found.get(record.label, record.guess) / record.guess) for record in problem.levels])
-    return at_levels(problem.system, point, levels)

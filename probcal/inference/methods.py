@@ -38,11 +38,13 @@ def choose_prior(method: Method, prior: Prior | None) -> Prior:
 
 
 def check_problem(problem: Problem) -> None:
-    """Raise `InputError` for a problem without free biases or with sensors that have no rows."""
+    """Raise `InputError` for a problem of a single row, without free biases or with sensors that have no rows."""
+    source = problem.measurements.table.source
+    if problem.measurements.measured.any(1).sum() < 2:
+        raise InputError(f"{source} has one measured row only; a fit needs at least two")
     if not problem.labels:
         raise InputError("the problem has no free bias; declare a Bias, a survey or a scale, or use track()")
     if problem.silent:
-        source = problem.measurements.table.source
         raise InputError(f'{source} has no row of sensor "{problem.silent[0]}"; add rows or take it out of the network')
 
 

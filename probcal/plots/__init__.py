@@ -1,11 +1,13 @@
 """Pictures of saved results: matplotlib figures without pyplot, one module a kind of result."""
 
 from probcal.plots.base import INTERVAL, INVALID
+from probcal.plots.bounds import plot_bound_map, plot_sensitivity
 from probcal.plots.fit import plot_biases, plot_gamma, plot_map, plot_objective, plot_outliers, plot_residuals
 from probcal.plots.observability import draw_check, plot_directions, plot_passes, plot_spectrum
 from probcal.plots.study import draw_study, plot_study
 
 __all__ = [
-    "INTERVAL", "INVALID", "draw_check", "draw_study", "plot_biases", "plot_directions", "plot_gamma", "plot_map",
-    "plot_objective", "plot_outliers", "plot_passes", "plot_residuals", "plot_spectrum", "plot_study",
+    "INTERVAL", "INVALID", "draw_check", "draw_study", "plot_biases", "plot_bound_map", "plot_directions", "plot_gamma",
+    "plot_map", "plot_objective", "plot_outliers", "plot_passes", "plot_residuals", "plot_sensitivity", "plot_spectrum",
+    "plot_study",
 ]  # fmt: skip

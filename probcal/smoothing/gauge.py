@@ -14,7 +14,7 @@ import numpy as np
 from probcal import linalg
 from probcal.motion import Known, as_motion
 from probcal.problem import Problem, Spec, System
-from probcal.smoothing.mode import Point, linearise, of_biases, of_both, of_states
+from probcal.smoothing.mode import Point, compress, linearise
 
 NULL = 1e-10  # share of information left below which a direction is a gauge
 CLOSE = 1e-6  # share below which a direction is looked at again, without cancellation
@@ -43,10 +43,10 @@ class Gauge(NamedTuple):
 def free_states(spec: Spec, system: System, point: Point, hold: tuple[jax.Array, ...]) -> Free:
     """Information about the biases with the state of every epoch free but for the precisions `hold` (E, n)."""
     lins = linearise(spec, system, point, expected=True)
-    known, _ = of_biases(spec, system, lins)
-    information, ranks = known, []
-    crosses = of_both(spec, system, lins, point.states)
-    for (J, _), cross, precision in zip(of_states(spec, system, lins, point.states), crosses, hold, strict=True):
+    compressed = compress(spec, system, lins, point.states)
+    known = information = compressed.information
+    ranks = []
+    for (J, _), cross, precision in zip(compressed.states, compressed.crosses, hold, strict=True):
         root, y = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision), cross)
         flat = y.reshape(-1, y.shape[2])
         information = information - linalg.gram(flat, flat)
@@ -58,12 +58,12 @@ def free_states(spec: Spec, system: System, point: Point, hold: tuple[jax.Array,
 def within(spec: Spec, system: System, point: Point, hold: tuple[jax.Array, ...], basis: jax.Array) -> jax.Array:
     """Information (k, k) of combinations (M, k) with free states, from the residuals of rows: no cancellation."""
     lins = linearise(spec, system, point, expected=True)
-    crosses = of_both(spec, system, lins, point.states)
+    compressed = compress(spec, system, lins, point.states)
     k = basis.shape[1]
     padded = jnp.concatenate([basis, jnp.zeros((1, k), basis.dtype)])
     moved = [
         linalg.semi_solve(J + jax.vmap(jnp.diag)(precision), cross @ basis)[0]
-        for (J, _), cross, precision in zip(of_states(spec, system, lins, point.states), crosses, hold, strict=True)
+        for (J, _), cross, precision in zip(compressed.states, compressed.crosses, hold, strict=True)
     ]
     total = jnp.zeros((k, k))
     for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):

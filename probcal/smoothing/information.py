@@ -1,6 +1,5 @@
 """The Laplace approximation at a point: information of the biases, gamma, evidence, noise levels."""
 
-from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -10,17 +9,15 @@ import jax.numpy as jnp
 from probcal import linalg, rows
 from probcal.priors import Precision
 from probcal.problem import Recursion, Spec, System
-from probcal.rows import Linearised
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import (
+    Compressed,
     Point,
+    compress,
     eliminate,
     factors,
     linearise,
     log_likelihood,
-    of_biases,
-    of_both,
-    of_states,
 )
 
 BATCH = 512  # rows whose leverage is formed at once
@@ -57,14 +54,6 @@ def laplace(spec: Spec, system: System, point: Point, prior: Precision) -> Lapla
     return Laplace(solved.information, covariance, gamma, evidence)
 
 
-def _parts(
-    spec: Spec, system: System, lins: list[Linearised], point: Point
-) -> Iterator[tuple[Recursion, tuple[jax.Array, jax.Array], jax.Array]]:
-    """Each recursion with its rows compressed: onto the states (information, score), and across to the biases."""
-    states = of_states(spec, system, lins, point.states)
-    return zip(system.recursions, states, of_both(spec, system, lins, point.states), strict=True)
-
-
 def paper_b(spec: Spec, system: System, point: Point, prior: Precision) -> tuple[Laplace, jax.Array]:
     """Paper B (10)-(17), (22)-(23) at smoothed trajectories: the posterior of z, and the step to its mean.
 
@@ -72,9 +61,10 @@ def paper_b(spec: Spec, system: System, point: Point, prior: Precision) -> tuple
     epochs share is dropped and the data count twice. By Woodbury no matrix of the size of the data is formed.
     """
     lins = linearise(spec, system, point, expected=True)
-    information, score = of_biases(spec, system, lins)
+    compressed = compress(spec, system, lins, point.states)
+    information, score = compressed.information, compressed.score
     likelihood, logdet = log_likelihood(spec, system, point), jnp.zeros(())
-    for part, (J, pull), cross in _parts(spec, system, lins, point):
+    for part, (J, pull), cross in zip(system.recursions, compressed.states, compressed.crosses, strict=True):
         L = factors(part, point.levels)
         P, _ = rec.covariances(part.F, L, J, rec.gains(part.F, L, J))
         values, vectors = linalg.spectrum(P)
@@ -109,9 +99,16 @@ class Moments(NamedTuple):
 def moments(spec: Spec, system: System, point: Point, covariance: jax.Array) -> list[Moments]:
     """Trajectory moments of each recursion at a point, for a covariance (M, M) of z."""
     lins = linearise(spec, system, point, expected=True)
+    return moments_compressed(system, point.levels, compress(spec, system, lins, point.states), covariance)
+
+
+def moments_compressed(
+    system: System, levels: jax.Array, compressed: Compressed, covariance: jax.Array
+) -> list[Moments]:
+    """Trajectory moments of each recursion from compressed rows, for a covariance (M, M) of z."""
     found = []
-    for part, (J, _), cross in _parts(spec, system, lins, point):
-        L = factors(part, point.levels)
+    for part, (J, _), cross in zip(system.recursions, compressed.states, compressed.crosses, strict=True):
+        L = factors(part, levels)
         gain = rec.gains(part.F, L, J)
         response = rec.smooth(part.F, L, J, gain, cross)
         found.append(moments_of(part, L, J, gain, response, covariance))

@@ -29,6 +29,15 @@ class Point(NamedTuple):
     levels: jax.Array  # (H,)
 
 
+class Compressed(NamedTuple):
+    """Rows compressed by epoch; linear in the rows, so that compressed systems can be added and averaged."""
+
+    information: jax.Array  # (M, M) of the biases at fixed trajectories
+    score: jax.Array  # (M,)
+    states: tuple[tuple[jax.Array, jax.Array], ...]  # of each recursion: J (E, n, n), score (E, n)
+    crosses: tuple[jax.Array, ...]  # (E, n, M) cross information with the biases
+
+
 class Eliminated(NamedTuple):
     """The system with all trajectories eliminated: what a step, a covariance or an evidence needs."""
 
@@ -126,21 +135,40 @@ def eliminate(spec: Spec, system: System, point: Point, *, expected: bool, joint
 def eliminate_rows(
     spec: Spec, system: System, point: Point, lins: list[Linearised], *, joint: bool = True
 ) -> Eliminated:
-    """Eliminate every trajectory from rows linearised around a point by any rule.
+    """Eliminate every trajectory from rows linearised around a point by any rule."""
+    compressed = compress(spec, system, lins, point.states, joint=joint)
+    return eliminate_compressed(spec, system, point.noises, point.levels, compressed, joint=joint)
+
+
+def compress(
+    spec: Spec, system: System, lins: list[Linearised], states: tuple[jax.Array, ...], *, joint: bool = True
+) -> Compressed:
+    """Rows compressed onto states and biases; without `joint` the biases are held and have no columns."""
+    own = tuple(of_states(spec, system, lins, states))
+    if joint:
+        return Compressed(*of_biases(spec, system, lins), own, tuple(of_both(spec, system, lins, states)))
+    crosses = tuple(jnp.zeros((*x.shape, 0)) for x in states)
+    return Compressed(jnp.zeros((0, 0)), jnp.zeros(0), own, crosses)
+
+
+def eliminate_compressed(
+    spec: Spec,
+    system: System,
+    noises: tuple[jax.Array, ...],
+    levels: jax.Array,
+    compressed: Compressed,
+    *,
+    joint: bool = True,
+) -> Eliminated:
+    """Eliminate every trajectory of whitened noises (E, n) from compressed rows.
 
     The biases keep information G - B'W^-1 B: Paper B (17) with the covariance of whole trajectories for R-bar.
     """
-    compressed = of_states(spec, system, lins, point.states)
-    if joint:
-        information, score = of_biases(spec, system, lins)
-        crosses = of_both(spec, system, lins, point.states)
-    else:
-        information, score = jnp.zeros((0, 0)), jnp.zeros(0)
-        crosses = [jnp.zeros((*x.shape, 0)) for x in point.states]
+    information, score = compressed.information, compressed.score
     kept, logdet = [], jnp.zeros(())
-    parts = zip(system.recursions, compressed, crosses, point.noises, strict=True)
+    parts = zip(system.recursions, compressed.states, compressed.crosses, noises, strict=True)
     for r, (part, (J, pull), cross, u) in enumerate(parts):
-        L = factors(part, point.levels)
+        L = factors(part, levels)
         gain = rec.gains(part.F, L, J)
         used = tuple(
             sorted({i for b, own in zip(spec.blocks, spec.recursion, strict=True) if own == r for i in b.used})

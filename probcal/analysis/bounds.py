@@ -1,0 +1,164 @@
+"""Cramer-Rao bounds of biases and tracks: what no estimator can do better on a problem, before any fit.
+
+The trajectory is a random nuisance whose density is that of the motion. Where an expectation is taken, the rows are
+compressed at every draw, the compressed systems averaged and the trajectory eliminated from their average: the
+bound of van Trees (1968, 2.4.3) for biases and whitened motion noise together, and the hybrid one (Rockah,
+Schultheiss 1987). Averages of eliminated systems would be no bound.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
+from probcal.problem import Problem, Spec, System
+from probcal.simulate import Key, Truth, as_key
+from probcal.smoothing.information import moments_compressed
+from probcal.smoothing.mode import Compressed, Point, compress, eliminate_compressed, linearise
+from probcal.tree import by_epoch
+from probcal.types import InputError, float64, nearest
+
+KINDS = ("parametric", "posterior", "hybrid")
+LOST = 1e-12  # share of its information below which a direction has no bound
+INVOLVED = 1e-5  # entry of such a direction above which a bias has none
+
+
+@float64
+def bounds(
+    problem: Problem, kind: str = "posterior", *, truth: Truth | None = None, draws: int = 50, key: Key = 0
+) -> xr.DataTree:
+    """Cramer-Rao bounds: of each bias with all trajectories marginalised, of each state with the biases marginalised.
+
+    - `"posterior"` (Bayesian): biases drawn from N(0, scale^2) or their survey; bounds the mean squared error.
+    - `"hybrid"`: biases at their true values and without a prior, unless surveyed; trajectories random.
+    - `"parametric"`: information at one point, true biases and true tracks; no prior but surveys and the motion.
+
+    Trajectories are drawn from the motion, but held at `truth.tracks` where there are some (velocities by differences):
+    a start that is not declared is drawn ten extents wide, and bounds over such draws mean little, so state it or give
+    tracks. True biases come from `truth.biases`, else 0. The parametric kind takes the motion's mean for what a track
+    leaves out, and the automatic start for a target without a track (for the biases too, without a truth). Unknown
+    noise levels are taken at their guesses.
+
+    Groups: `bias` (`sd` and `covariance` in the unit of the bias, `unit`, `scale`, dim `bias_label`) and `track` (`sd`
+    by `epoch` and `component`, `position_rmse` in m). A bias has no bound where it takes part in a direction of which
+    the elimination leaves less than 1e-12 of the information that its biases would have with all else known; such
+    biases are left out of `bias`, listed in the group `unbounded` and named in the attribute `message`, which also
+    names those whose bound exceeds their scale.
+    Raises `InputError` for an unknown kind or label, tracks with gaps, and draws at which a sensor is not finite.
+    """
+    if kind not in KINDS:
+        raise InputError(f'bounds: kind is "{kind}"{nearest(kind, KINDS)}')
+    if draws < 1:
+        raise InputError(f"bounds: draws={draws}; take at least one")
+    given = Truth() if truth is None else truth
+    keys = jax.random.split(as_key(key))
+    spec, system, levels = problem.spec, problem.system, jnp.zeros(len(problem.levels))
+    if kind == "parametric":
+        z, states = true_point(problem, truth)
+    else:
+        states = on_tracks_of(problem, given, draw_states(problem, draws, keys[0]))
+        z = jnp.broadcast_to(true_biases(problem, given), (draws, spec.biases))
+        z = jax.random.normal(keys[1], z.shape) if kind == "posterior" else z
+    compressed = average(spec, system, levels, z, states)
+    if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(compressed)):
+        raise InputError("bounds: a sensor is not finite at the trajectories drawn; give truth=Truth(tracks)")
+    prior = np.ones(spec.biases) if kind == "posterior" else problem.surveyed.astype(float)
+    information, alone = _information(spec, system, levels, compressed, jnp.asarray(prior))
+    covariance, bounded = invert(np.asarray(information), np.asarray(alone))
+    spread = _variances(system, levels, compressed, jnp.asarray(covariance))
+    return _tree(problem, kind, len(z), covariance, bounded, [np.asarray(v) for v in spread])
+
+
+@partial(jax.jit, static_argnames="spec")
+def average(spec: Spec, system: System, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...]) -> Compressed:
+    """Expected information of compressed rows, averaged over points z (D, M) and states (D, E, n)."""
+
+    def at(z_d: jax.Array, states_d: tuple[jax.Array, ...]) -> Compressed:
+        lins = linearise(spec, system, Point(states_d, (), z_d, levels), expected=True)
+        lins = [lin._replace(score=jnp.zeros_like(lin.score)) for lin in lins]  # a bound does not see the data
+        return compress(spec, system, lins, states_d)
+
+    def add(total: Compressed, point: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[Compressed, None]:
+        return jax.tree.map(jnp.add, total, at(*point)), None
+
+    shapes = jax.eval_shape(at, z[0], tuple(x[0] for x in states))
+    total, _ = jax.lax.scan(add, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), (z, states))
+    return jax.tree.map(lambda leaf: leaf / z.shape[0], total)
+
+
+@partial(jax.jit, static_argnames="spec")
+def _information(
+    spec: Spec, system: System, levels: jax.Array, compressed: Compressed, prior: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Information (M, M) of z with a prior (M,), trajectories marginalised; and that of each with all else known."""
+    noises = tuple(jnp.zeros_like(part.drift) for part in system.recursions)
+    solved = eliminate_compressed(spec, system, noises, levels, compressed)
+    return solved.information + jnp.diag(prior), jnp.diagonal(compressed.information) + prior
+
+
+def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance bound (M, M) from information and its diagonal with all else known (M,), and who is bounded (M,).
+
+    A parameter is bounded where its unit vector lies in the range of the information. The range is taken after
+    division by what each parameter would have with all else known, which no choice of units changes; the rows of the
+    others hold the generalised inverse, which is right for every function that is bounded.
+    """
+    if not len(alone):
+        return np.zeros((0, 0)), np.zeros(0, bool)
+    size = np.sqrt(np.where(alone > 0, alone, 1.0))
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    lost = values <= LOST
+    bounded = np.abs(vectors[:, lost]).max(1, initial=0.0) <= INVOLVED
+    inverse = (vectors[:, ~lost] / values[~lost]) @ vectors[:, ~lost].T
+    return inverse / np.outer(size, size), bounded
+
+
+@jax.jit
+def _variances(system: System, levels: jax.Array, compressed: Compressed, covariance: jax.Array) -> list[jax.Array]:
+    """Variance (E, n) of the states of each recursion, for a covariance (M, M) of z."""
+    found = []
+    for moment in moments_compressed(system, levels, compressed, covariance):
+        own = jnp.diagonal(moment.states, axis1=1, axis2=2)
+        found.append(own + jnp.einsum("eni,ij,enj->en", moment.response, covariance, moment.response))
+    return [jnp.maximum(variance, 0.0) for variance in found]
+
+
+def _tree(
+    problem: Problem, kind: str, count: int, covariance: np.ndarray, bounded: np.ndarray, variances: list[np.ndarray]
+) -> xr.DataTree:
+    labels, units = np.array(problem.labels, str), np.array([b.unit for b in problem.biases], str)
+    covariance = (covariance * np.outer(problem.scales, problem.scales))[np.ix_(bounded, bounded)]
+    own = {"sd": np.sqrt(np.diag(covariance)), "unit": units[bounded], "scale": problem.scales[bounded]}
+    coords = {"bias_label": labels[bounded], "bias_label_other": labels[bounded]}
+    bias = xr.Dataset({name: ("bias_label", value) for name, value in own.items()}, coords=coords)
+    bias["covariance"] = (("bias_label", "bias_label_other"), covariance)
+    place = [
+        np.sqrt(sum(v[:, start:stop].sum(1) for name, start, stop, _ in epochs.layout if name == "position"))
+        for epochs, v in zip(problem.epochs, variances, strict=True)
+    ]
+    groups = {"bias": bias, "track": by_epoch(problem, {"sd": [np.sqrt(v) for v in variances], "position_rmse": place})}
+    message = _message(labels, bounded, np.sqrt(np.diag(covariance)) > problem.scales[bounded])
+    if not bounded.all():
+        own = {"unit": ("bias_label", units[~bounded])}
+        groups["unbounded"] = xr.Dataset(own, coords={"bias_label": labels[~bounded]})
+    tree = xr.DataTree.from_dict(groups)
+    tree.attrs.update(kind=kind, draws=count, message=message, data=problem.measurements.table.source)
+    return tree
+
+
+def _message(labels: np.ndarray, bounded: np.ndarray, loose: np.ndarray) -> str:
+    """What has no bound, and which of the bounded (M',) have one beyond their scale, in words."""
+
+    def listed(names: np.ndarray) -> str:
+        return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
+
+    found = []
+    if not bounded.all():
+        open_ = listed(labels[~bounded])
+        found.append(f"Unbounded: the data say nothing of some combination of {open_}; survey or fix some of them.")
+    if loose.any():
+        found.append(f"Bounded beyond their scale, the data leave them to a prior: {listed(labels[bounded][loose])}.")
+    return " ".join(found) or "Every bias has a bound within its scale."

@@ -1,0 +1,147 @@
+"""Maps of the position bound: how well one snapshot of a network locates a target, cell by cell of an area."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from probcal import linalg, tree
+from probcal.problem import Problem, Spec, System
+from probcal.simulate import blank
+from probcal.smoothing.mode import Point, compress, factors, linearise
+from probcal.types import AXES, InputError, float64, nearest
+
+BATCH = (256, 200_000)  # cells worked on at once, and entries of their matrices
+LOST = 1e-13  # share of the information of a position below which a direction counts as open
+
+
+@float64
+def bound_map(
+    problem: Problem,
+    area: Sequence[Sequence[float]],
+    cells: int | tuple[int, int] = 100,
+    *,
+    biases: str | xr.DataTree = "known",
+    z: float | None = None,
+    target: str | None = None,
+    time: float | None = None,
+) -> xr.Dataset:
+    """Position bound over an area ((x0, x1), (y0, y1)) in m, every placed sensor seeing the target once.
+
+    The position is free; every further state component has its start as prior (its mean is where it is evaluated).
+    `biases` are `"known"` (the stated values), `"unknown"` (marginalised with one scale or their survey) or a fit:
+    its means with its covariance. `cells` along x and y, `z` the height in m of a 3-D map, `target` whose motion is
+    taken (the first), `time` at which moving nodes are met (the first). Of the table no more than that is used.
+
+    Variables over (y, x): `rmse` = sqrt tr J^-1 in m (thesis 4.4.2, RSS paper 22-23), `trace` and `smallest` eigenvalue
+    of the information J in 1/m^2 (RSS paper 20-21), `determined`. A bound beyond the diagonal of the area is no
+    position in it: there, as where J is singular, `rmse` is the diagonal and `determined` is False. Also
+    `node_position` (node, axis). Raises `InputError` for an area, cells, biases, target or time that cannot be used.
+    """
+    x, y = _axes(area, cells)
+    d = problem.network.dimension
+    if (z is None) == (d == 3):
+        raise InputError(f"bound_map: the network is {d}-D; {'give the height z' if d == 3 else 'leave z out'}")
+    at = snapshot(problem, target, time)
+    M = len(at.labels)
+    mean, levels = np.zeros(M), np.zeros(len(at.levels))
+    root: np.ndarray | None = np.zeros((0, 0))
+    if isinstance(biases, xr.DataTree):
+        if not {"calibration", "constant_data"} <= set(biases.children):
+            raise InputError("bound_map: the tree of biases has no group calibration; give the result of fit()")
+        found = tree.apply(at, biases)
+        at, mean, levels = found.problem, found.z, found.levels
+        variances, vectors = np.linalg.eigh(found.covariance)
+        root = vectors * np.sqrt(np.maximum(variances, 0.0))
+    elif biases == "unknown":
+        root = None
+    elif biases != "known":
+        raise InputError(f'bound_map: biases is {biases!r}; give "known", "unknown" or the result of fit()')
+    flat = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    places = flat if z is None else np.column_stack([flat, np.full(len(flat), float(z))])
+    span = next((start, stop) for name, start, stop, _ in at.epochs[0].layout if name == "position")
+    point = Point((), (), jnp.asarray(mean), jnp.asarray(levels))
+    values = np.asarray(spectra(at.spec, at.system, span, point, root, jnp.asarray(places)))
+    with np.errstate(divide="ignore"):
+        rmse = np.sqrt((1.0 / values).sum(1))
+    largest = float(np.hypot(*np.ptp(np.asarray(area, float), axis=1)))
+    variables = {
+        "rmse": np.minimum(rmse, largest), "determined": rmse < largest,
+        "trace": values.sum(1), "smallest": values[:, 0],
+    }  # fmt: skip
+    drawn = xr.Dataset(
+        {name: (("y", "x"), value.reshape(len(y), len(x))) for name, value in variables.items()}
+        | {"node_position": (("node", "axis"), _nodes(at, mean))},
+        coords={"x": x, "y": y, "node": [n.name for n in at.network.nodes], "axis": list(AXES[:d])},
+        attrs={"biases": biases if isinstance(biases, str) else "fitted", "target": at.measurements.target_names[0]},
+    )
+    return drawn if z is None else drawn.assign_coords(z=float(z))
+
+
+def _axes(area: Sequence[Sequence[float]], cells: int | tuple[int, int]) -> list[np.ndarray]:
+    """Centres of the cells along x and y."""
+    sides = np.asarray(area, float)
+    if sides.shape != (2, 2) or not np.isfinite(sides).all() or not (sides[:, 0] < sides[:, 1]).all():
+        raise InputError(f"bound_map: area is {area!r}; give ((x0, x1), (y0, y1)) in m with x0 < x1 and y0 < y1")
+    counts = np.broadcast_to(np.asarray(cells), 2)
+    if not np.issubdtype(counts.dtype, np.integer) or (counts < 1).any():
+        raise InputError(f"bound_map: cells is {cells!r}; give a positive number, or one along x and one along y")
+    return [a + (b - a) * (np.arange(n) + 0.5) / n for (a, b), n in zip(sides, counts, strict=True)]
+
+
+def _nodes(at: Problem, z: np.ndarray) -> np.ndarray:
+    """Where the nodes of a snapshot stand, their biases z (M,) added, (nodes, d)."""
+    found = []
+    shift = at.fixed | dict(zip(at.labels, z * at.scales, strict=True))
+    for node in at.network.nodes:
+        place = node.position if node.path is None else node.path.at(at.measurements.time[:1])["position"][0]
+        found.append([p + shift.get(f"{node.name}.position_{a}", 0.0) for p, a in zip(place, AXES, strict=False)])
+    return np.array(found)
+
+
+def snapshot(problem: Problem, target: str | None = None, time: float | None = None) -> Problem:
+    """The problem of one instant, the first of the table by default: every placed sensor sees one target once."""
+    names, motion = problem.measurements.target_names, problem.motion
+    name = names[0] if target is None else str(target)
+    if name not in (motion if isinstance(motion, Mapping) else names):
+        raise InputError(f'there is no target "{name}"{nearest(name, names)}')
+    instant = float(problem.measurements.time.min() if time is None else time)
+    rows = {"time": instant, "sensor": [s.name for s in problem.network.sensors]}
+    table = blank(problem.network, pd.DataFrame(rows).assign(target=name))
+    return Problem(problem.network, motion, table, fix=problem.fixed)
+
+
+@partial(jax.jit, static_argnames=("spec", "span"))
+def spectra(spec: Spec, system: System, span: tuple[int, int], point: Point, root: Any, places: jax.Array) -> jax.Array:
+    """Eigenvalues (cells, d) of the information about the position at places (cells, d).
+
+    The biases have covariance root root' (M, M), the identity if None; without columns, (0, 0), they are known.
+
+    What else is unknown is v = V e with e of unit covariance: A - C V (I + V'BV)^-1 V'C', with A, C and B the
+    information of the position, with v and of v. No covariance is inverted, so that any of them may be singular.
+    """
+    part, place = system.recursions[0], slice(*span)
+    own = factors(part, point.levels)[0].at[place].set(0.0)
+    joint = root is None or root.shape[1] > 0
+
+    def cell(position: jax.Array) -> jax.Array:
+        states = (part.drift.at[0, place].set(position),)
+        lins = linearise(spec, system, point._replace(states=states), expected=True)
+        rows = compress(spec, system, lins, states, joint=joint)
+        J, G, cross = rows.states[0][0][0], rows.information, rows.crosses[0][0]
+        if root is not None:
+            G, cross = root.T @ G @ root, cross @ root
+        inner = jnp.block([[own.T @ J @ own, own.T @ cross], [cross.T @ own, G]])
+        half = linalg.factor_and_inverse(inner + jnp.eye(inner.shape[0]))[1]
+        half = half @ jnp.concatenate([J[place] @ own, cross[place]], 1).T
+        left = J[place, place] - half.T @ half
+        values, _ = linalg.spectrum(0.5 * (left + left.T))
+        return jnp.where(values > LOST * jnp.trace(J[place, place]), values, 0.0)
+
+    width = own.shape[1] + (spec.biases if joint else 0)
+    return jax.lax.map(cell, places, batch_size=max(1, min(BATCH[0], BATCH[1] // width**2)))
