@@ -409,14 +409,14 @@ def gauge_count(problem, point):
 def test_misuse_is_told():
     problem = problem_of([plain_range], 2, None)
     fixed = problem.rebuild(fix="*")
-    with pytest.raises(InputError, match="observability: the problem has no free bias"):
+    with pytest.raises(InputError, match="every bias of the problem is fixed"):
         observability(fixed)
     point = automatic_start(problem)
     with pytest.raises(InputError, match=r"passes has shape \(1, 2, 3\); give \(passes, points, 2\)"):
         next_passes(problem, point=point, passes=np.zeros((1, 2, 3)))
     with pytest.raises(InputError, match=r"places has shape \(2,\); give \(places, 2\)"):
         next_sensors(problem, point=point, places=[1.0, 2.0])
-    with pytest.raises(InputError, match="survey=0 must be positive"):
+    with pytest.raises(InputError, match="survey=0 must be positive, a std over the scale"):
         next_anchors(problem, point=point, survey=0)
     grazing = point._replace(states=(jnp.full(point.states[0].shape, np.nan),))
     with pytest.raises(InputError, match="no finite derivatives at the start"):

@@ -37,7 +37,7 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     `rule`, counts. Raises `InputError` where no bias is free.
     """
     if not problem.labels:
-        raise InputError("observability: the problem has no free bias; declare a Bias, a survey or a scale")
+        raise InputError("observability: every bias of the problem is fixed or none is declared; free one of them")
     point = standpoint(problem, point, truth)
     found = _information(problem, point)
     null = gauge(problem, point)

@@ -202,7 +202,7 @@ class _Naming:
         more = f" and {len(labels) - 3} more" if len(labels) > 3 else ""
         amounts = ", ".join(_amount(problem, label, vector[self.labels.index(label)]) for label in labels[:3])
         name = f"{_of(first)} against {'its ' if one else ''}{others}{more}"
-        return Pattern(name, f"{amounts} together hardly change the data{self.cause}", vector, "", (*alone, labels[:2]))
+        return Pattern(name, f"{amounts} together hardly change the data{self.cause}", vector, "", alone)
 
 
 # Remedies
@@ -229,7 +229,8 @@ def _with_remedies(
         if _count(known, done) <= left:
             yield replace(direction, fix=fixed, remedy=f"{general}: {_together(fixed)} does both")
             continue
-        chosen = _anchor(known, done, [[labels.index(name) for name in group] for group in groups], left)
+        members = [[labels.index(name) for name in group] for group in groups]
+        chosen = _anchor(known, done, members, left) or _anchor(known, done, [sum(members[:2], [])], left)
         if not chosen:
             yield replace(direction, remedy=general)
             continue
