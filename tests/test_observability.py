@@ -149,9 +149,10 @@ def test_gauge_directions_are_counted_and_named(name):
     assert tree.attrs["status"] == "open"
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in ("trackers", "mixed") else n for n in CASES]
-)
+LONG = ("bearings", "clocks", "trackers", "mixed", "arrivals in space")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in CASES])
 def test_a_gauge_is_no_answer_until_anchored_as_advised(name):
     kinds, dimension, scale, motion, expected = CASES[name]
     free = problem_of(kinds, dimension, scale, motion)
@@ -372,7 +373,7 @@ def test_the_gain_of_a_sensor_is_what_its_rows_tell():
     [
         ([sensors.radar_3d], 3, FREE, None),
         ([difference], 2, {"clock": 10.0, "position": 5.0}, None),
-        ([arrival, compass], 2, {"position": 5.0}, EMITTED),
+        pytest.param([arrival, compass], 2, {"position": 5.0}, EMITTED, marks=pytest.mark.slow),
         ([plain_range], 2, {"position": 5.0}, Static()),
     ],
     ids=["3-D", "two nodes", "mixed", "static"],

@@ -230,7 +230,8 @@ def _with_remedies(
             yield replace(direction, fix=fixed, remedy=f"{general}: {_together(fixed)} does both")
             continue
         members = [[labels.index(name) for name in group] for group in groups]
-        chosen = _anchor(known, done, members, left) or _anchor(known, done, [sum(members[:2], [])], left)
+        both = [m for group in members[:2] for m in group]
+        chosen = _anchor(known, done, members, left) or _anchor(known, done, [both], left)
         if not chosen:
             yield replace(direction, remedy=general)
             continue
