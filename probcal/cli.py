@@ -21,7 +21,7 @@ import xarray as xr
 from rich.console import Console
 from rich.progress import Progress as RichProgress
 
-from probcal.analysis import next_anchors, next_passes, next_sensors, observability
+from probcal.analysis import bound_map, next_anchors, next_passes, next_sensors, observability
 from probcal.diagnostics import grid_of, scores, study_table
 from probcal.inference import METHODS, ORACLE, fit, study, track
 from probcal.inference.run import Progress
@@ -32,6 +32,8 @@ from probcal.simulate import Simulation, Truth, truth_beside
 from probcal.smoothing.start import automatic_start
 from probcal.tree import add_scores, load, outliers, save, summary
 from probcal.types import FitError, InputError, nearest
+
+MAP_CELLS = 60  # of a bound map an axis
 
 app = typer.Typer(
     help="Bayesian calibration of sensor networks from targets of opportunity.",
@@ -324,7 +326,7 @@ def check_command(
     tree.attrs["model"] = model.stem
     _print_check(problem, tree, plans)
     if out is not None:
-        _write_check(tree, passes, out)
+        _write_check(problem, tree, passes, out)
     raise typer.Exit(1 if tree.attrs["status"] == "open" else 0)
 
 
@@ -382,7 +384,7 @@ def check_table(tree: xr.DataTree) -> pd.DataFrame:
     return frame.assign(**{name: [form.format(v) for v in frame[name]] for name, form in shown.items()})
 
 
-def _write_check(tree: xr.DataTree, passes: xr.Dataset, out: Path) -> None:
+def _write_check(problem: Problem, tree: xr.DataTree, passes: xr.Dataset, out: Path) -> None:
     files = [out / "check.nc", out / "check.csv"]
     try:
         save(tree, files[0])
@@ -393,7 +395,11 @@ def _write_check(tree: xr.DataTree, passes: xr.Dataset, out: Path) -> None:
             from probcal.plots import draw_check  # the plot packages are an extra
 
             files.append(out / "check.png")
-            draw_check(tree, passes, files[-1])
+            low, high = passes["path"].values.min((0, 1)), passes["path"].values.max((0, 1))
+            height = float((low + high)[2] / 2) if len(low) == 3 else None
+            sides = [(a, b) for a, b in zip(low[:2], high[:2], strict=True)]
+            bound = bound_map(problem, sides, MAP_CELLS, biases="unknown", z=height)
+            draw_check(tree, passes, bound, files[-1])
     except OSError as error:
         raise InputError(f"{out} cannot be written: {error.strerror}") from None
     print(f"written: {', '.join(str(path) for path in files)}")

@@ -9,8 +9,10 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, new_axes, plain
+from probcal.plots.bounds import plot_bound_map
 
 REACH = 0.12  # longest arrow of a direction, in widths of the map
 SHOWN = 6  # directions on one map
@@ -28,6 +30,7 @@ def plot_spectrum(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     ax.semilogy(number[weak], shown[weak], "v", color=colour(1), markersize=5, label="weak: left to prior and survey")
     ax.axhline(1.0, color="0.3", linewidth=0.8)
     ax.set(xlabel="eigenvalue", ylabel="information in prior scales")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.grid(color="0.9")
     ax.set_title(f"{int(weak.sum())} of {len(values)} directions are weak", loc="left")
     ax.legend(frameon=False, fontsize=8)
@@ -74,14 +77,17 @@ def plot_passes(tree: xr.DataTree, passes: xr.Dataset, ax: Axes | None = None) -
     return ax
 
 
-def draw_check(tree: xr.DataTree, passes: xr.Dataset, path: str | PathLike[str]) -> None:
-    """Write the pictures of a check to one file: directions, spectrum, next passes."""
-    figure = Figure(figsize=(13.0, 11.0), layout="constrained")
-    places = figure.subplot_mosaic([["map", "map"], ["spectrum", "passes"]])
-    plot_directions(tree, places["map"])
-    plot_spectrum(tree, places["spectrum"])
-    plot_passes(tree, passes, places["passes"])
-    figure.savefig(path, dpi=110)
+def draw_check(tree: xr.DataTree, passes: xr.Dataset, bound: xr.Dataset, path: str | PathLike[str]) -> None:
+    """Write the pictures of a check to one file: directions, spectrum, next passes, map of the position bound."""
+    figure = Figure(figsize=(15.0, 12.0), layout="constrained")
+    parts: Any = figure.subfigures(2, 1, height_ratios=[1.1, 1.0])
+    left, right = parts[0].subplots(1, 2, width_ratios=[1.0, 2.2])
+    plot_spectrum(tree, left)
+    plot_directions(tree, right)
+    left, right = parts[1].subplots(1, 2)
+    plot_passes(tree, passes, left)
+    plot_bound_map(bound, right)
+    figure.savefig(path, dpi=100)
 
 
 def _draw_scene(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
