@@ -77,7 +77,7 @@ def _suffix(problem: Problem, r: int) -> str:
     return "" if len(problem.epochs) == 1 else f"_{r}"
 
 
-def data_coords(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
+def datum_of(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
     """Coordinates of the measured data, and where each block keeps them (rows, channels)."""
     data, network = problem.measurements, problem.network
     picks: list[Any] = []
@@ -108,7 +108,7 @@ def gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarray
 
 def build(problem: Problem, result: Result) -> xr.DataTree:
     """Assemble the DataTree of a fit (groups posterior, calibration, track, observed_data, ...)."""
-    datum, picks = data_coords(problem)
+    datum, picks = datum_of(problem)
     coords, labels = datum["coords"], list(problem.labels)
     scales = problem.scales
     sample = ("chain", "draw")

@@ -121,7 +121,7 @@ def _leverage_groups(
 ) -> dict[str, xr.Dataset]:
     """How many biases each datum, sensor and target determines; the motion tells the rest."""
     parts = leverages(problem.spec, problem.system, point, jnp.asarray(found.covariance), spread)
-    datum, picks = tree.data_coords(problem)
+    datum, picks = tree.datum_of(problem)
     values = tree.gather([np.asarray(part) for part in parts], picks)
     each = xr.Dataset({"leverage": ("datum", values)}, coords=datum["coords"])
     groups = {"datum": each}
