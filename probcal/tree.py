@@ -73,11 +73,12 @@ class Result:
     residuals: Residuals
 
 
-def _suffix(problem: Problem, r: int) -> str:
+def suffix(problem: Problem, r: int) -> str:
+    """What the names of recursion r end with: nothing where there is one only."""
     return "" if len(problem.epochs) == 1 else f"_{r}"
 
 
-def _datum(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
+def datum_of(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
     """Coordinates of the measured data, and where each block keeps them (rows, channels)."""
     data, network = problem.measurements, problem.network
     picks: list[Any] = []
@@ -99,7 +100,7 @@ def _datum(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
     return {"coords": coords, "y": np.concatenate([c[2] for c in columns])}, picks
 
 
-def _gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+def gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """Measured data of all blocks, last axis datum, from arrays (..., N, C)."""
     return np.concatenate(
         [np.asarray(p)[..., rows, channels] for p, (rows, channels) in zip(parts, picks, strict=True)], -1
@@ -108,7 +109,7 @@ def _gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarra
 
 def build(problem: Problem, result: Result) -> xr.DataTree:
     """Assemble the DataTree of a fit (groups posterior, calibration, track, observed_data, ...)."""
-    datum, picks = _datum(problem)
+    datum, picks = datum_of(problem)
     coords, labels = datum["coords"], list(problem.labels)
     scales = problem.scales
     sample = ("chain", "draw")
@@ -118,7 +119,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
     track = _track(problem, result.tracks)
     if result.states is not None:
         for r, states in enumerate(result.states):
-            s = _suffix(problem, r)
+            s = suffix(problem, r)
             posterior[f"state{s}"] = ((*sample, f"epoch{s}", f"component{s}"), states)
     z = ("bias_label", labels)
     sd = np.sqrt(np.diag(result.covariance))
@@ -130,7 +131,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         "status": np.array(result.bias_status, str), "unit": np.array([b.unit for b in problem.biases], str),
         "kind": np.array([b.kind for b in problem.biases], str),
     }  # fmt: skip
-    residual = {name: ("datum", _gather(parts, picks)) for name, parts in vars(result.residuals).items()}
+    residual = {name: ("datum", gather(parts, picks)) for name, parts in vars(result.residuals).items()}
     groups: dict[str, xr.Dataset] = {
         "posterior": xr.Dataset(posterior, coords={**base, "bias_label": z, **track.coords}),
         "calibration": xr.Dataset(
@@ -153,7 +154,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         )
     for name, parts in (("log_likelihood", result.log_likelihood), ("posterior_predictive", result.replicas)):
         if parts is not None:
-            groups[name] = xr.Dataset({"y": ((*sample, "datum"), _gather(parts, picks))}, coords={**base, **coords})
+            groups[name] = xr.Dataset({"y": ((*sample, "datum"), gather(parts, picks))}, coords={**base, **coords})
     if problem.levels:
         guess = np.array([level.guess for level in problem.levels])
         groups["level"] = xr.Dataset(
@@ -189,7 +190,7 @@ def _track(problem: Problem, tracks: Sequence[Tracks]) -> xr.Dataset:
     values: dict[str, Any] = {}
     coords: dict[str, Any] = {}
     for r, (epochs, moments) in enumerate(zip(problem.epochs, tracks, strict=True)):
-        s = _suffix(problem, r)
+        s = suffix(problem, r)
         coords |= {
             f"component{s}": list(epochs.components),
             f"epoch_time{s}": (f"epoch{s}", epochs.time),

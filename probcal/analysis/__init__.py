@@ -1,0 +1,1 @@
+"""Analysis of problems and fits: is the answer good?"""

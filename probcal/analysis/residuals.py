@@ -1,0 +1,268 @@
+"""Normalised innovations of the forward filter at a fit, with limits; whiteness and wrapped angles.
+
+Every datum counts as its standardised score v = score / sqrt(information): for Gaussian noise residual / std, and for
+every family of mean 0 and variance 1 where the model is right. The filter is linearised at the fitted trajectory.
+The innovations of an epoch are whitened by the symmetric root of their covariance, so that none comes first: their
+squares add up to the NIS of the epoch, and each stays with its sensor and channel.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from probcal import linalg, rows
+from probcal.analysis.fitted import Fitted
+from probcal.noise import Gaussian
+from probcal.problem import Spec, System
+from probcal.rows import Linearised
+from probcal.smoothing import recursion as rec
+from probcal.smoothing.mode import Point, factors, of_states
+
+COLUMNS = 16  # bias directions that are filtered together
+REPLICAS = 64  # simulated data behind a kurtosis
+LAGS = 10  # of the Ljung-Box statistic
+FEWEST = 20  # data below which whiteness is not judged
+
+
+class Filter(NamedTuple):
+    """What the covariance pass of one recursion leaves for any columns of data."""
+
+    gain: rec.Gains
+    J: jax.Array  # (E, n, n) information of the rows about the states
+    mix: jax.Array  # (E, n, n) root V g V' root', S^-1/2 - I between data of an epoch
+
+
+class Innovations(NamedTuple):
+    """Of every datum: its innovation, N(0, 1) under the model, and what is needed to judge sums of squares."""
+
+    value: np.ndarray  # (D,)
+    used: np.ndarray  # (D,) degrees of freedom that the biases took
+    kurtosis: np.ndarray  # (D,) excess over a Gaussian's
+
+
+@partial(jax.jit, static_argnames="spec")
+def prepare(spec: Spec, system: System, point: Point, lins: list[Linearised]) -> list[Filter]:
+    """Covariance pass of every recursion: with U the data's responses to the whitened prediction, S = I + U U'."""
+    found = []
+    for part, (J, _) in zip(system.recursions, of_states(spec, system, lins, point.states), strict=True):
+        gain = rec.gains(part.F, factors(part, point.levels), J)
+        root = gain.predicted
+        values, vectors = linalg.spectrum(root.mT @ J @ root)
+        size = jnp.sqrt(1.0 + jnp.maximum(values, 0.0))
+        half = root @ vectors
+        found.append(Filter(gain, J, (half * (-1.0 / (size * (1.0 + size)))[:, None, :]) @ half.mT))
+    return found
+
+
+def _whiten(
+    spec: Spec,
+    system: System,
+    lins: list[Linearised],
+    filters: list[Filter],
+    columns: list[jax.Array],
+    drifts: list[jax.Array],
+) -> list[jax.Array]:
+    """Innovations (N, C, K) of columns of unit-noise data (N, C, K) with drifts (E, n, K) of the states."""
+    seen = [jnp.sqrt(lin.weight)[:, :, None] * lin.state for lin in lins]
+    pulls = [jnp.zeros_like(drift) for drift in drifts]
+    for block, data, own, column, r in zip(spec.blocks, system.rows, seen, columns, spec.recursion, strict=True):
+        summed = jax.ops.segment_sum(jnp.einsum("ncu,nck->nuk", own, column), data.epoch, drifts[r].shape[0])
+        pulls[r] = pulls[r].at[:, jnp.asarray(block.used, int)].add(summed)
+    predicted, corrected = [], []
+    for part, known, pull, drift in zip(system.recursions, filters, pulls, drifts, strict=True):
+        keep, covariance = known.gain.keep, known.gain.updated @ known.gain.updated.mT
+
+        def forward(x, epoch):
+            T_k, s_k = epoch
+            x = linalg.multiply(T_k, x) + s_k
+            return x, x
+
+        source = covariance @ pull + keep @ drift
+        _, filtered = jax.lax.scan(forward, jnp.zeros_like(pull[0]), (keep @ part.F, source))
+        before = jnp.concatenate([jnp.zeros_like(filtered[:1]), filtered[:-1]])
+        x = part.F @ before + drift
+        predicted.append(x)
+        corrected.append(x - known.mix @ (pull - known.J @ x))  # what S^-1/2 takes off each datum
+    return [
+        column - jnp.einsum("ncu,nuk->nck", own, corrected[r][data.epoch][:, jnp.asarray(block.used, int)])
+        for block, data, own, column, r in zip(spec.blocks, system.rows, seen, columns, spec.recursion, strict=True)
+    ]
+
+
+@partial(jax.jit, static_argnames="spec")
+def _innovations(
+    spec: Spec, system: System, point: Point, lins: list[Linearised], filters: list[Filter], shift: list[jax.Array]
+) -> tuple[list[jax.Array], list[jax.Array]]:
+    """Innovations (N, C) with the biases of every row moved by `shift` (N, p), and the share of S^-1/2 they keep."""
+    columns, kept = [], []
+    for block, data, lin, dz, r in zip(spec.blocks, system.rows, lins, shift, spec.recursion, strict=True):
+        root = jnp.sqrt(lin.weight)
+        score = jnp.where(root > 0, lin.score / jnp.where(root > 0, root, 1.0), 0.0)
+        columns.append((score - root * jnp.einsum("ncp,np->nc", lin.bias, dz))[:, :, None])
+        used = jnp.asarray(block.used, int)
+        mix = filters[r].mix[:, used[:, None], used[None, :]][data.epoch]
+        kept.append(1.0 + lin.weight * jnp.einsum("ncu,nuv,ncv->nc", lin.state, mix, lin.state))
+    drifts = [
+        -(factors(part, point.levels) @ u[:, :, None]) for part, u in zip(system.recursions, point.noises, strict=True)
+    ]
+    return [c[:, :, 0] for c in _whiten(spec, system, lins, filters, columns, drifts)], kept
+
+
+@partial(jax.jit, static_argnames="spec")
+def _leverage(
+    spec: Spec, system: System, lins: list[Linearised], filters: list[Filter], root: jax.Array
+) -> list[jax.Array]:
+    """Sum of squares (N, C) of the innovations' responses to bias directions (M, K)."""
+    padded = jnp.concatenate([root, jnp.zeros((1, root.shape[1]))])
+    columns = [
+        jnp.einsum("nc,ncp,npk->nck", jnp.sqrt(lin.weight), lin.bias, padded[data.bias[data.sensor]])
+        for data, lin in zip(system.rows, lins, strict=True)
+    ]
+    drifts = [jnp.zeros((*part.drift.shape, root.shape[1])) for part in system.recursions]
+    return [jnp.sum(c**2, 2) for c in _whiten(spec, system, lins, filters, columns, drifts)]
+
+
+@partial(jax.jit, static_argnames="spec")
+def _kurtosis(spec: Spec, system: System, point: Point, key: jax.Array) -> list[jax.Array]:
+    """Excess kurtosis (N, C) of the standardised score, from simulated data at the fitted prediction."""
+
+    def fourth(seed):
+        found = []
+        for b, (block, data, r) in enumerate(zip(spec.blocks, system.rows, spec.recursion, strict=True)):
+            predicted = rows.predict(block, data, point.states[r], point.z)
+            drawn = rows.sample(block, data, predicted, point.levels, jax.random.fold_in(seed, b))
+            std = rows.noise_std(data, point.levels)
+            score, weight = rows.weigh(block, data._replace(y=drawn), predicted, std, expected=True)
+            found.append(score**4 / jnp.where(weight > 0, weight, 1.0) ** 2)
+        return found
+
+    sampled = jax.lax.map(fourth, jax.random.split(key, REPLICAS))
+    return [jnp.mean(s, 0) - 3.0 for s in sampled]
+
+
+class Filtered(NamedTuple):
+    """The filters of a fit, and its innovations."""
+
+    filters: list[Filter]
+    innovations: Innovations
+
+
+def innovations(fit: Fitted, key: jax.Array) -> Filtered:
+    """Innovations of all data, with the biases at their means.
+
+    A sum of squares over some data expects their number less what the biases used: over all data the sum of gamma,
+    over a share of them the trace of B (G + A)^-1 B', B their responses to the biases.
+    """
+    spec, system = fit.problem.spec, fit.problem.system
+    filters = prepare(spec, system, fit.point, fit.lins)
+    value, kept = _innovations(spec, system, fit.point, fit.lins, filters, _still(fit))
+    root, used = linalg.factor(jnp.asarray(fit.covariance)), np.zeros(len(fit.data))
+    chunk = min(COLUMNS, spec.biases)
+    root = jnp.pad(root, ((0, 0), (0, -spec.biases % chunk)))
+    for start in range(0, root.shape[1], chunk):
+        used += fit.flat(_leverage(spec, system, fit.lins, filters, root[:, start : start + chunk]))
+    kurtosis = np.zeros(len(used))
+    if any(not isinstance(channel.noise, Gaussian) for block in spec.blocks for channel in block.channels):
+        kurtosis = fit.flat(_kurtosis(spec, system, fit.point, key)) * fit.flat(kept) ** 4
+    return Filtered(filters, Innovations(fit.flat(value), used, kurtosis))
+
+
+def _still(fit: Fitted) -> list[jax.Array]:
+    return [jnp.zeros((lin.bias.shape[0], lin.bias.shape[2])) for lin in fit.lins]
+
+
+def moved_innovations(fit: Fitted, filters: list[Filter], shift: list[jax.Array]) -> np.ndarray:
+    """Innovations (D,) with the biases of every row of each block moved by `shift` (N, p) in z."""
+    return fit.flat(_innovations(fit.problem.spec, fit.problem.system, fit.point, fit.lins, filters, shift)[0])
+
+
+class Squares(NamedTuple):
+    """Mean square of the innovations of groups of data, each (groups,): NIS per datum and its limits."""
+
+    data: np.ndarray
+    nis: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+def squares(found: Innovations, group: Any, count: int, rate: float) -> Squares:
+    """Sums of squares by group (D,) over what they expect, with two-sided limits at a false-alarm rate each.
+
+    The limits are those of a scaled chi-square of the right mean and variance (exact for Gaussian noise).
+    """
+    group = np.asarray(group)
+    data, total, used, kurtosis = (
+        np.bincount(group, weight, count) for weight in (np.ones(len(group)), found.value**2, *found[1:])
+    )
+    expected = np.maximum(data - used, 1e-9)
+    variance = np.maximum(2.0 * expected + kurtosis, 1e-9 * expected)
+    scale, freedom = variance / (2.0 * expected), 2.0 * expected**2 / variance
+    lower, upper = (scale * stats.chi2.ppf(p, freedom) / expected for p in (rate / 2, 1 - rate / 2))
+    return Squares(data.astype(int), total / expected, lower, upper)
+
+
+class Whiteness(NamedTuple):
+    """Of one sensor's channel: lag-1 correlation of its innovations, mean, and Ljung-Box p-value."""
+
+    autocorrelation: float
+    mean: float
+    probability: float
+
+
+def whiteness(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> Whiteness | None:
+    """Innovations (n,) of one channel in the order of time, pairs within a target; None below 20 data.
+
+    Ljung and Box (1978), Q = sum of n_k r_k^2 (n + 2) / n over up to 10 lags, n_k the pairs at lag k.
+    """
+    n = len(value)
+    if n < FEWEST:
+        return None
+    order = np.lexsort((time, target))
+    value, target = value[order] - value.mean(), target[order]
+    variance = max(float(np.mean(value**2)), 1e-300)
+    statistic, lags, first = 0.0, 0, 0.0
+    for lag in range(1, min(LAGS, n // 5) + 1):
+        together = target[lag:] == target[:-lag]
+        pairs = int(together.sum())
+        if pairs < FEWEST // 2:
+            break
+        r = float(np.sum(value[lag:] * value[:-lag] * together)) / pairs / variance
+        statistic, lags = statistic + pairs * r**2 * (n + 2) / n, lag
+        first = r if lag == 1 else first
+    if not lags:
+        return None
+    return Whiteness(first, float(np.mean(value)), float(stats.chi2.sf(statistic, lags)))
+
+
+NEAR_TURN = 1.0  # rad of a full turn within which a residual tells of a missing wrap
+WIDE = np.pi / 3  # noise std in rad above which a wrapped angle is ambiguous
+FAR = 2 * np.pi / 3  # rad beyond which a wrapped residual may belong to the next turn
+SHARE = 0.01  # of a channel's data beyond which its residuals are
+
+
+def wrapping(fit: Fitted, innovation: np.ndarray, std: np.ndarray) -> list[tuple[str, str]]:
+    """Sentences (subject, sentence) on angles: residuals (D,) a turn off without `wrap`, or too wide with it."""
+    found = []
+    for kind in fit.problem.network.types:
+        for name, channel in kind.expand(fit.problem.network.dimension):
+            ours = [s.name for s in fit.problem.network.sensors if s.type is kind]
+            mine = (fit.data["channel"] == name).to_numpy() & fit.data["sensor"].isin(ours).to_numpy()
+            turn = {"rad": 1.0, "deg": np.pi / 180}.get(channel.unit)
+            if turn is None or not mine.any():
+                continue
+            residual, spread = np.abs(innovation[mine]) * turn, std[mine] * turn
+            subject, off = f"{kind.name}.{name}", np.abs(residual - 2 * np.pi) < NEAR_TURN
+            if channel.period is None and off.any():
+                text = f"{off.sum()} of {len(off)} residuals lie a full turn off: declare wrap=True"
+            elif channel.period is not None and np.median(spread) > WIDE:
+                text = f"its noise std of {np.median(spread):.2f} rad is too wide for an angle: wrapping is ambiguous"
+            elif channel.period is not None and (residual > FAR).mean() > SHARE:
+                text = f"{(residual > FAR).sum()} of {len(off)} residuals lie beyond 120 deg: wrapping is ambiguous"
+            else:
+                continue
+            found.append((subject, f"{subject}: {text}"))
+    return found
