@@ -2,12 +2,11 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal.analysis import checks, nees, pieces, residuals, sensitivity, verdict
+from probcal.analysis import checks, nees, pieces, predictive, residuals, sensitivity, verdict
 from probcal.analysis.checks import Finding
 from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.pieces import Change, Pieces
@@ -40,11 +39,11 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     the tree is no fit of the problem.
     """
     fit = take_up(problem, tree)
-    keys = jax.random.split(as_key(key), 2)
-    found = residuals.innovations(fit, keys[0])
+    replicas = predictive.check(fit, tree, as_key(key))
+    found = residuals.innovations(fit, replicas.kurtosis)
     groups: dict[str, xr.Dataset] = {"epoch_check": checks.by_epoch(fit, found.innovations)}
     groups["datum_check"], findings = checks.by_datum(fit, found.innovations, tree)
-    groups["channel_check"], more = checks.by_channel(fit, found.innovations, tree, keys[1])
+    groups["channel_check"], more = checks.by_channel(fit, found.innovations, replicas)
     findings += more
     for name in ("sensor", "target"):
         groups[f"{name}_check"], more = checks.squares_by(fit, found.innovations, name)
@@ -73,9 +72,7 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     return result
 
 
-def _verdicts(
-    fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups: dict[str, xr.Dataset]
-) -> xr.Dataset:
+def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups: dict[str, xr.Dataset]) -> xr.Dataset:
     """Group `verdict`; adds the group `halves` where the recording can be divided."""
     problem, calibration = fit.problem, tree["calibration"].to_dataset()
     M, inflation, square = problem.spec.biases, np.ones(problem.spec.biases), np.zeros(problem.spec.biases)
@@ -84,7 +81,7 @@ def _verdicts(
     if len(edges) > 1:
         piece = np.searchsorted(edges[1:], problem.measurements.time, side="right")
         quarters = pieces.divide(fit, piece, len(edges))
-        inflation = _inflation(fit, found.filters, quarters, piece)
+        inflation = _inflation(fit, found, quarters, piece)
         into = [2 * p // len(edges) for p in range(len(edges))]
         halves = pieces.merged(quarters, into)
         contrast = pieces.contrasts(halves)
@@ -111,7 +108,9 @@ def _verdicts(
     words, reasons = verdict.judge(problem, str(tree.attrs["status"]), pruned, known, drifts, disagreements)
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}
-    group = xr.Dataset({name: ("bias_label", value) for name, value in values.items()}, {"bias_label": list(problem.labels)})
+    group = xr.Dataset(
+        {name: ("bias_label", value) for name, value in values.items()}, {"bias_label": list(problem.labels)}
+    )
     group.attrs |= {"rate": RATE, "limit": known.limit}
     return group
 
@@ -124,7 +123,7 @@ def _edges(problem: Problem, count: int) -> np.ndarray:
     return edges if distinct else _edges(problem, 2) if count > 2 else edges[:1]
 
 
-def _inflation(fit: Fitted, filters: list[Any], quarters: Pieces, piece: np.ndarray) -> np.ndarray:
+def _inflation(fit: Fitted, found: residuals.Filtered, quarters: Pieces, piece: np.ndarray) -> np.ndarray:
     """How much wider (M,) the variance of a change is than the model says: overdispersion and correlation in time.
 
     Both are measured on innovations from which each quarter's own biases are taken, so that a change does not hide
@@ -136,7 +135,7 @@ def _inflation(fit: Fitted, filters: list[Any], quarters: Pieces, piece: np.ndar
         jnp.asarray(step[piece[index][:, None], np.asarray(data.bias)[np.asarray(data.sensor)]])
         for index, data in zip(fit.problem.row_index, fit.problem.system.rows, strict=True)
     ]
-    value = residuals.moved_innovations(fit, filters, shift)
+    value = residuals.moved_innovations(fit, found, shift)
     group, labels = checks.codes(fit.data, ["sensor", "channel"])
     data = np.bincount(group)
     wide = np.maximum(np.bincount(group, value**2) / data, 1.0)
@@ -220,5 +219,7 @@ def _score(fit: Fitted, tree: xr.DataTree, truth: Truth, groups: dict[str, xr.Da
             check.attrs |= {f"nees{s}": found.mean, f"nees_lower{s}": found.lower, f"nees_upper{s}": found.upper}
     biases = nees.of_biases(tree, truth, RATE)
     if biases is not None:
-        check.attrs |= dict(zip(("nees_bias", "nees_bias_count", "nees_bias_lower", "nees_bias_upper"), biases, strict=True))
+        check.attrs |= dict(
+            zip(("nees_bias", "nees_bias_count", "nees_bias_lower", "nees_bias_upper"), biases, strict=True)
+        )
     groups["epoch_check"] = check

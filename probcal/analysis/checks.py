@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 import pandas as pd
 import xarray as xr
@@ -34,8 +33,8 @@ def codes(frame: pd.DataFrame, names: list[str]) -> tuple[np.ndarray, pd.DataFra
 
 def _nis(name: str, nis: float, lower: float, upper: float) -> str:
     """Sentence on a NIS beyond its limits."""
-    way = f"std may be {np.sqrt(nis):.2g} times the declared one"
-    return f"{name}: NIS {nis:.3g} a datum, limits {lower:.3g} to {upper:.3g}: its noise {way}"
+    way = "larger" if nis > 1 else "smaller"
+    return f"{name}: NIS {nis:.3g} a datum, limits {lower:.3g} to {upper:.3g}: its noise is {way} than declared"
 
 
 def _beyond(names: list[str], part: residuals.Squares) -> list[Finding]:
@@ -51,11 +50,13 @@ def squares_by(fit: Fitted, found: residuals.Innovations, name: str) -> tuple[xr
     group, labels = codes(fit.data, [name])
     names = labels[name].tolist()
     part = residuals.squares(found, group, len(names), RATE / len(names))
-    return xr.Dataset({key: (name, value) for key, value in part._asdict().items()}, {name: names}), _beyond(names, part)
+    return xr.Dataset({key: (name, value) for key, value in part._asdict().items()}, {name: names}), _beyond(
+        names, part
+    )
 
 
 def by_channel(
-    fit: Fitted, found: residuals.Innovations, tree: xr.DataTree, key: jax.Array
+    fit: Fitted, found: residuals.Innovations, replicas: predictive.Predictive
 ) -> tuple[xr.Dataset, list[Finding]]:
     """NIS, mean, correlation in time and predictive p-values of every sensor's channels, dimension `part`.
 
@@ -81,16 +82,23 @@ def by_channel(
             text = f"{name}: innovations have mean {white.mean:.2f} noise std (limit {limit:.2f}): a bias is left"
             findings.append(Finding("mean", name, text))
     values |= dict(zip(("autocorrelation", "mean", "white"), extra.T, strict=True))
-    if (replicas := predictive.check(fit, tree, key)) is not None:
-        first = np.unique(group, return_index=True)[1]
-        for kind, p in (("misfit", replicas.misfit[first]), ("mean", replicas.mean[first])):
-            values[f"p_{kind}"] = p
-            for k in np.flatnonzero(np.minimum(p, 1 - p) < RATE / 2):
-                name = ".".join(labels.iloc[k])
-                text = f"{name}: its {kind} is unlike that of replicas (posterior predictive p {p[k]:.3f})"
-                findings.append(Finding("predictive", name, text))
+    first = np.unique(group, return_index=True)[1]
+    for kind, of in (("misfit", replicas.misfit), ("mean", replicas.mean)):
+        if of is not None:
+            values[f"p_{kind}"] = of[first]
+            findings += _unlike_replicas(kind, [".".join(pair) for pair in labels.to_numpy(str)], of[first])
     coords = {name: ("part", labels[name].to_numpy(str)) for name in labels}
     return xr.Dataset({name: ("part", value) for name, value in values.items()}, coords), findings
+
+
+def _unlike_replicas(kind: str, names: list[str], p: np.ndarray) -> list[Finding]:
+    """Findings of the predictive p-values (parts,) that are small or near one."""
+    words = {"misfit": ("fit worse", "fit better"), "mean": ("lie higher", "lie lower")}[kind]
+    return [
+        Finding("predictive", names[k], f"{names[k]}: the data {words[int(p[k] > 0.5)]} than replicas"
+                f" (posterior predictive p {min(p[k], 1 - p[k]):.3f})")
+        for k in np.flatnonzero(np.minimum(p, 1 - p) < RATE / 2)
+    ]  # fmt: skip
 
 
 def by_epoch(fit: Fitted, found: residuals.Innovations) -> xr.Dataset:
@@ -98,7 +106,9 @@ def by_epoch(fit: Fitted, found: residuals.Innovations) -> xr.Dataset:
     values: dict[str, Any] = {}
     coords: dict[str, Any] = {}
     places = [np.zeros(data.y.shape, int) + np.asarray(data.epoch)[:, None] for data in fit.problem.system.rows]
-    owners = [np.full(data.y.shape, r) for data, r in zip(fit.problem.system.rows, fit.problem.spec.recursion, strict=True)]
+    owners = [
+        np.full(data.y.shape, r) for data, r in zip(fit.problem.system.rows, fit.problem.spec.recursion, strict=True)
+    ]
     epoch, owner = fit.flat(places), fit.flat(owners)
     for r, epochs in enumerate(fit.problem.epochs):
         s, mine = suffix(fit.problem, r), owner == r

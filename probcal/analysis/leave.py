@@ -32,7 +32,7 @@ TARGETS = 32  # beyond which targets are not left out one by one
 class Refit(NamedTuple):
     """Where one refit ends."""
 
-    evidence: jax.Array  # log p(data)
+    evidence: jax.Array  # log p(data), but for the determinant of the prior
     square: jax.Array  # least squares of all innovations, noises and biases in the linearised problem
 
 
@@ -47,14 +47,13 @@ def _stepped(
     both = held[:, None] | held[None, :]
     eye = jnp.eye(len(held))
     matrix = solved.information + prior.matrix()
-    own = jnp.where(both, eye, prior.matrix() + jnp.diag(1.0 * (jnp.diagonal(prior.matrix()) == 0)))
     away = jnp.where(held, -point.z, 0.0)
     slope = jnp.where(held, away, solved.score - prior.pull(point.z) - matrix @ away)
     inverse, logdet = linalg.inverse_and_logdet(jnp.where(both, eye, matrix))
     start = point._replace(z=point.z + away)
     moved = follow(system, point, solved, inverse @ slope)
-    _, normaliser = linalg.inverse_and_logdet(own)
-    before, after = cost(spec, system, start, prior), cost(spec, system, moved, prior)
+    ends = jax.tree.map(lambda a, b: jnp.stack([a, b]), start, moved)
+    before, after = jax.vmap(lambda end: cost(spec, system, end, prior))(ends)
     least = jnp.where(after < before, after, before)
     square = sum(jnp.sum(u**2) for u in moved.noises) + prior.square(moved.z)
     padded = jnp.append(moved.z - point.z, 0.0)
@@ -65,7 +64,7 @@ def _stepped(
         change = jnp.einsum("ncu,nu->nc", lin.state, dx)
         change = change + jnp.einsum("ncp,np->nc", lin.bias, padded[data.bias][data.sensor])
         square = square + jnp.sum((score - root * change) ** 2)
-    return Refit(-least + 0.5 * normaliser - 0.5 * (solved.logdet + logdet), square)
+    return Refit(-least - 0.5 * (solved.logdet + logdet), square)
 
 
 class _Refits:
@@ -85,7 +84,7 @@ class _Refits:
         point, lins = fit.point, fit.lins
         if not self.quick:
             frozen = _frozen(system, held)
-            start = point._replace(z=jnp.where(jnp.asarray(held), 0.0, point.z))
+            start = point._replace(z=jnp.asarray(np.where(held, 0.0, point.z)))
             point = find_mode(spec, frozen, start, prior, STEPS, TOLERANCE).point
             lins = linearise(spec, frozen, point)
             solved, system = eliminate_rows(spec, frozen, point, lins), frozen
@@ -94,26 +93,38 @@ class _Refits:
                 self._solved = eliminate_rows(spec, system, point, lins)
             solved = self._solved
         else:
+            pairs = [(lin, np.asarray(new.mask)) for lin, new in zip(lins, system.rows, strict=True)]
             lins = [
-                lin._replace(score=lin.score * (new.mask > 0), weight=lin.weight * (new.mask > 0))
-                for lin, new in zip(lins, system.rows, strict=True)
+                lin._replace(
+                    score=jnp.asarray(np.asarray(lin.score) * mask), weight=jnp.asarray(np.asarray(lin.weight) * mask)
+                )
+                for lin, mask in pairs
             ]
             solved = eliminate_rows(spec, system, point, lins)
         found = _stepped(spec, system, point, prior, lins, solved, jnp.asarray(held))
-        return float(found.evidence), float(found.square)
+        return float(found.evidence) + 0.5 * _logdet(fit.prior.coupling, alpha, held), float(found.square)
 
 
 def masked(fit: Fitted, out: np.ndarray) -> System:
     """The system without the rows of the table in `out` (rows,) boolean."""
     pairs = zip(fit.problem.system.rows, fit.problem.row_index, strict=True)
-    rows = tuple(data._replace(mask=data.mask * jnp.asarray(~out[index])[:, None]) for data, index in pairs)
+    rows = tuple(data._replace(mask=jnp.asarray(np.asarray(data.mask) * ~out[index][:, None])) for data, index in pairs)
     return fit.problem.system._replace(rows=rows)
 
 
 def _frozen(system: System, held: np.ndarray) -> System:
     """The system that does not feel the biases in `held` (M,)."""
-    felt = jnp.asarray(np.append(~held, True).astype(float))
-    return system._replace(rows=tuple(data._replace(scale=data.scale * felt[data.bias]) for data in system.rows))
+    felt = np.append(~held, True)
+    rows = [
+        data._replace(scale=jnp.asarray(np.asarray(data.scale) * felt[np.asarray(data.bias)])) for data in system.rows
+    ]
+    return system._replace(rows=tuple(rows))
+
+
+def _logdet(coupling: jax.Array, alpha: np.ndarray, held: np.ndarray) -> float:
+    """Log determinant of the prior of the biases that are not held, a flat one counted as one."""
+    matrix = np.diag(np.where(alpha > 0, alpha, 1.0)) + np.asarray(coupling)
+    return float(np.linalg.slogdet(matrix[np.ix_(~held, ~held)])[1])
 
 
 class Left(NamedTuple):

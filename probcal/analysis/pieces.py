@@ -47,10 +47,13 @@ class Contrast(NamedTuple):
 def divide(fit: Fitted, piece: np.ndarray, count: int) -> Pieces:
     """Give every piece its own biases; `piece` (rows,) is that of each row of the table, below `count`."""
     spec, system = copied(fit, piece, count)
-    point = fit.point._replace(z=jnp.tile(fit.point.z, count))
+    point = fit.point._replace(z=jnp.asarray(np.tile(fit.point.z, count)))
     solved = eliminate_rows(spec, system, point, fit.lins)
     return Pieces(
-        np.asarray(solved.information), np.asarray(solved.score), np.asarray(fit.prior.matrix()), np.asarray(fit.point.z)
+        np.asarray(solved.information),
+        np.asarray(solved.score),
+        np.asarray(fit.prior.matrix()),
+        np.asarray(fit.point.z),
     )
 
 
@@ -63,10 +66,10 @@ def copied(fit: Fitted, piece: np.ndarray, count: int) -> tuple[Spec, System]:
         copies = [np.where(bias < M, bias + p * M, count * M) for p in range(count)]
         parts.append(
             data._replace(
-                sensor=data.sensor + S * jnp.asarray(piece[index]),
+                sensor=jnp.asarray(np.asarray(data.sensor) + S * piece[index]),
                 bias=jnp.asarray(np.concatenate(copies)),
-                scale=jnp.tile(data.scale, (count, 1)),
-                base=jnp.tile(data.base, (count, 1)),
+                scale=jnp.asarray(np.tile(data.scale, (count, 1))),
+                base=jnp.asarray(np.tile(data.base, (count, 1))),
             )
         )
     return replace(spec, biases=count * M), system._replace(rows=tuple(parts))
@@ -84,7 +87,9 @@ def contrasts(pieces: Pieces, free: Sequence[int] = ()) -> dict[int, Contrast]:
     prior = pieces.prior.copy()
     prior[free, :], prior[:, free] = 0.0, 0.0
     # parameters: the M common values, then what pieces 2, 3, ... of the free biases add to them
-    to = np.concatenate([np.tile(np.eye(M), (P, 1)), np.eye(P * M)[:, [p * M + m for m in free for p in range(1, P)]]], 1)
+    to = np.concatenate(
+        [np.tile(np.eye(M), (P, 1)), np.eye(P * M)[:, [p * M + m for m in free for p in range(1, P)]]], 1
+    )
     crosses = (pieces.information @ to).reshape(P, M, -1)
     K, slope = to.T @ pieces.information @ to, to.T @ pieces.score
     K[:M, :M] += prior

@@ -14,16 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from probcal import linalg, rows
+from probcal import linalg
 from probcal.analysis.fitted import Fitted
-from probcal.noise import Gaussian
 from probcal.problem import Spec, System
 from probcal.rows import Linearised
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Point, factors, of_states
 
 COLUMNS = 16  # bias directions that are filtered together
-REPLICAS = 64  # simulated data behind a kurtosis
 LAGS = 10  # of the Ljung-Box statistic
 FEWEST = 20  # data below which whiteness is not judged
 
@@ -95,89 +93,67 @@ def _whiten(
 
 @partial(jax.jit, static_argnames="spec")
 def _innovations(
-    spec: Spec, system: System, point: Point, lins: list[Linearised], filters: list[Filter], shift: list[jax.Array]
-) -> tuple[list[jax.Array], list[jax.Array]]:
-    """Innovations (N, C) with the biases of every row moved by `shift` (N, p), and the share of S^-1/2 they keep."""
+    spec: Spec,
+    system: System,
+    point: Point,
+    lins: list[Linearised],
+    filters: list[Filter],
+    shift: list[jax.Array],
+    root: jax.Array,
+) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
+    """Of each block: innovations with the biases of every row moved by `shift` (N, p) in z, the sum of squares of their
+    responses to bias directions `root` (M, K), and the share of itself that S^-1/2 leaves a datum; each (N, C)."""
     columns, kept = [], []
+    padded = jnp.concatenate([root, jnp.zeros((1, root.shape[1]))])
     for block, data, lin, dz, r in zip(spec.blocks, system.rows, lins, shift, spec.recursion, strict=True):
-        root = jnp.sqrt(lin.weight)
-        score = jnp.where(root > 0, lin.score / jnp.where(root > 0, root, 1.0), 0.0)
-        columns.append((score - root * jnp.einsum("ncp,np->nc", lin.bias, dz))[:, :, None])
+        size = jnp.sqrt(lin.weight)
+        score = jnp.where(size > 0, lin.score / jnp.where(size > 0, size, 1.0), 0.0)
+        moved = jnp.einsum("ncp,np->nc", lin.bias, dz)
+        responses = jnp.einsum("nc,ncp,npk->nck", size, lin.bias, padded[data.bias[data.sensor]])
+        columns.append(jnp.concatenate([(score - size * moved)[:, :, None], responses], 2))
         used = jnp.asarray(block.used, int)
         mix = filters[r].mix[:, used[:, None], used[None, :]][data.epoch]
         kept.append(1.0 + lin.weight * jnp.einsum("ncu,nuv,ncv->nc", lin.state, mix, lin.state))
     drifts = [
-        -(factors(part, point.levels) @ u[:, :, None]) for part, u in zip(system.recursions, point.noises, strict=True)
+        jnp.pad(-(factors(part, point.levels) @ u[:, :, None]), ((0, 0), (0, 0), (0, root.shape[1])))
+        for part, u in zip(system.recursions, point.noises, strict=True)
     ]
-    return [c[:, :, 0] for c in _whiten(spec, system, lins, filters, columns, drifts)], kept
-
-
-@partial(jax.jit, static_argnames="spec")
-def _leverage(
-    spec: Spec, system: System, lins: list[Linearised], filters: list[Filter], root: jax.Array
-) -> list[jax.Array]:
-    """Sum of squares (N, C) of the innovations' responses to bias directions (M, K)."""
-    padded = jnp.concatenate([root, jnp.zeros((1, root.shape[1]))])
-    columns = [
-        jnp.einsum("nc,ncp,npk->nck", jnp.sqrt(lin.weight), lin.bias, padded[data.bias[data.sensor]])
-        for data, lin in zip(system.rows, lins, strict=True)
-    ]
-    drifts = [jnp.zeros((*part.drift.shape, root.shape[1])) for part in system.recursions]
-    return [jnp.sum(c**2, 2) for c in _whiten(spec, system, lins, filters, columns, drifts)]
-
-
-@partial(jax.jit, static_argnames="spec")
-def _kurtosis(spec: Spec, system: System, point: Point, key: jax.Array) -> list[jax.Array]:
-    """Excess kurtosis (N, C) of the standardised score, from simulated data at the fitted prediction."""
-
-    def fourth(seed):
-        found = []
-        for b, (block, data, r) in enumerate(zip(spec.blocks, system.rows, spec.recursion, strict=True)):
-            predicted = rows.predict(block, data, point.states[r], point.z)
-            drawn = rows.sample(block, data, predicted, point.levels, jax.random.fold_in(seed, b))
-            std = rows.noise_std(data, point.levels)
-            score, weight = rows.weigh(block, data._replace(y=drawn), predicted, std, expected=True)
-            found.append(score**4 / jnp.where(weight > 0, weight, 1.0) ** 2)
-        return found
-
-    sampled = jax.lax.map(fourth, jax.random.split(key, REPLICAS))
-    return [jnp.mean(s, 0) - 3.0 for s in sampled]
+    white = _whiten(spec, system, lins, filters, columns, drifts)
+    return [(c[:, :, 0], jnp.sum(c[:, :, 1:] ** 2, 2), k) for c, k in zip(white, kept, strict=True)]
 
 
 class Filtered(NamedTuple):
-    """The filters of a fit, and its innovations."""
+    """The filters of a fit, its innovations, and the bias directions (M, K) behind their degrees of freedom."""
 
     filters: list[Filter]
     innovations: Innovations
+    roots: list[jax.Array]
 
 
-def innovations(fit: Fitted, key: jax.Array) -> Filtered:
-    """Innovations of all data, with the biases at their means.
+def innovations(fit: Fitted, kurtosis: np.ndarray) -> Filtered:
+    """Innovations of all data with the biases at their means, for noise of excess kurtosis (D,).
 
     A sum of squares over some data expects their number less what the biases used: over all data the sum of gamma,
     over a share of them the trace of B (G + A)^-1 B', B their responses to the biases.
     """
     spec, system = fit.problem.spec, fit.problem.system
     filters = prepare(spec, system, fit.point, fit.lins)
-    value, kept = _innovations(spec, system, fit.point, fit.lins, filters, _still(fit))
-    root, used = linalg.factor(jnp.asarray(fit.covariance)), np.zeros(len(fit.data))
+    root = np.asarray(linalg.factor(jnp.asarray(fit.covariance)))
     chunk = min(COLUMNS, spec.biases)
-    root = jnp.pad(root, ((0, 0), (0, -spec.biases % chunk)))
-    for start in range(0, root.shape[1], chunk):
-        used += fit.flat(_leverage(spec, system, fit.lins, filters, root[:, start : start + chunk]))
-    kurtosis = np.zeros(len(used))
-    if any(not isinstance(channel.noise, Gaussian) for block in spec.blocks for channel in block.channels):
-        kurtosis = fit.flat(_kurtosis(spec, system, fit.point, key)) * fit.flat(kept) ** 4
-    return Filtered(filters, Innovations(fit.flat(value), used, kurtosis))
+    root = np.pad(root, ((0, 0), (0, -spec.biases % chunk)))
+    roots = [jnp.asarray(part) for part in np.split(root, root.shape[1] // chunk, axis=1)]
+    still = [jnp.asarray(np.zeros((lin.bias.shape[0], lin.bias.shape[2]))) for lin in fit.lins]
+    found = [_innovations(spec, system, fit.point, fit.lins, filters, still, part) for part in roots]
+    value, _, kept = (fit.flat(parts) for parts in zip(*found[0], strict=True))
+    used = sum(fit.flat([own for _, own, _ in part]) for part in found)
+    return Filtered(filters, Innovations(value, used, kurtosis * kept**4), roots)
 
 
-def _still(fit: Fitted) -> list[jax.Array]:
-    return [jnp.zeros((lin.bias.shape[0], lin.bias.shape[2])) for lin in fit.lins]
-
-
-def moved_innovations(fit: Fitted, filters: list[Filter], shift: list[jax.Array]) -> np.ndarray:
+def moved_innovations(fit: Fitted, known: Filtered, shift: list[jax.Array]) -> np.ndarray:
     """Innovations (D,) with the biases of every row of each block moved by `shift` (N, p) in z."""
-    return fit.flat(_innovations(fit.problem.spec, fit.problem.system, fit.point, fit.lins, filters, shift)[0])
+    spec, system = fit.problem.spec, fit.problem.system
+    found = _innovations(spec, system, fit.point, fit.lins, known.filters, shift, known.roots[0])
+    return fit.flat([value for value, _, _ in found])
 
 
 class Squares(NamedTuple):
@@ -221,8 +197,8 @@ def whiteness(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> Whiten
     n = len(value)
     if n < FEWEST:
         return None
-    order = np.lexsort((time, target))
-    value, target = value[order] - value.mean(), target[order]
+    order, mean = np.lexsort((time, target)), float(np.mean(value))
+    value, target = value[order] - mean, target[order]
     variance = max(float(np.mean(value**2)), 1e-300)
     statistic, lags, first = 0.0, 0, 0.0
     for lag in range(1, min(LAGS, n // 5) + 1):
@@ -235,7 +211,7 @@ def whiteness(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> Whiten
         first = r if lag == 1 else first
     if not lags:
         return None
-    return Whiteness(first, float(np.mean(value)), float(stats.chi2.sf(statistic, lags)))
+    return Whiteness(first, mean, float(stats.chi2.sf(statistic, lags)))
 
 
 NEAR_TURN = 1.0  # rad of a full turn within which a residual tells of a missing wrap
