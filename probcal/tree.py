@@ -269,10 +269,17 @@ def add_scores(tree: xr.DataTree, scores: Mapping[str, float], biases: Mapping[s
 
 
 def summary(tree: xr.DataTree) -> Any:
-    """One row a bias as a DataFrame: bias, unit, scale, mean, sd, lower, upper, gamma, precision, status."""
+    """One row a bias as a DataFrame: bias, unit, scale, mean, sd, lower, upper, gamma, precision, status.
+
+    After `assess` also verdict and reason.
+    """
     group = tree["calibration"].to_dataset()
-    frame = group[[*SUMMARY[1:], "precision", "status"]].to_dataframe().reset_index()
-    return frame.rename(columns={"bias_label": "bias"})[[*SUMMARY, "precision", "status"]]
+    columns = [*SUMMARY, "precision", "status"]
+    if "verdict" in tree.children:
+        judged = tree["verdict"].to_dataset()[["verdict", "reason"]]
+        group, columns = group.merge(judged), [*columns, *judged.data_vars]
+    frame = group[columns[1:]].to_dataframe().reset_index()
+    return frame.rename(columns={"bias_label": "bias"})[columns]
 
 
 def save(tree: xr.DataTree, path: str | PathLike[str]) -> Path:

@@ -54,18 +54,16 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     ]
     findings += checks.left_out(fit, tree, groups)
     groups["verdict"] = _verdicts(fit, tree, found, groups)
-    findings += [
-        Finding(word, label, f"{label}: {reason}")
-        for label, word, reason in zip(*(groups["verdict"][n].values.tolist() for n in ("bias_label", "verdict", "reason")), strict=True)
-        if word in ("drifting", "conflicting")
-    ]  # fmt: skip
+    columns = [groups["verdict"][name].values.tolist() for name in ("verdict", "bias_label", "reason")]
+    alarms = [row for row in zip(*columns, strict=True) if row[0] in ("drifting", "conflicting")]
+    findings += [Finding(word, label, f"{label}: {reason}") for word, label, reason in alarms]
     scaled = sensitivity.power_scaling(tree)
     if scaled is not None:
         groups["sensitivity"] = scaled
     if truth is not None:
         _score(fit, tree, truth, groups)
-    columns = {name: ("finding", np.array([getattr(f, name) for f in findings], str)) for name in Finding._fields}
-    groups["finding"] = xr.Dataset(columns)
+    texts = {name: ("finding", np.array([getattr(f, name) for f in findings], str)) for name in Finding._fields}
+    groups["finding"] = xr.Dataset(texts)
     result = tree.copy()
     for name, group in groups.items():
         result[name] = xr.DataTree(group)
@@ -108,9 +106,8 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
     words, reasons = verdict.judge(problem, str(tree.attrs["status"]), pruned, known, drifts, disagreements)
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}
-    group = xr.Dataset(
-        {name: ("bias_label", value) for name, value in values.items()}, {"bias_label": list(problem.labels)}
-    )
+    labels = {"bias_label": list(problem.labels)}
+    group = xr.Dataset({name: ("bias_label", value) for name, value in values.items()}, labels)
     group.attrs |= {"rate": RATE, "limit": known.limit}
     return group
 

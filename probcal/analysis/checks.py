@@ -132,10 +132,11 @@ def by_datum(fit: Fitted, found: residuals.Innovations, tree: xr.DataTree) -> tu
         group, labels = codes(data, ["row", "sensor", "target", "time"])
         row = leave.psis(tree, group, len(labels))
         values |= {"elpd": row.elpd[group], "pareto_k": row.pareto_k[group]}
-        attrs |= {"elpd_loo": row.total, "elpd_se": row.se, "good_k": row.good}
-        bad = int((row.pareto_k > row.good).sum())
+        good = leave.good_k(tree)
+        attrs |= {"elpd_loo": float(row.elpd.sum()), "elpd_se": leave.standard_error(row.elpd), "good_k": good}
+        bad = int((row.pareto_k > good).sum())
         if bad > RATE * len(labels):
-            text = f"PSIS-LOO: Pareto k of {bad} of {len(labels)} rows is above {row.good:.2f}: its elpd is uncertain"
+            text = f"PSIS-LOO: Pareto k of {bad} of {len(labels)} rows is above {good:.2f}: its elpd is uncertain"
             findings.append(Finding("loo", "rows", text))
     coords = {name: ("datum", data[name].to_numpy()) for name in data}
     return xr.Dataset({name: ("datum", v) for name, v in values.items()}, coords, attrs), findings
@@ -159,7 +160,7 @@ def left_out(fit: Fitted, tree: xr.DataTree, groups: dict[str, xr.Dataset]) -> l
         check["elpd"] = (name, found.elpd[order])
         check["rest_nis"] = (name, found.nis[order])
         check.attrs |= {"refits": "one step" if found.quick else "full", "elpd": float(found.elpd.sum())}
-        check.attrs["elpd_se"] = float(np.sqrt(len(names) * np.var(found.elpd)))
+        check.attrs["elpd_se"] = leave.standard_error(found.elpd)
         if name == "sensor":
             check["elpd_stated"] = (name, found.stated[order])
             check["difference"] = (name, (found.elpd - found.stated)[order])

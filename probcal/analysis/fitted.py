@@ -11,7 +11,7 @@ import xarray as xr
 
 from probcal import linalg, tree
 from probcal.priors import Precision
-from probcal.problem import Problem, Spec, System
+from probcal.problem import Problem
 from probcal.rows import Linearised
 from probcal.smoothing import mode
 from probcal.smoothing.information import at_levels
@@ -64,7 +64,7 @@ def take_up(problem: Problem, fit: xr.DataTree) -> Fitted:
     if group["bias_label"].values.tolist() != list(problem.labels):
         raise InputError("assess: the tree was fitted with other free biases; give the problem as it was fitted")
     datum, picks = tree.datum_of(problem)
-    if not np.array_equal(datum["y"], fit["observed_data"]["y"].values):
+    if not np.array_equal(datum["y"], fit["observed_data"].to_dataset()["y"].values):
         raise InputError("assess: the tree was fitted to other data; give the problem as it was fitted")
     covariance = group["covariance"].values / np.outer(problem.scales, problem.scales)
     point = _point(problem, fit)
@@ -81,7 +81,7 @@ def _point(problem: Problem, fit: xr.DataTree) -> Point:
     if problem.levels:
         level = fit["level"].to_dataset()
         point = at_levels(problem.system, point, jnp.asarray(np.log(level["std"].values / level["guess"].values)))
-    z = jnp.asarray(fit["calibration"]["mean"].values / problem.scales)
+    z = jnp.asarray(fit["calibration"].to_dataset()["mean"].values / problem.scales)
     return track_mode(problem, point._replace(z=z))
 
 

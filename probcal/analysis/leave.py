@@ -9,12 +9,13 @@ import warnings
 from functools import partial
 from typing import Any, NamedTuple
 
-import arviz as az
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import xarray as xr
+from arviz_stats.base import array_stats
+from scipy import special
 
 from probcal import linalg
 from probcal.analysis.fitted import Fitted, eliminate_rows, linearise
@@ -177,32 +178,30 @@ def _left(names: list[str], rows: list[Any], owner: pd.Series, quick: bool) -> L
 
 
 class Pointwise(NamedTuple):
-    """PSIS-LOO of groups of data: log predictive density, Pareto k of each, and their sum as ArviZ has it."""
+    """PSIS-LOO of groups of data, each (groups,): log predictive density and Pareto k."""
 
     elpd: np.ndarray
     pareto_k: np.ndarray
-    total: float
-    se: float
-    good: float  # Pareto k up to which importance sampling can be trusted
 
 
 def psis(tree: xr.DataTree, group: np.ndarray, count: int) -> Pointwise:
-    """PSIS-LOO by `az.loo` of the log-likelihood in a tree, summed over groups (data,)."""
-    values = tree["log_likelihood"]["y"].values
+    """PSIS-LOO by ArviZ of the log-likelihood in a tree, summed over groups (data,); `az.loo` where each is a datum."""
+    values = tree["log_likelihood"].to_dataset()["y"].values
+    values = values.reshape(-1, values.shape[2])
     order = np.argsort(group, kind="stable")
-    first = np.searchsorted(group[order], np.arange(count))
-    summed = values if count == len(group) and (order == np.arange(count)).all() else None
-    if summed is None:
-        summed = np.add.reduceat(values[:, :, order], first, axis=2)
-    data = xr.DataTree.from_dict(
-        {
-            "posterior": xr.Dataset({"x": (("chain", "draw"), np.zeros(values.shape[:2]))}),
-            "log_likelihood": xr.Dataset({"y": (("chain", "draw", "group"), summed)}),
-        }
-    )
+    summed = np.add.reduceat(values[:, order], np.searchsorted(group[order], np.arange(count)), axis=1).T
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a large Pareto k is reported, not warned about
-        found = az.loo(data, pointwise=True, reff=1.0)
-    return Pointwise(
-        found.elpd_i.values, found.pareto_k.values, float(found.elpd), float(found.se), float(found.good_k)
-    )
+        weights, pareto_k = array_stats.psislw(-summed)
+    return Pointwise(special.logsumexp(weights + summed, axis=1), pareto_k)
+
+
+def good_k(tree: xr.DataTree) -> float:
+    """Pareto k up to which importance sampling can be trusted with so many draws (Vehtari et al. 2024)."""
+    posterior = tree["log_likelihood"].to_dataset()
+    return min(1.0 - 1.0 / np.log10(posterior.sizes["chain"] * posterior.sizes["draw"]), 0.7)
+
+
+def standard_error(elpd: np.ndarray) -> float:
+    """Standard error of a sum of log predictive densities, as ArviZ has it."""
+    return float(np.sqrt(len(elpd) * np.var(elpd)))

@@ -50,7 +50,7 @@ def of_positions(tree: xr.DataTree, truth: Truth, suffix: str, rate: float) -> N
 
 
 def of_biases(tree: xr.DataTree, truth: Truth, rate: float) -> tuple[float, int, float, float] | None:
-    """NEES of all biases that the truth knows, their number, and the limits of chi-square; None where there are none."""
+    """NEES of all biases that the truth knows, their number and limits; None where it knows none."""
     group = tree["calibration"].to_dataset()
     labels = [label for label in group["bias_label"].values.tolist() if label in truth.biases]
     if not labels:

@@ -104,7 +104,7 @@ def _of_tree(fit: Fitted, tree: xr.DataTree) -> Drawn | None:
     def thin(values: np.ndarray) -> np.ndarray:
         return values.reshape(total, *values.shape[2:])[chosen]
 
-    flat, replicas, start = thin(tree["posterior_predictive"]["y"].values), [], 0
+    flat, replicas, start = thin(tree["posterior_predictive"].to_dataset()["y"].values), [], 0
     for data, (row, channel) in zip(problem.system.rows, fit.picks, strict=True):
         block = np.zeros((len(chosen), *data.y.shape))
         block[:, row, channel] = flat[:, start : start + len(row)]

@@ -145,7 +145,7 @@ def innovations(fit: Fitted, kurtosis: np.ndarray) -> Filtered:
     still = [jnp.asarray(np.zeros((lin.bias.shape[0], lin.bias.shape[2]))) for lin in fit.lins]
     found = [_innovations(spec, system, fit.point, fit.lins, filters, still, part) for part in roots]
     value, _, kept = (fit.flat(parts) for parts in zip(*found[0], strict=True))
-    used = sum(fit.flat([own for _, own, _ in part]) for part in found)
+    used = np.sum([fit.flat([own for _, own, _ in part]) for part in found], axis=0)
     return Filtered(filters, Innovations(value, used, kurtosis * kept**4), roots)
 
 

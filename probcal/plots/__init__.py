@@ -1,10 +1,11 @@
 """Pictures of saved results: matplotlib figures without pyplot, one module a kind of result."""
 
+from probcal.plots.assess import plot_halves, plot_left_out, plot_nis, plot_shrinkage
 from probcal.plots.base import INTERVAL, INVALID
 from probcal.plots.fit import plot_biases, plot_gamma, plot_map, plot_objective, plot_outliers, plot_residuals
 from probcal.plots.study import draw_study, plot_study
 
 __all__ = [
-    "INTERVAL", "INVALID", "draw_study", "plot_biases", "plot_gamma", "plot_map", "plot_objective", "plot_outliers",
-    "plot_residuals", "plot_study",
+    "INTERVAL", "INVALID", "draw_study", "plot_biases", "plot_gamma", "plot_halves", "plot_left_out", "plot_map",
+    "plot_nis", "plot_objective", "plot_outliers", "plot_residuals", "plot_shrinkage", "plot_study",
 ]  # fmt: skip
