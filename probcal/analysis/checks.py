@@ -14,6 +14,7 @@ from probcal.tree import suffix
 
 PRACTICAL = 1.25  # factor from 1 within which a NIS beyond its limits is no finding
 NOTABLE = 0.1  # lag-1 correlation, and mean, of innovations within which neither is
+NAMES = 4  # that a sentence on several channels lists
 GAIN = 5.0  # nats that a calibration must win before it is a finding
 
 
@@ -92,13 +93,17 @@ def by_channel(
 
 
 def _unlike_replicas(kind: str, names: list[str], p: np.ndarray) -> list[Finding]:
-    """Findings of the predictive p-values (parts,) that are small or near one."""
-    words = {"misfit": ("fit worse", "fit better"), "mean": ("lie higher", "lie lower")}[kind]
-    return [
-        Finding("predictive", names[k], f"{names[k]}: the data {words[int(p[k] > 0.5)]} than replicas"
-                f" (posterior predictive p {min(p[k], 1 - p[k]):.3f})")
-        for k in np.flatnonzero(np.minimum(p, 1 - p) < RATE / 2)
-    ]  # fmt: skip
+    """Findings of the predictive p-values (parts,) that are small or near one, one sentence for those alike."""
+    words, found = {"misfit": ("fit worse", "fit better"), "mean": ("lie higher", "lie lower")}[kind], []
+    for word, extreme in zip(words, (p, 1 - p), strict=True):
+        out = np.flatnonzero(extreme < RATE / 2)
+        if len(out):
+            listed = ", ".join(names[k] for k in out[:NAMES]) + (
+                f" and {len(out) - NAMES} more" if len(out) > NAMES else ""
+            )
+            text = f"{listed}: the data {word} than replicas (posterior predictive p at most {extreme[out].max():.3f})"
+            found.append(Finding("predictive", names[out[0]], text))
+    return found
 
 
 def by_epoch(fit: Fitted, found: residuals.Innovations) -> xr.Dataset:
@@ -133,7 +138,7 @@ def by_datum(fit: Fitted, found: residuals.Innovations, tree: xr.DataTree) -> tu
         row = leave.psis(tree, group, len(labels))
         values |= {"elpd": row.elpd[group], "pareto_k": row.pareto_k[group]}
         good = leave.good_k(tree)
-        attrs |= {"elpd_loo": float(row.elpd.sum()), "elpd_se": leave.standard_error(row.elpd), "good_k": good}
+        attrs |= {"elpd": float(row.elpd.sum()), "elpd_se": leave.standard_error(row.elpd), "good_k": good}
         bad = int((row.pareto_k > good).sum())
         if bad > RATE * len(labels):
             text = f"PSIS-LOO: Pareto k of {bad} of {len(labels)} rows is above {good:.2f}: its elpd is uncertain"
@@ -160,7 +165,8 @@ def left_out(fit: Fitted, tree: xr.DataTree, groups: dict[str, xr.Dataset]) -> l
         check["elpd"] = (name, found.elpd[order])
         check["rest_nis"] = (name, found.nis[order])
         check.attrs |= {"refits": "one step" if found.quick else "full", "elpd": float(found.elpd.sum())}
-        check.attrs["elpd_se"] = leave.standard_error(found.elpd)
+        if len(names) > 1:
+            check.attrs["elpd_se"] = leave.standard_error(found.elpd)
         if name == "sensor":
             check["elpd_stated"] = (name, found.stated[order])
             check["difference"] = (name, (found.elpd - found.stated)[order])

@@ -192,16 +192,16 @@ def psis(tree: xr.DataTree, group: np.ndarray, count: int) -> Pointwise:
     summed = np.add.reduceat(values[:, order], np.searchsorted(group[order], np.arange(count)), axis=1).T
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a large Pareto k is reported, not warned about
-        weights, pareto_k = array_stats.psislw(-summed)
+        weights, pareto_k = array_stats.psislw(summed)
     return Pointwise(special.logsumexp(weights + summed, axis=1), pareto_k)
 
 
 def good_k(tree: xr.DataTree) -> float:
     """Pareto k up to which importance sampling can be trusted with so many draws (Vehtari et al. 2024)."""
     posterior = tree["log_likelihood"].to_dataset()
-    return min(1.0 - 1.0 / np.log10(posterior.sizes["chain"] * posterior.sizes["draw"]), 0.7)
+    return min(1.0 - 1.0 / float(np.log10(posterior.sizes["chain"] * posterior.sizes["draw"])), 0.7)
 
 
 def standard_error(elpd: np.ndarray) -> float:
     """Standard error of a sum of log predictive densities, as ArviZ has it."""
-    return float(np.sqrt(len(elpd) * np.var(elpd)))
+    return float(np.sqrt(len(elpd) * np.var(elpd, ddof=1)))
