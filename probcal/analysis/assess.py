@@ -1,6 +1,6 @@
 """`assess`: is the answer of a fit good? Innovations, predictive checks, left-out data, halves, and verdicts."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -74,36 +74,35 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
     """Group `verdict`; adds the group `halves` where the recording can be divided."""
     problem, calibration = fit.problem, tree["calibration"].to_dataset()
     M, inflation, square = problem.spec.biases, np.ones(problem.spec.biases), np.zeros(problem.spec.biases)
-    drifts, disagreements = list[tuple[Change, str]](), list[tuple[Change, str]]()
-    edges = _edges(problem, QUARTERS if QUARTERS * M <= COPIES else 2)
-    if len(edges) > 1:
-        piece = np.searchsorted(edges[1:], problem.measurements.time, side="right")
-        quarters = pieces.divide(fit, piece, len(edges))
-        inflation = _inflation(fit, found, quarters, piece)
-        into = [2 * p // len(edges) for p in range(len(edges))]
-        halves = pieces.merged(quarters, into)
-        contrast = pieces.contrasts(halves)
-        square[list(contrast)] = [c.square / inflation[m] for m, c in contrast.items()]
-        limit = limit_of(len(contrast))
-        if contrast:
-            groups["halves"] = _halves(problem, contrast, inflation, edges[into.index(1)], limit)
-        shapes = pieces.contrasts(quarters)
-        for change in pieces.changing(halves, inflation, limit):
-            drifts.append((change, _drift(problem, change, inflation, limit, shapes.get(change.bias), edges)))
-    names = problem.measurements.target_names
-    if len(names) > 1:
-        count = min(len(names), max(2, COPIES // M))
-        passes = pieces.divide(fit, problem.measurements.target % count, count)
-        limit = limit_of(M, count - 1)
-        for change in pieces.changing(passes, inflation, limit):
-            disagreements.append((change, _disagreement(change, inflation, limit, names, count)))
+    drifts, disagreements, first = dict[int, str](), dict[int, str](), ""
+    grid = _grid(problem)
+    if grid.patterns:
+        divided = pieces.divide(fit, grid.piece, grid.pieces)
+        inflation = _inflation(fit, found, divided, grid.piece)
+        limits = {name: limit_of(M, pattern.shape[1]) for name, pattern in grid.patterns.items()}
+        if "halves" in grid.patterns:
+            alone = pieces.contrasts(divided, grid.patterns["halves"])
+            square[list(alone)] = [c.square / inflation[m] for m, c in alone.items()]
+            if alone:
+                groups["halves"] = _halves(
+                    problem, alone, inflation, grid.edges[len(grid.edges) // 2], limits["halves"]
+                )
+        changes = pieces.changing(divided, grid.patterns, inflation, limits)
+        shapes = pieces.contrasts(divided, grid.quarters) if changes and grid.quarters.shape[1] > 1 else {}
+        first = problem.labels[changes[0].bias] if changes else ""
+        for change in changes:
+            if change.name == "halves":
+                text = _drift(problem, change, inflation, limits["halves"])
+                drifts[change.bias] = text + _shape(shapes.get(change.bias), grid.edges)
+            else:
+                disagreements[change.bias] = _disagreement(problem, change, limits["targets"])
     z, alpha = np.asarray(fit.point.z), np.asarray(fit.prior.alpha)
     known = verdict.Evidence(
         verdict.contraction(calibration["information"].values), square,
         verdict.pull(z, alpha, calibration["gamma"].values, inflation), float(np.sqrt(limit_of(M))),
     )  # fmt: skip
     pruned = calibration["status"].values == "pruned"
-    words, reasons = verdict.judge(problem, str(tree.attrs["status"]), pruned, known, drifts, disagreements)
+    words, reasons = verdict.judge(problem, str(tree.attrs["status"]), pruned, known, drifts, disagreements, first)
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}
     labels = {"bias_label": list(problem.labels)}
@@ -112,22 +111,54 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
     return group
 
 
-def _edges(problem: Problem, count: int) -> np.ndarray:
-    """Times at which pieces of equal numbers of rows begin, as many as the recording has times for."""
-    time = problem.measurements.time[problem.measurements.measured.any(1)]
+class _Grid(NamedTuple):
+    """The pieces of a recording, parts of its time by groups of targets, and what may differ between them."""
+
+    piece: np.ndarray  # (rows,) of the table
+    pieces: int
+    edges: np.ndarray  # times at which the parts begin
+    quarters: np.ndarray  # (pieces, parts - 1) which part
+    patterns: dict[str, np.ndarray]  # halves (pieces, 1), targets (pieces, groups - 1)
+
+
+def _grid(problem: Problem) -> _Grid:
+    """Quarters of equal numbers of rows (halves where biases are many) by targets (in groups where they are many)."""
+    M, time = problem.spec.biases, problem.measurements.time
+    edges = _edges(time[problem.measurements.measured.any(1)], QUARTERS if QUARTERS * M <= COPIES else 2)
+    parts = len(edges)
+    groups = _groups(problem, parts)
+    part = np.searchsorted(edges[1:], time, side="right")
+    piece = part * groups + problem.measurements.target % groups
+    quarters, patterns = np.kron(np.eye(parts)[:, 1:], np.ones((groups, 1))), {}
+    if parts > 1:
+        patterns["halves"] = np.repeat(2 * np.arange(parts) // parts, groups)[:, None].astype(float)
+    if groups > 1:
+        patterns["targets"] = np.kron(np.ones((parts, 1)), np.eye(groups)[:, 1:])
+    return _Grid(piece, parts * groups, edges, quarters, patterns)
+
+
+def _groups(problem: Problem, parts: int) -> int:
+    """Number of groups of targets: every target alone while the biases of all pieces are not too many."""
+    return max(1, min(len(problem.measurements.target_names), COPIES // (parts * problem.spec.biases)))
+
+
+def _edges(time: np.ndarray, count: int) -> np.ndarray:
+    """Times at which pieces of equal numbers of rows begin; fewer where there are hardly any times."""
     edges = np.quantile(time, np.arange(count) / count, method="inverted_cdf")
-    distinct = len(np.unique(edges)) == count and len(np.unique(time)) >= 2 * count
-    return edges if distinct else _edges(problem, 2) if count > 2 else edges[:1]
+    if len(np.unique(edges)) == count and len(np.unique(time)) >= 2 * count:
+        return edges
+    return _edges(time, 2) if count > 2 else edges[:1]
 
 
-def _inflation(fit: Fitted, found: residuals.Filtered, quarters: Pieces, piece: np.ndarray) -> np.ndarray:
+def _inflation(fit: Fitted, found: residuals.Filtered, divided: Pieces, piece: np.ndarray) -> np.ndarray:
     """How much wider (M,) the variance of a change is than the model says: overdispersion and correlation in time.
 
-    Both are measured on innovations from which each quarter's own biases are taken, so that a change does not hide
+    Both are measured on innovations from which each piece's own biases are taken, so that a change does not hide
     itself: the mean square of the sensors that read a bias (not below that of all), times (1 + r) / (1 - r), r their
     correlation from one datum to the next.
     """
-    step = np.concatenate([pieces.own_biases(quarters), np.zeros((int(piece.max()) + 1, 1))], 1)
+    own = pieces.own_biases(divided)
+    step = np.concatenate([own, np.zeros((len(own), 1))], 1)
     shift = [
         jnp.asarray(step[piece[index][:, None], np.asarray(data.bias)[np.asarray(data.sensor)]])
         for index, data in zip(fit.problem.row_index, fit.problem.system.rows, strict=True)
@@ -144,44 +175,38 @@ def _inflation(fit: Fitted, found: residuals.Filtered, quarters: Pieces, piece: 
             wide[k] *= (1 + r) / (1 - r)
     names = [placed.name for placed in fit.problem.network.sensors]
     weights = data * fit.readers[[names.index(name) for name in labels["sensor"]]].T  # (M, parts)
-    own = weights @ wide / np.maximum(weights.sum(1), 1)
-    return np.maximum(own, np.average(wide, weights=data))
+    read = weights @ wide / np.maximum(weights.sum(1), 1)
+    return np.maximum(read, np.average(wide, weights=data))
 
 
-class _Text(NamedTuple):
-    """Numbers of a change in the unit of its bias."""
-
-    change: float
-    sd: float
-    unit: str
-
-
-def _in_units(problem: Problem, change: Change, inflation: np.ndarray) -> _Text:
+def _drift(problem: Problem, change: Change, inflation: np.ndarray, limit: float) -> str:
+    """Reason of a bias whose halves differ: by how much."""
     bias, contrast = problem.biases[change.bias], change.contrast
-    sd = np.sqrt(inflation[change.bias] / contrast.information[0, 0])
-    return _Text(contrast.estimate[0] * bias.scale, sd * bias.scale, f" {bias.unit}" if bias.unit != "1" else "")
-
-
-def _drift(problem: Problem, change: Change, inflation: np.ndarray, limit: float, shape: Any, edges: np.ndarray) -> str:
-    """Reason of a bias whose halves differ: by how much, and whether it jumps or drifts."""
-    text = _in_units(problem, change, inflation)
-    reason = (
-        f"second half less first {text.change:.3g} \N{PLUS-MINUS SIGN} {text.sd:.2g}{text.unit} "
+    sd = np.sqrt(inflation[change.bias] / contrast.information[0, 0]) * bias.scale
+    unit = f" {bias.unit}" if bias.unit != "1" else ""
+    return (
+        f"second half less first {contrast.estimate[0] * bias.scale:.3g} \N{PLUS-MINUS SIGN} {sd:.2g}{unit} "
         f"({np.sqrt(change.square):.1f} sd, limit {np.sqrt(limit):.1f})"
     )
-    if shape is None or len(edges) < QUARTERS:
-        return reason
-    patterns = {f"it jumps at about {t:.4g} s": 1.0 * (np.arange(len(edges)) > k) for k, t in enumerate(edges[1:])}
-    patterns["it drifts"] = np.arange(len(edges)) / len(edges)
-    return f"{reason}; {max(patterns, key=lambda name: shape.along(patterns[name]))}"
 
 
-def _disagreement(change: Change, inflation: np.ndarray, limit: float, names: tuple[str, ...], count: int) -> str:
+def _shape(shape: pieces.Contrast | None, edges: np.ndarray) -> str:
+    """Whether quarters tell of a jump, and where, or of a drift."""
+    if shape is None:
+        return ""
+    later = np.arange(1, len(edges))
+    shapes = {f"it jumps at about {edges[k]:.4g} s": 1.0 * (later >= k) for k in later} | {"it drifts": 1.0 * later}
+    return f"; {max(shapes, key=lambda name: shape.along(shapes[name]))}"
+
+
+def _disagreement(problem: Problem, change: Change, limit: float) -> str:
     """Reason of a bias on which the targets disagree, with the one that is most out of line."""
-    alone = [change.contrast.along(unit) for unit in np.eye(count)]
-    odd = [name for k, name in enumerate(names) if k % count == int(np.argmax(alone))]
+    names, groups = problem.measurements.target_names, len(change.contrast.estimate) + 1
+    alone = [change.contrast.along(unit[1:] - unit[0]) for unit in np.eye(groups)]
+    odd = [name for k, name in enumerate(names) if k % groups == int(np.argmax(alone))]
     listed = odd[0] if len(odd) == 1 else f"{odd[0]} and {len(odd) - 1} more"
-    return f"the targets disagree, {listed} most (chi-square {change.square:.1f} on {count - 1}, limit {limit:.1f})"
+    listed = f"{names[0]} and {names[1]}" if len(names) == 2 else f"{listed} most"
+    return f"the targets disagree, {listed} (chi-square {change.square:.1f} on {groups - 1}, limit {limit:.1f})"
 
 
 def _halves(

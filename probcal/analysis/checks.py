@@ -98,10 +98,10 @@ def _unlike_replicas(kind: str, names: list[str], p: np.ndarray) -> list[Finding
     for word, extreme in zip(words, (p, 1 - p), strict=True):
         out = np.flatnonzero(extreme < RATE / 2)
         if len(out):
-            listed = ", ".join(names[k] for k in out[:NAMES]) + (
-                f" and {len(out) - NAMES} more" if len(out) > NAMES else ""
-            )
-            text = f"{listed}: the data {word} than replicas (posterior predictive p at most {extreme[out].max():.3f})"
+            listed = ", ".join(names[k] for k in out[:NAMES])
+            listed += f" and {len(out) - NAMES} more" if len(out) > NAMES else ""
+            largest = max(extreme[out].max(), 1 / predictive.DRAWS)
+            text = f"{listed}: the data {word} than replicas (posterior predictive p at most {largest:.3f})"
             found.append(Finding("predictive", names[out[0]], text))
     return found
 

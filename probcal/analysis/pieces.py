@@ -28,20 +28,27 @@ class Pieces(NamedTuple):
 
 
 class Contrast(NamedTuple):
-    """How one bias differs between pieces: pieces 2, 3, ... less piece 1, in z."""
+    """How one bias differs between pieces, in z: the coefficients of a pattern (P, q) beside a common level."""
 
-    estimate: np.ndarray  # (P - 1,)
-    information: np.ndarray  # (P - 1, P - 1)
+    estimate: np.ndarray  # (q,)
+    information: np.ndarray  # (q, q)
 
     @property
     def square(self) -> float:
-        """Chi-square of no difference, P - 1 degrees of freedom."""
+        """Chi-square of no difference, q degrees of freedom."""
         return float(self.estimate @ self.information @ self.estimate)
 
-    def along(self, pattern: np.ndarray) -> float:
-        """The part of the chi-square that a pattern (P,) of change explains."""
-        step = pattern[1:] - pattern[0]
-        return float((step @ self.information @ self.estimate) ** 2 / (step @ self.information @ step))
+    @property
+    def plausible(self) -> float:
+        """The part of the chi-square that changes of the order of the declared scale explain."""
+        q = len(self.estimate)
+        pull = self.information @ self.estimate
+        held = np.linalg.inv(np.eye(q) + np.ones((q, q)))  # each piece its own draw: differences share the first
+        return float(pull @ np.linalg.solve(self.information + held, pull))
+
+    def along(self, direction: np.ndarray) -> float:
+        """The part of the chi-square that coefficients in one direction (q,) explain."""
+        return float((direction @ self.information @ self.estimate) ** 2 / (direction @ self.information @ direction))
 
 
 def divide(fit: Fitted, piece: np.ndarray, count: int) -> Pieces:
@@ -75,54 +82,48 @@ def copied(fit: Fitted, piece: np.ndarray, count: int) -> tuple[Spec, System]:
     return replace(spec, biases=count * M), system._replace(rows=tuple(parts))
 
 
-def contrasts(pieces: Pieces, free: Sequence[int] = ()) -> dict[int, Contrast]:
-    """The difference of each bias alone between the pieces; biases in `free` differ too, all others are common.
+def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.ndarray]] = ()) -> dict[int, Contrast]:
+    """How each bias alone differs between the pieces along a pattern (P, q), all others common to all pieces.
 
-    What is common has the prior of the fit, a bias that differs none. A bias about whose difference the data say
-    nothing is left out.
+    The biases in `free` differ too, each along its own pattern. What is common has the prior of the fit, the level of
+    a bias that differs none. A bias about whose difference the data say nothing is left out.
     """
     M = len(pieces.z)
-    P, free = len(pieces.score) // M, list(free)
+    P, held = len(pieces.score) // M, [m for m, _ in free]
     G, g = pieces.information.reshape(P, M, P, M), pieces.score.reshape(P, M)
     prior = pieces.prior.copy()
-    prior[free, :], prior[:, free] = 0.0, 0.0
-    # parameters: the M common values, then what pieces 2, 3, ... of the free biases add to them
-    to = np.concatenate(
-        [np.tile(np.eye(M), (P, 1)), np.eye(P * M)[:, [p * M + m for m in free for p in range(1, P)]]], 1
-    )
+    prior[held, :], prior[:, held] = 0.0, 0.0
+    # parameters: the M common values, then the coefficients of what differs already
+    to = np.concatenate([np.tile(np.eye(M), (P, 1)), *(np.kron(own, np.eye(M)[:, [m]]) for m, own in free)], 1)
     crosses = (pieces.information @ to).reshape(P, M, -1)
     K, slope = to.T @ pieces.information @ to, to.T @ pieces.score
     K[:M, :M] += prior
     slope[:M] -= prior @ pieces.z
     inverse = np.linalg.pinv(K, hermitian=True)
     found = {}
-    for m in sorted(set(range(M)) - set(free)):
-        column = inverse[:, m]
-        if column[m] <= 0:
-            continue
-        others = inverse - np.outer(column, column) / column[m]  # inverse of K without its row and column m
-        pull = slope.copy()
-        pull[:M] += prior[:, m] * pieces.z[m]
-        own = G[:, m, :, m] - crosses[:, m] @ others @ crosses[:, m].T  # of the P values of bias m
-        score = g[:, m] - crosses[:, m] @ others @ pull
-        level, total = own.sum(0), own.sum()
-        if total <= LEAST:
-            continue
-        information = own[1:, 1:] - np.outer(level[1:], level[1:]) / total
+    for m in range(M):
+        others, pull, columns = inverse, slope, pattern
+        if m not in held:  # its level is taken out of the common values, so that it has no prior
+            column = inverse[:, m]
+            if column[m] <= 0:
+                continue
+            others = inverse - np.outer(column, column) / column[m]  # inverse of K without its row and column m
+            pull = slope.copy()
+            pull[:M] += prior[:, m] * pieces.z[m]
+            columns = np.concatenate([pattern, np.ones((P, 1))], 1)
+        cross = columns.T @ crosses[:, m]
+        information = columns.T @ G[:, m, :, m] @ columns - cross @ others @ cross.T
+        score = columns.T @ g[:, m] - cross @ others @ pull
+        if m not in held:
+            level = information[-1]
+            if level[-1] <= LEAST:
+                continue
+            score = score[:-1] - level[:-1] * score[-1] / level[-1]
+            information = information[:-1, :-1] - np.outer(level[:-1], level[:-1]) / level[-1]
         information = 0.5 * (information + information.T)
         if np.linalg.eigvalsh(information)[0] > LEAST:
-            rest = score[1:] - level[1:] * score.sum() / total
-            found[m] = Contrast(np.linalg.solve(information, rest), information)
+            found[m] = Contrast(np.linalg.solve(information, score), information)
     return found
-
-
-def merged(pieces: Pieces, into: Sequence[int]) -> Pieces:
-    """The same with pieces put together: piece p goes into number into[p]."""
-    M, P, Q = len(pieces.z), len(into), max(into) + 1
-    to = np.zeros((Q, P))
-    to[list(into), range(P)] = 1.0
-    G = np.einsum("ap,pmqn,bq->ambn", to, pieces.information.reshape(P, M, P, M), to)
-    return pieces._replace(information=G.reshape(Q * M, Q * M), score=(to @ pieces.score.reshape(P, M)).ravel())
 
 
 def own_biases(pieces: Pieces) -> np.ndarray:
@@ -133,24 +134,33 @@ def own_biases(pieces: Pieces) -> np.ndarray:
 
 
 class Change(NamedTuple):
-    """A bias that differs between pieces: which, its chi-square (corrected), and what it explains of others."""
+    """A bias that differs between pieces along a pattern of some name, and its chi-square, corrected."""
 
     bias: int
+    name: str
     square: float
     contrast: Contrast
 
 
-def changing(pieces: Pieces, inflation: np.ndarray, limit: float, most: int = 20) -> list[Change]:
-    """Biases whose chi-square over `inflation` (M,) passes the limit, the strongest first.
+def changing(
+    pieces: Pieces, patterns: dict[str, np.ndarray], inflation: np.ndarray, limits: dict[str, float], most: int = 20
+) -> list[Change]:
+    """Biases whose chi-square along a pattern, over `inflation` (M,), passes the limit, the strongest first.
 
-    Changes of several biases may look alike: one is let free at a time, and the others are judged anew beside it.
+    Changes of several biases may look alike. One is let free at a time, that whose change of the order of its scale
+    explains most, and the others are judged anew beside it.
     """
     found: list[Change] = []
     while len(found) < most:
-        rest = contrasts(pieces, [change.bias for change in found])
-        score = {m: c.square / inflation[m] for m, c in rest.items()}
-        if not score or max(score.values()) <= limit:
+        free = [(change.bias, patterns[change.name]) for change in found]
+        taken = {(change.bias, change.name) for change in found}
+        rest = [
+            Change(m, name, contrast.square / inflation[m], contrast)
+            for name, pattern in patterns.items()
+            for m, contrast in contrasts(pieces, pattern, free).items()
+            if (m, name) not in taken and contrast.square / inflation[m] > limits[name]
+        ]
+        if not rest:
             break
-        m = max(score, key=lambda k: score[k])
-        found.append(Change(m, score[m], rest[m]))
+        found.append(max(rest, key=lambda change: change.contrast.plausible / inflation[change.bias]))
     return found

@@ -3,9 +3,9 @@
 With s = 1 - [(G + I)^-1]_mm, G the information of the data in units of the declared scale (trajectories and other
 biases marginalised), how much the data narrow a bias, the first that applies:
 
-drifting     the halves of the recording differ beyond the limit, after what stronger changes explain
+drifting     the halves of the recording differ on it beyond the limit, after what stronger changes explain
 conflicting  it lies beyond the limit of its survey (or of its scale under a prior that does not learn), or the
-             targets disagree on it beyond the limit, after what stronger disagreements explain
+             targets disagree on it beyond the limit, after what stronger changes explain
 prior only   s < 0.05
 weak         s < 0.5 (information below 1), or the fit is no answer (at bound, diverged)
 determined   none of these
@@ -15,13 +15,12 @@ overdispersion of the innovations and their correlation in time. A sensor whose 
 whose data fit the rest badly, is a finding of its own: it widens those standard deviations and is no verdict.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
-from probcal.analysis.pieces import Change
 from probcal.problem import Problem
 
 RATE = 0.01  # false alarms of each kind of check, all its comparisons together
@@ -62,25 +61,25 @@ def judge(
     status: str,
     pruned: np.ndarray,
     known: Evidence,
-    drifts: Sequence[tuple[Change, str]],
-    disagreements: Sequence[tuple[Change, str]],
+    drifts: Mapping[int, str],
+    disagreements: Mapping[int, str],
+    first: str,
 ) -> tuple[list[str], list[str]]:
-    """Verdict and reason of every bias, from the evidence and the changes found (each with its reason)."""
-    reasons = {"drifting": {c.bias: text for c, text in drifts}, "conflicting": {c.bias: t for c, t in disagreements}}
+    """Verdict and reason of every bias, from the evidence and the reasons of those that change, `first` most."""
     verdicts, sentences = [], []
     for m, bias in enumerate(problem.biases):
         s, unit = known.contraction[m], bias.unit if bias.unit != "1" else ""
         declared = "survey" if problem.surveyed[m] else "scale"
         sizes = f"{declared} of {_size(bias.scale, unit)} to {_size(bias.scale * np.sqrt(1 - s), unit)}"
         information = f"information {s / max(1 - s, 1e-12):.2g}"
-        if m in reasons["drifting"]:
-            verdict, reason = "drifting", reasons["drifting"][m]
+        if m in drifts:
+            verdict, reason = "drifting", drifts[m]
         elif known.pull[m] > known.limit:
             verdict = "conflicting"
             where = f"its {declared} of {_size(bias.scale, unit)}"
             reason = f"{known.pull[m]:.1f} sd beyond {where} (limit {known.limit:.1f})"
-        elif m in reasons["conflicting"]:
-            verdict, reason = "conflicting", reasons["conflicting"][m]
+        elif m in disagreements:
+            verdict, reason = "conflicting", disagreements[m]
         elif s < PRIOR_ONLY:
             verdict, reason = "prior only", f"the data hardly narrow its {declared} ({information})"
         elif s < WEAK:
@@ -90,8 +89,7 @@ def judge(
         else:
             verdict, reason = "determined", f"the data narrow its {sizes}"
             reason += "; learnt to be zero" if pruned[m] else ""
-        if verdict != "drifting" and known.square[m] > known.limit**2 and drifts:
-            first = problem.labels[drifts[0][0].bias]
+        if verdict != "drifting" and known.square[m] > known.limit**2 and first not in ("", bias.label):
             reason += f"; its halves differ by {np.sqrt(known.square[m]):.1f} sd, which {first} explains"
         verdicts.append(verdict)
         sentences.append(reason)
