@@ -143,7 +143,8 @@ def by_datum(fit: Fitted, found: residuals.Innovations, tree: xr.DataTree) -> tu
         if bad > RATE * len(labels):
             text = f"PSIS-LOO: Pareto k of {bad} of {len(labels)} rows is above {good:.2f}: its elpd is uncertain"
             findings.append(Finding("loo", "rows", text))
-    coords = {name: ("datum", data[name].to_numpy()) for name in data}
+    texts = ("sensor", "channel", "target")
+    coords = {name: ("datum", data[name].to_numpy(str if name in texts else None)) for name in data}
     return xr.Dataset({name: ("datum", v) for name, v in values.items()}, coords, attrs), findings
 
 
