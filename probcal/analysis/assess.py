@@ -18,7 +18,6 @@ from probcal.types import float64
 
 QUARTERS = 4
 COPIES = 2000  # most biases of all pieces together
-SURE = 3.0  # sd beyond which a correlation of innovations widens the limits
 
 
 @float64
@@ -154,8 +153,8 @@ def _inflation(fit: Fitted, found: residuals.Filtered, divided: Pieces, piece: n
     """How much wider (M,) the variance of a change is than the model says: overdispersion and correlation in time.
 
     Both are measured on innovations from which each piece's own biases are taken, so that a change does not hide
-    itself: the mean square of the sensors that read a bias (not below that of all), times (1 + r) / (1 - r), r their
-    correlation from one datum to the next.
+    itself: the mean square of a sensor's channel (at least 1) times how many of its innovations count as one. A bias
+    has the mean of the channels that tell of it, by their information, and not less than the mean of all.
     """
     own = pieces.own_biases(divided)
     step = np.concatenate([own, np.zeros((len(own), 1))], 1)
@@ -166,16 +165,15 @@ def _inflation(fit: Fitted, found: residuals.Filtered, divided: Pieces, piece: n
     value = residuals.moved_innovations(fit, found, shift)
     group, labels = checks.codes(fit.data, ["sensor", "channel"])
     data = np.bincount(group)
-    wide = np.maximum(np.bincount(group, value**2) / data, 1.0)
     target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
-    for k in range(len(labels)):
-        white = residuals.whiteness(value[group == k], target[group == k], time[group == k])
-        if white is not None and white.autocorrelation > SURE / np.sqrt(data[k]):
-            r = min(white.autocorrelation, 0.95)
-            wide[k] *= (1 + r) / (1 - r)
-    names = [placed.name for placed in fit.problem.network.sensors]
-    weights = data * fit.readers[[names.index(name) for name in labels["sensor"]]].T  # (M, parts)
-    read = weights @ wide / np.maximum(weights.sum(1), 1)
+    wide = np.array(
+        [
+            max(float(np.mean(value[mine] ** 2)), 1.0) * residuals.memory(value[mine], target[mine], time[mine])
+            for mine in (group == k for k in range(len(labels)))
+        ]
+    )
+    share = fit.share(group, len(labels))
+    read = share @ wide / np.maximum(share.sum(1), 1e-300)
     return np.maximum(read, np.average(wide, weights=data))
 
 

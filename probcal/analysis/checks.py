@@ -32,18 +32,22 @@ def codes(frame: pd.DataFrame, names: list[str]) -> tuple[np.ndarray, pd.DataFra
     return group, frame[names].drop_duplicates().reset_index(drop=True)
 
 
-def _nis(name: str, nis: float, lower: float, upper: float) -> str:
-    """Sentence on a NIS beyond its limits."""
-    way = "larger" if nis > 1 else "smaller"
-    return f"{name}: NIS {nis:.3g} a datum, limits {lower:.3g} to {upper:.3g}: its noise is {way} than declared"
+def _listed(names: list[str], values: np.ndarray, order: np.ndarray) -> str:
+    """The first names in an order, each with its number."""
+    text = ", ".join(f"{names[k]} {values[k]:.3g}" for k in order[:NAMES])
+    return text + (f" and {len(order) - NAMES} more" if len(order) > NAMES else "")
 
 
 def _beyond(names: list[str], part: residuals.Squares) -> list[Finding]:
-    """Findings of the groups whose NIS lies beyond the limits, and notably so."""
-    out = (part.nis > np.maximum(part.upper, PRACTICAL)) | (part.nis < np.minimum(part.lower, 1 / PRACTICAL))
-    return [
-        Finding("nis", names[k], _nis(names[k], part.nis[k], part.lower[k], part.upper[k])) for k in np.flatnonzero(out)
-    ]
+    """Findings of the groups whose NIS lies beyond the limits, and notably so: one sentence for those alike."""
+    found, order = [], np.argsort(-np.abs(np.log(np.maximum(part.nis, 1e-300))))
+    high, low = part.nis > np.maximum(part.upper, PRACTICAL), part.nis < np.minimum(part.lower, 1 / PRACTICAL)
+    for out, word, limit in ((high, "larger", part.upper), (low, "smaller", part.lower)):
+        if out.any():
+            order_out = order[out[order]]
+            text = f"NIS a datum {_listed(names, part.nis, order_out)} (limit {limit[order_out[0]]:.3g})"
+            found.append(Finding("nis", names[order_out[0]], f"{text}: the noise is {word} than declared"))
+    return found
 
 
 def squares_by(fit: Fitted, found: residuals.Innovations, name: str) -> tuple[xr.Dataset, list[Finding]]:
@@ -75,19 +79,22 @@ def by_channel(
             continue
         extra[k] = white
         name, n = f"{sensor}.{channel}", mine.sum()
-        if white.probability < RATE / count and abs(white.autocorrelation) > NOTABLE:
-            text = f"{name}: innovations are correlated, {white.autocorrelation:.2f} from one to the next"
-            findings.append(Finding("whiteness", name, f"{text} (limit {stats.norm.isf(RATE / 2) / np.sqrt(n):.2f})"))
         limit = stats.norm.isf(RATE / (2 * count)) / np.sqrt(n)
         if abs(white.mean) > max(limit, NOTABLE):
             text = f"{name}: innovations have mean {white.mean:.2f} noise std (limit {limit:.2f}): a bias is left"
             findings.append(Finding("mean", name, text))
     values |= dict(zip(("autocorrelation", "mean", "white"), extra.T, strict=True))
+    names, r = [".".join(pair) for pair in labels.to_numpy(str)], extra[:, 0]
+    red = np.flatnonzero((extra[:, 2] < RATE / count) & (np.abs(r) > NOTABLE))
+    if len(red):
+        order = red[np.argsort(-np.abs(r[red]))]
+        text = f"innovations are correlated from one to the next: {_listed(names, r, order)}"
+        findings.append(Finding("whiteness", names[order[0]], text))
     first = np.unique(group, return_index=True)[1]
     for kind, of in (("misfit", replicas.misfit), ("mean", replicas.mean)):
         if of is not None:
             values[f"p_{kind}"] = of[first]
-            findings += _unlike_replicas(kind, [".".join(pair) for pair in labels.to_numpy(str)], of[first])
+            findings += _unlike_replicas(kind, names, of[first])
     coords = {name: ("part", labels[name].to_numpy(str)) for name in labels}
     return xr.Dataset({name: ("part", value) for name, value in values.items()}, coords), findings
 

@@ -46,6 +46,17 @@ class Fitted(NamedTuple):
             found[sensor[:, None], np.asarray(numbers.bias)[np.asarray(numbers.sensor)]] = True
         return found[:, :-1]
 
+    def share(self, group: np.ndarray, count: int) -> np.ndarray:
+        """Information (M, count) about each bias alone in groups (data,) of data, trajectories held."""
+        found, start, M = np.zeros((self.problem.spec.biases + 1) * count), 0, self.problem.spec.biases
+        for numbers, lin, (row, channel) in zip(self.problem.system.rows, self.lins, self.picks, strict=True):
+            own = (np.asarray(lin.weight)[:, :, None] * np.asarray(lin.bias) ** 2)[row, channel]  # (data, p)
+            bias = np.asarray(numbers.bias)[np.asarray(numbers.sensor)[row]]
+            index = bias * count + group[start : start + len(row)][:, None]
+            found += np.bincount(index.ravel(), own.ravel(), len(found))
+            start += len(row)
+        return found.reshape(M + 1, count)[:M]
+
 
 linearise = partial(jax.jit, static_argnames="spec")(partial(mode.linearise, expected=True))
 eliminate_rows = partial(jax.jit, static_argnames="spec")(mode.eliminate_rows)

@@ -124,8 +124,8 @@ def _frozen(system: System, held: np.ndarray) -> System:
 
 def _logdet(coupling: jax.Array, alpha: np.ndarray, held: np.ndarray) -> float:
     """Log determinant of the prior of the biases that are not held, a flat one counted as one."""
-    matrix = np.diag(np.where(alpha > 0, alpha, 1.0)) + np.asarray(coupling)
-    return float(np.linalg.slogdet(matrix[np.ix_(~held, ~held)])[1])
+    own, coupled = np.where(alpha > 0, alpha, 1.0)[~held], np.asarray(coupling)[np.ix_(~held, ~held)]
+    return float(np.linalg.slogdet(np.diag(own) + coupled)[1] if coupled.any() else np.log(own).sum())
 
 
 class Left(NamedTuple):

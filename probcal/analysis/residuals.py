@@ -23,6 +23,7 @@ from probcal.smoothing.mode import Point, factors, of_states
 
 COLUMNS = 16  # bias directions that are filtered together
 LAGS = 10  # of the Ljung-Box statistic
+LONGEST = 200  # lags over which a correlation in time is followed
 FEWEST = 20  # data below which whiteness is not judged
 
 
@@ -189,29 +190,49 @@ class Whiteness(NamedTuple):
     probability: float
 
 
+def _correlations(value: np.ndarray, target: np.ndarray, time: np.ndarray, lags: int) -> tuple[np.ndarray, np.ndarray]:
+    """Autocorrelations (lags,) of values in the order of time about their mean, and the pairs behind each.
+
+    Pairs lie within a target.
+    """
+    order = np.lexsort((time, target))
+    value, target = value[order] - value.mean(), target[order]
+    together = [target[lag:] == target[:-lag] for lag in range(1, lags + 1)]
+    pairs = np.array([same.sum() for same in together])
+    sums = [np.sum(value[k + 1 :] * value[: -k - 1] * same) for k, same in enumerate(together)]
+    return np.array(sums) / np.maximum(pairs, 1) / max(float(np.mean(value**2)), 1e-300), pairs
+
+
 def whiteness(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> Whiteness | None:
-    """Innovations (n,) of one channel in the order of time, pairs within a target; None below 20 data.
+    """Whiteness of the innovations (n,) of one channel; None where there are too few.
 
     Ljung and Box (1978), Q = sum of n_k r_k^2 (n + 2) / n over up to 10 lags, n_k the pairs at lag k.
     """
     n = len(value)
     if n < FEWEST:
         return None
-    order, mean = np.lexsort((time, target)), float(np.mean(value))
-    value, target = value[order] - mean, target[order]
-    variance = max(float(np.mean(value**2)), 1e-300)
-    statistic, lags, first = 0.0, 0, 0.0
-    for lag in range(1, min(LAGS, n // 5) + 1):
-        together = target[lag:] == target[:-lag]
-        pairs = int(together.sum())
-        if pairs < FEWEST // 2:
-            break
-        r = float(np.sum(value[lag:] * value[:-lag] * together)) / pairs / variance
-        statistic, lags = statistic + pairs * r**2 * (n + 2) / n, lag
-        first = r if lag == 1 else first
+    r, pairs = _correlations(value, target, time, min(LAGS, n // 5))
+    lags = int(np.sum(np.cumprod(pairs >= FEWEST // 2)))
     if not lags:
         return None
-    return Whiteness(first, mean, float(stats.chi2.sf(statistic, lags)))
+    statistic = np.sum(pairs[:lags] * r[:lags] ** 2) * (n + 2) / n
+    return Whiteness(float(r[0]), float(np.mean(value)), float(stats.chi2.sf(statistic, lags)))
+
+
+def memory(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> float:
+    """How many innovations of one channel count as one: 1 + 2 sum of r_k over the first positive pairs of lags.
+
+    The initial positive sequence of Geyer (1992); 1 where the first correlation is not beyond 3 sd.
+    """
+    n = len(value)
+    if n < FEWEST:
+        return 1.0
+    r, pairs = _correlations(value, target, time, min(LONGEST, n // 5))
+    if r[0] < 3.0 / np.sqrt(max(pairs[0], 1)):
+        return 1.0
+    r = np.concatenate([[1.0], r[: len(r) // 2 * 2 - 1]])
+    couples = r.reshape(-1, 2).sum(1) * np.cumprod(np.append(pairs[: len(r) - 1], n)[1::2] >= FEWEST // 2)
+    return float(max(2.0 * np.sum(couples * np.cumprod(couples > 0)) - 1.0, 1.0))
 
 
 NEAR_TURN = 1.0  # rad of a full turn within which a residual tells of a missing wrap
