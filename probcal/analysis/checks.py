@@ -55,9 +55,8 @@ def squares_by(fit: Fitted, found: residuals.Innovations, name: str) -> tuple[xr
     group, labels = codes(fit.data, [name])
     names = labels[name].tolist()
     part = residuals.squares(found, group, len(names), RATE / len(names))
-    return xr.Dataset({key: (name, value) for key, value in part._asdict().items()}, {name: names}), _beyond(
-        names, part
-    )
+    columns = {key: (name, value) for key, value in part._asdict().items()}
+    return xr.Dataset(columns, {name: names}), _beyond(names, part)
 
 
 def by_channel(
@@ -65,23 +64,21 @@ def by_channel(
 ) -> tuple[xr.Dataset, list[Finding]]:
     """NIS, mean, correlation in time and predictive p-values of every sensor's channels, dimension `part`.
 
-    `white` is the Ljung-Box p-value; where a channel has too few data its mean and correlation are 0 and `white` 1.
+    `white` is the Ljung-Box p-value; below 20 data nothing can be told, the correlation stays 0 and `white` 1.
     """
     data, findings = fit.data, list[Finding]()
     group, labels = codes(data, ["sensor", "channel"])
     count = len(labels)
     values: dict[str, Any] = residuals.squares(found, group, count, RATE / count)._asdict()
     target, time = data["target"].to_numpy(str), data["time"].to_numpy()
-    extra = np.tile([0.0, 0.0, 1.0], (count, 1))
+    extra = np.zeros((count, 3))
     for k, (sensor, channel) in enumerate(labels.itertuples(index=False)):
         mine = group == k
-        if (white := residuals.whiteness(found.value[mine], target[mine], time[mine])) is None:
-            continue
-        extra[k] = white
-        name, n = f"{sensor}.{channel}", mine.sum()
-        limit = stats.norm.isf(RATE / (2 * count)) / np.sqrt(n)
-        if abs(white.mean) > max(limit, NOTABLE):
-            text = f"{name}: innovations have mean {white.mean:.2f} noise std (limit {limit:.2f}): a bias is left"
+        white = residuals.whiteness(found.value[mine], target[mine], time[mine])
+        extra[k] = (0.0, float(np.mean(found.value[mine])), 1.0) if white is None else white
+        name, mean, limit = f"{sensor}.{channel}", extra[k, 1], stats.norm.isf(RATE / (2 * count)) / np.sqrt(mine.sum())
+        if abs(mean) > max(limit, NOTABLE):
+            text = f"{name}: innovations have mean {mean:.2f} noise std (limit {limit:.2f}): a bias is left"
             findings.append(Finding("mean", name, text))
     values |= dict(zip(("autocorrelation", "mean", "white"), extra.T, strict=True))
     names, r = [".".join(pair) for pair in labels.to_numpy(str)], extra[:, 0]
