@@ -1,6 +1,7 @@
 """What a fit is worth: exact on linear networks, right under the true model, and by name where something is wrong."""
 
 import sys
+import warnings
 from pathlib import Path
 
 import arviz as az
@@ -208,6 +209,11 @@ def test_psis_is_that_of_arviz():
     np.testing.assert_allclose(mine.pareto_k, found.pareto_k.values, rtol=1e-12)
     assert leave.standard_error(mine.elpd) == pytest.approx(found.se, rel=1e-12)
     assert leave.good_k(tree) == pytest.approx(found.good_k)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of large Pareto k
+        assert az.loo_pit(tree)["y"].sizes["datum"] == count
+        assert az.plot_khat(found, backend="none") is not None
+        assert az.plot_ppc_dist(tree, backend="none") is not None
     by_row = assess(problem, tree)["datum_check"].to_dataset().groupby("row").first()
     assert by_row.sizes["row"] < count, "both channels of a row are left out together"
 

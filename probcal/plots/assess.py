@@ -62,11 +62,15 @@ def plot_nis(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
         ax.plot(time[shown], lower[shown], "-", color="0.4", linewidth=0.7)
         ax.plot(time[shown], upper[shown], "-", color="0.4", linewidth=0.7, label="99 % limits" if k == 0 else None)
     ax.axhline(1.0, color="0.7", linewidth=0.8, zorder=0)
-    ax.set_yscale("asinh", linear_width=2.0)
-    ax.set_ylim(bottom=0.0)
+    top = ax.get_ylim()[1]
+    ax.set_yscale("asinh", linear_width=5.0)
+    ticks = np.array([0, 1, 2, 5, *(m * 10.0**e for e in range(1, 9) for m in (1, 2, 5))])
+    ax.set_yticks(ticks[ticks <= top], [f"{tick:g}" for tick in ticks[ticks <= top]])
+    ax.minorticks_off()
+    ax.set_ylim(0.0, top)
     ax.set(xlabel="time in s", ylabel="NIS a datum")
     ax.set_title(f"Innovations: {outside} of {total} epochs outside (1 % expected)", loc="left")
-    ax.legend(loc="upper right", frameon=False, fontsize=8)
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
     return ax
 
 
@@ -102,7 +106,12 @@ def plot_halves(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     ax.hlines(rows, (change - limit * sd)[order], (change + limit * sd)[order], color=tint, linewidth=2.0)
     ax.scatter(change[order], rows, color=tint, s=22, zorder=3)
     _named(ax, rows, group["bias_label"].values[order])
-    ax.set_xscale("asinh", linear_width=float(max(np.median(np.abs(change[order])), 1e-3)))
+    if np.abs(change[order]).max() + limit * sd[order].max() > 5.0:
+        ax.set_xscale("asinh", linear_width=1.0)
+        ticks = [sign * 10.0**e for sign in (-1, 1) for e in range(9)]
+        ticks = [0.0, *(tick for tick in ticks if ax.get_xlim()[0] < tick < ax.get_xlim()[1])]
+        ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        ax.minorticks_off()
     ax.set_xlabel(f"second half less first, in scales; intervals of {limit:.1f} sd")
     ax.set_title(f"Change between halves (at {group.attrs['time']:.4g} s)", loc="left")
     return ax
