@@ -1,7 +1,16 @@
 """probcal: Bayesian calibration of sensor networks from targets of opportunity."""
 
 from probcal import noise, priors, sensors
-from probcal.analysis import bound_map, bounds, next_anchors, next_passes, next_sensors, observability, sensitivity
+from probcal.analysis import (
+    assess,
+    bound_map,
+    bounds,
+    next_anchors,
+    next_passes,
+    next_sensors,
+    observability,
+    sensitivity,
+)
 from probcal.diagnostics import scores
 from probcal.inference import EA, EM, EMEA, MAP, LeastSquares, fit, study, track
 from probcal.motion import (
@@ -30,8 +39,8 @@ __all__ = [
     "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantAcceleration", "ConstantVelocity",
     "CoordinatedTurn", "FitError", "Flat", "Gaussian", "Horseshoe", "InputError", "Known", "Laplace",
     "LeastSquares", "LocalFrame", "Mixture", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor",
-    "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown", "White", "bound_map", "bounds",
-    "fit", "load", "next_anchors", "next_passes", "next_sensors", "noise", "observability", "outliers", "priors",
-    "read_nodes", "read_table", "save", "scores", "sensitivity", "sensor", "sensors", "simulate", "study",
+    "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown", "White", "assess", "bound_map",
+    "bounds", "fit", "load", "next_anchors", "next_passes", "next_sensors", "noise", "observability", "outliers",
+    "priors", "read_nodes", "read_table", "save", "scores", "sensitivity", "sensor", "sensors", "simulate", "study",
     "summary", "track", "write_nodes",
 ]  # fmt: skip

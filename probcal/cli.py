@@ -21,7 +21,7 @@ import xarray as xr
 from rich.console import Console
 from rich.progress import Progress as RichProgress
 
-from probcal.analysis import bound_map, next_anchors, next_passes, next_sensors, observability
+from probcal.analysis import assess, bound_map, next_anchors, next_passes, next_sensors, observability
 from probcal.diagnostics import grid_of, scores, study_table
 from probcal.inference import METHODS, ORACLE, fit, study, track
 from probcal.inference.run import Progress
@@ -39,6 +39,8 @@ app = typer.Typer(
     help="Bayesian calibration of sensor networks from targets of opportunity.",
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
 )  # fmt: skip
+
+FINDINGS = 8  # sentences of an assessment that are printed
 
 Model = Annotated[Path, typer.Argument(help="model file that defines problem(data=None)", show_default=False)]
 Data = Annotated[Path | None, typer.Argument(help="table of rows (CSV); the model's own data if left out")]
@@ -177,13 +179,13 @@ def _write_csv(frame: pd.DataFrame, path: Path) -> None:
 
 
 def table_text(tree: xr.DataTree) -> str:
-    """The table of biases as printed: label, unit, scale, mean, sd, interval, gamma, status."""
+    """The table of biases as printed: label, unit, scale, mean, sd, interval, gamma, status, verdict."""
     frame = summary(tree)
     numbers = ["scale", "mean", "sd", "lower", "upper"]
     for name in numbers:
         frame[name] = [f"{value:.4g}" for value in frame[name]]
     frame["gamma"] = [f"{value:.3f}" for value in frame["gamma"]]
-    shown = frame[["bias", "unit", *numbers, "gamma", "status"]]
+    shown = frame[["bias", "unit", *numbers, "gamma", "status", *(["verdict"] if "verdict" in frame else [])]]
     return shown.to_string(index=False, justify="right")
 
 
@@ -199,6 +201,9 @@ def fit_command(
     starts: Annotated[int, typer.Option(min=1, help="starts of the search; the best optimum is reported")] = 1,
     seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(help="folder for fit.nc, summary.csv, report.html")] = None,
+    assessed: Annotated[
+        bool, typer.Option("--assess/--no-assess", help="a verdict per bias, and what the residuals say")
+    ] = True,
 ) -> None:
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
     if method not in METHODS:
@@ -217,6 +222,8 @@ def fit_command(
     truth = _truth(module, model, data, problem)
     with _progress() as progress:
         tree = fit(problem, value, prior=chosen, key=seed, starts=starts, progress=progress)
+        if assessed:
+            tree = assess(problem, tree, truth=truth, key=seed)
     tree.attrs["model"] = model.stem
     if truth is not None:
         add_scores(tree, scores(tree, truth), truth.biases)
@@ -247,8 +254,20 @@ def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
         print(f"{score.name} by start: " + ", ".join(f"{k}: {value:.2f} ({status})" for k, status, value in pairs))
     if "position_rmse_after" in attrs:
         print(f"position RMSE before {attrs['position_rmse_before']:.3f} m, after {attrs['position_rmse_after']:.3f} m")
+    _print_findings(tree)
     if attrs["message"]:
         print(attrs["message"], file=sys.stdout if attrs["status"] == "converged" else sys.stderr)
+
+
+def _print_findings(tree: xr.DataTree) -> None:
+    """The first sentences that an assessment has to say."""
+    if "finding" not in tree.children:
+        return
+    sentences = tree["finding"].to_dataset()["sentence"].values.tolist()
+    for sentence in sentences[:FINDINGS]:
+        print(f"- {sentence}")
+    if len(sentences) > FINDINGS:
+        print(f"- and {len(sentences) - FINDINGS} more (group finding of fit.nc, report.html)")
 
 
 def _write(tree: xr.DataTree, out: Path) -> None:

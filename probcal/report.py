@@ -21,6 +21,28 @@ from probcal.tree import outliers
 NONE = "–"  # where there is no finite number
 EXTRA = {"r_hat": "r_hat", "ess_bulk": "ess bulk", "ess_tail": "ess tail", "ess": "ess"}  # of samplers
 LISTED = 20  # outlying data in the table
+CHECKED = 60  # rows of a table of checks
+# group of an assessment -> title, what a row is, and its columns with what they are called
+CHECKS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
+    "sensor_check": (
+        "Sensors: innovations, and what the other sensors say of each",
+        ("sensor",),
+        {"data": "data", "nis": "NIS", "elpd": "elpd left out", "difference": "gain by calibration, nats",
+         "rest_nis": "NIS given the rest", "pareto_k": "Pareto k"},
+    ),
+    "target_check": (
+        "Targets: innovations, and what the other targets say of each",
+        ("target",),
+        {"data": "data", "nis": "NIS", "elpd": "elpd left out", "rest_nis": "NIS given the rest",
+         "pareto_k": "Pareto k"},
+    ),
+    "channel_check": (
+        "Channels: whiteness and predictive checks",
+        ("sensor", "channel"),
+        {"data": "data", "nis": "NIS", "mean": "mean", "autocorrelation": "lag-1 correlation",
+         "white": "Ljung-Box p", "p_misfit": "predictive p, misfit", "p_mean": "predictive p, mean"},
+    ),
+}  # fmt: skip
 COLOURS = {"converged": "good", "not converged": "warn", "at bound": "bad", "diverged": "bad"}
 
 PAGE = """<!DOCTYPE html>
@@ -75,7 +97,8 @@ footer { margin-top: 2rem; padding-top: .5rem; border-top: 1px solid #d5d5d5; co
 {% endif %}Intervals hold {{ probability }}{% if attrs.intervals %}; {{ attrs.intervals }}{% endif %}.
 gamma: how well the data determine a bias (0 prior only, 1 data only).</caption>
 <thead><tr>{% for name in columns %}<th scope="col"
-{%- if name in ("bias", "unit", "status") %} class="text"{% endif %}>{{ name }}</th>{% endfor %}</tr></thead>
+{%- if name in ("bias", "unit", "status", "verdict", "reason") %} class="text"{% endif %}>{{ name }}</th>
+{%- endfor %}</tr></thead>
 <tbody>
 {% for row in rows %}<tr class="{{ row.colour }}"><th scope="row">{{ row.label }}</th>
 {%- for cell, text in row.cells %}<td{% if text %} class="text"{% endif %}>{{ cell }}</td>{% endfor %}</tr>
@@ -91,6 +114,10 @@ gamma: how well the data determine a bias (0 prior only, 1 data only).</caption>
 </tbody>
 </table>
 {% endfor %}
+{% if findings %}
+<h2>Findings</h2>
+<ul>{% for sentence in findings %}<li>{{ sentence }}</li>{% endfor %}</ul>
+{% endif %}
 {% if directions %}
 <h2>Weak directions</h2>
 <p>Combinations of biases that the data hardly determine, the weakest first.</p>
@@ -144,7 +171,18 @@ def _render(tree: xr.DataTree) -> str:
         probability=f"{float(attrs.get('interval_probability', plots.INTERVAL)):.0%}",
         columns=columns,
         rows=rows,
-        tables=[table for table in (_levels(tree), _fixed(tree), _optima(tree), _outliers(tree)) if table],
+        tables=[
+            table
+            for table in (
+                _levels(tree),
+                _fixed(tree),
+                _optima(tree),
+                _outliers(tree),
+                *(_checked(tree, name) for name in CHECKS),
+            )
+            if table
+        ],
+        findings=_findings(tree),
         directions=_directions(tree),
         pictures=_pictures(tree),
         versions=_versions(attrs),
@@ -192,6 +230,8 @@ def _biases(tree: xr.DataTree) -> tuple[list[str], list[dict[str, Any]]]:
     extra = [name for name in EXTRA if name in group]
     known = tree["truth"].to_dataset()["bias"].to_series().to_dict() if "truth" in tree.children else {}
     columns = ["bias", "unit", "scale", "mean", "sd", "interval", "gamma", "status"]
+    judged = tree["verdict"].to_dataset() if "verdict" in tree.children else None
+    columns += ["verdict", "reason"] if judged is not None else []
     columns += [EXTRA[name] for name in extra] + (["true value"] if known else [])
     table = {str(name): group[name].values for name in group.data_vars if group[name].ndim == 1}
     rows = []
@@ -201,7 +241,10 @@ def _biases(tree: xr.DataTree) -> tuple[list[str], list[dict[str, Any]]]:
         mean, lower, upper, spread = (_rounded(float(one[n]), sd) for n in ("mean", "lower", "upper", "sd"))
         cells = [(str(one["unit"]), True), (_number(one["scale"]), False), (mean, False)]
         cells += [(spread, False), (f"{lower} to {upper}", False), (_gamma(float(one["gamma"])), False)]
-        cells += [(status, True)] + [(_number(one[name], 4), False) for name in extra]
+        cells += [(status, True)]
+        if judged is not None:
+            cells += [(str(judged[name].values[k]), True) for name in ("verdict", "reason")]
+        cells += [(_number(one[name], 4), False) for name in extra]
         if known:
             cells.append((_rounded(known[label], sd) if label in known else "", False))
         colour = "bad" if status in plots.INVALID else "pruned" if status == "pruned" else ""
@@ -282,6 +325,32 @@ def _outliers(tree: xr.DataTree) -> dict[str, Any] | None:
     return {"title": title, "columns": columns, "rows": rows}
 
 
+def _checked(tree: xr.DataTree, name: str) -> dict[str, Any] | None:
+    """Table of one group of checks, the columns that it holds, limits as an interval."""
+    title, keys, wanted = CHECKS[name]
+    if name not in tree.children:
+        return None
+    group = tree[name].to_dataset()
+    columns: dict[str, Any] = {text: group[column].values for column, text in wanted.items() if column in group}
+    columns["limits"] = list(zip(group["lower"].values, group["upper"].values, strict=True))
+    dim = group["nis"].dims[0]
+    rows = [
+        [".".join(str(group[key].values[k]) for key in keys)]
+        + [
+            f"{_number(v[k][0])} to {_number(v[k][1])}" if text == "limits" else _number(v[k], 4)
+            for text, v in columns.items()
+        ]
+        for k in range(min(group.sizes[dim], CHECKED))
+    ]
+    left = group.sizes[dim] - len(rows)
+    return {"title": title + (f", the first {CHECKED}" if left else ""), "columns": [keys[-1], *columns], "rows": rows}
+
+
+def _findings(tree: xr.DataTree) -> list[str]:
+    """Sentences of an assessment."""
+    return tree["finding"].to_dataset()["sentence"].values.tolist() if "finding" in tree.children else []
+
+
 def _directions(tree: xr.DataTree) -> list[str]:
     """Sentences of the weak directions."""
     if "direction" not in tree.children:
@@ -309,6 +378,16 @@ def _pictures(tree: xr.DataTree) -> list[dict[str, str]]:
     if _weighted(tree):
         text = "Residuals over time, those that count less than half marked"
         found.insert(3, ("Residuals over time", text, {"residual"}, lambda: plots.plot_outliers(tree)))
+    found += [
+        ("Verdicts", "Gamma of every bias against how much the data narrow it, coloured by verdict", {"verdict"},
+         lambda: plots.plot_shrinkage(tree)),
+        ("Innovations", "NIS of every epoch with its limits", {"epoch_check"},
+         lambda: plots.plot_nis(tree)),
+        ("Sensors left out", "Gain by calibration of each sensor, judged by the rest", {"sensor_check"},
+         lambda: plots.plot_left_out(tree)),
+        ("Halves", "Change of every bias from the first half to the second", {"halves"},
+         lambda: plots.plot_halves(tree)),
+    ]  # fmt: skip
     present = set(tree.children)
     return [
         {"title": title, "alt": alt, "source": _embed(draw())} for title, alt, needs, draw in found if needs <= present

@@ -73,7 +73,8 @@ class Result:
     residuals: Residuals
 
 
-def _suffix(problem: Problem, r: int) -> str:
+def suffix(problem: Problem, r: int) -> str:
+    """What the names of recursion r end with: nothing where there is one only."""
     return "" if len(problem.epochs) == 1 else f"_{r}"
 
 
@@ -118,7 +119,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
     track = track_group(problem, result.tracks)
     if result.states is not None:
         for r, states in enumerate(result.states):
-            s = _suffix(problem, r)
+            s = suffix(problem, r)
             posterior[f"state{s}"] = ((*sample, f"epoch{s}", f"component{s}"), states)
     z = ("bias_label", labels)
     sd = np.sqrt(np.diag(result.covariance))
@@ -203,7 +204,7 @@ def by_epoch(problem: Problem, variables: Mapping[str, Sequence[np.ndarray]]) ->
     values: dict[str, Any] = {}
     coords: dict[str, Any] = {}
     for r, epochs in enumerate(problem.epochs):
-        s = _suffix(problem, r)
+        s = suffix(problem, r)
         coords |= {
             f"component{s}": list(epochs.components),
             f"epoch_time{s}": (f"epoch{s}", epochs.time),
@@ -316,10 +317,17 @@ def add_scores(tree: xr.DataTree, scores: Mapping[str, float], biases: Mapping[s
 
 
 def summary(tree: xr.DataTree) -> Any:
-    """One row a bias as a DataFrame: bias, unit, scale, mean, sd, lower, upper, gamma, precision, status."""
+    """One row a bias as a DataFrame: bias, unit, scale, mean, sd, lower, upper, gamma, precision, status.
+
+    After `assess` also verdict and reason.
+    """
     group = tree["calibration"].to_dataset()
-    frame = group[[*SUMMARY[1:], "precision", "status"]].to_dataframe().reset_index()
-    return frame.rename(columns={"bias_label": "bias"})[[*SUMMARY, "precision", "status"]]
+    columns = [*SUMMARY, "precision", "status"]
+    if "verdict" in tree.children:
+        judged = tree["verdict"].to_dataset()[["verdict", "reason"]]
+        group, columns = group.merge(judged), [*columns, *judged.data_vars]
+    frame = group[columns[1:]].to_dataframe().reset_index()
+    return frame.rename(columns={"bias_label": "bias"})[columns]
 
 
 def save(tree: xr.DataTree, path: str | PathLike[str]) -> Path:

@@ -152,7 +152,7 @@ def test_simulate_fit_track_report_of_a_small_model(model, rows, tmp_path, monke
 def test_fixing_a_bias_takes_it_out_of_the_table(model, rows, monkeypatch, capsys):
     code, out, _ = call(monkeypatch, capsys, "fit", model, rows, "--fix", "gauge_0.*", "--method", "map")
     assert code == 0
-    assert "gauge_0" not in out
+    assert "gauge_0.range_offset" not in out
     assert "gauge_1.range_offset" in out
 
 
@@ -278,6 +278,6 @@ def test_a_model_may_bring_its_prior(tmp_path, model):
     model.write_text(model.read_text() + '\nfrom probcal import ARD\nPRIOR = ARD(by="node")\n')
     assert run("simulate", model, "--out", tmp_path / "rows.csv").returncode == 0
     for extra, wanted in (((), "by='node'"), (("--prior", "ard"), "by=None"), (("--method", "map"), "Gaussian")):
-        done = run("fit", model, tmp_path / "rows.csv", "--out", tmp_path / "out", *extra)
+        done = run("fit", model, tmp_path / "rows.csv", "--no-assess", "--out", tmp_path / "out", *extra)
         assert done.returncode in (0, 1), done.stderr
         assert wanted in probcal.load(tmp_path / "out").attrs["settings"]

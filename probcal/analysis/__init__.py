@@ -1,9 +1,12 @@
 """Before and after a fit: observability, the next pass or sensor, bounds, and whether a result can be trusted."""
 
+from probcal.analysis.assess import assess
 from probcal.analysis.bounds import bounds
 from probcal.analysis.maps import bound_map
 from probcal.analysis.observability import observability
 from probcal.analysis.planning import next_anchors, next_passes, next_sensors
 from probcal.analysis.sensitivity import sensitivity
 
-__all__ = ["bound_map", "bounds", "next_anchors", "next_passes", "next_sensors", "observability", "sensitivity"]
+__all__ = [
+    "assess", "bound_map", "bounds", "next_anchors", "next_passes", "next_sensors", "observability", "sensitivity",
+]  # fmt: skip

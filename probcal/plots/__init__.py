@@ -1,5 +1,6 @@
 """Pictures of saved results: matplotlib figures without pyplot, one module a kind of result."""
 
+from probcal.plots.assess import plot_halves, plot_left_out, plot_nis, plot_shrinkage
 from probcal.plots.base import INTERVAL, INVALID
 from probcal.plots.bounds import plot_bound_map, plot_sensitivity
 from probcal.plots.fit import plot_biases, plot_gamma, plot_map, plot_objective, plot_outliers, plot_residuals
@@ -8,6 +9,6 @@ from probcal.plots.study import draw_study, plot_study
 
 __all__ = [
     "INTERVAL", "INVALID", "draw_check", "draw_study", "plot_biases", "plot_bound_map", "plot_directions", "plot_gamma",
-    "plot_map", "plot_objective", "plot_outliers", "plot_passes", "plot_residuals", "plot_sensitivity", "plot_spectrum",
-    "plot_study",
+    "plot_halves", "plot_left_out", "plot_map", "plot_nis", "plot_objective", "plot_outliers", "plot_passes",
+    "plot_residuals", "plot_sensitivity", "plot_shrinkage", "plot_spectrum", "plot_study",
 ]  # fmt: skip

@@ -1,0 +1,245 @@
+"""`assess`: is the answer of a fit good? Innovations, predictive checks, left-out data, halves, and verdicts."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from probcal.analysis import checks, nees, pieces, predictive, residuals, scaling, verdict
+from probcal.analysis.checks import Finding
+from probcal.analysis.fitted import Fitted, take_up
+from probcal.analysis.pieces import Change, Pieces
+from probcal.analysis.verdict import RATE, limit_of
+from probcal.problem import Problem
+from probcal.simulate import Key, Truth, as_key
+from probcal.tree import suffix
+from probcal.types import float64
+
+QUARTERS = 4
+COPIES = 2000  # most biases of all pieces together
+
+
+@float64
+def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, key: Key = 0) -> xr.DataTree:
+    """Say what a fit is worth: a copy of its tree with further groups.
+
+    `problem` is the one that `fit` solved, `truth` is used for scoring only, `key` seeds replicas.
+
+    - `datum_check`, `epoch_check`, `channel_check`, `sensor_check`, `target_check`: innovations, and their NIS (mean
+      square a datum) with limits; whiteness; posterior predictive p-values; PSIS-LOO by row; by sensor and target
+      the log predictive density `elpd` of what was left out, and its NIS given the rest.
+    - `halves`: what each bias alone would change from the first half of the recording to the second.
+    - `sensitivity`: power scaling of prior and likelihood, where the tree holds both.
+    - `verdict`: `verdict` and `reason` of every bias (rules in `probcal.analysis.verdict`); `finding`: sentences.
+
+    Limits have a false-alarm rate of 1 %: of one epoch in `epoch_check`, else of all comparisons of a kind together.
+    Refits of large networks are one step from the fit (attribute `refits` of the group). Raises `InputError` where
+    the tree is no fit of the problem.
+    """
+    fit = take_up(problem, tree)
+    replicas = predictive.check(fit, tree, as_key(key))
+    found = residuals.innovations(fit, replicas.kurtosis)
+    groups: dict[str, xr.Dataset] = {"epoch_check": checks.by_epoch(fit, found.innovations)}
+    groups["datum_check"], findings = checks.by_datum(fit, found.innovations, tree)
+    groups["channel_check"], more = checks.by_channel(fit, found.innovations, replicas)
+    findings += more
+    for name in ("sensor", "target"):
+        groups[f"{name}_check"], more = checks.squares_by(fit, found.innovations, name)
+        findings += more
+    residual = tree["residual"].to_dataset()
+    findings += [
+        Finding("wrapping", *pair) for pair in residuals.wrapping(fit, residual["after"].values, residual["std"].values)
+    ]
+    findings += checks.left_out(fit, tree, groups)
+    groups["verdict"] = _verdicts(fit, tree, found, groups)
+    columns = [groups["verdict"][name].values.tolist() for name in ("verdict", "bias_label", "reason")]
+    alarms = [row for row in zip(*columns, strict=True) if row[0] in ("drifting", "conflicting")]
+    findings += [Finding(word, label, f"{label}: {reason}") for word, label, reason in alarms]
+    scaled = scaling.power_scaling(tree)
+    if scaled is not None:
+        groups["sensitivity"] = scaled
+    if truth is not None:
+        _score(fit, tree, truth, groups)
+    texts = {name: ("finding", np.array([getattr(f, name) for f in findings], str)) for name in Finding._fields}
+    groups["finding"] = xr.Dataset(texts)
+    result = tree.copy()
+    for name, group in groups.items():
+        result[name] = xr.DataTree(group)
+    return result
+
+
+def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups: dict[str, xr.Dataset]) -> xr.Dataset:
+    """Group `verdict`; adds the group `halves` where the recording can be divided."""
+    problem, calibration = fit.problem, tree["calibration"].to_dataset()
+    M, inflation, square = problem.spec.biases, np.ones(problem.spec.biases), np.zeros(problem.spec.biases)
+    drifts, disagreements, first = dict[int, str](), dict[int, str](), ""
+    grid = _grid(problem)
+    if grid.patterns:
+        divided = pieces.divide(fit, grid.piece, grid.pieces)
+        inflation = _inflation(fit, found, divided, grid.piece)
+        limits = {name: limit_of(M, pattern.shape[1]) for name, pattern in grid.patterns.items()}
+        if "halves" in grid.patterns:
+            alone = pieces.contrasts(divided, grid.patterns["halves"])
+            square[list(alone)] = [c.square / inflation[m] for m, c in alone.items()]
+            if alone:
+                groups["halves"] = _halves(
+                    problem, alone, inflation, grid.edges[len(grid.edges) // 2], limits["halves"]
+                )
+        changes = pieces.changing(divided, grid.patterns, inflation, limits)
+        shapes = pieces.contrasts(divided, grid.quarters) if changes and grid.quarters.shape[1] > 1 else {}
+        first = problem.labels[changes[0].bias] if changes else ""
+        for change in changes:
+            if change.name == "halves":
+                text = _drift(problem, change, inflation, limits["halves"])
+                drifts[change.bias] = text + _shape(shapes.get(change.bias), grid.edges)
+            else:
+                disagreements[change.bias] = _disagreement(problem, change, limits["targets"])
+    z, alpha = np.asarray(fit.point.z), np.asarray(fit.prior.alpha)
+    known = verdict.Evidence(
+        verdict.contraction(calibration["information"].values), square,
+        verdict.pull(z, alpha, calibration["gamma"].values, inflation), float(np.sqrt(limit_of(M))),
+    )  # fmt: skip
+    pruned = calibration["status"].values == "pruned"
+    words, reasons = verdict.judge(problem, str(tree.attrs["status"]), pruned, known, drifts, disagreements, first)
+    values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
+    values |= {"inflation": inflation}
+    labels = {"bias_label": list(problem.labels)}
+    group = xr.Dataset({name: ("bias_label", value) for name, value in values.items()}, labels)
+    group.attrs |= {"rate": RATE, "limit": known.limit}
+    return group
+
+
+class _Grid(NamedTuple):
+    """The pieces of a recording, parts of its time by groups of targets, and what may differ between them."""
+
+    piece: np.ndarray  # (rows,) of the table
+    pieces: int
+    edges: np.ndarray  # times at which the parts begin
+    quarters: np.ndarray  # (pieces, parts - 1) which part
+    patterns: dict[str, np.ndarray]  # halves (pieces, 1), targets (pieces, groups - 1)
+
+
+def _grid(problem: Problem) -> _Grid:
+    """Quarters of equal numbers of rows (halves where biases are many) by targets (in groups where they are many)."""
+    M, time = problem.spec.biases, problem.measurements.time
+    edges = _edges(time[problem.measurements.measured.any(1)], QUARTERS if QUARTERS * M <= COPIES else 2)
+    parts = len(edges)
+    groups = _groups(problem, parts)
+    part = np.searchsorted(edges[1:], time, side="right")
+    piece = part * groups + problem.measurements.target % groups
+    quarters, patterns = np.kron(np.eye(parts)[:, 1:], np.ones((groups, 1))), {}
+    if parts > 1:
+        patterns["halves"] = np.repeat(2 * np.arange(parts) // parts, groups)[:, None].astype(float)
+    if groups > 1:
+        patterns["targets"] = np.kron(np.ones((parts, 1)), np.eye(groups)[:, 1:])
+    return _Grid(piece, parts * groups, edges, quarters, patterns)
+
+
+def _groups(problem: Problem, parts: int) -> int:
+    """Number of groups of targets: every target alone while the biases of all pieces are not too many."""
+    return max(1, min(len(problem.measurements.target_names), COPIES // (parts * problem.spec.biases)))
+
+
+def _edges(time: np.ndarray, count: int) -> np.ndarray:
+    """Times at which pieces of equal numbers of rows begin; fewer where there are hardly any times."""
+    edges = np.quantile(time, np.arange(count) / count, method="inverted_cdf")
+    if len(np.unique(edges)) == count and len(np.unique(time)) >= 2 * count:
+        return edges
+    return _edges(time, 2) if count > 2 else edges[:1]
+
+
+def _inflation(fit: Fitted, found: residuals.Filtered, divided: Pieces, piece: np.ndarray) -> np.ndarray:
+    """How much wider (M,) the variance of a change is than the model says: overdispersion and correlation in time.
+
+    Both are measured on innovations from which each piece's own biases are taken, so that a change does not hide
+    itself: the mean square of a sensor's channel (at least 1) times how many of its innovations count as one. A bias
+    has the mean of the channels that tell of it, by their information, and not less than the mean of all.
+    """
+    own = pieces.own_biases(divided)
+    step = np.concatenate([own, np.zeros((len(own), 1))], 1)
+    shift = [
+        jnp.asarray(step[piece[index][:, None], np.asarray(data.bias)[np.asarray(data.sensor)]])
+        for index, data in zip(fit.problem.row_index, fit.problem.system.rows, strict=True)
+    ]
+    value = residuals.moved_innovations(fit, found, shift)
+    group, labels = checks.codes(fit.data, ["sensor", "channel"])
+    data = np.bincount(group)
+    target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
+    wide = np.array(
+        [
+            max(float(np.mean(value[mine] ** 2)), 1.0) * residuals.memory(value[mine], target[mine], time[mine])
+            for mine in (group == k for k in range(len(labels)))
+        ]
+    )
+    share = fit.share(group, len(labels))
+    read = share @ wide / np.maximum(share.sum(1), 1e-300)
+    return np.maximum(read, np.average(wide, weights=data))
+
+
+def _drift(problem: Problem, change: Change, inflation: np.ndarray, limit: float) -> str:
+    """Reason of a bias whose halves differ: by how much."""
+    bias, contrast = problem.biases[change.bias], change.contrast
+    sd = np.sqrt(inflation[change.bias] / contrast.information[0, 0]) * bias.scale
+    unit = f" {bias.unit}" if bias.unit != "1" else ""
+    return (
+        f"second half less first {contrast.estimate[0] * bias.scale:.3g} \N{PLUS-MINUS SIGN} {sd:.2g}{unit} "
+        f"({np.sqrt(change.square):.1f} sd, limit {np.sqrt(limit):.1f})"
+    )
+
+
+def _shape(shape: pieces.Contrast | None, edges: np.ndarray) -> str:
+    """Whether quarters tell of a jump, and where, or of a drift."""
+    if shape is None:
+        return ""
+    later = np.arange(1, len(edges))
+    shapes = {f"it jumps at about {edges[k]:.4g} s": 1.0 * (later >= k) for k in later} | {"it drifts": 1.0 * later}
+    return f"; {max(shapes, key=lambda name: shape.along(shapes[name]))}"
+
+
+def _disagreement(problem: Problem, change: Change, limit: float) -> str:
+    """Reason of a bias on which the targets disagree, with the one that is most out of line."""
+    names, groups = problem.measurements.target_names, len(change.contrast.estimate) + 1
+    alone = [change.contrast.along(unit[1:] - unit[0]) for unit in np.eye(groups)]
+    odd = [name for k, name in enumerate(names) if k % groups == int(np.argmax(alone))]
+    listed = odd[0] if len(odd) == 1 else f"{odd[0]} and {len(odd) - 1} more"
+    listed = f"{names[0]} and {names[1]}" if len(names) == 2 else f"{listed} most"
+    return f"the targets disagree, {listed} (chi-square {change.square:.1f} on {groups - 1}, limit {limit:.1f})"
+
+
+def _halves(
+    problem: Problem, contrast: dict[int, pieces.Contrast], inflation: np.ndarray, middle: float, limit: float
+) -> xr.Dataset:
+    """Group `halves`: second half less first of each bias alone, in its unit, corrected sd, and their ratio."""
+    index = list(contrast)
+    scale = problem.scales[index]
+    change = np.array([contrast[m].estimate[0] for m in index]) * scale
+    sd = np.sqrt(inflation[index] / np.array([contrast[m].information[0, 0] for m in index])) * scale
+    group = xr.Dataset(
+        {"change": ("bias_label", change), "sd": ("bias_label", sd), "t": ("bias_label", change / sd)},
+        {"bias_label": [problem.labels[m] for m in index]},
+    )
+    group.attrs |= {"time": float(middle), "limit": float(np.sqrt(limit)), "rate": RATE}
+    return group
+
+
+def _score(fit: Fitted, tree: xr.DataTree, truth: Truth, groups: dict[str, xr.Dataset]) -> None:
+    """Add NEES of positions by epoch to `epoch_check`, and those of all positions and biases to its attributes."""
+    check = groups["epoch_check"]
+    for r in range(len(fit.problem.epochs)):
+        s = suffix(fit.problem, r)
+        found = nees.of_positions(tree, truth, s, RATE)
+        if found is not None:
+            track = tree["track"].to_dataset()
+            coords = {
+                f"nees_time{s}": (f"nees_epoch{s}", track[f"epoch_time{s}"].values[found.known]),
+                f"nees_target{s}": (f"nees_epoch{s}", track[f"epoch_target{s}"].values[found.known]),
+            }
+            check = check.assign_coords(coords).assign({f"nees{s}": (f"nees_epoch{s}", found.value)})
+            check.attrs |= {f"nees{s}": found.mean, f"nees_lower{s}": found.lower, f"nees_upper{s}": found.upper}
+    biases = nees.of_biases(tree, truth, RATE)
+    if biases is not None:
+        check.attrs |= dict(
+            zip(("nees_bias", "nees_bias_count", "nees_bias_lower", "nees_bias_upper"), biases, strict=True)
+        )
+    groups["epoch_check"] = check

@@ -1,0 +1,197 @@
+"""What the innovations and the replicas of a fit say, labelled: groups of a tree, and findings in words."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from scipy import stats
+
+from probcal.analysis import leave, predictive, residuals
+from probcal.analysis.fitted import Fitted
+from probcal.analysis.verdict import RATE
+from probcal.tree import suffix
+
+PRACTICAL = 1.25  # factor from 1 within which a NIS beyond its limits is no finding
+NOTABLE = 0.1  # lag-1 correlation, and mean, of innovations within which neither is
+NAMES = 4  # that a sentence on several channels lists
+GAIN = 5.0  # nats that a calibration must win before it is a finding
+
+
+class Finding(NamedTuple):
+    """One thing to know about a fit: its kind, what it concerns, and a sentence."""
+
+    kind: str
+    subject: str
+    sentence: str
+
+
+def codes(frame: pd.DataFrame, names: list[str]) -> tuple[np.ndarray, pd.DataFrame]:
+    """Number of each datum's group (D,), in order of appearance, and one row a group."""
+    group = frame.groupby(names, sort=False).ngroup().to_numpy()
+    return group, frame[names].drop_duplicates().reset_index(drop=True)
+
+
+def _listed(names: list[str], values: np.ndarray, order: np.ndarray) -> str:
+    """The first names in an order, each with its number."""
+    text = ", ".join(f"{names[k]} {values[k]:.3g}" for k in order[:NAMES])
+    return text + (f" and {len(order) - NAMES} more" if len(order) > NAMES else "")
+
+
+def _beyond(names: list[str], part: residuals.Squares) -> list[Finding]:
+    """Findings of the groups whose NIS lies beyond the limits, and notably so: one sentence for those alike."""
+    found, order = [], np.argsort(-np.abs(np.log(np.maximum(part.nis, 1e-300))))
+    high, low = part.nis > np.maximum(part.upper, PRACTICAL), part.nis < np.minimum(part.lower, 1 / PRACTICAL)
+    for out, word, limit in ((high, "larger", part.upper), (low, "smaller", part.lower)):
+        if out.any():
+            order_out = order[out[order]]
+            text = f"NIS a datum {_listed(names, part.nis, order_out)} (limit {limit[order_out[0]]:.3g})"
+            found.append(Finding("nis", names[order_out[0]], f"{text}: the noise is {word} than declared"))
+    return found
+
+
+def squares_by(fit: Fitted, found: residuals.Innovations, name: str) -> tuple[xr.Dataset, list[Finding]]:
+    """NIS by "sensor" or "target"."""
+    group, labels = codes(fit.data, [name])
+    names = labels[name].tolist()
+    part = residuals.squares(found, group, len(names), RATE / len(names))
+    columns = {key: (name, value) for key, value in part._asdict().items()}
+    return xr.Dataset(columns, {name: names}), _beyond(names, part)
+
+
+def by_channel(
+    fit: Fitted, found: residuals.Innovations, replicas: predictive.Predictive
+) -> tuple[xr.Dataset, list[Finding]]:
+    """NIS, mean, correlation in time and predictive p-values of every sensor's channels, dimension `part`.
+
+    `white` is the Ljung-Box p-value; below 20 data nothing can be told, the correlation stays 0 and `white` 1.
+    """
+    data, findings = fit.data, list[Finding]()
+    group, labels = codes(data, ["sensor", "channel"])
+    count = len(labels)
+    values: dict[str, Any] = residuals.squares(found, group, count, RATE / count)._asdict()
+    target, time = data["target"].to_numpy(str), data["time"].to_numpy()
+    extra = np.zeros((count, 3))
+    for k, (sensor, channel) in enumerate(labels.itertuples(index=False)):
+        mine = group == k
+        white = residuals.whiteness(found.value[mine], target[mine], time[mine])
+        extra[k] = (0.0, float(np.mean(found.value[mine])), 1.0) if white is None else white
+        name, mean, limit = f"{sensor}.{channel}", extra[k, 1], stats.norm.isf(RATE / (2 * count)) / np.sqrt(mine.sum())
+        if abs(mean) > max(limit, NOTABLE):
+            text = f"{name}: innovations have mean {mean:.2f} noise std (limit {limit:.2f}): a bias is left"
+            findings.append(Finding("mean", name, text))
+    values |= dict(zip(("autocorrelation", "mean", "white"), extra.T, strict=True))
+    names, r = [".".join(pair) for pair in labels.to_numpy(str)], extra[:, 0]
+    red = np.flatnonzero((extra[:, 2] < RATE / count) & (np.abs(r) > NOTABLE))
+    if len(red):
+        order = red[np.argsort(-np.abs(r[red]))]
+        text = f"innovations are correlated from one to the next: {_listed(names, r, order)}"
+        findings.append(Finding("whiteness", names[order[0]], text))
+    first = np.unique(group, return_index=True)[1]
+    for kind, of in (("misfit", replicas.misfit), ("mean", replicas.mean)):
+        if of is not None:
+            values[f"p_{kind}"] = of[first]
+            findings += _unlike_replicas(kind, names, of[first])
+    coords = {name: ("part", labels[name].to_numpy(str)) for name in labels}
+    return xr.Dataset({name: ("part", value) for name, value in values.items()}, coords), findings
+
+
+def _unlike_replicas(kind: str, names: list[str], p: np.ndarray) -> list[Finding]:
+    """Findings of the predictive p-values (parts,) that are small or near one, one sentence for those alike."""
+    words, found = {"misfit": ("fit worse", "fit better"), "mean": ("lie higher", "lie lower")}[kind], []
+    for word, extreme in zip(words, (p, 1 - p), strict=True):
+        out = np.flatnonzero(extreme < RATE / 2)
+        if len(out):
+            listed = ", ".join(names[k] for k in out[:NAMES])
+            listed += f" and {len(out) - NAMES} more" if len(out) > NAMES else ""
+            largest = max(extreme[out].max(), 1 / predictive.DRAWS)
+            text = f"{listed}: the data {word} than replicas (posterior predictive p at most {largest:.3f})"
+            found.append(Finding("predictive", names[out[0]], text))
+    return found
+
+
+def by_epoch(fit: Fitted, found: residuals.Innovations) -> xr.Dataset:
+    """NIS of every epoch with data, its number of data and limits (false-alarm rate 1 % of each epoch)."""
+    values: dict[str, Any] = {}
+    coords: dict[str, Any] = {}
+    places = [np.zeros(data.y.shape, int) + np.asarray(data.epoch)[:, None] for data in fit.problem.system.rows]
+    owners = [
+        np.full(data.y.shape, r) for data, r in zip(fit.problem.system.rows, fit.problem.spec.recursion, strict=True)
+    ]
+    epoch, owner = fit.flat(places), fit.flat(owners)
+    for r, epochs in enumerate(fit.problem.epochs):
+        s, mine = suffix(fit.problem, r), owner == r
+        there, group = np.unique(epoch[mine], return_inverse=True)
+        part = residuals.squares(residuals.Innovations(*(v[mine] for v in found)), group, len(there), RATE)
+        values |= {f"{name}{s}": (f"epoch{s}", value) for name, value in part._asdict().items()}
+        coords |= {
+            f"epoch_time{s}": (f"epoch{s}", epochs.time[there]),
+            f"epoch_target{s}": (f"epoch{s}", np.asarray(epochs.target, str)[there]),
+        }
+    return xr.Dataset(values, coords)
+
+
+def by_datum(fit: Fitted, found: residuals.Innovations, tree: xr.DataTree) -> tuple[xr.Dataset, list[Finding]]:
+    """Innovation of every datum, and PSIS-LOO of its row where the tree holds the log-likelihood."""
+    data = fit.data
+    values: dict[str, Any] = {"innovation": found.value}
+    used, findings = float(found.used.sum()), list[Finding]()
+    attrs = {"nis": float((found.value**2).sum()) / max(len(data) - used, 1e-9), "used": used}
+    if "log_likelihood" in tree.children:
+        group, labels = codes(data, ["row", "sensor", "target", "time"])
+        row = leave.psis(tree, group, len(labels))
+        values |= {"elpd": row.elpd[group], "pareto_k": row.pareto_k[group]}
+        good = leave.good_k(tree)
+        attrs |= {"elpd": float(row.elpd.sum()), "elpd_se": leave.standard_error(row.elpd), "good_k": good}
+        bad = int((row.pareto_k > good).sum())
+        if bad > RATE * len(labels):
+            text = f"PSIS-LOO: Pareto k of {bad} of {len(labels)} rows is above {good:.2f}: its elpd is uncertain"
+            findings.append(Finding("loo", "rows", text))
+    texts = ("sensor", "channel", "target")
+    coords = {name: ("datum", data[name].to_numpy(str if name in texts else None)) for name in data}
+    return xr.Dataset({name: ("datum", v) for name, v in values.items()}, coords, attrs), findings
+
+
+def left_out(fit: Fitted, tree: xr.DataTree, groups: dict[str, xr.Dataset]) -> list[Finding]:
+    """Add to the groups `sensor_check` and `target_check` what the rest says of each; returns findings."""
+    findings = list[Finding]()
+    for name, found in (("sensor", leave.leave_sensors(fit)), ("target", leave.leave_targets(fit))):
+        check = groups[f"{name}_check"]
+        if "log_likelihood" in tree.children and check.sizes[name] > 1:
+            group, labels = codes(fit.data, [name])
+            check["pareto_k"] = (name, leave.psis(tree, group, len(labels)).pareto_k)
+        if found is None:
+            continue
+        names = check[name].values.tolist()
+        order = [found.names.index(n) for n in names]
+        sound = all(np.isfinite(part).all() for part in (found.elpd, found.nis, found.stated, found.stated_nis))
+        if not sound:  # the rest alone leaves a flat prior without an answer
+            continue
+        check["elpd"] = (name, found.elpd[order])
+        check["rest_nis"] = (name, found.nis[order])
+        check.attrs |= {"refits": "one step" if found.quick else "full", "elpd": float(found.elpd.sum())}
+        if len(names) > 1:
+            check.attrs["elpd_se"] = leave.standard_error(found.elpd)
+        if name == "sensor":
+            check["elpd_stated"] = (name, found.stated[order])
+            check["difference"] = (name, (found.elpd - found.stated)[order])
+            check["stated_nis"] = (name, found.stated_nis[order])
+            findings += _unlike_the_rest(check)
+    return findings
+
+
+def _unlike_the_rest(check: xr.Dataset) -> list[Finding]:
+    """Findings on sensors that do not fit the rest: as stated (the largest gain by calibration), or even calibrated."""
+    names, gain = check["sensor"].values.tolist(), check["difference"].values
+    order, findings = np.argsort(-gain), list[Finding]()
+    worst = order[0]
+    if gain[worst] > GAIN:
+        text = f"{names[worst]} fits the rest {gain[worst]:.1f} nats better calibrated than as stated"
+        if len(order) > 1:
+            text += f"; next {names[order[1]]}, {gain[order[1]]:.1f}"
+        findings.append(Finding("rest", names[worst], text))
+    nis, upper = check["rest_nis"].values, check["upper"].values
+    for k in np.flatnonzero(nis > np.maximum(upper, PRACTICAL)):
+        text = f"{names[k]} does not fit the rest even when calibrated: NIS {nis[k]:.3g} a datum, limit {upper[k]:.3g}"
+        findings.append(Finding("rest", names[k], text))
+    return findings

@@ -1,0 +1,111 @@
+"""A fit taken up again: the problem at the point where a DataTree says that its fit ended, linearised there."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from probcal import linalg, tree
+from probcal.priors import Precision
+from probcal.problem import Problem
+from probcal.rows import Linearised
+from probcal.smoothing import mode
+from probcal.smoothing.information import at_levels
+from probcal.smoothing.mode import Point
+from probcal.smoothing.start import project, track_mode
+from probcal.types import InputError
+
+CLOSE = 1e6  # precision with which the saved states stand for the trajectories
+
+
+class Fitted(NamedTuple):
+    """A problem at a fit: the point, the prior with the precisions that the fit ended with, the rows linearised."""
+
+    problem: Problem
+    point: Point
+    prior: Precision
+    covariance: np.ndarray  # (M, M) of z
+    lins: list[Linearised]  # with the expected information
+    picks: list[Any]  # where each block keeps its data
+    data: pd.DataFrame  # sensor, channel, target, time, row of every datum
+
+    def flat(self, parts: Any) -> np.ndarray:
+        """Arrays (..., N, C) of the blocks as one (..., data)."""
+        return tree.gather([np.asarray(part) for part in parts], self.picks)
+
+    @property
+    def readers(self) -> np.ndarray:
+        """Which sensors read which bias, (sensors, M) boolean, sensors in the order of the network."""
+        found = np.zeros((len(self.problem.network.sensors), self.problem.spec.biases + 1), bool)
+        for index, numbers in zip(self.problem.row_index, self.problem.system.rows, strict=True):
+            sensor = self.problem.measurements.sensor[index]
+            found[sensor[:, None], np.asarray(numbers.bias)[np.asarray(numbers.sensor)]] = True
+        return found[:, :-1]
+
+    def share(self, group: np.ndarray, count: int) -> np.ndarray:
+        """Information (M, count) about each bias alone in groups (data,) of data, trajectories held."""
+        found, start, M = np.zeros((self.problem.spec.biases + 1) * count), 0, self.problem.spec.biases
+        for numbers, lin, (row, channel) in zip(self.problem.system.rows, self.lins, self.picks, strict=True):
+            own = (np.asarray(lin.weight)[:, :, None] * np.asarray(lin.bias) ** 2)[row, channel]  # (data, p)
+            bias = np.asarray(numbers.bias)[np.asarray(numbers.sensor)[row]]
+            index = bias * count + group[start : start + len(row)][:, None]
+            found += np.bincount(index.ravel(), own.ravel(), len(found))
+            start += len(row)
+        return found.reshape(M + 1, count)[:M]
+
+
+linearise = partial(jax.jit, static_argnames="spec")(partial(mode.linearise, expected=True))
+eliminate_rows = partial(jax.jit, static_argnames="spec")(mode.eliminate_rows)
+
+
+def take_up(problem: Problem, fit: xr.DataTree) -> Fitted:
+    """The fit of a problem from its tree: biases, precisions and levels as saved, trajectories at their mode.
+
+    Raises `InputError` where the tree is no fit of this problem.
+    """
+    if "calibration" not in fit.children or "track" not in fit.children:
+        raise InputError("assess: the tree is no fit; give the problem and the DataTree that fit() returned for it")
+    if fit.attrs.get("method") == "least squares":
+        problem = problem.unlinked()
+    group = fit["calibration"].to_dataset()
+    if group["bias_label"].values.tolist() != list(problem.labels):
+        raise InputError("assess: the tree was fitted with other free biases; give the problem as it was fitted")
+    datum, picks = tree.datum_of(problem)
+    if not np.array_equal(datum["y"], fit["observed_data"].to_dataset()["y"].values):
+        raise InputError("assess: the tree was fitted to other data; give the problem as it was fitted")
+    covariance = group["covariance"].values / np.outer(problem.scales, problem.scales)
+    point = _point(problem, fit)
+    lins = linearise(problem.spec, problem.system, point)
+    data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
+    return Fitted(problem, point, _prior(fit, group, covariance), covariance, lins, picks, data)
+
+
+def _point(problem: Problem, fit: xr.DataTree) -> Point:
+    """Biases and levels of the tree, trajectories at their mode, searched from the saved ones."""
+    track = fit["track"].to_dataset()
+    saved = [track[f"mean{tree.suffix(problem, r)}"].values for r in range(len(problem.epochs))]
+    point = project(problem, saved, [np.full_like(x, CLOSE) for x in saved])
+    if problem.levels:
+        level = fit["level"].to_dataset()
+        point = at_levels(problem.system, point, jnp.asarray(np.log(level["std"].values / level["guess"].values)))
+    z = jnp.asarray(fit["calibration"].to_dataset()["mean"].values / problem.scales)
+    return track_mode(problem, point._replace(z=z))
+
+
+def _prior(fit: xr.DataTree, group: xr.Dataset, covariance: np.ndarray) -> Precision:
+    """Precisions of the tree; couplings of correlated biases are what its covariance leaves for them."""
+    alpha = group["precision"].values
+    if "correlation=()" in str(fit.attrs.get("settings", "correlation=()")):
+        return Precision.single(jnp.asarray(alpha))
+    held, _ = linalg.inverse_and_logdet(jnp.asarray(covariance))
+    coupling = np.asarray(held) - group["information"].values - np.diag(alpha)
+    coupled = np.outer(alpha == 1, alpha == 1)  # only biases of a Gaussian known beforehand are correlated
+    coupling = np.where(coupled & (np.abs(coupling) > 1e-6), 0.5 * (coupling + coupling.T), 0.0)
+    _, whole = linalg.inverse_and_logdet(jnp.asarray(np.diag(np.where(alpha > 0, alpha, 1.0)) + coupling))
+    return Precision(
+        jnp.asarray(alpha), jnp.asarray(coupling), whole - jnp.sum(jnp.log(jnp.where(alpha > 0, alpha, 1.0)))
+    )

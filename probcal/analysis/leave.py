@@ -1,0 +1,207 @@
+"""Leaving data out: PSIS-LOO by row, exact refits by sensor and by target.
+
+For a whole sensor or target importance sampling fails nearly always, so each is left out for good: its rows are
+masked (shapes stay, one compiled kernel serves all), the mode is found again at the fit's precisions, and the log
+predictive density of what was left out is the difference of two Laplace evidences: exact on a linear problem.
+"""
+
+import warnings
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import xarray as xr
+from arviz_stats.base import array_stats
+from scipy import special
+
+from probcal import linalg
+from probcal.analysis.fitted import Fitted, eliminate_rows, linearise
+from probcal.priors import Precision
+from probcal.problem import Spec, System
+from probcal.rows import Linearised
+from probcal.smoothing.mode import Eliminated, Point, cost, find_mode, follow
+
+STEPS = 20  # Gauss-Newton steps of a refit
+TOLERANCE = 1e-5  # nats
+WORK = 3e9  # operations of all eliminations beyond which a refit is one step from the fit
+TARGETS = 32  # beyond which targets are not left out one by one
+
+
+class Refit(NamedTuple):
+    """Where one refit ends."""
+
+    evidence: jax.Array  # log p(data), but for the determinant of the prior
+    square: jax.Array  # least squares of all innovations, noises and biases in the linearised problem
+
+
+@partial(jax.jit, static_argnames="spec")
+def _stepped(
+    spec: Spec, system: System, point: Point, prior: Precision, lins: list[Linearised], solved: Eliminated, held: Any
+) -> Refit:
+    """One Fisher-scoring step from a point to the mode, and Laplace's evidence there; biases in `held` (M,) go to 0.
+
+    The step counts only where it raises the density: at a mode it changes nothing, on a linear problem it is exact.
+    """
+    both = held[:, None] | held[None, :]
+    eye = jnp.eye(len(held))
+    matrix = solved.information + prior.matrix()
+    away = jnp.where(held, -point.z, 0.0)
+    slope = jnp.where(held, away, solved.score - prior.pull(point.z) - matrix @ away)
+    inverse, logdet = linalg.inverse_and_logdet(jnp.where(both, eye, matrix))
+    start = point._replace(z=point.z + away)
+    moved = follow(system, point, solved, inverse @ slope)
+    ends = jax.tree.map(lambda a, b: jnp.stack([a, b]), start, moved)
+    before, after = jax.vmap(lambda end: cost(spec, system, end, prior))(ends)
+    least = jnp.where(after < before, after, before)
+    square = sum(jnp.sum(u**2) for u in moved.noises) + prior.square(moved.z)
+    padded = jnp.append(moved.z - point.z, 0.0)
+    for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
+        root = jnp.sqrt(lin.weight)
+        score = jnp.where(root > 0, lin.score / jnp.where(root > 0, root, 1.0), 0.0)
+        dx = (moved.states[r] - point.states[r])[data.epoch][:, jnp.asarray(block.used, int)]
+        change = jnp.einsum("ncu,nu->nc", lin.state, dx)
+        change = change + jnp.einsum("ncp,np->nc", lin.bias, padded[data.bias][data.sensor])
+        square = square + jnp.sum((score - root * change) ** 2)
+    return Refit(-least - 0.5 * (solved.logdet + logdet), square)
+
+
+class _Refits:
+    """Refits of a problem with data masked, precisions changed or biases held at 0."""
+
+    def __init__(self, fit: Fitted, jobs: int):
+        spec, system = fit.problem.spec, fit.problem.system
+        sizes = sum(part.drift.size for part in system.recursions)
+        self.fit, self.quick = fit, 2.0 * jobs * sizes * spec.biases**2 > WORK
+        self._solved: Eliminated | None = None
+
+    def run(self, out: np.ndarray | None, alpha: np.ndarray, held: np.ndarray) -> tuple[float, float]:
+        """Evidence and least squares without the rows (of the table) in `out`, at precisions alpha (M,)."""
+        fit, spec = self.fit, self.fit.problem.spec
+        prior = fit.prior._replace(alpha=jnp.asarray(alpha))
+        system = fit.problem.system if out is None else masked(fit, out)
+        point, lins = fit.point, fit.lins
+        if not self.quick:
+            frozen = _frozen(system, held)
+            start = point._replace(z=jnp.asarray(np.where(held, 0.0, point.z)))
+            point = find_mode(spec, frozen, start, prior, STEPS, TOLERANCE).point
+            lins = linearise(spec, frozen, point)
+            solved, system = eliminate_rows(spec, frozen, point, lins), frozen
+        elif out is None:
+            if self._solved is None:
+                self._solved = eliminate_rows(spec, system, point, lins)
+            solved = self._solved
+        else:
+            pairs = [(lin, np.asarray(new.mask)) for lin, new in zip(lins, system.rows, strict=True)]
+            lins = [
+                lin._replace(
+                    score=jnp.asarray(np.asarray(lin.score) * mask), weight=jnp.asarray(np.asarray(lin.weight) * mask)
+                )
+                for lin, mask in pairs
+            ]
+            solved = eliminate_rows(spec, system, point, lins)
+        found = _stepped(spec, system, point, prior, lins, solved, jnp.asarray(held))
+        return float(found.evidence) + 0.5 * _logdet(fit.prior.coupling, alpha, held), float(found.square)
+
+
+def masked(fit: Fitted, out: np.ndarray) -> System:
+    """The system without the rows of the table in `out` (rows,) boolean."""
+    pairs = zip(fit.problem.system.rows, fit.problem.row_index, strict=True)
+    rows = tuple(data._replace(mask=jnp.asarray(np.asarray(data.mask) * ~out[index][:, None])) for data, index in pairs)
+    return fit.problem.system._replace(rows=rows)
+
+
+def _frozen(system: System, held: np.ndarray) -> System:
+    """The system that does not feel the biases in `held` (M,)."""
+    felt = np.append(~held, True)
+    rows = [
+        data._replace(scale=jnp.asarray(np.asarray(data.scale) * felt[np.asarray(data.bias)])) for data in system.rows
+    ]
+    return system._replace(rows=tuple(rows))
+
+
+def _logdet(coupling: jax.Array, alpha: np.ndarray, held: np.ndarray) -> float:
+    """Log determinant of the prior of the biases that are not held, a flat one counted as one."""
+    own, coupled = np.where(alpha > 0, alpha, 1.0)[~held], np.asarray(coupling)[np.ix_(~held, ~held)]
+    return float(np.linalg.slogdet(np.diag(own) + coupled)[1] if coupled.any() else np.log(own).sum())
+
+
+class Left(NamedTuple):
+    """What the rest says of groups of data (sensors or targets) that were left out, each (groups,)."""
+
+    names: list[str]
+    elpd: np.ndarray  # log predictive density given the rest
+    nis: np.ndarray  # normalised square of its innovation predicted by the rest, a datum
+    stated: np.ndarray  # elpd with the group's own biases held at 0
+    stated_nis: np.ndarray
+    quick: bool  # one step from the fit instead of a search
+
+
+def leave_sensors(fit: Fitted) -> Left:
+    """Every sensor with data left out; the biases that only it reads have their declared scales, as nothing else can.
+
+    `elpd` less `stated` says how much better the sensor fits the rest calibrated than as stated.
+    """
+    problem, readers = fit.problem, fit.readers
+    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.spec.biases, bool)
+    sensor = problem.measurements.sensor
+    present = np.unique(sensor[problem.measurements.measured.any(1)])
+    refits, rows = _Refits(fit, 3 * len(present)), []
+    for s in present:
+        own = readers[s] & (readers.sum(0) == 1)
+        wide = np.where(own & ~problem.surveyed, 1.0, alpha)
+        rest = refits.run(sensor == s, wide, none)
+        rows.append([rest, refits.run(None, wide, none), refits.run(None, wide, own)])
+    return _left([problem.network.sensors[s].name for s in present], rows, fit.data["sensor"], refits.quick)
+
+
+def leave_targets(fit: Fitted) -> Left | None:
+    """Every target left out; None where there is one only, or more than 32."""
+    problem = fit.problem
+    target, names = problem.measurements.target, problem.measurements.target_names
+    if not 1 < len(names) <= TARGETS:
+        return None
+    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.spec.biases, bool)
+    refits = _Refits(fit, len(names))
+    whole = refits.run(None, alpha, none)
+    rows = [[refits.run(target == t, alpha, none), whole, whole] for t in range(len(names))]
+    return _left(list(names), rows, fit.data["target"], refits.quick)
+
+
+def _left(names: list[str], rows: list[Any], owner: pd.Series, quick: bool) -> Left:
+    values = np.array(rows)  # (groups, 3, 2)
+    count = owner.value_counts()[names].to_numpy()
+    elpd, square = values[:, 1:, 0] - values[:, :1, 0], (values[:, 1:, 1] - values[:, :1, 1]) / count[:, None]
+    return Left(names, elpd[:, 0], square[:, 0], elpd[:, 1], square[:, 1], quick)
+
+
+class Pointwise(NamedTuple):
+    """PSIS-LOO of groups of data, each (groups,): log predictive density and Pareto k."""
+
+    elpd: np.ndarray
+    pareto_k: np.ndarray
+
+
+def psis(tree: xr.DataTree, group: np.ndarray, count: int) -> Pointwise:
+    """PSIS-LOO by ArviZ of the log-likelihood in a tree, summed over groups (data,); `az.loo` where each is a datum."""
+    values = tree["log_likelihood"].to_dataset()["y"].values
+    values = values.reshape(-1, values.shape[2])
+    order = np.argsort(group, kind="stable")
+    summed = np.add.reduceat(values[:, order], np.searchsorted(group[order], np.arange(count)), axis=1).T
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a large Pareto k is reported, not warned about
+        weights, pareto_k = array_stats.psislw(summed)
+    return Pointwise(special.logsumexp(weights + summed, axis=1), pareto_k)
+
+
+def good_k(tree: xr.DataTree) -> float:
+    """Pareto k up to which importance sampling can be trusted with so many draws (Vehtari et al. 2024)."""
+    posterior = tree["log_likelihood"].to_dataset()
+    return min(1.0 - 1.0 / float(np.log10(posterior.sizes["chain"] * posterior.sizes["draw"])), 0.7)
+
+
+def standard_error(elpd: np.ndarray) -> float:
+    """Standard error of a sum of log predictive densities, as ArviZ has it."""
+    return float(np.sqrt(len(elpd) * np.var(elpd, ddof=1)))

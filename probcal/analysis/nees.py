@@ -1,0 +1,63 @@
+"""Normalised squared errors (NEES) of positions and biases against a truth, with limits."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from probcal import linalg
+from probcal.simulate import Truth
+from probcal.types import AXES
+
+
+class Nees(NamedTuple):
+    """Squared errors over what the posterior expects: of each epoch known (E,), and of all with its limits."""
+
+    value: np.ndarray  # (E,) a dimension
+    known: np.ndarray  # (E,) boolean, epochs that the truth covers
+    mean: float
+    lower: float
+    upper: float
+
+
+def of_positions(tree: xr.DataTree, truth: Truth, suffix: str, rate: float) -> Nees | None:
+    """NEES of the positions of one recursion, a dimension; None without draws of states or true positions.
+
+    Errors of neighbouring epochs are alike: the limits of the mean are those of the posterior's own draws.
+    """
+    track, posterior = tree["track"].to_dataset(), tree["posterior"].to_dataset()
+    axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in track[f"component{suffix}"].values]
+    if f"state{suffix}" not in posterior or truth.tracks is None:
+        return None
+    chosen = {f"component{suffix}": axes}
+    true = truth.positions(track[f"epoch_time{suffix}"].values, track[f"epoch_target{suffix}"].values, len(axes))
+    known = np.isfinite(true).all(1)
+    draws = posterior[f"state{suffix}"].sel(chosen).values
+    draws = draws.reshape(-1, *draws.shape[2:])[:, known]  # (S, E, d)
+    if not known.any() or len(draws) < 10 * len(axes):
+        return None
+    deviation = draws - draws.mean(0)
+    covariance = np.einsum("sei,sej->eij", deviation, deviation) / (len(draws) - 1)
+    whiten = np.asarray(jax.vmap(linalg.inverse_cholesky)(jnp.asarray(covariance)))
+    error = track[f"mean{suffix}"].sel(chosen).values[known] - true[known]
+    value = (np.einsum("eij,ej->ei", whiten, error) ** 2).mean(1)
+    own = (np.einsum("eij,sej->sei", whiten, deviation) ** 2).mean((1, 2))
+    lower, upper = np.quantile(own, [rate / 2, 1 - rate / 2])
+    return Nees(value, known, float(value.mean()), float(lower), float(upper))
+
+
+def of_biases(tree: xr.DataTree, truth: Truth, rate: float) -> tuple[float, int, float, float] | None:
+    """NEES of all biases that the truth knows, their number and limits; None where it knows none."""
+    group = tree["calibration"].to_dataset()
+    labels = [label for label in group["bias_label"].values.tolist() if label in truth.biases]
+    if not labels:
+        return None
+    chosen = group.sel(bias_label=labels, bias_label_other=labels)
+    error = (chosen["mean"].values - np.array([truth.biases[label] for label in labels])) / chosen["scale"].values
+    covariance = chosen["covariance"].values / np.outer(chosen["scale"].values, chosen["scale"].values)
+    value = float(error @ np.linalg.solve(covariance, error))
+    lower, upper = stats.chi2.ppf([rate / 2, 1 - rate / 2], len(labels))
+    return value, len(labels), float(lower), float(upper)

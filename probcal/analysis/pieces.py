@@ -1,0 +1,166 @@
+"""Does a bias hold still? A fit of pieces: halves and quarters of the recording, or its targets.
+
+Every piece gets its own copy of the biases and all trajectories are eliminated together, once, at the fit. From
+this one information matrix follows, for each bias alone, the generalised least-squares estimate of how it differs
+between the pieces while all others stay common: exact on a linear problem.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.analysis.fitted import Fitted, eliminate_rows
+from probcal.problem import Spec, System
+
+LEAST = 1e-6  # information in z about a difference below which there is none to tell
+
+
+class Pieces(NamedTuple):
+    """The biases of P pieces at a fit, trajectories eliminated, in z: piece by piece, M each."""
+
+    information: np.ndarray  # (P M, P M)
+    score: np.ndarray  # (P M,) of the log-likelihood
+    prior: np.ndarray  # (M, M) precision of what the pieces share
+    z: np.ndarray  # (M,) the fit
+
+
+class Contrast(NamedTuple):
+    """How one bias differs between pieces, in z: the coefficients of a pattern (P, q) beside a common level."""
+
+    estimate: np.ndarray  # (q,)
+    information: np.ndarray  # (q, q)
+
+    @property
+    def square(self) -> float:
+        """Chi-square of no difference, q degrees of freedom."""
+        return float(self.estimate @ self.information @ self.estimate)
+
+    @property
+    def plausible(self) -> float:
+        """The part of the chi-square that changes of the order of the declared scale explain."""
+        q = len(self.estimate)
+        pull = self.information @ self.estimate
+        held = np.linalg.inv(np.eye(q) + np.ones((q, q)))  # each piece its own draw: differences share the first
+        return float(pull @ np.linalg.solve(self.information + held, pull))
+
+    def along(self, direction: np.ndarray) -> float:
+        """The part of the chi-square that coefficients in one direction (q,) explain."""
+        return float((direction @ self.information @ self.estimate) ** 2 / (direction @ self.information @ direction))
+
+
+def divide(fit: Fitted, piece: np.ndarray, count: int) -> Pieces:
+    """Give every piece its own biases; `piece` (rows,) is that of each row of the table, below `count`."""
+    spec, system = copied(fit, piece, count)
+    point = fit.point._replace(z=jnp.asarray(np.tile(fit.point.z, count)))
+    solved = eliminate_rows(spec, system, point, fit.lins)
+    return Pieces(
+        np.asarray(solved.information),
+        np.asarray(solved.score),
+        np.asarray(fit.prior.matrix()),
+        np.asarray(fit.point.z),
+    )
+
+
+def copied(fit: Fitted, piece: np.ndarray, count: int) -> tuple[Spec, System]:
+    """The problem with a table of sensors for every piece, each pointing to its own biases."""
+    spec, system = fit.problem.spec, fit.problem.system
+    M, parts = spec.biases, []
+    for index, data in zip(fit.problem.row_index, system.rows, strict=True):
+        S, bias = data.bias.shape[0], np.asarray(data.bias)
+        copies = [np.where(bias < M, bias + p * M, count * M) for p in range(count)]
+        parts.append(
+            data._replace(
+                sensor=jnp.asarray(np.asarray(data.sensor) + S * piece[index]),
+                bias=jnp.asarray(np.concatenate(copies)),
+                scale=jnp.asarray(np.tile(data.scale, (count, 1))),
+                base=jnp.asarray(np.tile(data.base, (count, 1))),
+            )
+        )
+    return replace(spec, biases=count * M), system._replace(rows=tuple(parts))
+
+
+def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.ndarray]] = ()) -> dict[int, Contrast]:
+    """How each bias alone differs between the pieces along a pattern (P, q), all others common to all pieces.
+
+    The biases in `free` differ too, each along its own pattern. What is common has the prior of the fit, the level of
+    a bias that differs none. A bias about whose difference the data say nothing is left out.
+    """
+    M = len(pieces.z)
+    P, held = len(pieces.score) // M, [m for m, _ in free]
+    G, g = pieces.information.reshape(P, M, P, M), pieces.score.reshape(P, M)
+    prior = pieces.prior.copy()
+    prior[held, :], prior[:, held] = 0.0, 0.0
+    # parameters: the M common values, then the coefficients of what differs already
+    to = np.concatenate([np.tile(np.eye(M), (P, 1)), *(np.kron(own, np.eye(M)[:, [m]]) for m, own in free)], 1)
+    crosses = (pieces.information @ to).reshape(P, M, -1)
+    K, slope = to.T @ pieces.information @ to, to.T @ pieces.score
+    K[:M, :M] += prior
+    slope[:M] -= prior @ pieces.z
+    inverse = np.linalg.pinv(K, hermitian=True)
+    found = {}
+    for m in range(M):
+        others, pull, columns = inverse, slope, pattern
+        if m not in held:  # its level is taken out of the common values, so that it has no prior
+            column = inverse[:, m]
+            if column[m] <= 0:
+                continue
+            others = inverse - np.outer(column, column) / column[m]  # inverse of K without its row and column m
+            pull = slope.copy()
+            pull[:M] += prior[:, m] * pieces.z[m]
+            columns = np.concatenate([pattern, np.ones((P, 1))], 1)
+        cross = columns.T @ crosses[:, m]
+        information = columns.T @ G[:, m, :, m] @ columns - cross @ others @ cross.T
+        score = columns.T @ g[:, m] - cross @ others @ pull
+        if m not in held:
+            level = information[-1]
+            if level[-1] <= LEAST:
+                continue
+            score = score[:-1] - level[:-1] * score[-1] / level[-1]
+            information = information[:-1, :-1] - np.outer(level[:-1], level[:-1]) / level[-1]
+        information = 0.5 * (information + information.T)
+        if np.linalg.eigvalsh(information)[0] > LEAST:
+            found[m] = Contrast(np.linalg.solve(information, score), information)
+    return found
+
+
+def own_biases(pieces: Pieces) -> np.ndarray:
+    """Change of every piece's own biases (P, M) from the fit, held by their declared scales."""
+    M = len(pieces.z)
+    step = np.linalg.solve(pieces.information + np.eye(len(pieces.score)), pieces.score)
+    return step.reshape(-1, M)
+
+
+class Change(NamedTuple):
+    """A bias that differs between pieces along a pattern of some name, and its chi-square, corrected."""
+
+    bias: int
+    name: str
+    square: float
+    contrast: Contrast
+
+
+def changing(
+    pieces: Pieces, patterns: dict[str, np.ndarray], inflation: np.ndarray, limits: dict[str, float], most: int = 20
+) -> list[Change]:
+    """Biases whose chi-square along a pattern, over `inflation` (M,), passes the limit, the strongest first.
+
+    Changes of several biases may look alike. One is let free at a time, that whose change of the order of its scale
+    explains most, and the others are judged anew beside it.
+    """
+    found: list[Change] = []
+    while len(found) < most:
+        free = [(change.bias, patterns[change.name]) for change in found]
+        taken = {(change.bias, change.name) for change in found}
+        rest = [
+            Change(m, name, contrast.square / inflation[m], contrast)
+            for name, pattern in patterns.items()
+            for m, contrast in contrasts(pieces, pattern, free).items()
+            if (m, name) not in taken and contrast.square / inflation[m] > limits[name]
+        ]
+        if not rest:
+            break
+        found.append(max(rest, key=lambda change: change.contrast.plausible / inflation[change.bias]))
+    return found

@@ -1,0 +1,265 @@
+"""Normalised innovations of the forward filter at a fit, with limits; whiteness and wrapped angles.
+
+Every datum counts as its standardised score v = score / sqrt(information): for Gaussian noise residual / std, and for
+every family of mean 0 and variance 1 where the model is right. The filter is linearised at the fitted trajectory.
+The innovations of an epoch are whitened by the symmetric root of their covariance, so that none comes first: their
+squares add up to the NIS of the epoch, and each stays with its sensor and channel.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from probcal import linalg
+from probcal.analysis.fitted import Fitted
+from probcal.problem import Spec, System
+from probcal.rows import Linearised
+from probcal.smoothing import recursion as rec
+from probcal.smoothing.mode import Point, factors, of_states
+
+COLUMNS = 16  # bias directions that are filtered together
+LAGS = 10  # of the Ljung-Box statistic
+LONGEST = 200  # lags over which a correlation in time is followed
+FEWEST = 20  # data below which whiteness is not judged
+
+
+class Filter(NamedTuple):
+    """What the covariance pass of one recursion leaves for any columns of data."""
+
+    gain: rec.Gains
+    J: jax.Array  # (E, n, n) information of the rows about the states
+    mix: jax.Array  # (E, n, n) root V g V' root', S^-1/2 - I between data of an epoch
+
+
+class Innovations(NamedTuple):
+    """Of every datum: its innovation, N(0, 1) under the model, and what is needed to judge sums of squares."""
+
+    value: np.ndarray  # (D,)
+    used: np.ndarray  # (D,) degrees of freedom that the biases took
+    kurtosis: np.ndarray  # (D,) excess over a Gaussian's
+
+
+@partial(jax.jit, static_argnames="spec")
+def prepare(spec: Spec, system: System, point: Point, lins: list[Linearised]) -> list[Filter]:
+    """Covariance pass of every recursion: with U the data's responses to the whitened prediction, S = I + U U'."""
+    found = []
+    for part, (J, _) in zip(system.recursions, of_states(spec, system, lins, point.states), strict=True):
+        gain = rec.gains(part.F, factors(part, point.levels), J)
+        root = gain.predicted
+        values, vectors = linalg.spectrum(root.mT @ J @ root)
+        size = jnp.sqrt(1.0 + jnp.maximum(values, 0.0))
+        half = root @ vectors
+        found.append(Filter(gain, J, (half * (-1.0 / (size * (1.0 + size)))[:, None, :]) @ half.mT))
+    return found
+
+
+def _whiten(
+    spec: Spec,
+    system: System,
+    lins: list[Linearised],
+    filters: list[Filter],
+    columns: list[jax.Array],
+    drifts: list[jax.Array],
+) -> list[jax.Array]:
+    """Innovations (N, C, K) of columns of unit-noise data (N, C, K) with drifts (E, n, K) of the states."""
+    seen = [jnp.sqrt(lin.weight)[:, :, None] * lin.state for lin in lins]
+    pulls = [jnp.zeros_like(drift) for drift in drifts]
+    for block, data, own, column, r in zip(spec.blocks, system.rows, seen, columns, spec.recursion, strict=True):
+        summed = jax.ops.segment_sum(jnp.einsum("ncu,nck->nuk", own, column), data.epoch, drifts[r].shape[0])
+        pulls[r] = pulls[r].at[:, jnp.asarray(block.used, int)].add(summed)
+    predicted, corrected = [], []
+    for part, known, pull, drift in zip(system.recursions, filters, pulls, drifts, strict=True):
+        keep, covariance = known.gain.keep, known.gain.updated @ known.gain.updated.mT
+
+        def forward(x, epoch):
+            T_k, s_k = epoch
+            x = linalg.multiply(T_k, x) + s_k
+            return x, x
+
+        source = covariance @ pull + keep @ drift
+        _, filtered = jax.lax.scan(forward, jnp.zeros_like(pull[0]), (keep @ part.F, source))
+        before = jnp.concatenate([jnp.zeros_like(filtered[:1]), filtered[:-1]])
+        x = part.F @ before + drift
+        predicted.append(x)
+        corrected.append(x - known.mix @ (pull - known.J @ x))  # what S^-1/2 takes off each datum
+    return [
+        column - jnp.einsum("ncu,nuk->nck", own, corrected[r][data.epoch][:, jnp.asarray(block.used, int)])
+        for block, data, own, column, r in zip(spec.blocks, system.rows, seen, columns, spec.recursion, strict=True)
+    ]
+
+
+@partial(jax.jit, static_argnames="spec")
+def _innovations(
+    spec: Spec,
+    system: System,
+    point: Point,
+    lins: list[Linearised],
+    filters: list[Filter],
+    shift: list[jax.Array],
+    root: jax.Array,
+) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
+    """Of each block: innovations with the biases of every row moved by `shift` (N, p) in z, the sum of squares of their
+    responses to bias directions `root` (M, K), and the share of itself that S^-1/2 leaves a datum; each (N, C)."""
+    columns, kept = [], []
+    padded = jnp.concatenate([root, jnp.zeros((1, root.shape[1]))])
+    for block, data, lin, dz, r in zip(spec.blocks, system.rows, lins, shift, spec.recursion, strict=True):
+        size = jnp.sqrt(lin.weight)
+        score = jnp.where(size > 0, lin.score / jnp.where(size > 0, size, 1.0), 0.0)
+        moved = jnp.einsum("ncp,np->nc", lin.bias, dz)
+        responses = jnp.einsum("nc,ncp,npk->nck", size, lin.bias, padded[data.bias[data.sensor]])
+        columns.append(jnp.concatenate([(score - size * moved)[:, :, None], responses], 2))
+        used = jnp.asarray(block.used, int)
+        mix = filters[r].mix[:, used[:, None], used[None, :]][data.epoch]
+        kept.append(1.0 + lin.weight * jnp.einsum("ncu,nuv,ncv->nc", lin.state, mix, lin.state))
+    drifts = [
+        jnp.pad(-(factors(part, point.levels) @ u[:, :, None]), ((0, 0), (0, 0), (0, root.shape[1])))
+        for part, u in zip(system.recursions, point.noises, strict=True)
+    ]
+    white = _whiten(spec, system, lins, filters, columns, drifts)
+    return [(c[:, :, 0], jnp.sum(c[:, :, 1:] ** 2, 2), k) for c, k in zip(white, kept, strict=True)]
+
+
+class Filtered(NamedTuple):
+    """The filters of a fit, its innovations, and the bias directions (M, K) behind their degrees of freedom."""
+
+    filters: list[Filter]
+    innovations: Innovations
+    roots: list[jax.Array]
+
+
+def innovations(fit: Fitted, kurtosis: np.ndarray) -> Filtered:
+    """Innovations of all data with the biases at their means, for noise of excess kurtosis (D,).
+
+    A sum of squares over some data expects their number less what the biases used: over all data the sum of gamma,
+    over a share of them the trace of B (G + A)^-1 B', B their responses to the biases.
+    """
+    spec, system = fit.problem.spec, fit.problem.system
+    filters = prepare(spec, system, fit.point, fit.lins)
+    root = np.asarray(linalg.factor(jnp.asarray(fit.covariance)))
+    chunk = min(COLUMNS, spec.biases)
+    root = np.pad(root, ((0, 0), (0, -spec.biases % chunk)))
+    roots = [jnp.asarray(part) for part in np.split(root, root.shape[1] // chunk, axis=1)]
+    still = [jnp.asarray(np.zeros((lin.bias.shape[0], lin.bias.shape[2]))) for lin in fit.lins]
+    found = [_innovations(spec, system, fit.point, fit.lins, filters, still, part) for part in roots]
+    value, _, kept = (fit.flat(parts) for parts in zip(*found[0], strict=True))
+    used = np.sum([fit.flat([own for _, own, _ in part]) for part in found], axis=0)
+    return Filtered(filters, Innovations(value, used, kurtosis * kept**4), roots)
+
+
+def moved_innovations(fit: Fitted, known: Filtered, shift: list[jax.Array]) -> np.ndarray:
+    """Innovations (D,) with the biases of every row of each block moved by `shift` (N, p) in z."""
+    spec, system = fit.problem.spec, fit.problem.system
+    found = _innovations(spec, system, fit.point, fit.lins, known.filters, shift, known.roots[0])
+    return fit.flat([value for value, _, _ in found])
+
+
+class Squares(NamedTuple):
+    """Mean square of the innovations of groups of data, each (groups,): NIS per datum and its limits."""
+
+    data: np.ndarray
+    nis: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+def squares(found: Innovations, group: Any, count: int, rate: float) -> Squares:
+    """Sums of squares by group (D,) over what they expect, with two-sided limits at a false-alarm rate each.
+
+    The limits are those of a scaled chi-square of the right mean and variance (exact for Gaussian noise).
+    """
+    group = np.asarray(group)
+    data, total, used, kurtosis = (
+        np.bincount(group, weight, count) for weight in (np.ones(len(group)), found.value**2, *found[1:])
+    )
+    expected = np.maximum(data - used, 1e-9)
+    variance = np.maximum(2.0 * expected + kurtosis, 1e-9 * expected)
+    scale, freedom = variance / (2.0 * expected), 2.0 * expected**2 / variance
+    lower, upper = (scale * stats.chi2.ppf(p, freedom) / expected for p in (rate / 2, 1 - rate / 2))
+    return Squares(data.astype(int), total / expected, lower, upper)
+
+
+class Whiteness(NamedTuple):
+    """Of one sensor's channel: lag-1 correlation of its innovations, mean, and Ljung-Box p-value."""
+
+    autocorrelation: float
+    mean: float
+    probability: float
+
+
+def _correlations(value: np.ndarray, target: np.ndarray, time: np.ndarray, lags: int) -> tuple[np.ndarray, np.ndarray]:
+    """Autocorrelations (lags,) of values in the order of time about their mean, and the pairs behind each.
+
+    Pairs lie within a target.
+    """
+    order = np.lexsort((time, target))
+    value, target = value[order] - value.mean(), target[order]
+    together = [target[lag:] == target[:-lag] for lag in range(1, lags + 1)]
+    pairs = np.array([same.sum() for same in together])
+    sums = [np.sum(value[k + 1 :] * value[: -k - 1] * same) for k, same in enumerate(together)]
+    return np.array(sums) / np.maximum(pairs, 1) / max(float(np.mean(value**2)), 1e-300), pairs
+
+
+def whiteness(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> Whiteness | None:
+    """Whiteness of the innovations (n,) of one channel; None where there are too few.
+
+    Ljung and Box (1978), Q = sum of n_k r_k^2 (n + 2) / n over up to 10 lags, n_k the pairs at lag k.
+    """
+    n = len(value)
+    if n < FEWEST:
+        return None
+    r, pairs = _correlations(value, target, time, min(LAGS, n // 5))
+    lags = int(np.sum(np.cumprod(pairs >= FEWEST // 2)))
+    if not lags:
+        return None
+    statistic = np.sum(pairs[:lags] * r[:lags] ** 2) * (n + 2) / n
+    return Whiteness(float(r[0]), float(np.mean(value)), float(stats.chi2.sf(statistic, lags)))
+
+
+def memory(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> float:
+    """How many innovations of one channel count as one: 1 + 2 sum of r_k over the first positive pairs of lags.
+
+    The initial positive sequence of Geyer (1992); 1 where the first correlation is not beyond 3 sd.
+    """
+    n = len(value)
+    if n < FEWEST:
+        return 1.0
+    r, pairs = _correlations(value, target, time, min(LONGEST, n // 5))
+    if r[0] < 3.0 / np.sqrt(max(pairs[0], 1)):
+        return 1.0
+    r = np.concatenate([[1.0], r[: len(r) // 2 * 2 - 1]])
+    couples = r.reshape(-1, 2).sum(1) * np.cumprod(np.append(pairs[: len(r) - 1], n)[1::2] >= FEWEST // 2)
+    return float(max(2.0 * np.sum(couples * np.cumprod(couples > 0)) - 1.0, 1.0))
+
+
+NEAR_TURN = 1.0  # rad of a full turn within which a residual tells of a missing wrap
+WIDE = np.pi / 3  # noise std in rad above which a wrapped angle is ambiguous
+FAR = 2 * np.pi / 3  # rad beyond which a wrapped residual may belong to the next turn
+SHARE = 0.01  # of a channel's data beyond which its residuals are
+
+
+def wrapping(fit: Fitted, innovation: np.ndarray, std: np.ndarray) -> list[tuple[str, str]]:
+    """Sentences (subject, sentence) on angles: residuals (D,) a turn off without `wrap`, or too wide with it."""
+    found = []
+    for kind in fit.problem.network.types:
+        for name, channel in kind.expand(fit.problem.network.dimension):
+            ours = [s.name for s in fit.problem.network.sensors if s.type is kind]
+            mine = (fit.data["channel"] == name).to_numpy() & fit.data["sensor"].isin(ours).to_numpy()
+            turn = {"rad": 1.0, "deg": np.pi / 180}.get(channel.unit)
+            if turn is None or not mine.any():
+                continue
+            residual, spread = np.abs(innovation[mine]) * turn, std[mine] * turn
+            subject, off = f"{kind.name}.{name}", np.abs(residual - 2 * np.pi) < NEAR_TURN
+            if channel.period is None and off.any():
+                text = f"{off.sum()} of {len(off)} residuals lie a full turn off: declare wrap=True"
+            elif channel.period is not None and np.median(spread) > WIDE:
+                text = f"its noise std of {np.median(spread):.2f} rad is too wide for an angle: wrapping is ambiguous"
+            elif channel.period is not None and (residual > FAR).mean() > SHARE:
+                text = f"{(residual > FAR).sum()} of {len(off)} residuals lie beyond 120 deg: wrapping is ambiguous"
+            else:
+                continue
+            found.append((subject, f"{subject}: {text}"))
+    return found

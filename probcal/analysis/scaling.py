@@ -1,0 +1,47 @@
+"""Power scaling: how prior and likelihood move the posterior of every bias (Kallioinen et al. 2024), by ArviZ."""
+
+import warnings
+
+import arviz as az
+import numpy as np
+import xarray as xr
+
+THRESHOLD = 0.05  # of the distance a power, ArviZ's own
+
+
+def power_scaling(tree: xr.DataTree) -> xr.Dataset | None:
+    """Sensitivity (bias_label) of each bias to prior and likelihood; None where the tree lacks one of them.
+
+    `noise` is the largest sensitivity found after the draws of the densities were shuffled against those of the
+    biases: with the log-likelihood of thousands of data it may exceed ArviZ's threshold of 0.05, and what stays
+    below it tells nothing.
+    """
+    if not {"log_prior", "log_likelihood"} <= set(tree.children):
+        return None
+    kept = {name: tree[name].to_dataset() for name in ("posterior", "log_prior", "log_likelihood")}
+    kept["posterior"] = kept["posterior"][["bias"]]
+    summed = kept["log_likelihood"]["y"].sum("datum")
+    kept["log_likelihood"] = xr.Dataset({"y": summed.expand_dims(datum=1, axis=-1)})
+    shuffled = dict(kept)
+    order = np.random.default_rng(0).permutation(summed.size)
+    for name in ("log_prior", "log_likelihood"):
+        values = kept[name]
+        var = "bias" if name == "log_prior" else "y"
+        flat = values[var].values.reshape(len(order), -1)[order]
+        shuffled[name] = values.assign({var: (values[var].dims, flat.reshape(values[var].shape))})
+    found, chance = ({way: _distance(groups, way) for way in ("prior", "likelihood")} for groups in (kept, shuffled))
+    finite = np.isfinite(found["prior"]) & np.isfinite(found["likelihood"])
+    noise = max(float(np.nanmax(c, initial=0.0)) for c in chance.values())
+    labels = kept["posterior"]["bias_label"].values
+    group = xr.Dataset(
+        {way: ("bias_label", value[finite]) for way, value in found.items()}, coords={"bias_label": labels[finite]}
+    )
+    group.attrs |= {"noise": noise, "threshold": max(THRESHOLD, noise)}
+    return group
+
+
+def _distance(groups: dict[str, xr.Dataset], way: str) -> np.ndarray:
+    """Sensitivity (M,) of every bias to the prior or the likelihood."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return az.psense(xr.DataTree.from_dict(groups), var_names=["bias"], group=way)["bias"].values

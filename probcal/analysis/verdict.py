@@ -1,0 +1,100 @@
+"""One verdict per bias, with its reason in one short sentence with numbers.
+
+With s = 1 - [(G + I)^-1]_mm, G the information of the data in units of the declared scale (trajectories and other
+biases marginalised), how much the data narrow a bias, the first that applies:
+
+drifting     the halves of the recording differ on it beyond the limit, after what stronger changes explain
+conflicting  it lies beyond the limit of its survey (or of its scale under a prior that does not learn), or the
+             targets disagree on it beyond the limit, after what stronger changes explain
+prior only   s < 0.05
+weak         s < 0.5 (information below 1), or the fit is no answer (at bound, diverged)
+determined   none of these
+
+Limits have a false-alarm rate of 1 % over all biases together, and the standard deviations behind them carry the
+overdispersion of the innovations and their correlation in time. A sensor whose noise is larger than declared, or
+whose data fit the rest badly, is a finding of its own: it widens those standard deviations and is no verdict.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from probcal.problem import Problem
+
+RATE = 0.01  # false alarms of each kind of check, all its comparisons together
+PRIOR_ONLY, WEAK = 0.05, 0.5
+VERDICTS = ("determined", "prior only", "weak", "drifting", "conflicting")
+
+
+class Evidence(NamedTuple):
+    """What the verdicts rest on, each (M,) in z."""
+
+    contraction: np.ndarray  # s
+    square: np.ndarray  # of halves alike, over its limit's chi-square, 0 where nothing can be told
+    pull: np.ndarray  # sd from the prior, 0 where the prior follows the data
+    limit: float  # of pull and of the root of `square`
+
+
+def contraction(information: np.ndarray) -> np.ndarray:
+    """How much the data narrow each bias in units of its declared scale, s = 1 - [(G + I)^-1]_mm."""
+    return np.clip(1.0 - np.diag(np.linalg.inv(information + np.eye(len(information)))), 0.0, 1.0)
+
+
+def pull(z: np.ndarray, alpha: np.ndarray, gamma: np.ndarray, inflation: np.ndarray) -> np.ndarray:
+    """Distance (M,) of each estimate from its prior in sd, where the precision is that declared (1).
+
+    Under the model an estimate has variance gamma / alpha; noise `inflation` times too large adds to its own share.
+    """
+    spread = np.sqrt(np.maximum(gamma * (gamma + inflation * (1.0 - gamma)), 1e-12))
+    return np.where(alpha == 1.0, np.abs(z) / spread, 0.0)
+
+
+def limit_of(count: int, freedom: int = 1) -> float:
+    """Chi-square beyond which one of `count` statistics may go at the false-alarm rate of all."""
+    return float(stats.chi2.isf(RATE / max(count, 1), freedom))
+
+
+def judge(
+    problem: Problem,
+    status: str,
+    pruned: np.ndarray,
+    known: Evidence,
+    drifts: Mapping[int, str],
+    disagreements: Mapping[int, str],
+    first: str,
+) -> tuple[list[str], list[str]]:
+    """Verdict and reason of every bias, from the evidence and the reasons of those that change, `first` most."""
+    verdicts, sentences = [], []
+    for m, bias in enumerate(problem.biases):
+        s, unit = known.contraction[m], bias.unit if bias.unit != "1" else ""
+        declared = "survey" if problem.surveyed[m] else "scale"
+        sizes = f"{declared} of {_size(bias.scale, unit)} to {_size(bias.scale * np.sqrt(1 - s), unit)}"
+        information = f"information {s / max(1 - s, 1e-12):.2g}"
+        if m in drifts:
+            verdict, reason = "drifting", drifts[m]
+        elif known.pull[m] > known.limit:
+            verdict = "conflicting"
+            where = f"its {declared} of {_size(bias.scale, unit)}"
+            reason = f"{known.pull[m]:.1f} sd beyond {where} (limit {known.limit:.1f})"
+        elif m in disagreements:
+            verdict, reason = "conflicting", disagreements[m]
+        elif s < PRIOR_ONLY:
+            verdict, reason = "prior only", f"the data hardly narrow its {declared} ({information})"
+        elif s < WEAK:
+            verdict, reason = "weak", f"the data narrow its {sizes} only ({information})"
+        elif status in ("at bound", "diverged"):
+            verdict, reason = "weak", f"the fit ended {status}, which is no answer"
+        else:
+            verdict, reason = "determined", f"the data narrow its {sizes}"
+            reason += "; learnt to be zero" if pruned[m] else ""
+        if verdict != "drifting" and known.square[m] > known.limit**2 and first not in ("", bias.label):
+            reason += f"; its halves differ by {np.sqrt(known.square[m]):.1f} sd, which {first} explains"
+        verdicts.append(verdict)
+        sentences.append(reason)
+    return verdicts, sentences
+
+
+def _size(value: float, unit: str) -> str:
+    return f"{value:.2g} {unit}".strip()
