@@ -88,11 +88,9 @@ def _status(directions: Sequence[Direction]) -> str:
     return "open" if least < NONE else "weak" if least < HALF else "determined"
 
 
-def _verdict(share: float, kind: str) -> str:
-    """What data can say of a bias, from their share of the answer; a survey stands where they say little."""
-    if share >= HALF:
-        return "determined"
-    return "survey" if kind == "survey" else "prior only" if share < NONE else "weak"
+def _verdict(share: float) -> str:
+    """What data can say of a bias, from their share of the answer."""
+    return "prior only" if share < NONE else "weak" if share < HALF else "determined"
 
 
 def _biases(problem: Problem, found: Information) -> xr.Dataset:
@@ -103,7 +101,7 @@ def _biases(problem: Problem, found: Information) -> xr.Dataset:
         "kind": np.array([b.kind for b in problem.biases], str),
         "share": found.share,
         "sd": np.sqrt(np.diag(found.covariance)) * scales,
-        "verdict": np.array([_verdict(share, b.kind) for share, b in zip(found.share, problem.biases, strict=True)]),
+        "verdict": np.array([_verdict(share) for share in found.share]),
     }
     group = xr.Dataset({k: ("bias_label", v) for k, v in columns.items()}, coords={"bias_label": labels})
     matrix = (("bias_label", "bias_label_other"), found.information)

@@ -40,12 +40,13 @@ def plot_spectrum(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
 def plot_directions(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw each weak direction as arrows of the nodes it moves; a turning heading is a stroke across its arrow."""
     ax = new_axes(ax, 9.0, 6.0)
-    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_aspect("equal", adjustable="box")
     keys = _draw_scene(ax, tree)
     if "direction" in tree.children:
         group = tree["direction"].to_dataset()
-        ax.margins(0.2)
-        width = float(np.ptp(np.asarray(ax.get_xlim())))
+        (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
+        width = max(right - left, high - low)
+        ax.set(xlim=(left - REACH * width, right + REACH * width), ylim=(low - REACH * width, high + REACH * width))
         for k in range(min(SHOWN, group.sizes["direction"])):
             chosen = group.isel(direction=k)
             _draw_direction(ax, tree, chosen["vector"].to_series(), width, colour(k))
