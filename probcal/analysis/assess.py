@@ -1,5 +1,6 @@
 """`assess`: is the answer of a fit good? Innovations, predictive checks, left-out data, halves, and verdicts."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -78,23 +79,20 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
     if grid.patterns:
         divided = pieces.divide(fit, grid.piece, grid.pieces)
         inflation = _inflation(fit, found, divided, grid.piece)
-        limits = {name: limit_of(M, pattern.shape[1]) for name, pattern in grid.patterns.items()}
         if "halves" in grid.patterns:
             alone = pieces.contrasts(divided, grid.patterns["halves"])
             square[list(alone)] = [c.square / inflation[m] for m, c in alone.items()]
             if alone:
-                groups["halves"] = _halves(
-                    problem, alone, inflation, grid.edges[len(grid.edges) // 2], limits["halves"]
-                )
-        changes = pieces.changing(divided, grid.patterns, inflation, limits)
+                groups["halves"] = _halves(problem, alone, inflation, grid.edges[len(grid.edges) // 2], limit_of(M))
+        changes = pieces.changing(divided, grid.patterns, inflation, partial(limit_of, M))
         shapes = pieces.contrasts(divided, grid.quarters) if changes and grid.quarters.shape[1] > 1 else {}
         first = problem.labels[changes[0].bias] if changes else ""
         for change in changes:
             if change.name == "halves":
-                text = _drift(problem, change, inflation, limits["halves"])
+                text = _drift(problem, change, inflation, limit_of(M))
                 drifts[change.bias] = text + _shape(shapes.get(change.bias), grid.edges)
             else:
-                disagreements[change.bias] = _disagreement(problem, change, limits["targets"])
+                disagreements[change.bias] = _disagreement(problem, change, limit_of(M, change.contrast.freedom))
     z, alpha = np.asarray(fit.point.z), np.asarray(fit.prior.alpha)
     known = verdict.Evidence(
         verdict.contraction(calibration["information"].values), square,
@@ -204,7 +202,8 @@ def _disagreement(problem: Problem, change: Change, limit: float) -> str:
     odd = [name for k, name in enumerate(names) if k % groups == int(np.argmax(alone))]
     listed = odd[0] if len(odd) == 1 else f"{odd[0]} and {len(odd) - 1} more"
     listed = f"{names[0]} and {names[1]}" if len(names) == 2 else f"{listed} most"
-    return f"the targets disagree, {listed} (chi-square {change.square:.1f} on {groups - 1}, limit {limit:.1f})"
+    found = f"chi-square {change.square:.1f} on {change.contrast.freedom}, limit {limit:.1f}"
+    return f"the targets disagree, {listed} ({found})"
 
 
 def _halves(
