@@ -16,6 +16,7 @@ from probcal.analysis.fitted import Fitted, eliminate_rows
 from probcal.problem import Spec, System
 
 Limit = Callable[[int], float]  # chi-square by degrees of freedom
+Patterns = dict[str, np.ndarray]
 LEAST = 1e-6  # information in z about a difference below which there is none to tell
 
 
@@ -132,11 +133,12 @@ def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.
     return found
 
 
-def own_biases(pieces: Pieces) -> np.ndarray:
-    """Change of every piece's own biases (P, M) from the fit, held by their declared scales."""
+def own_biases(pieces: Pieces, member: np.ndarray) -> np.ndarray:
+    """Change (P, M) from the fit where groups of pieces, `member` (P,), have own biases, held by their scales."""
     M = len(pieces.z)
-    step = np.linalg.solve(pieces.information + np.eye(len(pieces.score)), pieces.score)
-    return step.reshape(-1, M)
+    to = np.kron(np.eye(int(member.max()) + 1)[member], np.eye(M))
+    step = np.linalg.solve(to.T @ pieces.information @ to + np.eye(to.shape[1]), to.T @ pieces.score)
+    return step.reshape(-1, M)[member]
 
 
 class Change(NamedTuple):
@@ -148,10 +150,8 @@ class Change(NamedTuple):
     contrast: Contrast
 
 
-def changing(
-    pieces: Pieces, patterns: dict[str, np.ndarray], inflation: np.ndarray, limit: Limit, most: int = 20
-) -> list[Change]:
-    """Biases whose chi-square along a pattern, over `inflation` (M,), passes the limit for its degrees of freedom.
+def changing(pieces: Pieces, patterns: Patterns, inflation: Patterns, limit: Limit, most: int = 20) -> list[Change]:
+    """Biases whose chi-square along a pattern, over its `inflation` (M,), passes the limit for its freedom.
 
     The strongest comes first.
 
@@ -163,12 +163,12 @@ def changing(
         free = [(change.bias, patterns[change.name]) for change in found]
         taken = {(change.bias, change.name) for change in found}
         rest = [
-            Change(m, name, contrast.square / inflation[m], contrast)
+            Change(m, name, contrast.square / inflation[name][m], contrast)
             for name, pattern in patterns.items()
             for m, contrast in contrasts(pieces, pattern, free).items()
-            if (m, name) not in taken and contrast.square / inflation[m] > limit(contrast.freedom)
+            if (m, name) not in taken and contrast.square / inflation[name][m] > limit(contrast.freedom)
         ]
         if not rest:
             break
-        found.append(max(rest, key=lambda change: change.contrast.plausible / inflation[change.bias]))
+        found.append(max(rest, key=lambda change: change.contrast.plausible / inflation[change.name][change.bias]))
     return found
