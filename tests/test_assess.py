@@ -354,6 +354,20 @@ def test_targets_that_disagree_are_a_conflict(judged):
     assert found["west.range_offset"][1].startswith("the targets disagree, car and van")
 
 
+def test_targets_that_a_sensor_does_not_see_tell_nothing_of_it(judged):
+    """West never sees the van: of its biases the targets tell nothing, of the others as before."""
+    _, _, problem = judged("target")
+    frame = problem.measurements.table.frame
+    problem = problem.rebuild(frame[(frame["sensor"] != "west") | (frame["target"] == "car")])
+    tree = probcal.fit(problem, EA(), predictive_draws=False)
+    with jax.enable_x64(True):
+        divided = pieces.divide(take_up(problem, tree), problem.measurements.target, 2)
+    found = pieces.contrasts(divided, np.array([[0.0], [1.0]]))
+    labels = {problem.labels[m] for m in found}
+    assert "west.range_offset" not in labels
+    assert {f"{name}.range_offset" for name in ("north", "east", "south")} <= labels
+
+
 def test_a_noisy_sensor_is_a_finding_and_no_verdict(judged):
     _, out, _ = judged("noisy")
     assert alarms(out) == {}

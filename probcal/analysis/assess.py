@@ -1,5 +1,6 @@
 """`assess`: is the answer of a fit good? Innovations, predictive checks, left-out data, halves, and verdicts."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -77,24 +78,22 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
     grid = _grid(problem)
     if grid.patterns:
         divided = pieces.divide(fit, grid.piece, grid.pieces)
-        inflation = _inflation(fit, found, divided, grid.piece)
-        limits = {name: limit_of(M, pattern.shape[1]) for name, pattern in grid.patterns.items()}
+        wide = {name: _inflation(fit, found, divided, grid, member) for name, member in grid.members.items()}
+        inflation = wide.get("halves", inflation)
         if "halves" in grid.patterns:
             alone = pieces.contrasts(divided, grid.patterns["halves"])
             square[list(alone)] = [c.square / inflation[m] for m, c in alone.items()]
             if alone:
-                groups["halves"] = _halves(
-                    problem, alone, inflation, grid.edges[len(grid.edges) // 2], limits["halves"]
-                )
-        changes = pieces.changing(divided, grid.patterns, inflation, limits)
+                groups["halves"] = _halves(problem, alone, inflation, grid.edges[len(grid.edges) // 2], limit_of(M))
+        changes = pieces.changing(divided, grid.patterns, wide, partial(limit_of, M))
         shapes = pieces.contrasts(divided, grid.quarters) if changes and grid.quarters.shape[1] > 1 else {}
         first = problem.labels[changes[0].bias] if changes else ""
         for change in changes:
             if change.name == "halves":
-                text = _drift(problem, change, inflation, limits["halves"])
+                text = _drift(problem, change, inflation, limit_of(M))
                 drifts[change.bias] = text + _shape(shapes.get(change.bias), grid.edges)
             else:
-                disagreements[change.bias] = _disagreement(problem, change, limits["targets"])
+                disagreements[change.bias] = _disagreement(problem, change, limit_of(M, change.contrast.freedom))
     z, alpha = np.asarray(fit.point.z), np.asarray(fit.prior.alpha)
     known = verdict.Evidence(
         verdict.contraction(calibration["information"].values), square,
@@ -117,7 +116,8 @@ class _Grid(NamedTuple):
     pieces: int
     edges: np.ndarray  # times at which the parts begin
     quarters: np.ndarray  # (pieces, parts - 1) which part
-    patterns: dict[str, np.ndarray]  # halves (pieces, 1), targets (pieces, groups - 1)
+    patterns: pieces.Patterns  # halves (pieces, 1), targets (pieces, groups - 1)
+    members: pieces.Patterns  # (pieces,) what has biases of its own while the noise behind a pattern is measured
 
 
 def _grid(problem: Problem) -> _Grid:
@@ -128,12 +128,14 @@ def _grid(problem: Problem) -> _Grid:
     groups = _groups(problem, parts)
     part = np.searchsorted(edges[1:], time, side="right")
     piece = part * groups + problem.measurements.target % groups
-    quarters, patterns = np.kron(np.eye(parts)[:, 1:], np.ones((groups, 1))), {}
+    quarters, patterns, members = np.kron(np.eye(parts)[:, 1:], np.ones((groups, 1))), {}, {}
     if parts > 1:
         patterns["halves"] = np.repeat(2 * np.arange(parts) // parts, groups)[:, None].astype(float)
+        members["halves"] = np.repeat(np.arange(parts), groups)
     if groups > 1:
         patterns["targets"] = np.kron(np.ones((parts, 1)), np.eye(groups)[:, 1:])
-    return _Grid(piece, parts * groups, edges, quarters, patterns)
+        members["targets"] = np.tile(np.arange(groups), parts)
+    return _Grid(piece, parts * groups, edges, quarters, patterns, members)
 
 
 def _groups(problem: Problem, parts: int) -> int:
@@ -149,14 +151,15 @@ def _edges(time: np.ndarray, count: int) -> np.ndarray:
     return _edges(time, 2) if count > 2 else edges[:1]
 
 
-def _inflation(fit: Fitted, found: residuals.Filtered, divided: Pieces, piece: np.ndarray) -> np.ndarray:
+def _inflation(fit: Fitted, found: residuals.Filtered, divided: Pieces, grid: _Grid, member: np.ndarray) -> np.ndarray:
     """How much wider (M,) the variance of a change is than the model says: overdispersion and correlation in time.
 
-    Both are measured on innovations from which each piece's own biases are taken, so that a change does not hide
-    itself: the mean square of a sensor's channel (at least 1) times how many of its innovations count as one. A bias
-    has the mean of the channels that tell of it, by their information, and not less than the mean of all.
+    Both are measured on innovations from which the own biases of every `member` (pieces,) are taken (each quarter, or
+    each target), so that a change does not hide itself: the mean square of a sensor's channel (at least 1) times how
+    many of its innovations count as one. A bias has the mean of the channels that tell of it, by their information,
+    and not less than the mean of all.
     """
-    own = pieces.own_biases(divided)
+    own, piece = pieces.own_biases(divided, member), grid.piece
     step = np.concatenate([own, np.zeros((len(own), 1))], 1)
     shift = [
         jnp.asarray(step[piece[index][:, None], np.asarray(data.bias)[np.asarray(data.sensor)]])
@@ -204,7 +207,8 @@ def _disagreement(problem: Problem, change: Change, limit: float) -> str:
     odd = [name for k, name in enumerate(names) if k % groups == int(np.argmax(alone))]
     listed = odd[0] if len(odd) == 1 else f"{odd[0]} and {len(odd) - 1} more"
     listed = f"{names[0]} and {names[1]}" if len(names) == 2 else f"{listed} most"
-    return f"the targets disagree, {listed} (chi-square {change.square:.1f} on {groups - 1}, limit {limit:.1f})"
+    found = f"chi-square {change.square:.1f} on {change.contrast.freedom}, limit {limit:.1f}"
+    return f"the targets disagree, {listed} ({found})"
 
 
 def _halves(

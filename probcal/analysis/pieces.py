@@ -5,7 +5,7 @@ this one information matrix follows, for each bias alone, the generalised least-
 between the pieces while all others stay common: exact on a linear problem.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,6 +15,8 @@ import numpy as np
 from probcal.analysis.fitted import Fitted, eliminate_rows
 from probcal.problem import Spec, System
 
+Limit = Callable[[int], float]  # chi-square by degrees of freedom
+Patterns = dict[str, np.ndarray]
 LEAST = 1e-6  # information in z about a difference below which there is none to tell
 
 
@@ -32,10 +34,11 @@ class Contrast(NamedTuple):
 
     estimate: np.ndarray  # (q,)
     information: np.ndarray  # (q, q)
+    freedom: int  # its rank: pieces in which a bias is not seen tell nothing
 
     @property
     def square(self) -> float:
-        """Chi-square of no difference, q degrees of freedom."""
+        """Chi-square of no difference, with its degrees of freedom."""
         return float(self.estimate @ self.information @ self.estimate)
 
     @property
@@ -48,7 +51,8 @@ class Contrast(NamedTuple):
 
     def along(self, direction: np.ndarray) -> float:
         """The part of the chi-square that coefficients in one direction (q,) explain."""
-        return float((direction @ self.information @ self.estimate) ** 2 / (direction @ self.information @ direction))
+        known = float(direction @ self.information @ direction)
+        return float((direction @ self.information @ self.estimate) ** 2) / known if known > LEAST else 0.0
 
 
 def divide(fit: Fitted, piece: np.ndarray, count: int) -> Pieces:
@@ -121,16 +125,20 @@ def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.
             score = score[:-1] - level[:-1] * score[-1] / level[-1]
             information = information[:-1, :-1] - np.outer(level[:-1], level[:-1]) / level[-1]
         information = 0.5 * (information + information.T)
-        if np.linalg.eigvalsh(information)[0] > LEAST:
-            found[m] = Contrast(np.linalg.solve(information, score), information)
+        values, vectors = np.linalg.eigh(information)
+        seen = values > LEAST
+        if seen.any():
+            estimate = vectors[:, seen] @ ((vectors[:, seen].T @ score) / values[seen])
+            found[m] = Contrast(estimate, information, int(seen.sum()))
     return found
 
 
-def own_biases(pieces: Pieces) -> np.ndarray:
-    """Change of every piece's own biases (P, M) from the fit, held by their declared scales."""
+def own_biases(pieces: Pieces, member: np.ndarray) -> np.ndarray:
+    """Change (P, M) from the fit where groups of pieces, `member` (P,), have own biases, held by their scales."""
     M = len(pieces.z)
-    step = np.linalg.solve(pieces.information + np.eye(len(pieces.score)), pieces.score)
-    return step.reshape(-1, M)
+    to = np.kron(np.eye(int(member.max()) + 1)[member], np.eye(M))
+    step = np.linalg.solve(to.T @ pieces.information @ to + np.eye(to.shape[1]), to.T @ pieces.score)
+    return step.reshape(-1, M)[member]
 
 
 class Change(NamedTuple):
@@ -142,10 +150,10 @@ class Change(NamedTuple):
     contrast: Contrast
 
 
-def changing(
-    pieces: Pieces, patterns: dict[str, np.ndarray], inflation: np.ndarray, limits: dict[str, float], most: int = 20
-) -> list[Change]:
-    """Biases whose chi-square along a pattern, over `inflation` (M,), passes the limit, the strongest first.
+def changing(pieces: Pieces, patterns: Patterns, inflation: Patterns, limit: Limit, most: int = 20) -> list[Change]:
+    """Biases whose chi-square along a pattern, over its `inflation` (M,), passes the limit for its freedom.
+
+    The strongest comes first.
 
     Changes of several biases may look alike. One is let free at a time, that whose change of the order of its scale
     explains most, and the others are judged anew beside it.
@@ -155,12 +163,12 @@ def changing(
         free = [(change.bias, patterns[change.name]) for change in found]
         taken = {(change.bias, change.name) for change in found}
         rest = [
-            Change(m, name, contrast.square / inflation[m], contrast)
+            Change(m, name, contrast.square / inflation[name][m], contrast)
             for name, pattern in patterns.items()
             for m, contrast in contrasts(pieces, pattern, free).items()
-            if (m, name) not in taken and contrast.square / inflation[m] > limits[name]
+            if (m, name) not in taken and contrast.square / inflation[name][m] > limit(contrast.freedom)
         ]
         if not rest:
             break
-        found.append(max(rest, key=lambda change: change.contrast.plausible / inflation[change.bias]))
+        found.append(max(rest, key=lambda change: change.contrast.plausible / inflation[change.name][change.bias]))
     return found
