@@ -1,4 +1,7 @@
-"""Real recordings: what a fit finds against what is known. They lie beside the project and are skipped where not."""
+"""Real recordings: what a fit finds against what is known. They lie beside the project and are skipped where not.
+
+`uv run pytest tests/test_recordings.py -n 0 -s -m "slow or not slow"` prints the figures.
+"""
 
 import sys
 from pathlib import Path
@@ -10,12 +13,17 @@ import pytest
 import probcal
 from probcal import EA
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
-import receivers  # noqa: E402
-import robots  # noqa: E402
-import sflab  # noqa: E402
-import tdoa_flight  # noqa: E402
+import receivers
+import robots
+import sflab
+import tdoa_flight
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def say(what, found):
+    print(f"\n{what}: " + ", ".join(f"{name} {value:.2f}" for name, value in found.items()))
 
 
 def recording(name):
@@ -35,7 +43,10 @@ def fit_sflab(swap, starts=1, prior=None):
     data = recording("sflab_mic_toa/dataset_1_exp2.mat")
     tree = probcal.fit(sflab.problem(data, swap), EA(), prior=prior, starts=starts, predictive_draws=False)
     assert tree.attrs["status"] == "converged"
-    return displaced(tree, sflab.truth(data, swap), [f"mic_{n}" for n in range(1, 9)], "xy"), tree
+    found = displaced(tree, sflab.truth(data, swap), [f"mic_{n}" for n in range(1, 9)], "xy")
+    evidence = f"log evidence {tree.attrs['log_evidence']:.1f}"
+    say(f"sflab, swap {swap}, {starts} start(s), prior {prior or 'ARD()'}, {evidence}, m from its place", found)
+    return found, tree
 
 
 def test_a_swap_of_two_microphones_is_found_and_none_is_made_up():
@@ -65,7 +76,9 @@ def test_a_strict_prior_by_node_finds_swaps_across_the_room_and_nothing_else(swa
 
 def headings(tree):
     mean = np.rad2deg(tree["calibration"]["mean"].to_series())
-    return {n: mean[f"robot_{n}.heading"] for n in range(1, 6)}
+    found = {n: mean[f"robot_{n}.heading"] for n in range(1, 6)}
+    say("headings of the robots in deg", found)
+    return found
 
 
 def test_robots_know_their_headings():
@@ -76,6 +89,18 @@ def test_robots_know_their_headings():
     turned = robots.problem(data, turn={"robot_2": np.deg2rad(5.0)})
     found = headings(probcal.fit(turned, EA(), predictive_draws=False))
     assert plain[2] - found[2] == pytest.approx(5.0, abs=0.15)
+
+
+def test_a_turned_robot_is_determined_before_and_after_the_fit():
+    data = recording("mrclam/MRCLAM_Dataset6")
+    problem = robots.problem(data)
+    before = probcal.observability(problem)
+    assert before["bias"]["verdict"].sel(bias_label="robot_4.heading").item() == "determined"
+    tree = probcal.assess(problem, probcal.fit(problem, EA(), predictive_draws=False))
+    row = probcal.summary(tree).set_index("bias").loc["robot_4.heading"]
+    assert row["verdict"] == "determined"
+    assert abs(row["mean"]) > 5 * row["sd"], "determined and biased"
+    print(f"\nrobot_4.heading {np.rad2deg(row['mean']):.2f} deg, {row['verdict']}: {row['reason']}")
 
 
 def test_delays_of_receivers_repeat_over_sets():
@@ -93,7 +118,9 @@ def test_delays_of_receivers_repeat_over_sets():
     for number in (2, 3, 4):
         apart = (delays[number] - delays[1]).dropna()
         assert len(apart) >= 10
-        assert np.sqrt(np.mean((apart - apart.mean()) ** 2)) < 10.0
+        left = apart - apart.mean()
+        say(f"receivers, set {number} against set 1, m", {"rms": np.sqrt(np.mean(left**2)), "worst": left.abs().max()})
+        assert np.sqrt(np.mean(left**2)) < 10.0
 
 
 def test_swapped_anchors_of_a_flight_are_found():
@@ -103,6 +130,8 @@ def test_swapped_anchors_of_a_flight_are_found():
     assert tree.attrs["status"] == "converged"
     truth = tdoa_flight.truth(data, swap)
     found = displaced(tree, truth, [f"anchor_{n}" for n in range(8)], "xyz")
+    say(f"flight, anchors {swap} swapped, m from its place", found)
     assert max(found.values()) < 0.3
     scores = probcal.scores(tree, truth)
+    say("flight", scores)
     assert scores["position_rmse_after"] < 0.5 * scores["position_rmse_before"]

@@ -8,6 +8,7 @@ import xarray as xr
 
 from probcal import tree
 from probcal.analysis.standpoint import standpoint
+from probcal.analysis.verdict import narrowed
 from probcal.problem import Problem
 from probcal.simulate import Truth
 from probcal.smoothing.directions import WEAK, Direction, weak_directions
@@ -20,8 +21,6 @@ RULE = (
     f"gauge: with the state of every epoch free, rows leave less than {NULL:g} of the information that known states "
     f"would give; weak: information below {WEAK:g} in units of the prior scale, trajectories marginalised"
 )
-NONE = 0.05  # share of an answer that comes from the data below which they say nothing of a bias
-HALF = 0.5  # share below which a bias is weak
 
 
 @float64
@@ -85,12 +84,8 @@ def _information(problem: Problem, point: Point) -> Information:
 
 def _status(directions: Sequence[Direction]) -> str:
     least = min((direction.share for direction in directions), default=1.0)
-    return "open" if least < NONE else "weak" if least < HALF else "determined"
-
-
-def _verdict(share: float) -> str:
-    """What data can say of a bias, from their share of the answer."""
-    return "prior only" if share < NONE else "weak" if share < HALF else "determined"
+    word = narrowed(least)
+    return "open" if word == "prior only" else word
 
 
 def _biases(problem: Problem, found: Information) -> xr.Dataset:
@@ -101,7 +96,7 @@ def _biases(problem: Problem, found: Information) -> xr.Dataset:
         "kind": np.array([b.kind for b in problem.biases], str),
         "share": found.share,
         "sd": np.sqrt(np.diag(found.covariance)) * scales,
-        "verdict": np.array([_verdict(share) for share in found.share]),
+        "verdict": np.array([narrowed(share) for share in found.share]),
     }
     group = xr.Dataset({k: ("bias_label", v) for k, v in columns.items()}, coords={"bias_label": labels})
     matrix = (("bias_label", "bias_label_other"), found.information)

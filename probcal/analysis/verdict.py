@@ -42,6 +42,11 @@ def contraction(information: np.ndarray) -> np.ndarray:
     return np.clip(1.0 - np.diag(np.linalg.inv(information + np.eye(len(information)))), 0.0, 1.0)
 
 
+def narrowed(share: float) -> str:
+    """What a share s of an answer that the data give is worth in words."""
+    return "prior only" if share < PRIOR_ONLY else "weak" if share < WEAK else "determined"
+
+
 def pull(z: np.ndarray, alpha: np.ndarray, gamma: np.ndarray, inflation: np.ndarray) -> np.ndarray:
     """Distance (M,) of each estimate from its prior in sd, where the precision is that declared (1).
 
