@@ -1,12 +1,20 @@
 """Severe numerics for every test: rank promotion raises, warnings are errors; x64 stays off as for a user.
 
-The tests compile hundreds of small kernels and run each once: they ask XLA for quick compilation, and drop
-compiled kernels after each file.
+The tests compile hundreds of small kernels and run each once: they ask XLA for quick compilation, drop compiled
+kernels after each file, and share them between workers, notebooks and command lines through a folder of the run.
 """
 
+import atexit
 import os
+import shutil
+import tempfile
 
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # set here, inherited by workers and subprocesses
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="probcal-kernels-")
+    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
 import jax
 import pytest
