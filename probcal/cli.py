@@ -40,6 +40,11 @@ app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
 )  # fmt: skip
 
+STATUS = {
+    "determined": "status: determined",
+    "weak": "status: weak: some directions are left to prior and survey by half or more",
+    "open": "status: open: the data say next to nothing of some direction; a fit may be no answer (exit code 1)",
+}
 FINDINGS = 8  # sentences of an assessment that are printed
 
 Model = Annotated[Path, typer.Argument(help="model file that defines problem(data=None)", show_default=False)]
@@ -222,6 +227,8 @@ def fit_command(
     truth = _truth(module, model, data, problem)
     with _progress() as progress:
         tree = fit(problem, value, prior=chosen, key=seed, starts=starts, progress=progress)
+        if out is not None:
+            save(tree, out / "fit.nc")  # what is found is safe whatever comes
         if assessed:
             tree = assess(problem, tree, truth=truth, key=seed)
     tree.attrs["model"] = model.stem
@@ -370,18 +377,22 @@ def _print_check(problem: Problem, tree: xr.DataTree, plans: tuple[xr.Dataset, x
     ends = " to ".join("(" + ", ".join(f"{v:.4g}" for v in place) + ")" for place in path[[0, -1]][: len(path)])
     what = "another pass" if len(path) > 1 else "another target"
     print(f"  {what}, {ends} m: {passes['gain'].values[0]:.2f} ({passes['weak'].values[0]})")
-    print(f"  a survey of {anchors['anchor'].values[0]} to {anchors.attrs['survey']:g} of its scale: "
-          f"{anchors['gain'].values[0]:.2f} ({anchors['weak'].values[0]})")  # fmt: skip
+    label, unit, std = (anchors[name].values[0] for name in ("anchor", "unit", "std"))
+    survey = f"a survey of {label} to {std:.2g} {unit.strip('1')}".rstrip()
+    print(f"  {survey}: {anchors['gain'].values[0]:.2f} of the other biases ({anchors['weak'].values[0]})")
     place = ", ".join(f"{v:.4g}" for v in sensors_["place"].values[0])
     print(f"  one more {sensors_['type'].values[0]} at ({place}) m: {sensors_['gain'].values[0]:.2f}")
+    print(STATUS[tree.attrs["status"]])
 
 
 def _directions_text(tree: xr.DataTree) -> str:
     """The directions that the data leave open, in words, each with its remedy."""
     if "direction" not in tree.children:
-        return "the data determine every direction of the biases"
+        surveyed = "survey" in tree["bias"].to_dataset()["kind"].values.tolist()
+        return f"the data determine every direction of the biases{' without a survey' if surveyed else ''}"
     group = tree["direction"].to_dataset()
-    lines = [f"{group.sizes['direction']} directions of the biases that the data hardly determine; remedies add up:"]
+    count = group.sizes["direction"]
+    lines = [f"{count} direction{'s' * (count > 1)} of the biases that the data hardly determine; remedies add up:"]
     for k in range(group.sizes["direction"]):
         kind, share, words = (group[name].values[k] for name in ("kind", "share", "words"))
         lines.append(f"  {k + 1}. {group['direction'].values[k]} ({kind}, the data give {share:.2g} of the answer)")
@@ -396,9 +407,10 @@ def _listed(values: pd.Series, most: int = 8) -> str:
 
 
 def check_table(tree: xr.DataTree) -> pd.DataFrame:
-    """The biases of a check: bias, unit, scale, sd (bound), share, verdict."""
-    frame = tree["bias"].to_dataset()[["unit", "scale", "sd", "share", "verdict"]].to_dataframe().reset_index()
-    frame = frame[["bias_label", "unit", "scale", "sd", "share", "verdict"]].rename(columns={"bias_label": "bias"})
+    """The biases of a check: bias, unit, scale (or survey), kind, sd (bound), share, verdict."""
+    columns = ["unit", "scale", "kind", "sd", "share", "verdict"]
+    frame = tree["bias"].to_dataset()[columns].to_dataframe().reset_index()
+    frame = frame[["bias_label", *columns]].rename(columns={"bias_label": "bias"})
     shown = {"scale": "{:.4g}", "sd": "{:.4g}", "share": "{:.3f}"}
     return frame.assign(**{name: [form.format(v) for v in frame[name]] for name, form in shown.items()})
 

@@ -373,7 +373,7 @@ def test_a_noisy_sensor_is_a_finding_and_no_verdict(judged):
     assert alarms(out) == {}
     findings = out["finding"].to_dataset().to_dataframe()
     assert findings[findings["kind"] == "nis"]["subject"].tolist() == ["north", "car"]
-    assert findings["sentence"].str.contains("the noise is larger than declared").sum() == 2
+    assert findings["sentence"].str.contains("the data scatter more than the declared noise").sum() == 2
     assert "north does not fit the rest even when calibrated" in " ".join(findings["sentence"])
     inflation = out["verdict"]["inflation"].to_series()
     assert inflation["north.range_offset"] > 2.0 * inflation["west.range_offset"] * 0.75

@@ -29,6 +29,7 @@ from probcal import (
 from probcal import rows as waist
 from probcal.analysis import next_anchors, next_passes, next_sensors, observability
 from probcal.geometry import bearing, norm
+from probcal.smoothing.directions import weak_directions
 from probcal.smoothing.gauge import gauge
 from probcal.smoothing.information import marginal_information
 from probcal.smoothing.start import automatic_start
@@ -341,8 +342,13 @@ def test_the_gain_of_an_anchor_has_a_closed_form():
     found = next_anchors(problem, point=point, survey=0.1)
     covariance = np.linalg.inv(spectrum(problem, point) + np.eye(len(problem.labels)))
     m = problem.labels.index("node_3.heading")
-    gain = found["gain"].sel(anchor="node_3.heading").item()
-    np.testing.assert_allclose(gain, 0.5 * np.log1p(covariance[m, m] / 0.01), rtol=1e-9)
+    own, gain = (found[name].sel(anchor="node_3.heading").item() for name in ("own", "gain"))
+    np.testing.assert_allclose(own, 0.5 * np.log1p(covariance[m, m] / 0.01), rtol=1e-9)
+    rest = np.delete(np.arange(len(covariance)), m)
+    with_it = np.linalg.inv(np.linalg.inv(covariance) + 100.0 * np.outer(*[np.eye(len(covariance))[m]] * 2))
+    parts = [np.linalg.slogdet(c[np.ix_(rest, rest)])[1] for c in (covariance, with_it)]
+    np.testing.assert_allclose(gain, 0.5 * (parts[0] - parts[1]), rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(found["std"].sel(anchor="node_3.heading").item(), 0.1 * 0.1)
     assert (np.diff(found["gain"].values) <= 1e-12).all()
     for anchor in ("node_3.position_*", "node_0.heading", "node_1.position_x"):
         stays = [fnmatch(label, anchor) for label in problem.labels]
@@ -386,7 +392,7 @@ def test_planning_works_for_every_kind(kinds, dimension, scale, motion):
         gain = found["gain"].values
         assert np.isfinite(gain).all()
         assert (gain >= -1e-9).all()
-        assert gain[0] > 0
+        assert gain[0] > 0 or len(problem.labels) == 1
         assert (np.diff(gain) <= 1e-12).all()
 
 
@@ -407,11 +413,51 @@ def gauge_count(problem, point):
     return gauge(problem, point).basis.shape[1]
 
 
+@pytest.mark.parametrize(
+    ("information", "names"),
+    [
+        ([[0.9, 0.5, 0.0], [0.5, 0.9, 0.0], [0.0, 0.0, 100.0]], ["range_offset of plain_range_0 against range_offset"]),
+        (np.diag([0.2, 0.5, 100.0]), ["range_offset of plain_range_0 alone", "range_offset of plain_range_1 alone"]),
+        ([[1.2, 0.5, 0.0], [0.5, 1.2, 0.0], [0.0, 0.0, 0.5]], ["range_offset of plain_range_2 alone", "against"]),
+    ],
+)
+def test_as_many_directions_are_named_as_there_are_and_each_has_a_remedy(information, names):
+    problem = problem_of([plain_range], 2, None, count=3)
+    found = weak_directions(problem, np.array(information), automatic_start(problem))
+    assert len(found) == (np.linalg.eigvalsh(information) < 1).sum() == len(names)
+    for name in names:
+        assert any(name in direction.name for direction in found)
+    assert all(direction.fix for direction in found)
+    fixed = {label for direction in found for label in direction.fix}
+    stay = [k for k, label in enumerate(problem.labels) if label not in fixed]
+    assert (np.linalg.eigvalsh(np.array(information)[np.ix_(stay, stay)]) >= 1).all()
+
+
+def test_an_anchor_fixed_at_a_value_is_the_centre_of_rotation():
+    problem = problem_of([scanner], 2, FREE)
+    held = problem.rebuild(fix={"node_0.position_x": 30.0, "node_0.position_y": 0.0})
+    assert "rotation about the anchor" in observability(held)["direction"]["direction"].values.tolist()
+
+
+def test_only_what_moves_along_is_named_in_a_dilation():
+    """Bearings know no range: a scale on another channel has nothing to do with the size of the scene."""
+
+    @sensor(azimuth=Channel("rad", std=0.01, wrap=True), level=Channel("dB", std=1.0))
+    def ear(target, pose, *, gain_scale=Bias("1", 0.1)):
+        azimuth = bearing(target.position - pose.position)
+        return dict(azimuth=azimuth, level=(1 + gain_scale) * 60.0)
+
+    group = observability(problem_of([ear], 2, {"position": 10.0}))["direction"].to_dataset()
+    (dilation,) = (k for k, name in enumerate(group["direction"].values.tolist()) if name == DILATED)
+    assert "scale" not in group["words"].values[dilation] + group["remedy"].values[dilation]
+
+
 def test_misuse_is_told():
     problem = problem_of([plain_range], 2, None)
     fixed = problem.rebuild(fix="*")
-    with pytest.raises(InputError, match="every bias of the problem is fixed"):
-        observability(fixed)
+    for call in (observability, next_passes, next_anchors, next_sensors):
+        with pytest.raises(InputError, match="every bias of the problem is fixed"):
+            call(fixed)
     point = automatic_start(problem)
     with pytest.raises(InputError, match=r"passes has shape \(1, 2, 3\); give \(passes, points, 2\)"):
         next_passes(problem, point=point, passes=np.zeros((1, 2, 3)))

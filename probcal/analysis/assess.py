@@ -57,6 +57,11 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     columns = [groups["verdict"][name].values.tolist() for name in ("verdict", "bias_label", "reason")]
     alarms = [row for row in zip(*columns, strict=True) if row[0] in ("drifting", "conflicting")]
     findings += [Finding(word, label, f"{label}: {reason}") for word, label, reason in alarms]
+    if tree.attrs["status"] in ("at bound", "diverged"):
+        text = (
+            f"the fit ended {tree.attrs['status']}, which is no answer: what is left of the data says nothing of them"
+        )
+        findings = [Finding("status", "fit", text)]
     scaled = scaling.power_scaling(tree)
     if scaled is not None:
         groups["sensitivity"] = scaled

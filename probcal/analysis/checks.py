@@ -42,11 +42,13 @@ def _beyond(names: list[str], part: residuals.Squares) -> list[Finding]:
     """Findings of the groups whose NIS lies beyond the limits, and notably so: one sentence for those alike."""
     found, order = [], np.argsort(-np.abs(np.log(np.maximum(part.nis, 1e-300))))
     high, low = part.nis > np.maximum(part.upper, PRACTICAL), part.nis < np.minimum(part.lower, 1 / PRACTICAL)
-    for out, word, limit in ((high, "larger", part.upper), (low, "smaller", part.lower)):
+    for out, word, limit in ((high, "more", part.upper), (low, "less", part.lower)):
         if out.any():
             order_out = order[out[order]]
             text = f"NIS a datum {_listed(names, part.nis, order_out)} (limit {limit[order_out[0]]:.3g})"
-            found.append(Finding("nis", names[order_out[0]], f"{text}: the noise is {word} than declared"))
+            found.append(
+                Finding("nis", names[order_out[0]], f"{text}: the data scatter {word} than the declared noise")
+            )
     return found
 
 
@@ -56,7 +58,8 @@ def squares_by(fit: Fitted, found: residuals.Innovations, name: str) -> tuple[xr
     names = labels[name].tolist()
     part = residuals.squares(found, group, len(names), RATE / len(names))
     columns = {key: (name, value) for key, value in part._asdict().items()}
-    return xr.Dataset(columns, {name: names}), _beyond(names, part)
+    alone = name == "target" and len(names) == 1  # its sensors say the same
+    return xr.Dataset(columns, {name: names}), [] if alone else _beyond(names, part)
 
 
 def by_channel(
@@ -64,7 +67,8 @@ def by_channel(
 ) -> tuple[xr.Dataset, list[Finding]]:
     """NIS, mean, correlation in time and predictive p-values of every sensor's channels, dimension `part`.
 
-    `white` is the Ljung-Box p-value; below 20 data nothing can be told, the correlation stays 0 and `white` 1.
+    `white` is the Ljung-Box p-value; below 20 data (of a yes-or-no channel: events) nothing can be told, the
+    correlation stays 0 and `white` 1.
     """
     data, findings = fit.data, list[Finding]()
     group, labels = codes(data, ["sensor", "channel"])
@@ -74,10 +78,11 @@ def by_channel(
     extra = np.zeros((count, 3))
     for k, (sensor, channel) in enumerate(labels.itertuples(index=False)):
         mine = group == k
-        white = residuals.whiteness(found.value[mine], target[mine], time[mine])
+        judged = residuals.enough(found.kurtosis[mine])
+        white = residuals.whiteness(found.value[mine], target[mine], time[mine]) if judged else None
         extra[k] = (0.0, float(np.mean(found.value[mine])), 1.0) if white is None else white
         name, mean, limit = f"{sensor}.{channel}", extra[k, 1], stats.norm.isf(RATE / (2 * count)) / np.sqrt(mine.sum())
-        if abs(mean) > max(limit, NOTABLE):
+        if judged and abs(mean) > max(limit, NOTABLE):
             text = f"{name}: innovations have mean {mean:.2f} noise std (limit {limit:.2f}): a bias is left"
             findings.append(Finding("mean", name, text))
     values |= dict(zip(("autocorrelation", "mean", "white"), extra.T, strict=True))

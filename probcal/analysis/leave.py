@@ -139,8 +139,8 @@ class Left(NamedTuple):
     quick: bool  # one step from the fit instead of a search
 
 
-def leave_sensors(fit: Fitted) -> Left:
-    """Every sensor with data left out; the biases that only it reads have their declared scales, as nothing else can.
+def leave_sensors(fit: Fitted) -> Left | None:
+    """Every sensor with data left out, None for a single one; the biases that only it reads have their declared scales.
 
     `elpd` less `stated` says how much better the sensor fits the rest calibrated than as stated.
     """
@@ -148,6 +148,8 @@ def leave_sensors(fit: Fitted) -> Left:
     alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.spec.biases, bool)
     sensor = problem.measurements.sensor
     present = np.unique(sensor[problem.measurements.measured.any(1)])
+    if len(present) < 2:
+        return None
     refits, rows = _Refits(fit, 3 * len(present)), []
     for s in present:
         own = readers[s] & (readers.sum(0) == 1)
@@ -159,15 +161,16 @@ def leave_sensors(fit: Fitted) -> Left:
 
 def leave_targets(fit: Fitted) -> Left | None:
     """Every target left out; None where there is one only, or more than 32."""
-    problem = fit.problem
-    target, names = problem.measurements.target, problem.measurements.target_names
-    if not 1 < len(names) <= TARGETS:
+    problem, target = fit.problem, fit.problem.measurements.target
+    present = np.unique(target[problem.measurements.measured.any(1)])
+    if not 1 < len(present) <= TARGETS:
         return None
     alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.spec.biases, bool)
-    refits = _Refits(fit, len(names))
+    refits = _Refits(fit, len(present))
     whole = refits.run(None, alpha, none)
-    rows = [[refits.run(target == t, alpha, none), whole, whole] for t in range(len(names))]
-    return _left(list(names), rows, fit.data["target"], refits.quick)
+    rows = [[refits.run(target == t, alpha, none), whole, whole] for t in present]
+    names = [problem.measurements.target_names[t] for t in present]
+    return _left(names, rows, fit.data["target"], refits.quick)
 
 
 def _left(names: list[str], rows: list[Any], owner: pd.Series, quick: bool) -> Left:
@@ -193,7 +196,8 @@ def psis(tree: xr.DataTree, group: np.ndarray, count: int) -> Pointwise:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a large Pareto k is reported, not warned about
         weights, pareto_k = array_stats.psislw(summed)
-    return Pointwise(special.logsumexp(weights + summed, axis=1), pareto_k)
+    k = np.where(np.isfinite(pareto_k), pareto_k, np.inf)  # tails too heavy to be fitted
+    return Pointwise(special.logsumexp(weights + summed, axis=1), k)
 
 
 def good_k(tree: xr.DataTree) -> float:

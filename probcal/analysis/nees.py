@@ -12,6 +12,8 @@ from probcal import linalg
 from probcal.simulate import Truth
 from probcal.types import AXES
 
+EXACT = 1e-9  # sd over the size of the scene below which a position is known: it has no error to be judged
+
 
 class Nees(NamedTuple):
     """Squared errors over what the posterior expects: of each epoch known (E,), and of all with its limits."""
@@ -41,6 +43,11 @@ def of_positions(tree: xr.DataTree, truth: Truth, suffix: str, rate: float) -> N
         return None
     deviation = draws - draws.mean(0)
     covariance = np.einsum("sei,sej->eij", deviation, deviation) / (len(draws) - 1)
+    free = np.linalg.eigvalsh(covariance)[:, 0] > (EXACT * (1.0 + np.abs(true[known]).max())) ** 2
+    if not free.any():
+        return None
+    known[known] = free
+    draws, deviation, covariance = draws[:, free], deviation[:, free], covariance[free]
     whiten = np.asarray(jax.vmap(linalg.inverse_cholesky)(jnp.asarray(covariance)))
     error = track[f"mean{suffix}"].sel(chosen).values[known] - true[known]
     value = (np.einsum("eij,ej->ei", whiten, error) ** 2).mean(1)

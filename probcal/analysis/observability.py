@@ -1,17 +1,15 @@
 """What the data of a problem can and cannot determine: information of all biases, trajectories marginalised."""
 
-from collections.abc import Sequence
-
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
 from probcal import tree
-from probcal.analysis.standpoint import standpoint
+from probcal.analysis.standpoint import check_free, standpoint
 from probcal.analysis.verdict import narrowed
 from probcal.problem import Problem
 from probcal.simulate import Truth
-from probcal.smoothing.directions import WEAK, Direction, weak_directions
+from probcal.smoothing.directions import WEAK, marginal, weak_directions
 from probcal.smoothing.gauge import NULL, gauge
 from probcal.smoothing.information import Moments, leverages, marginal_information, moments
 from probcal.smoothing.mode import Point
@@ -35,8 +33,7 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     tells), `track`. Attributes: `status` (determined; weak; open, where the data say next to nothing of a direction),
     `rule`, counts. Raises `InputError` where no bias is free.
     """
-    if not problem.labels:
-        raise InputError("observability: every bias of the problem is fixed or none is declared; free one of them")
+    check_free(problem)
     point = standpoint(problem, point, truth)
     found = _information(problem, point)
     null = gauge(problem, point)
@@ -51,11 +48,14 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     }
     if directions:
         groups["direction"] = tree.direction_group(problem.labels, directions)
+    free = ~problem.surveyed
+    values = np.linalg.eigvalsh(marginal(found.information, free)) if free.any() else np.full(1, np.inf)
     result = xr.DataTree.from_dict(groups)
     result.attrs.update(
-        status=_status(directions), rule=RULE, countable=int(null.countable), data=problem.measurements.table.source,
+        status=_status(max(float(values[0]), 0.0)), rule=RULE,
+        countable=int(null.countable), data=problem.measurements.table.source,
         gauge=null.basis.shape[1] if null.countable else 0,
-        weak=sum(direction.information < WEAK for direction in directions),
+        weak=int((values < WEAK).sum()),
     )  # fmt: skip
     return result
 
@@ -82,9 +82,9 @@ def _information(problem: Problem, point: Point) -> Information:
     return Information(information)
 
 
-def _status(directions: Sequence[Direction]) -> str:
-    least = min((direction.share for direction in directions), default=1.0)
-    word = narrowed(least)
+def _status(least: float) -> str:
+    """What the least information of any direction means for a fit."""
+    word = narrowed(1.0 - 1.0 / (1.0 + least))
     return "open" if word == "prior only" else word
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from probcal.analysis.standpoint import standpoint
+from probcal.analysis.standpoint import check_free, standpoint
 from probcal.network import Network, Node
 from probcal.problem import Epochs, Problem, Spec, System
 from probcal.sensor import SensorType
@@ -42,6 +42,7 @@ def next_passes(
     lines through the area in eight directions; places on a grid for static targets. All is taken at the automatic
     start, a `truth` or a `point`. Raises `InputError` for the shape.
     """
+    check_free(problem)
     point = standpoint(problem, point, truth)
     name, part = _pattern(problem)
     epochs, start = part.epochs[0], np.asarray(_states_of(problem, point, name))[: len(part.epochs[0].time)]
@@ -66,35 +67,49 @@ def next_passes(
 def next_anchors(
     problem: Problem, *, point: Point | None = None, truth: Truth | None = None, survey: float = SURVEY
 ) -> xr.Dataset:
-    """What a survey of each bias, and of each node's position, would tell: gain (nats) and weak directions left.
+    """What a survey of a bias, or of a node's position, would tell of the others: gain (nats), weak directions left.
 
-    `survey` is its std over the scale of the bias (over its first survey where it has one). Best first. Raises
-    `InputError` unless it is positive.
+    `survey` is its std over the scale of the bias, `std` the same in the unit of the bias. `gain` is what it tells of
+    all other biases, `own` that and what it says of itself. Biases that have a survey are left out where others have
+    none. Best first. Raises `InputError` unless `survey` is positive.
     """
     if not (np.isfinite(survey) and survey > 0):
         raise InputError(f"next_anchors: survey={survey} must be positive, a std over the scale of a bias")
+    check_free(problem)
     point = standpoint(problem, point, truth)
     known = _information(problem, point)
-    groups = {label: [m] for m, label in enumerate(problem.labels)}
-    for m, bias in enumerate(problem.biases):
-        if bias.component == "position":
-            groups.setdefault(f"{bias.owner}.position_*", []).append(m)
-    covariance = np.linalg.inv(known + np.eye(len(known)))
-    apart = np.linalg.inv(_less_one(problem, known))
+    whole = known + np.eye(len(known))
+    covariance, apart = np.linalg.inv(whole), np.linalg.inv(_less_one(problem, known))
     before = _weak(problem, known)
+    groups = _anchors(problem)
     found = []
     for g in groups.values():
         eye = np.eye(len(g))
-        gain = 0.5 * np.linalg.slogdet(eye + covariance[np.ix_(g, g)] / survey**2)[1]
+        own = 0.5 * np.linalg.slogdet(eye + covariance[np.ix_(g, g)] / survey**2)[1]
+        alone = 0.5 * np.linalg.slogdet(eye + np.linalg.inv(whole[np.ix_(g, g)]) / survey**2)[1]  # the others known
         inner = np.linalg.eigvalsh(-eye - apart[np.ix_(g, g)] / survey**2)  # inertia of the sum (Haynsworth 1968)
-        found.append((gain, before + int((inner < 0).sum()) - len(g)))
-    gains, left = (np.array(column) for column in zip(*found, strict=True))
-    order = np.argsort(-gains, kind="stable")
+        found.append((own - alone, own, before + int((inner < 0).sum()) - len(g), survey * problem.scales[g[0]]))
+    gain, own, left, std = (np.array(column) for column in zip(*found, strict=True))
+    order = np.lexsort((-own, -gain))
+    columns = {"gain": gain, "own": own, "weak": left, "std": std}
     return xr.Dataset(
-        {"gain": ("anchor", gains[order]), "weak": ("anchor", left[order])},
+        {name: ("anchor", column[order]) for name, column in columns.items()}
+        | {"unit": ("anchor", np.array([problem.biases[g[0]].unit for g in groups.values()], str)[order])},
         coords={"anchor": np.array(list(groups))[order]},
         attrs={"survey": survey, "weak_before": before},
     )
+
+
+def _anchors(problem: Problem) -> dict[str, list[int]]:
+    """Biases, and positions of nodes, that may be surveyed: those without a survey, or all where all have one."""
+    groups: dict[str, list[int]] = {}
+    for m, bias in enumerate(problem.biases):
+        if problem.surveyed[m] and not problem.surveyed.all():
+            continue
+        groups[bias.label] = [m]
+        if bias.component == "position":
+            groups.setdefault(f"{bias.owner}.position_*", []).append(m)
+    return groups
 
 
 @float64
@@ -106,6 +121,7 @@ def next_sensors(
     It sees every target at every epoch; its own biases are free. `places` (P, d) in m are by default a grid over the
     area; the second node of a two-node type is its first one. Best first. Raises `InputError` for the shape.
     """
+    check_free(problem)
     point = standpoint(problem, point, truth)
     d = problem.network.dimension
     places = _grid(problem, point) if places is None else np.asarray(places, float)

@@ -14,7 +14,7 @@ import xarray as xr
 
 from probcal import rows
 from probcal.analysis.fitted import Fitted
-from probcal.noise import Gaussian
+from probcal.noise import Bernoulli, Gaussian
 from probcal.problem import Spec, System
 from probcal.smoothing.draws import predictive
 from probcal.tree import suffix
@@ -81,7 +81,7 @@ def check(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Predictive:
             return Predictive(None, None, np.zeros(len(fit.data)))
         drawn = _at_fit(fit, key)
     found, fourth = _discrepancies(problem.spec, problem.system, fit.point.levels, drawn)
-    kurtosis = np.zeros(len(fit.data)) if gaussian else fit.flat(fourth) - 3.0
+    kurtosis = np.zeros(len(fit.data)) if gaussian else _exact(fit, fit.flat(fourth) - 3.0)
     if not known:
         return Predictive(None, None, kurtosis)
     parts: tuple[list[Any], list[Any]] = ([], [])
@@ -90,6 +90,17 @@ def check(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Predictive:
         for k, part in enumerate(parts):
             part.append(above[np.asarray(data.sensor), k])
     return Predictive(fit.flat(parts[0]), fit.flat(parts[1]), kurtosis)
+
+
+def _exact(fit: Fitted, kurtosis: np.ndarray) -> np.ndarray:
+    """Excess kurtosis (D,), that of yes-or-no data in closed form, 1 / (p q) - 6: replicas may lack a rare event."""
+    lins = zip(fit.problem.spec.blocks, fit.lins, strict=True)
+    answers = [
+        np.broadcast_to([isinstance(c.noise, Bernoulli) for c in block.channels], lin.weight.shape)
+        for block, lin in lins
+    ]
+    variance = fit.flat([lin.weight for lin in fit.lins])
+    return np.maximum(np.where(fit.flat(answers), 1 / np.maximum(variance, 1e-12) - 6, kurtosis), -2.0)
 
 
 def _of_tree(fit: Fitted, tree: xr.DataTree) -> Drawn | None:

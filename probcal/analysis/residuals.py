@@ -169,7 +169,8 @@ class Squares(NamedTuple):
 def squares(found: Innovations, group: Any, count: int, rate: float) -> Squares:
     """Sums of squares by group (D,) over what they expect, with two-sided limits at a false-alarm rate each.
 
-    The limits are those of a scaled chi-square of the right mean and variance (exact for Gaussian noise).
+    The limits are those of a scaled chi-square of the right mean and variance (exact for Gaussian noise); a group that
+    has less than one degree of freedom is not judged.
     """
     group = np.asarray(group)
     data, total, used, kurtosis = (
@@ -179,7 +180,13 @@ def squares(found: Innovations, group: Any, count: int, rate: float) -> Squares:
     variance = np.maximum(2.0 * expected + kurtosis, 1e-9 * expected)
     scale, freedom = variance / (2.0 * expected), 2.0 * expected**2 / variance
     lower, upper = (scale * stats.chi2.ppf(p, freedom) / expected for p in (rate / 2, 1 - rate / 2))
-    return Squares(data.astype(int), total / expected, lower, upper)
+    judged = freedom >= 1.0  # below, as with events that hardly ever happen, there is no limit
+    return Squares(data.astype(int), total / expected, np.where(judged, lower, 0.0), np.where(judged, upper, np.inf))
+
+
+def enough(kurtosis: np.ndarray) -> bool:
+    """Whether data of such excess kurtosis (n,) tell as much of a mean as 20 Gaussian ones of a variance."""
+    return bool(2.0 * len(kurtosis) >= FEWEST * (2.0 + np.mean(kurtosis)))
 
 
 class Whiteness(NamedTuple):

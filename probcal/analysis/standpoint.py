@@ -14,6 +14,12 @@ from probcal.smoothing.start import automatic_start, track_mode
 from probcal.types import InputError, nearest
 
 
+def check_free(problem: Problem) -> None:
+    """Raise `InputError` for a problem without free biases."""
+    if not problem.labels:
+        raise InputError("every bias of the problem is fixed or none is declared; free one of them")
+
+
 def standpoint(problem: Problem, point: Point | None, truth: Truth | None) -> Point:
     """The point where a problem is looked at: a given one, that of a truth, else the automatic start."""
     if point is not None or truth is None:

@@ -19,12 +19,15 @@ from probcal.types import AXES
 WEAK = 1.0  # marginal information below which a direction is left to the prior
 RIDGE = 1e-2  # keeps the completion of a pattern from running along other weak directions
 INVOLVED = 0.3  # share of the largest entry above which a bias is named
+ALONG = 0.1  # share of the largest entry above which a component moves along with a rigid motion
 APART = 0.5  # part of a unit direction outside those already named that makes it a new one
 MATCH = 1e-3  # how closely a gauge must follow a pattern
-INSIDE = 1e-6  # size outside one sensor below which a gauge is its own
+INSIDE = {"gauge": 1e-6, "weak": 0.3}  # size outside one sensor below which a unit direction is its own
+MOSTLY = 0.7  # size inside the weak space from which a completed pattern belongs to it
 TRIED = 12  # remedies of one direction that are recomputed
 HALVINGS = 6  # survey stds tried, each half of the one before
 STRAIGHT = 0.03  # width of a path over its length below which it is one line
+DILATION = "dilation: all positions grow or shrink together"
 TOWARDS = {"x": "east", "y": "north", "z": "up"}
 
 
@@ -116,47 +119,31 @@ class _Naming:
             near = np.linalg.norm(space[own] @ mixed - pattern[own]) <= MATCH * np.linalg.norm(pattern)
             return space @ mixed if near else None
 
-        def inside(own: np.ndarray) -> np.ndarray:
-            _, sizes, rows = np.linalg.svd(space[~own], full_matrices=True)
-            sizes = np.concatenate([sizes, np.zeros(len(rows) - len(sizes))])
-            return space @ rows[sizes < INSIDE].T
-
-        self._name("gauge", space, follow, inside)
+        self._name("gauge", space, follow)
 
     def name_weak(self) -> None:
         """Name what else the data leave weak."""
         values, vectors = np.linalg.eigh(self.known)
+        space = vectors[:, values < WEAK]
 
         def follow(pattern: np.ndarray) -> np.ndarray | None:
             vector = _complete(self.known, pattern)
-            return vector if vector @ self.known @ vector < WEAK else None
+            weak = vector @ self.known @ vector < WEAK and np.linalg.norm(space.T @ vector) > MOSTLY
+            return vector if weak else None
 
-        def inside(own: np.ndarray) -> np.ndarray:
-            values, vectors = np.linalg.eigh(self.known[np.ix_(own, own)])
-            whole = np.zeros((len(own), int((values < WEAK).sum())))
-            whole[own] = vectors[:, values < WEAK]
-            return whole
+        self._name("weak", space, follow)
 
-        self._name("weak", vectors[:, values < WEAK], follow, inside)
-
-    def _name(
-        self,
-        kind: str,
-        space: np.ndarray,
-        follow: Callable[[np.ndarray], np.ndarray | None],
-        inside: Callable[[np.ndarray], np.ndarray],
-    ) -> None:
-        """Name the part of a space (F, k) that has no name yet.
-
-        `follow` completes a pattern to a direction, or refuses; `inside` spans the directions of one owner's biases.
-        """
+    def _name(self, kind: str, space: np.ndarray, follow: Callable[[np.ndarray], np.ndarray | None]) -> None:
+        """Name the part of a space (F, k) that has no name yet; `follow` completes a pattern, or refuses."""
         left = self._outside(space)
-        groups = [inside(own) for own in self._owners()] if left.shape[1] else []
+        weak = sum(direction.information < WEAK for direction in self.found)
+        missing = min(left.shape[1], space.shape[1] - (weak if kind == "weak" else 0))
+        groups = [_inside(space, own, INSIDE[kind]) for own in self._owners()] if missing > 0 else []
         groups = [group for group in groups if group.shape[1]]
         owned = [self._combination(vector) for group in groups for vector in _readable(group)]
         candidates = [*owned, *self.rigid] if len(groups) > 1 else [*self.rigid, *owned]
         for pattern in (*candidates, *self.common):
-            if not left.shape[1]:
+            if missing <= 0 or not left.shape[1]:
                 return
             vector = pattern.vector if any(pattern is own for own in owned) else follow(pattern.vector)
             if vector is None:
@@ -165,7 +152,8 @@ class _Naming:
             if np.linalg.norm(left.T @ vector) > APART:
                 self._add(kind, pattern, vector)
                 left = self._outside(space)
-        for vector in _readable(left):
+                missing -= 1
+        for vector in _readable(left[:, : max(missing, 0)]):
             self._add(kind, self._combination(vector), vector)
 
     def _owners(self) -> list[np.ndarray]:
@@ -186,23 +174,41 @@ class _Naming:
         whole[self.free] = vector
         along = np.where(pattern.vector != 0, 0.0, vector)
         others = _involved(self.labels, along, np.abs(vector).max())
-        words = pattern.words + ("; only the start of the motion holds it" if strength >= WEAK else "")
-        self.found.append(Direction(pattern.name, words, kind, strength, whole, others, pattern.remedy))
-        self.anchors.append(pattern.anchors)
+        words, remedy, anchors = pattern.words, pattern.remedy, pattern.anchors
+        if any(pattern is rigid for rigid in self.rigid):  # range scales in a dilation, pitch and roll in a rotation
+            moved = self._moved_along(along, np.abs(vector).max())
+            if moved:
+                words += f" and the {' and '.join(name.replace('_', ' ') for name in moved)}s with them"
+                anchors = (*anchors, *((label,) for label in self.labels if _name(label) in moved))
+            if moved and pattern.name.startswith(DILATION):
+                remedy += f", or fix one {moved[0].replace('_', ' ')}"
+        if kind == "gauge" and strength >= WEAK:
+            words += "; only the start of the motion holds it"
+        self.found.append(Direction(pattern.name, words, kind, strength, whole, others, remedy))
+        self.anchors.append(anchors)
+
+    def _moved_along(self, along: np.ndarray, largest: float) -> list[str]:
+        """Components other than those of a pattern that a direction moves most, by name."""
+        most: dict[str, float] = {}
+        for label, size in zip(self.labels, np.abs(along), strict=True):
+            most[_name(label)] = max(most.get(_name(label), 0.0), float(size))
+        return [name for name, size in most.items() if size > max(ALONG * largest, 0.5 * max(most.values()))]
 
     def _combination(self, vector: np.ndarray) -> Pattern:
         """A direction without a pattern, in words: its largest bias against the next ones."""
         problem, labels = self.problem, _involved(self.labels, vector, np.abs(vector).max())
         first = labels[0]
         alone = tuple((label,) for label in labels)
+        placed = any(_name(label).startswith("position_") or _name(label) == "heading" for label in labels[:3])
+        cause = self.cause if placed else ""
         if len(labels) == 1:
-            return Pattern(f"{_of(first)} alone", f"the data hardly depend on it{self.cause}", vector, "", alone)
+            return Pattern(f"{_of(first)} alone", f"the data hardly depend on it{cause}", vector, "", alone)
         one = len({_owner(label) for label in labels[:3]}) == 1
         others = " and ".join(_name(label) if one else _of(label) for label in labels[1:3])
         more = f" and {len(labels) - 3} more" if len(labels) > 3 else ""
         amounts = ", ".join(_amount(problem, label, vector[self.labels.index(label)]) for label in labels[:3])
         name = f"{_of(first)} against {'its ' if one else ''}{others}{more}"
-        return Pattern(name, f"{amounts} together hardly change the data{self.cause}", vector, "", alone)
+        return Pattern(name, f"{amounts} together hardly change the data{cause}", vector, "", alone)
 
 
 # Remedies
@@ -221,18 +227,20 @@ def _with_remedies(
     fixed: tuple[str, ...] = ()
     left = _count(known, done)  # weak directions still to be removed
     for direction, groups in zip(found, anchors, strict=True):
-        general = direction.remedy or f"fix or survey {groups[0][0]}"
+        general = direction.remedy or f"fix or survey {groups[0][0]} (not verified)"
+        before = f"{direction.remedy}: " if direction.remedy else ""
         if direction.information >= WEAK:
             yield replace(direction, remedy=general)
             continue
         left -= 1
         if _count(known, done) <= left:
-            yield replace(direction, fix=fixed, remedy=f"{general}: {_together(fixed)} does both")
+            yield replace(direction, fix=fixed, remedy=f"{before}done by fixing {_together(fixed)}")
             continue
         members = [[labels.index(name) for name in group] for group in groups]
         both = [m for group in members[:2] for m in group]
         chosen = _anchor(known, done, members, left) or _anchor(known, done, [both], left)
         if not chosen:
+            left += 1
             yield replace(direction, remedy=general)
             continue
         fixed = tuple(labels[m] for m in chosen)
@@ -240,7 +248,6 @@ def _with_remedies(
         units = {problem.biases[problem.labels.index(label)].unit for label in fixed}
         std = std if len(units) == 1 else None
         survey = f", or survey it to {std:g} {units.pop().strip('1')}".rstrip() if std is not None else ""
-        before = f"{direction.remedy}: " if direction.remedy else ""
         yield replace(direction, fix=fixed, survey=std, remedy=f"{before}fix {_together(fixed)}{survey}")
         done += chosen
 
@@ -273,7 +280,7 @@ def _anchor(known: np.ndarray, done: list[int], groups: list[list[int]], left: i
     """
     values, vectors = _spectrum(known, done)
     hold = (vectors[:, values < WEAK] ** 2).sum(1)
-    best: tuple[int, float] = (left + 1, 0.0)
+    best: tuple[int, float] = (left, np.inf)
     chosen: list[int] = []
     for group in sorted(groups, key=lambda group: -hold[group].sum())[:TRIED]:
         values, _ = _spectrum(known, [*done, *group])
@@ -341,6 +348,13 @@ def _orthonormal(space: np.ndarray, least: float) -> np.ndarray:
     return left[:, sizes > least]
 
 
+def _inside(space: np.ndarray, own: np.ndarray, most: float) -> np.ndarray:
+    """The directions of an orthonormal space (F, k) of which at most `most` lies outside the entries `own` (F,)."""
+    _, sizes, rows = np.linalg.svd(space[~own], full_matrices=True)
+    sizes = np.concatenate([sizes, np.zeros(len(rows) - len(sizes))])
+    return space @ rows[sizes < most].T
+
+
 def _readable(space: np.ndarray) -> Iterator[np.ndarray]:
     """Unit vectors that span a space (F, k), each with a bias of its own that the others leave alone."""
     if not space.shape[1]:
@@ -385,11 +399,15 @@ def _rigid(problem: Problem, z: np.ndarray) -> list[Pattern]:
         (b.owner, b.axis): m for m, b in enumerate(problem.biases) if b.component == "position" and b.kind == "scale"
     }
     owners = {owner for owner, _ in place}
-    anchors = [node.position for node in problem.network.nodes if node.name not in owners]
+    held = {
+        node.name: np.array([problem.fixed.get(f"{node.name}.position_{axis}", 0.0) for axis in AXES[:d]])
+        for node in problem.network.nodes
+    }
+    anchors = [node.position + held[node.name] for node in problem.network.nodes if node.name not in owners]
     if not owners or len(anchors) > 1:
         return []
     shift = z * problem.scales
-    at = {node.name: np.array(node.position) for node in problem.network.nodes if node.name in owners}
+    at = {node.name: node.position + held[node.name] for node in problem.network.nodes if node.name in owners}
     for (owner, axis), m in place.items():
         at[owner][axis] += shift[m]
     centre = anchors[0] if anchors else np.mean(list(at.values()), 0)
@@ -429,12 +447,8 @@ def _rigid(problem: Problem, z: np.ndarray) -> list[Pattern]:
         )
         remedy = f"anchor the position of one more node{headed}"
         found.append(Pattern(name, words, vector, remedy, (*nodes, *turned)))
-    scaled = tuple((b.label,) for b in problem.biases if "scale" in b.component)
-    name = f"dilation: all positions grow or shrink together{about}"
-    along = " and the range scales with them" if scaled else ""
-    words = f"distances{about or ' from the centre'} grow together{along}"
-    remedy = "anchor the positions of two nodes" + (", or fix one range scale" if scaled else "")
-    found.append(Pattern(name, words, pattern(np.eye(d)), remedy, (*nodes, *scaled)))
+    words = f"distances{about or ' from the centre'} grow together"
+    found.append(Pattern(f"{DILATION}{about}", words, pattern(np.eye(d)), "anchor the positions of two nodes", nodes))
     return found
 
 
