@@ -558,6 +558,71 @@ def test_the_command_line_writes_verdicts(tmp_path, monkeypatch, capsys):
     assert "verdict" not in pd.read_csv(tmp_path / "b" / "summary.csv").columns
 
 
+def small(sensors_=3, **spread):
+    """Range sensors around a wave, thirty epochs, and a run of them without biases."""
+    places = [(0.0, 0.0), (100.0, 0.0), (0.0, 100.0)][:sensors_]
+    nodes = [Node(f"n{k}", place, **spread) for k, place in enumerate(places)]
+    network = Network([probcal.sensors.ranger.on(node) for node in nodes])
+    path = np.stack([20 + 2.0 * np.arange(30), 40 + 20 * np.sin(0.2 * np.arange(30))], 1)
+    run = simulate(network, ConstantVelocity(1.0), np.arange(30.0), 2, share=0.0, tracks={"car": path})
+    return network, path, run.table
+
+
+def test_a_target_that_nobody_measured_is_no_obstacle():
+    network, _, table = small()
+    ghost = table[table["time"] < 2].assign(target="ghost", range=np.nan)
+    problem = probcal.Problem(network, ConstantVelocity(1.0), pd.concat([table, ghost], ignore_index=True))
+    out = assess(problem, probcal.fit(problem, EA(), predictive_draws=False))
+    assert out["verdict"].sizes["bias_label"] == 6
+
+
+def test_a_known_target_has_no_error_to_be_judged():
+    network, path, table = small()
+    both = pd.concat([table, table.assign(target="plane")], ignore_index=True)
+    motion = {"car": ConstantVelocity(1.0), "plane": probcal.Known((np.arange(30.0), path))}
+    problem = probcal.Problem(network, motion, both)
+    tracks = pd.DataFrame(path, columns=["position_x", "position_y"]).assign(time=np.arange(30.0))
+    truth = probcal.Truth(pd.concat([tracks.assign(target=name) for name in motion], ignore_index=True))
+    check = assess(problem, probcal.fit(problem, EA()), truth=truth)["epoch_check"].to_dataset()
+    names = [name for name in check.attrs if name.startswith("nees")]
+    assert names
+    assert np.isfinite([check.attrs[name] for name in names]).all()
+    assert set(check["nees_target"].values) == {"car"}
+
+
+def test_events_that_hardly_ever_happen_raise_no_alarm():
+    """Presence sensors of which some never answer: a replica without an event is no evidence of anything."""
+    places = [(0.0, 0.0), (100.0, 0.0), (0.0, 100.0), (900.0, 900.0), (-900.0, 900.0)]
+    seen = [probcal.sensors.presence.on(Node(f"q{k}", place, scale=2.0)) for k, place in enumerate(places)]
+    network, path, _ = small()
+    network = Network([*network.sensors, *seen])
+    run = simulate(network, ConstantVelocity(1.0), np.arange(30.0), 2, share=0.0, tracks={"car": path})
+    problem = probcal.Problem(network, ConstantVelocity(1.0), run.table)
+    out = assess(problem, probcal.fit(problem, EA()))
+    kinds = list(zip(out["finding"]["kind"].values, out["finding"]["subject"].values, strict=True))
+    assert not [pair for pair in kinds if pair[0] in ("nis", "whiteness", "mean") and pair[1].startswith("q")]
+    check = out["sensor_check"].to_dataset()
+    assert check["upper"].sel(sensor="q3").item() == np.inf
+
+
+def test_a_single_sensor_has_no_rest_to_be_judged_by():
+    network, path, table = small(1)
+    problem = probcal.Problem(network, probcal.Known((np.arange(30.0), path)), table)
+    out = assess(problem, probcal.fit(problem, EA(), predictive_draws=False))
+    assert "difference" not in out["sensor_check"]
+    assert not any("the rest" in text for text in out["finding"]["sentence"].values)
+
+
+def test_a_fit_that_is_no_answer_has_one_finding():
+    network, _, table = small()
+    problem = probcal.Problem(network, ConstantVelocity(1.0), table)
+    tree = probcal.fit(problem, EA(), predictive_draws=False)
+    tree.attrs["status"] = "at bound"
+    out = assess(problem, tree)
+    assert out["finding"]["kind"].values.tolist() == ["status"]
+    assert "determined" not in out["verdict"]["verdict"].values
+
+
 def test_the_rest_points_at_swapped_microphones():
     path = DATA / "sflab_mic_toa" / "dataset_1_exp2.mat"
     if not path.exists():
