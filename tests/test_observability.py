@@ -136,7 +136,10 @@ def dense_gauge(problem, point):
     return problem.spec.biases - (np.linalg.matrix_rank(whole, rtol=1e-9) - np.linalg.matrix_rank(states, rtol=1e-9))
 
 
-@pytest.mark.parametrize("name", CASES)
+RARE = ("mixed", "arrivals in space")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in RARE else n for n in CASES])
 def test_gauge_directions_are_counted_and_named(name):
     kinds, dimension, scale, motion, expected = CASES[name]
     problem = problem_of(kinds, dimension, scale, motion)
@@ -380,7 +383,7 @@ def test_the_gain_of_a_sensor_is_what_its_rows_tell():
         ([sensors.radar_3d], 3, FREE, None),
         ([difference], 2, {"clock": 10.0, "position": 5.0}, None),
         pytest.param([arrival, compass], 2, {"position": 5.0}, EMITTED, marks=pytest.mark.slow),
-        ([plain_range], 2, {"position": 5.0}, Static()),
+        pytest.param([plain_range], 2, {"position": 5.0}, Static(), marks=pytest.mark.slow),
     ],
     ids=["3-D", "two nodes", "mixed", "static"],
 )
