@@ -516,6 +516,7 @@ def test_sensitivity_of_a_linear_network_is_the_predicted_one():
     assert (np.diff(found["rmse"].values, axis=1) > 0).all()
 
 
+@pytest.mark.slow
 def test_sensitivity_of_ranges_to_small_biases_is_the_predicted_one():
     """Eight ranges as in thesis 3.4 on a given track; 2 % are allowed for what is not linear and for the track."""
     angle = 2 * np.pi * np.arange(8) / 8
