@@ -276,7 +276,10 @@ def test_errors_of_maximum_likelihood_at_low_noise_reach_the_parametric_bound():
     assert np.abs(ratio - 1).max() < 0.05, dict(zip(problem.labels, ratio.round(3), strict=True))
 
 
-@pytest.mark.parametrize("world", [plane(), waves(), space()], ids=["plane", "waves", "space"])
+@pytest.mark.parametrize(
+    "world", [pytest.param(plane(), id="plane", marks=pytest.mark.slow), pytest.param(waves(), id="waves"),
+              pytest.param(space(), id="space", marks=pytest.mark.slow)],
+)  # fmt: skip
 def test_a_turned_and_moved_world_has_the_same_bounds(world):
     """Radars, finders, ranges, time differences, levels and presence, in 2-D and 3-D; places as rms over their axes."""
     angle, d = 0.7, len(world.nodes[0]["position"])

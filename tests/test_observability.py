@@ -153,7 +153,7 @@ def test_gauge_directions_are_counted_and_named(name):
     assert tree.attrs["status"] == "open"
 
 
-LONG = ("bearings", "clocks", "trackers", "mixed", "arrivals in space")
+LONG = ("arrivals", "bearings", "clocks", "trackers", "mixed", "arrivals in space")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in CASES])

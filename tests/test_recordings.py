@@ -81,6 +81,7 @@ def headings(tree):
     return found
 
 
+@pytest.mark.slow
 def test_robots_know_their_headings():
     data = recording("mrclam/MRCLAM_Dataset6")
     plain = headings(probcal.fit(robots.problem(data), EA(), predictive_draws=False))
@@ -103,6 +104,7 @@ def test_a_turned_robot_is_determined_before_and_after_the_fit():
     print(f"\nrobot_4.heading {np.rad2deg(row['mean']):.2f} deg, {row['verdict']}: {row['reason']}")
 
 
+@pytest.mark.slow
 def test_delays_of_receivers_repeat_over_sets():
     """Delays of the larger group of receivers, a shift common to it apart (nobody can know it), set by set."""
     delays = {}
@@ -123,6 +125,7 @@ def test_delays_of_receivers_repeat_over_sets():
         assert np.sqrt(np.mean(left**2)) < 10.0
 
 
+@pytest.mark.slow
 def test_swapped_anchors_of_a_flight_are_found():
     data, swap = recording("uwb_tdoa"), (3, 4)
     problem = tdoa_flight.problem(data, swap)
