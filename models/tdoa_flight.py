@@ -119,5 +119,5 @@ def truth(data=None, swap=()):
     """Track of the tag, and what undoes the swap."""
     track = read(data, "tag_position.csv", ["time", "position_x", "position_y", "position_z"])
     shift = anchors(data) - anchors(data, swap)
-    biases = {f"anchor_{n}.position_{axis}": float(v) for n, row in enumerate(shift) for axis, v in zip("xyz", row, strict=True)}  # fmt: skip # noqa: E501
-    return Truth(track, biases)
+    labels = [f"anchor_{n}.position_{axis}" for n in range(len(shift)) for axis in "xyz"]
+    return Truth(track, dict(zip(labels, shift.ravel().tolist(), strict=True)))

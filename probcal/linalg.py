@@ -72,8 +72,8 @@ def semi_cholesky(matrices: jax.Array, right: jax.Array) -> tuple[jax.Array, jax
     return jnp.stack(columns, 2), jnp.stack(solved, 1)
 
 
-def semi_solve(matrices: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Solutions x (E, n, m) of positive semi-definite systems (E, n, n) x = right in their range, and the ranks (E,).
+def semi_solve(matrices: jax.Array, right: jax.Array) -> jax.Array:
+    """Solutions x (E, n, m) of positive semi-definite systems (E, n, n) x = right in their range.
 
     Where a pivot is lost in rounding the entry of x is zero.
     """
@@ -85,7 +85,7 @@ def semi_solve(matrices: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Ar
     for j in reversed(range(n)):
         left = y[:, j] - jnp.einsum("ei,eim->em", root[:, :, j], x)
         x = x.at[:, j].set(jnp.where(there[:, j, None], left / jnp.where(there, pivots, 1.0)[:, j, None], 0.0))
-    return x, jnp.sum(there, 1)
+    return x
 
 
 def gram(rows: jax.Array, signed: jax.Array) -> jax.Array:

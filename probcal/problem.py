@@ -57,6 +57,11 @@ class Epochs:
     layout: Layout
     components: tuple[str, ...]
 
+    @property
+    def position(self) -> tuple[int, int]:
+        """First and last (excluded) state entry of the position."""
+        return next((start, stop) for name, start, stop, _ in self.layout if name == "position")
+
 
 @dataclass(frozen=True)
 class LevelRecord:

@@ -214,6 +214,12 @@ def linearise(
     return Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])
 
 
+def standardised(score: jax.Array, information: jax.Array) -> jax.Array:
+    """Scores over the root of their information, of mean 0 and variance 1 under the model; zero where missing."""
+    there = information > 0
+    return jnp.where(there, score / jnp.sqrt(jnp.where(there, information, 1.0)), 0.0)
+
+
 def weigh(
     block: Block, rows: Rows, predicted: jax.Array, std: jax.Array, *, expected: bool
 ) -> tuple[jax.Array, jax.Array]:

@@ -52,6 +52,7 @@ class Result:
     approximate: str
     intervals: str
     settings: str
+    correlated: bool  # whether the prior couples biases
     status: str
     message: str
     z: np.ndarray  # (M,)
@@ -165,7 +166,8 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         groups["direction"] = direction_group(labels, result.directions)
     attrs = {
         "method": result.method, "prior": result.prior, "seed": result.seed, "approximate": result.approximate,
-        "intervals": result.intervals, "settings": result.settings, "interval_probability": INTERVAL,
+        "intervals": result.intervals, "settings": result.settings, "correlated": int(result.correlated),
+        "interval_probability": INTERVAL,
         "status": result.status, "message": result.message, "data": problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
     }  # fmt: skip

@@ -135,10 +135,7 @@ def _tree(
     coords = {"bias_label": labels[bounded], "bias_label_other": labels[bounded]}
     bias = xr.Dataset({name: ("bias_label", value) for name, value in own.items()}, coords=coords)
     bias["covariance"] = (("bias_label", "bias_label_other"), covariance)
-    place = [
-        np.sqrt(sum(v[:, start:stop].sum(1) for name, start, stop, _ in epochs.layout if name == "position"))
-        for epochs, v in zip(problem.epochs, variances, strict=True)
-    ]
+    place = [np.sqrt(v[:, slice(*epochs.position)].sum(1)) for epochs, v in zip(problem.epochs, variances, strict=True)]
     groups = {"bias": bias, "track": by_epoch(problem, {"sd": [np.sqrt(v) for v in variances], "position_rmse": place})}
     message = _message(labels, bounded, np.sqrt(np.diag(covariance)) > problem.scales[bounded])
     if not bounded.all():

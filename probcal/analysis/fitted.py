@@ -16,10 +16,8 @@ from probcal.rows import Linearised
 from probcal.smoothing import mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import project, track_mode
+from probcal.smoothing.start import follow_states, track_mode
 from probcal.types import InputError
-
-CLOSE = 1e6  # precision with which the saved states stand for the trajectories
 
 
 class Fitted(NamedTuple):
@@ -88,7 +86,7 @@ def _point(problem: Problem, fit: xr.DataTree) -> Point:
     """Biases and levels of the tree, trajectories at their mode, searched from the saved ones."""
     track = fit["track"].to_dataset()
     saved = [track[f"mean{tree.suffix(problem, r)}"].values for r in range(len(problem.epochs))]
-    point = project(problem, saved, [np.full_like(x, CLOSE) for x in saved])
+    point = follow_states(problem, saved)
     if problem.levels:
         level = fit["level"].to_dataset()
         point = at_levels(problem.system, point, jnp.asarray(np.log(level["std"].values / level["guess"].values)))
@@ -99,7 +97,7 @@ def _point(problem: Problem, fit: xr.DataTree) -> Point:
 def _prior(fit: xr.DataTree, group: xr.Dataset, covariance: np.ndarray) -> Precision:
     """Precisions of the tree; couplings of correlated biases are what its covariance leaves for them."""
     alpha = group["precision"].values
-    if "correlation=()" in str(fit.attrs.get("settings", "correlation=()")):
+    if not fit.attrs["correlated"]:
         return Precision.single(jnp.asarray(alpha))
     held, _ = linalg.inverse_and_logdet(jnp.asarray(covariance))
     coupling = np.asarray(held) - group["information"].values - np.diag(alpha)

@@ -21,7 +21,7 @@ from probcal import linalg
 from probcal.analysis.fitted import Fitted, eliminate_rows, linearise
 from probcal.priors import Precision
 from probcal.problem import Spec, System
-from probcal.rows import Linearised
+from probcal.rows import Linearised, standardised
 from probcal.smoothing.mode import Eliminated, Point, cost, find_mode, follow
 
 STEPS = 20  # Gauss-Newton steps of a refit
@@ -59,12 +59,11 @@ def _stepped(
     square = sum(jnp.sum(u**2) for u in moved.noises) + prior.square(moved.z)
     padded = jnp.append(moved.z - point.z, 0.0)
     for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
-        root = jnp.sqrt(lin.weight)
-        score = jnp.where(root > 0, lin.score / jnp.where(root > 0, root, 1.0), 0.0)
+        score = standardised(lin.score, lin.weight)
         dx = (moved.states[r] - point.states[r])[data.epoch][:, jnp.asarray(block.used, int)]
         change = jnp.einsum("ncu,nu->nc", lin.state, dx)
         change = change + jnp.einsum("ncp,np->nc", lin.bias, padded[data.bias][data.sensor])
-        square = square + jnp.sum((score - root * change) ** 2)
+        square = square + jnp.sum((score - jnp.sqrt(lin.weight) * change) ** 2)
     return Refit(-least - 0.5 * (solved.logdet + logdet), square)
 
 

@@ -64,7 +64,7 @@ def bound_map(
         raise InputError(f'bound_map: biases is {biases!r}; give "known", "unknown" or the result of fit()')
     flat = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     places = flat if z is None else np.column_stack([flat, np.full(len(flat), float(z))])
-    span = next((start, stop) for name, start, stop, _ in at.epochs[0].layout if name == "position")
+    span = at.epochs[0].position
     point = Point((), (), jnp.asarray(mean), jnp.asarray(levels))
     values = np.asarray(spectra(at.spec, at.system, span, point, root, jnp.asarray(places)))
     with np.errstate(divide="ignore"):

@@ -119,7 +119,7 @@ def next_sensors(
     """What one more sensor of each type, its pose known, would tell about the biases that there are: gain (nats).
 
     It sees every target at every epoch; its own biases are free. `places` (P, d) in m are by default a grid over the
-    area; the second node of a two-node type is its first one. Best first. Raises `InputError` for the shape.
+    area; the second node of a two-node type is that of its first sensor. Best first. Raises `InputError` for the shape.
     """
     check_free(problem)
     point = standpoint(problem, point, truth)
@@ -240,8 +240,7 @@ def _area(problem: Problem, point: Point) -> tuple[np.ndarray, np.ndarray]:
     d = problem.network.dimension
     places = [problem.node_positions]
     for epochs, states in zip(problem.epochs, point.states, strict=True):
-        first = next(first for name, first, *_ in epochs.layout if name == "position")
-        places.append(np.asarray(states)[:, first : first + d])
+        places.append(np.asarray(states)[:, slice(*epochs.position)])
     low, high = (np.concatenate(places).min(0), np.concatenate(places).max(0))
     margin = MARGIN * max(float((high - low)[:2].max()), 1.0)
     low, high = low - margin, high + margin

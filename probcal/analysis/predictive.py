@@ -57,7 +57,7 @@ def _discrepancies(
             def of(y, block=block, data=data, predicted=predicted, std=std, count=count):
                 version = data._replace(y=y)
                 score, weight = rows.weigh(block, version, predicted, std, expected=True)
-                v = jnp.where(weight > 0, score / jnp.sqrt(jnp.where(weight > 0, weight, 1.0)), 0.0)
+                v = rows.standardised(score, weight)
                 misfit = -rows.log_likelihood(block, version, predicted, levels)
                 return jax.ops.segment_sum(jnp.stack([misfit, v], 1), data.sensor, count), v**4
 

@@ -17,7 +17,7 @@ from scipy import stats
 from probcal import linalg
 from probcal.analysis.fitted import Fitted
 from probcal.problem import Spec, System
-from probcal.rows import Linearised
+from probcal.rows import Linearised, standardised
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Point, factors, of_states
 
@@ -108,7 +108,7 @@ def _innovations(
     padded = jnp.concatenate([root, jnp.zeros((1, root.shape[1]))])
     for block, data, lin, dz, r in zip(spec.blocks, system.rows, lins, shift, spec.recursion, strict=True):
         size = jnp.sqrt(lin.weight)
-        score = jnp.where(size > 0, lin.score / jnp.where(size > 0, size, 1.0), 0.0)
+        score = standardised(lin.score, lin.weight)
         moved = jnp.einsum("ncp,np->nc", lin.bias, dz)
         responses = jnp.einsum("nc,ncp,npk->nck", size, lin.bias, padded[data.bias[data.sensor]])
         columns.append(jnp.concatenate([(score - size * moved)[:, :, None], responses], 2))

@@ -15,11 +15,10 @@ from probcal.problem import Problem, Spec, System
 from probcal.simulate import Key, Truth, as_key
 from probcal.smoothing.information import moments
 from probcal.smoothing.mode import Point, track
-from probcal.smoothing.start import project
+from probcal.smoothing.start import follow_states
 from probcal.types import InputError, float64, nearest
 
 ITERATIONS = 30  # of a track
-CLOSE = 1e6  # precision of every state component at which a start follows the true track
 BATCH = 1024  # tracks worked on at once by an accelerator; a CPU takes one after the other
 
 Spans = tuple[tuple[int, int], ...]
@@ -52,9 +51,9 @@ def sensitivity(
     given = Truth() if truth is None else truth
     keys = jax.random.split(as_key(key), 3)
     true = on_tracks_of(problem, given, draw_states(problem, runs, keys[0]))
-    starts = [_start(problem, [np.asarray(x[k]) for x in true]) for k in range(runs)]
+    starts = [follow_states(problem, [np.asarray(x[k]) for x in true]) for k in range(runs)]
     start = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
-    spans = tuple(next((a, b) for name, a, b, _ in e.layout if name == "position") for e in problem.epochs)
+    spans = tuple(epochs.position for epochs in problem.epochs)
     unit = jax.random.normal(keys[1], (runs, problem.spec.biases))
     arguments = (problem.spec, problem.system, spans)
     errors = _errors(*arguments, jnp.asarray(spread), unit, true, start, jax.random.split(keys[2], runs))
@@ -71,11 +70,6 @@ def sensitivity(
         coords={**values, "run": np.arange(runs)},
         attrs={"data": problem.measurements.table.source},
     )
-
-
-def _start(problem: Problem, states: list[np.ndarray]) -> Point:
-    """The trajectory of the motion nearest to given states (E, n) of each recursion, at zero biases."""
-    return project(problem, states, [np.full_like(x, CLOSE) for x in states])
 
 
 def _spread(problem: Problem, values: Mapping[str, np.ndarray]) -> np.ndarray:

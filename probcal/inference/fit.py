@@ -17,7 +17,7 @@ from probcal.simulate import Key, as_key
 from probcal.smoothing.draws import draw, predictive, residuals
 from probcal.smoothing.information import at_levels, moments
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import automatic_start, further_starts, project, track_mode
+from probcal.smoothing.start import automatic_start, follow_states, further_starts, track_mode
 from probcal.types import FitError, InputError, float64
 
 CHAINS, DRAWS = 4, 250
@@ -68,7 +68,7 @@ def _suited(given: Problem, problem: Problem, start: Point) -> Point:
     if problem is given:
         return start
     states = [np.asarray(x) for x in start.states]
-    return project(problem, states, [np.full_like(x, 1e6) for x in states])._replace(z=start.z)
+    return follow_states(problem, states)._replace(z=start.z)
 
 
 def _rank(prior: Prior, outcome: Outcome) -> tuple[bool, bool, float]:
@@ -103,6 +103,7 @@ def _result(
     return tree.Result(
         method=method.name, prior=type(prior).__name__, seed=seed, approximate="Laplace",
         intervals=prior.note or method.note(), settings=f"{method!r}, {prior!r}",
+        correlated=bool(prior.correlation),
         status=outcome.status, message=outcome.message, z=np.asarray(point.z),
         covariance=np.asarray(found.covariance), precision=alpha, gamma=np.asarray(found.gamma),
         bias_status=outcome.bias_status, information=np.asarray(found.information),

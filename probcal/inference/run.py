@@ -4,6 +4,7 @@ A method is a frozen dataclass that inherits `Method`: `iterate`, a pure step of
 `close`, what it computes at the end of a chunk; `maximise` drives one fit and `inference.study` many at once.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -45,7 +46,7 @@ class State(NamedTuple):
     done: jax.Array  # ()
 
 
-class Method:
+class Method(ABC):
     """What every method inherits: a frozen dataclass of static fields, with a pure `iterate`."""
 
     iterations: int  # most outer iterations
@@ -62,9 +63,9 @@ class Method:
         """The problem that is solved in the place of the given one."""
         return problem
 
+    @abstractmethod
     def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
         """One outer iteration."""
-        raise NotImplementedError
 
     def close(self, spec: Spec, system: System, given: Given, state: State) -> State:
         """What is computed once a chunk."""

@@ -101,7 +101,7 @@ def _position_rmse(run: _Run, states: Sequence[np.ndarray]) -> float:
     squares = []
     d = run.problem.network.dimension
     for epochs, x in zip(run.problem.epochs, states, strict=True):
-        span = next(slice(start, stop) for name, start, stop, _ in epochs.layout if name == "position")
+        span = slice(*epochs.position)
         true = run.truth.positions(epochs.time, epochs.target, d)
         known = np.isfinite(true).all(1)
         squares.append(((x[:, span] - true)[known] ** 2).sum(1))

@@ -454,10 +454,9 @@ def _rigid(problem: Problem, z: np.ndarray) -> list[Pattern]:
 
 def _cause(problem: Problem, point: Point) -> str:
     """Why a combination may be weak: all targets pass along one direction, each on one line, where that is so."""
-    d, lines = problem.network.dimension, []
+    lines = []
     for epochs, states in zip(problem.epochs, point.states, strict=True):
-        start = next(start for name, start, *_ in epochs.layout if name == "position")
-        places = np.asarray(states)[:, start : start + d]
+        places = np.asarray(states)[:, slice(*epochs.position)]
         for name in dict.fromkeys(epochs.target):
             path = places[epochs.target == name]
             if len(path) < 3:

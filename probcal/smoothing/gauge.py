@@ -62,7 +62,7 @@ def within(spec: Spec, system: System, point: Point, hold: tuple[jax.Array, ...]
     k = basis.shape[1]
     padded = jnp.concatenate([basis, jnp.zeros((1, k), basis.dtype)])
     moved = [
-        linalg.semi_solve(J + jax.vmap(jnp.diag)(precision), cross @ basis)[0]
+        linalg.semi_solve(J + jax.vmap(jnp.diag)(precision), cross @ basis)
         for (J, _), cross, precision in zip(compressed.states, compressed.crosses, hold, strict=True)
     ]
     total = jnp.zeros((k, k))

@@ -24,6 +24,7 @@ WINDOWS = 60  # at most so many windows a target
 INNER = {2: 24, 3: 10}  # grid points an axis inside the network
 OUTER = {2: 48, 3: 60}  # directions of the outer rings
 RINGS = (0.8, 1.2, 1.8, 2.8, 5.0, 9.0)  # their radii in extents
+CLOSE = 1e6  # precision of every state component at which a trajectory follows given states
 NEAR = 0.05  # error of a position found on the grid, in extents
 WINDOW_ROWS = 60  # rows of a window that are looked at, where there are more
 BEAM = 200  # candidates a window that the path may pass
@@ -204,12 +205,17 @@ def project(problem: Problem, tracks: list[np.ndarray], precision: list[np.ndarr
     return Point(tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), jnp.zeros(problem.spec.biases), levels)
 
 
+def follow_states(problem: Problem, states: list[np.ndarray]) -> Point:
+    """Point at zero biases whose trajectories follow given states (E, n) of each recursion closely."""
+    return project(problem, states, [np.full_like(x, CLOSE) for x in states])
+
+
 def _grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
     """Trajectories from the data alone at biases z (M,): grid, Viterbi path, motion model, iterated EKS."""
     places = candidates(problem)
     tracks, precisions = [], []
     for r, epochs in enumerate(problem.epochs):
-        span = next((start, stop) for name, start, stop, _ in epochs.layout if name == "position")
+        span = epochs.position
         path, known = _known(problem, r, span)
         unknown = [name for name in dict.fromkeys(epochs.target) if not known[epochs.target == name].all()]
         if unknown:
