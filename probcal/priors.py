@@ -205,7 +205,28 @@ class Horseshoe(_Prior):
                 raise InputError(f"Horseshoe({name}={getattr(self, name)}): it must be positive")
 
 
-Prior = Flat | Gaussian | Laplace | ARD | Horseshoe
+@dataclass(frozen=True, kw_only=True)
+class BernoulliGaussian(_Prior):
+    """Spike and slab, the generating model of Papers B and C: each bias is zero or Gaussian of `slab` declared scales.
+
+    `share` of the biases is non-zero; None learns it under a Beta(a, b) prior, uniform by default.
+    """
+
+    share: float | None = None
+    slab: float = 1.0
+    a: float = 1.0
+    b: float = 1.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.share is not None and not 0 < self.share < 1:
+            raise InputError(f"BernoulliGaussian(share={self.share}): it must lie between 0 and 1, or be None")
+        for name in ("slab", "a", "b"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InputError(f"BernoulliGaussian({name}={getattr(self, name)}): give a positive number")
+
+
+Prior = Flat | Gaussian | Laplace | ARD | Horseshoe | BernoulliGaussian
 # names on the command line
 PRIORS: dict[str, Prior] = {
     "flat": Flat(),
@@ -216,5 +237,7 @@ PRIORS: dict[str, Prior] = {
     "ard-owner": ARD(by="owner"),
     "ard-type": ARD(by="type"),
     "ard-component": ARD(by="component"),
+    "ard-gamma": ARD(shape=1.0, rate=0.5),
     "horseshoe": Horseshoe(),
+    "bernoulli-gaussian": BernoulliGaussian(),
 }

@@ -71,13 +71,22 @@ def log_likelihood(spec: Spec, system: System, point: Point) -> jax.Array:
     return total
 
 
+def log_density(spec: Spec, system: System, point: Point) -> jax.Array:
+    """Log density of data and whitened noises given biases and levels, up to the constant of the noises."""
+    return log_likelihood(spec, system, point) - 0.5 * sum(jnp.sum(u**2) for u in point.noises)
+
+
+def widening(system: System, levels: jax.Array) -> jax.Array:
+    """Log determinant by which the levels widen the noises that they multiply."""
+    levels = jnp.concatenate([levels, jnp.zeros(1, levels.dtype)])
+    parts = [jnp.sum(jnp.any(part.L != 0, 1) * levels[part.level]) for part in system.recursions]
+    return sum(parts, jnp.zeros(()))
+
+
 def cost(spec: Spec, system: System, point: Point, prior: Precision) -> jax.Array:
     """Negative log joint density of data, trajectories, biases and unknown levels, up to constants."""
-    squares = sum(jnp.sum(u**2) for u in point.noises) + prior.square(point.z)
-    squares = squares + jnp.sum((point.levels / system.level_spread) ** 2)
-    levels = jnp.concatenate([point.levels, jnp.zeros(1, point.levels.dtype)])
-    widened = sum(jnp.sum(jnp.any(part.L != 0, 1) * levels[part.level]) for part in system.recursions)
-    return 0.5 * squares + widened - log_likelihood(spec, system, point)
+    known = prior.square(point.z) + jnp.sum((point.levels / system.level_spread) ** 2)
+    return 0.5 * known + widening(system, point.levels) - log_density(spec, system, point)
 
 
 def linearise(spec: Spec, system: System, point: Point, *, expected: bool) -> list[Linearised]:

@@ -1,0 +1,142 @@
+"""Collapsed sampling: trajectories marginalised by the frame, Gibbs on what is left, every draw made exact.
+
+One draw: a few Gibbs sweeps on the frame's Gaussian likelihood propose hyper-parameters and biases together (surrogate
+transition, Liu 2001; delayed acceptance, Christen, Fox 2005), taken or refused by the weight of the joint posterior; the
+hyper-parameters are drawn anew; biases and trajectories then move along an ellipse (Murray, Adams, MacKay 2010).
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from probcal.inference.hierarchy import Phi, SpikeAndSlab
+from probcal.inference.posed import Conditional, Form, Posed, conditional, update_inclusions
+from probcal.inference.sampler import Sample, Sampler
+from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
+from probcal.smoothing.frame import log_weight
+
+SHRINKINGS = 40  # most times that an ellipse is cut
+
+
+class Chain(NamedTuple):
+    """Where a chain stands."""
+
+    theta: jax.Array
+    eps: tuple[jax.Array, ...]
+    phi: Phi
+    weight: jax.Array  # log weight of theta and eps
+    key: jax.Array
+
+
+def sweep(
+    form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array, *, backwards: bool
+) -> tuple[jax.Array, Phi]:
+    """Gibbs on the frame: hyper-parameters given the biases, then theta given them; `backwards` in reverse order."""
+    kind = form.hierarchy
+    learnt = jnp.asarray(kind.learnt, int)
+
+    def hyper(k: int, theta: jax.Array, phi: Phi, key: jax.Array) -> tuple[jax.Array, Phi]:
+        return theta, kind.updates()[k](phi, theta[learnt], key)
+
+    def biases(theta: jax.Array, phi: Phi, key: jax.Array) -> tuple[jax.Array, Phi]:
+        keys = jax.random.split(key)
+        if isinstance(kind, SpikeAndSlab):
+            phi = update_inclusions(form, posed, phi, keys[0], backwards=backwards)
+        return conditional(form, posed, phi).draw(keys[1]), phi
+
+    steps: list[Any] = [lambda t, p, s, k=k: hyper(k, t, p, s) for k in range(len(kind.updates()))] + [biases]
+    for step, own in zip(steps[::-1] if backwards else steps, jax.random.split(key, len(steps)), strict=True):
+        theta, phi = step(theta, phi, own)
+    return theta, phi
+
+
+def surrogate(
+    form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array, sweeps: int
+) -> tuple[jax.Array, Phi]:
+    """Some sweeps, all forwards or all backwards by a coin: reversible under the frame's posterior."""
+    keys = jax.random.split(key, sweeps + 1)
+
+    def run(backwards: bool) -> Any:
+        def one(carry: tuple[jax.Array, Phi], own: jax.Array) -> tuple[tuple[jax.Array, Phi], None]:
+            return sweep(form, posed, *carry, own, backwards=backwards), None
+
+        return lambda: jax.lax.scan(one, (theta, phi), keys[1:])[0]
+
+    return jax.lax.cond(jax.random.bernoulli(keys[0]), run(True), run(False))
+
+
+def ellipse(
+    form: Form, posed: Posed, chain: Chain, given: Conditional, key: jax.Array
+) -> tuple[jax.Array, tuple[jax.Array, ...], jax.Array, jax.Array]:
+    """Elliptical slice sampling of theta and eps given phi: new theta, eps, log weight and the tries it took."""
+    keys = jax.random.split(key, 4)
+    turn = given.deviation(keys[0])
+    seeds = jax.random.split(keys[1], len(chain.eps))
+    other = tuple(jax.random.normal(k, e.shape) for k, e in zip(seeds, chain.eps, strict=True))
+    level = chain.weight - jax.random.exponential(keys[2])
+    mean = jnp.where(given.active, given.mean, 0.0)
+
+    def at(angle: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        theta = mean + c * (chain.theta - mean) + s * turn
+        return theta, tuple(c * e + s * o for e, o in zip(chain.eps, other, strict=True))
+
+    def attempt(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        low, high, key, tries, _, _ = state
+        key, draw = jax.random.split(key)
+        angle = low + (high - low) * jax.random.uniform(draw)
+        weight = log_weight(form.spec, posed.system, posed.frame, *at(angle))
+        return jnp.where(angle < 0, angle, low), jnp.where(angle < 0, high, angle), key, tries + 1, angle, weight
+
+    start = 2 * jnp.pi * jax.random.uniform(keys[3])
+    first = (start - 2 * jnp.pi, start, key, jnp.zeros((), int), jnp.zeros(()), jnp.full((), -jnp.inf, float))
+    last = jax.lax.while_loop(lambda s: ~(s[5] >= level) & (s[3] < SHRINKINGS), attempt, first)
+    found = last[5] >= level
+    theta, eps = at(jnp.where(found, last[4], 0.0))
+    return theta, eps, jnp.where(found, last[5], chain.weight), last[3]
+
+
+@dataclass(frozen=True)
+class Collapsed(Sampler):
+    """Exact posterior of biases, hyper-parameters and trajectories, sampled with the trajectories marginalised.
+
+    Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it between two draws of each of
+    `chains`. Where the frame fits badly it is moved, and where that fails the joint sampler `NUTS` takes over.
+    """
+
+    chains: int = 4
+    warmup: int = 100
+    draws: int = 500
+    sweeps: int = 5
+
+    name: ClassVar[str] = "Collapsed"
+    priors: ClassVar[tuple[type, ...]] = (Horseshoe, BernoulliGaussian, Gaussian, Laplace, ARD, Flat)
+    chunk: ClassVar[int] = 50
+
+    def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Chain:
+        """A chain at a draw of the frame's posterior."""
+        keys = jax.random.split(key, len(posed.frame.loops) + 1)
+        pairs = zip(keys, posed.frame.point.states, strict=False)
+        eps = tuple(jax.random.normal(k, x.shape) for k, x in pairs)
+        weight = log_weight(form.spec, posed.system, posed.frame, theta, eps)
+        return Chain(theta, eps, phi, weight, keys[-1])
+
+    def step(self, form: Form, posed: Posed, chain: Chain) -> tuple[Chain, Sample]:
+        """One draw."""
+        key, *keys = jax.random.split(chain.key, 6)
+        theta, phi = surrogate(form, posed, chain.theta, chain.phi, keys[0], self.sweeps)
+        weight = log_weight(form.spec, posed.system, posed.frame, theta, chain.eps)
+        rate = jnp.exp(jnp.minimum(weight - chain.weight, 0.0))
+        taken = jax.random.uniform(keys[1]) < rate
+        proposed = chain._replace(theta=theta, phi=phi, weight=weight)
+        chain = jax.tree.map(lambda new, old: jnp.where(taken, new, old), proposed, chain._replace(key=chain.key))
+        phi, learnt = chain.phi, jnp.asarray(form.hierarchy.learnt, int)
+        for k, update in enumerate(form.hierarchy.updates()):
+            phi = update(phi, chain.theta[learnt], jax.random.fold_in(keys[2], k))
+        given = conditional(form, posed, phi)
+        theta, eps, weight, tries = ellipse(form, posed, chain, given, keys[3])
+        chain = Chain(theta, eps, phi, weight, key)
+        joint = weight + posed.frame.log_likelihood(theta) - 0.5 * sum(jnp.sum(e**2) for e in eps)
+        return chain, Sample(theta, eps, phi, joint, {"acceptance_rate": rate, "tries": tries, "log_weight": weight})

@@ -1,0 +1,249 @@
+"""What samplers make of a prior: its hyper-parameters, their densities, and their conjugate updates given the biases.
+
+A `Hierarchy` is the static part (which biases it governs, in which groups); its variables `phi` are a dict of arrays.
+Given them the biases are Gaussian of precision `alpha(phi)`, so that every prior but the spike is a scale mixture. To
+add one: a class here with its `hyper` distributions and its `updates`, and a line in `hierarchy_of`.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+
+from probcal.inference.draws import inverse_gaussian, slice_step
+from probcal.priors import ARD, BernoulliGaussian, Horseshoe, Laplace, Prior
+from probcal.problem import Problem
+from probcal.types import InputError
+
+LEAST, MOST = 1e-12, 1e16  # precisions outside carry no mass that a draw could show
+Phi = dict[str, jax.Array]
+Update = Callable[[Phi, jax.Array, jax.Array], Phi]  # phi, learnt z, key
+
+
+@dataclass(frozen=True)
+class Hierarchy(ABC):
+    """A prior over the biases that it governs: `learnt` their numbers, `group` the precision of each."""
+
+    prior: Any
+    learnt: tuple[int, ...]
+    group: tuple[int, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of precisions."""
+        return max(self.group, default=-1) + 1
+
+    @abstractmethod
+    def hyper(self) -> Mapping[str, dist.Distribution]:
+        """Independent prior distributions of the continuous hyper-parameters."""
+
+    @abstractmethod
+    def governed(self, phi: Phi) -> jax.Array:
+        """Precision of each governed bias, (L,)."""
+
+    @abstractmethod
+    def updates(self) -> list[Update]:
+        """Kernels that each leave p(phi | z) invariant and are reversible, z (L,) the governed biases."""
+
+    def alpha(self, phi: Phi, first: jax.Array) -> jax.Array:
+        """Precisions of all biases (M,): those of `first`, but for the governed ones."""
+        if not self.learnt:
+            return first
+        return first.at[jnp.asarray(self.learnt)].set(jnp.clip(self.governed(phi), LEAST, MOST))
+
+    def active(self, phi: Phi, biases: int) -> jax.Array:
+        """Which biases are not exactly zero, (M,)."""
+        return jnp.ones(biases, bool)
+
+    def draw(self, key: jax.Array) -> Phi:
+        """One draw of the hyper-parameters from their prior."""
+        hyper = self.hyper()
+        keys = jax.random.split(key, len(hyper) + 1)
+        return {name: d.sample(k) for (name, d), k in zip(hyper.items(), keys, strict=False)}
+
+    def log_prior(self, phi: Phi) -> jax.Array:
+        """Log density of the hyper-parameters."""
+        return sum((jnp.sum(d.log_prob(phi[name])) for name, d in self.hyper().items()), jnp.zeros(()))
+
+    def constrain(self, free: Phi) -> tuple[Phi, jax.Array]:
+        """Hyper-parameters of unconstrained values, and the log density of these under the prior."""
+        phi, density = {}, jnp.zeros(())
+        for name, d in self.hyper().items():
+            to = dist.biject_to(d.support)
+            phi[name] = to(free[name])
+            density = density + jnp.sum(d.log_prob(phi[name])) + jnp.sum(to.log_abs_det_jacobian(free[name], phi[name]))
+        return phi, density
+
+    def relax(self, phi: Phi) -> Phi:
+        """Unconstrained values of hyper-parameters."""
+        return {name: dist.biject_to(d.support).inv(phi[name]) for name, d in self.hyper().items()}
+
+
+class Known(Hierarchy):
+    """A prior without hyper-parameters: Gaussian or flat."""
+
+    def hyper(self):
+        """None."""
+        return {}
+
+    def governed(self, phi):
+        """None."""
+        raise AssertionError("a known prior governs no bias")
+
+    def updates(self):
+        """None."""
+        return []
+
+
+class Precisions(Hierarchy):
+    """ARD: one precision a group with a Gamma hyper-prior; the biases are then Student-t."""
+
+    def hyper(self):
+        """Precisions, (groups,)."""
+        return {"alpha": dist.Gamma(self.prior.shape * jnp.ones(self.count), self.prior.rate)}
+
+    def governed(self, phi):
+        """The precision of the group."""
+        return phi["alpha"][jnp.asarray(self.group)]
+
+    def updates(self):
+        """The conjugate Gamma."""
+
+        def alpha(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
+            group = jnp.asarray(self.group)
+            square = jnp.zeros(self.count).at[group].add(z**2)
+            number = jnp.zeros(self.count).at[group].add(1.0)
+            drawn = jax.random.gamma(key, self.prior.shape + 0.5 * number)
+            return phi | {"alpha": drawn / (self.prior.rate + 0.5 * square)}
+
+        return [alpha]
+
+
+class Exponentials(Hierarchy):
+    """Laplace density as a Gaussian of exponential variance (Park, Casella 2008)."""
+
+    def hyper(self):
+        """Variances, (L,)."""
+        return {"variance": dist.Exponential(0.5 * self.prior.rate**2 * jnp.ones(len(self.learnt)))}
+
+    def governed(self, phi):
+        """One over the variance."""
+        return 1.0 / phi["variance"]
+
+    def updates(self):
+        """Inverse Gaussian precisions."""
+
+        def variance(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
+            mean = self.prior.rate / jnp.maximum(jnp.abs(z), 1e-150)
+            return {"variance": 1.0 / jnp.maximum(inverse_gaussian(key, mean, self.prior.rate**2), 1e-300)}
+
+        return [variance]
+
+
+class RegularisedHorseshoe(Hierarchy):
+    """Half-Cauchy local and global scales, cut by a slab (Piironen, Vehtari 2017): alpha = 1/c^2 + 1/(tau lambda)^2."""
+
+    def hyper(self):
+        """Local scales (L,), global scale, slab variance; in declared scales."""
+        half = 0.5 * self.prior.slab_df
+        return {
+            "local": dist.HalfCauchy(jnp.ones(len(self.learnt))),
+            "global": dist.HalfCauchy(self.prior.expected / (1.0 - self.prior.expected)),
+            "slab": dist.InverseGamma(half, half * self.prior.slab_scale**2),
+        }
+
+    def governed(self, phi):
+        """Slab and shrinkage added."""
+        return 1.0 / phi["slab"] + 1.0 / (phi["global"] * phi["local"]) ** 2
+
+    def updates(self):
+        """Local scales by the auxiliary form (Makalic, Schmidt 2016) made exact for the slab; the others by slices."""
+        width = self.prior.expected / (1.0 - self.prior.expected)
+        half = 0.5 * self.prior.slab_df
+
+        def local(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
+            keys = jax.random.split(key, 3)
+            square, tau2 = phi["local"] ** 2, phi["global"] ** 2
+            auxiliary = (1.0 + 1.0 / square) / jax.random.exponential(keys[0], z.shape)
+            proposal = (1.0 / auxiliary + 0.5 * z**2 / tau2) / jax.random.exponential(keys[1], z.shape)
+            ratio = 0.5 * (jnp.log1p(tau2 * proposal / phi["slab"]) - jnp.log1p(tau2 * square / phi["slab"]))
+            taken = jnp.log(jax.random.uniform(keys[2], z.shape)) < ratio
+            return phi | {"local": jnp.sqrt(jnp.where(taken, proposal, square))}
+
+        def density(z: jax.Array, local: jax.Array, log_tau: jax.Array, log_slab: jax.Array) -> jax.Array:
+            tau, slab = jnp.exp(log_tau), jnp.exp(log_slab)
+            alpha = jnp.clip(1.0 / slab + 1.0 / (tau * local) ** 2, LEAST, MOST)
+            own = log_tau - jnp.log1p((tau / width) ** 2) - half * log_slab - half * self.prior.slab_scale**2 / slab
+            return own + 0.5 * jnp.sum(jnp.log(alpha) - alpha * z**2)
+
+        def shared(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
+            tau, slab = jnp.log(phi["global"]), jnp.log(phi["slab"])
+            keys = jax.random.split(key, 3)
+            tau = slice_step(keys[0], tau, lambda t: density(z, phi["local"], t, slab))
+            slab = slice_step(keys[1], slab, lambda s: density(z, phi["local"], tau, s))
+            tau = slice_step(keys[2], tau, lambda t: density(z, phi["local"], t, slab))
+            return phi | {"global": jnp.exp(tau), "slab": jnp.exp(slab)}
+
+        return [local, shared]
+
+
+class SpikeAndSlab(Hierarchy):
+    """Bernoulli-Gaussian: which biases are in, and the share of them; `collapsed.py` moves these with z integrated."""
+
+    def hyper(self):
+        """The share of the biases that are not zero, where it is not given."""
+        return {} if self.prior.share is not None else {"share": dist.Beta(self.prior.a, self.prior.b)}
+
+    def governed(self, phi):
+        """The slab."""
+        return jnp.full(len(self.learnt), 1.0 / self.prior.slab**2)
+
+    def active(self, phi, biases):
+        """Those that are in, and all that the prior does not govern."""
+        return jnp.ones(biases, bool).at[jnp.asarray(self.learnt, int)].set(phi["included"])
+
+    def share(self, phi: Phi) -> jax.Array:
+        """The share of the biases that are not zero."""
+        return phi["share"] if self.prior.share is None else jnp.asarray(self.prior.share)
+
+    def draw(self, key):
+        """Share and inclusions from the prior."""
+        keys = jax.random.split(key)
+        phi = super().draw(keys[0])
+        return phi | {"included": jax.random.uniform(keys[1], (len(self.learnt),)) < self.share(phi)}
+
+    def updates(self):
+        """The conjugate Beta of the share."""
+
+        def share(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
+            number = jnp.sum(phi["included"])
+            out = len(self.learnt) - number
+            return phi | {"share": jax.random.beta(key, self.prior.a + number, self.prior.b + out)}
+
+        return [share] if self.prior.share is None else []
+
+
+def hierarchy_of(prior: Prior, problem: Problem) -> Hierarchy:
+    """The hierarchy of a prior for the biases of a problem; those with a survey keep their own Gaussian.
+
+    Raises `InputError` for an ARD prior whose hyper-prior is not proper: no posterior of the biases exists then.
+    """
+    learnt = np.flatnonzero(~problem.surveyed)
+    groups = np.unique(prior.groups(problem.members)[learnt], return_inverse=True)[1] if len(learnt) else learnt
+    kinds: dict[type, type[Hierarchy]] = {
+        ARD: Precisions, Laplace: Exponentials, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab,
+    }  # fmt: skip
+    kind = kinds.get(type(prior))
+    if kind is None or not len(learnt):
+        return Known(prior, (), ())
+    if isinstance(prior, ARD) and prior.rate == 0.0:
+        raise InputError(
+            "a sampler needs a proper hyper-prior: ARD(shape=1, rate=0) is flat and its posterior does not exist;"
+            ' give ARD(rate=0.5) ("ard-gamma") or Horseshoe()'
+        )
+    return kind(prior, tuple(learnt.tolist()), tuple(int(g) for g in groups))

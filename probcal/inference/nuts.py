@@ -1,0 +1,104 @@
+"""The joint sampler: NUTS over biases, hyper-parameters and every trajectory, in coordinates that the frame whitens."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from numpyro.infer.hmc import hmc
+
+from probcal.inference.hierarchy import Phi
+from probcal.inference.posed import Form, Posed, conditional, log_prior, prior_precision, whiten
+from probcal.inference.sampler import Sample, Sampler
+from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
+from probcal.smoothing.frame import log_joint
+from probcal.types import InputError
+
+
+class Free(NamedTuple):
+    """Unconstrained coordinates: phi on the real line, eta and eps unit normals where the frame is exact."""
+
+    phi: Phi
+    eta: jax.Array  # (Q,) of theta given phi
+    eps: tuple[jax.Array, ...]  # (E, n) of the trajectories given theta
+
+
+class Parts(NamedTuple):
+    """What coordinates stand for, and the log densities there."""
+
+    theta: jax.Array
+    phi: Phi
+    joint: jax.Array  # of data and eps given theta
+    density: jax.Array  # of the coordinates
+
+
+def parts(form: Form, posed: Posed, free: Free) -> Parts:
+    """Biases and hyper-parameters of coordinates, and the log density of the joint posterior in them.
+
+    theta = mean(phi) + factor(phi) eta follows the hyper-parameters, the trajectories follow theta: neither the funnel
+    of a scale nor the ridge between a bias and a track is left.
+    """
+    phi, hyper = form.hierarchy.constrain(free.phi)
+    alpha, coupling = prior_precision(form, posed, phi)
+    theta, volume = whiten(posed.frame.information + coupling, alpha, posed.frame.pull, free.eta)
+    joint = log_joint(form.spec, posed.system, posed.frame, theta, free.eps)
+    return Parts(theta, phi, joint, hyper + volume + log_prior(form, posed, theta, phi) + joint)
+
+
+@dataclass(frozen=True)
+class NUTS(Sampler):
+    """Exact posterior of biases, hyper-parameters and trajectories by the no-U-turn sampler (Hoffman, Gelman 2014).
+
+    `chains` of `warmup` and `draws` steps, a diagonal metric (`dense=True`: full), steps that are accepted with
+    probability `target`, trees of at most `depth` doublings. Raises `InputError` for settings outside their ranges.
+    """
+
+    chains: int = 4
+    warmup: int = 400
+    draws: int = 500
+    target: float = 0.85
+    depth: int = 10
+    dense: bool = False
+
+    name: ClassVar[str] = "NUTS"
+    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Gaussian, Laplace, ARD, Flat)
+    chunk: ClassVar[int] = 20
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not (0.1 < self.target < 1 and 1 <= self.depth <= 20):
+            raise InputError(f"NUTS(target={self.target}, depth={self.depth}): target is in (0.1, 1), depth from 1 to 20")
+
+    def _kernels(self, form: Form, posed: Posed) -> tuple[Any, Any]:
+        return hmc(lambda free: -parts(form, posed, free).density, algo="NUTS")
+
+    def _started(self, kernels: tuple[Any, Any], free: Free, key: jax.Array) -> Any:
+        return kernels[0](
+            free, self.warmup, step_size=0.3, dense_mass=self.dense, target_accept_prob=self.target,
+            max_tree_depth=self.depth, rng_key=key,
+        )  # fmt: skip
+
+    def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
+        """A chain at theta and phi, its trajectories drawn from the frame."""
+        keys = jax.random.split(key, len(posed.frame.loops) + 1)
+        pairs = zip(keys, posed.frame.point.states, strict=False)
+        eps = tuple(jax.random.normal(k, x.shape) for k, x in pairs)
+        given = conditional(form, posed, phi)
+        eta = given.factor.T @ (theta - given.mean)
+        return self._started(self._kernels(form, posed), Free(form.hierarchy.relax(phi), eta, eps), keys[-1])
+
+    def step(self, form: Form, posed: Posed, chain: Any) -> tuple[Any, Sample]:
+        """One draw; during warm-up step size and metric adapt."""
+        kernels = self._kernels(form, posed)
+        self._started(kernels, chain.z, chain.rng_key)  # hands its settings to the kernel; its state is not used
+        chain = kernels[1](chain)
+        found = parts(form, posed, chain.z)
+        stats = {
+            "acceptance_rate": chain.accept_prob,
+            "diverging": chain.diverging,
+            "n_steps": chain.num_steps,
+            "tree_depth": jnp.floor(jnp.log2(chain.num_steps)).astype(int) + 1,
+            "energy": chain.energy,
+            "step_size": chain.adapt_state.step_size,
+        }
+        return chain, Sample(found.theta, chain.z.eps, found.phi, found.joint, stats)

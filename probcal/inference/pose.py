@@ -1,0 +1,128 @@
+"""From a problem to a posed posterior: a start, a frame that is moved to where a pilot finds the mass, its worth."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from arviz_stats.base import array_stats
+
+from probcal.inference.collapsed import sweep
+from probcal.inference.hierarchy import Phi, hierarchy_of
+from probcal.inference.posed import Form, Posed, activity, conditional
+from probcal.priors import Prior
+from probcal.problem import Problem, Spec, System
+from probcal.smoothing.frame import Frame, frame_at, log_weight, place
+from probcal.smoothing.mode import Point, track
+
+PILOTS = 4  # chains of the pilot
+BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, sweeps between two
+MOVES = 4  # most times that the frame is moved
+GOOD, LOST = 0.5, 0.02  # Pareto k-hat at which a frame is left alone; acceptance below which it has failed
+SPREAD = 1.5  # by how much chains start further out than the pilot's draws
+
+
+class Pilot(NamedTuple):
+    """Independent-looking draws of the frame's posterior, leading dims (draws,)."""
+
+    theta: jax.Array
+    phi: Phi
+
+
+class Worth(NamedTuple):
+    """How well a frame stands for the joint posterior."""
+
+    khat: float  # Pareto k-hat of the weights of its draws
+    acceptance: float  # of independent draws of it
+    moves: int
+
+
+@partial(jax.jit, static_argnames="form")
+def pilot(form: Form, posed: Posed, key: jax.Array) -> Pilot:
+    """Gibbs on the frame alone, from over-dispersed draws of the prior of the hyper-parameters."""
+
+    def chain(key: jax.Array) -> tuple[jax.Array, Phi]:
+        start, first, run = jax.random.split(key, 3)
+        phi = form.hierarchy.draw(start)
+        theta = conditional(form, posed, phi).draw(first)
+
+        def one(carry: Any, k: jax.Array) -> tuple[Any, Any]:
+            carry = sweep(form, posed, *carry, jax.random.fold_in(run, k), backwards=False)
+            return carry, carry
+
+        _, found = jax.lax.scan(one, (theta, phi), jnp.arange(BURN + STRIDE * KEPT))
+        return jax.tree.map(lambda leaf: leaf[BURN :: STRIDE], found)
+
+    found = jax.lax.map(chain, jax.random.split(key, PILOTS))
+    return Pilot(*jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found))
+
+
+@partial(jax.jit, static_argnames="form")
+def weights(form: Form, posed: Posed, theta: jax.Array, key: jax.Array) -> jax.Array:
+    """Log weights (D,) of draws theta (D, Q) with trajectories drawn from the frame."""
+
+    def one(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
+        keys = jax.random.split(pair[1], len(posed.frame.loops))
+        pairs = zip(keys, posed.frame.point.states, strict=True)
+        eps = tuple(jax.random.normal(k, x.shape) for k, x in pairs)
+        return log_weight(form.spec, posed.system, posed.frame, pair[0], eps)
+
+    return jax.lax.map(one, (theta, jax.random.split(key, theta.shape[0])))
+
+
+@partial(jax.jit, static_argnames="spec")
+def moved(spec: Spec, system: System, frame: Frame, theta: jax.Array) -> Frame:
+    """The frame at theta (Q,), trajectories at their mode."""
+    resting = tuple(jnp.zeros_like(x) for x in frame.point.states)
+    return frame_at(spec, system, track(spec, system, place(system, frame, theta, resting)))
+
+
+def pareto_khat(log_weights: np.ndarray) -> float:
+    """Pareto k-hat of log weights (D,); 0 where they are all equal, infinite where some draw has none."""
+    if not np.isfinite(log_weights).all():
+        return np.inf
+    if np.ptp(log_weights) < 1e-6:
+        return 0.0
+    return float(array_stats.psislw(log_weights)[1])
+
+
+def acceptance(log_weights: np.ndarray) -> float:
+    """Probability that one draw is taken after another by their weights."""
+    finite = np.nan_to_num(log_weights, neginf=-1e300)
+    return float(np.exp(np.minimum(finite[:, None] - finite[None, :], 0.0)).mean())
+
+
+def pose(problem: Problem, prior: Prior, start: Point, key: jax.Array) -> tuple[Form, Posed, Pilot, Worth]:
+    """The posterior of a problem posed around a start, the draws of its pilot, and the frame's worth.
+
+    The frame is moved to the mean of the pilot's draws, by their weights, until these say that it fits.
+    """
+    spec, system = problem.spec, problem.system
+    form = Form(spec, hierarchy_of(prior, problem))
+    posed = Posed(system, frame_at(spec, system, start), prior.precision(problem.labels, problem.surveyed))
+    best: tuple[Any, ...] | None = None
+    for move in range(MOVES + 1):
+        keys = jax.random.split(jax.random.fold_in(key, move))
+        found = pilot(form, posed, keys[0])
+        logs = np.asarray(weights(form, posed, found.theta, keys[1]))
+        worth = Worth(pareto_khat(logs), acceptance(logs), move)
+        if best is None or worth.acceptance > best[2].acceptance:
+            best = posed, found, worth
+        if move and worth.khat < GOOD:
+            break
+        mean = found.theta.mean(0) if worth.acceptance > LOST or move else posed.frame.theta
+        frame = moved(spec, system, posed.frame, mean)
+        if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(frame)):
+            break
+        posed = posed._replace(frame=frame)
+    return form, *best
+
+
+def chain_start(form: Form, posed: Posed, found: Pilot, k: int, chains: int) -> tuple[jax.Array, Phi]:
+    """theta and phi of chain k: a draw of the pilot, further out than it lies."""
+    pick = (k * found.theta.shape[0]) // chains
+    phi = jax.tree.map(lambda leaf: leaf[pick], found.phi)
+    mean = found.theta.mean(0)
+    theta = mean + SPREAD * (found.theta[pick] - mean)
+    return jnp.where(activity(form, posed, phi), theta, 0.0), phi

@@ -1,0 +1,166 @@
+"""Runs a sampler: chains in jitted chunks, each chain on its own thread, with progress, checkpoints and resume."""
+
+import hashlib
+import os
+import time
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.inference.pose import LOST, Pilot, Worth, chain_start, pose
+from probcal.inference.posed import Form, Posed
+from probcal.inference.run import Progress
+from probcal.inference.sampler import Draw, Sampler, run_chunk, run_chunks
+from probcal.inference.store import Store
+from probcal.priors import Prior
+from probcal.problem import Problem
+from probcal.smoothing.mode import Point
+from probcal.types import FitError
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """What a sampler leaves: draws by name (chain, draw, ...), and how the run went."""
+
+    method: Sampler
+    form: Form
+    posed: Posed
+    worth: Worth
+    draws: Mapping[str, np.ndarray]
+    seconds: float
+    interrupted: bool
+    note: str  # what happened on the way, a sentence or nothing
+
+    @property
+    def z(self) -> np.ndarray:
+        """Biases (chain, draw, M) over their scales."""
+        return self.draws["theta"][..., : self.form.biases]
+
+    @property
+    def levels(self) -> np.ndarray:
+        """Log levels (chain, draw, H)."""
+        return self.draws["theta"][..., self.form.biases :]
+
+    def group(self, prefix: str) -> dict[str, np.ndarray]:
+        """Draws whose name begins so, by the rest of the name."""
+        return {name.removeprefix(prefix): a for name, a in self.draws.items() if name.startswith(prefix)}
+
+    @property
+    def states(self) -> list[np.ndarray]:
+        """States (chain, draw, E, n) of each recursion; empty where they were not kept."""
+        found = self.group("states_")
+        return [found[str(r)] for r in range(len(found))]
+
+
+def sample(
+    problem: Problem,
+    method: Sampler,
+    prior: Prior,
+    start: Point,
+    key: jax.Array,
+    *,
+    progress: Progress | None = None,
+    store: Path | None = None,
+    resume: bool = False,
+    threads: int | None = None,
+    fallback: Sampler | None = None,
+) -> Sampled:
+    """Draws of a method from the posterior of a problem.
+
+    `store` is a folder for draws and state, taken up again by `resume`. `fallback` takes over where the frame does not
+    fit and has its prior. Raises `FitError` where no draw is finite, `InputError` where the stored run is another.
+    """
+    began = time.perf_counter()
+    keys = jax.random.split(key)
+    form, posed, found, worth = pose(problem, prior, start, keys[0])
+    note = ""
+    if worth.acceptance < LOST and fallback is not None and isinstance(prior, fallback.priors):
+        note = (
+            f"{method.name}: the collapse does not fit (Pareto k-hat {worth.khat:.2g}, acceptance"
+            f" {worth.acceptance:.2g} after {worth.moves} moves); {fallback.name} took over."
+        )
+        method = fallback
+    runs = _Run(method, form, posed, found, keys[1])
+    box = Store(store, _name(problem, method, prior, key), resume=resume)
+    state = runs.restored(box.state) if box.state is not None else runs.first()
+    total, interrupted = method.warmup + method.draws, False
+    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+        try:
+            while box.count * method.chunk < total:
+                state, draws = runs.advance(state, pool)
+                kept = max(0, min((box.count + 1) * method.chunk - method.warmup, method.chunk))
+                box.add({n: a[:, method.chunk - kept :] for n, a in named(draws).items()}, jax.tree.leaves(state))
+                if progress is not None:
+                    progress(method.name, min(box.count * method.chunk, total), float(np.mean(draws.density)))
+        except KeyboardInterrupt:
+            interrupted = True
+            if box.count * method.chunk <= method.warmup:
+                raise
+    chunks = box.chunks()
+    joined = {n: np.concatenate([c[n] for c in chunks], 1)[:, : method.draws] for n in chunks[-1]}
+    if not np.isfinite(joined["theta"]).all():
+        raise FitError(f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them")
+    return Sampled(method, form, posed, worth, joined, time.perf_counter() - began, interrupted, note)
+
+
+def named(draws: Draw) -> dict[str, np.ndarray]:
+    """Draws as arrays (chains, draws, ...) by flat names."""
+    found: dict[str, Any] = {name: getattr(draws, name) for name in ("theta", "gamma", "variance", "density")}
+    found |= {f"phi_{name}": value for name, value in draws.phi.items()}
+    found |= {f"stats_{name}": value for name, value in draws.stats.items()}
+    found |= {f"states_{r}": value for r, value in enumerate(draws.states)}
+    return {name: np.asarray(value) for name, value in found.items()}
+
+
+def _name(problem: Problem, method: Sampler, prior: Prior, key: jax.Array) -> dict[str, str]:
+    """What a stored run must share with the one that resumes it."""
+    numbers = hashlib.sha256()
+    for leaf in jax.tree.leaves(problem.system):
+        numbers.update(np.ascontiguousarray(leaf).tobytes())
+    return {
+        "method": repr(method), "prior": repr(prior), "data": numbers.hexdigest(), "biases": " ".join(problem.labels),
+        "seed": np.asarray(jax.random.key_data(key)).tolist().__repr__(),
+    }  # fmt: skip
+
+
+class _Run:
+    """Chains of one method, advanced by a chunk: a thread each on a CPU, together on an accelerator."""
+
+    def __init__(self, method: Sampler, form: Form, posed: Posed, found: Pilot, key: jax.Array):
+        self.method, self.form, self.posed, self.found = method, form, posed, found
+        self.keys = jax.random.split(key, method.chains)
+        self.apart = jax.default_backend() == "cpu"
+
+    def first(self) -> Any:
+        """State of all chains, leading dim (chains,)."""
+        starts = [
+            self.method.first(
+                self.form, self.posed, *chain_start(self.form, self.posed, self.found, k, self.method.chains),
+                jax.random.key_data(self.keys[k]),
+            )
+            for k in range(self.method.chains)
+        ]  # fmt: skip
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+
+    def restored(self, leaves: list[np.ndarray]) -> Any:
+        """The state of saved leaves."""
+        return jax.tree.unflatten(jax.tree.structure(jax.eval_shape(self.first)), [jnp.asarray(a) for a in leaves])
+
+    def advance(self, state: Any, pool: ThreadPoolExecutor) -> tuple[Any, Draw]:
+        """All chains one chunk further."""
+        if not self.apart:
+            return run_chunks(self.method, self.form, self.posed, state)
+
+        def one(k: int) -> tuple[Any, Draw]:
+            with jax.enable_x64(True):
+                own = jax.tree.map(lambda leaf: leaf[k], state)
+                return jax.block_until_ready(run_chunk(self.method, self.form, self.posed, own))
+
+        found = list(pool.map(one, range(self.method.chains)))
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)

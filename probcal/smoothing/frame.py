@@ -1,0 +1,203 @@
+"""A Gaussian frame of the posterior: coordinates in which biases and trajectories are nearly independent normals.
+
+At a point the trajectories given the biases are Gaussian with a block-tridiagonal precision. They are written as a
+response to theta = (biases z, log levels) plus a closed loop driven by independent unit normals `eps`:
+u_k = -K_k x_{k-1} + C_k eps_k, the factor of the posterior that a backward information pass gives (the control form
+of the Kalman smoother). With the trajectories marginalised the data have a Gaussian log-likelihood of theta. Both are
+exact where the problem is linear and Gaussian; elsewhere `log_weight` says by how much they are wrong at a point.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from probcal import linalg
+from probcal.linalg import inverse_cholesky, multiply
+from probcal.problem import Recursion, Spec, System
+from probcal.smoothing import recursion as rec
+from probcal.smoothing.information import at_levels
+from probcal.smoothing.mode import (
+    Point,
+    compress,
+    eliminate_compressed,
+    factors,
+    linearise,
+    log_density,
+    track,
+    widening,
+)
+
+STEP = 0.05  # of a log level, for differences
+
+
+class Loop(NamedTuple):
+    """Trajectories of one recursion given theta: response, and the closed loop of the rest."""
+
+    states: jax.Array  # (E, n, Q) response of the states to theta
+    noises: jax.Array  # (E, n, Q) response of the whitened noises
+    closed: jax.Array  # (E, n, n) transition of the deviation
+    spread: jax.Array  # (E, n, n) how eps enters the deviation
+    feedback: jax.Array  # (E, n, n) K
+    factor: jax.Array  # (E, n, n) C
+
+
+class Frame(NamedTuple):
+    """Gaussian approximation around a point; Q = M + H entries of theta, biases before levels."""
+
+    point: Point
+    information: jax.Array  # (Q, Q) of the data about theta, trajectories marginalised
+    score: jax.Array  # (Q,) slope of the marginal log-likelihood at the point
+    height: jax.Array  # () its value there
+    loops: tuple[Loop, ...]
+
+    @property
+    def theta(self) -> jax.Array:
+        """Biases and log levels of the point, (Q,)."""
+        return jnp.concatenate([self.point.z, self.point.levels])
+
+    @property
+    def pull(self) -> jax.Array:
+        """Linear term of the marginal log-likelihood about zero, (Q,)."""
+        return self.information @ self.theta + self.score
+
+    def log_likelihood(self, theta: jax.Array) -> jax.Array:
+        """Gaussian marginal log-likelihood of theta (Q,)."""
+        step = theta - self.theta
+        return self.height + self.score @ step - 0.5 * step @ (self.information @ step)
+
+
+def closed_loop(part: Recursion, L: jax.Array, J: jax.Array) -> tuple[jax.Array, ...]:
+    """Closed-loop transition, spread, feedback and factor (E, n, n) of one recursion with data information J.
+
+    The information S about x_k from its own and all later data runs backwards in the symmetric (Joseph) form.
+    """
+    n = part.F.shape[-1]
+    eye = jnp.eye(n, dtype=part.F.dtype)
+
+    def step(ahead: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        F_k, L_k, J_k = epoch
+        S = J_k + ahead
+        inverse = inverse_cholesky(eye + multiply(L_k.T, multiply(S, L_k)))
+        gain = multiply(inverse.T, multiply(inverse, multiply(L_k.T, S)))
+        keep = eye - multiply(L_k, gain)
+        behind = multiply(keep.T, multiply(S, keep)) + multiply(gain.T, gain)
+        behind = multiply(F_k.T, multiply(0.5 * (behind + behind.T), F_k))
+        return behind, (multiply(keep, F_k), multiply(L_k, inverse.T), multiply(gain, F_k), inverse.T)
+
+    _, found = jax.lax.scan(step, jnp.zeros_like(eye), (part.F, L, J), reverse=True)
+    return found
+
+
+class _AtLevels(NamedTuple):
+    """Marginal log-likelihood, its slope by z, and trajectories at other levels."""
+
+    value: jax.Array
+    score: jax.Array  # (M,)
+    states: tuple[jax.Array, ...]
+    noises: tuple[jax.Array, ...]  # at the levels of the frame
+
+
+def _at(spec: Spec, system: System, point: Point, levels: jax.Array) -> _AtLevels:
+    moved = track(spec, system, at_levels(system, point, levels))
+    lins = linearise(spec, system, moved, expected=True)
+    solved = eliminate_compressed(
+        spec, system, moved.noises, levels, compress(spec, system, lins, moved.states)
+    )
+    value = log_density(spec, system, moved) - 0.5 * solved.logdet
+    return _AtLevels(value, solved.score, moved.states, at_levels(system, moved, point.levels).noises)
+
+
+@partial(jax.jit, static_argnames="spec")
+def frame_at(spec: Spec, system: System, point: Point) -> Frame:
+    """The frame at a point whose trajectories are at their mode for its biases and levels.
+
+    Derivatives by the log levels are central differences of the marginal log-likelihood.
+    """
+    lins = linearise(spec, system, point, expected=True)
+    compressed = compress(spec, system, lins, point.states)
+    solved = eliminate_compressed(spec, system, point.noises, point.levels, compressed)
+    height = log_density(spec, system, point) - 0.5 * solved.logdet
+    H = point.levels.shape[0]
+    moves = STEP * jnp.concatenate([jnp.eye(H), -jnp.eye(H)])
+    sides = [_at(spec, system, point, point.levels + moves[k]) for k in range(2 * H)]
+    information, score = _with_levels(spec, system, point, solved.information, solved.score, height, sides)
+    loops = []
+    for r, (part, (J, _), cross) in enumerate(zip(system.recursions, compressed.states, compressed.crosses, strict=True)):
+        L = factors(part, point.levels)
+        smooth = rec.smooth(part.F, L, J, rec.gains(part.F, L, J), cross)
+        by_level = [
+            ((sides[h].states[r] - sides[H + h].states[r]) / (2 * STEP),
+             (sides[h].noises[r] - sides[H + h].noises[r]) / (2 * STEP))
+            for h in range(H)
+        ]  # fmt: skip
+        states = jnp.concatenate([-smooth.states, *(s[:, :, None] for s, _ in by_level)], 2)
+        noises = jnp.concatenate([-smooth.noises, *(u[:, :, None] for _, u in by_level)], 2)
+        loops.append(Loop(states, noises, *closed_loop(part, L, J)))
+    return Frame(point, information, score, height, tuple(loops))
+
+
+def _with_levels(
+    spec: Spec, system: System, point: Point, G: jax.Array, g: jax.Array, height: jax.Array, sides: list[_AtLevels]
+) -> tuple[jax.Array, jax.Array]:
+    """Information and score of theta: those of z, bordered by the levels."""
+    H = point.levels.shape[0]
+    if H == 0:
+        return G, g
+    slope = jnp.stack([(sides[h].value - sides[H + h].value) / (2 * STEP) for h in range(H)])
+    cross = jnp.stack([-(sides[h].score - sides[H + h].score) / (2 * STEP) for h in range(H)])  # (H, M)
+    own = [[jnp.zeros(())] * H for _ in range(H)]
+    for a in range(H):
+        own[a][a] = -(sides[a].value - 2 * height + sides[H + a].value) / STEP**2
+        for b in range(a):
+            both = jnp.zeros(H).at[jnp.array([a, b])].set(STEP)
+            pair = _at(spec, system, point, point.levels + both).value + _at(spec, system, point, point.levels - both).value
+            straight = sides[a].value + sides[H + a].value + sides[b].value + sides[H + b].value
+            own[a][b] = own[b][a] = -(pair - straight + 2 * height) / (2 * STEP**2)
+    corner = jnp.array([[jnp.asarray(v) for v in row] for row in own])
+    # what the levels tell once the biases are found is kept positive: differences are no proof of it
+    held = linalg.solve_positive(G + 1e-6 * jnp.eye(G.shape[0]), cross.T) if G.shape[0] else jnp.zeros((0, H))
+    explained = cross @ held
+    values, vectors = linalg.spectrum(corner - explained)
+    rest = (vectors * jnp.maximum(values, 1.0)) @ vectors.T
+    corner = explained + rest
+    return jnp.block([[G, cross.T], [cross, 0.5 * (corner + corner.T)]]), jnp.concatenate([g, slope])
+
+
+def place(system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> Point:
+    """The point of theta (Q,) and unit normals eps (E, n) of each recursion."""
+    M = frame.point.z.shape[0]
+    step = theta - frame.theta
+    states, noises = [], []
+    for loop, x, u, e in zip(frame.loops, frame.point.states, frame.point.noises, eps, strict=True):
+        driven = jnp.einsum("eij,ej->ei", loop.spread, e)
+
+        def forward(deviation: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+            T_k, s_k = epoch
+            following = jnp.sum(T_k * deviation[None, :], 1) + s_k
+            return following, deviation
+
+        last, before = jax.lax.scan(forward, jnp.zeros_like(x[0]), (loop.closed, driven))
+        deviations = jnp.concatenate([before[1:], last[None]])
+        states.append(x + loop.states @ step + deviations)
+        own = jnp.einsum("eij,ej->ei", loop.factor, e) - jnp.einsum("eij,ej->ei", loop.feedback, before)
+        noises.append(u + loop.noises @ step + own)
+    at = Point(tuple(states), tuple(noises), theta[:M], frame.point.levels)
+    return at_levels(system, at, theta[M:]) if theta.shape[0] > M else at
+
+
+def log_joint(spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:
+    """Log density of data and eps given theta, less that of independent unit normals' constant; -inf if not finite."""
+    point = place(system, frame, theta, eps)
+    diagonals = [jnp.diagonal(loop.factor, axis1=1, axis2=2) for loop in frame.loops]
+    volume = sum((jnp.sum(jnp.log(d)) for d in diagonals), jnp.zeros(()))
+    volume = volume + widening(system, frame.point.levels) - widening(system, point.levels)
+    value = log_density(spec, system, point) + volume
+    return jnp.where(jnp.isfinite(value), value, -jnp.inf)
+
+
+def log_weight(spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:
+    """Log of the joint density of data and trajectories over the frame's: zero where the frame is exact."""
+    squares = sum(jnp.sum(e**2) for e in eps)
+    return log_joint(spec, system, frame, theta, eps) + 0.5 * squares - frame.log_likelihood(theta)
