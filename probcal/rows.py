@@ -230,6 +230,15 @@ def weigh(
     return score, rows.mask * _by_channel(block, "weight", rows.y, predicted, std)
 
 
+def slopes(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Score of every datum by its predicted value and the observed information, zero where missing, both (N, C)."""
+    std = noise_std(rows, levels)
+    score, slope = jax.jvp(
+        lambda p: _by_channel(block, "score", rows.y, p, std), (predicted,), (jnp.ones_like(predicted),)
+    )
+    return rows.mask * score, -rows.mask * slope
+
+
 def reliance(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
     """How much each datum counts against one that fits: 1 inlying, towards 0 outlying, (N, C)."""
     return rows.mask * _by_channel(block, "reliance", rows.y, predicted, noise_std(rows, levels))

@@ -1,8 +1,9 @@
 """Collapsed sampling: trajectories marginalised by the frame, Gibbs on what is left, every draw made exact.
 
-One draw: a few Gibbs sweeps on the frame's Gaussian likelihood propose hyper-parameters and biases together (surrogate
-transition, Liu 2001; delayed acceptance, Christen, Fox 2005), taken or refused by the weight of the joint posterior; the
-hyper-parameters are drawn anew; biases and trajectories then move along an ellipse (Murray, Adams, MacKay 2010).
+One draw: a few Gibbs sweeps on the frame's Gaussian likelihood propose hyper-parameters and biases together
+(surrogate transition, Liu 2001; delayed acceptance, Christen, Fox 2005), taken or refused by the weight of the joint
+posterior; the hyper-parameters are drawn anew; biases and trajectories then move along an ellipse (Murray, Adams,
+MacKay 2010).
 """
 
 from dataclasses import dataclass

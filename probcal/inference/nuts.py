@@ -67,7 +67,9 @@ class NUTS(Sampler):
     def __post_init__(self):
         super().__post_init__()
         if not (0.1 < self.target < 1 and 1 <= self.depth <= 20):
-            raise InputError(f"NUTS(target={self.target}, depth={self.depth}): target is in (0.1, 1), depth from 1 to 20")
+            raise InputError(
+                f"NUTS(target={self.target}, depth={self.depth}): target is in (0.1, 1), depth from 1 to 20"
+            )
 
     def _kernels(self, form: Form, posed: Posed) -> tuple[Any, Any]:
         return hmc(lambda free: -parts(form, posed, free).density, algo="NUTS")

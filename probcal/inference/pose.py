@@ -13,13 +13,14 @@ from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.posed import Form, Posed, activity, conditional
 from probcal.priors import Prior
 from probcal.problem import Problem, Spec, System
-from probcal.smoothing.frame import Frame, frame_at, log_weight, place
+from probcal.smoothing.frame import Frame, frame_at, log_weight, place, refined
 from probcal.smoothing.mode import Point, track
 
 PILOTS = 4  # chains of the pilot
 BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, sweeps between two
 MOVES = 4  # most times that the frame is moved
-GOOD, LOST = 0.5, 0.02  # Pareto k-hat at which a frame is left alone; acceptance below which it has failed
+GOOD, LOST = 0.5, 0.7  # Pareto k-hat at which a frame is left alone, and above which it has failed
+FITTINGS, FITTED = 2, 20  # rounds and draws (with mirror images) that a frame is fitted to
 SPREAD = 1.5  # by how much chains start further out than the pilot's draws
 
 
@@ -37,6 +38,11 @@ class Worth(NamedTuple):
     acceptance: float  # of independent draws of it
     moves: int
 
+    @property
+    def failed(self) -> bool:
+        """Whether the frame's draws cannot stand for the posterior."""
+        return self.khat > LOST
+
 
 @partial(jax.jit, static_argnames="form")
 def pilot(form: Form, posed: Posed, key: jax.Array) -> Pilot:
@@ -52,7 +58,7 @@ def pilot(form: Form, posed: Posed, key: jax.Array) -> Pilot:
             return carry, carry
 
         _, found = jax.lax.scan(one, (theta, phi), jnp.arange(BURN + STRIDE * KEPT))
-        return jax.tree.map(lambda leaf: leaf[BURN :: STRIDE], found)
+        return jax.tree.map(lambda leaf: leaf[BURN::STRIDE], found)
 
     found = jax.lax.map(chain, jax.random.split(key, PILOTS))
     return Pilot(*jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found))
@@ -72,10 +78,16 @@ def weights(form: Form, posed: Posed, theta: jax.Array, key: jax.Array) -> jax.A
 
 
 @partial(jax.jit, static_argnames="spec")
-def moved(spec: Spec, system: System, frame: Frame, theta: jax.Array) -> Frame:
-    """The frame at theta (Q,), trajectories at their mode."""
+def moved(spec: Spec, system: System, frame: Frame, theta: jax.Array, key: jax.Array) -> Frame:
+    """The frame at the mean of draws theta (D, Q), trajectories at their mode, then fitted to the draws."""
     resting = tuple(jnp.zeros_like(x) for x in frame.point.states)
-    return frame_at(spec, system, track(spec, system, place(system, frame, theta, resting)))
+    mean = jnp.mean(theta, 0)
+    frame = frame_at(spec, system, track(spec, system, place(system, frame, mean, resting)))
+    for k in range(FITTINGS):
+        keys = jax.random.split(jax.random.fold_in(key, k), len(resting))
+        eps = tuple(jax.random.normal(s, (FITTED, *x.shape)) for s, x in zip(keys, resting, strict=True))
+        frame = refined(spec, system, frame, theta[:: theta.shape[0] // FITTED][:FITTED], eps)
+    return frame
 
 
 def pareto_khat(log_weights: np.ndarray) -> float:
@@ -88,9 +100,11 @@ def pareto_khat(log_weights: np.ndarray) -> float:
 
 
 def acceptance(log_weights: np.ndarray) -> float:
-    """Probability that one draw is taken after another by their weights."""
-    finite = np.nan_to_num(log_weights, neginf=-1e300)
-    return float(np.exp(np.minimum(finite[:, None] - finite[None, :], 0.0)).mean())
+    """Expected acceptance of an independent draw by an independence sampler, from log weights (D,) of such draws."""
+    if not np.isfinite(log_weights).any():
+        return 0.0
+    weight = np.exp(log_weights - log_weights.max())
+    return float(np.minimum(weight[:, None], weight[None, :]).mean() / weight.mean())
 
 
 def pose(problem: Problem, prior: Prior, start: Point, key: jax.Array) -> tuple[Form, Posed, Pilot, Worth]:
@@ -103,16 +117,16 @@ def pose(problem: Problem, prior: Prior, start: Point, key: jax.Array) -> tuple[
     posed = Posed(system, frame_at(spec, system, start), prior.precision(problem.labels, problem.surveyed))
     best: tuple[Any, ...] | None = None
     for move in range(MOVES + 1):
-        keys = jax.random.split(jax.random.fold_in(key, move))
+        keys = jax.random.split(jax.random.fold_in(key, move), 3)
         found = pilot(form, posed, keys[0])
         logs = np.asarray(weights(form, posed, found.theta, keys[1]))
         worth = Worth(pareto_khat(logs), acceptance(logs), move)
-        if best is None or worth.acceptance > best[2].acceptance:
+        if best is None or worth.khat < best[2].khat:
             best = posed, found, worth
         if move and worth.khat < GOOD:
             break
-        mean = found.theta.mean(0) if worth.acceptance > LOST or move else posed.frame.theta
-        frame = moved(spec, system, posed.frame, mean)
+        draws = found.theta
+        frame = moved(spec, system, posed.frame, draws, keys[2])
         if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(frame)):
             break
         posed = posed._replace(frame=frame)

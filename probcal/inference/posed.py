@@ -111,7 +111,6 @@ def update_inclusions(form: Form, posed: Posed, phi: Phi, key: jax.Array, *, bac
     covariance = jnp.where(both, start.inverse.T @ start.inverse, 0.0)
     share = kind.share(phi)
     odds = jnp.log(share) - jnp.log1p(-share)
-    Q = alpha.shape[0]
 
     def without(V: jax.Array, m: jax.Array) -> jax.Array:
         column = V[:, m]

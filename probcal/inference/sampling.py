@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.inference.pose import LOST, Pilot, Worth, chain_start, pose
+from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Posed
 from probcal.inference.run import Progress
 from probcal.inference.sampler import Draw, Sampler, run_chunk, run_chunks
@@ -80,7 +80,7 @@ def sample(
     keys = jax.random.split(key)
     form, posed, found, worth = pose(problem, prior, start, keys[0])
     note = ""
-    if worth.acceptance < LOST and fallback is not None and isinstance(prior, fallback.priors):
+    if worth.failed and fallback is not None and isinstance(prior, fallback.priors):
         note = (
             f"{method.name}: the collapse does not fit (Pareto k-hat {worth.khat:.2g}, acceptance"
             f" {worth.acceptance:.2g} after {worth.moves} moves); {fallback.name} took over."
@@ -105,7 +105,9 @@ def sample(
     chunks = box.chunks()
     joined = {n: np.concatenate([c[n] for c in chunks], 1)[:, : method.draws] for n in chunks[-1]}
     if not np.isfinite(joined["theta"]).all():
-        raise FitError(f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them")
+        raise FitError(
+            f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them"
+        )
     return Sampled(method, form, posed, worth, joined, time.perf_counter() - began, interrupted, note)
 
 

@@ -1,4 +1,4 @@
-"""Draws on their way to disk: a folder of whole chunks and the state to go on from, safe against a kill at any moment."""
+"""Draws on their way to disk: a folder of whole chunks and the state to go on from, safe against a kill."""
 
 import json
 import os
@@ -41,7 +41,7 @@ class Store:
             for key in mine:
                 if mine[key] != other.get(key):
                     raise InputError(
-                        f"--resume: the run in {path} has another {key}; resume it as it was begun, or give another --out"
+                        f"--resume: the run in {path} has another {key}; resume it as it began, or give another --out"
                     )
             self.count = int(saved["count"])
             self._state = [saved[f"leaf_{k}"] for k in range(int(saved["leaves"]))]

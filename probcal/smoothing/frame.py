@@ -13,9 +13,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from probcal import linalg
+from probcal import linalg, rows
 from probcal.linalg import inverse_cholesky, multiply
 from probcal.problem import Recursion, Spec, System
+from probcal.rows import Linearised
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import (
@@ -23,6 +24,7 @@ from probcal.smoothing.mode import (
     compress,
     eliminate_compressed,
     factors,
+    follow,
     linearise,
     log_density,
     track,
@@ -90,6 +92,36 @@ def closed_loop(part: Recursion, L: jax.Array, J: jax.Array) -> tuple[jax.Array,
     return found
 
 
+def averaged(
+    spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]
+) -> list[Linearised]:
+    """Every block linearised at the frame's point, with score and curvature averaged over draws.
+
+    These are the moments that the best Gaussian approximation of the joint posterior has (Opper, Archambeau 2009). Draws
+    theta (D, Q), eps (D, E, n) are taken with their mirror images, so that what is linear stays exact.
+    """
+
+    def at(theta: jax.Array, eps: tuple[jax.Array, ...]) -> list[tuple[jax.Array, jax.Array]]:
+        point = place(system, frame, theta, eps)
+        found = []
+        for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True):
+            predicted = rows.predict(block, data, point.states[r], point.z)
+            found.append(rows.slopes(block, data, predicted, point.levels))
+        return found
+
+    def pair(draw: tuple[jax.Array, tuple[jax.Array, ...]]) -> list[tuple[jax.Array, jax.Array]]:
+        theta, eps = draw
+        mirrored = at(2 * frame.theta - theta, tuple(-e for e in eps))
+        return jax.tree.map(lambda a, b: 0.5 * (a + b), at(theta, eps), mirrored)
+
+    means = jax.tree.map(lambda leaf: jnp.mean(leaf, 0), jax.lax.map(pair, (theta, eps)))
+    lins = linearise(spec, system, frame.point, expected=True)
+    return [
+        lin._replace(score=score, weight=jnp.maximum(curvature, 0.0))
+        for lin, (score, curvature) in zip(lins, means, strict=True)
+    ]
+
+
 class _AtLevels(NamedTuple):
     """Marginal log-likelihood, its slope by z, and trajectories at other levels."""
 
@@ -102,29 +134,38 @@ class _AtLevels(NamedTuple):
 def _at(spec: Spec, system: System, point: Point, levels: jax.Array) -> _AtLevels:
     moved = track(spec, system, at_levels(system, point, levels))
     lins = linearise(spec, system, moved, expected=True)
-    solved = eliminate_compressed(
-        spec, system, moved.noises, levels, compress(spec, system, lins, moved.states)
-    )
+    solved = eliminate_compressed(spec, system, moved.noises, levels, compress(spec, system, lins, moved.states))
     value = log_density(spec, system, moved) - 0.5 * solved.logdet
     return _AtLevels(value, solved.score, moved.states, at_levels(system, moved, point.levels).noises)
 
 
 @partial(jax.jit, static_argnames="spec")
 def frame_at(spec: Spec, system: System, point: Point) -> Frame:
-    """The frame at a point whose trajectories are at their mode for its biases and levels.
+    """The frame at a point whose trajectories are at their mode for its biases and levels."""
+    return _frame(spec, system, point, linearise(spec, system, point, expected=True))
 
-    Derivatives by the log levels are central differences of the marginal log-likelihood.
-    """
-    lins = linearise(spec, system, point, expected=True)
+
+@partial(jax.jit, static_argnames="spec")
+def refined(spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> Frame:
+    """The frame with trajectories and curvature fitted to draws theta (D, Q), eps (D, E, n) of it (see `averaged`)."""
+    lins = averaged(spec, system, frame, theta, eps)
+    compressed = compress(spec, system, lins, frame.point.states)
+    solved = eliminate_compressed(spec, system, frame.point.noises, frame.point.levels, compressed)
+    point = follow(system, frame.point, solved, jnp.zeros_like(frame.point.z))
+    return _frame(spec, system, point, averaged(spec, system, frame._replace(point=point), theta, eps))
+
+
+def _frame(spec: Spec, system: System, point: Point, lins: list[Linearised]) -> Frame:
+    """The frame of rows linearised at a point. By the log levels, differences of the marginal log-likelihood."""
     compressed = compress(spec, system, lins, point.states)
     solved = eliminate_compressed(spec, system, point.noises, point.levels, compressed)
-    height = log_density(spec, system, point) - 0.5 * solved.logdet
     H = point.levels.shape[0]
     moves = STEP * jnp.concatenate([jnp.eye(H), -jnp.eye(H)])
     sides = [_at(spec, system, point, point.levels + moves[k]) for k in range(2 * H)]
-    information, score = _with_levels(spec, system, point, solved.information, solved.score, height, sides)
+    information, score = _with_levels(spec, system, point, solved.information, solved.score, sides)
     loops = []
-    for r, (part, (J, _), cross) in enumerate(zip(system.recursions, compressed.states, compressed.crosses, strict=True)):
+    parts = zip(system.recursions, compressed.states, compressed.crosses, strict=True)
+    for r, (part, (J, _), cross) in enumerate(parts):
         L = factors(part, point.levels)
         smooth = rec.smooth(part.F, L, J, rec.gains(part.F, L, J), cross)
         by_level = [
@@ -135,33 +176,33 @@ def frame_at(spec: Spec, system: System, point: Point) -> Frame:
         states = jnp.concatenate([-smooth.states, *(s[:, :, None] for s, _ in by_level)], 2)
         noises = jnp.concatenate([-smooth.noises, *(u[:, :, None] for _, u in by_level)], 2)
         loops.append(Loop(states, noises, *closed_loop(part, L, J)))
+    height = log_density(spec, system, point) - 0.5 * solved.logdet
     return Frame(point, information, score, height, tuple(loops))
 
 
 def _with_levels(
-    spec: Spec, system: System, point: Point, G: jax.Array, g: jax.Array, height: jax.Array, sides: list[_AtLevels]
+    spec: Spec, system: System, point: Point, G: jax.Array, g: jax.Array, sides: list[_AtLevels]
 ) -> tuple[jax.Array, jax.Array]:
     """Information and score of theta: those of z, bordered by the levels."""
     H = point.levels.shape[0]
     if H == 0:
         return G, g
+    middle = _at(spec, system, point, point.levels).value
     slope = jnp.stack([(sides[h].value - sides[H + h].value) / (2 * STEP) for h in range(H)])
     cross = jnp.stack([-(sides[h].score - sides[H + h].score) / (2 * STEP) for h in range(H)])  # (H, M)
     own = [[jnp.zeros(())] * H for _ in range(H)]
     for a in range(H):
-        own[a][a] = -(sides[a].value - 2 * height + sides[H + a].value) / STEP**2
+        own[a][a] = -(sides[a].value - 2 * middle + sides[H + a].value) / STEP**2
         for b in range(a):
-            both = jnp.zeros(H).at[jnp.array([a, b])].set(STEP)
-            pair = _at(spec, system, point, point.levels + both).value + _at(spec, system, point, point.levels - both).value
+            both = STEP * (jnp.arange(H) == a) + STEP * (jnp.arange(H) == b)
+            pair = sum(_at(spec, system, point, point.levels + s * both).value for s in (1.0, -1.0))
             straight = sides[a].value + sides[H + a].value + sides[b].value + sides[H + b].value
-            own[a][b] = own[b][a] = -(pair - straight + 2 * height) / (2 * STEP**2)
-    corner = jnp.array([[jnp.asarray(v) for v in row] for row in own])
+            own[a][b] = own[b][a] = -(pair - straight + 2 * middle) / (2 * STEP**2)
+    corner = jnp.stack([jnp.stack(row) for row in own])
     # what the levels tell once the biases are found is kept positive: differences are no proof of it
-    held = linalg.solve_positive(G + 1e-6 * jnp.eye(G.shape[0]), cross.T) if G.shape[0] else jnp.zeros((0, H))
-    explained = cross @ held
+    explained = cross @ linalg.solve_positive(G + 1e-6 * jnp.eye(G.shape[0]), cross.T)
     values, vectors = linalg.spectrum(corner - explained)
-    rest = (vectors * jnp.maximum(values, 1.0)) @ vectors.T
-    corner = explained + rest
+    corner = explained + (vectors * jnp.maximum(values, 1.0)) @ vectors.T
     return jnp.block([[G, cross.T], [cross, 0.5 * (corner + corner.T)]]), jnp.concatenate([g, slope])
 
 
