@@ -9,5 +9,6 @@ from probcal.analysis.planning import next_anchors, next_passes, next_sensors
 from probcal.analysis.sensitivity import sensitivity
 
 __all__ = [
-    "assess", "bound_map", "bounds", "compare", "interchangeable", "next_anchors", "next_passes", "next_sensors", "observability", "sensitivity",
+    "assess", "bound_map", "bounds", "compare", "interchangeable", "next_anchors", "next_passes", "next_sensors",
+    "observability", "sensitivity",
 ]  # fmt: skip

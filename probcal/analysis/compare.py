@@ -98,23 +98,28 @@ def plugged_in(tree: xr.DataTree) -> bool:
     return bool((below > 0).all() and np.allclose(below, above, rtol=1e-6, atol=0.0))
 
 
-def interchangeable(tree: xr.DataTree, count: int = 3) -> list[tuple[str, str, float]]:
-    """The pairs of biases that a fit can hardly tell apart, with their posterior correlation, the closest first.
+def interchangeable(
+    tree: xr.DataTree, count: int = 3, among: Sequence[str] | None = None
+) -> list[tuple[str, str, float]]:
+    """The pairs of biases that a fit cannot tell apart, with their posterior correlation, those that trade most first.
 
-    These are the most anti-correlated ones, what the data know is their sum; of one node or sensor also the most
-    correlated ones, for the data may know a difference. A bias that does not vary has no pair.
+    A pair trades by its negative covariance in declared scales: the data know the sum and not the parts; within one
+    node or sensor by the size of the covariance, for there the data may know a difference. A pair of next to no
+    covariance is left out; `among` are the labels to choose from.
     """
-    draws = tree["posterior"]["bias"].transpose("chain", "draw", "bias_label")
-    labels, z = draws["bias_label"].values.astype(str), draws.values.reshape(-1, draws.sizes["bias_label"])
-    owner = np.array([label.rsplit(".", 1)[0] for label in labels])
-    varying = np.flatnonzero(z.std(0) > 0)
-    unit = (z - z.mean(0))[:, varying] / z.std(0)[varying]
-    correlation = unit.T @ unit / len(unit)
-    first, second = np.triu_indices(len(varying), 1)
-    value = correlation[first, second]
-    strength = np.where(owner[varying[first]] == owner[varying[second]], np.abs(value), -value)
-    best = np.argsort(-strength, kind="stable")[:count]
-    return [(str(labels[varying[first[k]]]), str(labels[varying[second[k]]]), float(value[k])) for k in best]
+    draws = tree["posterior"].to_dataset()["bias"].transpose("chain", "draw", "bias_label")
+    draws = draws if among is None else draws.sel(bias_label=list(among))
+    labels = draws["bias_label"].values.astype(str)
+    scale = tree["calibration"].to_dataset()["scale"].sel(bias_label=labels).values
+    covariance = np.atleast_2d(np.cov((draws.values / scale).reshape(-1, len(labels)).T))
+    sd, owner = np.sqrt(np.diag(covariance)), np.array([label.rsplit(".", 1)[0] for label in labels])
+    first, second = np.triu_indices(len(labels), 1)
+    value = covariance[first, second]
+    traded = np.where(owner[first] == owner[second], np.abs(value), -value)
+    best = [k for k in np.argsort(-traded, kind="stable")[:count] if traded[k] > 1e-12]
+    return [
+        (str(labels[first[k]]), str(labels[second[k]]), float(value[k] / (sd[first[k]] * sd[second[k]]))) for k in best
+    ]
 
 
 def chosen_pair(fits: Mapping[str, xr.DataTree], labels: Sequence[str]) -> tuple[str, str]:
@@ -253,7 +258,7 @@ def _left_out(fits: Mapping[str, xr.DataTree], labels: list[str]) -> list[Findin
     """Findings on the biases that not all fits have."""
     texts = list[str]()
     for name, tree in fits.items():
-        own = [label for label in tree["calibration"]["bias_label"].values.tolist() if label not in labels]
+        own = [label for label in tree["calibration"].to_dataset()["bias_label"].values.tolist() if label not in labels]
         if own:
             texts.append(f"{len(own)} of {name} ({own[0]}{', ...' if len(own) > 1 else ''})")
     said = f"biases that not all fits have are not compared: {', '.join(texts)}"

@@ -28,7 +28,10 @@ ENDED = {
 
 def findings(comparison: xr.DataTree) -> list[Finding]:
     """Sentences on a comparison, those that put it in question first."""
-    names, reference = comparison["estimate"]["estimator"].values.tolist(), str(comparison.attrs["reference"])
+    names, reference = (
+        comparison["estimate"].to_dataset()["estimator"].values.tolist(),
+        str(comparison.attrs["reference"]),
+    )
     methods = {name: comparison[f"method/{name}"].to_dataset() for name in names}
     found = [finding for name in names for finding in _doubts(name, methods[name])]
     for name in names:

@@ -39,11 +39,11 @@ def elpd(fits: Mapping[str, xr.DataTree], orders: Mapping[str, np.ndarray]) -> d
         if "log_likelihood" not in tree.children:
             continue
         y = tree["log_likelihood"]["y"].isel(datum=orders[name]).reset_coords(drop=True).to_dataset()
-        bias = tree["posterior"]["bias"].to_dataset()
-        pair = xr.DataTree.from_dict({"posterior": bias, "log_likelihood": y})
+        bias = tree["posterior"].to_dataset()["bias"]
+        pair = xr.DataTree.from_dict({"posterior": bias.to_dataset(), "log_likelihood": y})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a large Pareto k is reported, not warned about
-            loo = az.loo(pair, pointwise=True, reff=_efficiency(tree["posterior"]["bias"]))
+            loo = az.loo(pair, pointwise=True, reff=_efficiency(bias))
         if not np.isfinite(loo.elpd_i).all():
             continue
         pointwise[name] = loo.elpd_i.values
