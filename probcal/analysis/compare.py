@@ -17,6 +17,7 @@ Fits = Mapping[str, xr.DataTree] | Sequence[xr.DataTree]
 COLUMNS = ("mean", "sd", "lower", "upper", "gamma", "status")  # of every fit
 FURTHER = ("inclusion", "r_hat", "ess", "ess_tail")  # of some
 DRAWN = ("gamma", "contraction")  # of which samplers have draws
+NOTHING = 1e-3  # scales
 TOTALS = ("log_evidence", "log_evidence_se", "seconds")
 TEXTS = ("method", "prior", "status", "message", "settings", "intervals", "approximate")
 
@@ -103,23 +104,22 @@ def interchangeable(
 ) -> list[tuple[str, str, float]]:
     """The pairs of biases that a fit cannot tell apart, with their posterior correlation, those that trade most first.
 
-    A pair trades by its negative covariance in declared scales: the data know the sum and not the parts; within one
-    node or sensor by the size of the covariance, for there the data may know a difference. A pair of next to no
-    covariance is left out; `among` are the labels to choose from.
+    What a pair trades is its negative correlation, where the data know the sum and not the parts, times the smaller
+    sd in declared scales; within one node or sensor the size of the correlation counts, for there the data may know a
+    difference. A pair that trades next to nothing is left out; `among` are the labels to choose from.
     """
     draws = tree["posterior"].to_dataset()["bias"].transpose("chain", "draw", "bias_label")
     draws = draws if among is None else draws.sel(bias_label=list(among))
     labels = draws["bias_label"].values.astype(str)
     scale = tree["calibration"].to_dataset()["scale"].sel(bias_label=labels).values
-    covariance = np.atleast_2d(np.cov((draws.values / scale).reshape(-1, len(labels)).T))
-    sd, owner = np.sqrt(np.diag(covariance)), np.array([label.rsplit(".", 1)[0] for label in labels])
+    z = (draws.values / scale).reshape(-1, len(labels))
+    sd, owner = z.std(0), np.array([label.rsplit(".", 1)[0] for label in labels])
+    unit = (z - z.mean(0)) / np.where(sd > 0, sd, 1.0)
     first, second = np.triu_indices(len(labels), 1)
-    value = covariance[first, second]
-    traded = np.where(owner[first] == owner[second], np.abs(value), -value)
-    best = [k for k in np.argsort(-traded, kind="stable")[:count] if traded[k] > 1e-12]
-    return [
-        (str(labels[first[k]]), str(labels[second[k]]), float(value[k] / (sd[first[k]] * sd[second[k]]))) for k in best
-    ]
+    value = (unit.T @ unit / len(z))[first, second]
+    traded = np.where(owner[first] == owner[second], np.abs(value), -value) * np.minimum(sd[first], sd[second])
+    best = [k for k in np.argsort(-traded, kind="stable")[:count] if traded[k] > NOTHING]
+    return [(str(labels[first[k]]), str(labels[second[k]]), float(value[k])) for k in best]
 
 
 def chosen_pair(fits: Mapping[str, xr.DataTree], labels: Sequence[str]) -> tuple[str, str]:
