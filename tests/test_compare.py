@@ -120,8 +120,9 @@ def test_equal_fits_overlap_wholly_and_lie_at_no_distance():
     assert found["estimate"]["estimator"].values.tolist() == ["EA (ARD)", "EA (ARD) 2"]
     np.testing.assert_allclose(found["pair"]["overlap"], 1.0, atol=1e-4)
     np.testing.assert_array_equal(found["pair"]["wasserstein"], 0.0)
-    assert sentences(found, "enough")[0].startswith("EA (ARD) 2 is enough for 3 of 3 biases")
+    assert sentences(found, "enough")[0].startswith("EA (ARD) 2 agrees with EA (ARD) on 3 of 3 biases")
     assert not sentences(found, "narrow")
+    assert found["method/EA (ARD)"].attrs["posterior"] == "Gaussian"
     for node in found.subtree:
         for values in node.to_dataset().data_vars.values():
             assert values.dtype.kind != "f" or np.isfinite(values).all()

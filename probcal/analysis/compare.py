@@ -32,13 +32,13 @@ def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
     - `pair` (pair, bias_label): `overlap` of the two posteriors (1: equal) and `wasserstein`, their distance in
       declared scales (see `analysis.overlap`); coordinates first and second;
     - `method/NAME`: what this fit has and others may lack, by bias (inclusion, r_hat, ess, interval of gamma) and as
-      attributes: status, settings, `elpd` by PSIS-LOO with its error and its difference to the best, log evidence,
-      seconds, smallest ess; where the truth is known `bias_rmse` (in scales) and how many intervals hold it;
+      attributes: status, settings, `posterior` (Gaussian or draws: what the distances rest on), `elpd` by PSIS-LOO with
+      its error and its difference to the best, log evidence, seconds, smallest ess; where the truth is known
+      `bias_rmse` (in scales) and how many intervals hold it;
     - `truth` where one of the fits knows it, and `finding`: kind, subject and a sentence each.
 
     The attribute `reference` names the fit whose posterior the others are judged by: the first that was sampled, else
-    the first. Raises `InputError` for fits of different data, scales or units, and where no
-    bias is common.
+    the first. Raises `InputError` for fits of different data, scales or units, and where no bias is common.
     """
     known = named(fits, names)
     labels = _common(known)
@@ -209,6 +209,7 @@ def _method(tree: xr.DataTree, labels: list[str]) -> xr.Dataset:
             if name not in COLUMNS:
                 columns[name] = draws.mean(("chain", "draw")).values
     attrs: dict[str, Any] = {name: str(tree.attrs[name]) for name in TEXTS if name in tree.attrs}
+    attrs["posterior"] = "Gaussian" if plugged_in(tree) else "draws"  # what its distances to the others are taken from
     attrs |= {n: float(tree.attrs[n]) for n in TOTALS if n in tree.attrs and np.isfinite(tree.attrs[n])}
     if "sample_stats" in tree.children and "diverging" in tree["sample_stats"].data_vars:
         attrs["divergences"] = int(tree["sample_stats"]["diverging"].sum())

@@ -42,8 +42,8 @@ def findings(comparison: xr.DataTree) -> list[Finding]:
 
 def _doubts(name: str, method: xr.Dataset) -> list[Finding]:
     status, found = method.attrs["status"], list[Finding]()
-    if status in ENDED:
-        found.append(Finding("status", name, f"{name} {ENDED[status]}"))
+    if status != "converged":
+        found.append(Finding("status", name, f"{name} {ENDED.get(status, f'ended {status}')}"))
     if method.attrs.get("largest_r_hat", 1.0) > MIXED:
         label = method["bias_label"].values[int(np.argmax(method["r_hat"].values))]
         text = f"{name}: r_hat of {label} is {method.attrs['largest_r_hat']:.3f}, its chains disagree; draw more"
@@ -61,7 +61,8 @@ def _against(comparison: xr.DataTree, name: str, reference: str) -> list[Finding
     labels, level = estimate["bias_label"].values.astype(str), float(comparison.attrs["interval_probability"])
     scale, unit = estimate["scale"].values, [f" {u}" if u != "1" else "" for u in estimate["unit"].values]
     mean, sd = (other[column].values for column in ("mean", "sd"))
-    pruned, known = one["status"].values == "pruned", sd > 0
+    own, theirs = (estimated["status"].values == "pruned" for estimated in (one, other))
+    pruned, known = own | theirs, sd > 0
     missed = ~pruned & ((mean < one["lower"].values) | (mean > one["upper"].values))
     ratio = np.where(known, one["sd"].values / np.where(known, sd, 1.0), 1.0)
     narrow, wide = ~pruned & (ratio < NARROW), ~pruned & (ratio > 1 / NARROW)
@@ -81,19 +82,25 @@ def _against(comparison: xr.DataTree, name: str, reference: str) -> list[Finding
     there = pair["overlap"].values[np.flatnonzero(mine)[0]]  # of a pruned bias: how much of the reference is near zero
     lost = pruned & (there < level)
     enough = ~(lost | missed | narrow | wide)
-    text = f"its interval holds the mean of {reference} and its sd is within {NARROW:g} to {1 / NARROW:.2f} times that"
-    text += (
-        f", or it is pruned and {level:.0%} of {reference} lies within {ZERO:g} scales of zero" if pruned.any() else ""
+    sampled = comparison[f"method/{reference}"].attrs["posterior"] == "draws"
+    text = (
+        f"is enough for {enough.sum()} of {total} biases" if sampled else f"agrees on {enough.sum()} of {total} biases"
     )
-    found.append(Finding("enough", name, f"{name} is enough for {enough.sum()} of {total} biases: {text}"))
+    text += f": its interval holds the mean of {reference}, its sd is within {NARROW:g} to {1 / NARROW:.2f} times that"
+    if pruned.any():
+        text += f"; of those pruned {level:.0%} of the other posterior lies within {ZERO:g} scales of zero"
+    found.append(Finding("enough", name, f"{name} {text}"))
     tell("interval", missed, away, f"the {level:.0%} intervals of {{}} of {total} miss the mean of {reference}",
          lambda k: f"{one['mean'].values[k]:.3g} against {mean[k]:.3g}{unit[k]}")  # fmt: skip
     tell("narrow", narrow, -ratio, f"the sd of {{}} of {total} is below {NARROW:g} times that of {reference}",
          lambda k: f"{ratio[k]:.2g} times")  # fmt: skip
     tell("wide", wide, ratio, f"the sd of {{}} of {total} is above {1 / NARROW:.2f} times that of {reference}",
          lambda k: f"{ratio[k]:.2g} times")  # fmt: skip
-    text = f"{{}} of the {pruned.sum()} that it pruned are not zero to {reference}, which leaves them"
-    tell("pruned", lost, -there, text, lambda k: f"{there[k]:.0%} near zero, sd {sd[k] / scale[k]:.2g} scales")
+    text = f"{{}} of the {own.sum()} that it pruned are not zero to {reference}, which leaves them"
+    tell("pruned", lost & own, -there, text, lambda k: f"{there[k]:.0%} near zero, sd {sd[k] / scale[k]:.2g} scales")
+    wider = one["sd"].values / scale
+    text = f"{{}} of the {theirs.sum()} that {reference} pruned are not zero to it, which leaves them"
+    tell("pruned", lost & theirs & ~own, -there, text, lambda k: f"{there[k]:.0%} near zero, sd {wider[k]:.2g} scales")
     method = comparison[f"method/{reference}"].to_dataset()
     if "gamma_upper" in method:
         upper, gamma = method["gamma_upper"].values, one["gamma"].values
