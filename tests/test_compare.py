@@ -242,7 +242,7 @@ ERRORS = [
     (lambda: compare({"a": GOOD, "b": GOOD}, ["c", "d"]), "the fits have names already; give names to a sequence"),
     (lambda: compare([GOOD, GOOD], ["a"]), "compare: 1 names for 2 fits; give each fit a name of its own"),
     (lambda: compare([GOOD, GOOD], ["a", "a"]), "compare: 2 names for 2 fits; give each fit a name of its own"),
-    (lambda: compare([GOOD, GOOD], ["a", "b/c"]), 'compare: a fit cannot be called "b/c"; give a name without "/"'),
+    (lambda: compare([GOOD, GOOD], ["a", "b/c"]), 'compare: a fit cannot be called "b/c"; give a name of letters'),
     (lambda: compare([GOOD, synthetic([0], [1], ["c.x"])]),
      '"EA (ARD)" and the others have no bias in common; compare'),
     (lambda: compare([GOOD, changed(lambda t: t["calibration"]["scale"].__setitem__(1, 2.0))]),

@@ -87,8 +87,8 @@ def named(fits: Fits, names: Sequence[str] | None = None) -> dict[str, xr.DataTr
     if len(names) != len(fits) or len(set(names)) < len(names):
         raise InputError(f"compare: {len(names)} names for {len(fits)} fits; give each fit a name of its own")
     for name in names:
-        if not name or "/" in name:
-            raise InputError(f'compare: a fit cannot be called "{name}"; give a name without "/"')
+        if not name.strip(".") or "/" in name:
+            raise InputError(f'compare: a fit cannot be called "{name}"; give a name of letters, without "/"')
     return dict(zip(names, fits, strict=True))
 
 

@@ -70,12 +70,14 @@ def _against(comparison: xr.DataTree, name: str, reference: str) -> list[Finding
     total, found = len(labels), list[Finding]()
 
     def tell(kind: str, mask: np.ndarray, size: np.ndarray, text: str, of: Callable[[int], str]) -> None:
-        """One sentence on the biases in a mask, those of the largest size named."""
+        """One sentence on the biases in a mask, {} their number, those of the largest size named."""
         order = np.flatnonzero(mask)[np.argsort(-size[mask], kind="stable")]
         if len(order):
             listed = ", ".join(f"{labels[k]} ({of(k)})" for k in order[:NAMES])
             more = f" and {len(order) - NAMES} more" if len(order) > NAMES else ""
-            found.append(Finding(kind, labels[order[0]], f"{name}: {text.format(len(order))}: {listed}{more}"))
+            found.append(
+                Finding(kind, labels[order[0]], f"{name}: {text.replace('{}', str(len(order)), 1)}: {listed}{more}")
+            )
 
     pair = comparison["pair"].to_dataset()
     mine = [{a, b} == {name, reference} for a, b in zip(pair["first"].values, pair["second"].values, strict=True)]
@@ -83,9 +85,8 @@ def _against(comparison: xr.DataTree, name: str, reference: str) -> list[Finding
     lost = pruned & (there < level)
     enough = ~(lost | missed | narrow | wide)
     sampled = comparison[f"method/{reference}"].attrs["posterior"] == "draws"
-    text = (
-        f"is enough for {enough.sum()} of {total} biases" if sampled else f"agrees on {enough.sum()} of {total} biases"
-    )
+    verb = "is enough for" if sampled else f"agrees with {reference} on"
+    text = f"{verb} {enough.sum()} of {total} biases"
     text += f": its interval holds the mean of {reference}, its sd is within {NARROW:g} to {1 / NARROW:.2f} times that"
     if pruned.any():
         text += f"; of those pruned {level:.0%} of the other posterior lies within {ZERO:g} scales of zero"

@@ -35,8 +35,10 @@ def plot_methods(comparison: xr.DataTree, ax: Axes | None = None) -> Axes:
         mean, lower, upper = (mine[column].values / scale for column in ("mean", "lower", "upper"))
         place = rows + (k - (count - 1) / 2) * 0.8 / count
         ax.hlines(place, lower, upper, color=colour(k), linewidth=1.6, zorder=2)
-        ax.plot(mean, place, "o", color=colour(k), markersize=3.5, label=plain(name), zorder=3)
-        if comparison[f"method/{name}"].attrs["status"] not in INVALID:
+        status = comparison[f"method/{name}"].attrs["status"]
+        label = plain(name) + (f", {status}" if status in INVALID else "")
+        ax.plot(mean, place, "o", color=colour(k), markersize=3.5, label=label, zorder=3)
+        if status not in INVALID:
             seen += [lower, upper]
     if "truth" in comparison.children:
         true = comparison["truth"].to_dataset()["bias"].to_series().reindex(labels).to_numpy() / scale
