@@ -136,7 +136,7 @@ def _prediction(methods: dict[str, xr.Dataset]) -> list[Finding]:
         return found
     best, alike = max(known, key=lambda name: known[name]["elpd"]), list[str]()
     for name in known:
-        difference, error = -known[name]["elpd_difference"], known[name]["elpd_difference_se"]
+        difference, error = abs(known[name]["elpd_difference"]), known[name]["elpd_difference_se"]
         by = f"{difference:.1f} \N{PLUS-MINUS SIGN} {error:.1f}"
         if difference > max(2 * error, CERTAIN):
             found.append(Finding("elpd", name, f"{best} predicts better than {name} by {by} nats (elpd)"))
