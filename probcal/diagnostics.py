@@ -1,4 +1,4 @@
-"""What a truth says of a saved fit or study: position error, bias error, coverage."""
+"""What a truth says of a saved fit or study: position and bias error, coverage; tables of studies, comparisons."""
 
 import numpy as np
 import pandas as pd
@@ -59,3 +59,24 @@ def study_table(study: xr.Dataset) -> pd.DataFrame:
         frame[status] = frame["status"] == status
         table[status] = frame.reset_index().groupby([*grid_of(study), "estimator"], sort=False)[status].sum()
     return table.reset_index().rename(columns={"estimator": "method"}).dropna(axis=1, how="all")  # no sd of one run
+
+
+def comparison_rows(comparison: xr.DataTree) -> pd.DataFrame:
+    """A comparison as a long table: method, other, bias, quantity, value; other and bias may be empty."""
+    estimate = comparison["estimate"].to_dataset()
+    columns = ["method", "other", "bias", "quantity", "value"]
+    parts = [estimate[[n for n in estimate.data_vars if n != "status"]].drop_vars(["unit", "scale"])]
+    parts[0] = parts[0].rename(estimator="method")
+    parts.append(comparison["pair"].to_dataset().rename(first="method", second="other"))
+    for name in estimate["estimator"].values:
+        parts.append(comparison[f"method/{name}"].to_dataset().assign_coords(method=str(name)))
+    frames = []
+    for part in parts:
+        frame = part.to_dataframe().reset_index().rename(columns={"bias_label": "bias"})
+        frame = frame.assign(**{key: "" for key in ("other",) if key not in frame})
+        frames.append(frame.melt(columns[:3], [str(n) for n in part.data_vars], "quantity"))
+        totals = [(key, value) for key, value in part.attrs.items() if isinstance(value, (int, float, np.number))]
+        if totals:
+            rows = [[str(part["method"].item()), "", "", key, float(value)] for key, value in totals]
+            frames.append(pd.DataFrame(rows, columns=columns))
+    return pd.concat(frames, ignore_index=True)[columns]

@@ -1,8 +1,13 @@
 """What all pictures share: colours, limits, plain texts, axes without pyplot."""
 
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#5d3a9b")
 BEFORE = "#a6a6a6"
@@ -36,3 +41,13 @@ def plain(text: object, longest: int = 40) -> str:
 def probability(tree: xr.DataTree) -> float:
     """Probability of the intervals of a fit."""
     return float(tree.attrs.get("interval_probability", INTERVAL))
+
+
+def ellipse(centre: Sequence[float], covariance: np.ndarray, probability: float, **style: Any) -> Ellipse:
+    """Ellipse that holds a probability of a Gaussian in the plane, covariance (2, 2)."""
+    (xx, xy), (_, yy) = covariance
+    spread = np.hypot((xx - yy) / 2, xy)
+    variances = np.maximum([(xx + yy) / 2 + spread, (xx + yy) / 2 - spread], 0.0)
+    width, height = 2.0 * np.sqrt(-2.0 * np.log1p(-probability) * variances)
+    angle = float(np.degrees(np.arctan2(2 * xy, xx - yy) / 2))
+    return Ellipse((float(centre[0]), float(centre[1])), width, height, angle=angle, **style)

@@ -11,7 +11,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Ellipse, FancyArrowPatch
+from matplotlib.patches import FancyArrowPatch
 from matplotlib.ticker import MaxNLocator
 
 from probcal.plots.base import (
@@ -25,6 +25,7 @@ from probcal.plots.base import (
     POINTS,
     ROWS,
     colour,
+    ellipse,
     new_axes,
     plain,
     probability,
@@ -291,23 +292,8 @@ def _draw_shift(ax: Axes, tree: xr.DataTree, name: str, start: np.ndarray, end: 
     covariance = _position_covariance(tree, name)
     if not np.isfinite(covariance).all():
         return
-    (xx, xy), (_, yy) = covariance
-    spread = np.hypot((xx - yy) / 2, xy)
-    variances = np.maximum([(xx + yy) / 2 + spread, (xx + yy) / 2 - spread], 0.0)
-    width, height = 2.0 * np.sqrt(-2.0 * np.log1p(-probability(tree)) * variances)
-    angle = np.degrees(np.arctan2(2 * xy, xx - yy) / 2)
-    ax.add_patch(
-        Ellipse(
-            tuple(end),
-            width,
-            height,
-            angle=angle,
-            facecolor="#00000018",
-            edgecolor="black",
-            linewidth=0.8,
-            zorder=4,
-        )
-    )
+    shape: dict[str, Any] = {"facecolor": "#00000018", "edgecolor": "black", "linewidth": 0.8, "zorder": 4}
+    ax.add_patch(ellipse(end.tolist(), covariance, probability(tree), **shape))
 
 
 def _position_covariance(tree: xr.DataTree, name: str) -> np.ndarray:

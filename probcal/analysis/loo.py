@@ -1,0 +1,70 @@
+"""How well fits of the same data predict: elpd by PSIS-LOO of every datum, and the paired difference to the best.
+
+Vehtari, Gelman and Gabry 2017; they are what `arviz.loo` and `arviz.compare` give.
+"""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import arviz as az
+import numpy as np
+import xarray as xr
+
+from probcal.types import InputError
+
+
+def same_data(fits: Mapping[str, xr.DataTree]) -> dict[str, np.ndarray]:
+    """The order in which the data of each fit are those of all, by row and channel; sensor models may order them anew.
+
+    Raises `InputError` naming two fits where the data differ.
+    """
+    orders, kept = dict[str, np.ndarray](), dict[str, tuple[np.ndarray, ...]]()
+    for name, tree in fits.items():
+        data = tree["observed_data"].to_dataset()
+        row, channel = data["row"].values, data["channel"].values.astype(str)
+        orders[name] = np.lexsort((channel, row))
+        kept[name] = tuple(values[orders[name]] for values in (row, channel, data["y"].values))
+    (first, wanted), *others = kept.items()
+    for name, found in others:
+        if not all(np.array_equal(a, b) for a, b in zip(wanted, found, strict=True)):
+            raise InputError(f'compare: "{first}" and "{name}" are fits of different data; fit them to one table')
+    return orders
+
+
+def elpd(fits: Mapping[str, xr.DataTree], orders: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+    """By fit with a log-likelihood: elpd, its error, p_loo, share of bad Pareto k, and difference to the best."""
+    found, pointwise = dict[str, dict[str, Any]](), dict[str, np.ndarray]()
+    for name, tree in fits.items():
+        if "log_likelihood" not in tree.children:
+            continue
+        y = tree["log_likelihood"]["y"].isel(datum=orders[name]).reset_coords(drop=True).to_dataset()
+        bias = tree["posterior"].to_dataset()["bias"]
+        pair = xr.DataTree.from_dict({"posterior": bias.to_dataset(), "log_likelihood": y})
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a large Pareto k is reported, not warned about
+            loo = az.loo(pair, pointwise=True, reff=_efficiency(bias))
+        if not np.isfinite(loo.elpd_i).all():
+            continue
+        pointwise[name] = loo.elpd_i.values
+        bad = float(np.mean(~(loo.pareto_k.values <= loo.good_k)))
+        found[name] = {"elpd": float(loo.elpd), "elpd_se": float(loo.se), "p_loo": float(loo.p), "bad_k": bad}
+        found[name]["good_k"] = float(loo.good_k)
+    if len(found) > 1:
+        best = max(found, key=lambda name: found[name]["elpd"])
+        for name, values in found.items():
+            apart = pointwise[name] - pointwise[best]
+            values |= {
+                "elpd_difference": float(apart.sum()),
+                "elpd_difference_se": float(np.std(apart) * len(apart) ** 0.5),
+            }
+    return found
+
+
+def _efficiency(draws: xr.DataArray) -> float:
+    """Effective draws of the biases over all draws; a bias whose draws are all equal tells nothing of it."""
+    varying = draws.isel(bias_label=(draws.std(("chain", "draw")) > 0).values)
+    if draws.sizes["chain"] == 1 or not varying.sizes["bias_label"]:
+        return 1.0
+    ess = az.ess(varying.to_dataset(), method="mean")["bias"].values
+    return float(ess.mean()) / (draws.sizes["chain"] * draws.sizes["draw"])

@@ -1,0 +1,152 @@
+"""Pictures of fits side by side: forest of methods, gamma against gamma, posterior of a pair of biases."""
+
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from probcal.analysis.compare import Fits, chosen_pair, interchangeable, named, plugged_in
+from probcal.plots.base import INVALID, LINEAR, ROWS, colour, ellipse, new_axes, plain, probability
+
+SCATTER = 2_000  # draws of one fit in the picture of a pair
+PAIRS = 2  # of interchangeable biases that are drawn where none is asked for
+
+
+def plot_methods(comparison: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw mean and interval of every bias by every method in units of its scale, with the true value."""
+    estimate = comparison["estimate"].to_dataset()
+    total, names = estimate.sizes["bias_label"], estimate["estimator"].values.tolist()
+    apart = comparison["pair"].to_dataset()["wasserstein"].max("pair").values
+    estimate = estimate.isel(bias_label=np.sort(np.argsort(-apart, kind="stable")[:ROWS]))
+    labels, scale = estimate["bias_label"].values, estimate["scale"].values
+    rows, count = np.arange(len(labels)), len(names)
+    ax = new_axes(ax, 9.0, min(1.8 + (0.16 + 0.09 * count) * len(rows), 30.0))
+    for row in rows[::2]:
+        ax.axhspan(row - 0.5, row + 0.5, color="0.96", zorder=0)
+    ax.axvline(0.0, color="0.3", linewidth=0.8, zorder=1)
+    seen = [np.array([-1.0, 1.0])]
+    for k, name in enumerate(names):
+        mine = estimate.sel(estimator=name)
+        mean, lower, upper = (mine[column].values / scale for column in ("mean", "lower", "upper"))
+        place = rows + (k - (count - 1) / 2) * 0.8 / count
+        ax.hlines(place, lower, upper, color=colour(k), linewidth=1.6, zorder=2)
+        status = comparison[f"method/{name}"].attrs["status"]
+        label = plain(name) + (f", {status}" if status in INVALID else "")
+        ax.plot(mean, place, "o", color=colour(k), markersize=3.5, label=label, zorder=3)
+        if status not in INVALID:
+            seen += [lower, upper]
+    if "truth" in comparison.children:
+        true = comparison["truth"].to_dataset()["bias"].to_series().reindex(labels).to_numpy() / scale
+        known = np.isfinite(true)
+        ax.plot(
+            true[known], rows[known], "|", color="#d00000", markersize=11, markeredgewidth=1.4, zorder=4, label="true"
+        )
+        seen.append(true[known])
+    low, high = (float(f(np.concatenate(seen))) for f in (np.min, np.max))
+    if max(-low, high) > LINEAR:
+        ax.set_xscale("symlog", linthresh=3.0)
+    margin = 0.04 * (high - low)
+    ax.set_xlim(low - margin, high + margin)  # what diverged is cut
+    ax.set_yticks(rows, [plain(label) for label in labels], fontsize=7.5)
+    ax.set_ylim(len(rows) - 0.4, -0.6)
+    ax.grid(axis="x", color="0.9", zorder=0)
+    ax.set_xlabel(f"bias in units of its scale, {probability(comparison):.0%} interval")
+    some = f"{len(rows)} of {total} biases, those that differ most" if len(rows) < total else f"{total} biases"
+    ax.set_title(f"{some}, {count} methods", loc="left")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
+    return ax
+
+
+def plot_gammas(comparison: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw gamma of every bias by the first method against that of the others, with its interval where it was drawn."""
+    ax = new_axes(ax, 6.5, 4.8)
+    gamma = comparison["estimate"].to_dataset()["gamma"]
+    first, *others = gamma["estimator"].values.tolist()
+    across = gamma.sel(estimator=first).values
+    ax.plot([0, 1], [0, 1], color="0.3", linewidth=0.8, zorder=1)
+    for k, name in enumerate(others):
+        method, tint = comparison[f"method/{name}"].to_dataset(), colour(k + 1)
+        if "gamma_upper" in method:
+            ax.vlines(
+                across, method["gamma_lower"], method["gamma_upper"], color=tint, linewidth=0.9, alpha=0.5, zorder=2
+            )
+        ax.plot(across, gamma.sel(estimator=name), "o", color=tint, markersize=4, label=plain(name), zorder=3)
+    ax.set(xlim=(-0.04, 1.04), ylim=(-0.04, 1.04), xlabel=f"gamma by {plain(first)}", ylabel="gamma by the others")
+    ax.grid(color="0.9")
+    ax.set_title("How well the data determine each bias (0 prior only)", loc="left")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
+    return ax
+
+
+def plot_pair(fits: Fits, labels: Sequence[str], names: Sequence[str] | None = None, ax: Axes | None = None) -> Axes:
+    """Draw the posterior draws of two biases, and on them the ellipse of the first fit whose posterior is Gaussian.
+
+    `labels` are two labels that all fits have, for instance of `interchangeable`; raises `InputError` for others.
+    """
+    known = named(fits, names)
+    first, second = chosen_pair(known, labels)
+    ax = new_axes(ax, 6.5, 4.8)
+    plugged = next((name for name, tree in known.items() if plugged_in(tree)), None)
+    keys = list[Any]()
+    for k, (name, tree) in enumerate(known.items()):
+        group = tree["calibration"].to_dataset().sel(bias_label=[first, second])
+        if name == plugged:
+            covariance = group["covariance"].sel(bias_label_other=[first, second]).values
+            style: dict[str, Any] = {"facecolor": "none", "edgecolor": colour(k), "linewidth": 1.8, "zorder": 4}
+            ax.add_patch(ellipse(group["mean"].values.tolist(), covariance, probability(tree), **style))
+            ax.plot(*group["mean"].values, "+", color=colour(k), markersize=9, markeredgewidth=1.8, zorder=4)
+            keys.append(Line2D([], [], color=colour(k), label=f"{plain(name)}, {probability(tree):.0%} ellipse"))
+            continue
+        draws = tree["posterior"].to_dataset()["bias"].sel(bias_label=[first, second])
+        z = draws.transpose("chain", "draw", "bias_label").values.reshape(-1, 2)
+        z = z[np.linspace(0, len(z) - 1, min(SCATTER, len(z))).astype(int)]
+        ax.plot(*z.T, ".", color=colour(k), markersize=2.5, alpha=0.4, zorder=2, rasterized=True)
+        keys.append(Line2D([], [], marker=".", linestyle="", color=colour(k), label=f"{plain(name)}, draws"))
+    true = {label: value for tree in known.values() for label, value in _true(tree).items()}
+    if first in true and second in true:
+        ax.plot(true[first], true[second], "x", color="#d00000", markersize=8, markeredgewidth=1.8, zorder=5)
+        keys.append(Line2D([], [], marker="x", linestyle="", color="#d00000", label="true"))
+    unit = next(iter(known.values()))["calibration"].to_dataset()["unit"].to_series()
+    ax.set(xlabel=f"{plain(first)} [{unit[first]}]", ylabel=f"{plain(second)} [{unit[second]}]")
+    ax.grid(color="0.9")
+    ax.set_title("Posterior of a pair of biases", loc="left")
+    ax.legend(handles=keys, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
+    return ax
+
+
+def _true(tree: xr.DataTree) -> dict[str, float]:
+    """True biases that a tree knows."""
+    if "truth" not in tree.children:
+        return {}
+    return {str(label): float(value) for label, value in tree["truth"].to_dataset()["bias"].to_series().items()}
+
+
+def draw_compare(
+    comparison: xr.DataTree, fits: Fits, path: str | PathLike[str], pairs: Sequence[Sequence[str]] = ()
+) -> None:
+    """Write the pictures of a comparison to one file: forest, gammas, and pairs of biases.
+
+    `fits` are those compared; where no pair is given the most interchangeable ones of the reference are drawn.
+    """
+    names = comparison["estimate"].to_dataset()["estimator"].values.tolist()
+    known = named(list(fits.values()) if isinstance(fits, Mapping) else fits, names)
+    estimate = comparison["estimate"].to_dataset()
+    labels = estimate["bias_label"].values.tolist()
+    if not pairs:
+        found = interchangeable(known[str(comparison.attrs["reference"])], PAIRS, labels)
+        pairs = [(first, second) for first, second, _ in found]
+    height = min(1.8 + (0.16 + 0.09 * len(known)) * min(len(labels), ROWS), 30.0)
+    figure = Figure(figsize=(17.0, max(height, 4.2 * (1 + len(pairs)))), layout="constrained")
+    halves: Any = figure.subfigures(1, 2, width_ratios=[1.15, 1.0])
+    left, right = halves
+    plot_methods(comparison, left.subplots())
+    axes = np.atleast_1d(right.subplots(1 + len(pairs), 1))
+    plot_gammas(comparison, axes[0])
+    for ax, pair in zip(axes[1:], pairs, strict=True):
+        plot_pair(known, pair, ax=ax)
+    figure.savefig(path, dpi=110)
