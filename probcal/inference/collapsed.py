@@ -84,7 +84,7 @@ def ellipse(
         theta = mean + c * (chain.theta - mean) + s * turn
         return theta, tuple(c * e + s * o for e, o in zip(chain.eps, other, strict=True))
 
-    def attempt(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def attempt(state: Any) -> Any:
         low, high, key, tries, _, _ = state
         key, draw = jax.random.split(key)
         angle = low + (high - low) * jax.random.uniform(draw)
