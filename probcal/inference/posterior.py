@@ -105,7 +105,7 @@ def _predictive(
         return None, None
 
     def flat(a: np.ndarray) -> jax.Array:
-        return jnp.asarray(a.reshape(-1, *a.shape[2:]))
+        return jnp.asarray(a.reshape(chains * draws, *a.shape[2:]))
 
     found = predictive(
         problem.spec, problem.system, flat(run.levels), flat(run.z), tuple(flat(s) for s in states), key
