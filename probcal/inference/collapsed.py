@@ -178,9 +178,7 @@ class Collapsed(Sampler):
     def __post_init__(self):
         super().__post_init__()
         if self.move not in MOVES or self.sweeps < 1:
-            raise InputError(
-                f'Collapsed(sweeps={self.sweeps}, move="{self.move}"): sweeps at least 1, move one of {", ".join(MOVES)}'
-            )
+            raise InputError(f'Collapsed(sweeps={self.sweeps}, move="{self.move}"): move is one of {", ".join(MOVES)}')
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Chain:
         """A chain at a draw of the frame's posterior."""
