@@ -260,7 +260,7 @@ def test_a_constant_quantity_counts_as_mixed():
 def test_wrong_settings_are_refused():
     with pytest.raises(InputError, match="a sampler needs a proper hyper-prior"):
         hierarchy_of(ARD(), fitted_problem())
-    with pytest.raises(InputError, match="target lies in"):
+    with pytest.raises(InputError, match="target is in"):
         NUTS(target=1.5)
     with pytest.raises(InputError, match="move is one of ellipse, swing"):
         Collapsed(move="leap")
