@@ -159,8 +159,8 @@ MOVES = {"ellipse": ellipse, "swing": swing}
 class Collapsed(Sampler):
     """Exact posterior of biases, hyper-parameters and trajectories, sampled with the trajectories marginalised.
 
-    Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it (as many as pay for the prior where
-    None) between two draws of each of `chains`. Biases and trajectories also move together, along an "ellipse" or by a
+    Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it (None: as many as pay for the prior)
+    between two draws of each of `chains`. Biases and trajectories also move together, along an "ellipse" or by a
     Hamiltonian "swing". Where the frame fits badly it is moved; where that fails the joint sampler `NUTS` takes over,
     or, for a spike, the swing.
     Raises `InputError` for another move or less than one sweep.
