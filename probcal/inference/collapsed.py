@@ -159,7 +159,7 @@ MOVES = {"ellipse": ellipse, "swing": swing}
 class Collapsed(Sampler):
     """Exact posterior of biases, hyper-parameters and trajectories, sampled with the trajectories marginalised.
 
-    Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it (None: as many as pay for the prior)
+    Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it (None: as pays for the prior)
     between two draws of each of `chains`. Biases and trajectories also move together, along an "ellipse" or by a
     Hamiltonian "swing". Where the frame fits badly it is moved; where that fails the joint sampler `NUTS` takes over,
     or, for a spike, the swing.
