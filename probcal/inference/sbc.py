@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ from probcal.types import FitError, InputError, float64
 BATCH = 5  # runs of one file
 ALARM = 0.01  # probability of a false alarm, over all quantities together
 FAR = 2.0  # extents of the network beyond which the start of a target is called wide
+SHORT = {"chains": 2, "warmup": 150, "draws": 150}  # of a sampler whose draws are only ranked
 STARTS = ("automatic", "truth")
 Advance = Callable[[int, int], None]  # runs done, runs in all
 
@@ -118,6 +120,14 @@ def sbc(
         if len(box.records) < 2:
             raise
     return _tree(engine, {k: box.records[k] for k in range(runs) if k in box.records}, interrupted)
+
+
+def short(method: Method) -> Method:
+    """A sampler with chains just long enough for ranks; any other method as it is."""
+    if not isinstance(method, Sampler):
+        return method
+    least = {name: min(getattr(method, name), most) for name, most in SHORT.items()}
+    return replace(method, **least)  # type: ignore[type-var]
 
 
 class _Engine:
@@ -227,8 +237,8 @@ def _of_tree(problem: Problem, tree: xr.DataTree) -> Posterior:
     z = flat(group["bias"].sel(bias_label=list(problem.labels)).values) / problem.scales
     levels = np.zeros((len(z), len(problem.levels)))
     for h, level in enumerate(problem.levels):
-        std = group["level"] if "level" in group else tree["level"]["std"]
-        levels[:, h] = np.log(std.sel(level=level.label).values.reshape(-1) / level.guess)
+        std: Any = group["level"] if "level" in group else tree["level"]["std"]
+        levels[:, h] = np.log(np.ravel(std.sel(level=level.label).values) / level.guess)
     points = Points(z, levels, tuple(flat(group[name].values) for name in names))
     return Posterior(points, {}, group.sizes["chain"], True, "read")
 
@@ -340,7 +350,7 @@ def _message(engine: _Engine, tree: xr.DataTree, failed: dict[int, str], interru
         )
     if not engine.around and (wide := far_start(engine.problem)) > FAR:
         parts.append(
-            f"The start of a target is {wide:.0f} network sizes wide, so the simulated tracks pass far away: declare it,"
+            f"The start of a target is {wide:.0f} network sizes wide, its simulated tracks pass far away: declare it,"
             ' Target(motion, start={...}), or calibrate around the data (around="data", --posterior).'
         )
     return " ".join(parts)
