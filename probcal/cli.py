@@ -693,12 +693,12 @@ def sbc_command(
 ) -> None:
     """Check a method on a model by simulation: do its intervals hold the truth as often as they say?"""
     if method not in METHODS:
-        raise InputError(f'--method "{method}" is not known{nearest(method, METHODS)}')
-    for option, name in (("--prior", prior), ("--from", truths)):
+        raise InputError(f'sbc: no method is called "{method}"{nearest(method, METHODS)}')
+    for name in (prior, truths):
         if name is not None and name not in PRIORS:
-            raise InputError(f'{option} "{name}" is not known{nearest(name, PRIORS)}')
+            raise InputError(f'sbc: no prior is called "{name}"{nearest(name, PRIORS)}')
     if resume and out is None:
-        raise InputError("sbc --resume needs --out DIR, the folder of the runs to go on with")
+        raise InputError("sbc: --resume needs --out DIR, the folder of the runs to go on with")
     value, implied = METHODS[method]
     value = value if full else short(value)
     if out is not None:

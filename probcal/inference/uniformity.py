@@ -53,7 +53,7 @@ def p_value(places: np.ndarray) -> float:
     runs, points = len(places), min(len(places), POINTS)
     counts = np.searchsorted(np.sort(places), np.arange(1, points) / points, side="right")
     least = _table(runs, points)[np.arange(points - 1), counts].min(initial=1.0)
-    return _escape(runs, points, least * (1 - 1e-9))
+    return _escape(runs, points, least * (1 + 1e-9))
 
 
 @lru_cache(maxsize=16)
