@@ -5,6 +5,8 @@ from probcal.analysis import (
     assess,
     bound_map,
     bounds,
+    compare,
+    interchangeable,
     next_anchors,
     next_passes,
     next_sensors,
@@ -12,7 +14,7 @@ from probcal.analysis import (
     sensitivity,
 )
 from probcal.diagnostics import scores
-from probcal.inference import EA, EM, EMEA, MAP, LeastSquares, fit, study, track
+from probcal.inference import EA, EM, EMEA, MAP, NUTS, Collapsed, LeastSquares, fit, study, track
 from probcal.motion import (
     ConstantAcceleration,
     ConstantVelocity,
@@ -27,7 +29,7 @@ from probcal.motion import (
 from probcal.network import Network, Node, Path
 from probcal.nodes import LocalFrame, read_nodes, write_nodes
 from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
-from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
+from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
 from probcal.problem import Problem
 from probcal.sensor import Bias, Channel, Sensor, SensorType, sensor
 from probcal.simulate import Simulation, Truth, simulate
@@ -36,11 +38,12 @@ from probcal.tree import load, outliers, save, summary
 from probcal.types import FitError, InputError
 
 __all__ = [
-    "ARD", "EA", "EM", "EMEA", "MAP", "Bernoulli", "Bias", "Channel", "ConstantAcceleration", "ConstantVelocity",
-    "CoordinatedTurn", "FitError", "Flat", "Gaussian", "Horseshoe", "InputError", "Known", "Laplace",
-    "LeastSquares", "LocalFrame", "Mixture", "Motion", "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor",
-    "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown", "White", "assess", "bound_map",
-    "bounds", "fit", "load", "next_anchors", "next_passes", "next_sensors", "noise", "observability", "outliers",
-    "priors", "read_nodes", "read_table", "save", "scores", "sensitivity", "sensor", "sensors", "simulate", "study",
-    "summary", "track", "write_nodes",
+    "ARD", "EA", "EM", "EMEA", "MAP", "NUTS", "Bernoulli", "BernoulliGaussian", "Bias", "Channel", "Collapsed",
+    "ConstantAcceleration", "ConstantVelocity", "CoordinatedTurn", "FitError", "Flat", "Gaussian", "Horseshoe",
+    "InputError", "Known", "Laplace", "LeastSquares", "LocalFrame", "Mixture", "Motion", "Network", "Node", "Path",
+    "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth",
+    "Unknown", "White", "assess", "bound_map", "bounds", "compare", "fit", "interchangeable", "load",
+    "next_anchors", "next_passes", "next_sensors", "noise", "observability", "outliers", "priors", "read_nodes",
+    "read_table", "save", "scores", "sensitivity", "sensor", "sensors", "simulate", "study", "summary", "track",
+    "write_nodes",
 ]  # fmt: skip

@@ -5,11 +5,13 @@ Bad input ends with exit code 2, a fit that is no answer, or a problem that can 
 
 import importlib.util
 import os
+import shutil
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
@@ -25,7 +27,8 @@ from probcal.analysis import assess, bound_map, compare, next_anchors, next_pass
 from probcal.analysis.compare import chosen_pair, named
 from probcal.diagnostics import comparison_rows, grid_of, scores, study_table
 from probcal.inference import METHODS, ORACLE, fit, study, track
-from probcal.inference.run import Progress
+from probcal.inference.run import Method, Progress
+from probcal.inference.sampler import Sampler
 from probcal.inference.sbc import coverage_table, sbc, short
 from probcal.inference.study import choose_methods
 from probcal.priors import PRIORS
@@ -192,7 +195,10 @@ def table_text(tree: xr.DataTree) -> str:
     for name in numbers:
         frame[name] = [f"{value:.4g}" for value in frame[name]]
     frame["gamma"] = [f"{value:.3f}" for value in frame["gamma"]]
-    shown = frame[["bias", "unit", *numbers, "gamma", "status", *(["verdict"] if "verdict" in frame else [])]]
+    mixed = [name for name in ("inclusion", "r_hat", "ess") if name in frame]
+    for name in mixed:
+        frame[name] = [f"{value:.0f}" if name == "ess" else f"{value:.3f}" for value in frame[name]]
+    shown = frame[["bias", "unit", *numbers, "gamma", *mixed, "status", *(["verdict"] if "verdict" in frame else [])]]
     return shown.to_string(index=False, justify="right")
 
 
@@ -208,6 +214,10 @@ def fit_command(
     starts: Annotated[int, typer.Option(min=1, help="starts of the search; the best optimum is reported")] = 1,
     seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(help="folder for fit.nc, summary.csv, report.html")] = None,
+    chains: Annotated[int | None, typer.Option(min=1, help="chains of a sampler")] = None,
+    draws: Annotated[int | None, typer.Option(min=1, help="draws of each chain after warm-up")] = None,
+    warmup: Annotated[int | None, typer.Option(min=0, help="steps of each chain before its draws")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on with the stopped run of a sampler in --out")] = False,
     assessed: Annotated[
         bool, typer.Option("--assess/--no-assess", help="a verdict per bias, and what the residuals say")
     ] = True,
@@ -218,6 +228,9 @@ def fit_command(
     if prior is not None and prior not in PRIORS:
         raise InputError(f'--prior "{prior}" is not known{nearest(prior, PRIORS)}')
     value, implied = METHODS[method]
+    value = _sized(value, method, {"chains": chains, "draws": draws, "warmup": warmup})
+    if resume and out is None:
+        raise InputError("--resume needs --out, the folder of the run to go on with")
     chosen: Any = PRIORS[prior] if prior is not None else implied
     if out is not None:
         _folder(out)
@@ -228,9 +241,14 @@ def fit_command(
         chosen = own
     truth = _truth(module, model, data, problem)
     with _progress() as progress:
-        tree = fit(problem, value, prior=chosen, key=seed, starts=starts, progress=progress)
+        tree = fit(
+            problem, value, prior=chosen, key=seed, starts=starts, progress=progress,
+            store=out / "draws" if out is not None else None, resume=resume,
+        )  # fmt: skip
         if out is not None:
             save(tree, out / "fit.nc")  # what is found is safe whatever comes
+            if "Interrupted" not in tree.attrs["message"]:
+                shutil.rmtree(out / "draws", ignore_errors=True)  # they are in fit.nc now
         if assessed:
             tree = assess(problem, tree, truth=truth, key=seed)
     tree.attrs["model"] = model.stem
@@ -243,10 +261,21 @@ def fit_command(
     raise typer.Exit(0 if tree.attrs["status"] == "converged" else 1)
 
 
+def _sized(method: Method, name: str, sizes: dict[str, int | None]) -> Method:
+    """The method with the numbers of chains and draws that the command line gives."""
+    given = {option: number for option, number in sizes.items() if number is not None}
+    if given and not isinstance(method, Sampler):
+        raise InputError(f'--{next(iter(given))}: "{name}" draws no chains; take collapsed, nuts or svi')
+    changed: Any = method
+    return replace(changed, **given) if given else method
+
+
 def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
     attrs = tree.attrs
-    iterations = tree["optimisation"].sizes["iteration"]
-    print(f"{attrs['method']} ({attrs['prior']}): {attrs['status']} after {iterations} iterations, {seconds:.1f} s")
+    work = f"{tree['optimisation'].sizes['iteration']} iterations" if "optimisation" in tree.children else (
+        f"{tree['posterior'].sizes['chain']} x {tree['posterior'].sizes['draw']} draws"
+    )  # fmt: skip
+    print(f"{attrs['method']} ({attrs['prior']}): {attrs['status']} after {work}, {seconds:.1f} s")
     print(f"intervals are {attrs['interval_probability']:.0%}; {attrs['intervals']}")
     if "level" in tree.children:
         for label, std in tree["level"].to_dataset()["std"].to_series().items():

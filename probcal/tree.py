@@ -4,7 +4,7 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
@@ -20,6 +20,7 @@ from probcal.types import InputError
 
 INTERVAL = 0.89  # probability of lower to upper
 LARGEST = 20_000_000  # values of a group of draws above which it is written on request only
+MORE = ("r_hat", "ess", "ess_tail", "inclusion", "included", "contraction")  # columns of samplers
 SUMMARY = ("bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma")
 
 
@@ -62,7 +63,7 @@ class Result:
     bias_status: Sequence[str]
     information: np.ndarray  # (M, M)
     evidence: float | None
-    objective: np.ndarray  # trace
+    objective: np.ndarray | None  # trace
     levels: np.ndarray  # (H,) log factors
     directions: Sequence[Any]  # name, information, vector, sentence
     draws: np.ndarray  # (chain, draw, M) of z
@@ -72,6 +73,12 @@ class Result:
     replicas: Sequence[np.ndarray] | None
     tracks: Sequence[Tracks]
     residuals: Residuals
+    lower: np.ndarray | None = None  # (M,) of the interval, in z; Gaussian where not given
+    upper: np.ndarray | None = None
+    columns: Mapping[str, np.ndarray] = field(default_factory=dict)  # further columns (M,) of the calibration
+    posterior: Mapping[str, Any] = field(default_factory=dict)  # name -> dims, values (chain, draw, ...)[, coords]
+    sample_stats: Mapping[str, np.ndarray] = field(default_factory=dict)  # (chain, draw)
+    attrs: Mapping[str, Any] = field(default_factory=dict)
 
 
 def suffix(problem: Problem, r: int) -> str:
@@ -122,19 +129,24 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         for r, states in enumerate(result.states):
             s = suffix(problem, r)
             posterior[f"state{s}"] = ((*sample, f"epoch{s}", f"component{s}"), states)
+    further: dict[str, Any] = {}
+    for name, (dims, values, *own) in result.posterior.items():
+        posterior[name] = ((*sample, *dims), values)
+        further |= own[0] if own else {}
     z = ("bias_label", labels)
     sd = np.sqrt(np.diag(result.covariance))
     half = stats.norm.ppf(0.5 + INTERVAL / 2)
     calibration = {
         "mean": result.z * scales, "sd": sd * scales,
-        "lower": (result.z - half * sd) * scales, "upper": (result.z + half * sd) * scales,
+        "lower": (result.z - half * sd if result.lower is None else result.lower) * scales,
+        "upper": (result.z + half * sd if result.upper is None else result.upper) * scales,
         "gamma": result.gamma, "precision": result.precision, "scale": scales,
         "status": np.array(result.bias_status, str), "unit": np.array([b.unit for b in problem.biases], str),
-        "kind": np.array([b.kind for b in problem.biases], str),
+        "kind": np.array([b.kind for b in problem.biases], str), **result.columns,
     }  # fmt: skip
     residual = {name: ("datum", gather(parts, picks)) for name, parts in vars(result.residuals).items()}
     groups: dict[str, xr.Dataset] = {
-        "posterior": xr.Dataset(posterior, coords={**base, "bias_label": z, **track.coords}),
+        "posterior": xr.Dataset(posterior, coords={**base, **further, "bias_label": z, **track.coords}),
         "calibration": xr.Dataset(
             {k: ("bias_label", v) for k, v in calibration.items()}
             | {
@@ -146,9 +158,12 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         "track": track,
         "observed_data": xr.Dataset({"y": ("datum", datum["y"])}, coords=coords),
         "residual": xr.Dataset(residual, coords=coords),
-        "optimisation": xr.Dataset({"objective": ("iteration", result.objective)}),
         "constant_data": constant_group(problem),
     }
+    if result.objective is not None:
+        groups["optimisation"] = xr.Dataset({"objective": ("iteration", result.objective)})
+    if result.sample_stats:
+        groups["sample_stats"] = xr.Dataset({k: (sample, v) for k, v in result.sample_stats.items()}, coords=base)
     if result.log_prior is not None:
         groups["log_prior"] = xr.Dataset(
             {"bias": ((*sample, "bias_label"), result.log_prior)}, coords={**base, "bias_label": z}
@@ -170,7 +185,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         "interval_probability": INTERVAL,
         "status": result.status, "message": result.message, "data": problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
-    }  # fmt: skip
+    } | dict(result.attrs)  # fmt: skip
     if result.evidence is not None:
         attrs["log_evidence"] = result.evidence
     for group in groups.values():
@@ -324,7 +339,7 @@ def summary(tree: xr.DataTree) -> Any:
     After `assess` also verdict and reason.
     """
     group = tree["calibration"].to_dataset()
-    columns = [*SUMMARY, "precision", "status"]
+    columns = [*SUMMARY, "precision", "status", *(name for name in MORE if name in tree["calibration"])]
     if "verdict" in tree.children:
         judged = tree["verdict"].to_dataset()[["verdict", "reason"]]
         group, columns = group.merge(judged), [*columns, *judged.data_vars]

@@ -1,8 +1,23 @@
 """Inference: `fit(problem, method)` for every method, `track` for other data, `study` over runs."""
 
 from probcal.inference.fit import fit, track
-from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, LeastSquares, table
+from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, NUTS, Collapsed, LeastSquares, table
 from probcal.inference.run import Method
 from probcal.inference.study import ORACLE, study
 
-__all__ = ["EA", "EM", "EMEA", "MAP", "METHODS", "ORACLE", "LeastSquares", "Method", "fit", "study", "table", "track"]
+__all__ = [
+    "EA",
+    "EM",
+    "EMEA",
+    "MAP",
+    "METHODS",
+    "NUTS",
+    "ORACLE",
+    "Collapsed",
+    "LeastSquares",
+    "Method",
+    "fit",
+    "study",
+    "table",
+    "track",
+]

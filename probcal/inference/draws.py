@@ -1,6 +1,7 @@
 """Random draws that jax does not have, and the kernels that Gibbs samplers are made of."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +37,7 @@ def slice_step(key: jax.Array, x: jax.Array, density: Callable[[jax.Array], jax.
     high = widen(low + WIDTH, WIDTH, WIDENINGS - below)
     low = widen(low, -WIDTH, below)
 
-    def shrink(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def shrink(state: Any) -> Any:
         low, high, k, key, at, found = state
         key, draw = jax.random.split(key)
         at = low + (high - low) * jax.random.uniform(draw)

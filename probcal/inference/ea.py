@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from probcal.inference.run import Given, Method, State, learn
+from probcal.inference.run import Given, Maximiser, State, learn
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.smoothing.information import laplace, paper_b, update_levels
@@ -63,7 +63,7 @@ def _iterate_paper_b(spec: Spec, system: System, prior: Prior, given: Given, sta
 
 
 @dataclass(frozen=True)
-class EA(Method):
+class EA(Maximiser):
     """Evidence approximation with trajectories marginalised exactly: the default.
 
     `update` of the precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed points, slower).
@@ -100,7 +100,7 @@ class EA(Method):
 
 
 @dataclass(frozen=True)
-class MAP(Method):
+class MAP(Maximiser):
     """Joint mode of trajectories and biases under a given prior, Laplace covariance.
 
     `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood.

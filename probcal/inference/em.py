@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg
-from probcal.inference.run import Given, Method, State, learn
+from probcal.inference.run import Given, Maximiser, State, learn
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
 from probcal.problem import Spec, System
 from probcal.smoothing import sigma
@@ -77,7 +77,7 @@ def _iterate(
 
 
 @dataclass(frozen=True)
-class EM(Method):
+class EM(Maximiser):
     """Expectation maximisation of the biases: ML with `Flat`, MAP with `Gaussian` (Paper A 15-21, Paper C 27-36).
 
     `linearisation` of the E-step is "extended" or, by sigma points, "unscented" or "cubature". It stops when the

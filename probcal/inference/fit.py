@@ -1,5 +1,7 @@
 """The one verb: `fit(problem, method)` turns a problem into a DataTree, whatever the method."""
 
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -9,12 +11,15 @@ import xarray as xr
 from scipy import stats
 
 from probcal import tree
-from probcal.inference.methods import EA, check_problem, choose_prior
-from probcal.inference.run import Method, Outcome, Progress, maximise
-from probcal.priors import Prior
-from probcal.problem import Problem, Spec, System
+from probcal.inference.methods import EA, MAP, NUTS, check_problem, choose_prior
+from probcal.inference.posterior import result
+from probcal.inference.run import Maximiser, Method, Outcome, Progress, maximise
+from probcal.inference.sampler import Sampler
+from probcal.inference.sampling import sample
+from probcal.priors import Gaussian, Prior
+from probcal.problem import Problem
 from probcal.simulate import Key, as_key
-from probcal.smoothing.draws import draw, predictive, residuals
+from probcal.smoothing.draws import draw, predictive, residuals_of
 from probcal.smoothing.information import at_levels, moments
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start, follow_states, further_starts, track_mode
@@ -34,6 +39,8 @@ def fit(
     starts: int = 1,
     progress: Progress | None = None,
     predictive_draws: bool | None = None,
+    store: str | PathLike[str] | None = None,
+    resume: bool = False,
 ) -> xr.DataTree:
     """Calibrate: estimate the biases of a problem and the tracks of its targets.
 
@@ -41,7 +48,9 @@ def fit(
     of the draws and of further starts; `start` replaces the automatic start. `starts` runs the method from so many
     starts, the further ones with two nodes swapped or a share of the biases drawn: the best optimum is reported,
     all of them with their evidence in the group `optimum`. `predictive_draws` forces or forbids the groups of
-    draws by datum and of trajectories, by default written up to 2e7 values each. The attributes `status` and
+    draws by datum and of trajectories, by default written up to 2e7 values each. A sampler (`Collapsed()`, `NUTS()`,
+    `SVI()`) writes its draws to the folder `store` while it runs; `resume` goes on where a killed run of the same
+    settings stopped, with the draws of an uninterrupted one; Ctrl-C leaves what was drawn. The attributes `status` and
     `message` say what the fit is worth. Raises `InputError` for a prior that the method does not take and
     `FitError` where a flat prior leaves a singular problem without any interval.
     """
@@ -56,11 +65,32 @@ def fit(
     keys = jax.random.split(as_key(key), 3)
     first = automatic_start(problem) if start is None else _suited(given, problem, start)
     points = [first, *further_starts(problem, starts - 1, keys[2])]
+    seed = int(key) if isinstance(key, (int, np.integer)) else -1
+    if isinstance(method, Sampler):
+        return _sampled(problem, method, prior, points, keys, seed, progress, predictive_draws, store, resume)
+    assert isinstance(method, Maximiser)
     outcomes = [maximise(method, problem, prior, point, progress) for point in points]
     best = max(range(starts), key=lambda k: _rank(prior, outcomes[k]))
-    seed = int(key) if isinstance(key, (int, np.integer)) else -1
     tree_ = tree.build(problem, _result(problem, method, prior, outcomes[best], keys, seed, predictive_draws))
     return tree.add_optima(tree_, problem, outcomes, best) if starts > 1 else tree_
+
+
+def _sampled(
+    problem: Problem, method: Sampler, prior: Prior, points: list[Point], keys: jax.Array, seed: int,
+    progress: Progress | None, wanted: bool | None, store: str | PathLike[str] | None, resume: bool,
+) -> xr.DataTree:  # fmt: skip
+    """The tree of a sampler, from the best of several starts."""
+    best, outcomes = 0, []
+    if len(points) > 1 or problem.levels:  # the joint mode at the declared scales: levels, and which start is best
+        outcomes = [maximise(MAP(), problem, Gaussian(), point, progress) for point in points]
+        best = max(range(len(points)), key=lambda k: _rank(Gaussian(), outcomes[k]))
+        points = [outcome.point for outcome in outcomes]
+    run = sample(
+        problem, method, prior, points[best], keys[0], progress=progress,
+        store=None if store is None else Path(store), resume=resume, fallback=NUTS(),
+    )  # fmt: skip
+    found = tree.build(problem, result(problem, prior, run, keys[1], seed, wanted))
+    return tree.add_optima(found, problem, outcomes, best) if len(points) > 1 else found
 
 
 def _suited(given: Problem, problem: Problem, start: Point) -> Point:
@@ -91,7 +121,8 @@ def _result(
     by_datum = data <= tree.LARGEST if wanted is None else wanted
     log_likelihood, replicas = (None, None)
     if by_datum:
-        log_likelihood, replicas = predictive(spec, system, point.levels, z, states, keys[1])
+        levels = jnp.broadcast_to(point.levels, (len(z), *point.levels.shape))
+        log_likelihood, replicas = predictive(spec, system, levels, z, states, keys[1])
     before = track_mode(problem, _uncalibrated(point))
     shape = (CHAINS, DRAWS)
 
@@ -114,18 +145,8 @@ def _result(
         log_likelihood=[split(a) for a in log_likelihood] if log_likelihood is not None else None,
         replicas=[split(a) for a in replicas] if replicas is not None else None,
         tracks=_tracks(point, before, spread, found.covariance),
-        residuals=_residuals(spec, system, before, point),
+        residuals=residuals_of(spec, system, before, point),
     )  # fmt: skip
-
-
-def _residuals(spec: Spec, system: System, before: Point, after: Point) -> tree.Residuals:
-    old, new = residuals(spec, system, before), residuals(spec, system, after)
-    return tree.Residuals(
-        before=[np.asarray(r.innovation) for r in old],
-        after=[np.asarray(r.innovation) for r in new],
-        std=[np.asarray(r.std) for r in new],
-        weight=[np.asarray(r.reliance) for r in new],
-    )
 
 
 def _uncalibrated(point: Point) -> Point:

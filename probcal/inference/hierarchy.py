@@ -152,14 +152,14 @@ class RegularisedHorseshoe(Hierarchy):
         """Local scales (L,), global scale, slab variance; in declared scales."""
         half = 0.5 * self.prior.slab_df
         return {
-            "local": dist.HalfCauchy(jnp.ones(len(self.learnt))),
-            "global": dist.HalfCauchy(self.prior.expected / (1.0 - self.prior.expected)),
-            "slab": dist.InverseGamma(half, half * self.prior.slab_scale**2),
+            "local_scale": dist.HalfCauchy(jnp.ones(len(self.learnt))),
+            "global_scale": dist.HalfCauchy(self.prior.expected / (1.0 - self.prior.expected)),
+            "slab_variance": dist.InverseGamma(half, half * self.prior.slab_scale**2),
         }
 
     def governed(self, phi):
         """Slab and shrinkage added."""
-        return 1.0 / phi["slab"] + 1.0 / (phi["global"] * phi["local"]) ** 2
+        return 1.0 / phi["slab_variance"] + 1.0 / (phi["global_scale"] * phi["local_scale"]) ** 2
 
     def updates(self):
         """Local scales by the auxiliary form (Makalic, Schmidt 2016) made exact for the slab; the others by slices."""
@@ -168,12 +168,14 @@ class RegularisedHorseshoe(Hierarchy):
 
         def local(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
             keys = jax.random.split(key, 3)
-            square, tau2 = phi["local"] ** 2, phi["global"] ** 2
+            square, tau2 = phi["local_scale"] ** 2, phi["global_scale"] ** 2
             auxiliary = (1.0 + 1.0 / square) / jax.random.exponential(keys[0], z.shape)
             proposal = (1.0 / auxiliary + 0.5 * z**2 / tau2) / jax.random.exponential(keys[1], z.shape)
-            ratio = 0.5 * (jnp.log1p(tau2 * proposal / phi["slab"]) - jnp.log1p(tau2 * square / phi["slab"]))
+            ratio = 0.5 * (
+                jnp.log1p(tau2 * proposal / phi["slab_variance"]) - jnp.log1p(tau2 * square / phi["slab_variance"])
+            )
             taken = jnp.log(jax.random.uniform(keys[2], z.shape)) < ratio
-            return phi | {"local": jnp.sqrt(jnp.where(taken, proposal, square))}
+            return phi | {"local_scale": jnp.sqrt(jnp.where(taken, proposal, square))}
 
         def density(z: jax.Array, local: jax.Array, log_tau: jax.Array, log_slab: jax.Array) -> jax.Array:
             tau, slab = jnp.exp(log_tau), jnp.exp(log_slab)
@@ -182,12 +184,12 @@ class RegularisedHorseshoe(Hierarchy):
             return own + 0.5 * jnp.sum(jnp.log(alpha) - alpha * z**2)
 
         def shared(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
-            tau, slab = jnp.log(phi["global"]), jnp.log(phi["slab"])
+            tau, slab = jnp.log(phi["global_scale"]), jnp.log(phi["slab_variance"])
             keys = jax.random.split(key, 3)
-            tau = slice_step(keys[0], tau, lambda t: density(z, phi["local"], t, slab))
-            slab = slice_step(keys[1], slab, lambda s: density(z, phi["local"], tau, s))
-            tau = slice_step(keys[2], tau, lambda t: density(z, phi["local"], t, slab))
-            return phi | {"global": jnp.exp(tau), "slab": jnp.exp(slab)}
+            tau = slice_step(keys[0], tau, lambda t: density(z, phi["local_scale"], t, slab))
+            slab = slice_step(keys[1], slab, lambda s: density(z, phi["local_scale"], tau, s))
+            tau = slice_step(keys[2], tau, lambda t: density(z, phi["local_scale"], t, slab))
+            return phi | {"global_scale": jnp.exp(tau), "slab_variance": jnp.exp(slab)}
 
         return [local, shared]
 

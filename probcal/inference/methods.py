@@ -5,8 +5,10 @@ To add one: a module beside this one with a frozen dataclass that inherits `infe
 
 import pandas as pd
 
+from probcal.inference.collapsed import Collapsed
 from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
+from probcal.inference.nuts import NUTS
 from probcal.inference.run import Method
 from probcal.priors import PRIORS, Flat, Laplace, Prior
 from probcal.problem import Problem
@@ -24,6 +26,8 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
     "map-l1": (MAP(), Laplace()),
     "ml": (MAP(), Flat()),
     "nls": (LeastSquares(), None),
+    "collapsed": (Collapsed(), None),
+    "nuts": (NUTS(), None),
 }
 
 

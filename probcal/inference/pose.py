@@ -54,8 +54,9 @@ def pilot(form: Form, posed: Posed, key: jax.Array) -> Pilot:
         theta = conditional(form, posed, phi).draw(first)
 
         def one(carry: Any, k: jax.Array) -> tuple[Any, Any]:
-            carry = sweep(form, posed, *carry, jax.random.fold_in(run, k), backwards=False)
-            return carry, carry
+            theta, phi = carry
+            found = sweep(form, posed, theta, phi, jax.random.fold_in(run, k), backwards=False)
+            return found, found
 
         _, found = jax.lax.scan(one, (theta, phi), jnp.arange(BURN + STRIDE * KEPT))
         return jax.tree.map(lambda leaf: leaf[BURN::STRIDE], found)
@@ -115,7 +116,7 @@ def pose(problem: Problem, prior: Prior, start: Point, key: jax.Array) -> tuple[
     spec, system = problem.spec, problem.system
     form = Form(spec, hierarchy_of(prior, problem))
     posed = Posed(system, frame_at(spec, system, start), prior.precision(problem.labels, problem.surveyed))
-    best: tuple[Any, ...] | None = None
+    best: tuple[Posed, Pilot, Worth] | None = None
     for move in range(MOVES + 1):
         keys = jax.random.split(jax.random.fold_in(key, move), 3)
         found = pilot(form, posed, keys[0])
@@ -130,6 +131,7 @@ def pose(problem: Problem, prior: Prior, start: Point, key: jax.Array) -> tuple[
         if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(frame)):
             break
         posed = posed._replace(frame=frame)
+    assert best is not None
     return form, *best
 
 

@@ -15,8 +15,9 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from probcal.inference.hierarchy import Phi
+from probcal.inference.nuts import NUTS
 from probcal.inference.posed import Form, Posed, log_prior
-from probcal.inference.run import Method, maximise
+from probcal.inference.run import Maximiser, maximise
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import Sampled, sample
 from probcal.inference.uniformity import NOMINAL, randomised_rank
@@ -27,6 +28,7 @@ from probcal.smoothing.mode import Point, log_density, log_likelihood, widening
 from probcal.types import FitError
 
 CHAINS, DRAWS = 4, 250  # of a Gaussian
+TAKEN = "taken over"  # status of a run whose method gave way to another
 
 
 class Points(NamedTuple):
@@ -54,20 +56,22 @@ class Posterior:
         return len(self.points.z)
 
 
-def sampled_posterior(problem: Problem, method: Sampler, prior: Prior, start: Point, key: jax.Array) -> Posterior:
+def sampled_posterior(
+    problem: Problem, method: Sampler, prior: Prior, start: Point, key: jax.Array, fallback: NUTS | None
+) -> Posterior:
     """Draws of a sampler, its chains one after the other."""
-    found = sample(problem, method, prior, start, key, threads=1)
+    found = sample(problem, method, prior, start, key, threads=1, fallback=fallback)
 
     def flat(a: np.ndarray) -> np.ndarray:
         return a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
 
     points = Points(flat(found.z), flat(found.levels), tuple(flat(x) for x in found.states))
     phi = {name: flat(a) for name, a in found.group("phi_").items()}
-    return Posterior(points, phi, found.z.shape[0], True, "sampled", found)
+    return Posterior(points, phi, found.z.shape[0], True, TAKEN if found.note else "sampled", found)
 
 
 def gaussian_posterior(
-    problem: Problem, prepared: Problem, method: Method, prior: Prior, start: Point, key: jax.Array
+    problem: Problem, prepared: Problem, method: Maximiser, prior: Prior, start: Point, key: jax.Array
 ) -> Posterior:
     """Draws of the Gaussian that a plug-in method reports, its noise levels held.
 

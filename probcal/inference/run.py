@@ -1,7 +1,8 @@
-"""What all methods share: the outer loop in jitted chunks with progress, and the verdict on where a fit ended.
+"""What methods share, and the outer loop of those that climb to a point: jitted chunks, progress, the verdict.
 
-A method is a frozen dataclass that inherits `Method`: `iterate`, a pure step of its outer loop, and where needed
-`close`, what it computes at the end of a chunk; `maximise` drives one fit and `inference.study` many at once.
+A method is a frozen dataclass that inherits `Maximiser` or `sampler.Sampler`. A `Maximiser` has `iterate`, a pure step
+of its outer loop, and where needed `close`, what it computes at the end of a chunk; `maximise` drives one fit and
+`inference.study` many at once.
 """
 
 from abc import ABC, abstractmethod
@@ -46,11 +47,9 @@ class State(NamedTuple):
     done: jax.Array  # ()
 
 
-class Method(ABC):
-    """What every method inherits: a frozen dataclass of static fields, with a pure `iterate`."""
+class Method:
+    """What every method inherits: a frozen dataclass of static fields."""
 
-    iterations: int  # most outer iterations
-    tolerance: float  # change of the objective at which it stops
     name: ClassVar[str]
     priors: ClassVar[tuple[type, ...]]  # the first is its own
     intervals: ClassVar[str]  # what the intervals are worth
@@ -62,6 +61,13 @@ class Method(ABC):
     def prepare(self, problem: Problem) -> Problem:
         """The problem that is solved in the place of the given one."""
         return problem
+
+
+class Maximiser(Method, ABC):
+    """A method that climbs to a point by a pure `iterate` and reports a Gaussian there."""
+
+    iterations: int  # most outer iterations
+    tolerance: float  # change of the objective at which it stops
 
     @abstractmethod
     def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
@@ -90,7 +96,7 @@ def kernel(method: Any) -> Any:
     return replace(method, iterations=0, tolerance=0.0)
 
 
-def check_method(method: Method) -> None:
+def check_method(method: Maximiser) -> None:
     """Raise `InputError` where a method would run no iteration or never know when to stop."""
     if method.iterations < 1:
         raise InputError(f"{method.name}(iterations={method.iterations}): at least one iteration is needed")
@@ -98,7 +104,7 @@ def check_method(method: Method) -> None:
         raise InputError(f"{method.name}(tolerance={method.tolerance}): give a finite number that is not negative")
 
 
-def given_of(method: Method, problem: Problem, prior: Prior) -> Given:
+def given_of(method: Maximiser, problem: Problem, prior: Prior) -> Given:
     """Arrays of a prior and of the stopping rule for a problem."""
     group = prior.groups(problem.members)
     group = np.where(problem.surveyed, len(group) + np.arange(len(group)), group)  # surveyed biases share none
@@ -139,7 +145,7 @@ def chunk(
     return method.close(spec, system, given, state), trace
 
 
-def maximise(method: Method, problem: Problem, prior: Prior, start: Point, progress: Progress | None) -> Outcome:
+def maximise(method: Maximiser, problem: Problem, prior: Prior, start: Point, progress: Progress | None) -> Outcome:
     """Run a method from a start until it is done or its iterations are spent."""
     check_method(method)
     given = given_of(method, problem, prior)

@@ -1,6 +1,6 @@
 """What samplers share: the base class, and the kernels that run many steps of a chain between two checkpoints."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -36,13 +36,14 @@ class Draw(NamedTuple):
     stats: dict[str, jax.Array]
 
 
-class Sampler(Method):
+class Sampler(Method, ABC):
     """A method whose answer is draws: a frozen dataclass with `chains`, `warmup`, `draws` and a pure `step`."""
 
     chains: int
     warmup: int
     draws: int
     chunk: ClassVar[int]  # steps between two checkpoints
+    exact: ClassVar[bool] = True  # whether its draws are those of the posterior
     intervals: ClassVar[str] = "quantiles of the exact posterior"
 
     def __post_init__(self):
@@ -57,10 +58,6 @@ class Sampler(Method):
     @abstractmethod
     def step(self, form: Form, posed: Posed, chain: Any) -> tuple[Any, Sample]:
         """The next state, and the draw it stands for."""
-
-    def iterate(self, *_: Any) -> Any:
-        """Samplers have no outer loop."""
-        raise TypeError(f"{self.name} draws samples; it has no iterations")
 
 
 def keep(form: Form, posed: Posed, sample: Sample) -> Draw:

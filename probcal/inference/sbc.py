@@ -25,14 +25,14 @@ import xarray as xr
 
 from probcal.inference.batches import Batches
 from probcal.inference.hierarchy import hierarchy_of
-from probcal.inference.methods import check_problem, choose_prior
+from probcal.inference.methods import MAP, NUTS, check_problem, choose_prior
 from probcal.inference.posed import Form
 from probcal.inference.prior_draws import check_drawable, draw_data, draw_prior, far_start
-from probcal.inference.quantities import Points, Posterior, Trial, gaussian_posterior, ranked, sampled_posterior
-from probcal.inference.run import Method
+from probcal.inference.quantities import TAKEN, Points, Posterior, Trial, gaussian_posterior, ranked, sampled_posterior
+from probcal.inference.run import Maximiser, Method, maximise
 from probcal.inference.sampler import Sampler
 from probcal.inference.uniformity import NOMINAL, p_value, shape, share, spread_p_value
-from probcal.priors import Precision, Prior
+from probcal.priors import Gaussian, Precision, Prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
 from probcal.smoothing.information import at_levels
@@ -63,6 +63,7 @@ def sbc(
     draws: int = 100,
     store: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    fallback: bool = True,
     threads: int | None = None,
     progress: Advance | None = None,
 ) -> xr.DataTree:
@@ -72,6 +73,7 @@ def sbc(
     are not to be expected). `around="data"`, or a saved fit of this problem, draws them from the posterior instead.
     `start="truth"` starts each fit near the simulated truth: cheaper, and of no account to a sampler that mixes.
     The truth is ranked among at most `draws` nearly independent draws, thinned by their effective sample size.
+    Without `fallback` a sampler stands alone: the joint sampler does not take over where its collapse does not fit.
     `store` is a folder that keeps finished runs, `resume` goes on with it, for more `runs` too; results depend neither
     on an interruption nor on the number of `threads`. Ctrl-C leaves what was finished.
 
@@ -89,7 +91,7 @@ def sbc(
     prior = choose_prior(method, prior)
     check_problem(problem)
     key = as_key(key)
-    engine = _Engine(problem, method, prior, simulate_from or prior, around, start, draws, key)
+    engine = _Engine(problem, method, prior, simulate_from or prior, around, start, draws, fallback, key)
     box = Batches(None if store is None else Path(store), engine.name(), resume=resume)
     missing = [k for k in range(runs) if k not in box.records]
     batches = [missing[:1], *(missing[k : k + BATCH] for k in range(1, len(missing), BATCH))] if missing else []
@@ -135,10 +137,11 @@ class _Engine:
 
     def __init__(
         self, problem: Problem, method: Method, prior: Prior, source: Prior, around: Any, start: str, draws: int,
-        key: jax.Array,
+        fallback: bool, key: jax.Array,
     ):  # fmt: skip
         self.problem, self.method, self.prior, self.source = problem, method, prior, source
         self.start, self.draws, self.key = start, draws, key
+        self.other = replace(NUTS(), warmup=SHORT["warmup"]) if fallback else None
         self.first = source.precision(problem.labels, problem.surveyed)
         self.around = "data" if isinstance(around, str) else "fit" if around is not None else ""
         self.pool: Posterior | None = None
@@ -148,7 +151,7 @@ class _Engine:
         elif isinstance(around, xr.DataTree):
             self.pool = _of_tree(problem, around)
         elif around == "data":
-            self.pool = self._fit(problem, automatic_start(problem), jax.random.fold_in(key, 2**31 - 1))
+            self.pool = self._fit(problem, None, jax.random.fold_in(key, 2**31 - 1))
         else:
             raise InputError(f'sbc: around is "{around}"; give "data", or a tree of fit()')
 
@@ -159,7 +162,7 @@ class _Engine:
             numbers.update(np.ascontiguousarray(leaf).tobytes())
         return {
             "method": repr(self.method), "prior": repr(self.prior), "source": repr(self.source), "start": self.start,
-            "around": self.around, "draws": str(self.draws), "data": numbers.hexdigest(),
+            "around": self.around, "draws": str(self.draws), "fallback": repr(self.other), "data": numbers.hexdigest(),
             "biases": " ".join(self.problem.labels), "seed": str(np.asarray(jax.random.key_data(self.key)).tolist()),
         }  # fmt: skip
 
@@ -179,19 +182,25 @@ class _Engine:
         phi = {name: leaf[k] for name, leaf in self.pool.phi.items()}
         return Trial(_twice(self.problem, y), point, phi, joint=False)
 
-    def _starting(self, trial: Trial) -> Point:
+    def _starting(self, trial: Trial) -> Point | None:
+        """Near the truth, or None for a start from the data."""
         if self.start == "automatic":
-            return automatic_start(trial.problem)
+            return None
         wide = Precision.single(jnp.ones(trial.problem.spec.biases))
         return find_mode(trial.problem.spec, trial.problem.system, trial.point, wide, 30, 1e-3).point
 
     def _fit(self, problem: Problem, start: Point | None, key: jax.Array) -> Posterior:
-        if isinstance(self.method, Sampler):
-            return sampled_posterior(problem, self.method, self.prior, start or automatic_start(problem), key)
-        prepared = self.method.prepare(problem)
+        """The method's answer, started as `fit` starts it where no start is given."""
+        method = self.method
+        prepared = method.prepare(problem)
         if start is None or prepared is not problem:
             start = automatic_start(prepared)
-        return gaussian_posterior(problem, prepared, self.method, self.prior, start, key)
+            if isinstance(method, Sampler) and problem.levels:
+                start = maximise(MAP(), problem, Gaussian(), start, None).point
+        if isinstance(method, Sampler):
+            return sampled_posterior(problem, method, self.prior, start, key, self.other)
+        assert isinstance(method, Maximiser)
+        return gaussian_posterior(problem, prepared, method, self.prior, start, key)
 
     def run(self, number: int) -> dict[str, np.ndarray]:
         """The record of one run."""
@@ -237,8 +246,9 @@ def _of_tree(problem: Problem, tree: xr.DataTree) -> Posterior:
     z = flat(group["bias"].sel(bias_label=list(problem.labels)).values) / problem.scales
     levels = np.zeros((len(z), len(problem.levels)))
     for h, level in enumerate(problem.levels):
-        std: Any = group["level"] if "level" in group else tree["level"]["std"]
-        levels[:, h] = np.log(np.ravel(std.sel(level=level.label).values) / level.guess)
+        drawn, held = group.get("level"), tree["level"].to_dataset()["std"]
+        std = held.sel(level=level.label) if drawn is None else drawn.sel(level_label=level.label)
+        levels[:, h] = np.log(np.ravel(std.values) / level.guess)
     points = Points(z, levels, tuple(flat(group[name].values) for name in names))
     return Posterior(points, {}, group.sizes["chain"], True, "read")
 
@@ -340,6 +350,11 @@ def _message(engine: _Engine, tree: xr.DataTree, failed: dict[int, str], interru
         parts.append(
             f"{len(failed)} runs left no posterior and are not counted, which ranks cannot make up for: "
             + next(iter(failed.values()))
+        )
+    taken = int((tree["run"]["status"] == TAKEN).sum())
+    if taken:
+        parts.append(
+            f"The collapse did not fit in {taken} of {tree['run'].sizes['run']} runs, another sampler took over."
         )
     if interrupted:
         parts.append(f"Interrupted after {tree['run'].sizes['run']} runs; resume to go on.")

@@ -13,9 +13,11 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from probcal.inference.methods import METHODS, check_problem, choose_prior
+from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
+from probcal.inference.posterior import judge, mixing
 from probcal.inference.run import (
     Given,
+    Maximiser,
     Method,
     State,
     check_method,
@@ -25,6 +27,8 @@ from probcal.inference.run import (
     low_and_far,
     verdict,
 )
+from probcal.inference.sampler import Sampler
+from probcal.inference.sampling import sample
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import Truth
@@ -35,8 +39,10 @@ from probcal.types import InputError, nearest
 
 BATCH = 10  # runs that one compiled call solves
 RESERVED = ("run", "estimator", "method", "bias_label", "bias_rmse", "coverage", "position_rmse", "status",
-            "iterations", "error", "true", "sd", "gamma", "mean", "median", "worst", "position", "runs")  # fmt: skip
+            "iterations", "error", "lower", "upper", "true", "sd", "gamma", "mean", "median", "worst", "position",
+            "runs")  # fmt: skip
 ORACLE = "oracle"  # MAP whose prior knows which biases are zero
+VECTORS = ("error", "lower", "upper", "true", "sd", "gamma")  # by bias, over its scale; the interval less the truth
 Setting = Callable[..., tuple[Problem, Truth]]
 Advance = Callable[[int, int], None]  # fits done, fits in all
 
@@ -85,9 +91,10 @@ class _Run(NamedTuple):
     problem: Problem
     truth: Truth
     start: Point
+    number: int
 
 
-def _given(method: Method, prior: Prior, run: _Run, oracle: bool) -> Given:
+def _given(method: Maximiser, prior: Prior, run: _Run, oracle: bool) -> Given:
     given = given_of(method, run.problem, prior)
     if not oracle:
         return given
@@ -122,6 +129,13 @@ def _batch(
         whole = [_simulated(setting, point, run) for point, run in cases]
         found = []
         for name, (method, prior) in methods.items():
+            if isinstance(method, Sampler):
+                found += [
+                    {"case": case, "method": name} | _drawn(run, method, prior)
+                    for case, run in zip(cases, whole, strict=True)
+                ]
+                continue
+            assert isinstance(method, Maximiser)
             runs = [_prepared(method, run) for run in whole]
             groups: dict[tuple[Any, ...], list[int]] = {}
             for k, run in enumerate(runs):
@@ -154,12 +168,12 @@ def _simulated(setting: Setting, point: dict[str, Any], number: int) -> _Run:
     unknown = [label for label in problem.labels if label not in truth.biases]
     if unknown:
         raise InputError(f'study: the truth of setting(run, ...) does not name the bias "{unknown[0]}"; give its value')
-    return _Run(problem, truth, automatic_start(problem))
+    return _Run(problem, truth, automatic_start(problem), number)
 
 
 def _prepared(method: Method, run: _Run) -> _Run:
     problem = method.prepare(run.problem)
-    return run if problem is run.problem else _Run(problem, run.truth, automatic_start(problem))
+    return run if problem is run.problem else run._replace(problem=problem, start=automatic_start(problem))
 
 
 def _record(run: _Run, prior: Prior, one: Any) -> dict[str, Any]:
@@ -175,7 +189,29 @@ def _record(run: _Run, prior: Prior, one: Any) -> dict[str, Any]:
         "position_rmse": _position_rmse(run, one.states),
         "status": verdict(bool(one.done), bool(low.any()), bool(far.any()) or not sound),
         "iterations": int(one.iterations),
-        "error": error, "true": true, "gamma": one.gamma, "sd": one.sd, "labels": problem.labels,
+        "error": error, "true": true, "gamma": one.gamma, "sd": one.sd,
+        "lower": error - half * one.sd, "upper": error + half * one.sd, "labels": problem.labels,
+    }  # fmt: skip
+
+
+def _drawn(run: _Run, method: Sampler, prior: Prior) -> dict[str, Any]:
+    """The record of a sampler: posterior means, and intervals by quantiles."""
+    problem = run.problem
+    drawn = sample(problem, method, prior, run.start, jax.random.key(run.number), threads=1, fallback=NUTS())
+    true = np.array([run.truth.biases[label] for label in problem.labels]) / problem.scales
+    z = drawn.z.reshape(-1, len(true))
+    half = 50 * (1 - INTERVAL)
+    lower, upper = np.percentile(z, [half, 100 - half], axis=0)
+    status, _ = judge(problem, prior, drawn, mixing(drawn.draws["theta"]))
+    error = z.mean(0) - true
+    return {
+        "bias_rmse": float(np.sqrt(np.mean(error**2))),
+        "coverage": float(((lower <= true) & (true <= upper)).mean()),
+        "position_rmse": _position_rmse(run, [x.mean((0, 1)) for x in drawn.states]),
+        "status": status,
+        "iterations": drawn.z.shape[1],
+        "error": error, "true": true, "gamma": drawn.draws["gamma"].mean((0, 1)), "sd": z.std(0),
+        "lower": lower - true, "upper": upper - true, "labels": problem.labels,
     }  # fmt: skip
 
 
@@ -197,7 +233,8 @@ def _pairs(methods: Mapping[str, Any]) -> dict[str, tuple[Method, Prior]]:
         method, prior = value if isinstance(value, tuple) and len(value) == 2 else (value, None)
         if not isinstance(method, Method):
             raise InputError(f'study: method "{name}" is {value!r}; give a method such as EA(), or (EA(), ARD())')
-        check_method(method)
+        if isinstance(method, Maximiser):
+            check_method(method)
         found[name] = (method, choose_prior(method, prior))
     return found
 
@@ -231,7 +268,8 @@ def study(
     method and prior.
     Variables have the grid's dims, `estimator` (the method; xarray keeps that word for itself) and `run`:
     `bias_rmse` (root mean square of the errors over their scales), `position_rmse` in m, `coverage` of the
-    intervals, `status`, `iterations`; with `bias_label`: `error`, `true`, `sd` (all over their scales) and `gamma`.
+    intervals, `status`, `iterations`; with `bias_label`: `error`, `lower` and `upper` end of the interval less the
+    truth, `true`, `sd` (all over their scales) and `gamma`.
     Raises `InputError` for an unknown method or settings whose biases differ. Runs are solved in batches by
     compiled kernels, on as many threads as there are processors.
     """
@@ -270,7 +308,7 @@ def _dataset(
     shape = (*(len(values) for values in axes.values()), len(methods), len(runs))
     scalars: dict[str, Any] = {name: np.full(shape, np.nan) for name in ("bias_rmse", "coverage", "position_rmse")}
     scalars |= {"status": np.full(shape, "", "<U13"), "iterations": np.zeros(shape, int)}
-    vectors = {name: np.full((*shape, len(labels)), np.nan) for name in ("error", "true", "sd", "gamma")}
+    vectors = {name: np.full((*shape, len(labels)), np.nan) for name in VECTORS}
     for record in records:
         point, run = record["case"]
         where = (

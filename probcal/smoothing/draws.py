@@ -5,12 +5,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from probcal import linalg, rows
 from probcal.problem import Spec, System
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.information import Moments, moments_of
 from probcal.smoothing.mode import Point, factors, linearise, of_both, of_states
+from probcal.tree import Residuals
 
 
 @partial(jax.jit, static_argnames=("spec", "count"))
@@ -54,21 +56,21 @@ def draw(
 def predictive(
     spec: Spec, system: System, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...], key: jax.Array
 ) -> tuple[list[jax.Array], list[jax.Array]]:
-    """Log-likelihood and replicated data (D, N, C) of each block, at draws z (D, M) and states (D, E, n)."""
+    """Log-likelihood and replicas (D, N, C) of each block at draws of levels (D, H), z (D, M) and states (D, E, n)."""
 
     def one(draw):
-        z_d, states_d, seed = draw
+        levels_d, z_d, states_d, seed = draw
         found = []
         for b, (block, data, r) in enumerate(zip(spec.blocks, system.rows, spec.recursion, strict=True)):
             predicted = rows.predict(block, data, states_d[r], z_d)
-            replica = rows.sample(block, data, predicted, levels, jax.random.fold_in(seed, b))
-            found.append((rows.log_likelihood(block, data, predicted, levels), replica))
+            replica = rows.sample(block, data, predicted, levels_d, jax.random.fold_in(seed, b))
+            found.append((rows.log_likelihood(block, data, predicted, levels_d), replica))
         return [f[0] for f in found], [f[1] for f in found]
 
-    return jax.lax.map(one, (z, states, jax.random.split(key, z.shape[0])))
+    return jax.lax.map(one, (levels, z, states, jax.random.split(key, z.shape[0])))
 
 
-class Residuals(NamedTuple):
+class Remainder(NamedTuple):
     """What is left of every datum of a block at a point, each (N, C), zero where missing."""
 
     innovation: jax.Array
@@ -77,16 +79,27 @@ class Residuals(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="spec")
-def residuals(spec: Spec, system: System, point: Point) -> list[Residuals]:
+def residuals(spec: Spec, system: System, point: Point) -> list[Remainder]:
     """Innovation, noise level and reliance of every datum of each block at a point."""
     found = []
     for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True):
         predicted = rows.predict(block, data, point.states[r], point.z)
         found.append(
-            Residuals(
+            Remainder(
                 rows.innovation(block, data, predicted),
                 rows.noise_std(data, point.levels),
                 rows.reliance(block, data, predicted, point.levels),
             )
         )
     return found
+
+
+def residuals_of(spec: Spec, system: System, before: Point, after: Point) -> Residuals:
+    """Residuals without and with calibration, at two points."""
+    old, new = residuals(spec, system, before), residuals(spec, system, after)
+    return Residuals(
+        before=[np.asarray(r.innovation) for r in old],
+        after=[np.asarray(r.innovation) for r in new],
+        std=[np.asarray(r.std) for r in new],
+        weight=[np.asarray(r.reliance) for r in new],
+    )

@@ -97,7 +97,7 @@ def averaged(
 ) -> list[Linearised]:
     """Every block linearised at the frame's point, with score and curvature averaged over draws.
 
-    These are the moments that the best Gaussian approximation of the joint posterior has (Opper, Archambeau 2009). Draws
+    These are the moments of the best Gaussian approximation of the joint posterior (Opper, Archambeau 2009). Draws
     theta (D, Q), eps (D, E, n) are taken with their mirror images, so that what is linear stays exact.
     """
 

@@ -1,0 +1,238 @@
+"""What the draws of a sampler say: estimates, intervals, gamma, inclusion, how well the chains mixed, in words."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import arviz as az
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from probcal import tree
+from probcal.inference.hierarchy import LEAST, MOST, SpikeAndSlab
+from probcal.inference.pose import pareto_khat
+from probcal.inference.run import FAR
+from probcal.inference.sampling import Sampled
+from probcal.priors import PRECISION_BOUNDS, Flat, Prior
+from probcal.problem import Problem
+from probcal.smoothing.directions import weak_directions
+from probcal.smoothing.draws import predictive, residuals_of
+from probcal.smoothing.information import at_levels
+from probcal.smoothing.mode import Point
+from probcal.smoothing.start import track_mode
+
+ROPE = 0.1  # scales within which a bias is practically zero
+R_HAT = 1.01  # above which chains have not mixed
+ESS = 100  # effective draws a chain below which its quantiles are not to be trusted
+BFMI = 0.3  # below which the energy is not explored (Betancourt 2016)
+
+
+def mixing(draws: np.ndarray) -> dict[str, np.ndarray]:
+    """Rank-normalised r_hat, bulk and tail ess of draws (chain, draw, P), each (P,).
+
+    A quantity that is the same in every draw counts as mixed: r_hat 1, as many effective draws as there are.
+    """
+    still = np.ptp(draws, axis=(0, 1)) == 0
+    data = xr.DataTree.from_dict({"posterior": xr.Dataset({"x": (("chain", "draw", "p"), draws)})})
+    kinds = {"ess": az.ess(data, method="bulk"), "ess_tail": az.ess(data, method="tail")}
+    if draws.shape[0] > 1:
+        kinds["r_hat"] = az.rhat(data)
+    found = {}
+    for name, values in kinds.items():
+        whole = 1.0 if name == "r_hat" else float(draws.shape[0] * draws.shape[1])
+        found[name] = np.where(still, whole, np.asarray(values["x"].values, float))
+    return found
+
+
+def result(problem: Problem, prior: Prior, run: Sampled, key: jax.Array, seed: int, wanted: bool | None) -> tree.Result:
+    """The result of a sampler for the tree; `wanted` forces or forbids draws by datum and trajectories."""
+    z, levels = run.z, run.levels
+    mixed = mixing(run.draws["theta"])
+    M = run.form.biases
+    mean, mean_levels = z.mean((0, 1)), levels.mean((0, 1))
+    covariance = np.atleast_2d(np.cov(z.reshape(-1, M), rowvar=False))
+    before, after = _points(problem, run, mean, mean_levels)
+    states = run.states
+    half = 50 * (1 - tree.INTERVAL)
+    lower, upper = np.percentile(z, [half, 100 - half], axis=(0, 1))
+    gamma = run.draws["gamma"]
+    variance = np.diag(covariance)
+    precision = np.clip((1 - gamma.mean((0, 1))) / np.maximum(variance, 1e-300), *PRECISION_BOUNDS)
+    precision = np.where(problem.surveyed | isinstance(prior, Flat), np.asarray(run.posed.first.alpha), precision)
+    information = np.asarray(run.posed.frame.information)[:M, :M]
+    status, message = judge(problem, prior, run, mixed)
+    likelihood, replicas = _predictive(problem, run, states, key, wanted)
+    size = sum(s.size for s in states)
+    return tree.Result(
+        method=run.method.name, prior=type(prior).__name__, seed=seed,
+        approximate="exact" if run.method.exact else "variational",
+        intervals=run.method.note(), settings=f"{run.method!r}, {prior!r}",
+        correlated=bool(prior.correlation), status=status, message=message, z=mean, covariance=covariance,
+        precision=precision, gamma=gamma.mean((0, 1)), bias_status=_bias_status(problem, mixed, M),
+        information=information, evidence=None, objective=None, levels=mean_levels,
+        directions=weak_directions(problem, information, after), draws=z,
+        log_prior=_log_prior(problem, prior, run),
+        states=states if (size <= tree.LARGEST if wanted is None else wanted) else None,
+        log_likelihood=likelihood, replicas=replicas, tracks=_tracks(states, before),
+        residuals=residuals_of(problem.spec, problem.system, before, after), lower=lower, upper=upper,
+        columns=_columns(run, mixed, M), posterior=_posterior(problem, run), sample_stats=_stats(run),
+        attrs=_attrs(run),
+    )  # fmt: skip
+
+
+def _points(problem: Problem, run: Sampled, z: np.ndarray, levels: np.ndarray) -> tuple[Point, Point]:
+    """Trajectories at their mode without calibration, and at the posterior means."""
+    frame = run.posed.frame.point
+    start = at_levels(problem.system, frame, jnp.asarray(levels))
+    after = track_mode(problem, start._replace(z=jnp.asarray(z)))
+    return track_mode(problem, after._replace(z=jnp.zeros_like(after.z))), after
+
+
+def _tracks(states: list[np.ndarray], before: Point) -> list[tree.Tracks]:
+    parts = zip(states, before.states, strict=True)
+    return [tree.Tracks(x.mean((0, 1)), x.std((0, 1)), np.asarray(old)) for x, old in parts]
+
+
+def _predictive(
+    problem: Problem, run: Sampled, states: list[np.ndarray], key: jax.Array, wanted: bool | None
+) -> tuple[Any, Any]:
+    """Log-likelihood and replicated data (chain, draw, N, C) of each block, or nothing where they are too many."""
+    chains, draws = run.z.shape[:2]
+    size = sum(int(np.asarray(r.mask).size) for r in problem.system.rows) * chains * draws
+    if not (size <= tree.LARGEST if wanted is None else wanted):
+        return None, None
+
+    def flat(a: np.ndarray) -> jax.Array:
+        return jnp.asarray(a.reshape(chains * draws, *a.shape[2:]))
+
+    found = predictive(
+        problem.spec, problem.system, flat(run.levels), flat(run.z), tuple(flat(s) for s in states), key
+    )  # fmt: skip
+    shape = (chains, draws)
+    likelihood, replicas = ([np.asarray(a).reshape(*shape, *a.shape[1:]) for a in part] for part in found)
+    return likelihood, replicas
+
+
+def _log_prior(problem: Problem, prior: Prior, run: Sampled) -> np.ndarray | None:
+    """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
+    if isinstance(prior, Flat) or prior.correlation or isinstance(run.form.hierarchy, SpikeAndSlab):
+        return None
+    alpha = _alpha(run)
+    return stats.norm.logpdf(run.z, 0.0, 1 / np.sqrt(np.clip(alpha, LEAST, MOST)))
+
+
+def _alpha(run: Sampled) -> np.ndarray:
+    """Prior precision (chain, draw, M) of each bias, draw by draw."""
+    phi = {name: jnp.asarray(a) for name, a in run.group("phi_").items()}
+    first = run.posed.first.alpha
+    if not phi:
+        return np.broadcast_to(np.asarray(first), run.z.shape)
+    return np.asarray(jax.vmap(jax.vmap(lambda one: run.form.hierarchy.alpha(one, first)))(phi))
+
+
+def _columns(run: Sampled, mixed: Mapping[str, np.ndarray], M: int) -> dict[str, np.ndarray]:
+    """Columns by bias beyond the usual ones."""
+    found = {name: values[:M] for name, values in mixed.items()}
+    found["contraction"] = 1.0 - run.z.var((0, 1))
+    found["inclusion"] = (np.abs(run.z) > ROPE).mean((0, 1))
+    if "phi_included" in run.draws:
+        found["included"] = np.ones(M)
+        found["included"][list(run.form.hierarchy.learnt)] = run.draws["phi_included"].mean((0, 1))
+    return found
+
+
+def _posterior(problem: Problem, run: Sampled) -> dict[str, Any]:
+    """Further posterior variables, name -> (dims beyond chain and draw, values, coords)."""
+    labels = list(problem.labels)
+    found: dict[str, Any] = {
+        "gamma": (("bias_label",), run.draws["gamma"]),
+        "contraction": (("bias_label",), 1.0 - run.draws["variance"]),
+    }
+    learnt = [labels[m] for m in run.form.hierarchy.learnt]
+    for name, values in run.group("phi_").items():
+        if values.ndim == 2:
+            found[name] = ((), values)
+        elif values.shape[2] == len(learnt):
+            found[name] = (("governed_label",), values, {"governed_label": learnt})
+        else:
+            found[name] = (("precision_group",), values)
+    if problem.levels:
+        guess = np.array([level.guess for level in problem.levels])
+        names = [level.label for level in problem.levels]
+        found["level"] = (("level_label",), guess * np.exp(run.levels), {"level_label": names})
+    return found
+
+
+def _stats(run: Sampled) -> dict[str, np.ndarray]:
+    return {"lp": run.draws["density"]} | run.group("stats_")
+
+
+def _attrs(run: Sampled) -> dict[str, Any]:
+    """Numbers of the whole run."""
+    found = {"seconds": run.seconds, "rope": ROPE, "frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
+    if not run.method.exact:
+        found["khat"] = pareto_khat(run.draws["stats_log_weight"].ravel())
+    return {name: float(value) for name, value in found.items()}
+
+
+def _bias_status(problem: Problem, mixed: Mapping[str, np.ndarray], M: int) -> tuple[str, ...]:
+    lost = mixed["r_hat"][:M] > 1.05 if "r_hat" in mixed else np.zeros(M, bool)
+    pairs = zip(problem.surveyed, lost, strict=True)
+    return tuple("not mixed" if bad else "survey" if own else "estimated" for own, bad in pairs)
+
+
+def judge(problem: Problem, prior: Prior, run: Sampled, mixed: Mapping[str, np.ndarray]) -> tuple[str, str]:
+    """Status of a run, and one or more sentences on what hurts and what to do."""
+    said = [run.note] if run.note else []
+    chains, draws = run.z.shape[:2]
+    good = True
+    names = [*problem.labels, *(level.label for level in problem.levels)]
+    if run.interrupted:
+        said.append(f"Interrupted after {draws} of {run.method.draws} draws a chain; --resume goes on.")
+        good = False
+    if "r_hat" in mixed and mixed["r_hat"].max() > R_HAT:
+        worst = int(mixed["r_hat"].argmax())
+        said.append(
+            f"The chains have not mixed: r_hat of {names[worst]} is {mixed['r_hat'][worst]:.3f}; take more draws."
+        )
+        good = False
+    worst = int(mixed["ess"].argmin())
+    if mixed["ess"][worst] < ESS * chains:
+        said.append(f"Only {mixed['ess'][worst]:.0f} effective draws of {names[worst]}; take more draws.")
+        good = False
+    good = _say_steps(run, said) and good
+    if not run.method.exact:
+        khat = pareto_khat(run.draws["stats_log_weight"].ravel())
+        worth = "it stands for the posterior" if khat < 0.7 else "it does not fit; take nuts or collapsed"
+        said.append(f"Pareto k-hat of the guide {khat:.2f}: {worth}.")
+    if isinstance(prior, Flat) and (np.abs(run.z.mean((0, 1))[~problem.surveyed]) > FAR).any():
+        return "diverged", " ".join([*said, "Some biases lie far from the stated values: use a prior, or fix some."])
+    return "converged" if good else "not converged", " ".join(said)
+
+
+def _say_steps(run: Sampled, said: list[str]) -> bool:
+    """What the steps of NUTS or of the Metropolis correction say; whether all is well."""
+    found, good = run.group("stats_"), True
+    if "diverging" in found and found["diverging"].any():
+        said.append(f"{int(found['diverging'].sum())} divergences: raise target (0.95), or take collapsed.")
+        good = False
+    if "tree_depth" in found:
+        share = float((found["tree_depth"] >= getattr(run.method, "depth", np.inf)).mean())
+        if share > 0.05:
+            said.append(
+                f"{share:.0%} of the trees reached the greatest depth: the step is short (dense=True may help)."
+            )
+    if "energy" in found:
+        energy = found["energy"]
+        bfmi = (np.diff(energy, axis=1) ** 2).mean(1) / energy.var(1)
+        if bfmi.min() < BFMI:
+            said.append(f"BFMI {bfmi.min():.2f} is below {BFMI}: the energy is hardly explored; take more draws.")
+            good = False
+    if "tries" in found and run.worth.failed:
+        said.append(
+            f"The collapse fits badly (Pareto k-hat {run.worth.khat:.1f}), the Metropolis step accepts "
+            f"{found['acceptance_rate'].mean():.0%}: draws are exact but far from independent."
+        )
+    return good
