@@ -268,14 +268,14 @@ def test_coverage_under_another_prior():
 
 
 def quick(method, prior, runs=40, problem=None):
-    return sbc(problem or radars(), method, prior, runs, start="truth", threads=2)
+    return sbc(problem or radars(), method, prior, runs, start="truth", fallback=False, threads=2)
 
 
 def test_collapsed_is_uniform():
     """40 simulations of three radars; a right sampler fails with probability 1 %."""
     tree = quick(Collapsed(chains=2, warmup=50, draws=150), HORSESHOE)
     assert tree.attrs["status"] == "uniform", tree.attrs["verdict"]
-    assert {"global", "slab", "log joint", "log likelihood"} <= set(tree["sbc"]["quantity"].values)
+    assert {"global_scale", "slab_variance", "log joint", "log likelihood"} <= set(tree["sbc"]["quantity"].values)
     assert tree["run"]["r_hat"].values.min() >= 0.99
 
 
@@ -340,10 +340,11 @@ def test_around_the_data(fitted):
     assert (again[:4] < 0.9 * sd[:4]).all()  # twice the data
 
 
+@pytest.mark.slow
 def test_around_a_sampler_keeps_hyper_parameters():
     method = Collapsed(chains=2, warmup=50, draws=150)
-    found = sbc(radars(), method, HORSESHOE, 4, around="data", start="truth", threads=1)
-    assert {"global", "slab"} <= set(found["sbc"]["quantity"].values)
+    found = sbc(radars(), method, HORSESHOE, 3, around="data", start="truth", fallback=False)
+    assert {"global_scale", "slab_variance"} <= set(found["sbc"]["quantity"].values)
     assert "log joint" not in found["sbc"]["quantity"].values
 
 
@@ -380,16 +381,8 @@ def test_runs_are_resumed(tmp_path):
     assert "resume to go on" in part.attrs["message"]
     (tmp_path / ".batch-000099.1.part.npz").write_bytes(b"half written")
     seen = []
-    again = sbc(
-        problem,
-        method,
-        Gaussian(),
-        14,
-        store=tmp_path,
-        resume=True,
-        threads=1,
-        progress=lambda d, n: seen.append((d, n)),
-    )
+    rest = dict(store=tmp_path, resume=True, threads=1)
+    again = sbc(problem, method, Gaussian(), 42, **rest, progress=lambda *at: seen.append(at))
     assert seen[-1] == (42, 42)
     xr.testing.assert_identical(whole["sbc"].to_dataset(), again["sbc"].to_dataset())
     assert whole.attrs == again.attrs
