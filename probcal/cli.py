@@ -27,9 +27,10 @@ from probcal.analysis import assess, bound_map, compare, next_anchors, next_pass
 from probcal.analysis.compare import chosen_pair, named
 from probcal.diagnostics import comparison_rows, grid_of, scores, study_table
 from probcal.inference import METHODS, ORACLE, fit, study, track
+from probcal.inference.coverage import coverage_table
 from probcal.inference.run import Method, Progress
 from probcal.inference.sampler import Sampler
-from probcal.inference.sbc import coverage_table, sbc, short
+from probcal.inference.sbc import sbc, short
 from probcal.inference.study import choose_methods
 from probcal.priors import PRIORS
 from probcal.problem import Problem

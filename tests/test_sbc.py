@@ -42,11 +42,13 @@ from probcal import (
 )
 from probcal.inference import uniformity
 from probcal.inference.collapsed import Collapsed
+from probcal.inference.coverage import coverage_table
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.nuts import NUTS
+from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Form
 from probcal.inference.prior_draws import draw_prior
-from probcal.inference.sbc import coverage_table, sbc, short
+from probcal.inference.sbc import sbc, short
 from probcal.plots.sbc import draw_sbc, plot_ranks
 from probcal.priors import BernoulliGaussian
 
@@ -311,11 +313,24 @@ def test_samplers_are_uniform_over_500_simulations(method, prior):
     assert (abs(table["all"] - table["nominal"]) < 4 * table["all_se"]).all()
 
 
+def bent():
+    """Two radars turned by as much as 34 degrees, a near target of unknown start: no Gaussian frame fits."""
+    scale = {"position": 10.0, "heading": 0.6}
+    nodes = [Node(f"radar_{n}", place, scale=scale) for n, place in enumerate([(0.0, 0.0), (80.0, 0.0)])]
+    start = {"position": ((40.0, 40.0), 30.0), "velocity": ((3.0, 3.0), 3.0)}
+    return simulated(Network([sensors.radar.on(node) for node in nodes]), 6, Target(ConstantVelocity(1.0), start))
+
+
 @pytest.mark.slow
 def test_a_sampler_without_its_correction_is_caught():
-    """The same network and the frame taken for the posterior."""
-    tree = quick(Uncorrected(chains=2, warmup=50, draws=150), Gaussian(), 300, radars(4, 15))
+    tree = quick(Uncorrected(chains=2, warmup=50, draws=150), Gaussian(), 400, bent())
+    assert "width of all biases" in tree.attrs["verdict"].removeprefix("uniform")
     assert tree.attrs["status"] == "not uniform"
+
+
+def test_a_hopeless_frame_is_never_taken_for_a_good_one():
+    """Where all but a few weights are nought k-hat cannot be fitted; the collapse has failed all the more."""
+    assert pareto_khat(-1e3 * np.random.default_rng(0).exponential(size=400) ** 2) == np.inf
 
 
 # around the data

@@ -20,10 +20,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from probcal.inference.batches import Batches
+from probcal.inference.coverage import judge
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.methods import MAP, NUTS, check_problem, choose_prior
 from probcal.inference.posed import Form
@@ -31,7 +31,7 @@ from probcal.inference.prior_draws import check_drawable, draw_data, draw_prior,
 from probcal.inference.quantities import TAKEN, Points, Posterior, Trial, gaussian_posterior, ranked, sampled_posterior
 from probcal.inference.run import Maximiser, Method, maximise
 from probcal.inference.sampler import Sampler
-from probcal.inference.uniformity import NOMINAL, p_value, shape, share, spread_p_value
+from probcal.inference.uniformity import NOMINAL
 from probcal.priors import Gaussian, Precision, Prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
@@ -42,7 +42,6 @@ from probcal.tree import suffix
 from probcal.types import FitError, InputError, float64
 
 BATCH = 5  # runs of one file
-ALARM = 0.01  # probability of a false alarm, over all quantities together
 FAR = 2.0  # extents of the network beyond which the start of a target is called wide
 SHORT = {"chains": 2, "warmup": 150, "draws": 150}  # of a sampler whose draws are only ranked
 STARTS = ("automatic", "truth")
@@ -276,7 +275,7 @@ def _tree(engine: _Engine, records: dict[int, dict[str, np.ndarray]], interrupte
         "run": xr.Dataset({name: ("run", stacked[name]) for name in of_run}, coords={"run": runs}),
     }
     tree = xr.DataTree.from_dict(groups)
-    _judge(tree)
+    judge(tree)
     tree.attrs |= {
         "method": engine.method.name, "settings": f"{engine.method!r}, {engine.prior!r}", "runs": len(good),
         "prior": type(engine.prior).__name__, "source": engine.around or type(engine.source).__name__,
@@ -284,63 +283,6 @@ def _tree(engine: _Engine, records: dict[int, dict[str, np.ndarray]], interrupte
         "data": engine.problem.measurements.table.source, "message": _message(engine, tree, failed, interrupted),
     }  # fmt: skip
     return tree
-
-
-def _judge(tree: xr.DataTree) -> None:
-    """Add uniformity, coverage and the verdict."""
-    group = tree["sbc"].to_dataset()
-    place, kinds = group["place"].values, group["kind"].values
-    names = [str(name) for name in group["quantity"].values]
-    values = [p_value(place[:, q]) for q in range(len(names))]
-    shapes = [shape(place[:, q]) for q in range(len(names))]
-    biases = place[:, kinds == "bias"]
-    tests = [*names, "width of all biases"]
-    values.append(spread_p_value(biases))
-    spread = (np.abs(biases - 0.5).mean() - 0.25) > 0
-    shapes.append("the posterior is too narrow" if spread else "the posterior is too wide")
-    limit = ALARM / len(tests)
-    found: dict[str, Any] = {"p_value": ("test", np.array(values)), "shape": ("test", shapes)}
-    tree["uniformity"] = xr.DataTree(xr.Dataset(found, coords={"test": tests}))
-    tree["coverage"] = xr.DataTree(_coverage(group))
-    order = np.argsort(values)
-    wrong = [k for k in order if values[k] < limit]
-    least = order[0]
-    rate = f"over all {len(tests)} tests a right method fails with probability {ALARM:.0%} at most"
-    if wrong:
-        listed = "; ".join(f"{tests[k]} (p {values[k]:.1g}, {shapes[k]})" for k in wrong[:4])
-        rest = f" and {len(wrong) - 4} more" if len(wrong) > 4 else ""
-        verdict = f"not uniform: {listed}{rest}; {rate}."
-    else:
-        verdict = f"uniform over {len(place)} runs; the smallest p is {values[least]:.2g} of {tests[least]}; {rate}."
-    tree.attrs |= {"status": "not uniform" if wrong else "uniform", "verdict": verdict, "false_alarm_rate": ALARM}
-
-
-def _coverage(group: xr.Dataset) -> xr.Dataset:
-    """Observed coverage of the central intervals of the biases, by nominal probability."""
-    chosen = group.isel(quantity=np.flatnonzero(group["kind"].values == "bias"))
-    place, true = chosen["place"].values, chosen["truth"].values
-    everything, nonzero = np.ones(true.shape, bool), true != 0.0
-    columns: dict[str, list[float]] = {}
-    for i, nominal in enumerate(group["nominal"].values.tolist()):
-        random, plain = np.abs(place - 0.5) <= nominal / 2, chosen["inside"].values[:, :, i]
-        kinds = {"all": (random, everything), "nonzero": (random, nonzero), "plain": (plain, everything)}
-        for name, (inside, counted) in kinds.items():
-            if counted.any():
-                observed, error = share(inside, counted, nominal)
-                columns.setdefault(name, []).append(observed)
-                columns.setdefault(f"{name}_se", []).append(error)
-    values: dict[str, Any] = {name: ("nominal", np.array(column)) for name, column in columns.items()}
-    return xr.Dataset(values, coords={"nominal": group["nominal"].values})
-
-
-def coverage_table(tree: xr.DataTree) -> pd.DataFrame:
-    """Coverage of the central intervals of the biases by `nominal` probability, each with its Monte Carlo error.
-
-    `all` counts every bias, `nonzero` those that are truly not zero (left out where there is none), both with ties
-    broken at random so that a right method meets the nominal value; `plain` counts every bias whose truth lies within
-    the interval, its ends included: above the nominal value where a posterior has an atom.
-    """
-    return tree["coverage"].to_dataset().to_dataframe().reset_index()
 
 
 def _message(engine: _Engine, tree: xr.DataTree, failed: dict[int, str], interrupted: bool) -> str:
