@@ -14,7 +14,7 @@ from probcal.analysis import (
     sensitivity,
 )
 from probcal.diagnostics import scores
-from probcal.inference import EA, EM, EMEA, MAP, NUTS, Collapsed, LeastSquares, fit, study, track
+from probcal.inference import EA, EM, EMEA, MAP, NUTS, Collapsed, LeastSquares, fit, log_evidence, study, track
 from probcal.motion import (
     ConstantAcceleration,
     ConstantVelocity,
@@ -43,7 +43,7 @@ __all__ = [
     "InputError", "Known", "Laplace", "LeastSquares", "LocalFrame", "Mixture", "Motion", "Network", "Node", "Path",
     "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth",
     "Unknown", "White", "assess", "bound_map", "bounds", "compare", "fit", "interchangeable", "load",
-    "next_anchors", "next_passes", "next_sensors", "noise", "observability", "outliers", "priors", "read_nodes",
-    "read_table", "save", "scores", "sensitivity", "sensor", "sensors", "simulate", "study", "summary", "track",
-    "write_nodes",
+    "log_evidence", "next_anchors", "next_passes", "next_sensors", "noise", "observability", "outliers", "priors",
+    "read_nodes", "read_table", "save", "scores", "sensitivity", "sensor", "sensors", "simulate", "study",
+    "summary", "track", "write_nodes",
 ]  # fmt: skip

@@ -1,23 +1,12 @@
 """Inference: `fit(problem, method)` for every method, `track` for other data, `study` over runs."""
 
+from probcal.inference.evidence import Evidence, log_evidence
 from probcal.inference.fit import fit, track
 from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, NUTS, Collapsed, LeastSquares, table
 from probcal.inference.run import Method
 from probcal.inference.study import ORACLE, study
 
 __all__ = [
-    "EA",
-    "EM",
-    "EMEA",
-    "MAP",
-    "METHODS",
-    "NUTS",
-    "ORACLE",
-    "Collapsed",
-    "LeastSquares",
-    "Method",
-    "fit",
-    "study",
-    "table",
-    "track",
-]
+    "EA", "EM", "EMEA", "MAP", "METHODS", "NUTS", "ORACLE", "Collapsed", "Evidence", "LeastSquares", "Method",
+    "fit", "log_evidence", "study", "table", "track",
+]  # fmt: skip

@@ -8,7 +8,7 @@ add one: a class here with its `hyper` distributions and its `updates`, and a li
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,8 @@ class Hierarchy(ABC):
     prior: Any
     learnt: tuple[int, ...]
     group: tuple[int, ...]
+
+    sweeps: ClassVar[int] = 10  # Gibbs sweeps between two draws that pay for themselves
 
     @property
     def count(self) -> int:
@@ -177,25 +179,30 @@ class RegularisedHorseshoe(Hierarchy):
             taken = jnp.log(jax.random.uniform(keys[2], z.shape)) < ratio
             return phi | {"local_scale": jnp.sqrt(jnp.where(taken, proposal, square))}
 
-        def density(z: jax.Array, local: jax.Array, log_tau: jax.Array, log_slab: jax.Array) -> jax.Array:
-            tau, slab = jnp.exp(log_tau), jnp.exp(log_slab)
+        def density(z: jax.Array, local: jax.Array, logs: jax.Array) -> jax.Array:
+            tau, slab = jnp.exp(logs)
             alpha = jnp.clip(1.0 / slab + 1.0 / (tau * local) ** 2, LEAST, MOST)
-            own = log_tau - jnp.log1p((tau / width) ** 2) - half * log_slab - half * self.prior.slab_scale**2 / slab
+            own = logs[0] - jnp.log1p((tau / width) ** 2) - half * logs[1] - half * self.prior.slab_scale**2 / slab
             return own + 0.5 * jnp.sum(jnp.log(alpha) - alpha * z**2)
 
         def shared(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
-            tau, slab = jnp.log(phi["global_scale"]), jnp.log(phi["slab_variance"])
-            keys = jax.random.split(key, 3)
-            tau = slice_step(keys[0], tau, lambda t: density(z, phi["local_scale"], t, slab))
-            slab = slice_step(keys[1], slab, lambda s: density(z, phi["local_scale"], tau, s))
-            tau = slice_step(keys[2], tau, lambda t: density(z, phi["local_scale"], t, slab))
-            return phi | {"global_scale": jnp.exp(tau), "slab_variance": jnp.exp(slab)}
+            logs = jnp.log(jnp.stack([phi["global_scale"], phi["slab_variance"]]))
+
+            def one(logs: jax.Array, turn: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+                k, own = turn
+                moved = slice_step(own, logs[k], lambda t: density(z, phi["local_scale"], logs.at[k].set(t)))
+                return logs.at[k].set(moved), None
+
+            logs, _ = jax.lax.scan(one, logs, (jnp.array([0, 1, 0]), jax.random.split(key, 3)))
+            return phi | {"global_scale": jnp.exp(logs[0]), "slab_variance": jnp.exp(logs[1])}
 
         return [local, shared]
 
 
 class SpikeAndSlab(Hierarchy):
-    """Bernoulli-Gaussian: which biases are in, and the share of them; `collapsed.py` moves these with z integrated."""
+    """Bernoulli-Gaussian: which biases are in, and the share of them; `posed.update_inclusions` moves the first."""
+
+    sweeps = 2
 
     def hyper(self):
         """The share of the biases that are not zero, where it is not given."""
