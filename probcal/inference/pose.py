@@ -92,12 +92,13 @@ def moved(spec: Spec, system: System, frame: Frame, theta: jax.Array, key: jax.A
 
 
 def pareto_khat(log_weights: np.ndarray) -> float:
-    """Pareto k-hat of log weights (D,); 0 where they are all equal, infinite where some draw has none."""
+    """Pareto k-hat of log weights (D,); 0 where they are all equal, infinite where it cannot be told."""
     if not np.isfinite(log_weights).all():
         return np.inf
     if np.ptp(log_weights) < 1e-6:
         return 0.0
-    return float(array_stats.psislw(-log_weights)[1])  # it takes log-likelihoods, inverse weights
+    found = float(array_stats.psislw(-log_weights)[1])  # it takes log-likelihoods, inverse weights
+    return found if np.isfinite(found) else np.inf  # one draw has all the weight: no tail is left to fit
 
 
 def acceptance(log_weights: np.ndarray) -> float:
