@@ -228,6 +228,21 @@ def place(system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, 
     return at_levels(system, at, theta[M:]) if theta.shape[0] > M else at
 
 
+def driving(system: System, frame: Frame, point: Point) -> tuple[jax.Array, ...]:
+    """The unit normals eps (E, n) of each recursion that `place` makes a consistent point of."""
+    step = jnp.concatenate([point.z, point.levels]) - frame.theta
+    noises = at_levels(system, point, frame.point.levels).noises
+    found = []
+    parts = zip(frame.loops, frame.point.states, frame.point.noises, point.states, noises, strict=True)
+    for loop, x0, u0, x, u in parts:
+        deviations = x - x0 - loop.states @ step
+        before = jnp.concatenate([jnp.zeros_like(x[:1]), deviations[:-1]])
+        own = u - u0 - loop.noises @ step + jnp.einsum("eij,ej->ei", loop.feedback, before)
+        solved = linalg.solve_batched(loop.factor @ loop.factor.mT, own)
+        found.append(jnp.einsum("eji,ej->ei", loop.factor, solved))
+    return tuple(found)
+
+
 def log_joint(spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:
     """Log density of data and eps given theta, less that of independent unit normals' constant; -inf if not finite."""
     point = place(system, frame, theta, eps)
