@@ -1,7 +1,7 @@
-"""Gaussian guides of a variational fit: x = mean + exp(log_scale) * (B n), n unit normals (D,), and what B may be.
+"""Guides of a variational fit: densities of x (D,) that unit normals n (D,) are turned into, reparametrised.
 
-A `Mixing` is the static part, `mix` its numbers. Its `turned` gives B'^-1 n, which the path derivative needs: the
-slope of the guide's log density at x is -exp(-log_scale) * turned (Roeder, Wu, Duvenaud 2017).
+All are x = mean + exp(log_scale) * f(n) and differ in f. `slope` is what the path derivative needs: that of the log
+density by x, at fixed parameters (Roeder, Wu, Duvenaud 2017).
 """
 
 from abc import ABC, abstractmethod
@@ -15,117 +15,138 @@ import numpy as np
 from probcal import linalg
 
 
-class Guide(NamedTuple):
+class Fitted(NamedTuple):
     """Parameters of a guide over D coordinates."""
 
     mean: jax.Array  # (D,)
     log_scale: jax.Array  # (D,)
-    mix: jax.Array  # by its `Mixing`
+    rest: tuple[jax.Array, ...]  # of f
 
 
 @dataclass(frozen=True)
-class Mixing(ABC):
-    """How the unit normals are mixed."""
+class Guide(ABC):
+    """The static part of a guide: how f works. Draws are rows of (K, D)."""
 
     @abstractmethod
-    def first(self, size: int, key: jax.Array) -> jax.Array:
-        """The numbers to start from, B near the identity."""
+    def first(self, size: int, key: jax.Array) -> tuple[jax.Array, ...]:
+        """Parameters of f at the start, f near the identity."""
 
     @abstractmethod
-    def mixed(self, mix: jax.Array, n: jax.Array) -> jax.Array:
-        """B n of draws n (K, D)."""
+    def turned(self, rest: tuple[jax.Array, ...], n: jax.Array) -> jax.Array:
+        """f(n), (K, D)."""
 
     @abstractmethod
-    def turned(self, mix: jax.Array, n: jax.Array) -> jax.Array:
-        """B'^-1 n of draws n (K, D)."""
+    def pulled(self, rest: tuple[jax.Array, ...], n: jax.Array) -> jax.Array:
+        """Slope (K, D) of the log density of t = f(n) by t."""
 
     @abstractmethod
-    def volume(self, mix: jax.Array) -> jax.Array:
-        """Log determinant of B."""
+    def volume(self, rest: tuple[jax.Array, ...], n: jax.Array) -> jax.Array:
+        """Log determinant (K,) of the derivative of f."""
 
-    def place(self, guide: Guide, n: jax.Array) -> jax.Array:
-        """Coordinates (K, D) of unit normals (K, D)."""
-        return guide.mean[None] + jnp.exp(guide.log_scale)[None] * self.mixed(guide.mix, n)
+    def place(self, fitted: Fitted, n: jax.Array) -> jax.Array:
+        """Coordinates (K, D) of unit normals."""
+        return fitted.mean[None] + jnp.exp(fitted.log_scale)[None] * self.turned(fitted.rest, n)
 
-    def slope(self, guide: Guide, n: jax.Array) -> jax.Array:
+    def slope(self, fitted: Fitted, n: jax.Array) -> jax.Array:
         """Slope (K, D) of the log density by the coordinates."""
-        return -jnp.exp(-guide.log_scale)[None] * self.turned(guide.mix, n)
+        return jnp.exp(-fitted.log_scale)[None] * self.pulled(fitted.rest, n)
 
-    def log_density(self, guide: Guide, n: jax.Array) -> jax.Array:
-        """Log density (K,) of the coordinates that the unit normals (K, D) give."""
+    def log_density(self, fitted: Fitted, n: jax.Array) -> jax.Array:
+        """Log density (K,) of the coordinates of unit normals."""
         unit = -0.5 * jnp.sum(n**2, 1) - 0.5 * n.shape[1] * np.log(2 * np.pi)
-        return unit - jnp.sum(guide.log_scale) - self.volume(guide.mix)
+        return unit - jnp.sum(fitted.log_scale) - self.volume(fitted.rest, n)
 
 
 @dataclass(frozen=True)
-class Diagonal(Mixing):
-    """B the identity: mean-field."""
+class MeanField(Guide):
+    """Independent normals."""
 
     def first(self, size, key):
         """Nothing."""
-        return jnp.zeros(0)
+        return ()
 
-    def mixed(self, mix, n):
+    def turned(self, rest, n):
         """The draws themselves."""
         return n
 
-    def turned(self, mix, n):
-        """The draws themselves."""
-        return n
+    def pulled(self, rest, n):
+        """That of unit normals."""
+        return -n
 
-    def volume(self, mix):
+    def volume(self, rest, n):
         """Zero."""
-        return jnp.zeros(())
+        return jnp.zeros(n.shape[0])
 
 
 @dataclass(frozen=True)
-class Triangular(Mixing):
-    """Full rank over the first `head` entries, B = I + (strictly lower) mix there; the identity for the rest."""
-
-    head: int
-
-    def _matrix(self, mix: jax.Array) -> jax.Array:
-        return jnp.eye(self.head) + jnp.tril(mix, -1)
-
-    def first(self, size, key):
-        """Zeros (head, head)."""
-        return jnp.zeros((self.head, self.head))
-
-    def mixed(self, mix, n):
-        """The head mixed, the tail as it is."""
-        return jnp.concatenate([n[:, : self.head] @ self._matrix(mix).T, n[:, self.head :]], 1)
-
-    def turned(self, mix, n):
-        """The head turned, the tail as it is."""
-        inverse = linalg.inverse_lower(self._matrix(mix))
-        return jnp.concatenate([n[:, : self.head] @ inverse, n[:, self.head :]], 1)
-
-    def volume(self, mix):
-        """Zero: the diagonal is one."""
-        return jnp.zeros(())
-
-
-@dataclass(frozen=True)
-class LowRank(Mixing):
-    """B = I + U U', U = mix (D, rank): the covariance is a diagonal matrix and one of low rank, in scaled entries."""
+class LowRank(Guide):
+    """A normal with f = I + U U', U (D, rank): a diagonal covariance and one of low rank, in scaled entries."""
 
     rank: int
 
-    def _gram(self, mix: jax.Array) -> jax.Array:
-        return jnp.eye(self.rank) + mix.T @ mix
+    def first(self, size, key):
+        """Small random directions: at zero they have no slope. U is kept times the root of D."""
+        return (0.1 * jax.random.normal(key, (size, self.rank)),)
+
+    def _directions(self, rest: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        U = rest[0] / np.sqrt(rest[0].shape[0])
+        return U, jnp.eye(self.rank) + U.T @ U
+
+    def turned(self, rest, n):
+        """The draws, widened along the directions."""
+        U, _ = self._directions(rest)
+        return n + (n @ U) @ U.T
+
+    def pulled(self, rest, n):
+        """By the identity of Woodbury."""
+        U, gram = self._directions(rest)
+        return linalg.solve_positive(gram, (n @ U).T).T @ U.T - n
+
+    def volume(self, rest, n):
+        """Log determinant of I + U'U."""
+        return jnp.broadcast_to(linalg.inverse_and_logdet(self._directions(rest)[1])[1], n.shape[:1])
+
+
+@dataclass(frozen=True)
+class Structured(Guide):
+    """Full rank over the first `head` entries, each with a skewness and tails of its own; normals for the rest.
+
+    There t = sinh(tail asinh(Ln) + skew) entry by entry (Jones, Pewsey 2009), L unit lower triangular: scales of a
+    hierarchy are skewed on the log scale, with the tails of their half-Cauchy (tail 2 is that of an exponential).
+    Tail lies between 1/2 and 2, skew between -1 and 1.
+    """
+
+    head: int
 
     def first(self, size, key):
-        """Small random directions: at zero they have no slope."""
-        return 0.1 * jax.random.normal(key, (size, self.rank)) / np.sqrt(size)
+        """What stands below the diagonal of L (times the root of its size, lest its noise add up), skew and tail before they are bounded: zeros, so that t = n."""
+        return jnp.zeros((self.head, self.head)), jnp.zeros(self.head), jnp.zeros(self.head)
 
-    def mixed(self, mix, n):
-        """What the directions see is widened."""
-        return n + (n @ mix) @ mix.T
+    def _correlated(self, rest: tuple[jax.Array, ...], n: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Ln (K, head), and L."""
+        L = jnp.eye(self.head) + jnp.tril(rest[0], -1) / np.sqrt(self.head)
+        return n[:, : self.head] @ L.T, L
 
-    def turned(self, mix, n):
-        """By Woodbury's identity."""
-        return n - linalg.solve_positive(self._gram(mix), (n @ mix).T).T @ mix.T
+    def _shape(self, rest: tuple[jax.Array, ...], c: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """t of c = Ln, the log of its derivative, and the slope of that log."""
+        tail, skew = 2.0 ** jnp.tanh(rest[2])[None], jnp.tanh(rest[1])[None]
+        root = jnp.sqrt(1 + c**2)
+        angle = tail * jnp.arcsinh(c) + skew
+        volume = jnp.log(tail) + jnp.log(jnp.cosh(angle)) - jnp.log(root)
+        return jnp.sinh(angle), volume, tail * jnp.tanh(angle) / root - c / root**2
 
-    def volume(self, mix):
-        """Log determinant of I + U'U."""
-        return linalg.inverse_and_logdet(self._gram(mix))[1]
+    def turned(self, rest, n):
+        """The head correlated and bent, the tail as it is."""
+        t, _, _ = self._shape(rest, self._correlated(rest, n)[0])
+        return jnp.concatenate([t, n[:, self.head :]], 1)
+
+    def pulled(self, rest, n):
+        """By the chain rule."""
+        c, L = self._correlated(rest, n)
+        _, volume, bend = self._shape(rest, c)
+        own = -(n[:, : self.head] @ linalg.inverse_lower(L)) - bend
+        return jnp.concatenate([own * jnp.exp(-volume), -n[:, self.head :]], 1)
+
+    def volume(self, rest, n):
+        """That of the bending: the diagonal of L is one."""
+        return jnp.sum(self._shape(rest, self._correlated(rest, n)[0])[1], 1)

@@ -14,7 +14,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from probcal import linalg
-from probcal.inference.guides import Diagonal, Guide, LowRank, Mixing, Triangular
+from probcal.inference.guides import Fitted, Guide, LowRank, MeanField, Structured
 from probcal.inference.hierarchy import Phi
 from probcal.inference.nuts import Free, parts
 from probcal.inference.posed import Form, Posed, conditional, log_prior, prior_precision, whiten
@@ -34,9 +34,9 @@ SMOOTH = 0.95  # of the running bound
 class Chain(NamedTuple):
     """Where one optimisation stands."""
 
-    guide: Guide
-    slope: Guide  # running mean of the gradients
-    square: Guide  # and of their squares
+    fitted: Fitted
+    slope: Fitted  # running mean of the gradients
+    square: Fitted  # and of their squares
     count: jax.Array  # steps done, those that draw included
     bound: jax.Array  # running evidence lower bound
     trace: jax.Array  # (warmup,) the running bound of each step
@@ -124,11 +124,11 @@ class SVI(Sampler):
             noises = place(posed.system, posed.frame, theta, resting).noises
             mean, log_scale = Free(form.hierarchy.relax(phi), eta, noises), float(np.log(NARROW))
         flat = ravel_pytree(mean)[0]
-        mixing = self._mixing(form, posed)
-        guide = Guide(flat, jnp.full_like(flat, log_scale), mixing.first(flat.shape[0], keys[0]))
-        zero = jax.tree.map(jnp.zeros_like, guide)
+        rest = self._guide(form, posed).first(flat.shape[0], keys[0])
+        fitted = Fitted(flat, jnp.full_like(flat, log_scale), rest)
+        zero = jax.tree.map(jnp.zeros_like, fitted)
         return Chain(
-            guide, zero, zero, jnp.zeros((), int), jnp.zeros(()), jnp.zeros(self.warmup), keys[1]
+            fitted, zero, zero, jnp.zeros((), int), jnp.zeros(()), jnp.zeros(self.warmup), keys[1]
         )
 
     def step(self, form: Form, posed: Posed, chain: Chain) -> tuple[Chain, Sample]:
@@ -137,50 +137,50 @@ class SVI(Sampler):
         moved = jax.lax.cond(
             chain.count < self.warmup, lambda: self._improved(form, posed, chain, keys[0]), lambda: chain
         )
-        mixing = self._mixing(form, posed)
-        n = jax.random.normal(keys[1], (1, moved.guide.mean.shape[0]))
-        sample, density = self._sample(form, posed, mixing.place(moved.guide, n)[0])
+        guide = self._guide(form, posed)
+        n = jax.random.normal(keys[1], (1, moved.fitted.mean.shape[0]))
+        sample, density = self._sample(form, posed, guide.place(moved.fitted, n)[0])
         drawn = jnp.clip(moved.count - self.warmup, 0, self.draws - 1)
         stats = {
-            "log_weight": density - mixing.log_density(moved.guide, n)[0],
+            "log_weight": density - guide.log_density(moved.fitted, n)[0],
             "elbo": moved.trace[(drawn * self.warmup) // self.draws],
         }
         return moved._replace(count=chain.count + 1, key=keys[2]), sample._replace(stats=stats)
 
     def _improved(self, form: Form, posed: Posed, chain: Chain, key: jax.Array) -> Chain:
         """One step of Adam up the bound; a gradient that is not finite is left out."""
-        mixing = self._mixing(form, posed)
-        half = jax.random.normal(key, ((self.particles + 1) // 2, chain.guide.mean.shape[0]))
+        guide, fitted = self._guide(form, posed), chain.fitted
+        half = jax.random.normal(key, ((self.particles + 1) // 2, fitted.mean.shape[0]))
         n = jnp.concatenate([half, -half])[: self.particles]
         density = self._density(form, posed)
-        still = mixing.slope(chain.guide, n)
+        still = guide.slope(fitted, n)
 
-        def bound(guide: Guide) -> tuple[jax.Array, jax.Array]:
-            x = mixing.place(guide, n)
+        def bound(fitted: Fitted) -> tuple[jax.Array, jax.Array]:
+            x = guide.place(fitted, n)
             value = jax.vmap(density)(x)
-            return jnp.mean(value - jnp.sum(still * x, 1)), jnp.mean(value - mixing.log_density(guide, n))
+            return jnp.mean(value - jnp.sum(still * x, 1)), jnp.mean(value - guide.log_density(fitted, n))
 
-        gradient, value = jax.grad(bound, has_aux=True)(chain.guide)
-        sound = jnp.isfinite(value) & jnp.all(jnp.asarray([jnp.isfinite(g).all() for g in gradient]))
+        gradient, value = jax.grad(bound, has_aux=True)(fitted)
+        sound = jnp.isfinite(value) & jnp.all(jnp.asarray([jnp.isfinite(g).all() for g in jax.tree.leaves(gradient)]))
         t = chain.count + 1.0
         rate = self.rate * 0.5 * (1 + jnp.cos(jnp.pi * chain.count / self.warmup))
         slope = jax.tree.map(lambda m, g: DECAY * m + (1 - DECAY) * g, chain.slope, gradient)
         square = jax.tree.map(lambda s, g: SQUARE * s + (1 - SQUARE) * g**2, chain.square, gradient)
-        guide = jax.tree.map(
+        fitted = jax.tree.map(
             lambda p, m, s: p + rate * (m / (1 - DECAY**t)) / (jnp.sqrt(s / (1 - SQUARE**t)) + LEAST),
-            chain.guide, slope, square,
+            fitted, slope, square,
         )  # fmt: skip
         mean = jnp.where(chain.count == 0, value, SMOOTH * chain.bound + (1 - SMOOTH) * value)
-        found = chain._replace(guide=guide, slope=slope, square=square, bound=mean)
+        found = chain._replace(fitted=fitted, slope=slope, square=square, bound=mean)
         found = jax.tree.map(lambda new, old: jnp.where(sound, new, old), found, chain)
         return found._replace(trace=found.trace.at[chain.count].set(found.bound))
 
-    def _mixing(self, form: Form, posed: Posed) -> Mixing:
+    def _guide(self, form: Form, posed: Posed) -> Guide:
         free = _template(form, posed)
         size = sum(leaf.size for leaf in jax.tree.leaves(free))
         if self.guide == "structured":
-            return Triangular(size - sum(e.size for e in free.eps))
-        return Diagonal() if self.guide == "mean-field" else LowRank(round(float(np.sqrt(size))))
+            return Structured(size - sum(e.size for e in free.eps))
+        return MeanField() if self.guide == "mean-field" else LowRank(round(float(np.sqrt(size))))
 
     def _density(self, form: Form, posed: Posed) -> Any:
         """Log density of flat coordinates."""
