@@ -2,8 +2,10 @@
 
 from probcal.inference.fit import fit, track
 from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, NUTS, Collapsed, LeastSquares, table
+from probcal.inference.model import numpyro_model
 from probcal.inference.run import Method
 from probcal.inference.study import ORACLE, study
+from probcal.inference.svi import SVI
 
 __all__ = [
     "EA",
@@ -13,10 +15,12 @@ __all__ = [
     "METHODS",
     "NUTS",
     "ORACLE",
+    "SVI",
     "Collapsed",
     "LeastSquares",
     "Method",
     "fit",
+    "numpyro_model",
     "study",
     "table",
     "track",

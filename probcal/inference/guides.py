@@ -119,7 +119,7 @@ class Structured(Guide):
     head: int
 
     def first(self, size, key):
-        """What stands below the diagonal of L (times the root of its size, lest its noise add up), skew and tail before they are bounded: zeros, so that t = n."""
+        """Zeros, so that t = n: L below its diagonal (times the root of its size); skew, tail before their bounds."""
         return jnp.zeros((self.head, self.head)), jnp.zeros(self.head), jnp.zeros(self.head)
 
     def _correlated(self, rest: tuple[jax.Array, ...], n: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -17,7 +17,7 @@ from probcal import linalg
 from probcal.inference.guides import Fitted, Guide, LowRank, MeanField, Structured
 from probcal.inference.hierarchy import Phi
 from probcal.inference.nuts import Free, parts
-from probcal.inference.posed import Form, Posed, conditional, log_prior, prior_precision, whiten
+from probcal.inference.posed import Form, Posed, log_prior, prior_precision, whiten
 from probcal.inference.sampler import Sample, Sampler
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
 from probcal.smoothing.frame import driving, log_joint, place
@@ -63,9 +63,7 @@ def plain(form: Form, posed: Posed, free: Free) -> Plain:
     theta, volume = whiten(matrix, alpha, jnp.zeros_like(alpha), free.eta)
     levels = theta[form.biases :]
     tracks = zip(system.recursions, free.eps, strict=True)
-    states = tuple(
-        trajectory(p.F, factors(p, levels), p.drift[:, :, None], u[:, :, None])[:, :, 0] for p, u in tracks
-    )
+    states = tuple(trajectory(p.F, factors(p, levels), p.drift[:, :, None], u[:, :, None])[:, :, 0] for p, u in tracks)
     point = Point(states, free.eps, theta[: form.biases], levels)
     density = hyper + volume + log_prior(form, posed, theta, phi) + log_density(form.spec, system, point)
     return Plain(theta, phi, point, jnp.where(jnp.isfinite(density), density, -jnp.inf))
@@ -98,8 +96,9 @@ class SVI(Sampler):
     priors: ClassVar[tuple[type, ...]] = (Horseshoe, Gaussian, Laplace, ARD, Flat)
     chunk: ClassVar[int] = 50
     exact: ClassVar[bool] = False
-    intervals: ClassVar[str] = "quantiles of a variational approximation: too narrow where the guide does not fit, " \
-        "see k-hat"
+    intervals: ClassVar[str] = (
+        "quantiles of a variational approximation: too narrow where the guide does not fit, see k-hat"
+    )
 
     def __post_init__(self):
         super().__post_init__()
@@ -127,9 +126,7 @@ class SVI(Sampler):
         rest = self._guide(form, posed).first(flat.shape[0], keys[0])
         fitted = Fitted(flat, jnp.full_like(flat, log_scale), rest)
         zero = jax.tree.map(jnp.zeros_like, fitted)
-        return Chain(
-            fitted, zero, zero, jnp.zeros((), int), jnp.zeros(()), jnp.zeros(self.warmup), keys[1]
-        )
+        return Chain(fitted, zero, zero, jnp.zeros((), int), jnp.zeros(()), jnp.zeros(self.warmup), keys[1])
 
     def step(self, form: Form, posed: Posed, chain: Chain) -> tuple[Chain, Sample]:
         """One step of Adam until `warmup` of them are done, and one draw of the guide."""
