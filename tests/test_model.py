@@ -110,7 +110,7 @@ def test_its_density_is_that_of_the_samplers(case):
 
         @jax.jit
         def both(x):
-            jacobian = jax.jacfwd(lambda x: ravel_pytree(sites(x))[0])(x)
+            jacobian = jax.jacrev(lambda x: ravel_pytree(sites(x))[0])(x)
             return parts(form, posed, back(x)).density, log_density(model, (), {}, sites(x))[0], jacobian
 
         gaps, spread = [], []
