@@ -14,7 +14,21 @@ from probcal.analysis import (
     sensitivity,
 )
 from probcal.diagnostics import scores
-from probcal.inference import EA, EM, EMEA, MAP, NUTS, SVI, Collapsed, LeastSquares, fit, numpyro_model, study, track
+from probcal.inference import (
+    EA,
+    EM,
+    EMEA,
+    MAP,
+    NUTS,
+    SVI,
+    Collapsed,
+    LeastSquares,
+    fit,
+    numpyro_model,
+    log_evidence,
+    study,
+    track,
+)
 from probcal.motion import (
     ConstantAcceleration,
     ConstantVelocity,
@@ -42,8 +56,8 @@ __all__ = [
     "ConstantAcceleration", "ConstantVelocity", "CoordinatedTurn", "FitError", "Flat", "Gaussian", "Horseshoe",
     "InputError", "Known", "Laplace", "LeastSquares", "LocalFrame", "Mixture", "Motion", "Network", "Node", "Path",
     "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown",
-    "White", "assess", "bound_map", "bounds", "compare", "fit", "interchangeable", "load", "next_anchors",
-    "next_passes", "next_sensors", "noise", "numpyro_model", "observability", "outliers", "priors", "read_nodes",
-    "read_table", "save", "scores", "sensitivity", "sensor", "sensors", "simulate", "study", "summary", "track",
-    "write_nodes",
+    "White", "assess", "bound_map", "bounds", "compare", "fit", "interchangeable", "load", "log_evidence",
+    "next_anchors", "next_passes", "next_sensors", "noise", "numpyro_model", "observability", "outliers", "priors",
+    "read_nodes", "read_table", "save", "scores", "sensitivity", "sensor", "sensors", "simulate", "study", "summary",
+    "track", "write_nodes",
 ]  # fmt: skip

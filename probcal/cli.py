@@ -5,6 +5,7 @@ Bad input ends with exit code 2, a fit that is no answer, or a problem that can 
 
 import importlib.util
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -245,6 +246,8 @@ def fit_command(
         )  # fmt: skip
         if out is not None:
             save(tree, out / "fit.nc")  # what is found is safe whatever comes
+            if "Interrupted" not in tree.attrs["message"]:
+                shutil.rmtree(out / "draws", ignore_errors=True)  # they are in fit.nc now
         if assessed:
             tree = assess(problem, tree, truth=truth, key=seed)
     tree.attrs["model"] = model.stem

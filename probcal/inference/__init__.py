@@ -1,5 +1,6 @@
 """Inference: `fit(problem, method)` for every method, `track` for other data, `study` over runs."""
 
+from probcal.inference.evidence import Evidence, log_evidence
 from probcal.inference.fit import fit, track
 from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, NUTS, Collapsed, LeastSquares, table
 from probcal.inference.model import numpyro_model
@@ -8,20 +9,6 @@ from probcal.inference.study import ORACLE, study
 from probcal.inference.svi import SVI
 
 __all__ = [
-    "EA",
-    "EM",
-    "EMEA",
-    "MAP",
-    "METHODS",
-    "NUTS",
-    "ORACLE",
-    "SVI",
-    "Collapsed",
-    "LeastSquares",
-    "Method",
-    "fit",
-    "numpyro_model",
-    "study",
-    "table",
-    "track",
-]
+    "EA", "EM", "EMEA", "MAP", "METHODS", "NUTS", "ORACLE", "Collapsed", "Evidence", "LeastSquares", "Method",
+    "fit", "log_evidence", "study", "table", "track",
+]  # fmt: skip

@@ -74,14 +74,22 @@ class Hierarchy(ABC):
         """Hyper-parameters of unconstrained values, and the log density of these under the prior."""
         phi, density = {}, jnp.zeros(())
         for name, d in self.hyper().items():
-            to = dist.biject_to(d.support)
+            to = _from_line(d)
             phi[name] = to(free[name])
             density = density + jnp.sum(d.log_prob(phi[name])) + jnp.sum(to.log_abs_det_jacobian(free[name], phi[name]))
         return phi, density
 
     def relax(self, phi: Phi) -> Phi:
         """Unconstrained values of hyper-parameters."""
-        return {name: dist.biject_to(d.support).inv(phi[name]) for name, d in self.hyper().items()}
+        return {name: _from_line(d).inv(phi[name]) for name, d in self.hyper().items()}
+
+
+def _from_line(d: dist.Distribution) -> dist.transforms.Transform:
+    """From the real line to the support: Gamma variables by softplus, so that no tail is steeper than exponential."""
+    if not isinstance(d, dist.Gamma | dist.Exponential):
+        return dist.biject_to(d.support)
+    scale = dist.transforms.AffineTransform(0.0, 1.0 / d.rate, domain=dist.constraints.positive)
+    return dist.transforms.ComposeTransform([dist.transforms.SoftplusTransform(), scale])
 
 
 class Known(Hierarchy):
@@ -177,19 +185,22 @@ class RegularisedHorseshoe(Hierarchy):
             taken = jnp.log(jax.random.uniform(keys[2], z.shape)) < ratio
             return phi | {"local_scale": jnp.sqrt(jnp.where(taken, proposal, square))}
 
-        def density(z: jax.Array, local: jax.Array, log_tau: jax.Array, log_slab: jax.Array) -> jax.Array:
-            tau, slab = jnp.exp(log_tau), jnp.exp(log_slab)
+        def density(z: jax.Array, local: jax.Array, logs: jax.Array) -> jax.Array:
+            tau, slab = jnp.exp(logs)
             alpha = jnp.clip(1.0 / slab + 1.0 / (tau * local) ** 2, LEAST, MOST)
-            own = log_tau - jnp.log1p((tau / width) ** 2) - half * log_slab - half * self.prior.slab_scale**2 / slab
+            own = logs[0] - jnp.log1p((tau / width) ** 2) - half * logs[1] - half * self.prior.slab_scale**2 / slab
             return own + 0.5 * jnp.sum(jnp.log(alpha) - alpha * z**2)
 
         def shared(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
-            tau, slab = jnp.log(phi["global_scale"]), jnp.log(phi["slab_variance"])
-            keys = jax.random.split(key, 3)
-            tau = slice_step(keys[0], tau, lambda t: density(z, phi["local_scale"], t, slab))
-            slab = slice_step(keys[1], slab, lambda s: density(z, phi["local_scale"], tau, s))
-            tau = slice_step(keys[2], tau, lambda t: density(z, phi["local_scale"], t, slab))
-            return phi | {"global_scale": jnp.exp(tau), "slab_variance": jnp.exp(slab)}
+            logs = jnp.log(jnp.stack([phi["global_scale"], phi["slab_variance"]]))
+
+            def one(logs: jax.Array, turn: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+                k, own = turn
+                moved = slice_step(own, logs[k], lambda t: density(z, phi["local_scale"], logs.at[k].set(t)))
+                return logs.at[k].set(moved), None
+
+            logs, _ = jax.lax.scan(one, logs, (jnp.array([0, 1, 0]), jax.random.split(key, 3)))
+            return phi | {"global_scale": jnp.exp(logs[0]), "slab_variance": jnp.exp(logs[1])}
 
         return [local, shared]
 

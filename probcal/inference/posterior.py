@@ -3,11 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
-import arviz as az
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
+from arviz_stats.base import array_stats
 from scipy import stats
 
 from probcal import tree
@@ -35,15 +34,22 @@ def mixing(draws: np.ndarray) -> dict[str, np.ndarray]:
     A quantity that is the same in every draw counts as mixed: r_hat 1, as many effective draws as there are.
     """
     still = np.ptp(draws, axis=(0, 1)) == 0
-    data = xr.DataTree.from_dict({"posterior": xr.Dataset({"x": (("chain", "draw", "p"), draws)})})
-    kinds = {"ess": az.ess(data, method="bulk"), "ess_tail": az.ess(data, method="tail")}
-    if draws.shape[0] > 1:
-        kinds["r_hat"] = az.rhat(data)
-    found = {}
-    for name, values in kinds.items():
-        whole = 1.0 if name == "r_hat" else float(draws.shape[0] * draws.shape[1])
-        found[name] = np.where(still, whole, np.asarray(values["x"].values, float))
-    return found
+    names = ["ess", "ess_tail", *(["r_hat"] if draws.shape[0] > 1 else [])]
+    whole = {"ess": float(draws[..., 0].size), "ess_tail": float(draws[..., 0].size), "r_hat": 1.0}
+    found = {name: np.full(draws.shape[2], whole[name]) for name in names}
+    for m in np.flatnonzero(~still):
+        found["ess"][m] = array_stats.ess(draws[..., m], method="bulk")
+        # in the tails of a spike every draw may be the same: there the bulk is all there is
+        tail = array_stats.ess(draws[..., m], method="tail") if _both_tails(draws[..., m]) else np.nan
+        found["ess_tail"][m] = tail if np.isfinite(tail) else found["ess"][m]
+        if "r_hat" in found:
+            found["r_hat"][m] = array_stats.rhat(draws[..., m])
+    return {name: np.nan_to_num(values, nan=whole[name]) for name, values in found.items()}
+
+
+def _both_tails(draws: np.ndarray) -> bool:
+    """Whether some, but not all, draws lie beyond each of the quantiles that a tail ess looks at."""
+    return all(0 < (draws <= q).mean() < 1 for q in np.quantile(draws, (0.05, 0.95)))
 
 
 def result(problem: Problem, prior: Prior, run: Sampled, key: jax.Array, seed: int, wanted: bool | None) -> tree.Result:
@@ -105,7 +111,7 @@ def _predictive(
         return None, None
 
     def flat(a: np.ndarray) -> jax.Array:
-        return jnp.asarray(a.reshape(-1, *a.shape[2:]))
+        return jnp.asarray(a.reshape(chains * draws, *a.shape[2:]))
 
     found = predictive(
         problem.spec, problem.system, flat(run.levels), flat(run.z), tuple(flat(s) for s in states), key

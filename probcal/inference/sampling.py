@@ -5,7 +5,7 @@ import os
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.inference.collapsed import Collapsed
+from probcal.inference.nuts import NUTS
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Posed
 from probcal.inference.run import Progress
@@ -69,7 +71,7 @@ def sample(
     store: Path | None = None,
     resume: bool = False,
     threads: int | None = None,
-    fallback: Sampler | None = None,
+    fallback: NUTS | None = None,
 ) -> Sampled:
     """Draws of a method from the posterior of a problem.
 
@@ -80,12 +82,14 @@ def sample(
     keys = jax.random.split(key)
     form, posed, found, worth = pose(problem, prior, start, keys[0])
     note = ""
-    if worth.failed and fallback is not None and isinstance(prior, fallback.priors):
+    if worth.failed and isinstance(method, Collapsed) and fallback is not None:
+        joint = isinstance(prior, fallback.priors)
+        taken = replace(fallback, chains=method.chains, draws=method.draws) if joint else replace(method, move="swing")
         note = (
-            f"{method.name}: the collapse does not fit (Pareto k-hat {worth.khat:.2g}, acceptance"
-            f" {worth.acceptance:.2g} after {worth.moves} moves); {fallback.name} took over."
+            f"The collapse does not fit (Pareto k-hat {worth.khat:.2g} after {worth.moves} moves of the frame):"
+            f" {fallback.name if joint else 'the swing'} took over."
         )
-        method = fallback
+        method = taken
     runs = _Run(method, form, posed, found, keys[1])
     box = Store(store, _name(problem, method, prior, key), resume=resume)
     state = runs.restored(box.state) if box.state is not None else runs.first()

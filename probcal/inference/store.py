@@ -81,12 +81,9 @@ class Store:
     def clear(self) -> None:
         """Forget everything, on disk too."""
         self.count, self._state, self._chunks = 0, None, []
-        if self.path is None or not self.path.exists():
-            return
-        for file in [self.path / STATE, *self._files(), *self.path.glob(".*.part*")]:
-            file.unlink(missing_ok=True)
-        if not any(self.path.iterdir()):
-            self.path.rmdir()
+        if self.path is not None:
+            for file in [self.path / STATE, *self._files(), *self.path.glob(".*.part*")]:
+                file.unlink(missing_ok=True)
 
 
 def _write_chunk(path: Path, chunk: Mapping[str, np.ndarray]) -> None:

@@ -1,0 +1,293 @@
+"""Samplers: each kernel leaves its target alone, linear problems are exact, both samplers agree, results are whole."""
+
+import itertools
+from dataclasses import replace
+
+import arviz as az
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from scipy import stats
+from test_exact import CASES, resting
+
+import probcal
+from probcal import ARD, NUTS, BernoulliGaussian, Collapsed, Flat, Gaussian, Horseshoe, InputError, Laplace
+from probcal.inference.draws import inverse_gaussian, slice_step
+from probcal.inference.hierarchy import hierarchy_of
+from probcal.inference.posed import Form, Posed, conditional, update_inclusions, whiten
+from probcal.inference.posterior import mixing
+from probcal.smoothing.frame import frame_at, log_weight, place
+from probcal.smoothing.mode import track
+
+PRIORS = [ARD(shape=2.0, rate=0.7), ARD(by="node", rate=0.5), Laplace(), Horseshoe()]
+ALARM = 1e-4  # rate at which a right sampler fails one of these tests, for each comparison
+
+
+@pytest.fixture(autouse=True)
+def double():
+    with jax.enable_x64(True):
+        yield
+
+
+def made(name, prior, **options):
+    network, motion, table, fixed = CASES[name]()
+    problem = probcal.Problem(network, motion, table, fix=fixed)
+    point = track(problem.spec, problem.system, resting(problem))
+    posed = Posed(problem.system, frame_at(problem.spec, problem.system, point),
+                  prior.precision(problem.labels, problem.surveyed))  # fmt: skip
+    linear = reference.Linear(network, motion, table, fixed)
+    return problem, Form(problem.spec, hierarchy_of(prior, problem)), posed, linear
+
+
+def same_law(a, b):
+    """Two independent samples of one law, by Kolmogorov and Smirnov at the stated rate."""
+    assert stats.ks_2samp(np.asarray(a), np.asarray(b)).pvalue > ALARM
+
+
+def test_inverse_gaussian_draws_have_their_law():
+    for mean, shape in ((0.3, 2.0), (5.0, 2.0), (1e4, 2.0)):
+        drawn = inverse_gaussian(jax.random.key(0), jnp.full(20000, mean), shape)
+        assert stats.kstest(np.asarray(drawn), stats.invgauss(mean / shape, scale=shape).cdf).pvalue > ALARM
+
+
+def test_slice_steps_leave_a_density_alone():
+    keys = jax.random.split(jax.random.key(1), 20000)
+    start = jax.vmap(lambda k: jnp.log(jax.random.gamma(k, 0.7)))(keys)
+    move = jax.vmap(lambda k, x: slice_step(jax.random.fold_in(k, 1), x, lambda t: 0.7 * t - jnp.exp(t)))
+    moved = move(keys, start)
+    assert stats.kstest(np.exp(np.asarray(moved)), stats.gamma(0.7).cdf).pvalue > ALARM
+    assert np.corrcoef(start, moved)[0, 1] < 0.5, "it moves"
+
+
+@pytest.mark.parametrize("prior", [*PRIORS, BernoulliGaussian()], ids=lambda p: f"{type(p).__name__}-{p}"[:24])
+def test_updates_leave_the_joint_prior_of_scales_and_biases_alone(prior):
+    """phi from its prior and z given phi; phi updated given z must have the prior's law again (Geweke 2004)."""
+    _problem, form, _, _ = made("plane", prior)
+    kind = form.hierarchy
+
+    def one(key):
+        keys = jax.random.split(key, 3)
+        phi = kind.draw(keys[0])
+        active = kind.active(phi, form.biases)[jnp.asarray(kind.learnt)]
+        z = active * jax.random.normal(keys[1], active.shape) / jnp.sqrt(kind.governed(phi))
+        new = phi
+        for k, update in enumerate(kind.updates()):
+            new = update(new, z, jax.random.fold_in(keys[2], k))
+        return phi, new, z
+
+    phi, new, _z = jax.vmap(one)(jax.random.split(jax.random.key(2), 8000))
+    for name in kind.hyper():
+        fresh = jax.vmap(kind.draw)(jax.random.split(jax.random.key(3), 8000))[name]
+        for k in range((np.ndim(fresh[0]) and fresh.shape[1]) or 1):
+            old, after = (np.asarray(a).reshape(8000, -1)[:, k] for a in (fresh, new[name]))
+            same_law(np.log(old), np.log(after))
+    assert any(not np.array_equal(phi[name], new[name]) for name in kind.hyper()), "something was updated"
+    known = kind.hyper()
+    for name, values in kind.relax({n: phi[n][0] for n in known}).items():
+        back, _ = kind.constrain(kind.relax({n: phi[n][0] for n in known}))
+        np.testing.assert_allclose(back[name], phi[name][0], rtol=1e-9, err_msg=str(values))
+
+
+def test_inclusions_have_their_exact_probabilities():
+    prior = BernoulliGaussian(share=0.3, slab=1.5)
+    problem, form, posed, linear = made("plane", prior)
+    learnt = form.hierarchy.learnt
+    alpha = np.where(problem.surveyed, 1.0, 1 / 1.5**2)
+    assert list(problem.labels) == list(linear.labels)
+    total, share = {}, np.zeros(len(learnt))
+    for pattern in itertools.product([False, True], repeat=len(learnt)):
+        spread = 1 / alpha
+        spread[list(learnt)] *= pattern
+        odds = np.prod(np.where(pattern, 0.3, 0.7))
+        total[pattern] = reference.dense(linear, np.diag(spread)).evidence + np.log(odds)
+    weight = np.exp(np.array(list(total.values())) - max(total.values()))
+    share = (np.array(list(total)) * (weight / weight.sum())[:, None]).sum(0)
+    phi = form.hierarchy.draw(jax.random.key(0))
+
+    def step(phi, key):
+        keys = jax.random.split(key)
+        phi = update_inclusions(form, posed, phi, keys[0], backwards=False)
+        phi = update_inclusions(form, posed, phi, keys[1], backwards=True)
+        return phi, phi["included"]
+
+    _, drawn = jax.jit(lambda phi, keys: jax.lax.scan(step, phi, keys))(phi, jax.random.split(jax.random.key(1), 6000))
+    drawn = np.asarray(drawn, float)
+    ess = az.ess(az.convert_to_datatree({"x": drawn[None]}))["x"].values
+    error = np.sqrt(np.maximum(share * (1 - share), 1e-4) / ess)
+    assert np.all(np.abs(drawn.mean(0) - share) < 4.5 * error), (drawn.mean(0), share)
+    assert 0.02 < share.min() < share.max() < 0.999, "the case decides something"
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_a_frame_is_exact_on_linear_problems(name):
+    problem, form, posed, linear = made(name, Gaussian())
+    keys = jax.random.split(jax.random.key(4), 3)
+    theta = posed.frame.theta + 3 * jax.random.normal(keys[0], posed.frame.theta.shape)
+    eps = tuple(2 * jax.random.normal(keys[1], x.shape) for x in posed.frame.point.states)
+    weight = log_weight(problem.spec, problem.system, posed.frame, theta, eps)
+    assert abs(float(weight)) < 1e-8 * max(1.0, abs(float(posed.frame.log_likelihood(theta))))
+    exact = reference.dense(linear, np.ones(len(linear.labels)))
+    order = [list(problem.labels).index(label) for label in linear.labels]
+    found = conditional(form, posed, {})
+    np.testing.assert_allclose(np.asarray(found.mean)[order], exact.z[0], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(found.variance)[order], np.diag(exact.z[1]), rtol=1e-7)
+    point = place(problem.system, posed.frame, theta, eps)
+    for part, x, u in zip(problem.system.recursions, point.states, point.noises, strict=True):
+        before = np.concatenate([np.zeros_like(x[:1]), x[:-1]])
+        made_of = np.einsum("eij,ej->ei", part.F, before) + part.drift + np.einsum("eij,ej->ei", part.L, u)
+        np.testing.assert_allclose(x, made_of, rtol=1e-8, atol=1e-8)
+
+
+def test_whitening_has_the_derivative_of_its_value():
+    keys = jax.random.split(jax.random.key(5), 5)
+    root = jax.random.normal(keys[0], (20, 20))
+    matrix, alpha = root @ root.T, jax.random.uniform(keys[1], (20,)) + 0.1
+    pull, eta = jax.random.normal(keys[2], (20,)), jax.random.normal(keys[3], (20,))
+
+    def value(alpha, eta):
+        theta, volume = whiten(matrix, alpha, pull, eta)
+        return jnp.sum(jnp.sin(theta)) + 0.3 * volume
+
+    slopes = jax.grad(value, (0, 1))(alpha, eta)
+    for k, slope in enumerate(slopes):
+        turn = jax.random.normal(keys[4], (20,))
+        step = [1e-6 * turn if j == k else 0.0 for j in range(2)]
+        ends = [value(alpha + s * step[0], eta + s * step[1]) for s in (1, -1)]
+        assert (ends[0] - ends[1]) / 2e-6 == pytest.approx(float(slope @ turn), rel=1e-5)
+
+
+def fitted(name, method, prior, **options):
+    network, motion, table, fixed = CASES[name]()
+    problem = probcal.Problem(network, motion, table, fix=fixed)
+    tree = probcal.fit(problem, method, prior=prior, start=resting(problem), **options)
+    return problem, tree, reference.Linear(network, motion, table, fixed)
+
+
+def check_exact(tree, exact, labels):
+    """Means and variances of the biases within their Monte Carlo error, at 4.5 standard errors."""
+    z = tree["posterior"]["bias"].sel(bias_label=list(labels)).values / (
+        tree["calibration"]["scale"].sel(bias_label=list(labels)).values
+    )
+    ess = mixing(z)["ess"]
+    mean, sd = exact[0], np.sqrt(np.diag(exact[1]))
+    assert np.all(np.abs(z.mean((0, 1)) - mean) < 4.5 * sd / np.sqrt(ess))
+    squares = mixing(((z - mean) / sd) ** 2)["ess"]
+    assert np.all(np.abs(z.std((0, 1)) / sd - 1) < 4.5 / np.sqrt(2 * np.minimum(squares, ess)))
+
+
+SMALL = {
+    "collapsed": Collapsed(draws=1000, sweeps=1, warmup=50),
+    "swing": Collapsed(draws=600, sweeps=1, warmup=50, move="swing"),
+    "nuts": NUTS(draws=600, warmup=300),
+}
+
+
+@pytest.mark.parametrize(("name", "method"), [("plane", "collapsed"), ("mixed", "swing"), ("extras", "nuts")])
+def test_a_linear_problem_has_its_exact_posterior(name, method):
+    _problem, tree, linear = fitted(name, SMALL[method], Gaussian())
+    exact = reference.dense(linear, np.ones(len(linear.labels)))
+    check_exact(tree, exact.z, linear.labels)
+    assert tree.attrs["approximate"] == "exact"
+    if method == "collapsed":
+        assert np.allclose(tree["sample_stats"]["acceptance_rate"], 1.0), "the collapse is exact here"
+    states = np.concatenate([tree["track"][n].values.ravel() for n in tree["track"].data_vars if n.startswith("sd")])
+    assert np.isfinite(states).all()
+
+
+@pytest.mark.parametrize("prior", [ARD(shape=2.0, rate=0.7), Laplace(), Horseshoe()], ids=lambda p: type(p).__name__)
+def test_both_samplers_draw_from_one_posterior(prior):
+    """Collapsed and joint agree on means, spreads and hyper-parameters of a linear problem."""
+    _, one, _ = fitted("plane", replace(SMALL["collapsed"], sweeps=5), prior)
+    _, two, _ = fitted("plane", SMALL["nuts"], prior)
+    for name in ("bias", "gamma"):
+        a, b = (t["posterior"][name].values for t in (one, two))
+        error = np.sqrt(a.var((0, 1)) / mixing(a)["ess"] + b.var((0, 1)) / mixing(b)["ess"])
+        assert np.all(np.abs(a.mean((0, 1)) - b.mean((0, 1))) < 4.5 * error + 1e-9), name
+    quantiles = [np.percentile(t["posterior"]["bias"].values, [10, 50, 90], axis=(0, 1)) for t in (one, two)]
+    scale = one["calibration"]["sd"].values
+    assert np.abs(quantiles[0] - quantiles[1]).max() < 0.25 * scale.max()
+    assert two["sample_stats"]["diverging"].sum() == 0
+
+
+def test_the_tree_of_a_sampler_is_whole_and_arviz_reads_it():
+    _, tree, _ = fitted("plane", Collapsed(draws=100, warmup=50), BernoulliGaussian(), key=3)
+    for group in tree.children.values():
+        for name, values in group.data_vars.items():
+            assert values.dtype.kind in "USbO" or np.isfinite(values.values).all(), name
+    labels = tree["calibration"]["bias_label"].values.tolist()
+    frame = az.summary(tree, var_names="bias")
+    assert len(frame) == len(labels)
+    table = probcal.summary(tree)
+    assert {"r_hat", "ess", "ess_tail", "inclusion", "included", "contraction"} <= set(table.columns)
+    out = tree["posterior"]["included"].values
+    assert np.array_equal(out.mean((0, 1)), table.set_index("bias")["included"][tree["posterior"]["governed_label"]])
+    shares = tree["posterior"]["bias"].sel(bias_label=tree["posterior"]["governed_label"].values).values == 0
+    assert np.array_equal(shares, ~out.astype(bool)), "a bias is zero exactly where it is out"
+    again = fitted("plane", Collapsed(draws=100, warmup=50), BernoulliGaussian(), key=3)[1]
+    assert np.array_equal(again["posterior"]["bias"], tree["posterior"]["bias"]), "a seed gives its draws"
+    assessed = probcal.assess(fitted_problem(), tree)
+    assert "verdict" in assessed.children
+
+
+def fitted_problem():
+    network, motion, table, fixed = CASES["plane"]()
+    return probcal.Problem(network, motion, table, fix=fixed)
+
+
+def test_a_constant_quantity_counts_as_mixed():
+    draws = np.random.default_rng(0).standard_normal((4, 50, 2))
+    draws[:, :, 1] = 0.0
+    found = mixing(draws)
+    assert found["r_hat"][1] == 1.0
+    assert found["ess"][1] == 200
+    assert all(np.isfinite(values).all() for values in found.values())
+
+
+def test_wrong_settings_are_refused():
+    with pytest.raises(InputError, match="a sampler needs a proper hyper-prior"):
+        hierarchy_of(ARD(), fitted_problem())
+    with pytest.raises(InputError, match="target lies in"):
+        NUTS(target=1.5)
+    with pytest.raises(InputError, match="move is one of ellipse, swing"):
+        Collapsed(move="leap")
+    with pytest.raises(InputError, match="it must be at least"):
+        Collapsed(draws=0)
+    with pytest.raises(InputError, match="it must lie between 0 and 1, or be None"):
+        BernoulliGaussian(share=1.5)
+    with pytest.raises(InputError, match="give a positive number"):
+        BernoulliGaussian(slab=0.0)
+    with pytest.raises(InputError, match="NUTS does not take the prior BernoulliGaussian"):
+        fitted("plane", NUTS(), BernoulliGaussian())
+
+
+def test_a_flat_prior_on_a_determined_problem_is_the_likelihood():
+    problem, tree, linear = fitted("plane", Collapsed(draws=500, sweeps=1), Flat(), predictive_draws=False)
+    broad = np.where([label in set(np.array(problem.labels)[problem.surveyed]) for label in linear.labels], 1.0, 1e-9)
+    check_exact(tree, reference.dense(linear, broad).z, linear.labels)
+
+
+def test_the_evidence_integrates_every_hyper_parameter():
+    """Against the exact evidence of a Gaussian prior, and the sum over all patterns of a spike and slab."""
+    network, motion, table, fixed = CASES["plane"]()
+    problem, linear = (
+        probcal.Problem(network, motion, table, fix=fixed),
+        reference.Linear(network, motion, table, fixed),
+    )
+    start = resting(problem)
+    exact = reference.dense(linear, np.ones(len(linear.labels))).evidence
+    found = probcal.log_evidence(problem, Gaussian(), start=start)
+    assert abs(found.value - exact) < 4.5 * found.error + 1e-6
+    assert found.error < 0.3
+    prior, total = BernoulliGaussian(share=0.3), []
+    learnt = ~np.array([label in set(np.array(problem.labels)[problem.surveyed]) for label in linear.labels])
+    for pattern in itertools.product([False, True], repeat=int(learnt.sum())):
+        spread = np.ones(len(linear.labels))
+        spread[learnt] *= pattern
+        total.append(reference.dense(linear, np.diag(spread)).evidence + np.log(np.where(pattern, 0.3, 0.7)).sum())
+    found = probcal.log_evidence(problem, prior, start=start)
+    assert abs(found.value - np.logaddexp.reduce(total)) < 4.5 * found.error + 1e-6
+    assert found.khat == 0.0
+    with pytest.raises(InputError, match="a flat prior has no evidence"):
+        probcal.log_evidence(problem, Flat())
