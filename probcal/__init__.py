@@ -24,8 +24,8 @@ from probcal.inference import (
     Collapsed,
     LeastSquares,
     fit,
-    numpyro_model,
     log_evidence,
+    numpyro_model,
     study,
     track,
 )

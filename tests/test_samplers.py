@@ -120,7 +120,9 @@ def test_inclusions_have_their_exact_probabilities():
     assert 0.02 < share.min() < share.max() < 0.999, "the case decides something"
 
 
-@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize(
+    "name", ["plane", "extras", *(pytest.param(name, marks=pytest.mark.slow) for name in ("space", "mixed"))]
+)
 def test_a_frame_is_exact_on_linear_problems(name):
     problem, form, posed, linear = made(name, Gaussian())
     keys = jax.random.split(jax.random.key(4), 3)
@@ -184,7 +186,13 @@ SMALL = {
 }
 
 
-@pytest.mark.parametrize(("name", "method"), [("plane", "collapsed"), ("mixed", "swing"), ("extras", "nuts")])
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        ("plane", "collapsed"), ("plane", "swing"), ("plane", "nuts"),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in (("mixed", "swing"), ("extras", "nuts"))),
+    ],
+)  # fmt: skip
 def test_a_linear_problem_has_its_exact_posterior(name, method):
     _problem, tree, linear = fitted(name, SMALL[method], Gaussian())
     exact = reference.dense(linear, np.ones(len(linear.labels)))
@@ -196,7 +204,11 @@ def test_a_linear_problem_has_its_exact_posterior(name, method):
     assert np.isfinite(states).all()
 
 
-@pytest.mark.parametrize("prior", [ARD(shape=2.0, rate=0.7), Laplace(), Horseshoe()], ids=lambda p: type(p).__name__)
+@pytest.mark.parametrize(
+    "prior",
+    [Horseshoe(), *(pytest.param(p, marks=pytest.mark.slow) for p in (ARD(shape=2.0, rate=0.7), Laplace()))],
+    ids=lambda p: type(p).__name__,
+)
 def test_both_samplers_draw_from_one_posterior(prior):
     """Collapsed and joint agree on means, spreads and hyper-parameters of a linear problem."""
     _, one, _ = fitted("plane", replace(SMALL["collapsed"], sweeps=5), prior)

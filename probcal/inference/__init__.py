@@ -9,6 +9,6 @@ from probcal.inference.study import ORACLE, study
 from probcal.inference.svi import SVI
 
 __all__ = [
-    "EA", "EM", "EMEA", "MAP", "METHODS", "NUTS", "ORACLE", "Collapsed", "Evidence", "LeastSquares", "Method",
-    "fit", "log_evidence", "study", "table", "track",
+    "EA", "EM", "EMEA", "MAP", "METHODS", "NUTS", "ORACLE", "SVI", "Collapsed", "Evidence", "LeastSquares", "Method",
+    "fit", "log_evidence", "numpyro_model", "study", "table", "track",
 ]  # fmt: skip
