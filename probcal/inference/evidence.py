@@ -57,7 +57,7 @@ def log_evidence(problem: Problem, prior: Prior | None = None, *, key: Key = 0, 
     return Evidence(value, float(np.hypot(stones.std(ddof=1) / np.sqrt(len(stones)), own)), khat)
 
 
-def _tempered(posed: Posed, share: float) -> Posed:
+def _tempered(posed: Posed, share: jax.Array) -> Posed:
     """The posterior with the frame's likelihood to the power of `share`."""
     frame = posed.frame
     return posed._replace(frame=frame._replace(information=share * frame.information, score=share * frame.score))

@@ -40,7 +40,9 @@ def mixing(draws: np.ndarray) -> dict[str, np.ndarray]:
     for m in np.flatnonzero(~still):
         found["ess"][m] = array_stats.ess(draws[..., m], method="bulk")
         # in the tails of a spike every draw may be the same: there the bulk is all there is
-        tail = array_stats.ess(draws[..., m], method="tail") if _both_tails(draws[..., m]) else np.nan
+        tail = (
+            array_stats.ess(draws[..., m], method="tail", prob=(0.05, 0.95)) if _both_tails(draws[..., m]) else np.nan
+        )
         found["ess_tail"][m] = tail if np.isfinite(tail) else found["ess"][m]
         if "r_hat" in found:
             found["r_hat"][m] = array_stats.rhat(draws[..., m])
