@@ -97,7 +97,7 @@ def pareto_khat(log_weights: np.ndarray) -> float:
         return np.inf
     if np.ptp(log_weights) < 1e-6:
         return 0.0
-    return float(array_stats.psislw(log_weights)[1])
+    return float(array_stats.psislw(-log_weights)[1])  # it takes log-likelihoods, inverse weights
 
 
 def acceptance(log_weights: np.ndarray) -> float:
