@@ -52,13 +52,13 @@ def robust(target, pose, *, range_offset=Bias("m", 5.0)):
     return {"range": jnp.hypot(line[0], line[1]) + range_offset, "azimuth": jnp.arctan2(line[1], line[0])}
 
 
-def small(kind=radar, motion=None, missing=0.2):
-    """Two sensors, one of them on a surveyed node, and four scans of each target."""
+def small(kind=radar, motion=None, missing=0.2, scans=4):
+    """Two sensors, one of them on a surveyed node, and a few scans of each target."""
     nodes = [Node("a", (0.0, 0.0), scale={"heading": 0.1}), Node("b", (400.0, 0.0), survey={"position": 3.0})]
     network = Network([kind.on(node) for node in nodes])
     start = {"position": ((100.0, 200.0), 5.0), "velocity": ((20.0, 3.0), 2.0)}
     motion = Target(ConstantVelocity(1.0), start) if motion is None else motion(start)
-    time = np.arange(4.0)
+    time = np.arange(float(scans))
     drawn = simulate(network, motion, time, key=1, missing=missing)
     return Problem(network, motion, drawn.table)
 

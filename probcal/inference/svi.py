@@ -86,10 +86,10 @@ class SVI(Sampler):
     """
 
     chains: int = 4
-    warmup: int = 1500
+    warmup: int = 800
     draws: int = 500
     guide: str = "structured"
-    rate: float = 0.02
+    rate: float = 0.05
     particles: int = 4
 
     name: ClassVar[str] = "SVI"
