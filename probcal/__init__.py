@@ -14,7 +14,21 @@ from probcal.analysis import (
     sensitivity,
 )
 from probcal.diagnostics import scores
-from probcal.inference import EA, EM, EMEA, MAP, NUTS, Collapsed, LeastSquares, fit, log_evidence, study, track
+from probcal.inference import (
+    EA,
+    EM,
+    EMEA,
+    MAP,
+    NUTS,
+    SVI,
+    Collapsed,
+    LeastSquares,
+    fit,
+    log_evidence,
+    numpyro_model,
+    study,
+    track,
+)
 from probcal.motion import (
     ConstantAcceleration,
     ConstantVelocity,
@@ -38,12 +52,12 @@ from probcal.tree import load, outliers, save, summary
 from probcal.types import FitError, InputError
 
 __all__ = [
-    "ARD", "EA", "EM", "EMEA", "MAP", "NUTS", "Bernoulli", "BernoulliGaussian", "Bias", "Channel", "Collapsed",
+    "ARD", "EA", "EM", "EMEA", "MAP", "NUTS", "SVI", "Bernoulli", "BernoulliGaussian", "Bias", "Channel", "Collapsed",
     "ConstantAcceleration", "ConstantVelocity", "CoordinatedTurn", "FitError", "Flat", "Gaussian", "Horseshoe",
     "InputError", "Known", "Laplace", "LeastSquares", "LocalFrame", "Mixture", "Motion", "Network", "Node", "Path",
-    "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth",
-    "Unknown", "White", "assess", "bound_map", "bounds", "compare", "fit", "interchangeable", "load",
-    "log_evidence", "next_anchors", "next_passes", "next_sensors", "noise", "observability", "outliers", "priors",
-    "read_nodes", "read_table", "save", "scores", "sensitivity", "sensor", "sensors", "simulate", "study",
-    "summary", "track", "write_nodes",
+    "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown",
+    "White", "assess", "bound_map", "bounds", "compare", "fit", "interchangeable", "load", "log_evidence",
+    "next_anchors", "next_passes", "next_sensors", "noise", "numpyro_model", "observability", "outliers", "priors",
+    "read_nodes", "read_table", "save", "scores", "sensitivity", "sensor", "sensors", "simulate", "study", "summary",
+    "track", "write_nodes",
 ]  # fmt: skip

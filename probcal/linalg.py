@@ -121,6 +121,16 @@ def factor_and_inverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     )
 
 
+def inverse_lower(matrix: jax.Array) -> jax.Array:
+    """Inverse of a lower triangular (n, n) matrix, by halves; what stands above its diagonal is not read."""
+    n = matrix.shape[0]
+    if n <= BASE:
+        return solve_triangular(matrix, jnp.eye(n, dtype=matrix.dtype), lower=True)
+    h = n // 2
+    first, last = inverse_lower(matrix[:h, :h]), inverse_lower(matrix[h:, h:])
+    return jnp.block([[first, jnp.zeros((h, n - h), matrix.dtype)], [-(last @ matrix[h:, :h]) @ first, last]])
+
+
 def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:
     """Solve a symmetric positive definite system; non-finite where the matrix is not positive definite."""
     _, inverse = factor_and_inverse(matrix)

@@ -3,10 +3,12 @@
 from probcal.inference.evidence import Evidence, log_evidence
 from probcal.inference.fit import fit, track
 from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, NUTS, Collapsed, LeastSquares, table
+from probcal.inference.model import numpyro_model
 from probcal.inference.run import Method
 from probcal.inference.study import ORACLE, study
+from probcal.inference.svi import SVI
 
 __all__ = [
-    "EA", "EM", "EMEA", "MAP", "METHODS", "NUTS", "ORACLE", "Collapsed", "Evidence", "LeastSquares", "Method",
-    "fit", "log_evidence", "study", "table", "track",
+    "EA", "EM", "EMEA", "MAP", "METHODS", "NUTS", "ORACLE", "SVI", "Collapsed", "Evidence", "LeastSquares", "Method",
+    "fit", "log_evidence", "numpyro_model", "study", "table", "track",
 ]  # fmt: skip

@@ -76,14 +76,22 @@ class Hierarchy(ABC):
         """Hyper-parameters of unconstrained values, and the log density of these under the prior."""
         phi, density = {}, jnp.zeros(())
         for name, d in self.hyper().items():
-            to = dist.biject_to(d.support)
+            to = _from_line(d)
             phi[name] = to(free[name])
             density = density + jnp.sum(d.log_prob(phi[name])) + jnp.sum(to.log_abs_det_jacobian(free[name], phi[name]))
         return phi, density
 
     def relax(self, phi: Phi) -> Phi:
         """Unconstrained values of hyper-parameters."""
-        return {name: dist.biject_to(d.support).inv(phi[name]) for name, d in self.hyper().items()}
+        return {name: _from_line(d).inv(phi[name]) for name, d in self.hyper().items()}
+
+
+def _from_line(d: dist.Distribution) -> dist.transforms.Transform:
+    """From the real line to the support: Gamma variables by softplus, so that no tail is steeper than exponential."""
+    if not isinstance(d, dist.Gamma | dist.Exponential):
+        return dist.biject_to(d.support)
+    scale = dist.transforms.AffineTransform(0.0, 1.0 / d.rate, domain=dist.constraints.positive)
+    return dist.transforms.ComposeTransform([dist.transforms.SoftplusTransform(), scale])
 
 
 class Known(Hierarchy):

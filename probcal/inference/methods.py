@@ -10,6 +10,7 @@ from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
 from probcal.inference.nuts import NUTS
 from probcal.inference.run import Method
+from probcal.inference.svi import SVI
 from probcal.priors import PRIORS, Flat, Laplace, Prior
 from probcal.problem import Problem
 from probcal.types import InputError
@@ -28,6 +29,9 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
     "nls": (LeastSquares(), None),
     "collapsed": (Collapsed(), None),
     "nuts": (NUTS(), None),
+    "svi": (SVI(), None),
+    "svi-mean-field": (SVI(guide="mean-field"), None),
+    "svi-low-rank": (SVI(guide="low-rank"), None),
 }
 
 

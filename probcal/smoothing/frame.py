@@ -202,7 +202,7 @@ def _with_levels(
     # what the levels tell once the biases are found is kept positive: differences are no proof of it
     explained = cross @ linalg.solve_positive(G + 1e-6 * jnp.eye(G.shape[0]), cross.T)
     values, vectors = linalg.spectrum(corner - explained)
-    corner = explained + (vectors * jnp.maximum(values, 1.0)) @ vectors.T
+    corner = explained + (vectors * jnp.maximum(values, 1.0)[None]) @ vectors.T
     return jnp.block([[G, cross.T], [cross, 0.5 * (corner + corner.T)]]), jnp.concatenate([g, slope])
 
 
@@ -226,6 +226,21 @@ def place(system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, 
         noises.append(u + loop.noises @ step + own)
     at = Point(tuple(states), tuple(noises), theta[:M], frame.point.levels)
     return at_levels(system, at, theta[M:]) if theta.shape[0] > M else at
+
+
+def driving(system: System, frame: Frame, point: Point) -> tuple[jax.Array, ...]:
+    """The unit normals eps (E, n) of each recursion that `place` makes a consistent point of."""
+    step = jnp.concatenate([point.z, point.levels]) - frame.theta
+    noises = at_levels(system, point, frame.point.levels).noises
+    found = []
+    parts = zip(frame.loops, frame.point.states, frame.point.noises, point.states, noises, strict=True)
+    for loop, x0, u0, x, u in parts:
+        deviations = x - x0 - loop.states @ step
+        before = jnp.concatenate([jnp.zeros_like(x[:1]), deviations[:-1]])
+        own = u - u0 - loop.noises @ step + jnp.einsum("eij,ej->ei", loop.feedback, before)
+        solved = linalg.solve_batched(loop.factor @ loop.factor.mT, own)
+        found.append(jnp.einsum("eji,ej->ei", loop.factor, solved))
+    return tuple(found)
 
 
 def log_joint(spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:

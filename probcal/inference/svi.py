@@ -1,0 +1,205 @@
+"""Variational inference: a Gaussian guide fitted to the joint posterior, in the coordinates of the frame or plain ones.
+
+Each chain is one optimisation from its own start; r_hat over them says whether they agree. The gradient is that of
+the reparametrised bound without the score of the guide, whose variance vanishes where the guide fits (Roeder, Wu,
+Duvenaud 2017, "Sticking the landing"); steps by Adam (Kingma, Ba 2015) that shrink to nothing.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from probcal import linalg
+from probcal.inference.guides import Fitted, Guide, LowRank, MeanField, Structured
+from probcal.inference.hierarchy import Phi
+from probcal.inference.nuts import Free, parts
+from probcal.inference.posed import Form, Posed, log_prior, prior_precision, whiten
+from probcal.inference.sampler import Sample, Sampler
+from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
+from probcal.smoothing.frame import driving, log_joint, place
+from probcal.smoothing.mode import Point, factors, log_density
+from probcal.smoothing.recursion import trajectory
+from probcal.types import InputError, nearest
+
+GUIDES = ("structured", "mean-field", "low-rank")
+NARROW = 0.1  # scale of plain coordinates to start from
+DECAY, SQUARE, LEAST = 0.9, 0.999, 1e-8  # of Adam
+SMOOTH = 0.95  # of the running bound
+
+
+class Chain(NamedTuple):
+    """Where one optimisation stands."""
+
+    fitted: Fitted
+    slope: Fitted  # running mean of the gradients
+    square: Fitted  # and of their squares
+    count: jax.Array  # steps done, those that draw included
+    bound: jax.Array  # running evidence lower bound
+    trace: jax.Array  # (warmup,) the running bound of each step
+    key: jax.Array
+
+
+class Plain(NamedTuple):
+    """What plain coordinates stand for."""
+
+    theta: jax.Array
+    phi: Phi
+    point: Point
+    density: jax.Array  # of the coordinates
+
+
+def plain(form: Form, posed: Posed, free: Free) -> Plain:
+    """Biases, hyper-parameters and trajectories of non-centred coordinates that know nothing of the frame.
+
+    eta is theta over its prior sd (a declared scale where the prior is flat), eps the whitened noises of the problem.
+    """
+    system = posed.system
+    phi, hyper = form.hierarchy.constrain(free.phi)
+    matrix, alpha = _prior_matrix(form, posed, phi)
+    theta, volume = whiten(matrix, alpha, jnp.zeros_like(alpha), free.eta)
+    levels = theta[form.biases :]
+    tracks = zip(system.recursions, free.eps, strict=True)
+    states = tuple(trajectory(p.F, factors(p, levels), p.drift[:, :, None], u[:, :, None])[:, :, 0] for p, u in tracks)
+    point = Point(states, free.eps, theta[: form.biases], levels)
+    density = hyper + volume + log_prior(form, posed, theta, phi) + log_density(form.spec, system, point)
+    return Plain(theta, phi, point, jnp.where(jnp.isfinite(density), density, -jnp.inf))
+
+
+def _prior_matrix(form: Form, posed: Posed, phi: Phi) -> tuple[jax.Array, jax.Array]:
+    """Coupling (Q, Q) and precisions (Q,) of theta, one where flat."""
+    alpha, coupling = prior_precision(form, posed, phi)
+    return coupling, jnp.where(alpha > 0, alpha, 1.0)
+
+
+@dataclass(frozen=True)
+class SVI(Sampler):
+    """A Gaussian approximation of the joint posterior by stochastic variational inference, quicker than `NUTS`.
+
+    `guide`: "structured" (in the frame's coordinates: full rank over biases and hyper-parameters, given which each
+    trajectory has a block-tridiagonal precision), "mean-field" or "low-rank" (in plain coordinates, for comparison).
+    Each of `chains` takes `warmup` Adam steps of length `rate` with `particles` draws each, then `draws` from its
+    guide. Raises `InputError` for settings outside their ranges.
+    """
+
+    chains: int = 4
+    warmup: int = 800
+    draws: int = 500
+    guide: str = "structured"
+    rate: float = 0.05
+    particles: int = 4
+
+    name: ClassVar[str] = "SVI"
+    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Gaussian, Laplace, ARD, Flat)
+    chunk: ClassVar[int] = 50
+    exact: ClassVar[bool] = False
+    intervals: ClassVar[str] = (
+        "quantiles of a variational approximation: too narrow where the guide does not fit, see k-hat"
+    )
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.guide not in GUIDES:
+            raise InputError(f'SVI(guide="{self.guide}"): unknown guide{nearest(self.guide, GUIDES)}')
+        if not (self.warmup >= 1 and self.particles >= 1 and np.isfinite(self.rate) and self.rate > 0):
+            raise InputError(
+                f"SVI(warmup={self.warmup}, rate={self.rate}, particles={self.particles}): at least one step of at"
+                f" least one particle is needed, at a positive rate"
+            )
+
+    def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Chain:
+        """An optimisation that starts at phi and the frame's posterior, or narrowly around theta and phi."""
+        keys = jax.random.split(key)
+        if self.guide == "structured":
+            eps = tuple(jnp.zeros_like(x) for x in posed.frame.point.states)
+            mean, log_scale = Free(form.hierarchy.relax(phi), jnp.zeros_like(theta), eps), 0.0
+        else:
+            resting = tuple(jnp.zeros_like(x) for x in posed.frame.point.states)
+            coupling, alpha = _prior_matrix(form, posed, phi)
+            eta = linalg.factor(coupling + jnp.diag(alpha)).T @ theta
+            noises = place(posed.system, posed.frame, theta, resting).noises
+            mean, log_scale = Free(form.hierarchy.relax(phi), eta, noises), float(np.log(NARROW))
+        flat = ravel_pytree(mean)[0]
+        rest = self._guide(form, posed).first(flat.shape[0], keys[0])
+        fitted = Fitted(flat, jnp.full_like(flat, log_scale), rest)
+        zero = jax.tree.map(jnp.zeros_like, fitted)
+        return Chain(fitted, zero, zero, jnp.zeros((), int), jnp.zeros(()), jnp.zeros(self.warmup), keys[1])
+
+    def step(self, form: Form, posed: Posed, chain: Chain) -> tuple[Chain, Sample]:
+        """One step of Adam until `warmup` of them are done, and one draw of the guide."""
+        keys = jax.random.split(chain.key, 3)
+        moved = jax.lax.cond(
+            chain.count < self.warmup, lambda: self._improved(form, posed, chain, keys[0]), lambda: chain
+        )
+        guide = self._guide(form, posed)
+        n = jax.random.normal(keys[1], (1, moved.fitted.mean.shape[0]))
+        sample, density = self._sample(form, posed, guide.place(moved.fitted, n)[0])
+        drawn = jnp.clip(moved.count - self.warmup, 0, self.draws - 1)
+        stats = {
+            "log_weight": density - guide.log_density(moved.fitted, n)[0],
+            "elbo": moved.trace[(drawn * self.warmup) // self.draws],
+        }
+        return moved._replace(count=chain.count + 1, key=keys[2]), sample._replace(stats=stats)
+
+    def _improved(self, form: Form, posed: Posed, chain: Chain, key: jax.Array) -> Chain:
+        """One step of Adam up the bound; a gradient that is not finite is left out."""
+        guide, fitted = self._guide(form, posed), chain.fitted
+        half = jax.random.normal(key, ((self.particles + 1) // 2, fitted.mean.shape[0]))
+        n = jnp.concatenate([half, -half])[: self.particles]
+        density = self._density(form, posed)
+        still = guide.slope(fitted, n)
+
+        def bound(fitted: Fitted) -> tuple[jax.Array, jax.Array]:
+            x = guide.place(fitted, n)
+            value = jax.vmap(density)(x)
+            return jnp.mean(value - jnp.sum(still * x, 1)), jnp.mean(value - guide.log_density(fitted, n))
+
+        gradient, value = jax.grad(bound, has_aux=True)(fitted)
+        sound = jnp.isfinite(value) & jnp.all(jnp.asarray([jnp.isfinite(g).all() for g in jax.tree.leaves(gradient)]))
+        t = chain.count + 1.0
+        rate = self.rate * 0.5 * (1 + jnp.cos(jnp.pi * chain.count / self.warmup))
+        slope = jax.tree.map(lambda m, g: DECAY * m + (1 - DECAY) * g, chain.slope, gradient)
+        square = jax.tree.map(lambda s, g: SQUARE * s + (1 - SQUARE) * g**2, chain.square, gradient)
+        fitted = jax.tree.map(
+            lambda p, m, s: p + rate * (m / (1 - DECAY**t)) / (jnp.sqrt(s / (1 - SQUARE**t)) + LEAST),
+            fitted, slope, square,
+        )  # fmt: skip
+        mean = jnp.where(chain.count == 0, value, SMOOTH * chain.bound + (1 - SMOOTH) * value)
+        found = chain._replace(fitted=fitted, slope=slope, square=square, bound=mean)
+        found = jax.tree.map(lambda new, old: jnp.where(sound, new, old), found, chain)
+        return found._replace(trace=found.trace.at[chain.count].set(found.bound))
+
+    def _guide(self, form: Form, posed: Posed) -> Guide:
+        free = _template(form, posed)
+        size = sum(leaf.size for leaf in jax.tree.leaves(free))
+        if self.guide == "structured":
+            return Structured(size - sum(e.size for e in free.eps))
+        return MeanField() if self.guide == "mean-field" else LowRank(round(float(np.sqrt(size))))
+
+    def _density(self, form: Form, posed: Posed) -> Any:
+        """Log density of flat coordinates."""
+        back = ravel_pytree(_template(form, posed))[1]
+        of = parts if self.guide == "structured" else plain
+        return lambda x: of(form, posed, back(x)).density
+
+    def _sample(self, form: Form, posed: Posed, x: jax.Array) -> tuple[Sample, jax.Array]:
+        """What coordinates stand for, and their log density."""
+        free = ravel_pytree(_template(form, posed))[1](x)
+        if self.guide == "structured":
+            found = parts(form, posed, free)
+            return Sample(found.theta, free.eps, found.phi, found.joint, {}), found.density
+        at = plain(form, posed, free)
+        eps = driving(posed.system, posed.frame, at.point)
+        joint = log_joint(form.spec, posed.system, posed.frame, at.theta, eps)
+        return Sample(at.theta, eps, at.phi, joint, {}), at.density
+
+
+def _template(form: Form, posed: Posed) -> Free:
+    """Coordinates of the right shapes."""
+    kind = form.hierarchy
+    phi = jax.eval_shape(lambda: kind.relax(kind.draw(jax.random.PRNGKey(0))))
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), phi)
+    return Free(zeros, jnp.zeros_like(posed.frame.theta), tuple(jnp.zeros_like(x) for x in posed.frame.point.states))

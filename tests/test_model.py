@@ -1,0 +1,213 @@
+"""The numpyro model: the same density as the package's own coordinates, prior draws, and numpyro's own NUTS on it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import pandas as pd
+import pytest
+import reference
+from jax.flatten_util import ravel_pytree
+from numpyro.infer import MCMC, NUTS, Predictive
+from numpyro.infer.util import log_density
+
+import probcal
+from probcal import (
+    ARD,
+    Bias,
+    Channel,
+    ConstantVelocity,
+    Flat,
+    Gaussian,
+    Horseshoe,
+    InputError,
+    Laplace,
+    Network,
+    Node,
+    Problem,
+    StudentT,
+    Target,
+    Unknown,
+    numpyro_model,
+    sensor,
+    simulate,
+)
+from probcal.inference.hierarchy import hierarchy_of
+from probcal.inference.nuts import Free, parts
+from probcal.inference.posed import Form, Posed
+from probcal.priors import BernoulliGaussian
+from probcal.smoothing.frame import frame_at, place
+from probcal.smoothing.start import automatic_start
+
+FALSE_ALARM = 1e-6  # of each statistical test
+radar, fix = probcal.sensors.radar, probcal.sensors.position
+
+
+@sensor(
+    range=Channel("m", std=Unknown(3.0), noise=StudentT(4.0)),
+    azimuth=Channel("rad", std=0.02, wrap=True),
+)
+def robust(target, pose, *, range_offset=Bias("m", 5.0)):
+    line = pose.local(target.position)
+    return {"range": jnp.hypot(line[0], line[1]) + range_offset, "azimuth": jnp.arctan2(line[1], line[0])}
+
+
+def small(kind=radar, motion=None, missing=0.2, scans=4):
+    """Two sensors, one of them on a surveyed node, and a few scans of each target."""
+    nodes = [Node("a", (0.0, 0.0), scale={"heading": 0.1}), Node("b", (400.0, 0.0), survey={"position": 3.0})]
+    network = Network([kind.on(node) for node in nodes])
+    start = {"position": ((100.0, 200.0), 5.0), "velocity": ((20.0, 3.0), 2.0)}
+    motion = Target(ConstantVelocity(1.0), start) if motion is None else motion(start)
+    time = np.arange(float(scans))
+    drawn = simulate(network, motion, time, key=1, missing=missing)
+    return Problem(network, motion, drawn.table)
+
+
+def posed_of(problem, prior):
+    """The package's own form of the posterior, its frame at the automatic start."""
+    form = Form(problem.spec, hierarchy_of(prior, problem))
+    frame = frame_at(problem.spec, problem.system, automatic_start(problem))
+    return form, Posed(problem.system, frame, prior.precision(problem.labels, problem.surveyed))
+
+
+def two_motions(start):
+    """Two recursions, and a process noise that is not known."""
+    bent = probcal.ConstantAcceleration(0.5)
+    return {"one": Target(ConstantVelocity(Unknown(1.0)), start), "two": Target(bent, start)}
+
+
+CASES = {
+    "horseshoe": (Horseshoe(), {}),
+    "gaussian": (Gaussian(correlation={"b.position_*": 0.6}), {}),
+    "laplace": (Laplace(), {}),
+    "ard": (ARD(rate=0.5, by="owner"), {}),
+    "flat": (Flat(correlation={"b.position_*": -0.3}), {}),
+    "levels and Student-t": (Horseshoe(), {"kind": robust}),
+    "two recursions": (Gaussian(), {"motion": two_motions}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_its_density_is_that_of_the_samplers(case):
+    """log p of the frame's coordinates = log p of the model's sites + log |d sites / d coordinates|, to a constant."""
+    prior, settings = CASES[case]
+    problem = small(**settings)
+    several = len(problem.system.recursions) > 1
+    names = [f"noise_{r}" for r in range(2)] if several else ["noise"]
+    with jax.enable_x64(True):
+        form, posed = posed_of(problem, prior)
+        model, M = numpyro_model(problem, prior), form.biases
+        eps = tuple(jnp.zeros_like(x) for x in posed.frame.point.states)
+        phi = form.hierarchy.relax(form.hierarchy.draw(jax.random.key(0)))
+        flat, back = ravel_pytree(Free(phi, jnp.zeros_like(posed.frame.theta), eps))
+
+        def sites(x):
+            free = back(x)
+            found = parts(form, posed, free)
+            point = place(posed.system, posed.frame, found.theta, free.eps)
+            given = {"z": found.theta[:M], **dict(zip(names, point.noises, strict=True))} | dict(found.phi)
+            return given | ({"level": found.theta[M:]} if problem.levels else {})
+
+        @jax.jit
+        def both(x):
+            jacobian = jax.jacrev(lambda x: ravel_pytree(sites(x))[0])(x)
+            return parts(form, posed, back(x)).density, log_density(model, (), {}, sites(x))[0], jacobian
+
+        gaps, spread = [], []
+        for seed in range(4):
+            x = flat + 0.5 * np.random.default_rng(seed).standard_normal(flat.shape)
+            own, theirs, jacobian = both(x)
+            gaps.append(float(own - theirs) - np.linalg.slogdet(np.asarray(jacobian))[1])
+            spread.append(float(own))
+    assert np.ptp(spread) > 1.0, "the points must tell the densities apart"
+    np.testing.assert_allclose(gaps, gaps[0], rtol=0, atol=1e-6 * np.ptp(spread))
+
+
+def linear(seed=3):
+    """A linear network with its naive form: two places, each measuring where a target is."""
+    nodes = [Node("a", (0.0, 1.0), 0.4, scale=2.0), Node("b", (5.0, -2.0), -1.3, survey=0.5)]
+    network = Network([fix.on(node) for node in nodes])
+    motion = Target(ConstantVelocity(0.8), start={"position": ((1.0, -1.0), 1.0), "velocity": (0.3, 1.5)})
+    random = np.random.default_rng(seed)
+    rows = [
+        {"time": t, "sensor": placed.name, "target": "target"} for t in (0.0, 1.0, 2.5) for placed in network.sensors
+    ]
+    table = pd.DataFrame(rows)
+    table[["position_x", "position_y"]] = 2.0 * random.standard_normal((len(rows), 2))
+    table.loc[1, "position_y"] = np.nan
+    return network, motion, table
+
+
+def test_prior_draws_have_the_moments_of_the_declaration():
+    network, motion, table = linear()
+    problem = Problem(network, motion, table)
+    naive = reference.Linear(network, motion, table)
+    naive.data, observed = [], naive.data  # the prior: nothing is measured
+    prior = reference.dense(naive, np.ones(4))
+    with jax.enable_x64(True):
+        model, D = numpyro_model(problem, Gaussian()), 4000
+        drawn = Predictive(model, num_samples=D)(jax.random.key(5), observed=False)
+        free = Predictive(model, num_samples=2)(jax.random.key(5))
+    drawn = {name: np.asarray(values) for name, values in drawn.items()}
+    np.testing.assert_allclose(drawn["bias"], drawn["z"] * problem.scales)
+    np.testing.assert_array_equal(free["y_position"][0], problem.system.rows[0].y)  # conditioned by default
+    mean, sd = prior.states
+    width = 6.0 / np.sqrt(D)  # normal quantile of FALSE_ALARM over fewer than 100 comparisons
+    states = drawn["state"].reshape(D, -1)
+    assert (np.abs(states.mean(0) - mean) < width * sd).all()
+    assert (np.abs(states.std(0) / sd - 1) < width).all()
+    y = drawn["y_position"]
+    order = {(d.epoch, tuple(d.G)): d for d in observed}
+    assert len(order) == len(observed)
+    A = np.array([[*d.G, *np.eye(3)[d.epoch].repeat(4) * np.tile(d.H, 3)] for d in observed])
+    wide = np.sqrt(np.einsum("ij,jk,ik->i", A, prior.covariance, A) + np.array([d.std**2 for d in observed]))
+    centre = A @ prior.mean + np.array([d.offset for d in observed])
+    there = np.asarray(problem.system.rows[0].mask) > 0
+    flat = y[:, there]
+    assert (np.abs(flat.mean(0) - centre) < width * wide).all()
+    assert (np.abs(flat.std(0) / wide - 1) < width).all()
+
+
+def test_numpyros_own_sampler_finds_the_exact_posterior():
+    network, motion, table = linear()
+    problem = Problem(network, motion, table)
+    exact = reference.dense(reference.Linear(network, motion, table), np.ones(4))
+    mean, covariance = exact.z
+    with jax.enable_x64(True):
+        run = MCMC(NUTS(numpyro_model(problem, Gaussian())), num_warmup=300, num_samples=1500, progress_bar=False)
+        run.run(jax.random.key(0))
+        z = np.asarray(run.get_samples()["z"])
+    sd = np.sqrt(np.diag(covariance))
+    effective = numpyro.diagnostics.effective_sample_size(z[None])
+    assert effective.min() > 300
+    assert (np.abs(z.mean(0) - mean) < 5.5 * sd / np.sqrt(effective)).all()
+    assert (np.abs(z.std(0) / sd - 1) < 5.5 / np.sqrt(effective)).all()
+
+
+def test_other_data_take_the_place_of_the_tables():
+    problem = small()
+    with jax.enable_x64(True):
+        model, y = numpyro_model(problem, Gaussian()), problem.system.rows[0].y
+        seeded = numpyro.handlers.seed(model, jax.random.key(0))
+        mask = np.asarray(problem.system.rows[0].mask)
+        same = log_density(seeded, (), {}, {})[0]
+        blank = np.where(mask > 0, y, np.nan)
+        assert log_density(seeded, ({"y_radar": blank},), {}, {})[0] == same
+        found = numpyro.handlers.trace(seeded).get_trace({"y_radar": y.at[0].set(jnp.nan)})["y_radar"]
+        by_datum = found["fn"].log_prob(found["value"])
+        assert by_datum.shape == y.shape
+        assert (by_datum[0] == 0).all()
+        assert (np.asarray(by_datum)[1:][mask[1:] == 0] == 0).all()
+        assert found["fn"].sample(jax.random.key(1), (3, 2)).shape == (3, 2, *y.shape)
+        with pytest.raises(InputError, match='no observed site is called "y_rader"; did you mean "y_radar"'):
+            seeded({"y_rader": y})
+        with pytest.raises(InputError, match=r'data\["y_radar"\] has shape \(3,\), its rows'):
+            seeded({"y_radar": np.zeros(3)})
+
+
+def test_what_it_refuses():
+    problem = small()
+    with pytest.raises(InputError, match="BernoulliGaussian has no density that numpyro could take"):
+        numpyro_model(problem, BernoulliGaussian())
+    with pytest.raises(InputError, match=r"runs in double precision only: call numpyro\.enable_x64"):
+        numpyro.handlers.seed(numpyro_model(problem), 0)()

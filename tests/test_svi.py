@@ -1,0 +1,125 @@
+"""SVI: guides are what they say, linear problems exact, against NUTS on a radar network, what it refuses."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from test_exact import CASES, resting
+from test_model import posed_of, small
+
+import probcal
+from probcal import NUTS, SVI, Gaussian, Horseshoe, InputError
+from probcal.inference.guides import Fitted, LowRank, MeanField, Structured
+from probcal.inference.nuts import Free
+from probcal.inference.pose import pareto_khat
+from probcal.inference.sampling import sample
+from probcal.inference.svi import plain
+from probcal.smoothing.frame import driving, place
+from probcal.smoothing.mode import track
+from probcal.smoothing.start import automatic_start
+
+ALARM = 5.0  # standard errors: a right sampler fails one comparison in a million
+
+
+@pytest.fixture(autouse=True)
+def double():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.mark.parametrize("guide", [MeanField(), LowRank(2), Structured(3)], ids=lambda g: type(g).__name__)
+def test_guides_know_their_density_and_its_slope(guide):
+    """Against the change of variables by automatic differentiation, and the derivative of the density by x."""
+    size, keys = 5, jax.random.split(jax.random.key(0), 4)
+    rest = jax.tree.map(lambda a: 0.7 * jax.random.normal(keys[0], a.shape), guide.first(size, keys[1]))
+    fitted = Fitted(jax.random.normal(keys[2], (size,)), 0.3 * jnp.arange(size) - 0.5, rest)
+    n = jax.random.normal(keys[3], (1, size))
+    by_n = jax.jacfwd(lambda n: guide.place(fitted, n[None])[0])(n[0])
+    unit = -0.5 * np.sum(np.asarray(n) ** 2) - 0.5 * size * np.log(2 * np.pi)
+    expected = unit - np.linalg.slogdet(np.asarray(by_n))[1]
+    np.testing.assert_allclose(guide.log_density(fitted, n)[0], expected)
+    slope = jax.grad(lambda n: guide.log_density(fitted, n[None])[0])(n[0])
+    np.testing.assert_allclose(guide.slope(fitted, n)[0], np.linalg.solve(np.asarray(by_n).T, slope))
+
+
+def test_pareto_khat_is_that_of_the_large_weights():
+    heavy = -0.8 * np.log(np.random.default_rng(0).uniform(size=4000))  # weights u^-0.8
+    assert abs(pareto_khat(heavy) - 0.8) < 0.15
+    assert pareto_khat(-heavy) < 0.0
+    assert pareto_khat(np.append(heavy, -np.inf)) == np.inf
+    assert pareto_khat(np.zeros(100)) == 0.0
+
+
+@pytest.mark.parametrize("settings", [{}, {"missing": 0.0}], ids=str)
+def test_plain_coordinates_and_those_of_the_frame_are_one_posterior(settings):
+    """The same point in both: its density given phi, by the volumes of both coordinates."""
+    form, posed = posed_of(small(**settings), Horseshoe())
+    keys = jax.random.split(jax.random.key(3), 4)
+    free = form.hierarchy.relax(form.hierarchy.draw(keys[0]))
+    noises = tuple(0.1 * jax.random.normal(keys[1], x.shape) + x for x in posed.frame.point.noises)
+    at = plain(form, posed, Free(free, 0.1 * jax.random.normal(keys[2], posed.frame.theta.shape), noises))
+    eps = driving(posed.system, posed.frame, at.point)
+    again = place(posed.system, posed.frame, at.theta, eps)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), again, at.point)
+
+
+def solved(name, method, prior):
+    """A linear case by a method, and its exact posterior."""
+    network, motion, table, fixed = CASES[name]()
+    problem = probcal.Problem(network, motion, table, fix=fixed)
+    start = track(problem.spec, problem.system, resting(problem))
+    linear = reference.Linear(network, motion, table, fixed)
+    run = sample(problem, method, prior, start, jax.random.key(4))
+    return run, reference.dense(linear, np.ones(len(linear.labels)))
+
+
+@pytest.mark.parametrize("name", ["plane", "mixed"])
+def test_linear_problems_are_exact(name):
+    run, exact = solved(name, SVI(chains=2, warmup=50, draws=1000), Gaussian())
+    mean, covariance = exact.z
+    sd, count = np.sqrt(np.diag(covariance)), run.z.shape[0] * run.z.shape[1]
+    z = run.z.reshape(count, -1)
+    assert (np.abs(z.mean(0) - mean) < ALARM * sd / np.sqrt(count)).all()
+    assert (np.abs(z.std(0) / sd - 1) < ALARM / np.sqrt(2 * count)).all()
+    np.testing.assert_allclose(np.ptp(run.draws["stats_log_weight"]), 0.0, atol=1e-5)  # p / q is the evidence, always
+    track_mean, track_sd = exact.states
+    if name == "plane":  # one recursion, in the order of the reference
+        states = run.states[0].reshape(count, -1)
+        assert (np.abs(states.mean(0) - track_mean) < ALARM * track_sd / np.sqrt(count)).all()
+        assert (np.abs(states.std(0) / track_sd - 1) < ALARM / np.sqrt(2 * count)).all()
+
+
+def test_mean_field_is_too_narrow_where_biases_are_correlated():
+    """Plain coordinates of a linear problem: the variational optimum has the conditional variances ."""
+    run, exact = solved("plane", SVI(chains=2, warmup=1500, draws=500, guide="mean-field"), Gaussian())
+    wide, exact = solved("plane", SVI(chains=2, warmup=1500, draws=500, guide="low-rank"), Gaussian())
+    sd = np.sqrt(np.diag(exact.z[1]))
+    print((run.z.std((0, 1)) / sd), wide.z.std((0, 1)) / sd)
+    assert (run.z.std((0, 1)) / sd).min() < 0.8
+    assert (wide.z.std((0, 1)) / sd).min() > (run.z.std((0, 1)) / sd).min() + 0.1
+
+
+def test_determined_biases_have_the_sds_of_nuts():
+    problem = small(scans=20)
+    start = automatic_start(problem)
+    exact = sample(problem, NUTS(chains=2, warmup=200, draws=400), Horseshoe(), start, jax.random.key(0))
+    found = sample(problem, SVI(chains=2), Horseshoe(), start, jax.random.key(1))
+    determined = exact.draws["gamma"].mean((0, 1)) > 0.5
+    assert determined.sum() >= 2
+    sd = exact.z.std((0, 1))
+    print(found.z.std((0, 1)) / sd, pareto_khat(found.draws["stats_log_weight"].ravel()))
+    assert (np.abs(found.z.std((0, 1)) / sd - 1)[determined] < 0.15).all()
+    assert (np.abs(found.z.mean((0, 1)) - exact.z.mean((0, 1))) < 0.25 * sd).all()
+    assert pareto_khat(found.draws["stats_log_weight"].ravel()) < 0.7
+    bound = found.draws["stats_elbo"]
+    assert (bound[:, -1] > bound[:, 0] + 1.0).all()
+    np.testing.assert_allclose(bound[:, -1], found.draws["stats_log_weight"].mean(1), atol=0.5)
+
+
+def test_what_it_refuses():
+    with pytest.raises(InputError, match=r'SVI\(guide="meanfield"\): unknown guide; did you mean "mean-field"'):
+        SVI(guide="meanfield")
+    for wrong in ({"warmup": 0}, {"rate": 0.0}, {"particles": 0}):
+        with pytest.raises(InputError, match="at least one step of at least one particle is needed"):
+            SVI(**wrong)
