@@ -37,7 +37,7 @@ class Chain(NamedTuple):
     fitted: Fitted
     slope: Fitted  # running mean of the gradients
     square: Fitted  # and of their squares
-    count: jax.Array  # steps done, those that draw included
+    steps: jax.Array  # done, those that draw included
     bound: jax.Array  # running evidence lower bound
     trace: jax.Array  # (warmup,) the running bound of each step
     key: jax.Array
@@ -132,17 +132,17 @@ class SVI(Sampler):
         """One step of Adam until `warmup` of them are done, and one draw of the guide."""
         keys = jax.random.split(chain.key, 3)
         moved = jax.lax.cond(
-            chain.count < self.warmup, lambda: self._improved(form, posed, chain, keys[0]), lambda: chain
+            chain.steps < self.warmup, lambda: self._improved(form, posed, chain, keys[0]), lambda: chain
         )
         guide = self._guide(form, posed)
         n = jax.random.normal(keys[1], (1, moved.fitted.mean.shape[0]))
         sample, density = self._sample(form, posed, guide.place(moved.fitted, n)[0])
-        drawn = jnp.clip(moved.count - self.warmup, 0, self.draws - 1)
+        drawn = jnp.clip(moved.steps - self.warmup, 0, self.draws - 1)
         stats = {
             "log_weight": density - guide.log_density(moved.fitted, n)[0],
             "elbo": moved.trace[(drawn * self.warmup) // self.draws],
         }
-        return moved._replace(count=chain.count + 1, key=keys[2]), sample._replace(stats=stats)
+        return moved._replace(steps=chain.steps + 1, key=keys[2]), sample._replace(stats=stats)
 
     def _improved(self, form: Form, posed: Posed, chain: Chain, key: jax.Array) -> Chain:
         """One step of Adam up the bound; a gradient that is not finite is left out."""
@@ -159,18 +159,18 @@ class SVI(Sampler):
 
         gradient, value = jax.grad(bound, has_aux=True)(fitted)
         sound = jnp.isfinite(value) & jnp.all(jnp.asarray([jnp.isfinite(g).all() for g in jax.tree.leaves(gradient)]))
-        t = chain.count + 1.0
-        rate = self.rate * 0.5 * (1 + jnp.cos(jnp.pi * chain.count / self.warmup))
+        t = chain.steps + 1.0
+        rate = self.rate * 0.5 * (1 + jnp.cos(jnp.pi * chain.steps / self.warmup))
         slope = jax.tree.map(lambda m, g: DECAY * m + (1 - DECAY) * g, chain.slope, gradient)
         square = jax.tree.map(lambda s, g: SQUARE * s + (1 - SQUARE) * g**2, chain.square, gradient)
         fitted = jax.tree.map(
             lambda p, m, s: p + rate * (m / (1 - DECAY**t)) / (jnp.sqrt(s / (1 - SQUARE**t)) + LEAST),
             fitted, slope, square,
         )  # fmt: skip
-        mean = jnp.where(chain.count == 0, value, SMOOTH * chain.bound + (1 - SMOOTH) * value)
+        mean = jnp.where(chain.steps == 0, value, SMOOTH * chain.bound + (1 - SMOOTH) * value)
         found = chain._replace(fitted=fitted, slope=slope, square=square, bound=mean)
         found = jax.tree.map(lambda new, old: jnp.where(sound, new, old), found, chain)
-        return found._replace(trace=found.trace.at[chain.count].set(found.bound))
+        return found._replace(trace=found.trace.at[chain.steps].set(found.bound))
 
     def _guide(self, form: Form, posed: Posed) -> Guide:
         free = _template(form, posed)
