@@ -11,7 +11,7 @@ from probcal.inference.em import EM, EMEA
 from probcal.inference.nuts import NUTS
 from probcal.inference.run import Method
 from probcal.inference.svi import SVI
-from probcal.priors import PRIORS, Flat, Laplace, Prior
+from probcal.priors import PRIORS, BernoulliGaussian, Flat, Laplace, Prior
 from probcal.problem import Problem
 from probcal.types import InputError
 
@@ -28,6 +28,7 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
     "ml": (MAP(), Flat()),
     "nls": (LeastSquares(), None),
     "collapsed": (Collapsed(), None),
+    "collapsed-spike": (Collapsed(), BernoulliGaussian()),
     "nuts": (NUTS(), None),
     "svi": (SVI(), None),
     "svi-mean-field": (SVI(guide="mean-field"), None),
