@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import reference
 from test_exact import CASES, resting
-from test_model import posed_of, small
+from test_model import posed_of, small, two_motions
 
 import probcal
 from probcal import NUTS, SVI, Gaussian, Horseshoe, InputError
@@ -51,16 +51,17 @@ def test_pareto_khat_is_that_of_the_large_weights():
     assert pareto_khat(np.zeros(100)) == 0.0
 
 
-@pytest.mark.parametrize("settings", [{}, {"missing": 0.0}], ids=str)
-def test_plain_coordinates_and_those_of_the_frame_are_one_posterior(settings):
-    """The same point in both: its density given phi, by the volumes of both coordinates."""
-    form, posed = posed_of(small(**settings), Horseshoe())
-    keys = jax.random.split(jax.random.key(3), 4)
-    free = form.hierarchy.relax(form.hierarchy.draw(keys[0]))
+def test_any_point_has_coordinates_in_the_frame():
+    """Plain coordinates placed, turned into those of the frame and placed again: with a level, two recursions."""
+    problem = small(motion=two_motions)
+    form, posed = posed_of(problem, Horseshoe())
+    keys = jax.random.split(jax.random.key(3), 3)
+    phi = form.hierarchy.relax(form.hierarchy.draw(keys[0]))
     noises = tuple(0.1 * jax.random.normal(keys[1], x.shape) + x for x in posed.frame.point.noises)
-    at = plain(form, posed, Free(free, 0.1 * jax.random.normal(keys[2], posed.frame.theta.shape), noises))
-    eps = driving(posed.system, posed.frame, at.point)
-    again = place(posed.system, posed.frame, at.theta, eps)
+    at = plain(form, posed, Free(phi, 0.1 * jax.random.normal(keys[2], posed.frame.theta.shape), noises))
+    again = place(posed.system, posed.frame, at.theta, driving(posed.system, posed.frame, at.point))
+    assert len(again.states) == 2
+    assert again.levels.shape == (1,)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), again, at.point)
 
 
@@ -74,30 +75,24 @@ def solved(name, method, prior):
     return run, reference.dense(linear, np.ones(len(linear.labels)))
 
 
-@pytest.mark.parametrize("name", ["plane", "mixed"])
-def test_linear_problems_are_exact(name):
-    run, exact = solved(name, SVI(chains=2, warmup=50, draws=1000), Gaussian())
-    mean, covariance = exact.z
-    sd, count = np.sqrt(np.diag(covariance)), run.z.shape[0] * run.z.shape[1]
-    z = run.z.reshape(count, -1)
-    assert (np.abs(z.mean(0) - mean) < ALARM * sd / np.sqrt(count)).all()
-    assert (np.abs(z.std(0) / sd - 1) < ALARM / np.sqrt(2 * count)).all()
-    np.testing.assert_allclose(np.ptp(run.draws["stats_log_weight"]), 0.0, atol=1e-5)  # p / q is the evidence, always
-    track_mean, track_sd = exact.states
-    if name == "plane":  # one recursion, in the order of the reference
-        states = run.states[0].reshape(count, -1)
-        assert (np.abs(states.mean(0) - track_mean) < ALARM * track_sd / np.sqrt(count)).all()
-        assert (np.abs(states.std(0) / track_sd - 1) < ALARM / np.sqrt(2 * count)).all()
+def test_linear_problems_are_exact():
+    run, exact = solved("plane", SVI(chains=2, warmup=50, draws=1000), Gaussian())
+    count = run.z.shape[0] * run.z.shape[1]
+    for drawn, mean, sd in ((run.z, exact.z[0], np.sqrt(np.diag(exact.z[1]))), (run.states[0], *exact.states)):
+        flat = drawn.reshape(count, -1)
+        assert (np.abs(flat.mean(0) - mean) < ALARM * sd / np.sqrt(count)).all()
+        assert (np.abs(flat.std(0) / sd - 1) < ALARM / np.sqrt(2 * count)).all()
+    # no gradient where the guide is exact: it stays, and p / q is the evidence at every draw
+    np.testing.assert_allclose(np.ptp(run.draws["stats_log_weight"]), 0.0, atol=1e-5)
 
 
 def test_mean_field_is_too_narrow_where_biases_are_correlated():
-    """Plain coordinates of a linear problem: the variational optimum has the conditional variances ."""
+    """Plain coordinates of a linear problem: its optimum has the conditional variances (Bishop 2006, 10.2)."""
     run, exact = solved("plane", SVI(chains=2, warmup=1500, draws=500, guide="mean-field"), Gaussian())
     wide, exact = solved("plane", SVI(chains=2, warmup=1500, draws=500, guide="low-rank"), Gaussian())
     sd = np.sqrt(np.diag(exact.z[1]))
-    print((run.z.std((0, 1)) / sd), wide.z.std((0, 1)) / sd)
-    assert (run.z.std((0, 1)) / sd).min() < 0.8
-    assert (wide.z.std((0, 1)) / sd).min() > (run.z.std((0, 1)) / sd).min() + 0.1
+    assert (run.z.std((0, 1)) / sd).min() < 0.7
+    assert (wide.z.std((0, 1)) / sd).min() > 0.75
 
 
 def test_determined_biases_have_the_sds_of_nuts():
@@ -108,7 +103,6 @@ def test_determined_biases_have_the_sds_of_nuts():
     determined = exact.draws["gamma"].mean((0, 1)) > 0.5
     assert determined.sum() >= 2
     sd = exact.z.std((0, 1))
-    print(found.z.std((0, 1)) / sd, pareto_khat(found.draws["stats_log_weight"].ravel()))
     assert (np.abs(found.z.std((0, 1)) / sd - 1)[determined] < 0.15).all()
     assert (np.abs(found.z.mean((0, 1)) - exact.z.mean((0, 1))) < 0.25 * sd).all()
     assert pareto_khat(found.draws["stats_log_weight"].ravel()) < 0.7

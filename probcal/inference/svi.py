@@ -27,7 +27,8 @@ from probcal.types import InputError, nearest
 
 GUIDES = ("structured", "mean-field", "low-rank")
 NARROW = 0.1  # scale of plain coordinates to start from
-DECAY, SQUARE, LEAST = 0.9, 0.999, 1e-8  # of Adam
+DECAY, SQUARE = 0.9, 0.999  # of Adam: memory of the gradients and of their squares
+STEEP = 2.0  # steps are at most slope / STEEP long: a coordinate of unit spread settles instead of swinging
 SMOOTH = 0.95  # of the running bound
 
 
@@ -164,7 +165,7 @@ class SVI(Sampler):
         slope = jax.tree.map(lambda m, g: DECAY * m + (1 - DECAY) * g, chain.slope, gradient)
         square = jax.tree.map(lambda s, g: SQUARE * s + (1 - SQUARE) * g**2, chain.square, gradient)
         fitted = jax.tree.map(
-            lambda p, m, s: p + rate * (m / (1 - DECAY**t)) / (jnp.sqrt(s / (1 - SQUARE**t)) + LEAST),
+            lambda p, m, s: p + rate * (m / (1 - DECAY**t)) / (jnp.sqrt(s / (1 - SQUARE**t)) + STEEP * self.rate),
             fitted, slope, square,
         )  # fmt: skip
         mean = jnp.where(chain.steps == 0, value, SMOOTH * chain.bound + (1 - SMOOTH) * value)
