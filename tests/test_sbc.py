@@ -281,6 +281,7 @@ def test_collapsed_is_uniform():
     assert tree["run"]["r_hat"].values.min() >= 0.99
 
 
+@pytest.mark.slow
 def test_collapsed_with_a_spike_is_uniform():
     """40 simulations of three radars; a right sampler fails with probability 1 %."""
     tree = quick(Collapsed(chains=2, warmup=50, draws=150), SPIKE)
@@ -288,6 +289,7 @@ def test_collapsed_with_a_spike_is_uniform():
     assert {"share", "biases not zero"} <= set(tree["sbc"]["quantity"].values)
 
 
+@pytest.mark.slow
 def test_nuts_is_uniform():
     """40 simulations with unknown noise, blanks and a yes-or-no channel; a right sampler fails with probability 1 %."""
     tree = quick(NUTS(chains=1, warmup=80, draws=100), Gaussian(), problem=cameras())
