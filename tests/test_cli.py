@@ -299,7 +299,17 @@ def test_options_of_samplers_are_checked(options, text, model, rows, monkeypatch
 def test_a_sampler_prints_and_writes_what_its_chains_are_worth(model, rows, tmp_path, monkeypatch, capsys):
     sizes = ["--chains", "2", "--draws", "60", "--warmup", "50"]
     code, out, err = call(
-        monkeypatch, capsys, "fit", model, rows, "--method", "collapsed", *sizes, "--no-assess", "--out", tmp_path / "fit"
+        monkeypatch,
+        capsys,
+        "fit",
+        model,
+        rows,
+        "--method",
+        "collapsed",
+        *sizes,
+        "--no-assess",
+        "--out",
+        tmp_path / "fit",
     )
     assert "2 x 60 draws" in out
     assert code == 1
