@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from probcal import linalg
 from probcal.inference.hierarchy import Hierarchy, Phi, SpikeAndSlab
