@@ -38,7 +38,7 @@ class Chain(NamedTuple):
     fitted: Fitted
     slope: Fitted  # running mean of the gradients
     square: Fitted  # and of their squares
-    count: jax.Array  # steps done, those that draw included
+    steps: jax.Array  # done, those that draw included
     bound: jax.Array  # running evidence lower bound
     trace: jax.Array  # (warmup,) the running bound of each step
     key: jax.Array
@@ -83,7 +83,8 @@ class SVI(Sampler):
     `guide`: "structured" (in the frame's coordinates: full rank over biases and hyper-parameters, given which each
     trajectory has a block-tridiagonal precision), "mean-field" or "low-rank" (in plain coordinates, for comparison).
     Each of `chains` takes `warmup` Adam steps of length `rate` with `particles` draws each, then `draws` from its
-    guide. Raises `InputError` for settings outside their ranges.
+    guide. Sample statistics: `log_weight`, log p - log q of each draw, and `elbo`, the running bound along the warm-up,
+    spread over the draws. Raises `InputError` for settings outside their ranges.
     """
 
     chains: int = 4
@@ -127,23 +128,23 @@ class SVI(Sampler):
         rest = self._guide(form, posed).first(flat.shape[0], keys[0])
         fitted = Fitted(flat, jnp.full_like(flat, log_scale), rest)
         zero = jax.tree.map(jnp.zeros_like, fitted)
-        return Chain(fitted, zero, zero, jnp.zeros((), int), jnp.zeros(()), jnp.zeros(self.warmup), keys[1])
+        return Chain(fitted, zero, zero, jnp.zeros((), int), jnp.full((), -jnp.inf), jnp.zeros(self.warmup), keys[1])
 
     def step(self, form: Form, posed: Posed, chain: Chain) -> tuple[Chain, Sample]:
         """One step of Adam until `warmup` of them are done, and one draw of the guide."""
         keys = jax.random.split(chain.key, 3)
         moved = jax.lax.cond(
-            chain.count < self.warmup, lambda: self._improved(form, posed, chain, keys[0]), lambda: chain
+            chain.steps < self.warmup, lambda: self._improved(form, posed, chain, keys[0]), lambda: chain
         )
         guide = self._guide(form, posed)
         n = jax.random.normal(keys[1], (1, moved.fitted.mean.shape[0]))
         sample, density = self._sample(form, posed, guide.place(moved.fitted, n)[0])
-        drawn = jnp.clip(moved.count - self.warmup, 0, self.draws - 1)
+        drawn = jnp.clip(moved.steps - self.warmup, 0, self.draws - 1)
         stats = {
             "log_weight": density - guide.log_density(moved.fitted, n)[0],
             "elbo": moved.trace[(drawn * self.warmup) // self.draws],
         }
-        return moved._replace(count=chain.count + 1, key=keys[2]), sample._replace(stats=stats)
+        return moved._replace(steps=chain.steps + 1, key=keys[2]), sample._replace(stats=stats)
 
     def _improved(self, form: Form, posed: Posed, chain: Chain, key: jax.Array) -> Chain:
         """One step of Adam up the bound; a gradient that is not finite is left out."""
@@ -160,18 +161,18 @@ class SVI(Sampler):
 
         gradient, value = jax.grad(bound, has_aux=True)(fitted)
         sound = jnp.isfinite(value) & jnp.all(jnp.asarray([jnp.isfinite(g).all() for g in jax.tree.leaves(gradient)]))
-        t = chain.count + 1.0
-        rate = self.rate * 0.5 * (1 + jnp.cos(jnp.pi * chain.count / self.warmup))
+        t = chain.steps + 1.0
+        rate = self.rate * 0.5 * (1 + jnp.cos(jnp.pi * chain.steps / self.warmup))
         slope = jax.tree.map(lambda m, g: DECAY * m + (1 - DECAY) * g, chain.slope, gradient)
         square = jax.tree.map(lambda s, g: SQUARE * s + (1 - SQUARE) * g**2, chain.square, gradient)
         fitted = jax.tree.map(
             lambda p, m, s: p + rate * (m / (1 - DECAY**t)) / (jnp.sqrt(s / (1 - SQUARE**t)) + STEEP * self.rate),
             fitted, slope, square,
         )  # fmt: skip
-        mean = jnp.where(chain.count == 0, value, SMOOTH * chain.bound + (1 - SMOOTH) * value)
+        mean = jnp.where(jnp.isfinite(chain.bound), SMOOTH * chain.bound + (1 - SMOOTH) * value, value)
         found = chain._replace(fitted=fitted, slope=slope, square=square, bound=mean)
         found = jax.tree.map(lambda new, old: jnp.where(sound, new, old), found, chain)
-        return found._replace(trace=found.trace.at[chain.count].set(found.bound))
+        return found._replace(trace=found.trace.at[chain.steps].set(found.bound))
 
     def _guide(self, form: Form, posed: Posed) -> Guide:
         free = _template(form, posed)
