@@ -23,9 +23,11 @@ from probcal.inference import (
     SVI,
     Collapsed,
     LeastSquares,
+    coverage_table,
     fit,
     log_evidence,
     numpyro_model,
+    sbc,
     study,
     track,
 )
@@ -52,12 +54,12 @@ from probcal.tree import load, outliers, save, summary
 from probcal.types import FitError, InputError
 
 __all__ = [
-    "ARD", "EA", "EM", "EMEA", "MAP", "NUTS", "SVI", "Bernoulli", "BernoulliGaussian", "Bias", "Channel", "Collapsed",
-    "ConstantAcceleration", "ConstantVelocity", "CoordinatedTurn", "FitError", "Flat", "Gaussian", "Horseshoe",
-    "InputError", "Known", "Laplace", "LeastSquares", "LocalFrame", "Mixture", "Motion", "Network", "Node", "Path",
-    "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target", "Truth", "Unknown",
-    "White", "assess", "bound_map", "bounds", "compare", "fit", "interchangeable", "load", "log_evidence",
-    "next_anchors", "next_passes", "next_sensors", "noise", "numpyro_model", "observability", "outliers", "priors",
-    "read_nodes", "read_table", "save", "scores", "sensitivity", "sensor", "sensors", "simulate", "study", "summary",
-    "track", "write_nodes",
+    "ARD", "EA", "EM", "EMEA", "MAP", "NUTS", "SVI", "Bernoulli", "BernoulliGaussian", "Bias", "Channel",
+    "Collapsed", "ConstantAcceleration", "ConstantVelocity", "CoordinatedTurn", "FitError", "Flat", "Gaussian",
+    "Horseshoe", "InputError", "Known", "Laplace", "LeastSquares", "LocalFrame", "Mixture", "Motion", "Network",
+    "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target",
+    "Truth", "Unknown", "White", "assess", "bound_map", "bounds", "compare", "coverage_table", "fit",
+    "interchangeable", "load", "log_evidence", "next_anchors", "next_passes", "next_sensors", "noise",
+    "numpyro_model", "observability", "outliers", "priors", "read_nodes", "read_table", "save", "sbc", "scores",
+    "sensitivity", "sensor", "sensors", "simulate", "study", "summary", "track", "write_nodes",
 ]  # fmt: skip

@@ -27,8 +27,10 @@ from probcal.analysis import assess, bound_map, compare, next_anchors, next_pass
 from probcal.analysis.compare import chosen_pair, named
 from probcal.diagnostics import comparison_rows, grid_of, scores, study_table
 from probcal.inference import METHODS, ORACLE, fit, study, track
+from probcal.inference.coverage import coverage_table
 from probcal.inference.run import Method, Progress
 from probcal.inference.sampler import Sampler
+from probcal.inference.sbc import sbc, short
 from probcal.inference.study import choose_methods
 from probcal.priors import PRIORS
 from probcal.problem import Problem
@@ -696,6 +698,79 @@ def report_command(
     tree = load(folder)
     target = folder if folder.is_dir() else folder.parent
     print(f"written: {_report(tree, _folder(target))}")
+
+
+@app.command(name="sbc")
+def sbc_command(
+    model: Model,
+    data: Data = None,
+    method: Annotated[str, typer.Option(help=" | ".join(METHODS))] = "ea",
+    prior: Annotated[str | None, typer.Option(help=" | ".join(PRIORS) + "; the method's own if left out")] = None,
+    truths: Annotated[
+        str | None, typer.Option("--from", help="prior that the truths are drawn from; that of the fit if left out")
+    ] = None,
+    fix: Annotated[list[str], typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = [],  # noqa: B006
+    runs: Annotated[int, typer.Option(min=2, help="simulations")] = 200,
+    seed: Seed = 0,
+    posterior: Annotated[
+        bool, typer.Option("--posterior", help="draw the truths from the posterior of the data instead of the prior")
+    ] = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="run samplers as long as a fit would, not just long enough for ranks")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="folder for sbc.nc, sbc.csv, sbc.png, and finished runs")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on with the finished runs in --out")] = False,
+) -> None:
+    """Check a method on a model by simulation: do its intervals hold the truth as often as they say?"""
+    if method not in METHODS:
+        raise InputError(f'sbc: no method is called "{method}"{nearest(method, METHODS)}')
+    for name in (prior, truths):
+        if name is not None and name not in PRIORS:
+            raise InputError(f'sbc: no prior is called "{name}"{nearest(name, PRIORS)}')
+    if resume and out is None:
+        raise InputError("sbc: --resume needs --out DIR, the folder of the runs to go on with")
+    value, implied = METHODS[method]
+    value = value if full else short(value)
+    if out is not None:
+        _folder(out)
+    module, problem = _problem(model, data, fix)
+    chosen: Any = PRIORS[prior] if prior is not None else implied
+    own = getattr(module, "PRIOR", None)
+    if chosen is None and isinstance(own, value.priors):
+        chosen = own
+    began = time.perf_counter()
+    with _bar() as advance:
+        tree = sbc(
+            problem, value, chosen, runs, simulate_from=PRIORS[truths] if truths is not None else None,
+            around="data" if posterior else None, key=seed, progress=advance, resume=resume,
+            store=None if out is None else out / "runs",
+        )  # fmt: skip
+    tree.attrs["model"] = model.stem
+    table = coverage_table(tree)
+    print(table.to_string(index=False, float_format=lambda number: f"{number:.3f}"))
+    counted = f"{tree.attrs['runs']} runs, truths from {tree.attrs['source']}"
+    print(f"{tree.attrs['method']} ({tree.attrs['prior']}): {counted}, {time.perf_counter() - began:.1f} s")
+    print(tree.attrs["verdict"])
+    if tree.attrs["message"]:
+        print(tree.attrs["message"])
+    if out is not None:
+        _write_sbc(tree, table, out)
+    raise typer.Exit(0 if tree.attrs["status"] == "uniform" else 1)
+
+
+def _write_sbc(tree: xr.DataTree, table: pd.DataFrame, out: Path) -> None:
+    files = [out / "sbc.nc", out / "sbc.csv"]
+    try:
+        save(tree, files[0])
+        _write_csv(table, files[1])
+        if _can_plot():
+            from probcal.plots.sbc import draw_sbc  # the plot packages are an extra
+
+            files.append(out / "sbc.png")
+            draw_sbc(tree, files[-1])
+    except OSError as error:
+        raise InputError(f"{out} cannot be written: {error.strerror}") from None
+    print(f"written: {', '.join(str(path) for path in files)}")
 
 
 if __name__ == "__main__":

@@ -54,6 +54,10 @@ def study_table(study: xr.Dataset) -> pd.DataFrame:
     if "position_rmse" in frame:
         table["position"] = groups["position_rmse"].mean()
     table["coverage"] = groups["coverage"].mean()
+    there = study["true"] != 0
+    inside = ((study["lower"] <= 0) & (study["upper"] >= 0)).where(there)
+    if bool(there.any()) and not bool(there.all()):
+        table["of non-zero"] = inside.mean(["run", "bias_label"]).to_series().reindex(table.index)
     table["runs"] = groups.size()
     for status in ("converged", "not converged", "at bound", "diverged"):
         frame[status] = frame["status"] == status

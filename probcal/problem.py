@@ -1,7 +1,8 @@
 """Problem = network + motion + table (+ fixed biases): labels above, arrays below."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from os import PathLike
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, Level, Unknown, guess_of
 from probcal.rows import Block, Layout, Rows, make_block, pose_entries, pose_vector
 from probcal.sensor import VECTORS
-from probcal.table import Measurements, Table, measure, read_table
+from probcal.table import Measurements, Table, factor, header, measure, read_table
 from probcal.types import InputError, float64, nearest
 
 DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
@@ -172,6 +173,35 @@ class Problem:
         table = self.measurements.table
         frame = table.frame.iloc[rows].reset_index(drop=True)
         return self.rebuild(Table(frame, table.source, table.lines[rows], table.word))
+
+    def redrawn(self, y: Sequence[Any]) -> "Problem":
+        """The same rows with other measured values: y (N, C) of each block, read where a value is measured.
+
+        Shapes and static form stay, so that kernels compiled for this problem serve the other.
+        """
+        data, frame = self.measurements, self.measurements.table.frame.copy()
+        value = data.value.copy()
+        for block, index, numbers, new in zip(self.spec.blocks, self.row_index, self.system.rows, y, strict=True):
+            there = np.asarray(numbers.mask) > 0
+            for c, (name, _) in enumerate(block.type.expand(self.network.dimension)):
+                value[index[there[:, c]], data.channels.index(name)] = np.asarray(new)[there[:, c], c]
+        names, units = header(data.table)
+        for j, name in enumerate(data.channels):
+            if name in names:
+                column = np.full(len(frame), np.nan)
+                for k in np.unique(data.sensor[data.measured[:, j]]):
+                    channel = dict(self.network.sensors[k].type.expand(self.network.dimension))[name]
+                    mine = (data.sensor == k) & data.measured[:, j]
+                    column[mine] = value[mine, j] / factor(data.table, name, units[name], channel.unit)
+                frame[frame.columns[names.index(name)]] = column
+        other = copy(self)
+        other.measurements = replace(data, value=value, table=replace(data.table, frame=frame))
+        rows = [
+            r._replace(y=jnp.where(r.mask > 0, jnp.asarray(new, r.y.dtype), 0.0))
+            for r, new in zip(self.system.rows, y, strict=True)
+        ]
+        other.system = self.system._replace(rows=tuple(rows))
+        return other
 
     def target(self, name: str) -> Target:
         """Motion and start of a target by name."""

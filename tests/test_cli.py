@@ -281,3 +281,39 @@ def test_a_model_may_bring_its_prior(tmp_path, model):
         done = run("fit", model, tmp_path / "rows.csv", "--no-assess", "--out", tmp_path / "out", *extra)
         assert done.returncode in (0, 1), done.stderr
         assert wanted in probcal.load(tmp_path / "out").attrs["settings"]
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--method", "collapsed", "--resume"], "--resume needs --out, the folder of the run to go on with"),
+        (["--method", "map", "--draws", "10"], '--draws: "map" draws no chains; take collapsed, nuts or svi'),
+    ],
+)
+def test_options_of_samplers_are_checked(options, text, model, rows, monkeypatch, capsys):
+    code, _, err = call(monkeypatch, capsys, "fit", model, rows, *options)
+    assert code == 2
+    assert text in err
+
+
+def test_a_sampler_prints_and_writes_what_its_chains_are_worth(model, rows, tmp_path, monkeypatch, capsys):
+    sizes = ["--chains", "2", "--draws", "60", "--warmup", "50"]
+    code, out, err = call(
+        monkeypatch,
+        capsys,
+        "fit",
+        model,
+        rows,
+        "--method",
+        "collapsed",
+        *sizes,
+        "--no-assess",
+        "--out",
+        tmp_path / "fit",
+    )
+    assert "2 x 60 draws" in out
+    assert code == 1
+    assert "effective draws" in err, "so few draws are not called converged"
+    frame = pd.read_csv(tmp_path / "fit" / "summary.csv")
+    assert {"r_hat", "ess", "ess_tail", "inclusion", "contraction"} <= set(frame.columns)
+    assert not (tmp_path / "fit" / "draws").exists(), "the draws are in fit.nc"

@@ -16,6 +16,7 @@ import probcal
 from probcal import ARD, NUTS, BernoulliGaussian, Collapsed, Flat, Gaussian, Horseshoe, InputError, Laplace
 from probcal.inference.draws import inverse_gaussian, slice_step
 from probcal.inference.hierarchy import hierarchy_of
+from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Form, Posed, conditional, update_inclusions, whiten
 from probcal.inference.posterior import mixing
 from probcal.smoothing.frame import frame_at, log_weight, place
@@ -260,7 +261,7 @@ def test_a_constant_quantity_counts_as_mixed():
 def test_wrong_settings_are_refused():
     with pytest.raises(InputError, match="a sampler needs a proper hyper-prior"):
         hierarchy_of(ARD(), fitted_problem())
-    with pytest.raises(InputError, match="target lies in"):
+    with pytest.raises(InputError, match="target is in"):
         NUTS(target=1.5)
     with pytest.raises(InputError, match="move is one of ellipse, swing"):
         Collapsed(move="leap")
@@ -303,3 +304,13 @@ def test_the_evidence_integrates_every_hyper_parameter():
     assert found.khat == 0.0
     with pytest.raises(InputError, match="a flat prior has no evidence"):
         probcal.log_evidence(problem, Flat())
+
+
+def test_khat_is_that_of_the_heavy_right_tail():
+    """Weights that are Pareto of shape k have k-hat k; their inverses have none to speak of."""
+    uniform = np.random.default_rng(0).uniform(size=20000)
+    for k in (0.3, 0.9):
+        assert pareto_khat(-k * np.log(uniform)) == pytest.approx(k, abs=0.15)
+    assert pareto_khat(0.9 * np.log(uniform)) < 0.0
+    assert pareto_khat(np.zeros(100)) == 0.0
+    assert pareto_khat(np.array([0.0, -np.inf])) == np.inf

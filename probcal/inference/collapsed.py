@@ -159,16 +159,17 @@ MOVES = {"ellipse": ellipse, "swing": swing}
 class Collapsed(Sampler):
     """Exact posterior of biases, hyper-parameters and trajectories, sampled with the trajectories marginalised.
 
-    Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it between two draws of each of
-    `chains`. Biases and trajectories also move together, along an "ellipse" or by a Hamiltonian "swing". Where the
-    frame fits badly it is moved; where that fails the joint sampler `NUTS` takes over, or, for a spike, the swing.
+    Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it (None: as pays for the prior)
+    between two draws of each of `chains`. Biases and trajectories also move together, along an "ellipse" or by a
+    Hamiltonian "swing". Where the frame fits badly it is moved; where that fails the joint sampler `NUTS` takes over,
+    or, for a spike, the swing.
     Raises `InputError` for another move or less than one sweep.
     """
 
     chains: int = 4
     warmup: int = 100
     draws: int = 500
-    sweeps: int = 5
+    sweeps: int | None = None
     move: str = "ellipse"
 
     name: ClassVar[str] = "Collapsed"
@@ -177,7 +178,7 @@ class Collapsed(Sampler):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.move not in MOVES or self.sweeps < 1:
+        if self.move not in MOVES or (self.sweeps is not None and self.sweeps < 1):
             raise InputError(f'Collapsed(sweeps={self.sweeps}, move="{self.move}"): move is one of {", ".join(MOVES)}')
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Chain:
@@ -191,7 +192,7 @@ class Collapsed(Sampler):
     def step(self, form: Form, posed: Posed, chain: Chain) -> tuple[Chain, Sample]:
         """One draw."""
         key, *keys = jax.random.split(chain.key, 6)
-        theta, phi = surrogate(form, posed, chain.theta, chain.phi, keys[0], self.sweeps)
+        theta, phi = surrogate(form, posed, chain.theta, chain.phi, keys[0], self.sweeps or form.hierarchy.sweeps)
         weight = log_weight(form.spec, posed.system, posed.frame, theta, chain.eps)
         rate = jnp.exp(jnp.minimum(weight - chain.weight, 0.0))
         taken = jax.random.uniform(keys[1]) < rate

@@ -47,7 +47,7 @@ def log_evidence(problem: Problem, prior: Prior | None = None, *, key: Key = 0, 
     logs = np.asarray(weights(form, posed, found.theta, keys[1]))
     khat = pareto_khat(logs)
     if khat > 0:
-        smooth = np.asarray(array_stats.psislw(logs)[0])
+        smooth = np.asarray(array_stats.psislw(-logs)[0])
         logs = smooth + (logs - smooth)[logs.argmin()]  # smoothing leaves the small weights alone
     relative = np.exp(logs - logs.max())
     correction = float(logs.max() + np.log(relative.mean()))

@@ -8,7 +8,7 @@ add one: a class here with its `hyper` distributions and its `updates`, and a li
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,8 @@ class Hierarchy(ABC):
     prior: Any
     learnt: tuple[int, ...]
     group: tuple[int, ...]
+
+    sweeps: ClassVar[int] = 10  # Gibbs sweeps between two draws that pay for themselves
 
     @property
     def count(self) -> int:
@@ -206,7 +208,9 @@ class RegularisedHorseshoe(Hierarchy):
 
 
 class SpikeAndSlab(Hierarchy):
-    """Bernoulli-Gaussian: which biases are in, and the share of them; `collapsed.py` moves these with z integrated."""
+    """Bernoulli-Gaussian: which biases are in, and the share of them; `posed.update_inclusions` moves the first."""
+
+    sweeps = 2
 
     def hyper(self):
         """The share of the biases that are not zero, where it is not given."""

@@ -10,7 +10,8 @@ from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
 from probcal.inference.nuts import NUTS
 from probcal.inference.run import Method
-from probcal.priors import PRIORS, Flat, Laplace, Prior
+from probcal.inference.svi import SVI
+from probcal.priors import PRIORS, BernoulliGaussian, Flat, Laplace, Prior
 from probcal.problem import Problem
 from probcal.types import InputError
 
@@ -27,7 +28,11 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
     "ml": (MAP(), Flat()),
     "nls": (LeastSquares(), None),
     "collapsed": (Collapsed(), None),
+    "collapsed-spike": (Collapsed(), BernoulliGaussian()),
     "nuts": (NUTS(), None),
+    "svi": (SVI(), None),
+    "svi-mean-field": (SVI(guide="mean-field"), None),
+    "svi-low-rank": (SVI(guide="low-rank"), None),
 }
 
 

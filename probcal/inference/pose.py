@@ -20,6 +20,7 @@ PILOTS = 4  # chains of the pilot
 BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, sweeps between two
 MOVES = 4  # most times that the frame is moved
 GOOD, LOST = 0.5, 0.7  # Pareto k-hat at which a frame is left alone, and above which it has failed
+SCARCE = 0.2  # acceptance of independent draws below which it has failed too
 FITTINGS, FITTED = 2, 20  # rounds and draws (with mirror images) that a frame is fitted to
 SPREAD = 1.5  # by how much chains start further out than the pilot's draws
 
@@ -41,7 +42,7 @@ class Worth(NamedTuple):
     @property
     def failed(self) -> bool:
         """Whether the frame's draws cannot stand for the posterior."""
-        return self.khat > LOST
+        return self.khat > LOST or self.acceptance < SCARCE
 
 
 @partial(jax.jit, static_argnames="form")
@@ -92,12 +93,13 @@ def moved(spec: Spec, system: System, frame: Frame, theta: jax.Array, key: jax.A
 
 
 def pareto_khat(log_weights: np.ndarray) -> float:
-    """Pareto k-hat of log weights (D,); 0 where they are all equal, infinite where some draw has none."""
+    """Pareto k-hat of log weights (D,); 0 where they are all equal, infinite where it cannot be told."""
     if not np.isfinite(log_weights).all():
         return np.inf
     if np.ptp(log_weights) < 1e-6:
         return 0.0
-    return float(array_stats.psislw(-log_weights)[1])  # it takes log-likelihoods, inverse weights
+    found = float(array_stats.psislw(-log_weights)[1])  # it takes log-likelihoods, inverse weights
+    return found if np.isfinite(found) else np.inf  # one draw has all the weight: no tail is left to fit
 
 
 def acceptance(log_weights: np.ndarray) -> float:
@@ -122,7 +124,7 @@ def pose(problem: Problem, prior: Prior, start: Point, key: jax.Array) -> tuple[
         found = pilot(form, posed, keys[0])
         logs = np.asarray(weights(form, posed, found.theta, keys[1]))
         worth = Worth(pareto_khat(logs), acceptance(logs), move)
-        if best is None or worth.khat < best[2].khat:
+        if best is None or worth.acceptance > best[2].acceptance:
             best = posed, found, worth
         if move and worth.khat < GOOD:
             break

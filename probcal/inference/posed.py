@@ -4,12 +4,10 @@ theta holds the biases z (M,) and the log levels (H,). Given the hyper-parameter
 """
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from probcal import linalg
 from probcal.inference.hierarchy import Hierarchy, Phi, SpikeAndSlab
@@ -157,7 +155,7 @@ def update_inclusions(form: Form, posed: Posed, phi: Phi, key: jax.Array, *, bac
     return phi | {"included": jnp.diagonal(covariance)[learnt] > 0}
 
 
-@partial(jax.custom_vjp)
+@jax.custom_vjp
 def whiten(matrix: jax.Array, alpha: jax.Array, pull: jax.Array, eta: jax.Array) -> tuple[jax.Array, jax.Array]:
     """theta (Q,) of unit normals eta (Q,) for the Gaussian of precision matrix + diag(alpha), and its log volume.
 
@@ -186,10 +184,3 @@ def _whiten_back(saved: Any, slopes: tuple[jax.Array, jax.Array]) -> tuple[Any, 
 
 
 whiten.defvjp(_whiten, _whiten_back)
-
-
-def by_label(values: np.ndarray, form: Form) -> np.ndarray:
-    """Values of the governed biases (..., L) among all (..., M), ones elsewhere."""
-    found = np.ones((*values.shape[:-1], form.biases), values.dtype)
-    found[..., list(form.hierarchy.learnt)] = values
-    return found

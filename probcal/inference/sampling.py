@@ -131,7 +131,7 @@ def _name(problem: Problem, method: Sampler, prior: Prior, key: jax.Array) -> di
         numbers.update(np.ascontiguousarray(leaf).tobytes())
     return {
         "method": repr(method), "prior": repr(prior), "data": numbers.hexdigest(), "biases": " ".join(problem.labels),
-        "seed": np.asarray(jax.random.key_data(key)).tolist().__repr__(),
+        "seed": str(np.asarray(jax.random.key_data(key)).tolist()),
     }  # fmt: skip
 
 

@@ -1,0 +1,77 @@
+"""Draws from a problem's own prior: hyper-parameters, biases, noise levels, trajectories, and the data they give."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg, rows
+from probcal.inference.hierarchy import Phi
+from probcal.inference.posed import Form
+from probcal.priors import ARD, Flat, Precision, Prior
+from probcal.problem import Problem, Spec, System
+from probcal.smoothing.mode import Point, factors
+from probcal.smoothing.recursion import trajectory
+from probcal.types import InputError
+
+
+class Drawn(NamedTuple):
+    """One simulated truth and its data."""
+
+    phi: Phi
+    point: Point
+    y: tuple[jax.Array, ...]  # (N, C) of each block
+
+
+def check_drawable(prior: Prior, problem: Problem) -> None:
+    """Raise `InputError` for a prior that is no distribution, of which no truth can be drawn."""
+    if isinstance(prior, Flat) or (isinstance(prior, ARD) and prior.rate == 0.0):
+        if problem.surveyed.all():
+            return
+        raise InputError(
+            f"no truth can be drawn from {prior!r}, whose density has no integral: simulate from a proper prior such as"
+            " Gaussian(), ARD(rate=0.5), Horseshoe() or BernoulliGaussian()"
+        )
+
+
+@partial(jax.jit, static_argnames="form")
+def draw_prior(form: Form, system: System, first: Precision, key: jax.Array) -> Drawn:
+    """A truth from the prior and its data: hyper-parameters, biases given them, levels, trajectories, every row."""
+    keys = jax.random.split(key, 5)
+    phi = form.hierarchy.draw(keys[0])
+    alpha = form.hierarchy.alpha(phi, first.alpha)
+    _, inverse = linalg.factor_and_inverse(jnp.diag(alpha) + first.coupling)
+    z = inverse.T @ jax.random.normal(keys[1], alpha.shape)
+    z = jnp.where(form.hierarchy.active(phi, form.biases), z, 0.0)
+    levels = system.level_spread * jax.random.normal(keys[2], system.level_spread.shape)
+    states, noises = [], []
+    for r, part in enumerate(system.recursions):
+        noise = jax.random.normal(jax.random.fold_in(keys[3], r), part.drift.shape)
+        path = trajectory(part.F, factors(part, levels), part.drift[:, :, None], noise[:, :, None])
+        states.append(path[:, :, 0])
+        noises.append(noise)
+    point = Point(tuple(states), tuple(noises), z, levels)
+    return Drawn(phi, point, draw_data(form.spec, system, point, keys[4]))
+
+
+@partial(jax.jit, static_argnames="spec")
+def draw_data(spec: Spec, system: System, point: Point, key: jax.Array) -> tuple[jax.Array, ...]:
+    """Measured values (N, C) of each block at a point; 0 where the problem has none."""
+    found = []
+    for b, (block, data, r) in enumerate(zip(spec.blocks, system.rows, spec.recursion, strict=True)):
+        predicted = rows.predict(block, data, point.states[r], point.z)
+        drawn = rows.sample(block, data, predicted, point.levels, jax.random.fold_in(key, b))
+        found.append(jnp.where(data.mask > 0, drawn, 0.0))
+    return tuple(found)
+
+
+def far_start(problem: Problem) -> float:
+    """How wide the start of a target is, in extents of the network: above 1 the prior's tracks pass far from it."""
+    widest = 0.0
+    for part, epochs in zip(problem.system.recursions, problem.epochs, strict=True):
+        begins = ~np.asarray(part.F).any((1, 2))
+        spread = np.sqrt((np.asarray(part.L) ** 2).sum(2))[begins][:, slice(*epochs.position)]
+        widest = max(widest, float(spread.max(initial=0.0)))
+    return widest / problem.extent

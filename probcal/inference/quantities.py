@@ -1,0 +1,221 @@
+"""What is ranked in a simulation: every bias, level and shared hyper-parameter, the track, and the data's density.
+
+The density of the data is a quantity that depends on them: ranks of parameters alone cannot see a method that ignores
+part of the data (Modrak et al. 2023).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from arviz_stats.base import array_stats
+
+from probcal.inference.hierarchy import Phi
+from probcal.inference.nuts import NUTS
+from probcal.inference.posed import Form, Posed, log_prior
+from probcal.inference.run import Maximiser, maximise
+from probcal.inference.sampler import Sampler
+from probcal.inference.sampling import Sampled, sample
+from probcal.inference.uniformity import NOMINAL, randomised_rank
+from probcal.priors import Prior
+from probcal.problem import Problem, Spec, System
+from probcal.smoothing.draws import draw
+from probcal.smoothing.mode import Point, log_density, log_likelihood, widening
+from probcal.types import FitError
+
+CHAINS, DRAWS = 4, 250  # of a Gaussian
+TAKEN = "taken over"  # status of a run whose method gave way to another
+
+
+class Points(NamedTuple):
+    """Draws of all that data depend on; the leading dim is that of all draws."""
+
+    z: np.ndarray  # (D, M)
+    levels: np.ndarray  # (D, H)
+    states: tuple[np.ndarray, ...]  # (D, E, n) of each recursion
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """What a method says of one data set: draws, chain after chain, and how it went."""
+
+    points: Points
+    phi: Mapping[str, np.ndarray]  # hyper-parameters (D, ...), of samplers
+    chains: int
+    drawn: bool  # by a Markov chain: draws depend on each other, and levels vary
+    status: str
+    sampled: Sampled | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of draws D."""
+        return len(self.points.z)
+
+
+def sampled_posterior(
+    problem: Problem, method: Sampler, prior: Prior, start: Point, key: jax.Array, fallback: NUTS | None
+) -> Posterior:
+    """Draws of a sampler, its chains one after the other."""
+    found = sample(problem, method, prior, start, key, threads=1, fallback=fallback)
+
+    def flat(a: np.ndarray) -> np.ndarray:
+        return a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
+
+    points = Points(flat(found.z), flat(found.levels), tuple(flat(x) for x in found.states))
+    phi = {name: flat(a) for name, a in found.group("phi_").items()}
+    return Posterior(points, phi, found.z.shape[0], True, TAKEN if found.note else "sampled", found)
+
+
+def gaussian_posterior(
+    problem: Problem, prepared: Problem, method: Maximiser, prior: Prior, start: Point, key: jax.Array
+) -> Posterior:
+    """Draws of the Gaussian that a plug-in method reports, its noise levels held.
+
+    The trajectories are those of the problem that the method solves in the place of the given one. Raises `FitError`
+    where there is no covariance.
+    """
+    outcome = maximise(method, prepared, prior, start, None)
+    covariance = outcome.laplace.covariance
+    if not bool(jnp.isfinite(covariance).all() & jnp.isfinite(outcome.point.z).all()):
+        raise FitError(outcome.message)
+    z, states, _ = draw(prepared.spec, prepared.system, outcome.point, covariance, key, CHAINS * DRAWS)
+    held = np.broadcast_to(np.asarray(outcome.point.levels), (CHAINS * DRAWS, len(problem.levels)))
+    kept = tuple(np.asarray(x) for x in states) if prepared is problem else ()
+    return Posterior(Points(np.asarray(z), held, kept), {}, CHAINS, False, outcome.status)
+
+
+@partial(jax.jit, static_argnames="spec")
+def _likelihoods(spec: Spec, system: System, z: jax.Array, levels: jax.Array, states: Any) -> jax.Array:
+    """Log-likelihood of all data at draws, (D,)."""
+    return jax.lax.map(lambda d: log_likelihood(spec, system, Point(d[2], (), d[0], d[1])), (z, levels, states))
+
+
+@partial(jax.jit, static_argnames="form")
+def _joint(form: Form, posed: Posed, point: Point, phi: Phi) -> jax.Array:
+    """Log joint density of data, noises and biases at the truth, as samplers keep it of each draw."""
+    diagonals = [jnp.diagonal(loop.factor, axis1=1, axis2=2) for loop in posed.frame.loops]
+    volume = sum((jnp.sum(jnp.log(d)) for d in diagonals), jnp.zeros(()))
+    volume = volume + widening(posed.system, posed.frame.point.levels) - widening(posed.system, point.levels)
+    theta = jnp.concatenate([point.z, point.levels])
+    return log_density(form.spec, posed.system, point) + volume + log_prior(form, posed, theta, phi)
+
+
+class Trial(NamedTuple):
+    """One simulated truth and the problem that a method is given."""
+
+    problem: Problem
+    point: Point
+    phi: Mapping[str, Any]  # hyper-parameters of the truth, empty where they are not those of the fit's prior
+    joint: bool  # whether the point and phi are a draw of the fit's own prior, noises included
+
+
+class _Quantity(NamedTuple):
+    kind: str  # bias, level, hyper, density, track
+    truth: float
+    draws: np.ndarray  # (D,)
+
+
+def _hyper(phi: Mapping[str, Any], truth: Mapping[str, Any], learnt: int) -> dict[str, _Quantity]:
+    """Hyper-parameters that biases share, and how many biases a spike and slab lets in."""
+    found = {}
+    for name, draws in phi.items():
+        if name not in truth:
+            continue
+        if name == "included":
+            found["biases not zero"] = _Quantity("hyper", float(np.sum(truth[name])), draws.sum(1).astype(float))
+        elif draws.ndim == 1:
+            found[name] = _Quantity("hyper", float(truth[name]), draws)
+        elif draws.shape[1] < learnt:
+            values = np.asarray(truth[name])
+            found |= {f"{name} {g}": _Quantity("hyper", float(values[g]), draws[:, g]) for g in range(len(values))}
+    return found
+
+
+def _quantities(trial: Trial, found: Posterior) -> dict[str, _Quantity]:
+    problem, point, points = trial.problem, trial.point, found.points
+    all_: dict[str, _Quantity] = {}
+    for m, label in enumerate(problem.labels):
+        scale = problem.scales[m]
+        all_[label] = _Quantity("bias", float(point.z[m]) * scale, points.z[:, m] * scale)
+    if found.drawn:
+        for h, level in enumerate(problem.levels):
+            draws = level.guess * np.exp(points.levels[:, h])
+            all_[level.label] = _Quantity("level", level.guess * float(np.exp(point.levels[h])), draws)
+    sampled = found.sampled
+    if sampled is not None:
+        all_ |= _hyper(found.phi, trial.phi, len(sampled.form.hierarchy.learnt))
+    if points.states:
+        all_ |= _middle(problem, point, points)
+        args = jax.tree.map(jnp.asarray, tuple(points))
+        true = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (point.z, point.levels, point.states))
+        draws = np.asarray(_likelihoods(problem.spec, problem.system, *args))
+        truth = float(_likelihoods(problem.spec, problem.system, *true)[0])
+        all_["log likelihood"] = _Quantity("density", truth, draws)
+    if sampled is not None and trial.joint:
+        phi = {name: jnp.asarray(value) for name, value in trial.phi.items()}
+        truth = float(_joint(sampled.form, sampled.posed, point, phi))
+        all_["log joint"] = _Quantity("density", truth, sampled.draws["density"].reshape(-1))
+    return all_
+
+
+def _middle(problem: Problem, point: Point, points: Points) -> dict[str, _Quantity]:
+    """The position of the first target of each recursion at the middle of its track."""
+    found = {}
+    for r, epochs in enumerate(problem.epochs):
+        mine = np.flatnonzero(epochs.target == epochs.target[0])
+        e = mine[len(mine) // 2]
+        for j in range(*epochs.position):
+            name = f"{epochs.target[e]} {epochs.components[j]} at {epochs.time[e]:g}"
+            found[name] = _Quantity("track", float(point.states[r][e, j]), points.states[r][:, e, j])
+    return found
+
+
+def _position_rmse(problem: Problem, point: Point, points: Points) -> float:
+    """Root mean square error in m of the mean positions, over all epochs."""
+    squares = []
+    for r, epochs in enumerate(problem.epochs):
+        span = slice(*epochs.position)
+        error = points.states[r][:, :, span].mean(0) - np.asarray(point.states[r])[:, span]
+        squares.append((error**2).sum(1))
+    return float(np.sqrt(np.concatenate(squares).mean()))
+
+
+def _effective(draws: np.ndarray, chains: int) -> tuple[float, float]:
+    """Effective number of draws (D,), all of them where none varies, and their r_hat."""
+    by_chain = draws.reshape(chains, -1)
+    if np.ptp(draws) == 0.0 or by_chain.shape[1] < 4:
+        return float(len(draws)), 1.0
+    ess = float(array_stats.ess(by_chain, chain_axis=0, draw_axis=1, method="bulk"))
+    r_hat = float(array_stats.rhat(by_chain, chain_axis=0, draw_axis=1))
+    return (ess if np.isfinite(ess) else float(len(draws))), (r_hat if np.isfinite(r_hat) else 1.0)
+
+
+def ranked(trial: Trial, found: Posterior, most: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Rank of the truth among at most `most` nearly independent draws of every quantity, and what else is recorded."""
+    record: dict[str, list[Any]] = {
+        name: [] for name in ("quantity", "kind", "truth", "mean", "sd", "rank", "draws", "place", "inside", "ess")
+    }
+    worst = 1.0
+    tails = np.array(NOMINAL)[:, None] / 2 * np.array([-1.0, 1.0]) + 0.5
+    for name, (kind, truth, draws) in _quantities(trial, found).items():
+        ess, r_hat = _effective(draws, found.chains) if found.drawn else (float(len(draws)), 1.0)
+        worst = max(worst, r_hat)
+        count = int(np.clip(ess, 1, most))
+        thin = draws[((np.arange(count) + 0.5) * len(draws) / count).astype(int)]
+        rank, place = randomised_rank(truth, thin, rng)
+        ends = np.quantile(draws, tails)
+        inside = (ends[:, 0] <= truth) & (truth <= ends[:, 1])
+        values = (name, kind, truth, draws.mean(), draws.std(), rank, count, place, inside, ess)
+        for field, value in zip(record, values, strict=True):
+            record[field].append(value)
+    arrays = {field: np.array(values) for field, values in record.items()}
+    arrays["status"] = np.array(found.status, "<U13")
+    if found.points.states:
+        arrays["position_rmse"] = np.array(_position_rmse(trial.problem, trial.point, found.points))
+    if found.sampled is not None:
+        arrays |= {"r_hat": np.array(worst), "khat": np.array(found.sampled.worth.khat)}
+    return arrays

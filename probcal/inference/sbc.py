@@ -1,0 +1,313 @@
+"""Simulation-based calibration: does a method find what a problem's own prior draws, as often as it says?
+
+Every run draws a truth from the prior and data at the problem's own rows, fits them, and asks where the truth lies
+among the posterior's draws (Talts et al. 2018). `around` makes it posterior calibration (Sailynoja et al. 2025): the
+truth is drawn from the posterior of the data at hand, the fit sees these data and new ones of the same trajectories,
+and what is checked is the method where it will be used. It is the right tool where the prior is wide: the tracks of a
+target whose start is not declared would pass many network sizes away.
+"""
+
+import hashlib
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from copy import copy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from probcal.inference.batches import Batches
+from probcal.inference.coverage import judge
+from probcal.inference.hierarchy import hierarchy_of
+from probcal.inference.methods import MAP, NUTS, check_problem, choose_prior
+from probcal.inference.posed import Form
+from probcal.inference.prior_draws import check_drawable, draw_data, draw_prior, far_start
+from probcal.inference.quantities import TAKEN, Points, Posterior, Trial, gaussian_posterior, ranked, sampled_posterior
+from probcal.inference.run import Maximiser, Method, maximise
+from probcal.inference.sampler import Sampler
+from probcal.inference.uniformity import NOMINAL
+from probcal.priors import Gaussian, Precision, Prior
+from probcal.problem import Problem
+from probcal.simulate import Key, as_key
+from probcal.smoothing.information import at_levels
+from probcal.smoothing.mode import Point, find_mode
+from probcal.smoothing.start import automatic_start, follow_states
+from probcal.tree import suffix
+from probcal.types import FitError, InputError, float64
+
+BATCH = 5  # runs of one file
+FAR = 2.0  # extents of the network beyond which the start of a target is called wide
+SHORT = {"chains": 2, "warmup": 150, "draws": 150}  # of a sampler whose draws are only ranked
+STARTS = ("automatic", "truth")
+Advance = Callable[[int, int], None]  # runs done, runs in all
+
+
+@float64
+def sbc(
+    problem: Problem,
+    method: Method,
+    prior: Prior | None = None,
+    runs: int = 200,
+    *,
+    simulate_from: Prior | None = None,
+    around: str | xr.DataTree | None = None,
+    start: str = "automatic",
+    key: Key = 0,
+    draws: int = 100,
+    store: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    fallback: bool = True,
+    threads: int | None = None,
+    progress: Advance | None = None,
+) -> xr.DataTree:
+    """Simulation-based calibration of a method on a problem: ranks, coverage of intervals, and a verdict.
+
+    Truths come from `prior`, or from `simulate_from` where that is given (then coverage is reported, and uniform ranks
+    are not to be expected). `around="data"`, or a saved fit of this problem, draws them from the posterior instead.
+    `start="truth"` starts each fit near the simulated truth: cheaper, and of no account to a sampler that mixes.
+    The truth is ranked among at most `draws` nearly independent draws, thinned by their effective sample size.
+    Without `fallback` a sampler stands alone: the joint sampler does not take over where its collapse does not fit.
+    `store` is a folder that keeps finished runs, `resume` goes on with it, for more `runs` too; results depend neither
+    on an interruption nor on the number of `threads`. Ctrl-C leaves what was finished.
+
+    Groups: `sbc` by run and quantity (`truth`, `mean`, `sd`, `rank` among `draws`, `place` in (0, 1), `inside` by
+    nominal interval), `run` (`status`, `seconds`, ...), `uniformity` (p-values), `coverage` (see `coverage_table`).
+    Attributes: `status` ("uniform", "not uniform"), `verdict`, `false_alarm_rate` of all quantities together.
+    Raises `InputError` for a prior that cannot be drawn from, and `FitError` where no run left a posterior.
+    """
+    if not isinstance(method, Method):
+        raise InputError(f"sbc: method must be a value such as NUTS() or EA(), got {method!r}")
+    if runs < 2 or draws < 10:
+        raise InputError(f"sbc(runs={runs}, draws={draws}): give at least 2 runs and 10 draws")
+    if start not in STARTS:
+        raise InputError(f'sbc: start "{start}" is not known; give "automatic" or "truth"')
+    prior = choose_prior(method, prior)
+    check_problem(problem)
+    key = as_key(key)
+    engine = _Engine(problem, method, prior, simulate_from or prior, around, start, draws, fallback, key)
+    box = Batches(None if store is None else Path(store), engine.name(), resume=resume)
+    missing = [k for k in range(runs) if k not in box.records]
+    batches = [missing[:1], *(missing[k : k + BATCH] for k in range(1, len(missing), BATCH))] if missing else []
+
+    def one(batch: list[int]) -> None:
+        with jax.enable_x64(True):
+            box.add(batch, [engine.run(k) for k in batch])
+
+    def told() -> None:
+        if progress is not None:
+            progress(sum(k in box.records for k in range(runs)), runs)
+
+    interrupted = False
+    try:
+        if batches:
+            one(batches[0])  # compiles
+            told()
+        pool = ThreadPoolExecutor(threads or os.cpu_count())
+        waiting: list[Future[None]] = [pool.submit(one, batch) for batch in batches[1:]]
+        try:
+            for finished in as_completed(waiting):
+                finished.result()
+                told()
+        finally:
+            pool.shutdown(cancel_futures=True)
+    except KeyboardInterrupt:
+        interrupted = True
+        if len(box.records) < 2:
+            raise
+    return _tree(engine, {k: box.records[k] for k in range(runs) if k in box.records}, interrupted)
+
+
+def short(method: Method) -> Method:
+    """A sampler with chains just long enough for ranks; any other method as it is."""
+    if not isinstance(method, Sampler):
+        return method
+    least = {name: min(getattr(method, name), most) for name, most in SHORT.items()}
+    return replace(method, **least)  # type: ignore[type-var]
+
+
+class _Engine:
+    """What every run shares."""
+
+    def __init__(
+        self, problem: Problem, method: Method, prior: Prior, source: Prior, around: Any, start: str, draws: int,
+        fallback: bool, key: jax.Array,
+    ):  # fmt: skip
+        self.problem, self.method, self.prior, self.source = problem, method, prior, source
+        self.start, self.draws, self.key = start, draws, key
+        self.other = replace(NUTS(), warmup=SHORT["warmup"]) if fallback else None
+        self.first = source.precision(problem.labels, problem.surveyed)
+        self.around = "data" if isinstance(around, str) else "fit" if around is not None else ""
+        self.pool: Posterior | None = None
+        if around is None:
+            check_drawable(source, problem)
+            self.form = Form(problem.spec, hierarchy_of(source, problem))
+        elif isinstance(around, xr.DataTree):
+            self.pool = _of_tree(problem, around)
+        elif around == "data":
+            self.pool = self._fit(problem, None, jax.random.fold_in(key, 2**31 - 1))
+        else:
+            raise InputError(f'sbc: around is "{around}"; give "data", or a tree of fit()')
+
+    def name(self) -> dict[str, str]:
+        """What runs must share to be counted together."""
+        numbers = hashlib.sha256()
+        for leaf in jax.tree.leaves((self.problem.system, self.pool.points if self.pool else ())):
+            numbers.update(np.ascontiguousarray(leaf).tobytes())
+        return {
+            "method": repr(self.method), "prior": repr(self.prior), "source": repr(self.source), "start": self.start,
+            "around": self.around, "draws": str(self.draws), "fallback": repr(self.other), "data": numbers.hexdigest(),
+            "biases": " ".join(self.problem.labels), "seed": str(np.asarray(jax.random.key_data(self.key)).tolist()),
+        }  # fmt: skip
+
+    def trial(self, key: jax.Array) -> Trial:
+        """A truth, and the problem with its data."""
+        if self.pool is None:
+            drawn = draw_prior(self.form, self.problem.system, self.first, key)
+            same = self.prior == self.source
+            return Trial(self.problem.redrawn(drawn.y), drawn.point, drawn.phi if same else {}, same)
+        pick, seed = jax.random.split(key)
+        k = int(jax.random.randint(pick, (), 0, self.pool.count))
+        z, levels, states = jax.tree.map(lambda leaf: leaf[k], self.pool.points)
+        flat = follow_states(self.problem, list(states))._replace(z=jnp.asarray(z))
+        point = at_levels(self.problem.system, flat, jnp.asarray(levels))
+        point = point._replace(states=tuple(jnp.asarray(x) for x in states))
+        y = draw_data(self.problem.spec, self.problem.system, point, seed)
+        phi = {name: leaf[k] for name, leaf in self.pool.phi.items()}
+        return Trial(_twice(self.problem, y), point, phi, joint=False)
+
+    def _starting(self, trial: Trial) -> Point | None:
+        """Near the truth, or None for a start from the data."""
+        if self.start == "automatic":
+            return None
+        wide = Precision.single(jnp.ones(trial.problem.spec.biases))
+        return find_mode(trial.problem.spec, trial.problem.system, trial.point, wide, 30, 1e-3).point
+
+    def _fit(self, problem: Problem, start: Point | None, key: jax.Array) -> Posterior:
+        """The method's answer, started as `fit` starts it where no start is given."""
+        method = self.method
+        prepared = method.prepare(problem)
+        if start is None or prepared is not problem:
+            start = automatic_start(prepared)
+            if isinstance(method, Sampler) and problem.levels:
+                start = maximise(MAP(), problem, Gaussian(), start, None).point
+        if isinstance(method, Sampler):
+            return sampled_posterior(problem, method, self.prior, start, key, self.other)
+        assert isinstance(method, Maximiser)
+        return gaussian_posterior(problem, prepared, method, self.prior, start, key)
+
+    def run(self, number: int) -> dict[str, np.ndarray]:
+        """The record of one run."""
+        keys = jax.random.split(jax.random.fold_in(self.key, number), 3)
+        began = time.perf_counter()
+        trial = self.trial(keys[0])
+        rng = np.random.default_rng(np.asarray(jax.random.key_data(keys[2])))
+        try:
+            found = self._fit(trial.problem, self._starting(trial), keys[1])
+        except FitError as error:
+            return {"failed": np.array(str(error))}
+        return ranked(trial, found, self.draws, rng) | {"seconds": np.array(time.perf_counter() - began)}
+
+
+def _twice(problem: Problem, y: tuple[jax.Array, ...]) -> Problem:
+    """The problem whose every row is measured twice, the second time as y (N, C) of each block."""
+    other = copy(problem)
+    rows = []
+    for data, new in zip(problem.system.rows, y, strict=True):
+        mine = {
+            name: jnp.concatenate([getattr(data, name), getattr(data, name)])
+            for name in ("epoch", "sensor", "pose", "mask", "std", "level")
+        }
+        rows.append(data._replace(y=jnp.concatenate([data.y, new]), **mine))
+    other.system = problem.system._replace(rows=tuple(rows))
+    other.row_index = [np.concatenate([index, index]) for index in problem.row_index]
+    return other
+
+
+def _of_tree(problem: Problem, tree: xr.DataTree) -> Posterior:
+    """The draws of a saved fit of a problem."""
+    names = [f"state{suffix(problem, r)}" for r in range(len(problem.epochs))]
+    group = tree["posterior"].to_dataset() if "posterior" in tree.children else xr.Dataset()
+    if not {"bias", *names} <= set(group.data_vars) or set(problem.labels) != set(group["bias_label"].values.tolist()):
+        raise InputError(
+            "sbc: around must be a fit of this problem that kept its draws of biases and states; fit it again with"
+            " predictive_draws=True"
+        )
+
+    def flat(values: np.ndarray) -> np.ndarray:
+        return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
+
+    z = flat(group["bias"].sel(bias_label=list(problem.labels)).values) / problem.scales
+    levels = np.zeros((len(z), len(problem.levels)))
+    for h, level in enumerate(problem.levels):
+        drawn, held = group.get("level"), tree["level"].to_dataset()["std"]
+        std = held.sel(level=level.label) if drawn is None else drawn.sel(level_label=level.label)
+        levels[:, h] = np.log(np.ravel(std.values) / level.guess)
+    points = Points(z, levels, tuple(flat(group[name].values) for name in names))
+    return Posterior(points, {}, group.sizes["chain"], True, "read")
+
+
+def _tree(engine: _Engine, records: dict[int, dict[str, np.ndarray]], interrupted: bool) -> xr.DataTree:
+    """All runs as a tree, judged."""
+    good = {run: record for run, record in records.items() if "failed" not in record}
+    failed = {run: str(record["failed"]) for run, record in records.items() if "failed" in record}
+    if len(good) < 2:
+        raise FitError(
+            f"sbc: {len(failed)} of {len(records)} runs left no posterior: {next(iter(failed.values()), '')}"
+        )
+    first = next(iter(good.values()))
+    stacked = {name: np.stack([record[name] for record in good.values()]) for name in first}
+    names, kinds = first["quantity"].tolist(), first["kind"].tolist()
+    of_run = [name for name in stacked if stacked[name].ndim == 1]
+    columns = [name for name in stacked if stacked[name].ndim > 1 and name not in ("quantity", "kind")]
+    runs = list(good)
+    table: dict[str, Any] = {
+        name: (("run", "quantity", "nominal")[: stacked[name].ndim], stacked[name]) for name in columns
+    }
+    quantity = {"quantity": names, "kind": ("quantity", kinds)}
+    groups = {
+        "sbc": xr.Dataset(table, coords={"run": runs, **quantity, "nominal": list(NOMINAL)}),
+        "run": xr.Dataset({name: ("run", stacked[name]) for name in of_run}, coords={"run": runs}),
+    }
+    tree = xr.DataTree.from_dict(groups)
+    judge(tree)
+    tree.attrs |= {
+        "method": engine.method.name, "settings": f"{engine.method!r}, {engine.prior!r}", "runs": len(good),
+        "prior": type(engine.prior).__name__, "source": engine.around or type(engine.source).__name__,
+        "start": engine.start, "failed": len(failed), "interrupted": int(interrupted),
+        "data": engine.problem.measurements.table.source, "message": _message(engine, tree, failed, interrupted),
+    }  # fmt: skip
+    return tree
+
+
+def _message(engine: _Engine, tree: xr.DataTree, failed: dict[int, str], interrupted: bool) -> str:
+    """What to know before the numbers are believed."""
+    parts = []
+    if failed:
+        parts.append(
+            f"{len(failed)} runs left no posterior and are not counted, which ranks cannot make up for: "
+            + next(iter(failed.values()))
+        )
+    taken = int((tree["run"]["status"] == TAKEN).sum())
+    if taken:
+        parts.append(
+            f"The collapse did not fit in {taken} of {tree['run'].sizes['run']} runs, another sampler took over."
+        )
+    if interrupted:
+        parts.append(f"Interrupted after {tree['run'].sizes['run']} runs; resume to go on.")
+    if not engine.around and engine.prior != engine.source:
+        parts.append(
+            f"Truths come from {type(engine.source).__name__}, not from the prior of the fit: read the coverage, ranks"
+            " need not be uniform."
+        )
+    if not engine.around and (wide := far_start(engine.problem)) > FAR:
+        parts.append(
+            f"The start of a target is {wide:.0f} network sizes wide, its simulated tracks pass far away: declare it,"
+            ' Target(motion, start={...}), or calibrate around the data (around="data", --posterior).'
+        )
+    return " ".join(parts)
