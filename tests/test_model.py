@@ -8,7 +8,8 @@ import pandas as pd
 import pytest
 import reference
 from jax.flatten_util import ravel_pytree
-from numpyro.infer import MCMC, NUTS, Predictive
+from numpyro.infer import MCMC, NUTS, SVI, Predictive, Trace_ELBO
+from numpyro.infer.autoguide import AutoNormal
 from numpyro.infer.util import log_density
 
 import probcal
@@ -203,6 +204,24 @@ def test_other_data_take_the_place_of_the_tables():
             seeded({"y_rader": y})
         with pytest.raises(InputError, match=r'data\["y_radar"\] has shape \(3,\), its rows'):
             seeded({"y_radar": np.zeros(3)})
+
+
+def test_autoguides_and_log_likelihoods_of_numpyro_take_it():
+    problem = small()
+    with jax.enable_x64(True), jax.numpy_rank_promotion("allow"):  # numpyro's guides promote ranks
+        model = numpyro_model(problem)
+        guide = AutoNormal(model)
+        svi = SVI(model, guide, numpyro.optim.Adam(0.01), Trace_ELBO())
+        fitted = svi.run(jax.random.key(0), 50, progress_bar=False)
+        drawn = guide.sample_posterior(jax.random.key(1), fitted.params, sample_shape=(3,))
+        likely = numpyro.infer.log_likelihood(model, drawn)["y_radar"]
+        again = Predictive(model, drawn)(jax.random.key(2), observed=False)["y_radar"]
+    assert float(fitted.losses[-1]) < float(fitted.losses[0])
+    assert drawn["z"].shape == (3, len(problem.labels))
+    mask = np.asarray(problem.system.rows[0].mask)
+    assert likely.shape == again.shape == (3, *mask.shape)
+    assert ((np.asarray(likely) != 0) == (mask > 0)).all()
+    assert np.isfinite(np.asarray(again)).all()
 
 
 def test_what_it_refuses():

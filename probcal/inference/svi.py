@@ -83,7 +83,8 @@ class SVI(Sampler):
     `guide`: "structured" (in the frame's coordinates: full rank over biases and hyper-parameters, given which each
     trajectory has a block-tridiagonal precision), "mean-field" or "low-rank" (in plain coordinates, for comparison).
     Each of `chains` takes `warmup` Adam steps of length `rate` with `particles` draws each, then `draws` from its
-    guide. Raises `InputError` for settings outside their ranges.
+    guide. Sample statistics: `log_weight`, log p - log q of each draw, and `elbo`, the running bound along the warm-up,
+    spread over the draws. Raises `InputError` for settings outside their ranges.
     """
 
     chains: int = 4
@@ -127,7 +128,7 @@ class SVI(Sampler):
         rest = self._guide(form, posed).first(flat.shape[0], keys[0])
         fitted = Fitted(flat, jnp.full_like(flat, log_scale), rest)
         zero = jax.tree.map(jnp.zeros_like, fitted)
-        return Chain(fitted, zero, zero, jnp.zeros((), int), jnp.zeros(()), jnp.zeros(self.warmup), keys[1])
+        return Chain(fitted, zero, zero, jnp.zeros((), int), jnp.full((), -jnp.inf), jnp.zeros(self.warmup), keys[1])
 
     def step(self, form: Form, posed: Posed, chain: Chain) -> tuple[Chain, Sample]:
         """One step of Adam until `warmup` of them are done, and one draw of the guide."""
@@ -168,7 +169,7 @@ class SVI(Sampler):
             lambda p, m, s: p + rate * (m / (1 - DECAY**t)) / (jnp.sqrt(s / (1 - SQUARE**t)) + STEEP * self.rate),
             fitted, slope, square,
         )  # fmt: skip
-        mean = jnp.where(chain.steps == 0, value, SMOOTH * chain.bound + (1 - SMOOTH) * value)
+        mean = jnp.where(jnp.isfinite(chain.bound), SMOOTH * chain.bound + (1 - SMOOTH) * value, value)
         found = chain._replace(fitted=fitted, slope=slope, square=square, bound=mean)
         found = jax.tree.map(lambda new, old: jnp.where(sound, new, old), found, chain)
         return found._replace(trace=found.trace.at[chain.steps].set(found.bound))
