@@ -19,7 +19,10 @@ from probcal import (
     EM,
     EMEA,
     MAP,
+    NUTS,
+    SVI,
     Bias,
+    Collapsed,
     ConstantAcceleration,
     ConstantVelocity,
     CoordinatedTurn,
@@ -156,8 +159,15 @@ def test_every_sensor_simulates_and_fits(name, d):
 
 
 @pytest.mark.parametrize(
-    ("method", "d"), [(EA(), 2), (EA(), 3), (EMEA(), 3), (EM(), 2), (MAP(), 3)], ids=lambda v: getattr(v, "name", v)
-)
+    ("method", "d"),
+    [
+        (EA(), 3), (EM(), 2),
+        *(pytest.param(method, d, marks=pytest.mark.slow) for method, d in (
+            (EA(), 2), (EMEA(), 3), (MAP(), 3), (Collapsed(draws=60, warmup=50), 3), (NUTS(draws=100, warmup=150), 2), (SVI(draws=50), 3),
+        )),
+    ],
+    ids=lambda v: getattr(v, "name", v),
+)  # fmt: skip
 def test_every_method_on_a_mixed_network(method, d):
     """Mixed sensors, two targets of different motions, a static one, asynchronous and missing rows, a moving node."""
     walk = Path([0.0, 30.0], [CORNERS[d][0], CORNERS[d][5]], [0.0, 0.5])
