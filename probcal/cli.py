@@ -238,7 +238,7 @@ def fit_command(
     began = time.perf_counter()
     module, problem = _problem(model, data, fix)
     own = getattr(module, "PRIOR", None)
-    if chosen is None and isinstance(own, value.priors):
+    if chosen is None and own is not None and value.takes(own):
         chosen = own
     truth = _truth(module, model, data, problem)
     with _progress() as progress:
@@ -736,7 +736,7 @@ def sbc_command(
     module, problem = _problem(model, data, fix)
     chosen: Any = PRIORS[prior] if prior is not None else implied
     own = getattr(module, "PRIOR", None)
-    if chosen is None and isinstance(own, value.priors):
+    if chosen is None and own is not None and value.takes(own):
         chosen = own
     began = time.perf_counter()
     with _bar() as advance:

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import reference
 from scipy import stats
+from test_catalogue import check_tree
 from test_exact import CASES, resting
 
 import probcal
-from probcal import ARD, NUTS, BernoulliGaussian, Collapsed, Flat, Gaussian, Horseshoe, InputError, Laplace
+from probcal import ARD, NUTS, SVI, BernoulliGaussian, Collapsed, Flat, Gaussian, Horseshoe, InputError, Laplace
 from probcal.inference.draws import inverse_gaussian, slice_step
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.pose import pareto_khat
@@ -314,3 +315,22 @@ def test_khat_is_that_of_the_heavy_right_tail():
     assert pareto_khat(0.9 * np.log(uniform)) < 0.0
     assert pareto_khat(np.zeros(100)) == 0.0
     assert pareto_khat(np.array([0.0, -np.inf])) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("method", "prior"),
+    [
+        (Collapsed(draws=60), ARD(by="node", rate=0.5)),
+        *(
+            pytest.param(method, prior, marks=pytest.mark.slow)
+            for method in (Collapsed(draws=60), NUTS(draws=60, warmup=100), SVI(draws=60, warmup=200))
+            for prior in (Flat(), Gaussian(), Laplace(), ARD(rate=0.5), Horseshoe(), BernoulliGaussian())
+            if method.takes(prior)
+        ),
+    ],
+    ids=lambda v: type(v).__name__,
+)
+def test_every_prior_gives_a_whole_tree(method, prior):
+    problem, tree, _ = fitted("plane", method, prior)
+    check_tree(tree, problem)
+    assert tree.attrs["prior"] == type(prior).__name__

@@ -40,8 +40,8 @@ def choose_prior(method: Method, prior: Prior | None) -> Prior:
     """The prior of a fit: the given one if the method takes it, else the method's first."""
     if prior is None:
         return method.priors[0]()
-    if not isinstance(prior, method.priors):
-        allowed = ", ".join(name for name, known in PRIORS.items() if isinstance(known, method.priors))
+    if not method.takes(prior):
+        allowed = ", ".join(name for name, known in PRIORS.items() if method.takes(known))
         raise InputError(f"{method.name} does not take the prior {type(prior).__name__}; it takes: {allowed}")
     return prior
 
@@ -60,8 +60,5 @@ def check_problem(problem: Problem) -> None:
 def table() -> pd.DataFrame:
     """Which method (rows, by class) takes which prior (columns, by name on the command line)."""
     classes = {type(method).__name__: type(method) for method, _ in METHODS.values()}
-    rows = {
-        name: ["yes" if isinstance(prior, kind.priors) else "" for prior in PRIORS.values()]
-        for name, kind in classes.items()
-    }
+    rows = {name: ["yes" if kind.takes(prior) else "" for prior in PRIORS.values()] for name, kind in classes.items()}
     return pd.DataFrame.from_dict(rows, orient="index", columns=list(PRIORS))

@@ -54,6 +54,11 @@ class Method:
     priors: ClassVar[tuple[type, ...]]  # the first is its own
     intervals: ClassVar[str]  # what the intervals are worth
 
+    @classmethod
+    def takes(cls, prior: Prior) -> bool:
+        """Whether the method can be used with a prior."""
+        return isinstance(prior, cls.priors)
+
     def note(self) -> str:
         """What the intervals are worth with these settings."""
         return self.intervals

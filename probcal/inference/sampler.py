@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.run import Method
+from probcal.priors import ARD, Prior
 from probcal.smoothing.frame import place
 from probcal.types import InputError
 
@@ -50,6 +51,11 @@ class Sampler(Method, ABC):
         for field, least in (("chains", 1), ("warmup", 0), ("draws", 1)):
             if getattr(self, field) < least:
                 raise InputError(f"{self.name}({field}={getattr(self, field)}): it must be at least {least}")
+
+    @classmethod
+    def takes(cls, prior: Prior) -> bool:
+        """Whether there is a posterior to draw from: a flat hyper-prior of ARD leaves none."""
+        return super().takes(prior) and not (isinstance(prior, ARD) and prior.rate == 0.0)
 
     @abstractmethod
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:

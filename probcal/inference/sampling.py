@@ -83,7 +83,7 @@ def sample(
     form, posed, found, worth = pose(problem, prior, start, keys[0])
     note = ""
     if worth.failed and isinstance(method, Collapsed) and fallback is not None:
-        joint = isinstance(prior, fallback.priors)
+        joint = fallback.takes(prior)
         taken = replace(fallback, chains=method.chains, draws=method.draws) if joint else replace(method, move="swing")
         note = (
             f"The collapse does not fit (Pareto k-hat {worth.khat:.2g} after {worth.moves} moves of the frame):"
