@@ -124,7 +124,8 @@ def _biases(hierarchy: Hierarchy, first: Precision, phi: Phi) -> jax.Array:
     matrix = jnp.diag(alpha) + first.coupling
     if isinstance(hierarchy.prior, Flat):
         z = numpyro.sample("z", dist.ImproperUniform(dist.constraints.real_vector, (), alpha.shape))
-        numpyro.factor("survey", -0.5 * z @ matrix @ z)
+        unit = dist.Unit(-0.5 * z @ matrix @ z)
+        numpyro.sample("survey", unit, obs=unit.sample(None), infer={"is_auxiliary": True})
         return z
     if hierarchy.prior.correlation:
         return numpyro.sample("z", dist.MultivariateNormal(jnp.zeros_like(alpha), precision_matrix=matrix))
