@@ -420,7 +420,6 @@ def test_a_run_without_posterior_is_counted_apart(monkeypatch):
             raise FitError("no covariance")
         return given(*arguments)
 
-    module = probcal.inference.sbc
     module = importlib.import_module("probcal.inference.sbc")  # the name in the package is the function
     given = module.gaussian_posterior
     monkeypatch.setattr(module, "gaussian_posterior", fails)
