@@ -501,6 +501,7 @@ def wire(target, pose):
     return dict(angle=bearing(target.position - pose.position))
 
 
+@pytest.mark.slow
 def test_every_kind_of_noise_and_correlated_surveys():
     """Student-t of unknown level, Bernoulli, a channel without wrap; surveys correlated; no draws in the tree."""
     nodes = [Node(f"n_{k}", p, survey={"position": 0.5}) for k, p in enumerate([(0, 0), (60, 0), (0, 60)])]

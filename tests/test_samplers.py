@@ -206,6 +206,7 @@ def test_a_linear_problem_has_its_exact_posterior(name, method):
     assert np.isfinite(states).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "prior",
     [Horseshoe(), *(pytest.param(p, marks=pytest.mark.slow) for p in (ARD(shape=2.0, rate=0.7), Laplace()))],

@@ -274,6 +274,7 @@ def quick(method, prior, runs=40, problem=None):
     return sbc(problem or radars(), method, prior, runs, start="truth", fallback=False, threads=2)
 
 
+@pytest.mark.slow
 def test_collapsed_is_uniform():
     """40 simulations of three radars; a right sampler fails with probability 1 %."""
     tree = quick(Collapsed(chains=2, warmup=50, draws=150), HORSESHOE)

@@ -37,6 +37,7 @@ def check(scenario, shares, runs):
     return found
 
 
+@pytest.mark.slow
 def test_c1_at_one_share_reproduces_the_trial_and_equals_single_fits():
     found = check("C1", (0.3,), 8)
     assert (found["status"].sel(estimator=["ea", "em-ea", "oracle"]) != "at bound").all()
