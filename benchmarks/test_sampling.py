@@ -28,7 +28,7 @@ import radars
 PRIOR = Horseshoe(expected=0.3 / 1.3, slab_scale=1.0, slab_df=4.0)  # tau ~ HalfCauchy(0.3), c^2 ~ InverseGamma(2, 2)
 SHARE = 0.4
 METHODS = {
-    "collapsed": (Collapsed(), PRIOR),
+    "collapsed": (Collapsed(draws=1000), PRIOR),
     "collapsed-spike": (Collapsed(), BernoulliGaussian()),
     "nuts": (NUTS(), PRIOR),
     "svi": (SVI(), PRIOR),
