@@ -9,7 +9,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -129,7 +129,7 @@ def _call(module: ModuleType, path: Path, name: str, /, *arguments: Any, **optio
         return function(*arguments, **options)
 
 
-def _problem(model: Path, data: Path | None, fix: list[str] = []) -> tuple[ModuleType, Problem]:  # noqa: B006
+def _problem(model: Path, data: Path | None, fix: Sequence[str] | None = ()) -> tuple[ModuleType, Problem]:
     module = load_model(model)
     if data is not None and not _exists(data):
         raise InputError(f"{data}: no such file")
@@ -211,7 +211,7 @@ def fit_command(
     prior: Annotated[
         str | None, typer.Option(help=" | ".join(PRIORS) + "; the model's or the method's own if left out")
     ] = None,
-    fix: Annotated[list[str], typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = [],  # noqa: B006
+    fix: Annotated[list[str] | None, typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = None,
     starts: Annotated[int, typer.Option(min=1, help="starts of the search; the best optimum is reported")] = 1,
     seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(help="folder for fit.nc, summary.csv, report.html")] = None,
@@ -367,7 +367,7 @@ def simulate_command(
 def check_command(
     model: Model,
     data: Data = None,
-    fix: Annotated[list[str], typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = [],  # noqa: B006
+    fix: Annotated[list[str] | None, typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = None,
     out: Annotated[Path | None, typer.Option(help="folder for check.nc, check.csv, check.png")] = None,
 ) -> None:
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
@@ -545,8 +545,9 @@ def _number(text: str) -> Any:
 def study_command(
     model: Model,
     setting: Annotated[
-        list[str], typer.Option("--set", help="values of an argument of setting(): share=0:1:0.1, scenario=C1,C2")
-    ] = [],  # noqa: B006
+        list[str] | None,
+        typer.Option("--set", help="values of an argument of setting(): share=0:1:0.1, scenario=C1,C2"),
+    ] = None,
     methods: Annotated[str, typer.Option(help=", ".join([*METHODS, ORACLE]))] = f"ml,em-ea,ea,{ORACLE}",
     runs: Annotated[int, typer.Option(min=1, help="simulated runs of every setting")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="number of the first run")] = 0,
@@ -555,7 +556,7 @@ def study_command(
     """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
     chosen = choose_methods([name.strip() for name in methods.split(",")])
     grid: dict[str, list[Any]] = {}
-    for name, values in map(parse_values, setting):
+    for name, values in map(parse_values, setting or ()):
         grid[name] = grid.get(name, []) + values
     if out is not None:
         _folder(out)
@@ -601,14 +602,16 @@ def _bar() -> Iterator[Callable[[int, int], None]]:
 def compare_command(
     folders: Annotated[list[Path], typer.Argument(help="folders (or fit.nc) of fits to the same data")],
     name: Annotated[
-        list[str], typer.Option(help="name of each fit in turn (repeat); method and prior if left out")
-    ] = [],  # noqa: B006
-    pair: Annotated[list[str], typer.Option(help="two biases whose posterior is drawn, LABEL,LABEL (repeat)")] = [],  # noqa: B006
+        list[str] | None, typer.Option(help="name of each fit in turn (repeat); method and prior if left out")
+    ] = None,
+    pair: Annotated[
+        list[str] | None, typer.Option(help="two biases to draw against each other, LABEL,LABEL (repeat)")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="folder for compare.nc, compare.csv, compare.png")] = None,
 ) -> None:
     """Put fits of the same data side by side: estimates, distances, gamma, coverage, prediction, evidence, cost."""
-    fits = named([load(folder) for folder in folders], name or None)
-    pairs = [chosen_pair(fits, text.split(",")) for text in pair]
+    fits = named([load(folder) for folder in folders], name)
+    pairs = [chosen_pair(fits, text.split(",")) for text in pair or ()]
     if out is not None:
         _folder(out)
     comparison = compare(fits)
@@ -709,7 +712,7 @@ def sbc_command(
     truths: Annotated[
         str | None, typer.Option("--from", help="prior that the truths are drawn from; that of the fit if left out")
     ] = None,
-    fix: Annotated[list[str], typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = [],  # noqa: B006
+    fix: Annotated[list[str] | None, typer.Option(help="hold biases at 0, by label or pattern (repeat)")] = None,
     runs: Annotated[int, typer.Option(min=2, help="simulations")] = 200,
     seed: Seed = 0,
     posterior: Annotated[

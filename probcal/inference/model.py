@@ -5,7 +5,7 @@ Nothing of the frame enters: sites are the declared quantities, trajectories wri
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ class Measured(dist.Distribution):
     any other.
     """
 
-    arg_constraints: dict[str, Any] = {}  # noqa: RUF012 (numpyro reads a dict)
+    arg_constraints: ClassVar[dict[str, Any]] = {}
     support = dist.constraints.real
     pytree_data_fields = ("rows", "predicted", "levels")
     pytree_aux_fields = ("block",)

@@ -128,7 +128,8 @@ def short(method: Method) -> Method:
     if not isinstance(method, Sampler):
         return method
     least = {name: min(getattr(method, name), most) for name, most in SHORT.items()}
-    return replace(method, **least)  # type: ignore[type-var]
+    changed: Any = method
+    return replace(changed, **least)
 
 
 class _Engine:
