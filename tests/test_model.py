@@ -1,5 +1,8 @@
 """The numpyro model: the same density as the package's own coordinates, prior draws, and numpyro's own NUTS on it."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -230,3 +233,8 @@ def test_what_it_refuses():
         numpyro_model(problem, BernoulliGaussian())
     with pytest.raises(InputError, match=r"runs in double precision only: call numpyro\.enable_x64"):
         numpyro.handlers.seed(numpyro_model(problem), 0)()
+
+
+def test_numpyro_is_whole_after_arviz_has_put_a_lazy_one_in_its_place():
+    code = "import arviz_base, probcal, numpyro; numpyro.distributions.distribution.Unit"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -127,6 +127,8 @@ def _of_tree(fit: Fitted, tree: xr.DataTree) -> Drawn | None:
 
 def _at_fit(fit: Fitted, key: jax.Array) -> Drawn:
     """Replicas at the fit itself."""
-    z, *states = (jnp.asarray(np.tile(x, (AT_FIT,) + (1,) * x.ndim)) for x in (fit.point.z, *fit.point.states))
-    _, replicas = predictive(fit.problem.spec, fit.problem.system, fit.point.levels, z, tuple(states), key)
+    levels, z, *states = (
+        jnp.asarray(np.tile(x, (AT_FIT,) + (1,) * x.ndim)) for x in (fit.point.levels, fit.point.z, *fit.point.states)
+    )
+    _, replicas = predictive(fit.problem.spec, fit.problem.system, levels, z, tuple(states), key)
     return Drawn(z, tuple(states), replicas)

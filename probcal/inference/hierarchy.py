@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
+from numpyro import distributions as dist  # not `import numpyro.distributions`: ArviZ's lazy numpyro runs it twice
 
 from probcal.inference.draws import inverse_gaussian, slice_step
 from probcal.priors import ARD, BernoulliGaussian, Horseshoe, Laplace, Prior

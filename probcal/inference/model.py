@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpyro
-import numpyro.distributions as dist
+from numpyro import distributions as dist
 
 from probcal import rows
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
