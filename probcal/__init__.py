@@ -13,7 +13,7 @@ from probcal.analysis import (
     observability,
     sensitivity,
 )
-from probcal.diagnostics import scores
+from probcal.diagnostics import drift_table, scores
 from probcal.inference import (
     EA,
     EM,
@@ -47,7 +47,7 @@ from probcal.nodes import LocalFrame, read_nodes, write_nodes
 from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
 from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
 from probcal.problem import Problem
-from probcal.sensor import Bias, Channel, Sensor, SensorType, sensor
+from probcal.sensor import Bias, Channel, Drift, Sensor, SensorType, sensor
 from probcal.simulate import Simulation, Truth, simulate
 from probcal.table import read_table
 from probcal.tree import load, outliers, save, summary
@@ -55,11 +55,11 @@ from probcal.types import FitError, InputError
 
 __all__ = [
     "ARD", "EA", "EM", "EMEA", "MAP", "NUTS", "SVI", "Bernoulli", "BernoulliGaussian", "Bias", "Channel",
-    "Collapsed", "ConstantAcceleration", "ConstantVelocity", "CoordinatedTurn", "FitError", "Flat", "Gaussian",
-    "Horseshoe", "InputError", "Known", "Laplace", "LeastSquares", "LocalFrame", "Mixture", "Motion", "Network",
-    "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT", "Target",
-    "Truth", "Unknown", "White", "assess", "bound_map", "bounds", "compare", "coverage_table", "fit",
-    "interchangeable", "load", "log_evidence", "next_anchors", "next_passes", "next_sensors", "noise",
-    "numpyro_model", "observability", "outliers", "priors", "read_nodes", "read_table", "save", "sbc", "scores",
-    "sensitivity", "sensor", "sensors", "simulate", "study", "summary", "track", "write_nodes",
+    "Collapsed", "ConstantAcceleration", "ConstantVelocity", "CoordinatedTurn", "Drift", "FitError", "Flat",
+    "Gaussian", "Horseshoe", "InputError", "Known", "Laplace", "LeastSquares", "LocalFrame", "Mixture", "Motion",
+    "Network", "Node", "Path", "Problem", "RandomWalk", "Sensor", "SensorType", "Simulation", "Static", "StudentT",
+    "Target", "Truth", "Unknown", "White", "assess", "bound_map", "bounds", "compare", "coverage_table",
+    "drift_table", "fit", "interchangeable", "load", "log_evidence", "next_anchors", "next_passes", "next_sensors",
+    "noise", "numpyro_model", "observability", "outliers", "priors", "read_nodes", "read_table", "save", "sbc",
+    "scores", "sensitivity", "sensor", "sensors", "simulate", "study", "summary", "track", "write_nodes",
 ]  # fmt: skip

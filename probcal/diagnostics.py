@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from probcal.network import step_of
 from probcal.simulate import Truth
 from probcal.types import AXES
 
@@ -63,6 +64,37 @@ def study_table(study: xr.Dataset) -> pd.DataFrame:
         frame[status] = frame["status"] == status
         table[status] = frame.reset_index().groupby([*grid_of(study), "estimator"], sort=False)[status].sum()
     return table.reset_index().rename(columns={"estimator": "method"}).dropna(axis=1, how="all")  # no sd of one run
+
+
+def drift_table(tree: xr.DataTree) -> pd.DataFrame:
+    """Values of the drifting biases of a fit, one row a piece: bias, unit, since (s), mean, sd, lower, upper.
+
+    A value is the bias and its steps so far; mean and sd are exact sums, the interval is of the draws. `since` of the
+    first piece is the time of the first datum. Empty where nothing drifts.
+    """
+    columns = ["bias", "unit", "since", "mean", "sd", "lower", "upper"]
+    if not {"calibration", "posterior"} <= set(tree.children):
+        return pd.DataFrame(columns=columns)
+    group, draws = tree["calibration"].to_dataset(), tree["posterior"].to_dataset()["bias"].values
+    labels = group["bias_label"].values.astype(str).tolist()
+    mean, covariance = group["mean"].values, group["covariance"].values
+    units = dict(zip(labels, group["unit"].values, strict=True))
+    start = float(tree["observed_data"].to_dataset()["time"].min())
+    tail = (1 - tree.attrs["interval_probability"]) / 2
+    found: dict[str, list[tuple[float, str]]] = {}
+    for label in labels:
+        step = step_of(label, labels)
+        if step is not None:
+            found.setdefault(step[0], [(start, step[0])]).append((step[1], label))
+    table = []
+    for name, pieces in found.items():
+        members: list[int] = []
+        for since, label in sorted(pieces):
+            members.append(labels.index(label))
+            lower, upper = np.quantile(draws[..., members].sum(-1), [tail, 1 - tail])
+            sd = np.sqrt(covariance[np.ix_(members, members)].sum())
+            table.append((name, units[name], since, mean[members].sum(), sd, lower, upper))
+    return pd.DataFrame(table, columns=columns)
 
 
 def comparison_rows(comparison: xr.DataTree) -> pd.DataFrame:

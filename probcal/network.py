@@ -1,13 +1,13 @@
 """Nodes and placed sensors, and the table of biases that follows from them."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from probcal.geometry import slopes
-from probcal.sensor import VECTORS, Bias, Sensor, SensorType
+from probcal.sensor import VECTORS, Bias, Drift, Sensor, SensorType
 from probcal.types import AXES, InputError, nearest
 
 POSE_UNITS = {"position": "m", "heading": "rad", "pitch": "rad", "roll": "rad", "clock": "m", "time_offset": "s"}
@@ -131,7 +131,10 @@ class Node:
 
 @dataclass(frozen=True)
 class BiasRecord:
-    """One bias of the network: label, unit, scale, whether `survey` or `scale` governs it, and where it lives."""
+    """One bias of the network: label, unit, scale, what governs it (`survey`, `scale`, `drift`) and where it lives.
+
+    A step of a drifting bias has the time at which it happens, and the component `<component>_step`.
+    """
 
     label: str
     unit: str
@@ -141,6 +144,40 @@ class BiasRecord:
     owner: str
     component: str
     axis: int = 0
+    since: float | None = None  # time of a step
+
+    def steps(self, drift: Drift | None) -> list["BiasRecord"]:
+        """The steps of this bias in order of time."""
+        return [
+            replace(
+                self,
+                label=f"{self.label}@{np.format_float_positional(time, trim='-')}",
+                scale=size, nominal=0.0, kind="drift" if drift.scale is None else "scale",
+                component=f"{self.component}_step", since=time,
+            )
+            for time, size in drift.steps
+        ] if drift else []  # fmt: skip
+
+
+def label_parts(label: str) -> tuple[str, str]:
+    """Owner and bias of a label: `mic_3` and `position_x`, `radar_2` and `heading@0.5` of a step."""
+    constant, _, time = label.rpartition("@")
+    try:
+        float(time)
+    except ValueError:
+        constant = label
+    constant = constant if "." in constant else label
+    owner, _, name = constant.rpartition(".")
+    return owner, name + label[len(constant) :]
+
+
+def step_of(label: str, labels: Collection[str]) -> tuple[str, float] | None:
+    """The drifting bias that a label is a step of, and the time of the step in s; None for any other bias."""
+    owner, _, time = label.rpartition("@")
+    try:
+        return (owner, float(time)) if owner in labels else None
+    except ValueError:
+        return None
 
 
 class Network:
@@ -184,6 +221,11 @@ class Network:
         """Labels of all biases."""
         return tuple(bias.label for bias in self.biases)
 
+    def steps(self, owner: str, component: str, axis: int = 0) -> tuple[BiasRecord, ...]:
+        """Steps of a drifting bias in order of time, none where it is constant."""
+        where = (owner, f"{component}_step", axis)
+        return tuple(b for b in self.biases if b.since is not None and (b.owner, b.component, b.axis) == where)
+
     @property
     def channel_names(self) -> tuple[str, ...]:
         """Scalar channels of all sensor types, each once."""
@@ -225,7 +267,8 @@ class Network:
                 for axis in range(self.dimension if component == "position" else 1):
                     suffix = f"_{AXES[axis]}" if component == "position" else ""
                     label = f"{node.name}.{component}{suffix}"
-                    records.append(BiasRecord(label, bias.unit, bias.scale, 0.0, kind, node.name, component, axis))
+                    record = BiasRecord(label, bias.unit, bias.scale, 0.0, kind, node.name, component, axis)
+                    records += [record, *record.steps(bias.drift)]
         return records
 
     def _sensor_biases(self) -> list[BiasRecord]:
@@ -234,5 +277,6 @@ class Network:
             for name, bias in placed.type.biases.items():
                 owner = placed.type.name if bias.shared else placed.name
                 label = f"{owner}.{name}"
-                records[label] = BiasRecord(label, bias.unit, bias.scale, bias.nominal, "scale", owner, name)
+                record = BiasRecord(label, bias.unit, bias.scale, bias.nominal, "scale", owner, name)
+                records |= {r.label: r for r in (record, *record.steps(bias.drift))}
         return list(records.values())

@@ -15,7 +15,7 @@ import pandas as pd
 import pyproj
 import xarray as xr
 
-from probcal.network import ANGLES, POSE_UNITS, Node
+from probcal.network import ANGLES, POSE_UNITS, Node, step_of
 from probcal.sensor import Bias
 from probcal.table import Table, factor, header, name_of, numbers, read_table
 from probcal.types import AXES, InputError, nearest
@@ -336,7 +336,7 @@ def write_nodes(
 
     Nodes are written with their `survey_...` and `scale_...`, a fit as stated value + bias (its mean) with columns
     `sd_<bias>`. With a `frame` (that of `Nodes` from `read_nodes` by default) places are latitude and longitude, and
-    GeoJSON can be written; without, metres. Nodes that move are left out. Raises `InputError`.
+    GeoJSON can be written; without, metres. Nodes that move or drift are left out. Raises `InputError`.
     """
     path = Path(path)
     if frame is None and isinstance(nodes, Nodes):
@@ -371,7 +371,7 @@ def _stated(nodes: Iterable[Node]) -> list[_Record]:
     for node in nodes:
         further = {f"{kind}_{component}": bias.scale for component, (kind, bias) in node.spread.items()}
         units = {component: bias.unit for component, (_, bias) in node.spread.items()}
-        if node.path is None:
+        if node.path is None and not any(bias.drift for _, bias in node.spread.values()):
             records.append(_Record(node.name, node.position, node.components, further, units))
     return records
 
@@ -383,7 +383,7 @@ def _calibrated(tree: xr.DataTree) -> list[_Record]:
     constant, found = tree["constant_data"].to_dataset(), tree["calibration"].to_dataset()
     table = found[["mean", "sd", "unit"]].to_dataframe().to_dict("index")
     fixed = constant["fixed"].to_series().to_dict() if "fixed" in constant else {}
-    shift = fixed | {label: row["mean"] for label, row in table.items()}
+    shift: dict[str, float] = fixed | {label: row["mean"] for label, row in table.items()}
     stated = zip(*(constant[name].values for name in ("stated_node", "stated_component", "stated")), strict=True)
     components: dict[str, dict[str, float]] = {}
     for node, component, value in stated:
@@ -395,7 +395,8 @@ def _calibrated(tree: xr.DataTree) -> list[_Record]:
         position = place + [shift.get(f"{node}.{axis}", 0.0) for axis in axes]
         further = {f"sd_{name}": row["sd"] for name, row in own.items()}
         units = {name: row["unit"] for name, row in own.items() if name not in axes}
-        if not moving:
+        drifts = any(label.startswith(f"{node}.") and step_of(label, shift) for label in shift)
+        if not moving and not drifts:
             records.append(_Record(str(node), position, components[node], further, units))
     return records
 

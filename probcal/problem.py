@@ -15,7 +15,7 @@ import pandas as pd
 from probcal.motion import Motion, Static, Target, White, as_motion
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, Level, Unknown, guess_of
-from probcal.rows import Block, Layout, Rows, make_block, pose_entries, pose_vector
+from probcal.rows import Block, Layout, Rows, addresses, make_block, pose_entries, pose_vector
 from probcal.sensor import VECTORS
 from probcal.table import Measurements, Table, factor, header, measure, read_table
 from probcal.types import InputError, float64, nearest
@@ -97,7 +97,7 @@ class Problem:
         self.fixed = _fixed(network, fix)
         self.biases: tuple[BiasRecord, ...] = tuple(b for b in network.biases if b.label not in self.fixed)
         self.scales = np.array([bias.scale for bias in self.biases])
-        self.surveyed = np.array([bias.kind == "survey" for bias in self.biases], bool)
+        self.surveyed = np.array([bias.kind != "scale" for bias in self.biases], bool)
         self.measurements = measure(read_table(data), network)
         self.silent = _check_rows(self.measurements, network)
         self.levels: tuple[LevelRecord, ...]
@@ -345,14 +345,18 @@ class Problem:
             for a, node in enumerate(pair):
                 self._check_path(node, chosen[sensor == s])
                 pose[sensor == s, a] = pose_vector(node, block.extras, data.time[chosen][sensor == s])
-        index, scale, base = self._local(block, ours)
+        local, starts = self._local(block, ours)
+        pieces = [np.flatnonzero(sensor == s) for s in range(len(ours))]
+        first = np.cumsum([0, *map(len, starts)])
+        for s, own in enumerate(pieces):
+            sensor[own] = first[s] + np.searchsorted(starts[s], data.time[chosen][own], side="right") - 1
         names = [name for name, _ in block.type.expand(network.dimension)]
         columns = [data.channels.index(name) for name in names]
         pick = np.ix_(chosen, columns)
         declared = np.array([1.0 if isinstance(c.noise, Bernoulli) else guess_of(c.std) for c in block.channels])
         own = data.has_std[pick]
         return dict(
-            epoch=epoch, sensor=sensor, pose=pose, bias=index, scale=scale, base=base,
+            epoch=epoch, sensor=sensor, pose=pose, **local,
             y=np.where(data.measured[pick], data.value[pick], 0.0),
             mask=data.measured[pick].astype(float),
             std=np.where(own, data.std[pick], declared),
@@ -369,25 +373,31 @@ class Problem:
             where = self.measurements.table.where(rows[outside[0]])
             raise InputError(f'{where}: time {time[outside[0]]:g} is outside the path of node "{node.name}"')
 
-    def _local(self, block: Block, ours: list[int]) -> tuple[np.ndarray, ...]:
-        """Which biases the sensors of a block read: index, scale, fixed part, each (S, p)."""
-        records = {(b.owner, b.component, b.axis): b for b in self.network.biases}
+    def _local(self, block: Block, ours: list[int]) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
+        """Which biases the sensors of a block read: arrays (S, p) by the names of `Rows`, a sensor once for each piece.
+
+        And the start of each sensor's pieces: between two of them its drifting biases are constant.
+        """
+        constant = {(b.owner, b.component, b.axis): b for b in self.network.biases if b.since is None}
         number = {label: m for m, label in enumerate(self.labels)}
         entries = pose_entries(self.network.dimension, block.extras)
-        index, scale, base = [], [], []
+        records: list[list[BiasRecord | None]] = []
+        starts = []
         for k in ours:
-            placed = self.network.sensors[k]
-            keys = [(placed.nodes[a].name, *entries[e]) for a, e in block.free]
-            keys += [(placed.type.name if b.shared else placed.name, n, 0) for n, b in placed.type.biases.items()]
-            found = [records.get(key) for key in keys]
-            free = [b is not None and b.label in number for b in found]
-            index.append([number[b.label] if f and b else len(number) for b, f in zip(found, free, strict=True)])
-            scale.append([b.scale if f and b else 0.0 for b, f in zip(found, free, strict=True)])
-            base.append([b.nominal + self.fixed.get(b.label, 0.0) if b else 0.0 for b in found])
-        shape = (len(ours), len(block.free) + len(block.type.biases))
-        return tuple(
-            np.array(part, kind).reshape(shape) for part, kind in ((index, int), (scale, float), (base, float))
-        )
+            keys = addresses(block.type, self.network.sensors[k], block.free, entries)
+            steps = [iter(self.network.steps(*key)) for key in keys]
+            found = [constant.get(key) for key in keys] + [next(steps[column], None) for column in block.steps]
+            starts.append(np.array([-np.inf, *sorted({b.since for b in found if b and b.since is not None})]))
+            records += [[b if b and (b.since is None or b.since <= t) else None for b in found] for t in starts[-1]]
+        shape = (len(records), len(block.free) + len(block.type.biases) + len(block.steps))
+        bias, scale, base = np.full(shape, len(number)), np.zeros(shape), np.zeros(shape)
+        for s, found in enumerate(records):
+            for j, b in enumerate(found):
+                if b is not None:
+                    base[s, j] = b.nominal + self.fixed.get(b.label, 0.0)
+                    if b.label in number:
+                        bias[s, j], scale[s, j] = number[b.label], b.scale
+        return {"bias": bias, "scale": scale, "base": base}, starts
 
 
 class _Levels:

@@ -16,6 +16,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from probcal import plots
+from probcal.diagnostics import drift_table
 from probcal.tree import outliers
 
 NONE = "–"  # where there is no finite number
@@ -378,6 +379,9 @@ def _pictures(tree: xr.DataTree) -> list[dict[str, str]]:
     if _weighted(tree):
         text = "Residuals over time, those that count less than half marked"
         found.insert(3, ("Residuals over time", text, {"residual"}, lambda: plots.plot_outliers(tree)))
+    if len(drift_table(tree)):
+        text = "Values of the drifting biases over time with their intervals"
+        found.insert(2, ("Drift", text, {"posterior"}, lambda: plots.plot_drift(tree)))
     found += [
         ("Verdicts", "Gamma of every bias against how much the data narrow it, coloured by verdict", {"verdict"},
          lambda: plots.plot_shrinkage(tree)),

@@ -4,6 +4,7 @@ A block holds the rows of one sensor type seeing targets of one state layout, ga
 Labels stay above; here are a static `Block` (what to compute) and a pytree `Rows` (the numbers).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 from probcal.geometry import wrap
 from probcal.motion import view
 from probcal.network import ANGLES, Network, Node
-from probcal.sensor import VECTORS, Channel, SensorType
+from probcal.sensor import VECTORS, Channel, Sensor, SensorType
 from probcal.types import InputError, PoseView, nearest
 
 Layout = tuple[tuple[str, int, int, bool], ...]
@@ -30,6 +31,7 @@ class Block:
     used: tuple[int, ...]  # state entries that the function reads
     extras: tuple[str, ...]  # pose components beyond the position, in the order of a pose vector
     free: tuple[tuple[int, int], ...]  # (node, entry of its pose vector) of the biased pose entries
+    steps: tuple[int, ...]  # which bias each further column steps: the biased pose entries, then those of the sensor
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -38,7 +40,10 @@ class Block:
 
 
 class Rows(NamedTuple):
-    """Numbers of a block: N rows of C channels by S sensors with p biases and nodes of P pose entries each."""
+    """Numbers of a block: N rows of C channels by S sensors with p biases and nodes of P pose entries each.
+
+    A sensor with a drifting bias counts once for each of its pieces.
+    """
 
     epoch: jax.Array  # (N,) epoch of the recursion
     sensor: jax.Array  # (N,) sensor within the block
@@ -96,7 +101,17 @@ def make_block(network: Network, kind: SensorType, layout: Layout) -> Block:
         for e, (component, _) in enumerate(entries)
         if any(component in s.nodes[a].spread for s in placed)
     )
-    return Block(kind, layout, network.dimension, used, extras, free)
+    columns = zip(*(addresses(kind, sensor, free, entries) for sensor in placed), strict=True)
+    steps = [(k, max(len(network.steps(*address)) for address in column)) for k, column in enumerate(columns)]
+    return Block(kind, layout, network.dimension, used, extras, free, tuple(k for k, n in steps for _ in range(n)))
+
+
+def addresses(
+    kind: SensorType, placed: Sensor, free: Sequence[tuple[int, int]], entries: Sequence[tuple[str, int]]
+) -> list[tuple[str, str, int]]:
+    """Owner, component and axis of each bias that a sensor reads: the biased pose entries, then its own."""
+    own = [(kind.name if bias.shared else placed.name, name, 0) for name, bias in kind.biases.items()]
+    return [(placed.nodes[a].name, *entries[e]) for a, e in free] + own
 
 
 def pose_entries(dimension: int, extras: tuple[str, ...]) -> list[tuple[str, int]]:
@@ -134,6 +149,9 @@ def _view(block: Block, pose: jax.Array) -> PoseView:
 
 def _one(block: Block, state: jax.Array, pose: jax.Array, local: jax.Array) -> jax.Array:
     """Predicted channels (C,) of one row from its state (n,), poses (nodes, P) and biases (p,)."""
+    if block.steps:
+        constant = len(local) - len(block.steps)
+        local = local[:constant].at[np.asarray(block.steps)].add(local[constant:])
     if block.free:
         where = np.asarray(block.free)
         pose = pose.at[where[:, 0], where[:, 1]].add(local[: len(where)])

@@ -18,17 +18,52 @@ PERIODS = {"rad": 2 * np.pi, "deg": 360.0}
 
 
 @dataclass(frozen=True)
+class Drift:
+    """How a bias changes: constant from each of the `times` (T,) in s to the next, the first also before it.
+
+    `std`, in the bias's unit s^-1/2, makes a random walk: a step over dt has the known standard deviation
+    std * sqrt(dt). `scale`, in its unit, is that of every step and governed by the prior chosen at the fit: a sparse
+    one finds jumps. Raises `InputError` unless one of the two is positive and the times increase.
+    """
+
+    times: Any
+    std: float | None = None
+    scale: float | None = None
+
+    def __post_init__(self):
+        times = np.asarray(self.times, float)
+        if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or not (np.diff(times) > 0).all():
+            raise InputError("Drift: times are those at which the pieces start, two or more, finite and increasing")
+        if (self.std is None) == (self.scale is None):
+            raise InputError(
+                "Drift: give either std (a random walk of known level) or scale (steps that the prior governs)"
+            )
+        size = self.std if self.scale is None else self.scale
+        if size is None or not (np.isfinite(size) and size > 0):
+            raise InputError(f"Drift: {'std' if self.scale is None else 'scale'} is {size}; it must be positive")
+        object.__setattr__(self, "times", tuple(times.tolist()))
+
+    @property
+    def steps(self) -> tuple[tuple[float, float], ...]:
+        """Time of each step, and its standard deviation in the bias's unit."""
+        gaps = np.diff(self.times)
+        sizes = np.full(len(gaps), self.scale) if self.std is None else self.std * np.sqrt(gaps)
+        return tuple(zip(self.times[1:], sizes.tolist(), strict=True))
+
+
+@dataclass(frozen=True)
 class Bias:
     """An unknown parameter of a sensor: its unit, prior scale (standard deviation) and nominal value.
 
     The function receives nominal + bias, tables report the bias. `shared="type"` gives one bias to all
-    sensors of the type.
+    sensors of the type. With a `drift` it changes in time: `<label>@<time>` is its step at that time.
     """
 
     unit: str
     scale: float
     nominal: float = 0.0
     shared: str | None = None
+    drift: Drift | None = None
 
     def __post_init__(self):
         if not isinstance(self.unit, str):
@@ -41,6 +76,8 @@ class Bias:
             raise InputError(f"Bias({self.unit!r}, nominal={self.nominal}): the nominal value must be finite")
         if self.shared not in (None, "type"):
             raise InputError(f'Bias({self.unit!r}, shared={self.shared!r}): shared is None or "type"')
+        if not isinstance(self.drift, Drift | None):
+            raise InputError(f"Bias({self.unit!r}, drift={self.drift!r}): give Drift(times, std=...) or scale=...")
 
 
 @dataclass(frozen=True)

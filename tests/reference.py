@@ -124,16 +124,16 @@ class Linear:
     def __init__(self, network, motion, table, fix=()):
         self.d = len(network.sensors[0].nodes[0].position)
         fixed = dict(fix) if isinstance(fix, dict) else dict.fromkeys(fix, 0.0)
-        self.scales = {}
+        self.scales, self.steps = {}, {}
         for placed in network.sensors:
             for node in placed.nodes:
                 for component, (_, bias) in node.spread.items():
                     axes = [f"_{a}" for a in AXES[: self.d]] if component == "position" else [""]
                     for axis in axes:
-                        self.scales[f"{node.name}.{component}{axis}"] = bias.scale
+                        self._declare(f"{node.name}.{component}{axis}", bias)
         for placed in network.sensors:
             for name, bias in placed.type.biases.items():
-                self.scales[self.owner(placed, bias) + name] = bias.scale
+                self._declare(self.owner(placed, bias) + name, bias)
         self.fixed = fixed
         for label in fixed:
             del self.scales[label]
@@ -159,6 +159,18 @@ class Linear:
             epoch = chain.times.index(row["time"]) if len(chain.times) > 1 else 0
             self._add(by_name[row["sensor"]], row, k, epoch)
 
+    def _declare(self, label, bias):
+        """A bias, and where it drifts its steps with their times."""
+        self.scales[label] = bias.scale
+        if bias.drift is None:
+            return
+        self.steps[label] = []
+        for before, time in pairwise(bias.drift.times):
+            step = f"{label}@{float(time):g}"
+            self.steps[label].append((time, step))
+            walk = bias.drift.scale is None
+            self.scales[step] = bias.drift.std * (time - before) ** 0.5 if walk else bias.drift.scale
+
     @staticmethod
     def owner(placed, bias):
         return f"{placed.type.name if bias.shared else placed.name}."
@@ -166,6 +178,8 @@ class Linear:
     def _evaluate(self, placed, row, chain, x, z):
         """Predicted channels by scalar name at one state and one z."""
         value = dict(zip(self.labels, z * np.array(list(self.scales.values())), strict=True)) | self.fixed
+        for label, steps in self.steps.items():
+            value[label] += sum(value[step] for time, step in steps if time <= row["time"])
         state = dict(zip(chain.names, x, strict=True))
         parts = {n: v for n, v in state.items() if n[:-2] not in ("position", "velocity")}
         for vector in ("position", "velocity"):

@@ -18,6 +18,7 @@ from probcal import (
     Bias,
     Channel,
     ConstantVelocity,
+    Drift,
     Network,
     Node,
     Path,
@@ -140,8 +141,34 @@ def mixed():
     return network, motion, table, {}
 
 
+def drifting():
+    """Drifting position, survey, clock, gain and shared bias, each with times of its own; one step fixed."""
+    walk, jumps = Drift((0.0, 1.0, 2.5), std=0.7), Drift((-5.0, 1.7), scale=1.3)
+    nodes = [
+        Node("a", (0.0, 1.0), scale={"position": Bias("m", 2.0, drift=walk), "clock": Bias("m", 1.0, drift=jumps)}),
+        Node("b", (5.0, -2.0), survey={"position": Bias("m", 0.5, drift=Drift((0.0, 3.0), std=0.2)), "clock": 0.3}),
+    ]
+
+    @sensor(level=Channel("dB", std=0.4))
+    def gauge(
+        target,
+        pose,
+        *,
+        gain=Bias("dB", 2.0, drift=Drift((0.0, 0.75, 1.7, 3.1), std=1.1)),
+        common=Bias("dB", 0.7, nominal=3.0, shared="type", drift=Drift((0.0, 3.0), scale=0.4)),
+    ):
+        return {"level": target.position[0] + gain + 0.5 * common - 0.1 * pose.position[0]}
+
+    network = Network([kind.on(n, name=f"{kind.name}_{n.name}") for kind in (fix, gauge, pulse) for n in nodes])
+    motion = Target(
+        ConstantVelocity(0.8) + White("emission", "m", 3.0), start={"position": (0.5, 4.0), "velocity": (0.0, 1.0)}
+    )
+    table = table_of(network, {"one": [0.0, 1.0, 1.7, 3.0, 3.2], "two": [0.5, 1.0, 2.0, 3.5]}, 5, silent=1.7)
+    return network, motion, table, {"gauge_b.gain@1.7": 0.6}
+
+
 DRAWN = ("plane", "mixed")
-CASES = {make.__name__: make for make in (plane, space, extras, mixed)}
+CASES = {make.__name__: make for make in (plane, space, extras, mixed, drifting)}
 
 
 def resting(problem):

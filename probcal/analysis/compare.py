@@ -11,6 +11,7 @@ from probcal.analysis import loo
 from probcal.analysis.checks import Finding
 from probcal.analysis.differences import findings
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
+from probcal.network import label_parts
 from probcal.types import InputError, nearest
 
 Fits = Mapping[str, xr.DataTree] | Sequence[xr.DataTree]
@@ -113,7 +114,7 @@ def interchangeable(
     labels = draws["bias_label"].values.astype(str)
     scale = tree["calibration"].to_dataset()["scale"].sel(bias_label=labels).values
     z = (draws.values / scale).reshape(-1, len(labels))
-    sd, owner = z.std(0), np.array([label.rsplit(".", 1)[0] for label in labels])
+    sd, owner = z.std(0), np.array([label_parts(label)[0] for label in labels])
     unit = (z - z.mean(0)) / np.where(sd > 0, sd, 1.0)
     first, second = np.triu_indices(len(labels), 1)
     value = (unit.T @ unit / len(z))[first, second]

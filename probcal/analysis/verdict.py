@@ -74,7 +74,7 @@ def judge(
     verdicts, sentences = [], []
     for m, bias in enumerate(problem.biases):
         s, unit = known.contraction[m], bias.unit if bias.unit != "1" else ""
-        declared = "survey" if problem.surveyed[m] else "scale"
+        declared = bias.kind
         sizes = f"{declared} of {_size(bias.scale, unit)} to {_size(bias.scale * np.sqrt(1 - s), unit)}"
         information = f"information {s / max(1 - s, 1e-12):.2g}"
         if m in drifts:

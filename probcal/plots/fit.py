@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
@@ -14,6 +15,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch
 from matplotlib.ticker import MaxNLocator
 
+from probcal.diagnostics import drift_table
+from probcal.network import label_parts
 from probcal.plots.base import (
     ALL_POINTS,
     BEFORE,
@@ -144,6 +147,26 @@ def plot_objective(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     return ax
 
 
+def plot_drift(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw the drifting biases over time with their intervals, in units of their scales."""
+    table = drift_table(tree)
+    ax = new_axes(ax, 9.0, 4.2)
+    scales = tree["calibration"].to_dataset()["scale"].to_series()
+    end = float(tree["observed_data"].to_dataset()["time"].max())
+    for k, (name, pieces) in enumerate(table.groupby("bias", sort=False)):
+        time = np.append(pieces["since"], max(end, pieces["since"].max()))
+        held = pd.concat([pieces, pieces.tail(1)])[["mean", "lower", "upper"]] / scales[name]
+        mean, lower, upper = held.to_numpy().T
+        ax.plot(time, mean, drawstyle="steps-post", color=colour(k), label=plain(name))
+        ax.fill_between(time, lower, upper, step="post", color=colour(k), alpha=0.2, linewidth=0)
+    ax.axhline(0.0, color="0.7", linewidth=0.8, zorder=0)
+    ax.set(xlabel="time in s", ylabel="bias / scale")
+    ax.grid(color="0.9")
+    ax.set_title(f"Drift of {table['bias'].nunique()} biases, with {probability(tree):.0%} intervals", loc="left")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
+    return ax
+
+
 def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw gamma of all biases in ascending order, coloured by the kind of bias."""
     group = tree["calibration"].to_dataset()
@@ -175,8 +198,9 @@ def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
 
 
 def _bias(label: str) -> str:
-    """Name of a bias without its owner: `heading` of `radar_2.heading`."""
-    return label.rsplit(".", 1)[-1]
+    """Name of a bias without its owner: `heading` of `radar_2.heading`, `heading_step` of `radar_2.heading@0.5`."""
+    name, _, time = label_parts(label)[1].partition("@")
+    return f"{name}_step" if time else name
 
 
 # Map

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from probcal.network import label_parts
 from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, new_axes, plain
 from probcal.plots.bounds import plot_bound_map
 
@@ -135,7 +136,7 @@ def _draw_direction(ax: Axes, tree: xr.DataTree, vector: pd.Series, width: float
     others = [label for label, amount in moved.items() if abs(amount) > limits[label]]
     rest = [label for label in others if "position" not in label and "heading" not in label]
     for name, place in zip(names, stated, strict=True):
-        mine = [label for label in rest if label.rsplit(".", 1)[0] == name]
+        mine = [label for label in rest if label_parts(label)[0] == name]
         if mine and len(names) <= NAMED:
-            text = ", ".join(plain(label.rsplit(".", 1)[-1], 16) for label in mine[:2])
+            text = ", ".join(plain(label_parts(label)[1], 16) for label in mine[:2])
             ax.annotate(text, place, xytext=(6, -10), textcoords="offset points", fontsize=6, color=shade, zorder=6)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg as dense
 
+from probcal.network import label_parts
 from probcal.problem import Problem
 from probcal.smoothing.gauge import Gauge
 from probcal.smoothing.mode import Point
@@ -314,16 +315,16 @@ def _round_down(value: float) -> float:
 
 
 def _owner(label: str) -> str:
-    return label.rsplit(".", 1)[0]
+    return label_parts(label)[0]
 
 
 def _name(label: str) -> str:
-    return label.rsplit(".", 1)[-1]
+    return label_parts(label)[1]
 
 
 def _of(label: str) -> str:
     """A bias in words: `range_offset of mic_3`."""
-    owner, name = label.rsplit(".", 1)
+    owner, name = label_parts(label)
     return f"{name} of {owner}"
 
 
@@ -381,8 +382,8 @@ def _complete(information: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 def _common(problem: Problem) -> list[Pattern]:
     """One component of all owners shifted together, by the same amount."""
     found = []
-    for component in dict.fromkeys(b.component for b in problem.biases if b.component != "position"):
-        members = [m for m, b in enumerate(problem.biases) if b.component == component]
+    for component, since in dict.fromkeys((b.component, b.since) for b in problem.biases if b.component != "position"):
+        members = [m for m, b in enumerate(problem.biases) if (b.component, b.since) == (component, since)]
         if len(members) > 1:
             vector = np.zeros(len(problem.biases))
             vector[members] = 1.0 / problem.scales[members]
