@@ -16,8 +16,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
 
+import jax
 import numpy as np
 import pandas as pd
+import platformdirs
 import typer
 import xarray as xr
 from rich.console import Console
@@ -60,6 +62,7 @@ Seed = Annotated[int, typer.Option(min=0, help="seed of everything random")]
 
 def main() -> None:
     """Entry point: one sentence on stderr and exit code 2 for bad input, 1 for a fit that left no answer."""
+    _keep_kernels()
     try:
         app()
     except InputError as error:
@@ -68,6 +71,21 @@ def main() -> None:
     except FitError as error:
         _say(error)
         sys.exit(1)
+
+
+def _keep_kernels() -> None:
+    """Compiled kernels stay in the user's cache folder, the latest 1 GB; JAX_COMPILATION_CACHE_DIR names another."""
+    if jax.config.jax_compilation_cache_dir:
+        return
+    folder = platformdirs.user_cache_path("probcal") / "kernels"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # a home that cannot be written: compile anew
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_compilation_cache_max_size", 10**9)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
 def _say(text: object) -> None:

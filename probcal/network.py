@@ -151,7 +151,7 @@ class BiasRecord:
         return [
             replace(
                 self,
-                label=f"{self.label}@{np.format_float_positional(time, trim='-')}",
+                label=f"{self.label}@{np.format_float_positional(time, precision=3, trim='-')}",
                 scale=size, nominal=0.0, kind="drift" if drift.scale is None else "scale",
                 component=f"{self.component}_step", since=time,
             )

@@ -56,7 +56,8 @@ class Bias:
     """An unknown parameter of a sensor: its unit, prior scale (standard deviation) and nominal value.
 
     The function receives nominal + bias, tables report the bias. `shared="type"` gives one bias to all
-    sensors of the type. With a `drift` it changes in time: `<label>@<time>` is its step at that time.
+    sensors of the type. With a `drift` it changes in time: `<label>@<time>` is its step at that time, to the
+    millisecond.
     """
 
     unit: str

@@ -160,14 +160,14 @@ def test_every_sensor_simulates_and_fits(name, d):
 
 SLOWER = (
     (EA(), 2), (EMEA(), 3), (MAP(), 3), (Collapsed(draws=60, warmup=50), 3), (NUTS(draws=100, warmup=150), 2),
-    (SVI(draws=50), 3),
+    (SVI(draws=50), 3), (EM(), 2),
 )  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("method", "d"),
     [
-        (EA(), 3), (EM(), 2),
+        (EA(), 3),
         *(pytest.param(method, d, marks=pytest.mark.slow) for method, d in SLOWER),
     ],
     ids=lambda v: getattr(v, "name", v),

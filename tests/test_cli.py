@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pandas as pd
 import pytest
@@ -93,10 +94,10 @@ def test_plaza_is_calibrated_from_the_command_line(tmp_path):
     assert (tracks["position_x_sd"] > 0).all()
 
 
-def test_freed_beacons_end_at_bound_and_name_the_dilation():
-    done = run("fit", ROOT / "models" / "plaza_free.py")
-    assert done.returncode == 1
-    assert "at bound" in done.stdout
+def test_freed_beacons_end_at_bound_and_name_the_dilation(monkeypatch, capsys):
+    code, out, err = call(monkeypatch, capsys, "fit", ROOT / "models" / "plaza_free.py")
+    assert code == 1
+    assert "at bound" in out
     for word in (
         "estimate is invalid",
         "beacon_5.range_scale",
@@ -104,7 +105,7 @@ def test_freed_beacons_end_at_bound_and_name_the_dilation():
         "translation",
         "anchor the positions of two nodes",
     ):
-        assert word in done.stderr
+        assert word in err
 
 
 def test_check_names_what_freed_beacons_leave_open(tmp_path):
@@ -274,12 +275,13 @@ def _parts(model):
     return load_model(model).network(), probcal.ConstantVelocity(0.5)
 
 
-def test_a_model_may_bring_its_prior(tmp_path, model):
+def test_a_model_may_bring_its_prior(tmp_path, model, monkeypatch, capsys):
     model.write_text(model.read_text() + '\nfrom probcal import ARD\nPRIOR = ARD(by="node")\n')
-    assert run("simulate", model, "--out", tmp_path / "rows.csv").returncode == 0
+    assert call(monkeypatch, capsys, "simulate", model, "--out", tmp_path / "rows.csv")[0] == 0
     for extra, wanted in (((), "by='node'"), (("--prior", "ard"), "by=None"), (("--method", "map"), "Gaussian")):
-        done = run("fit", model, tmp_path / "rows.csv", "--no-assess", "--out", tmp_path / "out", *extra)
-        assert done.returncode in (0, 1), done.stderr
+        order = ("fit", model, tmp_path / "rows.csv", "--no-assess", "--out", tmp_path / "out", *extra)
+        code, _, err = call(monkeypatch, capsys, *order)
+        assert code in (0, 1), err
         assert wanted in probcal.load(tmp_path / "out").attrs["settings"]
 
 
@@ -317,3 +319,25 @@ def test_a_sampler_prints_and_writes_what_its_chains_are_worth(model, rows, tmp_
     frame = pd.read_csv(tmp_path / "fit" / "summary.csv")
     assert {"r_hat", "ess", "ess_tail", "inclusion", "contraction"} <= set(frame.columns)
     assert not (tmp_path / "fit" / "draws").exists(), "the draws are in fit.nc"
+
+
+def test_kernels_are_kept_in_the_cache_folder_of_the_user_unless_jax_has_one(tmp_path, monkeypatch):
+    from probcal.cli import _keep_kernels
+
+    cache = ("jax_compilation_cache_dir", "jax_compilation_cache_max_size")
+    least = ("jax_persistent_cache_min_compile_time_secs", "jax_persistent_cache_min_entry_size_bytes")
+    before = {name: getattr(jax.config, name) for name in (*cache, *least)}
+    assert before[cache[0]], "the tests share one"
+    _keep_kernels()
+    assert jax.config.jax_compilation_cache_dir == before[cache[0]]
+    (tmp_path / "file").write_text("no folder")
+    try:
+        for home, kept in ((tmp_path / "cache", True), (tmp_path / "file", False)):
+            jax.config.update(cache[0], None)
+            monkeypatch.setenv("XDG_CACHE_HOME", str(home))
+            _keep_kernels()
+            assert bool(jax.config.jax_compilation_cache_dir) == kept
+            assert (home / "probcal" / "kernels").is_dir() == kept
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)

@@ -3,7 +3,9 @@
 Their numbers are exact on linear networks: the case `drifting` of test_exact.
 """
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from test_exact import CASES, resting
 
 import probcal
 from probcal import (
+    EA,
     MAP,
     BernoulliGaussian,
     Bias,
@@ -33,6 +36,9 @@ from probcal import (
 from probcal.network import label_parts
 from probcal.plots import plot_drift, plot_gamma
 from probcal.report import write_report
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
+import plaza
 
 TIMES = np.arange(0.0, 50.0, 10.0)
 FALSE_ALARM = 1e-6
@@ -207,3 +213,25 @@ def test_a_clock_of_its_own_type_may_drift():
     problem = Problem(network, motion, simulate(network, motion, np.arange(10.0), 0).table)
     assert [m["component"] for m in problem.members] == ["delay", "delay_step"]
     assert log_evidence(problem, prior=Gaussian()).value < 0
+
+
+@pytest.mark.slow
+def test_the_radios_of_plaza_stand_still():
+    """Constant offsets and scales against walks of both: elpd and evidence agree that nothing drifts."""
+    constant = plaza.problem()
+    times = np.linspace(constant.measurements.time.min(), constant.measurements.time.max(), 7)[:-1]
+    fits, evidence = {}, {}
+    for name, step in (("constant", {}), ("range_offset", {"std": 0.05}), ("range_scale", {"std": 0.0003})):
+        drift = {name: Drift(times, **step)} if step else {}
+        kind = replace(plaza.radio, biases={n: replace(b, drift=drift.get(n)) for n, b in plaza.radio.biases.items()})
+        network = Network([kind.on(node) for node in constant.network.nodes])
+        problem = Problem(network, constant.motion, constant.measurements.table)
+        fits[name] = probcal.fit(problem, EA())
+        evidence[name] = fits[name].attrs["log_evidence"]
+    compared = probcal.compare(fits)
+    for name in fits:
+        found = compared[f"method/{name}"].attrs
+        apart = f"{found['elpd_difference']:.1f} ± {found['elpd_difference_se']:.1f}"
+        print(f"\nPlaza, {name}: elpd {apart} to the best, evidence {evidence[name] - evidence['constant']:.1f}")
+    assert compared["method/constant"].attrs["elpd_difference"] == 0
+    assert max(evidence, key=lambda name: evidence[name]) == "constant"

@@ -104,7 +104,8 @@ def _anchors(problem: Problem) -> dict[str, list[int]]:
     """Biases, and positions of nodes, that may be surveyed: those without a survey, or all where all have one."""
     groups: dict[str, list[int]] = {}
     for m, bias in enumerate(problem.biases):
-        if problem.surveyed[m] and not problem.surveyed.all():
+        step = bias.since is not None  # nobody goes out to survey one
+        if step or (problem.surveyed[m] and not problem.surveyed.all()):
             continue
         groups[bias.label] = [m]
         if bias.component == "position":
