@@ -24,7 +24,8 @@ from probcal.inference.uniformity import NOMINAL, randomised_rank
 from probcal.priors import Prior
 from probcal.problem import Problem, Spec, System
 from probcal.smoothing.draws import draw
-from probcal.smoothing.mode import Point, log_density, log_likelihood, widening
+from probcal.smoothing.frame import volume
+from probcal.smoothing.mode import Point, log_density, log_likelihood
 from probcal.types import FitError
 
 CHAINS, DRAWS = 4, 250  # of a Gaussian
@@ -97,11 +98,9 @@ def _likelihoods(spec: Spec, system: System, z: jax.Array, levels: jax.Array, st
 @partial(jax.jit, static_argnames="form")
 def _joint(form: Form, posed: Posed, point: Point, phi: Phi) -> jax.Array:
     """Log joint density of data, noises and biases at the truth, as samplers keep it of each draw."""
-    diagonals = [jnp.diagonal(loop.factor, axis1=1, axis2=2) for loop in posed.frame.loops]
-    volume = sum((jnp.sum(jnp.log(d)) for d in diagonals), jnp.zeros(()))
-    volume = volume + widening(posed.system, posed.frame.point.levels) - widening(posed.system, point.levels)
     theta = jnp.concatenate([point.z, point.levels])
-    return log_density(form.spec, posed.system, point) + volume + log_prior(form, posed, theta, phi)
+    spread = volume(posed.system, posed.frame, theta)
+    return log_density(form.spec, posed.system, point) + spread + log_prior(form, posed, theta, phi)
 
 
 class Trial(NamedTuple):

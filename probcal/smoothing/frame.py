@@ -3,8 +3,10 @@
 At a point the trajectories given the biases are Gaussian with a block-tridiagonal precision. They are written as a
 response to theta = (biases z, log levels) plus a closed loop driven by independent unit normals `eps`:
 u_k = -K_k x_{k-1} + C_k eps_k, the factor of the posterior that a backward information pass gives (the control form
-of the Kalman smoother). With the trajectories marginalised the data have a Gaussian log-likelihood of theta. Both are
-exact where the problem is linear and Gaussian; elsewhere `log_weight` says by how much they are wrong at a point.
+of the Kalman smoother). K and C follow the levels: a track that the data hardly hold widens with its process noise,
+one that they hold does not, and neither leaves a funnel. With the trajectories marginalised the data have a Gaussian
+log-likelihood of theta. Both are exact where the problem is linear and Gaussian; elsewhere `log_weight` says by how
+much they are wrong at a point.
 """
 
 from functools import partial
@@ -12,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from probcal import linalg, rows
 from probcal.linalg import inverse_cholesky, multiply
@@ -38,11 +41,20 @@ class Loop(NamedTuple):
     """Trajectories of one recursion given theta: response, and the closed loop of the rest."""
 
     states: jax.Array  # (E, n, Q) response of the states to theta
-    noises: jax.Array  # (E, n, Q) response of the whitened noises
-    closed: jax.Array  # (E, n, n) transition of the deviation
-    spread: jax.Array  # (E, n, n) how eps enters the deviation
+    noises: jax.Array  # (E, n, Q) response of the whitened noises, those at the levels of the frame's point
     feedback: jax.Array  # (E, n, n) K
-    factor: jax.Array  # (E, n, n) C
+    factor: jax.Array  # (E, n, n) C with columns of unit diagonal
+    size: jax.Array  # (E, n) log of that diagonal
+    slopes: tuple[jax.Array, ...]  # of feedback, factor and size by the log levels, each with H leading
+
+    def at(self, step: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Feedback, factor and log size where the log levels are `step` (H,) from those of the point."""
+        base = self.feedback, self.factor, self.size
+        if step.shape[0] == 0:
+            return base
+        moved = (b + jnp.tensordot(step, slope, 1) for b, slope in zip(base, self.slopes, strict=True))
+        feedback, factor, size = moved
+        return feedback, factor, size
 
 
 class Frame(NamedTuple):
@@ -70,8 +82,8 @@ class Frame(NamedTuple):
         return self.height + self.score @ step - 0.5 * step @ (self.information @ step)
 
 
-def closed_loop(part: Recursion, L: jax.Array, J: jax.Array) -> tuple[jax.Array, ...]:
-    """Closed-loop transition, spread, feedback and factor (E, n, n) of one recursion with data information J.
+def closed_loop(part: Recursion, L: jax.Array, J: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Feedback (E, n, n), factor (E, n, n) of unit diagonal and its log size (E, n) with data information J.
 
     The information S about x_k from its own and all later data runs backwards in the symmetric (Joseph) form.
     """
@@ -86,10 +98,11 @@ def closed_loop(part: Recursion, L: jax.Array, J: jax.Array) -> tuple[jax.Array,
         keep = eye - multiply(L_k, gain)
         behind = multiply(keep.T, multiply(S, keep)) + multiply(gain.T, gain)
         behind = multiply(F_k.T, multiply(0.5 * (behind + behind.T), F_k))
-        return behind, (multiply(keep, F_k), multiply(L_k, inverse.T), multiply(gain, F_k), inverse.T)
+        return behind, (multiply(gain, F_k), inverse.T)
 
-    _, found = jax.lax.scan(step, jnp.zeros_like(eye), (part.F, L, J), reverse=True)
-    return found
+    _, (feedback, factor) = jax.lax.scan(step, jnp.zeros_like(eye), (part.F, L, J), reverse=True)
+    size = jnp.diagonal(factor, axis1=1, axis2=2)
+    return feedback, factor / size[:, None, :], jnp.log(size)
 
 
 def averaged(
@@ -123,20 +136,36 @@ def averaged(
 
 
 class _AtLevels(NamedTuple):
-    """Marginal log-likelihood, its slope by z, and trajectories at other levels."""
+    """Marginal log-likelihood, its slope by z, trajectories and closed loops at other levels, leading dim (levels,)."""
 
     value: jax.Array
     score: jax.Array  # (M,)
     states: tuple[jax.Array, ...]
     noises: tuple[jax.Array, ...]  # at the levels of the frame
+    loops: tuple[tuple[jax.Array, ...], ...]  # of each recursion: feedback, factor and size of the latter
 
 
+@partial(jax.jit, static_argnames="spec")
 def _at(spec: Spec, system: System, point: Point, levels: jax.Array) -> _AtLevels:
-    moved = track(spec, system, at_levels(system, point, levels))
-    lins = linearise(spec, system, moved, expected=True)
-    solved = eliminate_compressed(spec, system, moved.noises, levels, compress(spec, system, lins, moved.states))
-    value = log_density(spec, system, moved) - 0.5 * solved.logdet
-    return _AtLevels(value, solved.score, moved.states, at_levels(system, moved, point.levels).noises)
+    """At levels (D, H), one after the other."""
+
+    def one(levels: jax.Array) -> _AtLevels:
+        moved = track(spec, system, at_levels(system, point, levels))
+        lins = linearise(spec, system, moved, expected=True)
+        compressed = compress(spec, system, lins, moved.states)
+        solved = eliminate_compressed(spec, system, moved.noises, levels, compressed)
+        value = log_density(spec, system, moved) - 0.5 * solved.logdet
+        change = jnp.concatenate([levels - point.levels, jnp.zeros(1)])
+        loops = []
+        for part, (J, _) in zip(system.recursions, compressed.states, strict=True):
+            feedback, factor, size = closed_loop(part, factors(part, levels), J)
+            wider = change[part.level]
+            ratio = jnp.exp(wider)[:, :, None]
+            loops.append((ratio * feedback, factor * ratio / ratio.mT, size + wider))
+        noises = at_levels(system, moved, point.levels).noises
+        return _AtLevels(value, solved.score, moved.states, noises, tuple(loops))
+
+    return jax.lax.map(one, levels)
 
 
 @partial(jax.jit, static_argnames="spec")
@@ -160,44 +189,47 @@ def _frame(spec: Spec, system: System, point: Point, lins: list[Linearised]) -> 
     compressed = compress(spec, system, lins, point.states)
     solved = eliminate_compressed(spec, system, point.noises, point.levels, compressed)
     H = point.levels.shape[0]
-    moves = STEP * jnp.concatenate([jnp.eye(H), -jnp.eye(H)])
-    sides = [_at(spec, system, point, point.levels + moves[k]) for k in range(2 * H)]
-    information, score = _with_levels(spec, system, point, solved.information, solved.score, sides)
+    sides = _at(spec, system, point, point.levels + _moves(H)) if H else None
+    information, score = solved.information, solved.score
+    if sides is not None:
+        information, score = _with_levels(information, score, sides, H)
     loops = []
     parts = zip(system.recursions, compressed.states, compressed.crosses, strict=True)
     for r, (part, (J, _), cross) in enumerate(parts):
         L = factors(part, point.levels)
         smooth = rec.smooth(part.F, L, J, rec.gains(part.F, L, J), cross)
-        by_level = [
-            ((sides[h].states[r] - sides[H + h].states[r]) / (2 * STEP),
-             (sides[h].noises[r] - sides[H + h].noises[r]) / (2 * STEP))
-            for h in range(H)
-        ]  # fmt: skip
-        states = jnp.concatenate([-smooth.states, *(s[:, :, None] for s, _ in by_level)], 2)
-        noises = jnp.concatenate([-smooth.noises, *(u[:, :, None] for _, u in by_level)], 2)
-        loops.append(Loop(states, noises, *closed_loop(part, L, J)))
+        states, noises = -smooth.states, -smooth.noises
+        slopes: list[jax.Array] = []
+        if sides is not None:
+            paths = (sides.states[r], sides.noises[r], *sides.loops[r])
+            by_x, by_u, *slopes = ((side[:H] - side[H : 2 * H]) / (2 * STEP) for side in paths)
+            states = jnp.concatenate([states, jnp.moveaxis(by_x, 0, 2)], 2)
+            noises = jnp.concatenate([noises, jnp.moveaxis(by_u, 0, 2)], 2)
+        loops.append(Loop(states, noises, *closed_loop(part, L, J), tuple(slopes)))
     height = log_density(spec, system, point) - 0.5 * solved.logdet
     return Frame(point, information, score, height, tuple(loops))
 
 
-def _with_levels(
-    spec: Spec, system: System, point: Point, G: jax.Array, g: jax.Array, sides: list[_AtLevels]
-) -> tuple[jax.Array, jax.Array]:
+def _moves(H: int) -> np.ndarray:
+    """Steps of the log levels (2 H + 1 + H (H - 1), H): each up, each down, none, each pair up and down."""
+    one = np.eye(H)
+    both = [s * (one[a] + one[b]) for a in range(H) for b in range(a) for s in (1.0, -1.0)]
+    return STEP * np.array([*one, *-one, np.zeros(H), *both])
+
+
+def _with_levels(G: jax.Array, g: jax.Array, sides: _AtLevels, H: int) -> tuple[jax.Array, jax.Array]:
     """Information and score of theta: those of z, bordered by the levels."""
-    H = point.levels.shape[0]
-    if H == 0:
-        return G, g
-    middle = _at(spec, system, point, point.levels).value
-    slope = jnp.stack([(sides[h].value - sides[H + h].value) / (2 * STEP) for h in range(H)])
-    cross = jnp.stack([-(sides[h].score - sides[H + h].score) / (2 * STEP) for h in range(H)])  # (H, M)
+    up, down, middle = sides.value[:H], sides.value[H : 2 * H], sides.value[2 * H]
+    slope = (up - down) / (2 * STEP)
+    cross = -(sides.score[:H] - sides.score[H : 2 * H]) / (2 * STEP)  # (H, M)
     own = [[jnp.zeros(())] * H for _ in range(H)]
+    pairs = iter(range(2 * H + 1, sides.value.shape[0], 2))
     for a in range(H):
-        own[a][a] = -(sides[a].value - 2 * middle + sides[H + a].value) / STEP**2
+        own[a][a] = -(up[a] - 2 * middle + down[a]) / STEP**2
         for b in range(a):
-            both = STEP * (jnp.arange(H) == a) + STEP * (jnp.arange(H) == b)
-            pair = sum(_at(spec, system, point, point.levels + s * both).value for s in (1.0, -1.0))
-            straight = sides[a].value + sides[H + a].value + sides[b].value + sides[H + b].value
-            own[a][b] = own[b][a] = -(pair - straight + 2 * middle) / (2 * STEP**2)
+            k = next(pairs)
+            straight = up[a] + down[a] + up[b] + down[b]
+            own[a][b] = own[b][a] = -(sides.value[k] + sides.value[k + 1] - straight + 2 * middle) / (2 * STEP**2)
     corner = jnp.stack([jnp.stack(row) for row in own])
     # what the levels tell once the biases are found is kept positive: differences are no proof of it
     explained = cross @ linalg.solve_positive(G + 1e-6 * jnp.eye(G.shape[0]), cross.T)
@@ -211,19 +243,23 @@ def place(system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, 
     M = frame.point.z.shape[0]
     step = theta - frame.theta
     states, noises = [], []
-    for loop, x, u, e in zip(frame.loops, frame.point.states, frame.point.noises, eps, strict=True):
-        driven = jnp.einsum("eij,ej->ei", loop.spread, e)
+    for part, loop, x, u, e in zip(
+        system.recursions, frame.loops, frame.point.states, frame.point.noises, eps, strict=True
+    ):
+        L = factors(part, frame.point.levels)
+        feedback, factor, size = loop.at(step[M:])
+        own = jnp.einsum("eij,ej->ei", factor, jnp.exp(size) * e)
+        closed, driven = part.F - L @ feedback, jnp.einsum("eij,ej->ei", L, own)
 
         def forward(deviation: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
             T_k, s_k = epoch
             following = jnp.sum(T_k * deviation[None, :], 1) + s_k
             return following, deviation
 
-        last, before = jax.lax.scan(forward, jnp.zeros_like(x[0]), (loop.closed, driven))
+        last, before = jax.lax.scan(forward, jnp.zeros_like(x[0]), (closed, driven))
         deviations = jnp.concatenate([before[1:], last[None]])
         states.append(x + loop.states @ step + deviations)
-        own = jnp.einsum("eij,ej->ei", loop.factor, e) - jnp.einsum("eij,ej->ei", loop.feedback, before)
-        noises.append(u + loop.noises @ step + own)
+        noises.append(u + loop.noises @ step + own - jnp.einsum("eij,ej->ei", feedback, before))
     at = Point(tuple(states), tuple(noises), theta[:M], frame.point.levels)
     return at_levels(system, at, theta[M:]) if theta.shape[0] > M else at
 
@@ -237,19 +273,24 @@ def driving(system: System, frame: Frame, point: Point) -> tuple[jax.Array, ...]
     for loop, x0, u0, x, u in parts:
         deviations = x - x0 - loop.states @ step
         before = jnp.concatenate([jnp.zeros_like(x[:1]), deviations[:-1]])
-        own = u - u0 - loop.noises @ step + jnp.einsum("eij,ej->ei", loop.feedback, before)
-        solved = linalg.solve_batched(loop.factor @ loop.factor.mT, own)
-        found.append(jnp.einsum("eji,ej->ei", loop.factor, solved))
+        feedback, factor, size = loop.at(step[point.z.shape[0] :])
+        own = u - u0 - loop.noises @ step + jnp.einsum("eij,ej->ei", feedback, before)
+        solved = linalg.solve_batched(factor @ factor.mT, own)
+        found.append(jnp.exp(-size) * jnp.einsum("eji,ej->ei", factor, solved))
     return tuple(found)
+
+
+def volume(system: System, frame: Frame, theta: jax.Array) -> jax.Array:
+    """Log determinant by which `place` spreads eps over the whitened noises at theta (Q,)."""
+    levels = theta[frame.point.z.shape[0] :]
+    sizes = [jnp.sum(loop.at(levels - frame.point.levels)[2]) for loop in frame.loops]
+    return sum(sizes, widening(system, frame.point.levels) - widening(system, levels))
 
 
 def log_joint(spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:
     """Log density of data and eps given theta, less that of independent unit normals' constant; -inf if not finite."""
     point = place(system, frame, theta, eps)
-    diagonals = [jnp.diagonal(loop.factor, axis1=1, axis2=2) for loop in frame.loops]
-    volume = sum((jnp.sum(jnp.log(d)) for d in diagonals), jnp.zeros(()))
-    volume = volume + widening(system, frame.point.levels) - widening(system, point.levels)
-    value = log_density(spec, system, point) + volume
+    value = log_density(spec, system, point) + volume(system, frame, theta)
     return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
 
