@@ -20,8 +20,8 @@ from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Form, Posed, conditional, update_inclusions, whiten
 from probcal.inference.posterior import mixing
-from probcal.smoothing.frame import frame_at, log_weight, place
-from probcal.smoothing.mode import track
+from probcal.smoothing.frame import driving, frame_at, log_weight, place, volume
+from probcal.smoothing.mode import factors, track
 
 PRIORS = [ARD(shape=2.0, rate=0.7), ARD(by="node", rate=0.5), Laplace(), Horseshoe()]
 ALARM = 1e-4  # rate at which a right sampler fails one of these tests, for each comparison
@@ -142,6 +142,52 @@ def test_a_frame_is_exact_on_linear_problems(name):
         before = np.concatenate([np.zeros_like(x[:1]), x[:-1]])
         made_of = np.einsum("eij,ej->ei", part.F, before) + part.drift + np.einsum("eij,ej->ei", part.L, u)
         np.testing.assert_allclose(x, made_of, rtol=1e-8, atol=1e-8)
+
+
+def test_a_frame_follows_its_levels():
+    """At other levels the track of a linear problem is nearly the frame's law still, and is not where K and C stay."""
+    network, motion, table, _ = CASES["plane"]()
+    unknown = probcal.Target(probcal.ConstantVelocity(probcal.Unknown(0.8)), motion.start)
+    kind = network.types[0]
+    channels = {name: replace(channel, std=probcal.Unknown(1.0)) for name, channel in kind.channels.items()}
+    placed = replace(kind, channels=channels)
+    network = probcal.Network([placed.on(s.nodes[0]) for s in network.sensors])
+    problem = probcal.Problem(network, unknown, table.filter(regex="^(?!.*_std)"))
+    start = resting(problem)._replace(levels=jnp.zeros(len(problem.levels)))
+    frame = frame_at(problem.spec, problem.system, track(problem.spec, problem.system, start))
+    still = frame._replace(
+        loops=tuple(loop._replace(slopes=tuple(map(jnp.zeros_like, loop.slopes))) for loop in frame.loops)
+    )
+    keys = jax.random.split(jax.random.key(9), 200)
+
+    def spread(frame, theta):
+        def one(key):
+            eps = tuple(jax.random.normal(key, x.shape) for x in frame.point.states)
+            return log_weight(problem.spec, problem.system, frame, theta, eps)
+
+        return float(jnp.std(jax.lax.map(one, keys)))
+
+    H = len(problem.levels)
+    assert H == 2
+    assert spread(frame, frame.theta) < 1e-6, "at its own levels the frame is exact"
+    for step in 0.2 * np.concatenate([np.eye(H), -np.eye(H)]):
+        theta = frame.theta.at[-H:].add(step)
+        assert spread(frame, theta) < 0.3 * spread(still, theta)
+        eps = tuple(jax.random.normal(keys[0], x.shape) for x in frame.point.states)
+        point = place(problem.system, frame, theta, eps)
+        for again, e in zip(driving(problem.system, frame, point), eps, strict=True):
+            np.testing.assert_allclose(again, e, rtol=1e-7, atol=1e-7)
+        for part, x, u in zip(problem.system.recursions, point.states, point.noises, strict=True):
+            before = np.concatenate([np.zeros_like(x[:1]), x[:-1]])
+            made_of = np.einsum("eij,ej->ei", part.F, before) + part.drift
+            made_of += np.einsum("eij,ej->ei", factors(part, point.levels), u)
+            np.testing.assert_allclose(x, made_of, rtol=1e-8, atol=1e-8)
+
+        def noises(e, theta=theta):
+            return jnp.concatenate([u.ravel() for u in place(problem.system, frame, theta, (e,)).noises])
+
+        slope = jax.jacfwd(noises)(eps[0]).reshape(eps[0].size, -1)
+        assert np.linalg.slogdet(slope)[1] == pytest.approx(float(volume(problem.system, frame, theta)), abs=1e-8)
 
 
 def test_whitening_has_the_derivative_of_its_value():

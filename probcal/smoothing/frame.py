@@ -189,7 +189,7 @@ def _frame(spec: Spec, system: System, point: Point, lins: list[Linearised]) -> 
     compressed = compress(spec, system, lins, point.states)
     solved = eliminate_compressed(spec, system, point.noises, point.levels, compressed)
     H = point.levels.shape[0]
-    sides = _at(spec, system, point, point.levels + _moves(H)) if H else None
+    sides = _at(spec, system, point, point.levels[None] + _moves(H)) if H else None
     information, score = solved.information, solved.score
     if sides is not None:
         information, score = _with_levels(information, score, sides, H)
