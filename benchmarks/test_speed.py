@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probcal import ARD, EMEA, ConstantVelocity, Network, Node, Problem, fit, study
+from probcal import ARD, EMEA, Bias, ConstantVelocity, Drift, Network, Node, Problem, fit, study
 from probcal.analysis import next_passes, observability
 from probcal.inference.run import maximise
 from probcal.priors import Precision
@@ -82,6 +82,22 @@ def test_one_elimination_grows_with_epochs_and_rows(benchmark, K):
     with jax.enable_x64(True):
         alpha = Precision.single(jnp.ones(len(problem.labels)))
         benchmark(lambda: jax.block_until_ready(laplace(problem.spec, problem.system, start, alpha).covariance))
+
+
+@pytest.mark.parametrize("pieces", [1, 5, 20, 50])
+def test_drifting_headings(benchmark, pieces):
+    """MAP and marginals of 10 x 100 where every heading walks in so many pieces: 30 biases and 10 more a step."""
+    problem, start = network(10, 100)
+    if pieces > 1:
+        drift = Drift(np.linspace(0, 100, pieces + 1)[:-1], std=0.01)
+        scale = {"position": 10.0, "heading": Bias("rad", np.deg2rad(10.0), drift=drift)}
+        nodes = [Node(node.name, node.position, scale=scale) for node in problem.network.nodes]
+        table = problem.measurements.table
+        problem = Problem(Network([radar.on(n) for n in nodes]), problem.motion, table, fix=["*.range_offset"])
+        start = start._replace(z=np.zeros(len(problem.labels)))
+    with jax.enable_x64(True):
+        mode_and_marginals(problem, start)
+        benchmark.pedantic(mode_and_marginals, (problem, start), rounds=20, warmup_rounds=1)
 
 
 @pytest.mark.parametrize("plan", [observability, next_passes], ids=lambda plan: plan.__name__)
