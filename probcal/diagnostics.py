@@ -69,31 +69,38 @@ def study_table(study: xr.Dataset) -> pd.DataFrame:
 def drift_table(tree: xr.DataTree) -> pd.DataFrame:
     """Values of the drifting biases of a fit, one row a piece: bias, unit, since (s), mean, sd, lower, upper.
 
-    A value is the bias and its steps so far; mean and sd are exact sums, the interval is of the draws. `since` of the
-    first piece is the time of the first datum. Empty where nothing drifts.
+    A value is the bias and its steps so far, fixed ones included; mean and sd are exact sums, the interval is of the
+    draws. The first piece begins with the first datum, steps before it are in its value. Empty where nothing drifts.
     """
     columns = ["bias", "unit", "since", "mean", "sd", "lower", "upper"]
     if not {"calibration", "posterior"} <= set(tree.children):
         return pd.DataFrame(columns=columns)
     group, draws = tree["calibration"].to_dataset(), tree["posterior"].to_dataset()["bias"].values
     labels = group["bias_label"].values.astype(str).tolist()
-    mean, covariance = group["mean"].values, group["covariance"].values
+    constant = tree["constant_data"].to_dataset()
+    fixed = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
+    every = [*labels, *fixed]
     units = dict(zip(labels, group["unit"].values, strict=True))
+    mean, covariance = group["mean"].values, group["covariance"].values
     start = float(tree["observed_data"].to_dataset()["time"].min())
     tail = (1 - tree.attrs["interval_probability"]) / 2
-    found: dict[str, list[tuple[float, str]]] = {}
-    for label in labels:
-        step = step_of(label, labels)
+    steps: dict[str, list[tuple[float, str]]] = {}
+    for label in every:
+        step = step_of(label, every)
         if step is not None:
-            found.setdefault(step[0], [(start, step[0])]).append((step[1], label))
+            steps.setdefault(step[0], []).append((step[1], label))
     table = []
-    for name, pieces in found.items():
-        members: list[int] = []
-        for since, label in sorted(pieces):
-            members.append(labels.index(label))
-            lower, upper = np.quantile(draws[..., members].sum(-1), [tail, 1 - tail])
+    for name, own in steps.items():
+        known = [label for label in (name, *(label for _, label in own)) if label in units]
+        if not known:
+            continue
+        for since in sorted({max(time, start) for time, _ in own} | {start}):
+            so_far = [name, *(label for time, label in own if time <= since)]
+            members = [labels.index(label) for label in so_far if label in units]
+            held = sum(fixed.get(label, 0.0) for label in so_far)
+            lower, upper = held + np.quantile(draws[..., members].sum(-1), [tail, 1 - tail])
             sd = np.sqrt(covariance[np.ix_(members, members)].sum())
-            table.append((name, units[name], since, mean[members].sum(), sd, lower, upper))
+            table.append((name, units[known[0]], since, held + mean[members].sum(), sd, lower, upper))
     return pd.DataFrame(table, columns=columns)
 
 

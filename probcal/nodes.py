@@ -395,7 +395,8 @@ def _calibrated(tree: xr.DataTree) -> list[_Record]:
         position = place + [shift.get(f"{node}.{axis}", 0.0) for axis in axes]
         further = {f"sd_{name}": row["sd"] for name, row in own.items()}
         units = {name: row["unit"] for name, row in own.items() if name not in axes}
-        drifts = any(label.startswith(f"{node}.") and step_of(label, shift) for label in shift)
+        names = {f"{node}.{name}" for name in (*axes, *components[node])}
+        drifts = any((step := step_of(label, shift)) is not None and step[0] in names for label in shift)
         if not moving and not drifts:
             records.append(_Record(str(node), position, components[node], further, units))
     return records

@@ -19,7 +19,9 @@ PERIODS = {"rad": 2 * np.pi, "deg": 360.0}
 
 @dataclass(frozen=True)
 class Drift:
-    """How a bias changes: constant from each of the `times` (T,) in s to the next, the first also before it.
+    """How a bias changes: constant from each of the `times` (T,) to the next, the first also before it.
+
+    `times` are seconds of the table (of its first row on, where the table has dates).
 
     `std`, in the bias's unit s^-1/2, makes a random walk: a step over dt has the known standard deviation
     std * sqrt(dt). `scale`, in its unit, is that of every step and governed by the prior chosen at the fit: a sparse
@@ -31,15 +33,20 @@ class Drift:
     scale: float | None = None
 
     def __post_init__(self):
-        times = np.asarray(self.times, float)
+        given = np.asarray(self.times)
+        times = given.astype(float) if given.dtype.kind in "iuf" else np.full(1, np.nan)  # no dates
         if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or not (np.diff(times) > 0).all():
-            raise InputError("Drift: times are those at which the pieces start, two or more, finite and increasing")
+            raise InputError(
+                "Drift: times are those at which the pieces start, in seconds of the table, two or more, increasing"
+            )
+        if np.diff(times).min() < 1e-3:
+            raise InputError("Drift: times are less than a millisecond apart; merge those pieces")
         if (self.std is None) == (self.scale is None):
             raise InputError(
                 "Drift: give either std (a random walk of known level) or scale (steps that the prior governs)"
             )
         size = self.std if self.scale is None else self.scale
-        if size is None or not (np.isfinite(size) and size > 0):
+        if not isinstance(size, (int, float)) or not (np.isfinite(size) and size > 0):
             raise InputError(f"Drift: {'std' if self.scale is None else 'scale'} is {size}; it must be positive")
         object.__setattr__(self, "times", tuple(times.tolist()))
 

@@ -78,14 +78,20 @@ def test_steps_have_times_scales_and_labels():
 
 
 def test_what_it_refuses():
-    for times in ([0.0], [0.0, 0.0], [[0.0, 1.0]], [0.0, np.inf]):
-        with pytest.raises(InputError, match="times are those at which the pieces start, two or more, finite and inc"):
+    dates = np.array(["2024-01-01", "2024-01-02"], "M8[s]")
+    for times in ([0.0], [0.0, 0.0], [[0.0, 1.0]], [0.0, np.inf], [0.0, "x"], dates):
+        with pytest.raises(InputError, match="the pieces start, in seconds of the table, two or more, increasing"):
             Drift(times, std=1.0)
     for options in ({}, {"std": 1.0, "scale": 1.0}):
         with pytest.raises(InputError, match=r"give either std \(a random walk of known level\) or scale"):
             Drift((0.0, 1.0), **options)
     with pytest.raises(InputError, match=r"Drift: std is 0\.0; it must be positive"):
         Drift((0.0, 1.0), std=0.0)
+    for size in ("x", -1.0, np.nan):
+        with pytest.raises(InputError, match=r"Drift: std is .*; it must be positive"):
+            Drift((0.0, 1.0), std=size)
+    with pytest.raises(InputError, match="times are less than a millisecond apart; merge those pieces"):
+        Drift((0.0, 1.0, 1.0001), std=1.0)
     with pytest.raises(InputError, match=r"Bias\('m', drift=3\): give Drift"):
         Bias("m", 1.0, drift=3)
 
@@ -235,3 +241,47 @@ def test_the_radios_of_plaza_stand_still():
         print(f"\nPlaza, {name}: elpd {apart} to the best, evidence {evidence[name] - evidence['constant']:.1f}")
     assert compared["method/constant"].attrs["elpd_difference"] == 0
     assert max(evidence, key=lambda name: evidence[name]) == "constant"
+
+
+def test_fixed_steps_and_steps_before_the_data_count_in_the_values():
+    """A step fixed at its true 5 m, one 5 s before the data, one free: each piece has the sum of what began by then."""
+    network, motion = watched(Drift((-9.0, -5.0, 4.0, 8.0), scale=3.0))
+    truth = {"b.position_x": 1.0, "b.position_x@4": 5.0}
+    table = simulate(network, motion, np.arange(12.0), 0, biases=truth).table
+    problem = Problem(network, motion, table, fix={"b.position_x@4": 5.0})
+    found = drift_table(probcal.fit(problem, MAP(), prior=Gaussian())).query("bias == 'b.position_x'")
+    assert list(found["since"]) == [0.0, 4.0, 8.0]
+    assert (np.abs(found["mean"] - [1.0, 6.0, 6.0]) < 6 * found["sd"]).all()
+    assert (found["sd"] < 0.6).all()
+    steps = Problem(network, motion, table, fix=["b.position_?"])
+    found = drift_table(probcal.fit(steps, MAP(), prior=Gaussian()))
+    assert set(found["bias"]) == {"b.position_x", "b.position_y"}
+
+
+def test_a_drifting_sensor_is_checked_whole():
+    """Noise spoilt after the step is the sensor's, though its first piece is fine; and its node may be written."""
+    network, motion = watched()
+    table = simulate(network, motion, np.arange(40.0), 0).table
+    late = (table["sensor"] == "b") & (table["time"] > 8)
+    table.loc[late, "position_x"] += 2.0 * np.random.default_rng(0).standard_normal(late.sum())
+    node = Node("b", (50.0, 10.0), scale={"position": Bias("m", 2.0, drift=Drift((0.0, 8.0), std=1e-4))})
+    nodes = [node if s.name == "b" else s.nodes[0] for s in network.sensors]
+    problem = Problem(Network([network.types[0].on(n) for n in nodes]), motion, table)
+    tree = probcal.assess(problem, probcal.fit(problem, MAP(), prior=Gaussian()))
+    check = tree["channel_check"].to_dataset()
+    mine = (check["sensor"].values == "b") & (check["channel"].values == "position_x")
+    assert check["p_misfit"].values[mine].item() < 0.01
+    anchors = probcal.analysis.next_anchors(problem)["anchor"].values
+    assert not [name for name in anchors if "@" in str(name)]
+
+
+def test_a_node_stands_still_though_its_sensor_drifts(tmp_path):
+    kind = probcal.sensors.flight_time
+    wander = replace(kind.biases["range_offset"], drift=Drift((0.0, 4.0), std=1.0))
+    kind = replace(kind, biases={"range_offset": wander})
+    nodes = [Node(n, place, scale=1.0) for n, place in zip("abcd", [(0, 0), (50, 0), (0, 50), (60, 60)], strict=True)]
+    target = Target(ConstantVelocity(0.3), start={"position": (20.0, 5.0), "velocity": (1.0, 1.0)})
+    network = Network([kind.on(node) for node in nodes])
+    problem = Problem(network, target, simulate(network, target, np.arange(8.0), 0).table)
+    tree = probcal.fit(problem, MAP(), prior=Gaussian(), predictive_draws=False)
+    assert len(probcal.write_nodes(tmp_path / "n.csv", tree).read_text().splitlines()) == 5

@@ -98,6 +98,10 @@ def _nodes(at: Problem, z: np.ndarray) -> np.ndarray:
     """Where the nodes of a snapshot stand, their biases z (M,) added, (nodes, d)."""
     found = []
     shift = at.fixed | dict(zip(at.labels, z * at.scales, strict=True))
+    for record in at.network.biases:
+        if record.since is not None and record.since <= at.measurements.time[0]:
+            constant = record.label.rpartition("@")[0]
+            shift[constant] = shift.get(constant, 0.0) + shift[record.label]
     for node in at.network.nodes:
         place = node.position if node.path is None else node.path.at(at.measurements.time[:1])["position"][0]
         found.append([p + shift.get(f"{node.name}.position_{a}", 0.0) for p, a in zip(place, AXES, strict=False)])

@@ -103,9 +103,11 @@ def next_anchors(
 def _anchors(problem: Problem) -> dict[str, list[int]]:
     """Biases, and positions of nodes, that may be surveyed: those without a survey, or all where all have one."""
     groups: dict[str, list[int]] = {}
-    for m, bias in enumerate(problem.biases):
-        step = bias.since is not None  # nobody goes out to survey one
-        if step or (problem.surveyed[m] and not problem.surveyed.all()):
+    constant = [m for m, bias in enumerate(problem.biases) if bias.since is None]  # nobody goes out to survey a step
+    constant = constant or list(range(len(problem.biases)))
+    for m in constant:
+        bias = problem.biases[m]
+        if problem.surveyed[m] and not problem.surveyed[constant].all():
             continue
         groups[bias.label] = [m]
         if bias.component == "position":

@@ -42,24 +42,25 @@ class Predictive(NamedTuple):
     kurtosis: np.ndarray
 
 
-@partial(jax.jit, static_argnames="spec")
+@partial(jax.jit, static_argnames=("spec", "count"))
 def _discrepancies(
-    spec: Spec, system: System, levels: jax.Array, drawn: Drawn
+    spec: Spec, system: System, levels: jax.Array, drawn: Drawn, sensors: tuple[jax.Array, ...], count: int
 ) -> tuple[list[jax.Array], list[jax.Array]]:
     """By draw, data or replica, sensor and channel (D, 2, 2, S, C): -log p and sum of scores; fourth powers (N, C)."""
 
     def one(draw):
         found, fourth = [], []
-        for block, data, r, replica in zip(spec.blocks, system.rows, spec.recursion, draw.replicas, strict=True):
+        parts = zip(spec.blocks, system.rows, spec.recursion, draw.replicas, sensors, strict=True)
+        for block, data, r, replica, sensor in parts:
             predicted = rows.predict(block, data, draw.states[r], draw.z)
-            std, count = rows.noise_std(data, levels), data.bias.shape[0]
+            std = rows.noise_std(data, levels)
 
-            def of(y, block=block, data=data, predicted=predicted, std=std, count=count):
+            def of(y, block=block, data=data, predicted=predicted, std=std, sensor=sensor):
                 version = data._replace(y=y)
                 score, weight = rows.weigh(block, version, predicted, std, expected=True)
                 v = rows.standardised(score, weight)
                 misfit = -rows.log_likelihood(block, version, predicted, levels)
-                return jax.ops.segment_sum(jnp.stack([misfit, v], 1), data.sensor, count), v**4
+                return jax.ops.segment_sum(jnp.stack([misfit, v], 1), sensor, count), v**4
 
             sums, powers = jax.vmap(of)(jnp.stack([data.y, replica]))
             found.append(sums)
@@ -80,15 +81,17 @@ def check(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Predictive:
         if gaussian:
             return Predictive(None, None, np.zeros(len(fit.data)))
         drawn = _at_fit(fit, key)
-    found, fourth = _discrepancies(problem.spec, problem.system, fit.point.levels, drawn)
+    sensors = tuple(jnp.asarray(problem.measurements.sensor[index]) for index in problem.row_index)
+    count = len(problem.network.sensors)
+    found, fourth = _discrepancies(problem.spec, problem.system, fit.point.levels, drawn, sensors, count)
     kurtosis = np.zeros(len(fit.data)) if gaussian else _exact(fit, fit.flat(fourth) - 3.0)
     if not known:
         return Predictive(None, None, kurtosis)
     parts: tuple[list[Any], list[Any]] = ([], [])
-    for data, values in zip(problem.system.rows, map(np.asarray, found), strict=True):
+    for sensor, values in zip(sensors, map(np.asarray, found), strict=True):
         above = (values[:, 1] > values[:, 0]).mean(0) + 0.5 * (values[:, 1] == values[:, 0]).mean(0)  # (S, 2, C)
         for k, part in enumerate(parts):
-            part.append(above[np.asarray(data.sensor), k])
+            part.append(above[np.asarray(sensor), k])
     return Predictive(fit.flat(parts[0]), fit.flat(parts[1]), kurtosis)
 
 

@@ -4,7 +4,7 @@ A direction is weak when its marginal information lambda is below 1 in units of 
 is the share of its answer that the data give. It is a gauge when no row fixes it (`smoothing.gauge`).
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -235,7 +235,7 @@ def _with_remedies(
             continue
         left -= 1
         if _count(known, done) <= left:
-            yield replace(direction, fix=fixed, remedy=f"{before}done by fixing {_together(fixed)}")
+            yield replace(direction, fix=fixed, remedy=f"{before}done by fixing {_together(fixed, problem.labels)}")
             continue
         members = [[labels.index(name) for name in group] for group in groups]
         both = [m for group in members[:2] for m in group]
@@ -249,15 +249,17 @@ def _with_remedies(
         units = {problem.biases[problem.labels.index(label)].unit for label in fixed}
         std = std if len(units) == 1 else None
         survey = f", or survey it to {std:g} {units.pop().strip('1')}".rstrip() if std is not None else ""
-        yield replace(direction, fix=fixed, survey=std, remedy=f"{before}fix {_together(fixed)}{survey}")
+        yield replace(
+            direction, fix=fixed, survey=std, remedy=f"{before}fix {_together(fixed, problem.labels)}{survey}"
+        )
         done += chosen
 
 
-def _together(labels: tuple[str, ...]) -> str:
-    """Labels as `--fix` takes them: the position of a node as one pattern."""
-    owners = {_owner(label) for label in labels}
-    whole = len(owners) == 1 and len(labels) > 1 and all(_name(label).startswith("position_") for label in labels)
-    return f"{owners.pop()}.position_*" if whole else " and ".join(labels)
+def _together(labels: tuple[str, ...], known: Sequence[str]) -> str:
+    """Labels as `--fix` takes them: the position of a node as one pattern, where that reaches no other of the known."""
+    owner = _owner(labels[0])
+    whole = len(labels) > 1 and set(labels) == {name for name in known if name.startswith(f"{owner}.position_")}
+    return f"{owner}.position_*" if whole else " and ".join(labels)
 
 
 def _spectrum(known: np.ndarray, done: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -382,8 +384,10 @@ def _complete(information: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 def _common(problem: Problem) -> list[Pattern]:
     """One component of all owners shifted together, by the same amount."""
     found = []
-    for component, since in dict.fromkeys((b.component, b.since) for b in problem.biases if b.component != "position"):
-        members = [m for m, b in enumerate(problem.biases) if (b.component, b.since) == (component, since)]
+    kinds = [(b.component, b.axis, b.since) for b in problem.biases]
+    for kind in dict.fromkeys(kind for kind in kinds if kind[0] != "position"):
+        members = [m for m, own in enumerate(kinds) if own == kind]
+        component = kind[0] if kind[2] is None else label_parts(problem.labels[members[0]])[1]
         if len(members) > 1:
             vector = np.zeros(len(problem.biases))
             vector[members] = 1.0 / problem.scales[members]

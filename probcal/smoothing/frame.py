@@ -1,16 +1,16 @@
 """A Gaussian frame of the posterior: coordinates in which biases and trajectories are nearly independent normals.
 
 At a point the trajectories given the biases are Gaussian with a block-tridiagonal precision. They are written as a
-response to theta = (biases z, log levels) plus a closed loop driven by independent unit normals `eps`:
-u_k = -K_k x_{k-1} + C_k eps_k, the factor of the posterior that a backward information pass gives (the control form
-of the Kalman smoother). K and C follow the levels: a track that the data hardly hold widens with its process noise,
-one that they hold does not, and neither leaves a funnel. With the trajectories marginalised the data have a Gaussian
-log-likelihood of theta. Both are exact where the problem is linear and Gaussian; elsewhere `log_weight` says by how
-much they are wrong at a point.
+response to the biases plus a closed loop driven by independent unit normals `eps`: u_k = -K_k x_{k-1} + C_k eps_k,
+the factor of the posterior that a backward information pass gives (the control form of the Kalman smoother). At other
+levels the pass is made anew: a track that the data hardly hold widens with its process noise, one that they hold does
+not, and neither leaves a funnel. theta is the biases z and the log levels. With the trajectories marginalised the data
+have a Gaussian log-likelihood of theta. Trajectories given z near the point are exact where the problem is linear and
+Gaussian, the likelihood where no level is unknown too; elsewhere `log_weight` says by how much they are wrong.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ from probcal.smoothing.mode import (
     follow,
     linearise,
     log_density,
+    of_states,
     track,
     widening,
 )
@@ -37,24 +38,23 @@ from probcal.smoothing.mode import (
 STEP = 0.05  # of a log level, for differences
 
 
-class Loop(NamedTuple):
-    """Trajectories of one recursion given theta: response, and the closed loop of the rest."""
+class Closed(NamedTuple):
+    """A closed loop u = shift - feedback x + factor exp(size) eps, its noises u at the levels of the frame's point."""
 
-    states: jax.Array  # (E, n, Q) response of the states to theta
-    noises: jax.Array  # (E, n, Q) response of the whitened noises, those at the levels of the frame's point
     feedback: jax.Array  # (E, n, n) K
     factor: jax.Array  # (E, n, n) C with columns of unit diagonal
     size: jax.Array  # (E, n) log of that diagonal
-    slopes: tuple[jax.Array, ...]  # of feedback, factor and size by the log levels, each with H leading
+    shift: jax.Array  # (E, n) where the mean of the noises moves with the levels
 
-    def at(self, step: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Feedback, factor and log size where the log levels are `step` (H,) from those of the point."""
-        base = self.feedback, self.factor, self.size
-        if step.shape[0] == 0:
-            return base
-        moved = (b + jnp.tensordot(step, slope, 1) for b, slope in zip(base, self.slopes, strict=True))
-        feedback, factor, size = moved
-        return feedback, factor, size
+
+class Loop(NamedTuple):
+    """Trajectories of one recursion given theta: response to the biases, and the closed loop of the rest."""
+
+    states: jax.Array  # (E, n, M) response of the states to the biases
+    noises: jax.Array  # (E, n, M) response of the whitened noises
+    closed: Closed  # at the levels of the point
+    data: tuple[jax.Array, jax.Array]  # (E, n, n) information of the data about the states, (E, n) their score
+    shares: tuple[jax.Array, jax.Array]  # the same with H leading, by the unknown level that the noise of a datum has
 
 
 class Frame(NamedTuple):
@@ -82,27 +82,30 @@ class Frame(NamedTuple):
         return self.height + self.score @ step - 0.5 * step @ (self.information @ step)
 
 
-def closed_loop(part: Recursion, L: jax.Array, J: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Feedback (E, n, n), factor (E, n, n) of unit diagonal and its log size (E, n) with data information J.
+def closed_loop(part: Recursion, L: jax.Array, J: jax.Array, score: jax.Array, u: jax.Array) -> Closed:
+    """The loop of one recursion with data information J (E, n, n) and score (E, n) at a path of noises u (E, n).
 
-    The information S about x_k from its own and all later data runs backwards in the symmetric (Joseph) form.
+    The information S about x_k from its own and all later data, and its score m, run backwards in the symmetric
+    (Joseph) form.
     """
     n = part.F.shape[-1]
     eye = jnp.eye(n, dtype=part.F.dtype)
 
-    def step(ahead: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        F_k, L_k, J_k = epoch
-        S = J_k + ahead
+    def step(ahead: tuple[jax.Array, jax.Array], epoch: tuple[jax.Array, ...]) -> tuple[Any, tuple[jax.Array, ...]]:
+        F_k, L_k, J_k, score_k, u_k = epoch
+        S, m = J_k + ahead[0], score_k + ahead[1]
         inverse = inverse_cholesky(eye + multiply(L_k.T, multiply(S, L_k)))
         gain = multiply(inverse.T, multiply(inverse, multiply(L_k.T, S)))
         keep = eye - multiply(L_k, gain)
         behind = multiply(keep.T, multiply(S, keep)) + multiply(gain.T, gain)
         behind = multiply(F_k.T, multiply(0.5 * (behind + behind.T), F_k))
-        return behind, (multiply(gain, F_k), inverse.T)
+        shift = inverse.T @ (inverse @ (L_k.T @ m - u_k))
+        return (behind, F_k.T @ (m - S @ (L_k @ shift))), (multiply(gain, F_k), inverse.T, shift)
 
-    _, (feedback, factor) = jax.lax.scan(step, jnp.zeros_like(eye), (part.F, L, J), reverse=True)
+    last = jnp.zeros_like(eye), jnp.zeros(n, part.F.dtype)
+    _, (feedback, factor, shift) = jax.lax.scan(step, last, (part.F, L, J, score, u), reverse=True)
     size = jnp.diagonal(factor, axis1=1, axis2=2)
-    return feedback, factor / size[:, None, :], jnp.log(size)
+    return Closed(feedback, factor / size[:, None, :], jnp.log(size), shift)
 
 
 def averaged(
@@ -135,35 +138,15 @@ def averaged(
     ]
 
 
-class _AtLevels(NamedTuple):
-    """Marginal log-likelihood, its slope by z, trajectories and closed loops at other levels, leading dim (levels,)."""
-
-    value: jax.Array
-    score: jax.Array  # (M,)
-    states: tuple[jax.Array, ...]
-    noises: tuple[jax.Array, ...]  # at the levels of the frame
-    loops: tuple[tuple[jax.Array, ...], ...]  # of each recursion: feedback, factor and size of the latter
-
-
 @partial(jax.jit, static_argnames="spec")
-def _at(spec: Spec, system: System, point: Point, levels: jax.Array) -> _AtLevels:
-    """At levels (D, H), one after the other."""
+def _at(spec: Spec, system: System, point: Point, levels: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Marginal log-likelihood (D,) and its slope by z (D, M) at levels (D, H), trajectories at their mode."""
 
-    def one(levels: jax.Array) -> _AtLevels:
+    def one(levels: jax.Array) -> tuple[jax.Array, jax.Array]:
         moved = track(spec, system, at_levels(system, point, levels))
         lins = linearise(spec, system, moved, expected=True)
-        compressed = compress(spec, system, lins, moved.states)
-        solved = eliminate_compressed(spec, system, moved.noises, levels, compressed)
-        value = log_density(spec, system, moved) - 0.5 * solved.logdet
-        change = jnp.concatenate([levels - point.levels, jnp.zeros(1)])
-        loops = []
-        for part, (J, _) in zip(system.recursions, compressed.states, strict=True):
-            feedback, factor, size = closed_loop(part, factors(part, levels), J)
-            wider = change[part.level]
-            ratio = jnp.exp(wider)[:, :, None]
-            loops.append((ratio * feedback, factor * ratio / ratio.mT, size + wider))
-        noises = at_levels(system, moved, point.levels).noises
-        return _AtLevels(value, solved.score, moved.states, noises, tuple(loops))
+        solved = eliminate_compressed(spec, system, moved.noises, levels, compress(spec, system, lins, moved.states))
+        return log_density(spec, system, moved) - 0.5 * solved.logdet, solved.score
 
     return jax.lax.map(one, levels)
 
@@ -189,25 +172,35 @@ def _frame(spec: Spec, system: System, point: Point, lins: list[Linearised]) -> 
     compressed = compress(spec, system, lins, point.states)
     solved = eliminate_compressed(spec, system, point.noises, point.levels, compressed)
     H = point.levels.shape[0]
-    sides = _at(spec, system, point, point.levels[None] + _moves(H)) if H else None
     information, score = solved.information, solved.score
-    if sides is not None:
-        information, score = _with_levels(information, score, sides, H)
+    if H:
+        values, slopes = _at(spec, system, point, point.levels[None] + _moves(H))
+        information, score = _with_levels(information, score, values, slopes, H)
+    by_level = [_share(spec, system, point, lins, h) for h in range(H)]
     loops = []
     parts = zip(system.recursions, compressed.states, compressed.crosses, strict=True)
-    for r, (part, (J, _), cross) in enumerate(parts):
+    for r, (part, (J, pull), cross) in enumerate(parts):
         L = factors(part, point.levels)
         smooth = rec.smooth(part.F, L, J, rec.gains(part.F, L, J), cross)
-        states, noises = -smooth.states, -smooth.noises
-        slopes: list[jax.Array] = []
-        if sides is not None:
-            paths = (sides.states[r], sides.noises[r], *sides.loops[r])
-            by_x, by_u, *slopes = ((side[:H] - side[H : 2 * H]) / (2 * STEP) for side in paths)
-            states = jnp.concatenate([states, jnp.moveaxis(by_x, 0, 2)], 2)
-            noises = jnp.concatenate([noises, jnp.moveaxis(by_u, 0, 2)], 2)
-        loops.append(Loop(states, noises, *closed_loop(part, L, J), tuple(slopes)))
+        closed = closed_loop(part, L, J, pull, point.noises[r])
+        closed = closed._replace(shift=jnp.zeros_like(pull))  # the point is the mean, by definition
+        own = [share[r] for share in by_level]
+        shares = (
+            jnp.stack([J_h for J_h, _ in own]) if own else jnp.zeros((0, *J.shape)),
+            jnp.stack([pull_h for _, pull_h in own]) if own else jnp.zeros((0, *pull.shape)),
+        )
+        loops.append(Loop(-smooth.states, -smooth.noises, closed, (J, pull), shares))
     height = log_density(spec, system, point) - 0.5 * solved.logdet
     return Frame(point, information, score, height, tuple(loops))
+
+
+def _share(
+    spec: Spec, system: System, point: Point, lins: list[Linearised], h: int
+) -> list[tuple[jax.Array, jax.Array]]:
+    """Information and score of the states of each recursion by the data whose noise has unknown level h."""
+    pairs = ((lin, data.level == h) for lin, data in zip(lins, system.rows, strict=True))
+    own = [lin._replace(weight=lin.weight * mine, score=lin.score * mine) for lin, mine in pairs]
+    return of_states(spec, system, own, point.states)
 
 
 def _moves(H: int) -> np.ndarray:
@@ -217,19 +210,21 @@ def _moves(H: int) -> np.ndarray:
     return STEP * np.array([*one, *-one, np.zeros(H), *both])
 
 
-def _with_levels(G: jax.Array, g: jax.Array, sides: _AtLevels, H: int) -> tuple[jax.Array, jax.Array]:
-    """Information and score of theta: those of z, bordered by the levels."""
-    up, down, middle = sides.value[:H], sides.value[H : 2 * H], sides.value[2 * H]
+def _with_levels(
+    G: jax.Array, g: jax.Array, values: jax.Array, slopes: jax.Array, H: int
+) -> tuple[jax.Array, jax.Array]:
+    """Information and score of theta: those of z, bordered by the levels, from log-likelihoods at `_moves`."""
+    up, down, middle = values[:H], values[H : 2 * H], values[2 * H]
     slope = (up - down) / (2 * STEP)
-    cross = -(sides.score[:H] - sides.score[H : 2 * H]) / (2 * STEP)  # (H, M)
+    cross = -(slopes[:H] - slopes[H : 2 * H]) / (2 * STEP)  # (H, M)
     own = [[jnp.zeros(())] * H for _ in range(H)]
-    pairs = iter(range(2 * H + 1, sides.value.shape[0], 2))
+    pairs = iter(range(2 * H + 1, values.shape[0], 2))
     for a in range(H):
         own[a][a] = -(up[a] - 2 * middle + down[a]) / STEP**2
         for b in range(a):
             k = next(pairs)
             straight = up[a] + down[a] + up[b] + down[b]
-            own[a][b] = own[b][a] = -(sides.value[k] + sides.value[k + 1] - straight + 2 * middle) / (2 * STEP**2)
+            own[a][b] = own[b][a] = -(values[k] + values[k + 1] - straight + 2 * middle) / (2 * STEP**2)
     corner = jnp.stack([jnp.stack(row) for row in own])
     # what the levels tell once the biases are found is kept positive: differences are no proof of it
     explained = cross @ linalg.solve_positive(G + 1e-6 * jnp.eye(G.shape[0]), cross.T)
@@ -238,18 +233,40 @@ def _with_levels(G: jax.Array, g: jax.Array, sides: _AtLevels, H: int) -> tuple[
     return jnp.block([[G, cross.T], [cross, 0.5 * (corner + corner.T)]]), jnp.concatenate([g, slope])
 
 
+def _closed(system: System, frame: Frame, theta: jax.Array) -> list[Closed]:
+    """The closed loops of all recursions at the levels of theta (Q,): stable whatever these are."""
+    step = theta[frame.point.z.shape[0] :] - frame.point.levels
+    if step.shape[0] == 0:
+        return [loop.closed for loop in frame.loops]
+    found = []
+    change = jnp.concatenate([step, jnp.zeros(1)])
+    for part, loop, u in zip(system.recursions, frame.loops, frame.point.noises, strict=True):
+        J, pull = (
+            whole + jnp.tensordot(jnp.expm1(-2 * step), own, 1)
+            for whole, own in zip(loop.data, loop.shares, strict=True)
+        )
+        wider = change[part.level]
+        ratio = jnp.exp(wider)
+        at = closed_loop(part, factors(part, frame.point.levels + step), J, pull, u / ratio)
+        column = ratio[:, :, None]
+        found.append(Closed(column * at.feedback, at.factor * column / column.mT, at.size + wider, ratio * at.shift))
+    return found
+
+
 def place(system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> Point:
     """The point of theta (Q,) and unit normals eps (E, n) of each recursion."""
+    return _placed(system, frame, theta, eps, _closed(system, frame, theta))
+
+
+def _placed(system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...], loops: list[Closed]) -> Point:
     M = frame.point.z.shape[0]
-    step = theta - frame.theta
+    step = theta[:M] - frame.point.z
     states, noises = [], []
-    for part, loop, x, u, e in zip(
-        system.recursions, frame.loops, frame.point.states, frame.point.noises, eps, strict=True
-    ):
+    parts = zip(system.recursions, frame.loops, loops, frame.point.states, frame.point.noises, eps, strict=True)
+    for part, loop, at, x, u, e in parts:
         L = factors(part, frame.point.levels)
-        feedback, factor, size = loop.at(step[M:])
-        own = jnp.einsum("eij,ej->ei", factor, jnp.exp(size) * e)
-        closed, driven = part.F - L @ feedback, jnp.einsum("eij,ej->ei", L, own)
+        own = at.shift + jnp.einsum("eij,ej->ei", at.factor, jnp.exp(at.size) * e)
+        closed, driven = part.F - L @ at.feedback, jnp.einsum("eij,ej->ei", L, own)
 
         def forward(deviation: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
             T_k, s_k = epoch
@@ -259,38 +276,42 @@ def place(system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, 
         last, before = jax.lax.scan(forward, jnp.zeros_like(x[0]), (closed, driven))
         deviations = jnp.concatenate([before[1:], last[None]])
         states.append(x + loop.states @ step + deviations)
-        noises.append(u + loop.noises @ step + own - jnp.einsum("eij,ej->ei", feedback, before))
-    at = Point(tuple(states), tuple(noises), theta[:M], frame.point.levels)
-    return at_levels(system, at, theta[M:]) if theta.shape[0] > M else at
+        noises.append(u + loop.noises @ step + own - jnp.einsum("eij,ej->ei", at.feedback, before))
+    point = Point(tuple(states), tuple(noises), theta[:M], frame.point.levels)
+    return at_levels(system, point, theta[M:]) if theta.shape[0] > M else point
 
 
 def driving(system: System, frame: Frame, point: Point) -> tuple[jax.Array, ...]:
     """The unit normals eps (E, n) of each recursion that `place` makes a consistent point of."""
-    step = jnp.concatenate([point.z, point.levels]) - frame.theta
+    step = point.z - frame.point.z
     noises = at_levels(system, point, frame.point.levels).noises
     found = []
-    parts = zip(frame.loops, frame.point.states, frame.point.noises, point.states, noises, strict=True)
-    for loop, x0, u0, x, u in parts:
+    loops = _closed(system, frame, jnp.concatenate([point.z, point.levels]))
+    parts = zip(frame.loops, loops, frame.point.states, frame.point.noises, point.states, noises, strict=True)
+    for loop, at, x0, u0, x, u in parts:
         deviations = x - x0 - loop.states @ step
         before = jnp.concatenate([jnp.zeros_like(x[:1]), deviations[:-1]])
-        feedback, factor, size = loop.at(step[point.z.shape[0] :])
-        own = u - u0 - loop.noises @ step + jnp.einsum("eij,ej->ei", feedback, before)
-        solved = linalg.solve_batched(factor @ factor.mT, own)
-        found.append(jnp.exp(-size) * jnp.einsum("eji,ej->ei", factor, solved))
+        own = u - u0 - loop.noises @ step - at.shift + jnp.einsum("eij,ej->ei", at.feedback, before)
+        solved = linalg.solve_batched(at.factor @ at.factor.mT, own)
+        found.append(jnp.exp(-at.size) * jnp.einsum("eji,ej->ei", at.factor, solved))
     return tuple(found)
 
 
 def volume(system: System, frame: Frame, theta: jax.Array) -> jax.Array:
     """Log determinant by which `place` spreads eps over the whitened noises at theta (Q,)."""
-    levels = theta[frame.point.z.shape[0] :]
-    sizes = [jnp.sum(loop.at(levels - frame.point.levels)[2]) for loop in frame.loops]
-    return sum(sizes, widening(system, frame.point.levels) - widening(system, levels))
+    return _volume(system, frame, theta, _closed(system, frame, theta))
+
+
+def _volume(system: System, frame: Frame, theta: jax.Array, loops: list[Closed]) -> jax.Array:
+    change = widening(system, frame.point.levels) - widening(system, theta[frame.point.z.shape[0] :])
+    return sum((jnp.sum(at.size) for at in loops), change)
 
 
 def log_joint(spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:
     """Log density of data and eps given theta, less that of independent unit normals' constant; -inf if not finite."""
-    point = place(system, frame, theta, eps)
-    value = log_density(spec, system, point) + volume(system, frame, theta)
+    loops = _closed(system, frame, theta)
+    point = _placed(system, frame, theta, eps, loops)
+    value = log_density(spec, system, point) + _volume(system, frame, theta, loops)
     return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
 
