@@ -20,8 +20,11 @@ from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Form, Posed, conditional, update_inclusions, whiten
 from probcal.inference.posterior import mixing
+from probcal.priors import Precision
 from probcal.smoothing.frame import driving, frame_at, log_weight, place, volume
-from probcal.smoothing.mode import factors, track
+from probcal.smoothing.information import at_levels, laplace
+from probcal.smoothing.mode import factors, find_mode, track
+from probcal.smoothing.start import automatic_start
 
 PRIORS = [ARD(shape=2.0, rate=0.7), ARD(by="node", rate=0.5), Laplace(), Horseshoe()]
 ALARM = 1e-4  # rate at which a right sampler fails one of these tests, for each comparison
@@ -377,3 +380,37 @@ def test_every_prior_gives_a_whole_tree(method, prior):
     problem, tree, _ = fitted("plane", method, prior)
     check_tree(tree, problem)
     assert tree.attrs["prior"] == type(prior).__name__
+
+
+@pytest.mark.slow
+def test_a_process_noise_hardly_known_keeps_its_lower_tail():
+    """One straight track: the level is known within a factor of 2.5; shares below exact quantiles, by quadrature.
+
+    With 400 effective draws a share lies within three of its standard errors of the right one but for 0.3 % each.
+    """
+    kind = probcal.sensors.position
+    kind = replace(kind, channels={"position": replace(kind.channels["position"], std=5.0)})
+    nodes = [probcal.Node("a", (0.0, 0.0)), probcal.Node("b", (5.0, 0.0), scale=1.0)]
+    network = probcal.Network([kind.on(node) for node in nodes])
+    start = {"position": (0.0, 20.0), "velocity": (0.0, 1.0)}
+    table = probcal.simulate(
+        network, probcal.Target(probcal.ConstantVelocity(0.02), start), np.arange(30.0), 2
+    ).table  # fmt: skip
+    unknown = probcal.Target(probcal.ConstantVelocity(probcal.Unknown(0.3, 5.0)), start)
+    problem = probcal.Problem(network, unknown, table)
+    point = automatic_start(problem)
+    prior = Precision.single(jnp.ones(len(problem.labels)))
+    grid = jnp.linspace(-9.0, 2.5, 400)
+
+    def evidence(level):
+        found = find_mode(problem.spec, problem.system, at_levels(problem.system, point, level[None]), prior, 2, 1e-9)
+        return laplace(problem.spec, problem.system, found.point, prior).evidence
+
+    value = np.asarray(jax.lax.map(evidence, grid))
+    mass = np.cumsum(np.exp(value - value.max()))
+    tree = probcal.fit(problem, NUTS(draws=600), prior=Gaussian(), key=1, start=point, predictive_draws=False)
+    drawn = np.log(tree["posterior"]["level"].values.ravel() / 0.3)
+    assert tree.attrs["status"] == "converged", tree.attrs["message"]
+    for share in (0.01, 0.05, 0.25, 0.5, 0.75, 0.95):
+        quantile = np.interp(share * mass[-1], mass, grid)
+        assert abs((drawn < quantile).mean() - share) < 0.15 * np.sqrt(share * (1 - share))
