@@ -47,6 +47,7 @@ class Spec:
     blocks: tuple[Block, ...]
     recursion: tuple[int, ...]
     biases: int  # M, number of free biases
+    driven: bool = False  # whether a process noise has an unknown level
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +264,8 @@ class Problem:
                     recursion_index.append(r)
                     self.row_index.append(chosen)
         self.levels = tuple(levels.records)
-        self.spec = Spec(tuple(blocks), tuple(recursion_index), len(self.biases))
+        driven = any((r.level >= 0).any() for r in recursions)
+        self.spec = Spec(tuple(blocks), tuple(recursion_index), len(self.biases), driven)
         spread: Any = np.array([np.log(level.factor) for level in self.levels])
         recursions = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in recursions]
         rows_of = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in rows_of]

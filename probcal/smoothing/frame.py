@@ -2,11 +2,11 @@
 
 At a point the trajectories given the biases are Gaussian with a block-tridiagonal precision. They are written as a
 response to the biases plus a closed loop driven by independent unit normals `eps`: u_k = -K_k x_{k-1} + C_k eps_k,
-the factor of the posterior that a backward information pass gives (the control form of the Kalman smoother). At other
-levels the pass is made anew: a track that the data hardly hold widens with its process noise, one that they hold does
-not, and neither leaves a funnel. theta is the biases z and the log levels. With the trajectories marginalised the data
-have a Gaussian log-likelihood of theta. Trajectories given z near the point are exact where the problem is linear and
-Gaussian, the likelihood where no level is unknown too; elsewhere `log_weight` says by how much they are wrong.
+the factor of the posterior that a backward information pass gives (the control form of the Kalman smoother). Where a
+process noise is unknown the pass is made anew at every level: a track that the data hardly hold widens with its
+process noise, one that they hold does not, and neither leaves a funnel. theta is the biases z and the log levels. With
+the trajectories marginalised the data have a Gaussian log-likelihood of theta. Both are exact where the problem is
+linear and Gaussian and no level is unknown; elsewhere `log_weight` says by how much they are wrong at a point.
 """
 
 from functools import partial
@@ -54,7 +54,8 @@ class Loop(NamedTuple):
     noises: jax.Array  # (E, n, M) response of the whitened noises
     closed: Closed  # at the levels of the point
     data: tuple[jax.Array, jax.Array]  # (E, n, n) information of the data about the states, (E, n) their score
-    shares: tuple[jax.Array, jax.Array]  # the same with H leading, by the unknown level that the noise of a datum has
+    shares: tuple[jax.Array, jax.Array]  # the same with H leading, by the unknown level that the noise of a datum has;
+    # none where the process noise is known: data tell their own noise so well that one loop serves
 
 
 class Frame(NamedTuple):
@@ -176,7 +177,7 @@ def _frame(spec: Spec, system: System, point: Point, lins: list[Linearised]) -> 
     if H:
         values, slopes = _at(spec, system, point, point.levels[None] + _moves(H))
         information, score = _with_levels(information, score, values, slopes, H)
-    by_level = [_share(spec, system, point, lins, h) for h in range(H)]
+    by_level = [_share(spec, system, point, lins, h) for h in range(H if spec.driven else 0)]
     loops = []
     parts = zip(system.recursions, compressed.states, compressed.crosses, strict=True)
     for r, (part, (J, pull), cross) in enumerate(parts):
@@ -236,7 +237,7 @@ def _with_levels(
 def _closed(system: System, frame: Frame, theta: jax.Array) -> list[Closed]:
     """The closed loops of all recursions at the levels of theta (Q,): stable whatever these are."""
     step = theta[frame.point.z.shape[0] :] - frame.point.levels
-    if step.shape[0] == 0:
+    if frame.loops[0].shares[0].shape[0] == 0:
         return [loop.closed for loop in frame.loops]
     found = []
     change = jnp.concatenate([step, jnp.zeros(1)])
