@@ -1,30 +1,114 @@
-"""Severe numerics for every test: rank promotion raises, warnings are errors; x64 stays off as for a user.
+"""Severe numerics for every test, kernels kept between runs, and a budget of kernels.
 
-The tests compile hundreds of small kernels and run each once: they ask XLA for quick compilation, drop compiled
-kernels after each file, and share them between workers, notebooks and command lines through a folder of the run.
+Rank promotion raises and warnings are errors; x64 stays off as for a user. What a test costs is what it compiles:
+XLA is asked for quick compilation, kernels are kept in a folder that every run shares (`.pytest_cache/kernels`), tests
+of one world run in one worker, and a whole default run that makes more kernels than BUDGET fails.
 """
 
-import atexit
 import os
-import shutil
-import tempfile
 from pathlib import Path
 
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # set here, inherited by workers and subprocesses
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="probcal-kernels-")
-    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "kernels"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
 import jax
 import pytest
 from hypothesis import settings
+from xdist.scheduler import LoadFileScheduling
 
-MOST_MAPS = 20_000
+BUDGET = 3000  # kernels of a whole default run, all workers together; a new capability pays for its own by less
+MOST_MAPS = 20_000  # memory maps of a process, which may have 65530: past them XLA fails without a word
+KERNELS = Path(__file__).parents[1] / ".pytest_cache" / "kernels"
+MOST_BYTES = 1_000_000_000  # of kernels kept there
+TOGETHER = {  # files that share a world run in one worker
+    "test_exact.py": "linear", "test_methods.py": "linear", "test_samplers.py": "linear", "test_svi.py": "linear",
+}  # fmt: skip
+compiled = {"here": 0, "workers": 0}
 
 settings.register_profile("probcal", deadline=None, max_examples=10, derandomize=True, print_blob=False)
 settings.load_profile("probcal")
+
+
+def count(event, duration, **_):
+    """Every kernel that jax makes in this process, be it compiled or read from the folder."""
+    compiled["here"] += event == "/jax/core/compile/backend_compile_duration"
+
+
+def pytest_configure(config):
+    jax.monitoring.register_event_duration_secs_listener(count)
+    if not hasattr(config, "workerinput"):
+        trim(KERNELS, MOST_BYTES)
+
+
+def trim(folder, most):
+    """Delete the kernels not used for longest until the others fit."""
+    files = [(path.stat(), path) for path in folder.glob("*")] if folder.exists() else []
+    left = sum(stat.st_size for stat, _ in files)
+    for stat, path in sorted(files, key=lambda pair: pair[0].st_mtime):
+        if left <= most:
+            break
+        path.unlink(missing_ok=True)
+        left -= stat.st_size
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.path.name == "README.md":
+            item.add_marker("ci")
+
+
+class ByWorld(LoadFileScheduling):
+    """Files are handed to workers whole, and those that share a world together."""
+
+    def _split_scope(self, nodeid):
+        name = nodeid.split("::", 1)[0].rsplit("/", 1)[-1]
+        return TOGETHER.get(name, name)
+
+
+def pytest_xdist_make_scheduler(config, log):
+    return ByWorld(config, log) if config.getvalue("dist") == "loadfile" else None
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node, error):
+    compiled["workers"] += getattr(node, "workeroutput", {}).get("kernels", 0)
+
+
+def whole(config):
+    """Whether a run is that of `pytest` without a choice of tests."""
+    return (
+        config.args_source is pytest.Config.ArgsSource.TESTPATHS
+        and not config.option.keyword
+        and config.option.markexpr == DEFAULT
+    )
+
+
+DEFAULT = "not slow and not ci"
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionfinish(session):
+    config = session.config
+    if hasattr(config, "workerinput"):
+        config.workeroutput["kernels"] = compiled["here"]
+    elif whole(config) and compiled["here"] + compiled["workers"] > BUDGET and session.exitstatus == 0:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    made = compiled["here"] + compiled["workers"]
+    if config.option.collectonly:
+        return
+    terminalreporter.write_line(f"kernels: {made} of {BUDGET}" if whole(config) else f"kernels: {made}")
+    if whole(config) and made > BUDGET:
+        terminalreporter.write_line(
+            "The default run compiles more than its budget: share a world of tests/worlds.py, evaluate without jit, or"
+            " mark what is long with `slow` or `ci`. See which files by `pytest -n 0 tests/test_NAME.py`.",
+            red=True,
+        )
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -36,15 +120,9 @@ def severe_numerics():
     jax.config.update("jax_numpy_rank_promotion", before)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def few_kernels():
-    yield
-    jax.clear_caches()
-
-
 @pytest.fixture(autouse=True)
 def few_maps():
-    """Every compiled kernel takes memory maps, of which a process has 65530: past them XLA fails without a word."""
+    """Every compiled kernel takes memory maps, of which a process has a limited number."""
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:

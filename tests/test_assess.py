@@ -12,7 +12,7 @@ import pytest
 import reference
 import xarray as xr
 from scipy import stats
-from test_exact import CASES, resting
+from worlds import LINEAR, resting
 
 import probcal
 from probcal import (
@@ -78,7 +78,7 @@ class Tagged(reference.Linear):
 
 
 def fitted(name, method=None, **options):
-    network, motion, table, fixed = CASES[name]()
+    network, motion, table, fixed = LINEAR[name]()
     problem = probcal.Problem(network, motion, table, fix=fixed)
     tree = probcal.fit(problem, method or MAP(), start=resting(problem), **options)
     return problem, tree, Tagged(network, motion, table, fixed)
@@ -648,7 +648,7 @@ def test_halves_hold_their_false_alarm_rate():
 
     The t of each bias, without the widening, is standard normal: its sum of squares is held to 1e-6 limits.
     """
-    _, _, table, _ = CASES["plane"]()
+    _, _, table, _ = LINEAR["plane"]()
     problem, _, naive = fitted("plane", predictive_draws=False)
     G, V, y = naive.regression()
     base, root = np.array([d.y for d in naive.data]) - y, np.linalg.cholesky(V + G @ G.T)

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from bent import plane, space, waves
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_exact import CASES
-from test_metamorphic import plane, space, waves
+from worlds import LINEAR
 
 import probcal
 from probcal import (
@@ -87,7 +87,7 @@ def hessian(problem, precision):
 
 @pytest.mark.parametrize("name", ["extras", "mixed"])
 def test_the_bound_of_a_linear_problem_is_the_inverse_hessian(name):
-    network, motion, table, fixed = CASES[name]()
+    network, motion, table, fixed = LINEAR[name]()
     gauge = {"mixed": {"box.clock": 0.3}}.get(name, {})  # beside a free difference_offset
     problem = Problem(network, motion, table, fix=fixed | gauge)
     for kind, precision in (("posterior", np.ones(len(problem.labels))), ("hybrid", problem.surveyed.astype(float))):
@@ -107,7 +107,7 @@ def test_the_bound_of_a_linear_problem_is_the_inverse_hessian(name):
 
 def test_the_posterior_bound_is_the_hybrid_one_and_the_prior():
     """On a linear problem, where no kind depends on where the sensors are linearised."""
-    network, motion, table, _ = CASES["plane"]()
+    network, motion, table, _ = LINEAR["plane"]()
     problem = Problem(network, motion, table)
     track = pd.DataFrame({"time": [0.0, 5.0], "position_x": [0.0, 3.0], "position_y": [1.0, 1.0]})
     found = {

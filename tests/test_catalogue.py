@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
+from contracts import check_tree
 from scipy.spatial.transform import Rotation
 
 import probcal
@@ -108,23 +109,6 @@ def place(kind, d):
     if kind.arity == 2:
         return Network([kind.on(nodes[0], node) for node in nodes[1:]])
     return Network([kind.on(node) for node in nodes])
-
-
-def check_tree(tree, problem):
-    """Schema, finiteness and honesty of a result."""
-    assert set(tree.children) >= {"posterior", "calibration", "track", "observed_data", "residual", "constant_data"}
-    assert tree["posterior"]["bias"].dims == ("chain", "draw", "bias_label")
-    assert tree["posterior"].sizes["chain"] == 4
-    assert tuple(tree["calibration"]["bias_label"].values) == problem.labels
-    for node in tree.subtree:
-        for name, variable in node.data_vars.items():
-            assert isinstance(variable.values, np.ndarray)
-            if variable.dtype.kind == "f":
-                assert variable.dtype == np.float64, name
-                assert np.isfinite(variable.values).all(), (node.path, name)
-    gamma = tree["calibration"]["gamma"].values
-    assert ((gamma >= 0) & (gamma <= 1)).all()
-    assert tree.attrs["status"] in ("converged", "not converged", "at bound", "diverged")
 
 
 def test_every_type_of_the_catalogue_is_listed():

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from scipy import stats
 from test_cli import call
-from test_studies import small
+from worlds import heights
 
 import probcal
 from probcal import cli, diagnostics
@@ -274,7 +274,7 @@ def test_names_are_made_unique():
 @pytest.fixture(scope="module")
 def fitted():
     """EA and MAP of one small problem with its truth, and MAP of a network that lacks a bias."""
-    problem, truth = small(3, 3)
+    problem, truth = heights(3, 3)
     trees = [probcal.fit(problem, probcal.EA()), probcal.fit(problem, probcal.MAP())]
     trees.append(probcal.fit(problem.rebuild(fix={"n0.shift": 0.0}), probcal.MAP()))
     for tree in trees:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from test_exact import CASES, resting
+from worlds import LINEAR, resting
 
 import probcal
 from probcal import (
@@ -198,7 +198,7 @@ def test_a_sparse_prior_finds_the_jump():
 
 @pytest.mark.slow
 def test_both_samplers_agree_on_a_drift():
-    network, motion, table, fixed = CASES["drifting"]()
+    network, motion, table, fixed = LINEAR["drifting"]()
     problem = Problem(network, motion, table, fix=fixed)
     options = {"prior": Gaussian(), "start": resting(problem), "predictive_draws": False}
     exact = probcal.fit(problem, MAP(), **options)["calibration"].to_dataset()

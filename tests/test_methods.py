@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import reference
-from test_catalogue import check_tree
-from test_exact import CASES, close, plane, resting, table_of
+from contracts import check_tree, close
+from worlds import LINEAR, resting, shifted
 
 import probcal
 from probcal import ARD, EA, EM, EMEA, MAP, Flat, Gaussian, Laplace, Mixture, StudentT
@@ -20,16 +20,8 @@ from probcal.priors import PRIORS
 from probcal.types import InputError
 
 
-def shifted(offset=8.0):
-    """The plane network with one bias that is plainly there."""
-    network, motion, _, _ = plane()
-    table = table_of(network, {"one": [0.0, 0.5, 1.5, 2.0, 4.0], "two": [0.2, 0.5, 2.0, 3.5]}, 7, missing=0.0)
-    table.loc[table["sensor"] == "a", "position_x"] += offset
-    return network, motion, table
-
-
 def solve(method, prior=None, made=None, **options):
-    network, motion, table = shifted() if made is None else made
+    network, motion, table, _ = shifted() if made is None else made
     problem = probcal.Problem(network, motion, table)
     tree = probcal.fit(problem, method, prior=prior, start=resting(problem), predictive_draws=False, **options)
     return reference.Linear(network, motion, table), problem, tree
@@ -151,7 +143,7 @@ def test_em_reaches_the_mode_and_the_maximum_likelihood():
 @pytest.mark.parametrize("rule", ["unscented", "cubature"])
 @pytest.mark.parametrize("name", ["plane", "extras"])
 def test_sigma_points_change_nothing_where_sensors_are_linear(name, rule):
-    network, motion, table, fixed = CASES[name]()
+    network, motion, table, fixed = LINEAR[name]()
     problem = probcal.Problem(network, motion, table, fix=fixed)
     found = [
         probcal.fit(problem, EM(iterations=40, tolerance=0.0, linearisation=choice), start=resting(problem),
@@ -187,7 +179,7 @@ def test_paper_b_marginalises_each_epoch_alone():
     from probcal.smoothing.information import paper_b
     from probcal.smoothing.mode import track
 
-    network, motion, table = shifted()
+    network, motion, table, _ = shifted()
     problem = probcal.Problem(network, motion, table)
     linear = reference.Linear(network, motion, table)
     alpha, M = np.full(len(linear.labels), 0.7), len(linear.labels)

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from contracts import check_tree
 from scipy import stats
-from test_catalogue import check_tree
-from test_exact import CASES, resting
+from worlds import LINEAR, resting
 
 import probcal
 from probcal import ARD, NUTS, SVI, BernoulliGaussian, Collapsed, Flat, Gaussian, Horseshoe, InputError, Laplace
@@ -37,7 +37,7 @@ def double():
 
 
 def made(name, prior, **options):
-    network, motion, table, fixed = CASES[name]()
+    network, motion, table, fixed = LINEAR[name]()
     problem = probcal.Problem(network, motion, table, fix=fixed)
     point = track(problem.spec, problem.system, resting(problem))
     posed = Posed(problem.system, frame_at(problem.spec, problem.system, point),
@@ -149,7 +149,7 @@ def test_a_frame_is_exact_on_linear_problems(name):
 
 def test_a_frame_follows_its_levels():
     """At any levels the track of a linear problem has the frame's law, exactly."""
-    network, motion, table, _ = CASES["plane"]()
+    network, motion, table, _ = LINEAR["plane"]()
     unknown = probcal.Target(probcal.ConstantVelocity(probcal.Unknown(0.8)), motion.start)
     kind = network.types[0]
     channels = {name: replace(channel, std=probcal.Unknown(1.0)) for name, channel in kind.channels.items()}
@@ -208,7 +208,7 @@ def test_whitening_has_the_derivative_of_its_value():
 
 
 def fitted(name, method, prior, **options):
-    network, motion, table, fixed = CASES[name]()
+    network, motion, table, fixed = LINEAR[name]()
     problem = probcal.Problem(network, motion, table, fix=fixed)
     tree = probcal.fit(problem, method, prior=prior, start=resting(problem), **options)
     return problem, tree, reference.Linear(network, motion, table, fixed)
@@ -292,7 +292,7 @@ def test_the_tree_of_a_sampler_is_whole_and_arviz_reads_it():
 
 
 def fitted_problem():
-    network, motion, table, fixed = CASES["plane"]()
+    network, motion, table, fixed = LINEAR["plane"]()
     return probcal.Problem(network, motion, table, fix=fixed)
 
 
@@ -330,7 +330,7 @@ def test_a_flat_prior_on_a_determined_problem_is_the_likelihood():
 
 def test_the_evidence_integrates_every_hyper_parameter():
     """Against the exact evidence of a Gaussian prior, and the sum over all patterns of a spike and slab."""
-    network, motion, table, fixed = CASES["plane"]()
+    network, motion, table, fixed = LINEAR["plane"]()
     problem, linear = (
         probcal.Problem(network, motion, table, fix=fixed),
         reference.Linear(network, motion, table, fixed),

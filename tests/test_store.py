@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_exact import plane, resting
+from worlds import plane, resting
 
 import probcal
 from probcal import NUTS, Collapsed, Gaussian, InputError
@@ -21,7 +21,7 @@ METHOD = Collapsed(chains=2, warmup=50, draws=200, sweeps=1)
 SCRIPT = """
 import sys, time
 sys.path.insert(0, {tests!r})
-from test_exact import plane, resting
+from worlds import plane, resting
 import probcal
 from probcal import NUTS, Collapsed, Gaussian
 network, motion, table, _ = plane()

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds import heights
 
 import probcal
 from probcal import EA, EMEA, MAP, Flat, study
@@ -76,32 +77,20 @@ def test_values_of_settings():
             parse_values(text)
 
 
-@probcal.sensor(height=probcal.Channel("m", std=1.0))
-def gauge(target, pose, *, shift=probcal.Bias("m", 1.0)):
-    return {"height": target.position[1] - pose.position[1] + shift}
-
-
-def small(run, size=2):
-    """A problem of `size` gauges and its truth, without any fit."""
-    network = probcal.Network([gauge.on(probcal.Node(f"n{k}", (0.0, float(k)))) for k in range(size)])
-    drawn = probcal.simulate(network, probcal.ConstantVelocity(1.0), np.arange(4.0), run)
-    return probcal.Problem(network, probcal.ConstantVelocity(1.0), drawn.table), drawn.truth
-
-
 ERRORS = [
-    (lambda: study(small, {}, ["eaa"]), 'method "eaa" is not known; did you mean "ea"'),
-    (lambda: study(small, {"size": []}, ["ea"]), "give at least one run, one method and one value"),
-    (lambda: study(small, {"size": "12"}, ["ea"]), "the values of size are '12'; give a list of values"),
-    (lambda: study(small, {"size": 2}, ["ea"]), "the values of size are 2; give a list of values"),
-    (lambda: study(small, {"size": [1, 1]}, ["ea"]), "a value of size is given twice; give every value once"),
-    (lambda: study(small, {"size": [(1, 2)]}, ["ea"]), "the values of size must be numbers or texts"),
-    (lambda: study(small, {"sd": [1]}, ["ea"]), 'a setting cannot be called "sd"'),
-    (lambda: study(small, {}, ["ea"], runs=[1, 1]), "a run is given twice"),
-    (lambda: study(small, {}, {"a": "ea"}), "study: method \"a\" is 'ea'; give a method such as EA()"),
-    (lambda: study(small, {}, {"a": (MAP(), probcal.Horseshoe())}), "MAP does not take the prior Horseshoe"),
-    (lambda: study(lambda run: small(run)[0], {}, ["ea"]), "must return a pair, the Problem and its Truth"),
-    (lambda: study(lambda run: (small(run)[0], probcal.Truth()), {}, ["ea"]), 'does not name the bias "n0.shift"'),
-    (lambda: study(small, {"size": [1, 2]}, ["em"], runs=1), "the settings have different biases"),
+    (lambda: study(heights, {}, ["eaa"]), 'method "eaa" is not known; did you mean "ea"'),
+    (lambda: study(heights, {"size": []}, ["ea"]), "give at least one run, one method and one value"),
+    (lambda: study(heights, {"size": "12"}, ["ea"]), "the values of size are '12'; give a list of values"),
+    (lambda: study(heights, {"size": 2}, ["ea"]), "the values of size are 2; give a list of values"),
+    (lambda: study(heights, {"size": [1, 1]}, ["ea"]), "a value of size is given twice; give every value once"),
+    (lambda: study(heights, {"size": [(1, 2)]}, ["ea"]), "the values of size must be numbers or texts"),
+    (lambda: study(heights, {"sd": [1]}, ["ea"]), 'a setting cannot be called "sd"'),
+    (lambda: study(heights, {}, ["ea"], runs=[1, 1]), "a run is given twice"),
+    (lambda: study(heights, {}, {"a": "ea"}), "study: method \"a\" is 'ea'; give a method such as EA()"),
+    (lambda: study(heights, {}, {"a": (MAP(), probcal.Horseshoe())}), "MAP does not take the prior Horseshoe"),
+    (lambda: study(lambda run: heights(run)[0], {}, ["ea"]), "must return a pair, the Problem and its Truth"),
+    (lambda: study(lambda run: (heights(run)[0], probcal.Truth()), {}, ["ea"]), 'does not name the bias "n0.shift"'),
+    (lambda: study(heights, {"size": [1, 2]}, ["em"], runs=1), "the settings have different biases"),
 ]
 
 
@@ -113,7 +102,7 @@ def test_errors_of_studies(call, text):
 
 
 def test_a_study_without_a_number_has_no_picture():
-    found = study(small, {}, ["em"], runs=2)
+    found = study(heights, {}, ["em"], runs=2)
     with pytest.raises(InputError, match="no setting of the study is a number"):
         plot_study(found)
     assert "sd" not in study_table(found.isel(run=[0]))

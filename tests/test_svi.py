@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from test_exact import CASES, resting
 from test_model import posed_of, small, two_motions
+from worlds import LINEAR, resting
 
 import probcal
 from probcal import NUTS, SVI, Gaussian, Horseshoe, InputError
@@ -67,7 +67,7 @@ def test_any_point_has_coordinates_in_the_frame():
 
 def solved(name, method, prior):
     """A linear case by a method, and its exact posterior."""
-    network, motion, table, fixed = CASES[name]()
+    network, motion, table, fixed = LINEAR[name]()
     problem = probcal.Problem(network, motion, table, fix=fixed)
     start = track(problem.spec, problem.system, resting(problem))
     linear = reference.Linear(network, motion, table, fixed)
