@@ -7,8 +7,6 @@ structure with what `probcal fit` writes today.
 from functools import cache
 from pathlib import Path
 
-import xarray as xr
-
 import probcal
 
 DATA = Path(__file__).parent / "data"
