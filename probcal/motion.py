@@ -12,9 +12,10 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import pandas as pd
 
+from probcal.errors import InputError, nearest
 from probcal.geometry import slopes
 from probcal.noise import Level, check_level
-from probcal.types import AXES, InputError, TargetView, nearest
+from probcal.types import AXES, TargetView
 
 
 class Component(Protocol):

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from probcal.errors import InputError, nearest
 from probcal.geometry import slopes
 from probcal.sensor import VECTORS, Bias, Drift, Sensor, SensorType
-from probcal.types import AXES, InputError, nearest
+from probcal.types import AXES
 
 POSE_UNITS = {"position": "m", "heading": "rad", "pitch": "rad", "roll": "rad", "clock": "m", "time_offset": "s"}
 ANGLES = ("heading", "pitch", "roll")

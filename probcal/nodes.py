@@ -15,10 +15,11 @@ import pandas as pd
 import pyproj
 import xarray as xr
 
+from probcal.errors import InputError, nearest
 from probcal.network import ANGLES, POSE_UNITS, Node, step_of
 from probcal.sensor import Bias
 from probcal.table import Table, factor, header, name_of, numbers, read_table
-from probcal.types import AXES, InputError, nearest
+from probcal.types import AXES
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563  # WGS84: radius in m
 LOCAL, GEODETIC = ("x", "y", "z"), ("latitude", "longitude", "height")

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
 
+from probcal.errors import InputError
 from probcal.geometry import wrap
-from probcal.types import InputError
 
 
 @dataclass(frozen=True)

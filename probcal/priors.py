@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.types import InputError, nearest
+from probcal.errors import InputError, nearest
 
 PRECISION_BOUNDS = (1e-2, 1e8)  # of z; a fit with a bias at the lower bound is not an answer
 GROUPS = ("owner", "node", "type", "component")

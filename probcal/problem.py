@@ -12,13 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from probcal.errors import InputError, nearest
 from probcal.motion import Motion, Static, Target, White, as_motion
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, Level, Unknown, guess_of
 from probcal.rows import Block, Layout, Rows, addresses, make_block, pose_entries, pose_vector
 from probcal.sensor import VECTORS
 from probcal.table import Measurements, Table, factor, header, measure, read_table
-from probcal.types import InputError, float64, nearest
+from probcal.types import float64
 
 DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
 

@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.errors import InputError, nearest
 from probcal.geometry import wrap
 from probcal.motion import view
 from probcal.network import ANGLES, Network, Node
 from probcal.sensor import VECTORS, Channel, Sensor, SensorType
-from probcal.types import InputError, PoseView, nearest
+from probcal.types import PoseView
 
 Layout = tuple[tuple[str, int, int, bool], ...]
 

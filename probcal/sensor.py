@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.errors import InputError, nearest
 from probcal.noise import Bernoulli, Family, Gaussian, Level, check_level
-from probcal.types import AXES, InputError, PoseView, TargetView, nearest
+from probcal.types import AXES, PoseView, TargetView
 
 VECTORS = ("position", "velocity", "acceleration", "moment")  # components with one value an axis
 PERIODS = {"rad": 2 * np.pi, "deg": 360.0}

@@ -12,11 +12,12 @@ import numpy as np
 import pandas as pd
 
 from probcal import rows
+from probcal.errors import InputError, nearest
 from probcal.network import Network
 from probcal.noise import Bernoulli
 from probcal.problem import Epochs, Problem
 from probcal.table import Table, factor, header, name_of, numbers, read_table
-from probcal.types import AXES, InputError, float64, nearest
+from probcal.types import AXES, float64
 
 Key = int | jax.Array
 

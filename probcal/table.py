@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from probcal.errors import InputError, nearest
 from probcal.network import Network
 from probcal.noise import Bernoulli
-from probcal.types import InputError, nearest
 
 # unit -> (quantity, factor to its base); offsets do not occur
 UNITS = {

@@ -15,8 +15,8 @@ import pandas as pd
 import xarray as xr
 from scipy import stats
 
+from probcal.errors import InputError
 from probcal.problem import Problem
-from probcal.types import InputError
 
 INTERVAL = 0.89  # probability of lower to upper
 LARGEST = 20_000_000  # values of a group of draws above which it is written on request only

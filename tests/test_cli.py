@@ -270,7 +270,7 @@ def test_a_fit_that_fails_to_be_written_leaves_nothing_behind(model, rows, tmp_p
 
 
 def _parts(model):
-    from probcal.cli import load_model
+    from probcal.cli.models import load_model
 
     return load_model(model).network(), probcal.ConstantVelocity(0.5)
 
@@ -322,20 +322,20 @@ def test_a_sampler_prints_and_writes_what_its_chains_are_worth(model, rows, tmp_
 
 
 def test_kernels_are_kept_in_the_cache_folder_of_the_user_unless_jax_has_one(tmp_path, monkeypatch):
-    from probcal.cli import _keep_kernels
+    from probcal.cli.kernels import keep_kernels
 
     cache = ("jax_compilation_cache_dir", "jax_compilation_cache_max_size")
     least = ("jax_persistent_cache_min_compile_time_secs", "jax_persistent_cache_min_entry_size_bytes")
     before = {name: getattr(jax.config, name) for name in (*cache, *least)}
     assert before[cache[0]], "the tests share one"
-    _keep_kernels()
+    keep_kernels()
     assert jax.config.jax_compilation_cache_dir == before[cache[0]]
     (tmp_path / "file").write_text("no folder")
     try:
         for home, kept in ((tmp_path / "cache", True), (tmp_path / "file", False)):
             jax.config.update(cache[0], None)
             monkeypatch.setenv("XDG_CACHE_HOME", str(home))
-            _keep_kernels()
+            keep_kernels()
             assert bool(jax.config.jax_compilation_cache_dir) == kept
             assert (home / "probcal" / "kernels").is_dir() == kept
     finally:

@@ -10,12 +10,13 @@ from test_cli import call
 from worlds import heights
 
 import probcal
-from probcal import cli, diagnostics
+from probcal import diagnostics
 from probcal.analysis import compare, interchangeable
 from probcal.analysis.compare import named
 from probcal.analysis.differences import NARROW
 from probcal.analysis.overlap import ZERO, of_draws, of_gaussian, overlap, wasserstein
-from probcal.types import InputError
+from probcal.cli.compare import estimates_text, methods_text
+from probcal.errors import InputError
 
 HALF = stats.norm.ppf(0.5 + 0.89 / 2)
 LABELS = ("a.heading", "a.gain", "b.gain")
@@ -198,9 +199,9 @@ def test_a_sampler_judges_what_evidence_approximation_found():
         (table["method"] == "NUTS (Horseshoe)") & (table["quantity"] == "inclusion") & (table["bias"] == "a.heading")
     ]
     assert row["value"].tolist() == [0.3]
-    text = cli.methods_text(found)
+    text = methods_text(found)
     assert "-12.0 ± 0.1" in text
-    assert "nan" not in text + cli.estimates_text(found)
+    assert "nan" not in text + estimates_text(found)
     bayes["calibration"]["r_hat"][1] = 1.2
     bayes["sample_stats"]["diverging"][0, 0] = True
     doubts = sentences(compare([plugged, bayes]), "sampling")

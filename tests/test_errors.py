@@ -32,7 +32,6 @@ from probcal import (
     Truth,
     Unknown,
     White,
-    cli,
     fit,
     load,
     read_nodes,
@@ -43,6 +42,8 @@ from probcal import (
     track,
     write_nodes,
 )
+from probcal.cli import commands
+from probcal.cli.models import load_model, load_truth
 from probcal.geometry import norm
 from probcal.simulate import truth_beside
 from probcal.types import TargetView
@@ -262,10 +263,10 @@ CASES = [
     # inference, command line
     (lambda _: fit(problem(), EA), "method must be a value such as EA() or MAP(), got <class"),
     (lambda _: track(problem(), calibrated("other")), "; fit the same network, or fix that bias"),
-    (lambda f: cli.load_model(written(f, "model.txt", "")), "model.txt is not a Python file; a model file defines"),
-    (lambda f: cli.simulate_command(written(f, "model.py", "def scenario(key): return 3")),
+    (lambda f: load_model(written(f, "model.txt", "")), "model.txt is not a Python file; a model file defines"),
+    (lambda f: commands.simulate_command(written(f, "model.py", "def scenario(key): return 3")),
      "scenario() returned int; return probcal.simulate(...)"),
-    (lambda f: cli._truth(cli.load_model(path := written(f, "model.py", "def truth(data): return 3")), path, None, None),
+    (lambda f: load_truth(load_model(path := written(f, "model.py", "def truth(data): return 3")), path, None, None),
      "truth() returned int; return a probcal.Truth or None"),
     # nodes
     (lambda _: LocalFrame("north", 0.0), "LocalFrame: latitude, longitude and height must be numbers"),
@@ -312,9 +313,9 @@ def test_an_error_says_what_is_wrong_and_what_to_do(call, text, tmp_path):
 
 
 def test_the_report_without_plot_packages_says_what_to_install(monkeypatch, tmp_path):
-    monkeypatch.setattr(cli, "_can_plot", lambda: False)
+    monkeypatch.setattr(commands.files, "can_plot", lambda: False)
     with pytest.raises(InputError, match="the report needs plot packages: pip install"):
-        cli.report_command(tmp_path)
+        commands.report_command(tmp_path)
 
 
 def test_a_text_that_no_test_matches_is_found():

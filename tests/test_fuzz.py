@@ -25,12 +25,13 @@ from probcal import (
     Node,
     Problem,
     Truth,
-    cli,
     load,
     read_nodes,
     read_table,
     sensors,
 )
+from probcal.cli import commands
+from probcal.cli.models import load_model, load_problem, load_truth
 from probcal.simulate import truth_beside
 from probcal.table import measure
 
@@ -327,7 +328,7 @@ def test_a_model_file_that_fails_is_refused(text, tmp_path):
     before = list(sys.path)
     for name in ("model.py", "no-name 1.py", "model.txt", "model.pyc", "model.so"):
         try:
-            assert refused(lambda name=name: cli._problem(written(tmp_path, name, text), None)) is None
+            assert refused(lambda name=name: load_problem(written(tmp_path, name, text), None)) is None
         finally:
             sys.path[:], changed = before, list(sys.path)
         assert changed == before or "clear" in text
@@ -336,23 +337,23 @@ def test_a_model_file_that_fails_is_refused(text, tmp_path):
 @pytest.mark.parametrize("text", RESULTS, ids=repr)
 def test_a_model_function_that_returns_the_wrong_thing_is_refused(text, tmp_path):
     path = written(tmp_path, "model.py", f"def problem(data=None):\n    {text}\nscenario = truth = problem\n")
-    assert refused(lambda: cli._problem(path, None)) is None
-    module = refused(lambda: cli.load_model(path))
+    assert refused(lambda: load_problem(path, None)) is None
+    module = refused(lambda: load_model(path))
     problem = Problem(NETWORK, ConstantVelocity(1.0), pd.DataFrame({"time": [0, 1], "sensor": "a", "range": 1.0}))
     if module is not None:
-        assert refused(lambda: cli._truth(module, path, None, problem)) is None
-        assert refused(lambda: cli.simulate_command(path)) is None
+        assert refused(lambda: load_truth(module, path, None, problem)) is None
+        assert refused(lambda: commands.simulate_command(path)) is None
 
 
 @fuzz
 @given(content=st.binary(max_size=60) | st.text(max_size=60))
 def test_bytes_as_a_model_file(content, folder):
-    assert refused(lambda: cli._problem(written(folder, "model.py", content), None)) is None
+    assert refused(lambda: load_problem(written(folder, "model.py", content), None)) is None
 
 
 def test_ctrl_c_in_a_model_file_ends_the_program(tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        cli.load_model(written(tmp_path, "model.py", "raise KeyboardInterrupt"))
+        load_model(written(tmp_path, "model.py", "raise KeyboardInterrupt"))
 
 
 @pytest.mark.parametrize(
@@ -362,9 +363,9 @@ def test_a_path_that_is_no_file_is_refused(name, tmp_path):
     for path in (tmp_path / name, Path(name), str(tmp_path / name)):
         for reader in (read_table, read_nodes, load, Truth):
             assert refused(lambda reader=reader, path=path: reader(path)) is None
-        assert refused(lambda path=path: cli.load_model(Path(path))) is None
+        assert refused(lambda path=path: load_model(Path(path))) is None
         if name not in ("", "."):
-            assert refused(lambda path=path: cli._problem(Path(cli.__file__), Path(path))) is None
+            assert refused(lambda path=path: load_problem(Path(commands.__file__), Path(path))) is None
 
 
 @fuzz

@@ -13,11 +13,11 @@ from worlds import LINEAR, resting, shifted
 
 import probcal
 from probcal import ARD, EA, EM, EMEA, MAP, Flat, Gaussian, Laplace, Mixture, StudentT
+from probcal.errors import InputError
 from probcal.inference import METHODS, table
 from probcal.inference.sampler import Sampler
 from probcal.noise import Gaussian as Normal
 from probcal.priors import PRIORS
-from probcal.types import InputError
 
 
 def solve(method, prior=None, made=None, **options):

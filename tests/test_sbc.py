@@ -42,6 +42,7 @@ from probcal import (
     sensors,
     simulate,
 )
+from probcal.cli.models import load_model
 from probcal.inference import uniformity
 from probcal.inference.collapsed import Collapsed
 from probcal.inference.coverage import coverage_table
@@ -322,7 +323,7 @@ def test_samplers_are_uniform_over_500_simulations(method, prior):
 def test_nine_tenths_hold_on_networks_of_the_size_of_c1():
     """Ten radars, 100 scans, 300 simulations from the prior of the fit: the 90 % interval holds 88 to 92 %."""
     path = Path(__file__).parents[1] / "models" / "radars.py"
-    tree = sbc(cli.load_model(path).problem(), short(Collapsed()), SPIKE, 300, start="truth")
+    tree = sbc(load_model(path).problem(), short(Collapsed()), SPIKE, 300, start="truth")
     assert tree.attrs["status"] == "uniform", tree.attrs["verdict"]
     table = coverage_table(tree).set_index("nominal")
     print(f"\n{table.round(3)}")

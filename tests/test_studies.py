@@ -9,10 +9,10 @@ from worlds import heights
 
 import probcal
 from probcal import EA, EMEA, MAP, Flat, study
-from probcal.cli import parse_values
+from probcal.cli.options import parse_values
 from probcal.diagnostics import study_table
+from probcal.errors import InputError
 from probcal.plots import plot_study
-from probcal.types import InputError
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import radars

@@ -1,14 +1,27 @@
 """Before and after a fit: observability, the next pass or sensor, bounds, whether to trust it, fits side by side."""
 
-from probcal.analysis.assess import assess
-from probcal.analysis.bounds import bounds
-from probcal.analysis.compare import compare, interchangeable
-from probcal.analysis.maps import bound_map
-from probcal.analysis.observability import observability
-from probcal.analysis.planning import next_anchors, next_passes, next_sensors
-from probcal.analysis.sensitivity import sensitivity
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "assess", "bound_map", "bounds", "compare", "interchangeable", "next_anchors", "next_passes", "next_sensors",
-    "observability", "sensitivity",
-]  # fmt: skip
+from probcal.lazy import lazy
+
+if TYPE_CHECKING:
+    from probcal.analysis.assess import assess
+    from probcal.analysis.bounds import bounds
+    from probcal.analysis.compare import compare, interchangeable
+    from probcal.analysis.maps import bound_map
+    from probcal.analysis.observability import observability
+    from probcal.analysis.planning import next_anchors, next_passes, next_sensors
+    from probcal.analysis.sensitivity import sensitivity
+
+__all__ = lazy(
+    __name__,
+    {
+        "probcal.analysis.assess": "assess",
+        "probcal.analysis.bounds": "bounds",
+        "probcal.analysis.compare": "compare interchangeable",
+        "probcal.analysis.maps": "bound_map",
+        "probcal.analysis.observability": "observability",
+        "probcal.analysis.planning": "next_anchors next_passes next_sensors",
+        "probcal.analysis.sensitivity": "sensitivity",
+    },
+)

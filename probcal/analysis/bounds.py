@@ -14,12 +14,13 @@ import numpy as np
 import xarray as xr
 
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
+from probcal.errors import InputError, nearest
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import Key, Truth, as_key
 from probcal.smoothing.information import moments_compressed
 from probcal.smoothing.mode import Compressed, Point, compress, eliminate_compressed, linearise
 from probcal.tree import by_epoch
-from probcal.types import InputError, float64, nearest
+from probcal.types import float64
 
 KINDS = ("parametric", "posterior", "hybrid")
 LOST = 1e-12  # share of its information below which a direction has no bound

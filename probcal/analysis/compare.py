@@ -9,10 +9,11 @@ import xarray as xr
 
 from probcal.analysis import loo
 from probcal.analysis.checks import Finding
+from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.analysis.differences import findings
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
+from probcal.errors import InputError, nearest
 from probcal.network import label_parts
-from probcal.types import InputError, nearest
 
 Fits = Mapping[str, xr.DataTree] | Sequence[xr.DataTree]
 COLUMNS = ("mean", "sd", "lower", "upper", "gamma", "status")  # of every fit
@@ -72,8 +73,7 @@ def named(fits: Fits, names: Sequence[str] | None = None) -> dict[str, xr.DataTr
         if names is not None:
             raise InputError("compare: the fits have names already; give names to a sequence of fits only")
         names, fits = [str(name) for name in fits], list(fits.values())
-    if len(fits) < 2:
-        raise InputError(f"compare: {len(fits)} fit(s) given; give at least two")
+    check_count(len(fits))
     for k, tree in enumerate(fits):
         if not isinstance(tree, xr.DataTree) or not {"calibration", "posterior", "observed_data"} <= set(tree.children):
             raise InputError(
@@ -85,11 +85,7 @@ def named(fits: Fits, names: Sequence[str] | None = None) -> dict[str, xr.DataTr
             plain = f"{tree.attrs['method']} ({tree.attrs['prior']})"
             taken = sum(name == plain or name.startswith(f"{plain} ") for name in names)
             names.append(f"{plain} {taken + 1}" if taken else plain)
-    if len(names) != len(fits) or len(set(names)) < len(names):
-        raise InputError(f"compare: {len(names)} names for {len(fits)} fits; give each fit a name of its own")
-    for name in names:
-        if not name.strip(".") or "/" in name:
-            raise InputError(f'compare: a fit cannot be called "{name}"; give a name of letters, without "/"')
+    check_names(names, len(fits))
     return dict(zip(names, fits, strict=True))
 
 
@@ -126,13 +122,11 @@ def interchangeable(
 def chosen_pair(fits: Mapping[str, xr.DataTree], labels: Sequence[str]) -> tuple[str, str]:
     """A pair of labels that all fits have; raises `InputError` for any other."""
     common = _common(fits)
-    pair = tuple(str(label).strip() for label in labels)
-    if len(pair) != 2 or pair[0] == pair[1]:
-        raise InputError(f'the pair "{",".join(pair)}" must be two labels of biases, LABEL,LABEL')
+    pair = split_pair(labels)
     for label in pair:
         if label not in common:
             raise InputError(f'the pair names "{label}", which is no bias of all the fits{nearest(label, common)}')
-    return pair[0], pair[1]
+    return pair
 
 
 def _sound(tree: xr.DataTree) -> bool:

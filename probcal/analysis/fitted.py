@@ -10,6 +10,7 @@ import pandas as pd
 import xarray as xr
 
 from probcal import linalg, tree
+from probcal.errors import InputError
 from probcal.priors import Precision
 from probcal.problem import Problem
 from probcal.rows import Linearised
@@ -17,7 +18,6 @@ from probcal.smoothing import mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import follow_states, track_mode
-from probcal.types import InputError
 
 
 class Fitted(NamedTuple):

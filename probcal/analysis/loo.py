@@ -11,7 +11,7 @@ import arviz as az
 import numpy as np
 import xarray as xr
 
-from probcal.types import InputError
+from probcal.errors import InputError
 
 
 def same_data(fits: Mapping[str, xr.DataTree]) -> dict[str, np.ndarray]:

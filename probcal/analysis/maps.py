@@ -11,10 +11,11 @@ import pandas as pd
 import xarray as xr
 
 from probcal import linalg, tree
+from probcal.errors import InputError, nearest
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import blank
 from probcal.smoothing.mode import Point, compress, factors, linearise
-from probcal.types import AXES, InputError, float64, nearest
+from probcal.types import AXES, float64
 
 BATCH = (256, 200_000)  # cells worked on at once, and entries of their matrices
 LOST = 1e-13  # share of the information of a position below which a direction counts as open

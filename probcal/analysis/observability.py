@@ -7,13 +7,14 @@ import xarray as xr
 from probcal import tree
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.analysis.verdict import narrowed
+from probcal.errors import InputError
 from probcal.problem import Problem
 from probcal.simulate import Truth
 from probcal.smoothing.directions import WEAK, marginal, weak_directions
 from probcal.smoothing.gauge import NULL, gauge
 from probcal.smoothing.information import Moments, leverages, marginal_information, moments
 from probcal.smoothing.mode import Point
-from probcal.types import InputError, float64
+from probcal.types import float64
 
 RULE = (
     f"gauge: with the state of every epoch free, rows leave less than {NULL:g} of the information that known states "

@@ -11,12 +11,13 @@ import xarray as xr
 
 from probcal import rows
 from probcal.analysis.standpoint import draw_states, on_tracks_of
+from probcal.errors import InputError, nearest
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import Key, Truth, as_key
 from probcal.smoothing.information import moments
 from probcal.smoothing.mode import Point, track
 from probcal.smoothing.start import follow_states
-from probcal.types import InputError, float64, nearest
+from probcal.types import float64
 
 ITERATIONS = 30  # of a track
 BATCH = 1024  # tracks worked on at once by an accelerator; a CPU takes one after the other

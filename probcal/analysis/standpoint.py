@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.errors import InputError, nearest
 from probcal.problem import Problem
 from probcal.simulate import Truth, on_tracks
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Point, factors
 from probcal.smoothing.start import automatic_start, track_mode
-from probcal.types import InputError, nearest
 
 
 def check_free(problem: Problem) -> None:

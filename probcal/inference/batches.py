@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from probcal.types import InputError
+from probcal.errors import InputError
 
 NAME = "runs.json"
 Record = Mapping[str, Any]  # arrays of one run by name

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.errors import InputError
 from probcal.inference.hierarchy import Phi, SpikeAndSlab
 from probcal.inference.posed import Conditional, Form, Posed, conditional, update_inclusions
 from probcal.inference.sampler import Sample, Sampler
 from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
 from probcal.smoothing.frame import log_weight
-from probcal.types import InputError
 
 SHRINKINGS = 40  # most times that an ellipse is cut
 STEP = 1.3  # of a swing, over the fourth root of the dimension (Beskos and others 2013)

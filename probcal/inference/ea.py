@@ -6,12 +6,12 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
+from probcal.errors import InputError
 from probcal.inference.run import Given, Maximiser, State, learn
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.smoothing.information import laplace, paper_b, update_levels
 from probcal.smoothing.mode import Point, between, cost, find_mode, track
-from probcal.types import InputError
 
 MODE_STEPS = 30  # Gauss-Newton steps between two updates of the precisions
 RULES = ("mackay", "em")

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg
+from probcal.errors import InputError
 from probcal.inference.run import Given, Maximiser, State, learn
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
 from probcal.problem import Spec, System
 from probcal.smoothing import sigma
 from probcal.smoothing.information import laplace, update_levels
 from probcal.smoothing.mode import Point, between, cost, eliminate_rows, find_mode, follow, linearise, of_biases
-from probcal.types import InputError
 
 HALVINGS = 8
 LINEARISATIONS = ("extended", "unscented", "cubature")

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from arviz_stats.base import array_stats
 
+from probcal.errors import InputError
 from probcal.inference.methods import check_problem
 from probcal.inference.pose import PILOTS, Pilot, pareto_khat, pilot, pose, weights
 from probcal.inference.posed import Form, Posed
@@ -16,7 +17,7 @@ from probcal.problem import Problem
 from probcal.simulate import Key, as_key
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start
-from probcal.types import InputError, float64
+from probcal.types import float64
 
 RUNGS, BEND = 24, 4.0  # temperatures, and the power by which they crowd towards the prior
 

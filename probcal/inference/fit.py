@@ -11,6 +11,7 @@ import xarray as xr
 from scipy import stats
 
 from probcal import tree
+from probcal.errors import FitError, InputError
 from probcal.inference.methods import EA, MAP, NUTS, check_problem, choose_prior
 from probcal.inference.posterior import result
 from probcal.inference.run import Maximiser, Method, Outcome, Progress, maximise
@@ -23,7 +24,7 @@ from probcal.smoothing.draws import draw, predictive, residuals_of
 from probcal.smoothing.information import at_levels, moments
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start, follow_states, further_starts, track_mode
-from probcal.types import FitError, InputError, float64
+from probcal.types import float64
 
 CHAINS, DRAWS = 4, 250
 

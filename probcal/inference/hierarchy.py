@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import distributions as dist  # not `import numpyro.distributions`: ArviZ's lazy numpyro runs it twice
 
+from probcal.errors import InputError
 from probcal.inference.draws import inverse_gaussian, slice_step
 from probcal.priors import ARD, BernoulliGaussian, Horseshoe, Laplace, Prior
 from probcal.problem import Problem
-from probcal.types import InputError
 
 LEAST, MOST = 1e-12, 1e16  # precisions outside carry no mass that a draw could show
 Phi = dict[str, jax.Array]

@@ -5,6 +5,7 @@ To add one: a module beside this one with a frozen dataclass that inherits `infe
 
 import pandas as pd
 
+from probcal.errors import InputError
 from probcal.inference.collapsed import Collapsed
 from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
@@ -13,7 +14,6 @@ from probcal.inference.run import Method
 from probcal.inference.svi import SVI
 from probcal.priors import PRIORS, BernoulliGaussian, Flat, Laplace, Prior
 from probcal.problem import Problem
-from probcal.types import InputError
 
 # names on the command line: method, and the prior it means where that is not the method's first
 METHODS: dict[str, tuple[Method, Prior | None]] = {

@@ -13,13 +13,14 @@ import numpyro
 from numpyro import distributions as dist
 
 from probcal import rows
+from probcal.errors import InputError, nearest
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
 from probcal.rows import Block, Rows
 from probcal.smoothing.mode import factors
 from probcal.smoothing.recursion import trajectory
-from probcal.types import InputError, float64, nearest
+from probcal.types import float64
 
 DENSE = (Horseshoe, Gaussian, Laplace, ARD, Flat)  # priors with a density
 

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 from numpyro.infer.hmc import hmc
 
+from probcal.errors import InputError
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior, prior_precision, whiten
 from probcal.inference.sampler import Sample, Sampler
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
 from probcal.smoothing.frame import log_joint
-from probcal.types import InputError
 
 
 class Free(NamedTuple):

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg, rows
+from probcal.errors import InputError
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form
 from probcal.priors import ARD, Flat, Precision, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.smoothing.mode import Point, factors
 from probcal.smoothing.recursion import trajectory
-from probcal.types import InputError
 
 
 class Drawn(NamedTuple):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from arviz_stats.base import array_stats
 
+from probcal.errors import FitError
 from probcal.inference.hierarchy import Phi
 from probcal.inference.nuts import NUTS
 from probcal.inference.posed import Form, Posed, log_prior
@@ -26,7 +27,6 @@ from probcal.problem import Problem, Spec, System
 from probcal.smoothing.draws import draw
 from probcal.smoothing.frame import volume
 from probcal.smoothing.mode import Point, log_density, log_likelihood
-from probcal.types import FitError
 
 CHAINS, DRAWS = 4, 250  # of a Gaussian
 TAKEN = "taken over"  # status of a run whose method gave way to another

@@ -15,13 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.errors import InputError
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Precision, Prior
 from probcal.priors import Laplace as LaplacePrior
 from probcal.problem import Problem, Spec, System
 from probcal.smoothing.directions import Direction, weak_directions
 from probcal.smoothing.information import Laplace
 from probcal.smoothing.mode import Point
-from probcal.types import InputError
 
 CHUNK = 5  # outer iterations between two reports of progress
 FAR = 10.0  # scales from the stated value beyond which a bias without prior has diverged

@@ -7,12 +7,12 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from probcal.errors import InputError
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.run import Method
 from probcal.priors import ARD, Prior
 from probcal.smoothing.frame import place
-from probcal.types import InputError
 
 
 class Sample(NamedTuple):

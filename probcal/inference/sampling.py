@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.errors import FitError
 from probcal.inference.collapsed import Collapsed
 from probcal.inference.nuts import NUTS
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
@@ -23,7 +24,6 @@ from probcal.inference.store import Store
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.smoothing.mode import Point
-from probcal.types import FitError
 
 
 @dataclass(frozen=True, eq=False)

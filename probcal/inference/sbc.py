@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from probcal.errors import FitError, InputError
 from probcal.inference.batches import Batches
 from probcal.inference.coverage import judge
 from probcal.inference.hierarchy import hierarchy_of
@@ -39,7 +40,7 @@ from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import Point, find_mode
 from probcal.smoothing.start import automatic_start, follow_states
 from probcal.tree import suffix
-from probcal.types import FitError, InputError, float64
+from probcal.types import float64
 
 BATCH = 5  # runs of one file
 FAR = 2.0  # extents of the network beyond which the start of a target is called wide

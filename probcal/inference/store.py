@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from probcal.types import InputError
+from probcal.errors import InputError
 
 STATE = "state.npz"
 

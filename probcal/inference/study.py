@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
+from probcal.errors import InputError, nearest
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
 from probcal.inference.posterior import judge, mixing
 from probcal.inference.run import (
@@ -29,18 +30,15 @@ from probcal.inference.run import (
 )
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import sample
+from probcal.inference.settings import check_setting
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import Truth
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start
 from probcal.tree import INTERVAL
-from probcal.types import InputError, nearest
 
 BATCH = 10  # runs that one compiled call solves
-RESERVED = ("run", "estimator", "method", "bias_label", "bias_rmse", "coverage", "position_rmse", "status",
-            "iterations", "error", "lower", "upper", "true", "sd", "gamma", "mean", "median", "worst", "position",
-            "runs")  # fmt: skip
 ORACLE = "oracle"  # MAP whose prior knows which biases are zero
 VECTORS = ("error", "lower", "upper", "true", "sd", "gamma")  # by bias, over its scale; the interval less the truth
 Setting = Callable[..., tuple[Problem, Truth]]
@@ -241,15 +239,10 @@ def _pairs(methods: Mapping[str, Any]) -> dict[str, tuple[Method, Prior]]:
 
 def _values(name: str, values: Any) -> list[Any]:
     """Values of one setting, checked before any work is done."""
-    if name in RESERVED:
-        raise InputError(f'study: a setting cannot be called "{name}", the results use that name; rename the argument')
     if isinstance(values, str) or not hasattr(values, "__iter__"):
         raise InputError(f"study: the values of {name} are {values!r}; give a list of values")
     found = [value.item() if isinstance(value, np.generic) else value for value in values]
-    if any(not isinstance(value, (int, float, str, bool)) for value in found):
-        raise InputError(f"study: the values of {name} must be numbers or texts")
-    if len(set(found)) < len(found):
-        raise InputError(f"study: a value of {name} is given twice; give every value once")
+    check_setting(name, found)
     return found
 
 

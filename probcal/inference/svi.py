@@ -14,6 +14,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from probcal import linalg
+from probcal.errors import InputError, nearest
 from probcal.inference.guides import Fitted, Guide, LowRank, MeanField, Structured
 from probcal.inference.hierarchy import Phi
 from probcal.inference.nuts import Free, parts
@@ -23,7 +24,6 @@ from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
 from probcal.smoothing.frame import driving, log_joint, place
 from probcal.smoothing.mode import Point, factors, log_density
 from probcal.smoothing.recursion import trajectory
-from probcal.types import InputError, nearest
 
 GUIDES = ("structured", "mean-field", "low-rank")
 NARROW = 0.1  # scale of plain coordinates to start from

@@ -7,8 +7,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 
+from probcal.errors import InputError
 from probcal.plots.base import COLOURS, NAMED, new_axes, plain
-from probcal.types import InputError
 
 SURFACE = "viridis"
 WIDE = 20.0  # ratio of largest to smallest value above which the colours are logarithmic

@@ -10,9 +10,9 @@ from arviz_plots import PlotCollection, plot_ecdf_pit
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
+from probcal.errors import InputError, nearest
 from probcal.inference.uniformity import band
 from probcal.plots.base import BEFORE, colour, new_axes, plain
-from probcal.types import InputError, nearest
 
 COLUMNS = 5
 WIDTH, HEIGHT = 13.0, 2.3  # of the picture and of a row of panels, inches

@@ -8,8 +8,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from probcal.errors import InputError
 from probcal.plots.base import colour, plain
-from probcal.types import InputError
 
 
 def plot_study(study: xr.Dataset, variable: str = "bias_rmse", axes: Sequence[Axes] | None = None) -> list[Axes]:

@@ -1,0 +1,5 @@
+"""`python -m probcal.cli`."""
+
+from probcal.cli.commands import main
+
+main()

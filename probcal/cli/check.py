@@ -1,0 +1,120 @@
+"""`check`: what the data can and cannot determine, by name, what to do, and what to measure next."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from probcal.analysis import bound_map, next_anchors, next_passes, next_sensors, observability
+from probcal.cli.files import can_plot, say_written, write_csv, writing
+from probcal.cli.kernels import keep_kernels
+from probcal.cli.models import load_problem
+from probcal.cli.progress import line
+from probcal.problem import Problem
+from probcal.smoothing.start import automatic_start
+from probcal.tree import save
+
+MAP_CELLS = 60  # of a bound map an axis
+STATUS = {
+    "determined": "status: determined",
+    "weak": "status: weak: some directions are left to prior and survey by half or more",
+    "open": "status: open: the data say next to nothing of some direction; a fit may be no answer (exit code 1)",
+}
+
+
+def run(model: Path, data: Path | None, fix: Sequence[str], out: Path | None) -> int:
+    """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
+    keep_kernels()
+    _, problem = load_problem(model, data, fix)
+    with line() as progress:
+        if progress is not None:
+            progress("check", 0, 0.0)
+        start = automatic_start(problem)
+        tree = observability(problem, point=start)
+        passes = next_passes(problem, point=start)
+        plans = (passes, next_anchors(problem, point=start), next_sensors(problem, point=start))
+    tree.attrs["model"] = model.stem
+    _print_check(problem, tree, plans)
+    if out is not None:
+        _write(problem, tree, passes, out)
+    return 1 if tree.attrs["status"] == "open" else 0
+
+
+def _print_check(problem: Problem, tree: xr.DataTree, plans: tuple[xr.Dataset, xr.Dataset, xr.Dataset]) -> None:
+    data = problem.measurements
+    print(
+        f"{data.table.source}: {len(data.time)} rows of {len(set(data.sensor))} sensors, {len(data.target_names)} "
+        f"target(s), {sum(len(e.time) for e in problem.epochs)} epochs over {np.ptp(data.time):g} s"
+    )
+    for name in problem.silent:
+        print(f'sensor "{name}" has no row: a fit refuses it; add rows or take it out of the network')
+    print(check_table(tree).to_string(index=False, justify="right"))
+    print("share: how much of the answer the data give under a prior of one scale; sd: the bound that goes with it")
+    sensors = tree["sensor"].to_dataset().to_dataframe().sort_values("leverage")
+    print("biases that the rows of each sensor determine: " + _listed(sensors["leverage"]))
+    targets = tree["target"].to_dataset()["leverage"].to_series().sort_values()
+    print(f"of each target: {_listed(targets)}; of the motion: {tree['target'].attrs['motion']:.2f}")
+    print(_directions_text(tree))
+    passes, anchors, sensors_ = plans
+    print(f"weak directions now: {passes.attrs['weak_before']}. What would tell most (nats; weak directions left):")
+    path = passes["path"].values[0]
+    ends = " to ".join("(" + ", ".join(f"{v:.4g}" for v in place) + ")" for place in path[[0, -1]][: len(path)])
+    what = "another pass" if len(path) > 1 else "another target"
+    print(f"  {what}, {ends} m: {passes['gain'].values[0]:.2f} ({passes['weak'].values[0]})")
+    label, unit, std = (anchors[name].values[0] for name in ("anchor", "unit", "std"))
+    survey = f"a survey of {label} to {std:.2g} {unit.strip('1')}".rstrip()
+    print(f"  {survey}: {anchors['gain'].values[0]:.2f} of the other biases ({anchors['weak'].values[0]})")
+    place = ", ".join(f"{v:.4g}" for v in sensors_["place"].values[0])
+    print(f"  one more {sensors_['type'].values[0]} at ({place}) m: {sensors_['gain'].values[0]:.2f}")
+    print(STATUS[tree.attrs["status"]])
+
+
+def _directions_text(tree: xr.DataTree) -> str:
+    """The directions that the data leave open, in words, each with its remedy."""
+    if "direction" not in tree.children:
+        surveyed = "survey" in tree["bias"].to_dataset()["kind"].values.tolist()
+        return f"the data determine every direction of the biases{' without a survey' if surveyed else ''}"
+    group = tree["direction"].to_dataset()
+    count = group.sizes["direction"]
+    lines = [f"{count} direction{'s' * (count > 1)} of the biases that the data hardly determine; remedies add up:"]
+    for k in range(group.sizes["direction"]):
+        kind, share, words = (group[name].values[k] for name in ("kind", "share", "words"))
+        lines.append(f"  {k + 1}. {group['direction'].values[k]} ({kind}, the data give {share:.2g} of the answer)")
+        lines += [f"     {words}", f"     {group['remedy'].values[k]}"]
+    return "\n".join([*lines, tree.attrs["rule"]])
+
+
+def _listed(values: pd.Series, most: int = 8) -> str:
+    """Names and numbers of a series in one line, the first and the last where there are many."""
+    pairs = [f"{name} {value:.2f}" for name, value in values.items()]
+    return ", ".join(pairs if len(pairs) <= most else [*pairs[: most // 2], "...", *pairs[-most // 2 :]])
+
+
+def check_table(tree: xr.DataTree) -> pd.DataFrame:
+    """The biases of a check: bias, unit, scale (or survey), kind, sd (bound), share, verdict."""
+    columns = ["unit", "scale", "kind", "sd", "share", "verdict"]
+    frame = tree["bias"].to_dataset()[columns].to_dataframe().reset_index()
+    frame = frame[["bias_label", *columns]].rename(columns={"bias_label": "bias"})
+    shown = {"scale": "{:.4g}", "sd": "{:.4g}", "share": "{:.3f}"}
+    return frame.assign(**{name: [form.format(v) for v in frame[name]] for name, form in shown.items()})
+
+
+def _write(problem: Problem, tree: xr.DataTree, passes: xr.Dataset, out: Path) -> None:
+    files = [out / "check.nc", out / "check.csv"]
+    with writing(out):
+        save(tree, files[0])
+        columns = ["unit", "scale", "kind", "sd", "share", "verdict"]
+        frame = tree["bias"].to_dataset()[columns].to_dataframe().reset_index().rename(columns={"bias_label": "bias"})
+        write_csv(frame[["bias", *columns]], files[1])
+        if can_plot():
+            from probcal.plots import draw_check  # the plot packages are an extra
+
+            files.append(out / "check.png")
+            low, high = passes["path"].values.min((0, 1)), passes["path"].values.max((0, 1))
+            height = float((low + high)[2] / 2) if len(low) == 3 else None
+            sides = [(a, b) for a, b in zip(low[:2], high[:2], strict=True)]
+            bound = bound_map(problem, sides, MAP_CELLS, biases="unknown", z=height)
+            draw_check(tree, passes, bound, files[-1])
+    say_written(files)

@@ -1,0 +1,234 @@
+"""The commands, their options and the checks of these; nothing heavy is imported before they hold."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from probcal.analysis.choices import check_count, check_names, split_pair
+from probcal.cli import files, options
+from probcal.cli.names import METHODS, ORACLE, PRIORS
+from probcal.errors import FitError, InputError, nearest
+
+app = typer.Typer(
+    help="Bayesian calibration of sensor networks from targets of opportunity.",
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+)  # fmt: skip
+
+Model = Annotated[Path, typer.Argument(help="model file that defines problem(data=None)", show_default=False)]
+Data = Annotated[Path | None, typer.Argument(help="table of rows (CSV); the model's own data if left out")]
+Method = Annotated[str, typer.Option(help=" | ".join(METHODS))]
+Fix = Annotated[list[str] | None, typer.Option(help="hold biases at 0, by label or pattern (repeat)")]
+Seed = Annotated[int, typer.Option(min=0, help="seed of everything random")]
+
+
+def main() -> None:
+    """Entry point: one sentence on stderr and exit code 2 for bad input, 1 for a fit that left no answer."""
+    try:
+        app()
+    except InputError as error:
+        _say(error)
+        sys.exit(2)
+    except FitError as error:
+        _say(error)
+        sys.exit(1)
+
+
+def _say(text: object) -> None:
+    print(f"probcal: {text}", file=sys.stderr)
+
+
+@app.command(name="fit")
+def fit_command(
+    model: Model,
+    data: Data = None,
+    method: Method = "ea",
+    prior: Annotated[
+        str | None, typer.Option(help=" | ".join(PRIORS) + "; the model's or the method's own if left out")
+    ] = None,
+    fix: Fix = None,
+    starts: Annotated[int, typer.Option(min=1, help="starts of the search; the best optimum is reported")] = 1,
+    seed: Seed = 0,
+    out: Annotated[Path | None, typer.Option(help="folder for fit.nc, summary.csv, report.html")] = None,
+    chains: Annotated[int | None, typer.Option(min=1, help="chains of a sampler")] = None,
+    draws: Annotated[int | None, typer.Option(min=1, help="draws of each chain after warm-up")] = None,
+    warmup: Annotated[int | None, typer.Option(min=0, help="steps of each chain before its draws")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on with the stopped run of a sampler in --out")] = False,
+    assessed: Annotated[
+        bool, typer.Option("--assess/--no-assess", help="a verdict per bias, and what the residuals say")
+    ] = True,
+) -> None:
+    """Calibrate: one row a bias, and where the truth is known the position error before and after."""
+    if method not in METHODS:
+        raise InputError(f'--method "{method}" is not known{nearest(method, METHODS)}')
+    if prior is not None and prior not in PRIORS:
+        raise InputError(f'--prior "{prior}" is not known{nearest(prior, PRIORS)}')
+    options.check_taken(method, prior)
+    sizes = options.chain_sizes(method, {"chains": chains, "draws": draws, "warmup": warmup})
+    if resume and out is None:
+        raise InputError("--resume needs --out, the folder of the run to go on with")
+    options.check_files(model, data)
+    if out is not None:
+        files.folder(out)
+    from probcal.cli import fit
+
+    raise typer.Exit(
+        fit.run(
+            model, data, method=method, prior=prior, fix=fix or (), starts=starts, seed=seed, out=out, sizes=sizes,
+            resume=resume, assessed=assessed,
+        )
+    )  # fmt: skip
+
+
+@app.command(name="simulate")
+def simulate_command(
+    model: Model,
+    seed: Seed = 0,
+    out: Annotated[Path | None, typer.Option(help="table to write (MODEL-SEED.csv if left out)")] = None,
+) -> None:
+    """Simulate a model's scenario: the table, and beside it its true tracks and biases."""
+    options.check_files(model)
+    path = Path(f"{model.stem}-{seed}.csv") if out is None else out
+    files.folder(path.parent)
+    from probcal.cli import simulate
+
+    raise typer.Exit(simulate.run(model, seed, path))
+
+
+@app.command(name="check")
+def check_command(
+    model: Model,
+    data: Data = None,
+    fix: Fix = None,
+    out: Annotated[Path | None, typer.Option(help="folder for check.nc, check.csv, check.png")] = None,
+) -> None:
+    """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
+    options.check_files(model, data)
+    if out is not None:
+        files.folder(out)
+    from probcal.cli import check
+
+    raise typer.Exit(check.run(model, data, fix or (), out))
+
+
+@app.command(name="track")
+def track_command(
+    model: Model,
+    data: Data = None,
+    calibration: Annotated[Path | None, typer.Option(help="folder (or fit.nc) of a fit", show_default=False)] = None,
+    out: Annotated[Path, typer.Option(help="table of tracks to write")] = Path("tracks.csv"),
+) -> None:
+    """Tracks of other data with a calibration applied: time, target, each state component with its sd."""
+    if calibration is None:
+        raise InputError("track needs --calibration DIR, the folder of a fit")
+    options.check_fit(calibration)
+    options.check_files(model, data)
+    files.folder(out.parent)
+    from probcal.cli import track
+
+    raise typer.Exit(track.run(model, data, calibration, out))
+
+
+@app.command(name="study")
+def study_command(
+    model: Model,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="values of an argument of setting(): share=0:1:0.1, scenario=C1,C2"),
+    ] = None,
+    methods: Annotated[str, typer.Option(help=", ".join([*METHODS, ORACLE]))] = f"ml,em-ea,ea,{ORACLE}",
+    runs: Annotated[int, typer.Option(min=1, help="simulated runs of every setting")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="number of the first run")] = 0,
+    out: Annotated[Path | None, typer.Option(help="folder for study.nc, study.csv, study.png")] = None,
+) -> None:
+    """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
+    chosen = options.method_names(methods)
+    grid = options.grid(setting or ())
+    options.check_files(model)
+    if out is not None:
+        files.folder(out)
+    from probcal.cli import study
+
+    raise typer.Exit(study.run(model, grid, chosen, runs, seed, out))
+
+
+@app.command(name="compare")
+def compare_command(
+    folders: Annotated[list[Path], typer.Argument(help="folders (or fit.nc) of fits to the same data")],
+    name: Annotated[
+        list[str] | None, typer.Option(help="name of each fit in turn (repeat); method and prior if left out")
+    ] = None,
+    pair: Annotated[
+        list[str] | None, typer.Option(help="two biases to draw against each other, LABEL,LABEL (repeat)")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for compare.nc, compare.csv, compare.png")] = None,
+) -> None:
+    """Put fits of the same data side by side: estimates, distances, gamma, coverage, prediction, evidence, cost."""
+    for path in folders:
+        options.check_fit(path)
+    check_count(len(folders))
+    if name:
+        check_names(name, len(folders))
+    pairs = [split_pair(text.split(",")) for text in pair or ()]
+    if out is not None:
+        files.folder(out)
+    from probcal.cli import compare
+
+    raise typer.Exit(compare.run(folders, name, pairs, out))
+
+
+@app.command(name="report")
+def report_command(
+    folder: Annotated[Path, typer.Argument(help="folder of a fit", show_default=False)],
+) -> None:
+    """Write report.html of a saved fit: map, forest of biases, residuals, trace."""
+    if not files.can_plot():
+        raise InputError('the report needs plot packages: pip install "probcal[plot]"')
+    options.check_fit(folder)
+    from probcal.cli import report
+
+    raise typer.Exit(report.run(folder))
+
+
+@app.command(name="sbc")
+def sbc_command(
+    model: Model,
+    data: Data = None,
+    method: Method = "ea",
+    prior: Annotated[str | None, typer.Option(help=" | ".join(PRIORS) + "; the method's own if left out")] = None,
+    truths: Annotated[
+        str | None, typer.Option("--from", help="prior that the truths are drawn from; that of the fit if left out")
+    ] = None,
+    fix: Fix = None,
+    runs: Annotated[int, typer.Option(min=2, help="simulations")] = 200,
+    seed: Seed = 0,
+    posterior: Annotated[
+        bool, typer.Option("--posterior", help="draw the truths from the posterior of the data instead of the prior")
+    ] = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="run samplers as long as a fit would, not just long enough for ranks")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="folder for sbc.nc, sbc.csv, sbc.png, and finished runs")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on with the finished runs in --out")] = False,
+) -> None:
+    """Check a method on a model by simulation: do its intervals hold the truth as often as they say?"""
+    if method not in METHODS:
+        raise InputError(f'sbc: no method is called "{method}"{nearest(method, METHODS)}')
+    for name in (prior, truths):
+        if name is not None and name not in PRIORS:
+            raise InputError(f'sbc: no prior is called "{name}"{nearest(name, PRIORS)}')
+    options.check_taken(method, prior)
+    if resume and out is None:
+        raise InputError("sbc: --resume needs --out DIR, the folder of the runs to go on with")
+    options.check_files(model, data)
+    if out is not None:
+        files.folder(out)
+    from probcal.cli import sbc
+
+    raise typer.Exit(
+        sbc.run(
+            model, data, method=method, prior=prior, truths=truths, fix=fix or (), runs=runs, seed=seed,
+            posterior=posterior, full=full, out=out, resume=resume,
+        )
+    )  # fmt: skip

@@ -1,0 +1,127 @@
+"""`fit`: calibrate, print one row a bias and what the fit is worth, write fit.nc, summary.csv and report.html."""
+
+import shutil
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from probcal.cli.files import can_plot, report_of, say_written, write_csv, writing
+from probcal.cli.kernels import keep_kernels
+from probcal.cli.models import choose_prior, load_problem, load_truth
+from probcal.cli.progress import line
+from probcal.inference import METHODS, fit
+from probcal.tree import add_scores, outliers, save, summary
+
+FINDINGS = 8  # sentences of an assessment that are printed
+
+
+def run(
+    model: Path, data: Path | None, *, method: str, prior: str | None, fix: Sequence[str], starts: int, seed: int,
+    out: Path | None, sizes: Mapping[str, int], resume: bool, assessed: bool,
+) -> int:  # fmt: skip
+    """Calibrate: one row a bias, and where the truth is known the position error before and after."""
+    keep_kernels()
+    known, implied = METHODS[method]
+    value: Any = known
+    value = replace(value, **sizes) if sizes else value
+    began = time.perf_counter()
+    module, problem = load_problem(model, data, fix)
+    chosen = choose_prior(module, value, implied, prior)
+    truth = load_truth(module, model, data, problem)
+    with line() as progress:
+        tree = fit(
+            problem, value, prior=chosen, key=seed, starts=starts, progress=progress,
+            store=out / "draws" if out is not None else None, resume=resume,
+        )  # fmt: skip
+        if out is not None:
+            save(tree, out / "fit.nc")  # what is found is safe whatever comes
+            if "Interrupted" not in tree.attrs["message"]:
+                shutil.rmtree(out / "draws", ignore_errors=True)  # they are in fit.nc now
+        if assessed:
+            from probcal.analysis import assess
+
+            tree = assess(problem, tree, truth=truth, key=seed)
+    tree.attrs["model"] = model.stem
+    if truth is not None:
+        from probcal.diagnostics import scores
+
+        add_scores(tree, scores(tree, truth), truth.biases)
+    print(table_text(tree))
+    _print_verdict(tree, time.perf_counter() - began)
+    if out is not None:
+        _write(tree, out)
+    return 0 if tree.attrs["status"] == "converged" else 1
+
+
+def table_text(tree: xr.DataTree) -> str:
+    """The table of biases as printed: label, unit, scale, mean, sd, interval, gamma, status, verdict."""
+    frame = summary(tree)
+    numbers = ["scale", "mean", "sd", "lower", "upper"]
+    for name in numbers:
+        frame[name] = [f"{value:.4g}" for value in frame[name]]
+    frame["gamma"] = [f"{value:.3f}" for value in frame["gamma"]]
+    mixed = [name for name in ("inclusion", "r_hat", "ess") if name in frame]
+    for name in mixed:
+        frame[name] = [f"{value:.0f}" if name == "ess" else f"{value:.3f}" for value in frame[name]]
+    shown = frame[["bias", "unit", *numbers, "gamma", *mixed, "status", *(["verdict"] if "verdict" in frame else [])]]
+    return shown.to_string(index=False, justify="right")
+
+
+def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
+    attrs = tree.attrs
+    work = f"{tree['optimisation'].sizes['iteration']} iterations" if "optimisation" in tree.children else (
+        f"{tree['posterior'].sizes['chain']} x {tree['posterior'].sizes['draw']} draws"
+    )  # fmt: skip
+    print(f"{attrs['method']} ({attrs['prior']}): {attrs['status']} after {work}, {seconds:.1f} s")
+    print(f"intervals are {attrs['interval_probability']:.0%}; {attrs['intervals']}")
+    if "level" in tree.children:
+        for label, std in tree["level"].to_dataset()["std"].to_series().items():
+            print(f"estimated {label} = {std:.4g}")
+    listed = outliers(tree)
+    if len(listed):
+        total = tree["residual"].sizes["datum"]
+        first = listed.iloc[0]
+        print(f"{len(listed)} of {total} data count less than half; the least: row {first['row']}, {first['sensor']}")
+    if "optimum" in tree.children:
+        optima = tree["optimum"].to_dataset()
+        score = optima["log_evidence" if "log_evidence" in optima else "objective"]
+        pairs = zip(optima["start"].values, optima["status"].values, score.values, strict=True)
+        print(f"{score.name} by start: " + ", ".join(f"{k}: {value:.2f} ({status})" for k, status, value in pairs))
+    if "position_rmse_after" in attrs:
+        print(f"position RMSE before {attrs['position_rmse_before']:.3f} m, after {attrs['position_rmse_after']:.3f} m")
+    _print_findings(tree)
+    if attrs["message"]:
+        print(attrs["message"], file=sys.stdout if attrs["status"] == "converged" else sys.stderr)
+
+
+def _print_findings(tree: xr.DataTree) -> None:
+    """The first sentences that an assessment has to say."""
+    if "finding" not in tree.children:
+        return
+    sentences = tree["finding"].to_dataset()["sentence"].values.tolist()
+    for sentence in sentences[:FINDINGS]:
+        print(f"- {sentence}")
+    if len(sentences) > FINDINGS:
+        print(f"- and {len(sentences) - FINDINGS} more (group finding of fit.nc, report.html)")
+
+
+def _write(tree: xr.DataTree, out: Path) -> None:
+    with writing(out):
+        save(tree, out / "fit.nc")
+    files = [out / "fit.nc", out / "summary.csv"]
+    write_csv(summary(tree), files[1])
+    if (tree["residual"]["weight"] < 1).any():  # some noise has heavy tails
+        files.append(out / "outliers.csv")
+        write_csv(outliers(tree), files[2])
+    else:
+        (out / "outliers.csv").unlink(missing_ok=True)  # of an earlier fit
+    if can_plot():
+        files.append(report_of(tree, out))
+    say_written(files)
+    if not can_plot():
+        print('report.html is left out: pip install "probcal[plot]"')

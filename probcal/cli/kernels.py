@@ -1,0 +1,19 @@
+"""Compiled kernels are kept between runs of the command line."""
+
+import jax
+import platformdirs
+
+
+def keep_kernels() -> None:
+    """Compiled kernels stay in the user's cache folder, the latest 1 GB; JAX_COMPILATION_CACHE_DIR names another."""
+    if jax.config.jax_compilation_cache_dir:
+        return
+    folder = platformdirs.user_cache_path("probcal") / "kernels"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # a home that cannot be written: compile anew
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_compilation_cache_max_size", 10**9)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)

@@ -1,0 +1,105 @@
+"""Model files: imported, their functions called, whatever they raise in one sentence."""
+
+import importlib.util
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from probcal.cli.options import check_files
+from probcal.errors import FitError, InputError
+
+if TYPE_CHECKING:
+    from probcal.inference.run import Method
+    from probcal.priors import Prior
+    from probcal.problem import Problem
+    from probcal.simulate import Truth
+
+
+def load_model(path: Path) -> ModuleType:
+    """Import a model file; raises `InputError` if it is missing or fails."""
+    check_files(path)
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    folder = str(path.parent.resolve())
+    sys.path.insert(0, folder)
+    try:
+        with _told(f"{path.name} cannot be loaded:", f"{path.name}: "):
+            spec.loader.exec_module(module)
+    finally:
+        if folder in sys.path:
+            sys.path.remove(folder)
+    return module
+
+
+@contextmanager
+def _told(what: str, prefix: str = "") -> Iterator[None]:
+    """Whatever a user's file raises, `sys.exit()` included, becomes one sentence; Ctrl-C stays what it is."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{prefix}{error}") from None
+    except (FitError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        try:
+            reason = str(error)
+        except Exception:  # an exception of the user's own that cannot be printed
+            reason = "no text"
+        raise InputError(f"{what} {type(error).__name__}: {reason}") from None
+
+
+def call(module: ModuleType, path: Path, name: str, /, *arguments: Any, **options: Any) -> Any:
+    """Call a function of a model file; its own failures become one sentence."""
+    function = getattr(module, name, None)
+    if not callable(function):
+        raise InputError(
+            f"{path.name} defines no {name}(); a model file defines problem(data=None) and, to simulate, scenario(key)"
+        )
+    with _told(f"{path.name}: {name}() failed with"):
+        return function(*arguments, **options)
+
+
+def load_problem(model: Path, data: Path | None, fix: Sequence[str] | None = ()) -> "tuple[ModuleType, Problem]":
+    """A model file and its problem with the given data, some biases held at 0."""
+    check_files(model, data)
+    module = load_model(model)
+    problem = call(module, model, "problem", data)
+    from probcal.problem import Problem  # loaded by the model, if it is one
+
+    if not isinstance(problem, Problem):
+        raise InputError(
+            f"{model.name}: problem() returned {type(problem).__name__}; return a probcal.Problem with a network"
+        )
+    if fix:
+        problem = problem.rebuild(fix=problem.fixed | dict.fromkeys(fix, 0.0))
+    return module, problem
+
+
+def load_truth(module: ModuleType, model: Path, data: Path | None, problem: "Problem") -> "Truth | None":
+    """The truth beside the data, else the model's own; checked before a fit rather than at its scores."""
+    import numpy as np
+
+    from probcal.simulate import Truth, truth_beside
+
+    truth = truth_beside(data) if data is not None else None
+    if truth is None and hasattr(module, "truth"):
+        truth = call(module, model, "truth", data)
+        if not isinstance(truth, Truth | None):
+            raise InputError(f"{model.name}: truth() returned {type(truth).__name__}; return a probcal.Truth or None")
+    if truth is not None:
+        truth.positions(np.zeros(0), np.zeros(0, str), problem.network.dimension)
+    return truth
+
+
+def choose_prior(module: ModuleType, method: "Method", implied: "Prior | None", name: str | None) -> "Prior | None":
+    """The prior that is named, else that of the method's name, else the model's own `PRIOR` if the method takes it."""
+    from probcal.priors import PRIORS
+
+    chosen = PRIORS[name] if name is not None else implied
+    own = getattr(module, "PRIOR", None)
+    return own if chosen is None and own is not None and method.takes(own) else chosen

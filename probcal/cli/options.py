@@ -1,0 +1,99 @@
+"""Checks of options and arguments that need nothing heavy: names, files, values of settings."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from probcal.cli.names import METHODS, ORACLE, PRIORS
+from probcal.errors import InputError, nearest
+from probcal.inference.settings import check_setting
+
+
+def check_files(model: Path, data: Path | None = None) -> None:
+    """Raise `InputError` where the model file, or the table given with it, is not there."""
+    if not exists(model) or not model.is_file():
+        raise InputError(f"{model}: no such model file")
+    if model.suffix != ".py":
+        raise InputError(f"{model} is not a Python file; a model file defines problem(data=None)")
+    if data is not None and not exists(data):
+        raise InputError(f"{data}: no such file")
+
+
+def check_fit(path: Path) -> None:
+    """Raise `InputError` where there is no file of a fit to read."""
+    file = path / "fit.nc" if exists(path) and path.is_dir() else path
+    if not exists(file):
+        raise InputError(f"{file} is not a fit written by probcal: there is no such file")
+
+
+def exists(path: Path) -> bool:
+    """Whether a file or folder is there; a name that no file can have is not."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def check_taken(method: str, prior: str | None) -> None:
+    """Raise `InputError` for a known prior that a known method does not take."""
+    known = METHODS[method]
+    if prior is not None and prior not in known.priors:
+        raise InputError(f"{known.title} does not take the prior {PRIORS[prior]}; it takes: {', '.join(known.priors)}")
+
+
+def chain_sizes(method: str, sizes: Mapping[str, int | None]) -> dict[str, int]:
+    """The numbers of chains and draws that are given; raises `InputError` for a method that draws none."""
+    given = {option: number for option, number in sizes.items() if number is not None}
+    if given and not METHODS[method].chains:
+        raise InputError(f'--{next(iter(given))}: "{method}" draws no chains; take collapsed, nuts or svi')
+    return given
+
+
+def method_names(text: str) -> list[str]:
+    """Names of the methods of a study, separated by commas."""
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in METHODS and name != ORACLE:
+            raise InputError(f'method "{name}" is not known{nearest(name, [*METHODS, ORACLE])}')
+    return names
+
+
+def grid(settings: Sequence[str]) -> dict[str, list[Any]]:
+    """The values of each setting of a study, those given in several options one after the other."""
+    found: dict[str, list[Any]] = {}
+    for name, values in map(parse_values, settings):
+        found[name] = found.get(name, []) + values
+    for name, values in found.items():
+        check_setting(name, values)
+    return found
+
+
+def parse_values(text: str) -> tuple[str, list[Any]]:
+    """`name=a,b,c` or `name=first:last:step` as a name and its values; numbers where they are numbers."""
+    name, equals, values = text.partition("=")
+    parts = [part.strip() for part in values.split(",")]
+    if not equals or not name.strip() or not all(parts):
+        raise InputError(f'--set "{text}": write name=value,value,... or name=first:last:step')
+    found: list[Any] = []
+    for part in parts:
+        numbers = [_number(piece) for piece in part.split(":")]
+        if len(numbers) == 3 and all(isinstance(number, (int, float)) for number in numbers):
+            first, last, step = numbers
+            if not all(map(math.isfinite, numbers)) or not step or (last - first) / step < 0:
+                raise InputError(f'--set "{text}": the step does not lead from {first} to {last}')
+            count = math.floor((last - first) / step + 1e-9) + 1
+            found += [round(first + k * step, 12) for k in range(count)]
+        else:
+            found.append(_number(part))
+    return name.strip(), found
+
+
+def _number(text: str) -> Any:
+    """An integer or a float where the text is one, else the text."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text

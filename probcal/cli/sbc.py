@@ -1,0 +1,61 @@
+"""`sbc`: a method checked on a model by simulation."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+import xarray as xr
+
+from probcal.cli.files import can_plot, say_written, write_csv, writing
+from probcal.cli.kernels import keep_kernels
+from probcal.cli.models import choose_prior, load_problem
+from probcal.cli.progress import bar
+from probcal.inference import METHODS, sbc
+from probcal.inference.coverage import coverage_table
+from probcal.inference.sbc import short
+from probcal.priors import PRIORS
+from probcal.tree import save
+
+
+def run(
+    model: Path, data: Path | None, *, method: str, prior: str | None, truths: str | None, fix: Sequence[str],
+    runs: int, seed: int, posterior: bool, full: bool, out: Path | None, resume: bool,
+) -> int:  # fmt: skip
+    """Check a method on a model by simulation: do its intervals hold the truth as often as they say?"""
+    keep_kernels()
+    value, implied = METHODS[method]
+    value = value if full else short(value)
+    module, problem = load_problem(model, data, fix)
+    chosen = choose_prior(module, value, implied, prior)
+    began = time.perf_counter()
+    with bar() as advance:
+        tree = sbc(
+            problem, value, chosen, runs, simulate_from=PRIORS[truths] if truths is not None else None,
+            around="data" if posterior else None, key=seed, progress=advance, resume=resume,
+            store=None if out is None else out / "runs",
+        )  # fmt: skip
+    tree.attrs["model"] = model.stem
+    table = coverage_table(tree)
+    print(table.to_string(index=False, float_format=lambda number: f"{number:.3f}"))
+    counted = f"{tree.attrs['runs']} runs, truths from {tree.attrs['source']}"
+    print(f"{tree.attrs['method']} ({tree.attrs['prior']}): {counted}, {time.perf_counter() - began:.1f} s")
+    print(tree.attrs["verdict"])
+    if tree.attrs["message"]:
+        print(tree.attrs["message"])
+    if out is not None:
+        _write(tree, table, out)
+    return 0 if tree.attrs["status"] == "uniform" else 1
+
+
+def _write(tree: xr.DataTree, table: pd.DataFrame, out: Path) -> None:
+    files = [out / "sbc.nc", out / "sbc.csv"]
+    with writing(out):
+        save(tree, files[0])
+        write_csv(table, files[1])
+        if can_plot():
+            from probcal.plots.sbc import draw_sbc  # the plot packages are an extra
+
+            files.append(out / "sbc.png")
+            draw_sbc(tree, files[-1])
+    say_written(files)

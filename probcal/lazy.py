@@ -1,0 +1,44 @@
+"""Packages whose names are imported when they are first used (PEP 562, by a class of module)."""
+
+import sys
+from collections.abc import Mapping
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+
+class LazyPackage(ModuleType):
+    """A package that loads a public name, or a submodule, when it is asked for."""
+
+    _homes: dict[str, str]  # the module of each public name
+
+    def __getattr__(self, name: str) -> Any:
+        if name in self._homes:
+            value = getattr(import_module(self._homes[name]), name)
+            setattr(self, name, value)
+            return value
+        module = f"{self.__name__}.{name}"
+        if not name.startswith("_"):
+            try:
+                return import_module(module)
+            except ModuleNotFoundError as error:
+                if error.name != module:
+                    raise
+        raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}", name=name, obj=self)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """The import of a submodule binds it to its name, which is left to the function of that name."""
+        if isinstance(value, ModuleType) and self._homes.get(name) == value.__name__:
+            value = getattr(value, name)
+        super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *self.__dict__["__all__"]})
+
+
+def lazy(package: str, homes: Mapping[str, str], submodules: str = "") -> list[str]:
+    """Make a package lazy and return its `__all__`: `homes` gives the public names of each module, by spaces."""
+    module = sys.modules[package]
+    module.__dict__["_homes"] = {name: home for home, names in homes.items() for name in names.split()}
+    module.__class__ = LazyPackage
+    return sorted([*module.__dict__["_homes"], *submodules.split()])

@@ -1,0 +1,133 @@
+"""What is loaded and when: modules are counted in fresh interpreters, never seconds."""
+
+import ast
+import importlib
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import probcal
+from probcal import analysis, inference, plots
+from probcal.cli.names import METHODS, ORACLE, PRIORS
+from probcal.inference.sampler import Sampler
+from probcal.inference.study import ORACLE as ORACLE_OF_STUDIES
+
+ROOT = Path(__file__).parents[1]
+HEAVY = ("jax", "numpy", "pandas", "xarray", "scipy.stats", "arviz", "arviz_stats", "numpyro", "matplotlib", "pyproj")
+PLAZA = str(ROOT / "models" / "plaza.py")
+ERRORS = [  # of options and arguments, with the end of what is said
+    ("fit none.py", "none.py: no such model file"),
+    ("fit pyproject.toml", "pyproject.toml is not a Python file; a model file defines problem(data=None)"),
+    ("fit {plaza} none.csv", "none.csv: no such file"),
+    ("fit {plaza} --method eaa", '--method "eaa" is not known; did you mean "ea"?'),
+    ("fit {plaza} --prior gausian", '--prior "gausian" is not known; did you mean "gaussian"?'),
+    (
+        "fit {plaza} --prior gaussian",
+        "EA does not take the prior Gaussian; it takes: ard, ard-node, ard-owner, ard-typ",
+    ),
+    ("fit {plaza} --chains 2", '--chains: "ea" draws no chains; take collapsed, nuts or svi'),
+    ("fit {plaza} --method nuts --resume", "--resume needs --out, the folder of the run to go on with"),
+    ("fit {plaza} --out pyproject.toml/fit", "pyproject.toml/fit cannot be written: Not a directory"),
+    ("sbc {plaza} --resume", "sbc: --resume needs --out DIR, the folder of the runs to go on with"),
+    ("sbc {plaza} --method mop", 'sbc: no method is called "mop"; did you mean "map"?'),
+    ("study {plaza} --set share", '--set "share": write name=value,value,... or name=first:last:step'),
+    ("study {plaza} --set share=1,1", "study: a value of share is given twice; give every value once"),
+    ("study {plaza} --methods ea,mop", 'method "mop" is not known; did you mean "map"?'),
+    ("track {plaza}", "track needs --calibration DIR, the folder of a fit"),
+    ("track {plaza} --calibration tests", "tests/fit.nc is not a fit written by probcal: there is no such file"),
+    ("compare a b", "a is not a fit written by probcal: there is no such file"),
+    ("compare pyproject.toml", "compare: 1 fit(s) given; give at least two"),
+    ("compare pyproject.toml README.md --name a", "compare: 1 names for 2 fits; give each fit a name of its own"),
+    ("compare pyproject.toml README.md --pair a", 'the pair "a" must be two labels of biases, LABEL,LABEL'),
+    ("report none", "none is not a fit written by probcal: there is no such file"),
+    ("check none.py", "none.py: no such model file"),
+    ("simulate none.py", "none.py: no such model file"),
+]
+
+
+def fresh(code):
+    """What a fresh interpreter prints, line by line; warnings and errors fail."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+LOADED = f"""
+import sys
+def loaded():
+    return " ".join(name for name in {HEAVY} if name in sys.modules) or "nothing"
+"""
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    code = LOADED + (
+        "import probcal\nprint(loaded())\nprobcal.InputError, probcal.analysis, probcal.inference, dir(probcal.plots)\n"
+        "print(loaded())\nimport jax\nprint(loaded())"
+    )
+    assert fresh(code) == ["nothing", "nothing", "jax numpy"]
+
+
+def test_help_and_errors_of_options_load_nothing_heavy():
+    orders = [order.format(plaza=PLAZA) for order, _ in ERRORS]
+    code = LOADED + (
+        "import contextlib, io\nfrom probcal.cli import main\n"
+        f"for order in {['--help', 'fit --help', 'sbc --help', *orders]!r}:\n"
+        "    sys.argv, said = ['probcal', *order.split()], io.StringIO()\n"
+        "    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):\n"
+        "        try:\n            main()\n        except SystemExit as end:\n            code = end.code\n"
+        "    print(loaded(), code, *said.getvalue().splitlines()[-1:])\n"
+    )
+    lines = fresh(code)
+    assert [line[:9] for line in lines[:3]] == ["nothing 0"] * 3
+    for line, (order, text) in zip(lines[3:], ERRORS, strict=True):
+        assert line.startswith("nothing 2 probcal: "), order
+        assert text in line, order
+
+
+def test_names_on_the_command_line_are_those_of_the_library():
+    assert list(PRIORS) == list(probcal.priors.PRIORS)
+    assert {name: type(prior).__name__ for name, prior in probcal.priors.PRIORS.items()} == PRIORS
+    assert list(METHODS) == list(inference.METHODS)
+    for name, (method, prior) in inference.METHODS.items():
+        taken = tuple(key for key, value in probcal.priors.PRIORS.items() if method.takes(value))
+        assert METHODS[name] == (method.name, isinstance(method, Sampler), taken)
+        assert prior is None or method.takes(prior)
+    assert ORACLE == ORACLE_OF_STUDIES
+
+
+@pytest.mark.parametrize("package", [probcal, analysis, inference, plots], ids=lambda package: package.__name__)
+def test_a_lazy_package_has_all_its_names(package):
+    modules = {module.name for module in pkgutil.iter_modules(package.__path__)}
+    for name in package.__all__:
+        value = getattr(package, name)
+        assert isinstance(value, ModuleType) == (package is probcal and name in ("noise", "priors", "sensors")), name
+        if name in modules:  # a function and the module it stands in: the name stays the function's
+            importlib.import_module(f"{package.__name__}.{name}")
+            assert getattr(package, name) is value
+    assert set(package.__all__) <= set(dir(package))
+    with pytest.raises(AttributeError, match="has no attribute 'nothing_of_the_kind'"):
+        package.nothing_of_the_kind  # noqa: B018
+
+
+@pytest.mark.parametrize("package", [probcal, analysis, inference, plots], ids=lambda package: package.__name__)
+def test_type_checkers_see_the_names_that_are_loaded(package):
+    block = next(node for node in ast.parse(Path(package.__file__).read_text()).body if isinstance(node, ast.If))
+    seen = {alias.name: node.module for node in block.body for alias in node.names}
+    assert sorted(seen) == sorted(package.__all__)
+    for name, home in package._homes.items():
+        assert seen[name] == home
+
+
+def test_the_import_of_a_module_leaves_its_name_to_the_function():
+    code = (
+        "import probcal.sensor, probcal.analysis.compare, probcal.inference.sbc\n"
+        "import probcal\nfrom probcal import simulate, linalg\n"
+        "from probcal.analysis import compare\nfrom probcal.inference import sbc\n"
+        "found = (probcal.sensor, probcal.analysis.compare, compare, sbc, simulate, linalg, probcal.sensors)\n"
+        "print(*(type(value).__name__ for value in found))"
+    )
+    assert fresh(code) == ["function " * 5 + "module module"]
