@@ -134,4 +134,4 @@ def test_ten_runs_of_a_study(benchmark):
 
 def test_whole_fit_of_c1(benchmark):
     problem, _ = radars.setting(0, 0.3, "C1")
-    benchmark(lambda: fit(problem, EMEA(), predictive_draws=False))
+    benchmark(lambda: fit(problem, EMEA()))

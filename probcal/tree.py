@@ -19,7 +19,7 @@ from probcal.errors import InputError
 from probcal.problem import Problem
 
 INTERVAL = 0.89  # probability of lower to upper
-LARGEST = 20_000_000  # values of a group of draws above which it is written on request only
+SHARP = 256  # steps to which the spread of a log-likelihood over the draws is rounded, so that its file is small
 MORE = ("r_hat", "ess", "ess_tail", "inclusion", "included", "contraction")  # columns of samplers
 SUMMARY = ("bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma")
 
@@ -68,9 +68,10 @@ class Result:
     directions: Sequence[Any]  # name, information, vector, sentence
     draws: np.ndarray  # (chain, draw, M) of z
     log_prior: np.ndarray | None  # (chain, draw, M) where the biases are independent
-    states: Sequence[np.ndarray] | None  # (chain, draw, E, n) of each recursion
-    log_likelihood: Sequence[np.ndarray] | None  # (chain, draw, N, C) of each block
-    replicas: Sequence[np.ndarray] | None
+    states: Sequence[np.ndarray]  # (chain, draw, E, n) of each recursion, empty where not kept
+    kept: np.ndarray  # (kept,) which draws of each chain have values by datum
+    log_likelihood: Sequence[np.ndarray]  # (chain, kept, N, C) of each block
+    replicas: Sequence[np.ndarray]  # (chain, kept, N, C) of each block, empty where not kept
     tracks: Sequence[Tracks]
     residuals: Residuals
     lower: np.ndarray | None = None  # (M,) of the interval, in z; Gaussian where not given
@@ -125,11 +126,10 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
     base = {"chain": np.arange(chains), "draw": np.arange(draws)}
     posterior: dict[str, Any] = {"bias": ((*sample, "bias_label"), result.draws * scales)}
     track = track_group(problem, result.tracks)
-    if result.states is not None:
-        for r, states in enumerate(result.states):
-            s = suffix(problem, r)
-            posterior[f"state{s}"] = ((*sample, f"epoch{s}", f"component{s}"), states)
-    further: dict[str, Any] = {}
+    for r, states in enumerate(result.states):
+        s = suffix(problem, r)
+        posterior[f"state{s}"] = ((*sample, f"epoch{s}", f"component{s}"), states)
+    further: dict[str, Any] = {str(k): v for k, v in track.coords.items()} if len(result.states) else {}
     for name, (dims, values, *own) in result.posterior.items():
         posterior[name] = ((*sample, *dims), values)
         further |= own[0] if own else {}
@@ -146,7 +146,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
     }  # fmt: skip
     residual = {name: ("datum", gather(parts, picks)) for name, parts in vars(result.residuals).items()}
     groups: dict[str, xr.Dataset] = {
-        "posterior": xr.Dataset(posterior, coords={**base, **further, "bias_label": z, **track.coords}),
+        "posterior": xr.Dataset(posterior, coords={**base, **further, "bias_label": z}),
         "calibration": xr.Dataset(
             {k: ("bias_label", v) for k, v in calibration.items()}
             | {
@@ -168,9 +168,11 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         groups["log_prior"] = xr.Dataset(
             {"bias": ((*sample, "bias_label"), result.log_prior)}, coords={**base, "bias_label": z}
         )
-    for name, parts in (("log_likelihood", result.log_likelihood), ("posterior_predictive", result.replicas)):
-        if parts is not None:
-            groups[name] = xr.Dataset({"y": ((*sample, "datum"), gather(parts, picks))}, coords={**base, **coords})
+    by_datum = {"log_likelihood": result.log_likelihood, "posterior_predictive": result.replicas}
+    for name, values in ((name, gather(parts, picks)) for name, parts in by_datum.items() if len(parts)):
+        kept = {"chain": base["chain"], "draw": result.kept, **coords}
+        rounded = _rounded(values) if name == "log_likelihood" else values
+        groups[name] = xr.Dataset({"y": ((*sample, "datum"), rounded)}, coords=kept)
     if problem.levels:
         guess = np.array([level.guess for level in problem.levels])
         groups["level"] = xr.Dataset(
@@ -193,6 +195,22 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
     tree = xr.DataTree.from_dict(groups)
     tree.attrs.update(attrs)
     return tree
+
+
+def _rounded(log_likelihood: np.ndarray) -> np.ndarray:
+    """Values (chain, draw, datum) in single precision, rounded to 1/256 of their spread over the draws of a datum.
+
+    What is rounded away is noise: the elpd of a datum moves by less than 1e-5 of that spread, and a file needs a byte
+    and a half a value in the place of eight.
+    """
+    values = np.array(log_likelihood, np.float32)
+    with np.errstate(invalid="ignore"):  # a row of probability zero
+        spread = values.std((0, 1), dtype=float)
+    sure = np.isfinite(spread) & (spread > 0)
+    step = np.exp2(np.floor(np.log2(np.where(sure, np.maximum(spread, 1e-12), 1e-3) / SHARP))).astype(np.float32)
+    np.divide(values, step, out=values)
+    np.rint(values, out=values)
+    return np.multiply(values, step, out=values)
 
 
 def direction_group(labels: Sequence[str], directions: Sequence[Any]) -> xr.Dataset:

@@ -86,7 +86,7 @@ def fitted(name, method=None, **options):
 
 @pytest.fixture(scope="module", params=["plane", "mixed"])
 def linear(request):
-    problem, tree, naive = fitted(request.param, predictive_draws=request.param == "plane")
+    problem, tree, naive = fitted(request.param, save=("states", "predictive") if request.param == "plane" else ())
     return problem, tree, naive, assess(problem, tree)
 
 
@@ -280,7 +280,7 @@ def judged():
             if change is not None:
                 change(table)
             problem = probcal.Problem(radars(), ConstantVelocity(0.5), table)
-            tree = probcal.fit(problem, EA(), predictive_draws=name == "true" or None)
+            tree = probcal.fit(problem, EA(), save=("states", "predictive"))
             found[name] = tree, assess(problem, tree, truth=run.truth), problem
         return found[name]
 
@@ -359,7 +359,7 @@ def test_targets_that_a_sensor_does_not_see_tell_nothing_of_it(judged):
     _, _, problem = judged("target")
     frame = problem.measurements.table.frame
     problem = problem.rebuild(frame[(frame["sensor"] != "west") | (frame["target"] == "car")])
-    tree = probcal.fit(problem, EA(), predictive_draws=False)
+    tree = probcal.fit(problem, EA())
     with jax.enable_x64(True):
         divided = pieces.divide(take_up(problem, tree), problem.measurements.target, 2)
     found = pieces.contrasts(divided, np.array([[0.0], [1.0]]))
@@ -387,7 +387,7 @@ def test_sensors_that_changed_places_do_not_fit_the_rest(judged):
     swap(table)
     places = PLACES | {"east": (-192.0, 0.0), "west": (192.0, 0.0)}  # stated wrong by 8 m, after the swap
     swapped = probcal.Problem(radars(places), ConstantVelocity(0.5), table)
-    out = assess(swapped, probcal.fit(swapped, EA(), predictive_draws=False))
+    out = assess(swapped, probcal.fit(swapped, EA()))
     found = alarms(out)
     assert {"east.position_x", "west.position_x"} <= set(found)
     assert found["east.position_x"][0] == found["west.position_x"][0] == "conflicting"
@@ -516,7 +516,7 @@ def test_every_kind_of_noise_and_correlated_surveys():
     table.loc[table.index[angle][:5], "angle"] -= 2 * np.pi
     problem = probcal.Problem(network, ConstantVelocity(0.5), table)
     prior = probcal.ARD(correlation={"*.position_x": 0.6})
-    tree = probcal.fit(problem, EA(), prior=prior, predictive_draws=False)
+    tree = probcal.fit(problem, EA(), prior=prior)
     with jax.enable_x64(True):
         coupling = np.asarray(take_up(problem, tree).prior.coupling)
         wanted = np.asarray(prior.precision(problem.labels, problem.surveyed).coupling)
@@ -532,7 +532,7 @@ def test_every_kind_of_noise_and_correlated_surveys():
 
 
 def test_a_flat_prior_and_another_method():
-    problem, tree, _ = fitted("plane", MAP(), prior=Flat(), predictive_draws=False)
+    problem, tree, _ = fitted("plane", MAP(), prior=Flat())
     out = assess(problem, tree)
     assert np.isfinite(out["sensor_check"].to_dataset().to_dataframe().to_numpy(float)).all()
     assert (out["verdict"]["contraction"] < 1).all()
@@ -575,7 +575,7 @@ def test_a_target_that_nobody_measured_is_no_obstacle():
     network, _, table = small()
     ghost = table[table["time"] < 2].assign(target="ghost", range=np.nan)
     problem = probcal.Problem(network, ConstantVelocity(1.0), pd.concat([table, ghost], ignore_index=True))
-    out = assess(problem, probcal.fit(problem, EA(), predictive_draws=False))
+    out = assess(problem, probcal.fit(problem, EA()))
     assert out["verdict"].sizes["bias_label"] == 6
 
 
@@ -611,7 +611,7 @@ def test_events_that_hardly_ever_happen_raise_no_alarm():
 def test_a_single_sensor_has_no_rest_to_be_judged_by():
     network, path, table = small(1)
     problem = probcal.Problem(network, probcal.Known((np.arange(30.0), path)), table)
-    out = assess(problem, probcal.fit(problem, EA(), predictive_draws=False))
+    out = assess(problem, probcal.fit(problem, EA()))
     assert "difference" not in out["sensor_check"]
     assert not any("the rest" in text for text in out["finding"]["sentence"].values)
 
@@ -619,7 +619,7 @@ def test_a_single_sensor_has_no_rest_to_be_judged_by():
 def test_a_fit_that_is_no_answer_has_one_finding():
     network, _, table = small()
     problem = probcal.Problem(network, ConstantVelocity(1.0), table)
-    tree = probcal.fit(problem, EA(), predictive_draws=False)
+    tree = probcal.fit(problem, EA())
     tree.attrs["status"] = "at bound"
     out = assess(problem, tree)
     assert out["finding"]["kind"].values.tolist() == ["status"]
@@ -631,7 +631,7 @@ def test_the_rest_points_at_swapped_microphones():
     if not path.exists():
         pytest.skip("the recording sflab_mic_toa is not here")
     problem = sflab.problem(path, swap=(5, 8))
-    tree = probcal.fit(problem, EA(), prior=sflab.PRIOR, predictive_draws=False)
+    tree = probcal.fit(problem, EA(), prior=sflab.PRIOR)
     out = assess(problem, tree)
     gain = out["sensor_check"].to_dataset()["difference"].to_series().sort_values()
     print("\nnats by which each fits the rest better calibrated than as stated:", gain.round(1).to_dict())
@@ -649,7 +649,7 @@ def test_halves_hold_their_false_alarm_rate():
     The t of each bias, without the widening, is standard normal: its sum of squares is held to 1e-6 limits.
     """
     _, _, table, _ = LINEAR["plane"]()
-    problem, _, naive = fitted("plane", predictive_draws=False)
+    problem, _, naive = fitted("plane")
     G, V, y = naive.regression()
     base, root = np.array([d.y for d in naive.data]) - y, np.linalg.cholesky(V + G @ G.T)
     random, raised, ratios, runs = np.random.default_rng(5), 0, [], 200
@@ -659,7 +659,7 @@ def test_halves_hold_their_false_alarm_rate():
         values = table[columns].to_numpy().ravel()
         values[cells] = base + root @ random.standard_normal(len(base))
         drawn = problem.rebuild(table.assign(**dict(zip(columns, values.reshape(-1, 2).T, strict=True))))
-        out = assess(drawn, probcal.fit(drawn, MAP(), start=resting(drawn), predictive_draws=False))
+        out = assess(drawn, probcal.fit(drawn, MAP(), start=resting(drawn)))
         raised += bool(alarms(out))
         inflation = out["verdict"]["inflation"].sel(bias_label=out["halves"]["bias_label"])
         ratios.append(out["halves"]["t"].values * np.sqrt(inflation.values))

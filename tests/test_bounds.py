@@ -409,7 +409,7 @@ def test_the_map_of_a_fit_has_its_means_and_its_covariance():
     path = np.stack([np.linspace(10, 90, 15), 50 + 20 * np.sin(np.linspace(0, 5, 15))], 1)
     run = probcal.simulate(network, ConstantVelocity(1.0), np.arange(15.0), biases={}, tracks={"target": path})
     problem = Problem(network, ConstantVelocity(1.0), run.table, fix={"d0.heading": 0.2})
-    tree = probcal.fit(problem, probcal.MAP(), prior=Gaussian(), predictive_draws=False)
+    tree = probcal.fit(problem, probcal.MAP(), prior=Gaussian())
     found = bound_map(problem.rebuild(fix=()), AREA, 5, biases=tree)
     group, labels = tree["calibration"].to_dataset(), network.labels
     shift = group["mean"].to_series().reindex(labels, fill_value=0.0).to_numpy().reshape(8, 3)

@@ -122,7 +122,7 @@ def test_every_sensor_simulates_and_fits(name, d):
     motion = CV + EXTRAS[name] if name in EXTRAS else CV
     run = simulate(network, motion, np.arange(25.0), 1, share=0.5, missing=0.1, tracks={"target": path(d)})
     problem = Problem(network, motion, run.table)
-    tree = fit(problem, MAP(), predictive_draws=True)
+    tree = fit(problem, MAP(), save=("states", "predictive"))
     check_tree(tree, problem)
     # a presence is coarse, and angles in the plane tell no height
     informative = name != "presence" and not (name in FLAT and d == 3)
@@ -175,7 +175,7 @@ def test_every_method_on_a_mixed_network(method, d):
     late = run.table["sensor"].str.startswith("pole") & (run.table["target"] != "mast")
     table = run.table.drop(run.table[late & (run.table["time"] % 2 == 1)].index)
     problem = Problem(network, motions, table)
-    tree = fit(problem, method, predictive_draws=True)
+    tree = fit(problem, method, save=("states", "predictive"))
     check_tree(tree, problem)
     assert probcal.scores(tree, run.truth)["position_rmse_after"] < 3.0
     if isinstance(method, EA):
@@ -208,7 +208,7 @@ def test_every_motion_tracks(motion, d):
     network = place(sensors.ranger, d)
     run = simulate(network, motion, np.arange(25.0), 2, share=0.0, tracks={"target": path(d)})
     problem = Problem(network, motion, run.table)
-    tree = fit(problem, MAP(), predictive_draws=False)
+    tree = fit(problem, MAP())
     check_tree(tree, problem)
     # six ranges of std 1 m from 60 m around: about 1 m in the plane, 3 m upwards without a motion to help
     assert probcal.scores(tree, run.truth)["position_rmse_after"] < 5.0
@@ -232,7 +232,7 @@ def test_a_known_track_calibrates(d, std):
     run = simulate(network, drawn, np.arange(25.0), 4, share=0.5, tracks=tracks, schedule=schedule)
     problem = Problem(network, drawn | {"plane": Known(frame(d), std)}, run.table)
     assert len(problem.epochs) == 1
-    tree = fit(problem, MAP(), predictive_draws=False)
+    tree = fit(problem, MAP())
     check_tree(tree, problem)
     track = tree["track"].to_dataset()
     mine = track["epoch_target"].values == "plane"
@@ -523,7 +523,7 @@ def test_a_microphone_and_a_geophone_share_the_displacement_of_their_node():
     def sds(table):
         """Displacement over its sd, and the sd."""
         problem = Problem(network, motion, table, fix=["*.gain", "*.exponent"])
-        found = fit(problem, MAP(), predictive_draws=False)["calibration"].to_dataset()
+        found = fit(problem, MAP())["calibration"].to_dataset()
         return (found["mean"].values - list(moved.values())) / found["sd"].values, found["sd"].values
 
     score, both = sds(run.table)

@@ -144,22 +144,22 @@ def test_nodes_that_drift_are_left_out_of_the_file(moved, tmp_path):
 def test_steps_before_and_after_the_data_change_nothing_else():
     network, motion = watched()
     table = simulate(network, motion, np.arange(12.0), 1).table
-    still = probcal.fit(Problem(network, motion, table), MAP(), prior=Gaussian(), predictive_draws=False)
+    still = probcal.fit(Problem(network, motion, table), MAP(), prior=Gaussian())
     late = watched(Drift((0.0, 100.0), std=0.1))[0]
-    tree = probcal.fit(Problem(late, motion, table), MAP(), prior=Gaussian(), predictive_draws=False)
+    tree = probcal.fit(Problem(late, motion, table), MAP(), prior=Gaussian())
     group, constant = tree["calibration"].to_dataset(), still["calibration"].to_dataset()
     own = constant["bias_label"].values
     np.testing.assert_allclose(group["mean"].sel(bias_label=own), constant["mean"], rtol=1e-9)
     assert group["gamma"].sel(bias_label="b.position_x@100").item() == pytest.approx(0.0, abs=1e-9)
     early = watched(Drift((-9.0, -5.0), std=0.1))[0]
-    tree = probcal.fit(Problem(early, motion, table), MAP(), prior=Gaussian(), predictive_draws=False)
+    tree = probcal.fit(Problem(early, motion, table), MAP(), prior=Gaussian())
     both = tree["calibration"].to_dataset()["mean"].to_series()
     # the bias and a step before the data are one bias of their common spread
     wide = np.hypot(2.0, 0.1 * 2)
     other = Node("b", (50.0, 10.0), scale={"position": Bias("m", wide)})
     sensors = [other if p.name == "b" else p.nodes[0] for p in network.sensors]
     merged = Network([p.type.on(n) for p, n in zip(network.sensors, sensors, strict=True)])
-    single = probcal.fit(Problem(merged, motion, table), MAP(), prior=Gaussian(), predictive_draws=False)
+    single = probcal.fit(Problem(merged, motion, table), MAP(), prior=Gaussian())
     mean = single["calibration"].to_dataset()["mean"].to_series()
     assert both["b.position_x"] + both["b.position_x@-5"] == pytest.approx(mean["b.position_x"], rel=1e-9)
 
@@ -200,7 +200,7 @@ def test_a_sparse_prior_finds_the_jump():
 def test_both_samplers_agree_on_a_drift():
     network, motion, table, fixed = LINEAR["drifting"]()
     problem = Problem(network, motion, table, fix=fixed)
-    options = {"prior": Gaussian(), "start": resting(problem), "predictive_draws": False}
+    options = {"prior": Gaussian(), "start": resting(problem)}
     exact = probcal.fit(problem, MAP(), **options)["calibration"].to_dataset()
     drawn = probcal.fit(problem, Collapsed(chains=4, draws=1000), key=2, **options)["calibration"].to_dataset()
     error = (drawn["mean"] - exact["mean"]) / (exact["sd"] / np.sqrt(drawn["ess"]))
@@ -283,5 +283,5 @@ def test_a_node_stands_still_though_its_sensor_drifts(tmp_path):
     target = Target(ConstantVelocity(0.3), start={"position": (20.0, 5.0), "velocity": (1.0, 1.0)})
     network = Network([kind.on(node) for node in nodes])
     problem = Problem(network, target, simulate(network, target, np.arange(8.0), 0).table)
-    tree = probcal.fit(problem, MAP(), prior=Gaussian(), predictive_draws=False)
+    tree = probcal.fit(problem, MAP(), prior=Gaussian())
     assert len(probcal.write_nodes(tmp_path / "n.csv", tree).read_text().splitlines()) == 5

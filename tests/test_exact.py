@@ -133,7 +133,7 @@ def learnt():
     """EA on the plane network with one bias that is plainly there and others that are not."""
     problem, naive = linear("shifted")
     method = probcal.EA(iterations=2000, tolerance=1e-11)
-    tree = probcal.fit(problem, method, start=resting(problem), predictive_draws=False)
+    tree = probcal.fit(problem, method, start=resting(problem))
     return naive, tree
 
 

@@ -39,7 +39,7 @@ def test_unknown_noise_and_process_noise_are_estimated_along():
     motion = probcal.Target(ConstantVelocity(1.5), {"position": ((30.0, 30.0), 1.0), "velocity": (0.0, 1.0)})
     run = simulate(gauges(2.0), motion, np.arange(0, 60, 0.5), 3, share=0.3)
     guess = probcal.Target(ConstantVelocity(Unknown(0.5, 5.0)), dict(motion.start))
-    tree = fit(Problem(gauges(Unknown(0.8, 5.0)), guess, run.table), EA(), predictive_draws=False)
+    tree = fit(Problem(gauges(Unknown(0.8, 5.0)), guess, run.table), EA())
     assert tree.attrs["status"] == "converged"
     level = tree["level"].to_dataset()["std"].to_series()
     # 720 ranges, 480 left after the track: relative sd 3.2 %, so that 15 % fails in 3e-6 of seeds
@@ -56,7 +56,7 @@ def test_every_method_estimates_an_unknown_level(method):
     biases, tracks = {"gauge_1.range_offset": 3.0}, {"target": path}
     run = simulate(gauges(1.0), ConstantVelocity(0.5), np.arange(60.0), 1, biases=biases, tracks=tracks)
     problem = Problem(gauges(Unknown(3.0, 5.0)), ConstantVelocity(0.5), run.table, fix=["gauge_0.range_offset"])
-    tree = fit(problem, method, predictive_draws=False)
+    tree = fit(problem, method)
     std = float(tree["level"]["std"].values[0])
     # 360 ranges, at least 200 left after track and biases: relative sd 5 %, so that 25 % fails in 1e-6 of seeds;
     # EM holds the track at its mean and Paper B counts the data twice: both find less noise than there is
@@ -69,7 +69,7 @@ def test_a_gamma_hyper_prior_moves_the_fixed_point():
     run = simulate(gauges(1.0), ConstantVelocity(0.5), np.arange(40.0), 1, tracks={"target": path})
     problem = Problem(gauges(1.0), ConstantVelocity(0.5), run.table)
     for prior in (ARD(), ARD(2.0, 1.5)):
-        tree = fit(problem, EA(tolerance=1e-9), prior=prior, predictive_draws=False)
+        tree = fit(problem, EA(tolerance=1e-9), prior=prior)
         group = tree["calibration"].to_dataset()
         z = group["mean"].values / problem.scales
         wanted = (group["gamma"].values + 2 * (prior.shape - 1)) / (z**2 + 2 * prior.rate)
@@ -85,5 +85,5 @@ def test_the_start_finds_the_track_without_any_hint():
     tracks = {"far": far, "near": near}
     run = simulate(gauges(1.0), {"far": ConstantVelocity(0.5), "near": ConstantVelocity(0.5)}, np.arange(40.0), 2,
                    share=0.0, tracks=tracks)  # fmt: skip
-    tree = fit(Problem(gauges(1.0), ConstantVelocity(0.5), run.table), EA(), predictive_draws=False)
+    tree = fit(Problem(gauges(1.0), ConstantVelocity(0.5), run.table), EA())
     assert probcal.scores(tree, run.truth)["position_rmse_after"] < 3.0

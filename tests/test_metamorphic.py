@@ -259,6 +259,6 @@ def test_the_fit_as_a_whole():
     method = probcal.MAP(tolerance=1e-9)
     for angle, shift in ((0.0, 0.0), (1.1, 300.0), (-2.5, -80.0)):
         problem = world.moved(angle, np.array([shift, -shift])).problem(table.sample(frac=1, random_state=1))
-        group = probcal.fit(problem, method, predictive_draws=False)["calibration"].to_dataset()
+        group = probcal.fit(problem, method)["calibration"].to_dataset()
         z = dict(zip(problem.labels, (group["mean"] / group["scale"]).values, strict=True))
         same(vectors(z, 0.0, 0.0), vectors(expected.mean, angle, 0.0))

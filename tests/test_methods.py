@@ -23,7 +23,7 @@ from probcal.priors import PRIORS
 def solve(method, prior=None, made=None, **options):
     network, motion, table, _ = shifted() if made is None else made
     problem = probcal.Problem(network, motion, table)
-    tree = probcal.fit(problem, method, prior=prior, start=resting(problem), predictive_draws=False, **options)
+    tree = probcal.fit(problem, method, prior=prior, start=resting(problem), **options)
     return reference.Linear(network, motion, table), problem, tree
 
 
@@ -128,7 +128,7 @@ def test_least_squares_does_not_know_the_origin():
         run = probcal.simulate(network, probcal.ConstantVelocity(0.5), np.arange(12.0), 1, biases={},
                                tracks={"target": path + shift})  # fmt: skip
         problem = probcal.Problem(network, probcal.ConstantVelocity(0.5), run.table, fix=["*.range_scale"])
-        found.append(probcal.fit(problem, probcal.LeastSquares(), predictive_draws=False))
+        found.append(probcal.fit(problem, probcal.LeastSquares()))
     means = [tree["calibration"]["mean"].values for tree in found]
     np.testing.assert_allclose(means[1], means[0], atol=1e-3)
 
@@ -146,11 +146,11 @@ def test_sigma_points_change_nothing_where_sensors_are_linear(name, rule):
     network, motion, table, fixed = LINEAR[name]()
     problem = probcal.Problem(network, motion, table, fix=fixed)
     found = [
-        probcal.fit(problem, EM(iterations=40, tolerance=0.0, linearisation=choice), start=resting(problem),
-                    predictive_draws=False)["calibration"]["mean"].values
+        probcal.fit(problem, EM(iterations=40, tolerance=0.0, linearisation=choice), start=resting(problem))
         for choice in ("extended", rule)
-    ]  # fmt: skip
-    np.testing.assert_allclose(found[1], found[0], atol=1e-6)
+    ]
+    first, second = (tree["calibration"]["mean"].values for tree in found)
+    np.testing.assert_allclose(second, first, atol=1e-6)
 
 
 @pytest.mark.parametrize("rule", ["unscented", "cubature"])
@@ -163,9 +163,7 @@ def test_sigma_points_where_sensors_are_bent(method, rule):
     path = np.stack([np.linspace(5, 55, 30), 20 + 8 * np.sin(np.linspace(0, 6, 30))], 1)
     run = probcal.simulate(network, probcal.ConstantVelocity(1.0), np.arange(30.0), 3, tracks={"target": path})
     problem = probcal.Problem(network, probcal.ConstantVelocity(1.0), run.table)
-    found = [
-        probcal.fit(problem, method(linearisation=choice), predictive_draws=False) for choice in ("extended", rule)
-    ]
+    found = [probcal.fit(problem, method(linearisation=choice)) for choice in ("extended", rule)]
     means = [tree["calibration"]["mean"].values for tree in found]
     moved = np.abs(means[1] - means[0]) / problem.scales
     assert moved.max() > 1e-6, "the rule must matter"
@@ -280,7 +278,7 @@ def test_outlying_rows_are_listed(noise, method):
     table["range"] = clean + 0.5 * np.random.default_rng(1).normal(size=len(table))
     hit = np.arange(3, len(table), 17)
     table.loc[hit, "range"] += 8.0
-    tree = probcal.fit(probcal.Problem(network, motion, table), method, predictive_draws=False)
+    tree = probcal.fit(probcal.Problem(network, motion, table), method)
     listed = probcal.outliers(tree)
     assert set(listed["row"][: len(hit)]) == set(hit), "the rows that were hit stand first"
     assert (np.diff(listed["weight"]) >= 0).all()
@@ -330,7 +328,7 @@ def test_least_squares_with_known_targets_is_the_closed_form():
     data = pd.DataFrame(rows, columns=["time", "sensor", "target", "position_x", "position_y"])
     for chosen in (data[data["target"] == "car"], data):
         problem = probcal.Problem(network, motion, chosen)
-        tree = probcal.fit(problem, probcal.LeastSquares(), predictive_draws=False)
+        tree = probcal.fit(problem, probcal.LeastSquares())
         known = chosen[chosen["target"] == "car"].reset_index(drop=True)
         stated = known["sensor"].map({"a": 0, "b": 1}).to_numpy()
         truth = path[["position_x", "position_y"]].to_numpy()[known["time"].astype(int)]

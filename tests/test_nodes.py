@@ -213,7 +213,7 @@ def test_the_nodes_of_a_fit_are_written_with_bias_and_sd(tmp_path):
     built = Network([sensors.radar.on(node) for node in nodes])
     path = np.stack([np.linspace(10, 70, 8), np.linspace(60, 20, 8)], 1)
     run = simulate(built, ConstantVelocity(0.1), np.arange(8.0), 0, tracks={"target": path})
-    tree = fit(Problem(built, ConstantVelocity(0.1), run.table, fix={"c.heading": 0.25}), MAP(), predictive_draws=False)
+    tree = fit(Problem(built, ConstantVelocity(0.1), run.table, fix={"c.heading": 0.25}), MAP())
     cells = pd.read_csv(write_nodes(tmp_path / "fit.csv", tree)).set_index("node")
     mean, sd = (tree["calibration"][name].to_series() for name in ("mean", "sd"))
     assert list(cells.columns) == ["x", "y", "heading [deg]", "sd_position_x", "sd_position_y", "sd_heading [deg]"]

@@ -160,7 +160,7 @@ LONG = ("arrivals", "bearings", "clocks", "trackers", "mixed", "arrivals in spac
 def test_a_gauge_is_no_answer_until_anchored_as_advised(name):
     kinds, dimension, scale, motion, expected = CASES[name]
     free = problem_of(kinds, dimension, scale, motion)
-    tree = fit(free, EA(), predictive_draws=False)
+    tree = fit(free, EA())
     assert tree.attrs["status"] == "at bound" or "Weakly determined" in tree.attrs["message"]
     assert expected[0].split(":")[0] in tree.attrs["message"]
     group = observability(free)["direction"].to_dataset()
@@ -170,7 +170,7 @@ def test_a_gauge_is_no_answer_until_anchored_as_advised(name):
     again = observability(anchored)
     assert again.attrs["weak"] == 0
     assert again.attrs["status"] == "determined"
-    found = fit(anchored, EA(), predictive_draws=False)
+    found = fit(anchored, EA())
     assert found.attrs["status"] == "converged"
     assert "Weakly determined" not in found.attrs["message"]
     error = np.abs(found["calibration"]["mean"].values) / found["calibration"]["scale"].values  # the truth is 0

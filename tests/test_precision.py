@@ -74,7 +74,7 @@ def fitted(data):
     start = {"position": ((5.0, 10.0), 5.0), "velocity": ((4.0, 2.0), 0.5)}
     motion = Target(ConstantVelocity(0.3), start)
     problem = probcal.Problem(Network([probcal.sensors.radar.on(node) for node in nodes]), motion, data)
-    return problem, probcal.fit(problem, probcal.EA(iterations=20), predictive_draws=False)
+    return problem, probcal.fit(problem, probcal.EA(iterations=20))
 
 
 def start_process(mode):

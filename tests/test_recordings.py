@@ -41,7 +41,7 @@ def displaced(tree, truth, nodes, axes):
 
 def fit_sflab(swap, starts=1, prior=None):
     data = recording("sflab_mic_toa/dataset_1_exp2.mat")
-    tree = probcal.fit(sflab.problem(data, swap), EA(), prior=prior, starts=starts, predictive_draws=False)
+    tree = probcal.fit(sflab.problem(data, swap), EA(), prior=prior, starts=starts)
     assert tree.attrs["status"] == "converged"
     found = displaced(tree, sflab.truth(data, swap), [f"mic_{n}" for n in range(1, 9)], "xy")
     evidence = f"log evidence {tree.attrs['log_evidence']:.1f}"
@@ -84,11 +84,11 @@ def headings(tree):
 @pytest.mark.slow
 def test_robots_know_their_headings():
     data = recording("mrclam/MRCLAM_Dataset6")
-    plain = headings(probcal.fit(robots.problem(data), EA(), predictive_draws=False))
+    plain = headings(probcal.fit(robots.problem(data), EA()))
     # regression of the bearings on the motion capture, in deg: the heading bias is minus the bearing bias
     assert plain[4] == pytest.approx(0.81, abs=0.15)
     turned = robots.problem(data, turn={"robot_2": np.deg2rad(5.0)})
-    found = headings(probcal.fit(turned, EA(), predictive_draws=False))
+    found = headings(probcal.fit(turned, EA()))
     assert plain[2] - found[2] == pytest.approx(5.0, abs=0.15)
 
 
@@ -97,7 +97,7 @@ def test_a_turned_robot_is_determined_before_and_after_the_fit():
     problem = robots.problem(data)
     before = probcal.observability(problem)
     assert before["bias"]["verdict"].sel(bias_label="robot_4.heading").item() == "determined"
-    tree = probcal.assess(problem, probcal.fit(problem, EA(), predictive_draws=False))
+    tree = probcal.assess(problem, probcal.fit(problem, EA()))
     row = probcal.summary(tree).set_index("bias").loc["robot_4.heading"]
     assert row["verdict"] == "determined"
     assert abs(row["mean"]) > 5 * row["sd"], "determined and biased"
@@ -111,7 +111,7 @@ def test_delays_of_receivers_repeat_over_sets():
     for number in range(1, 5):
         path = recording(f"mlat_locards/set_{number}.csv")
         problem = receivers.problem(path)
-        tree = probcal.fit(problem, EA(), predictive_draws=False)
+        tree = probcal.fit(problem, EA())
         assert tree.attrs["status"] == "converged"
         group = pd.Series(receivers.groups(receivers.messages(path)[0]))
         members = group.index[group == group.mode()[0]]
@@ -129,7 +129,7 @@ def test_delays_of_receivers_repeat_over_sets():
 def test_swapped_anchors_of_a_flight_are_found():
     data, swap = recording("uwb_tdoa"), (3, 4)
     problem = tdoa_flight.problem(data, swap)
-    tree = probcal.fit(problem, EA(), prior=tdoa_flight.PRIOR, predictive_draws=False)
+    tree = probcal.fit(problem, EA(), prior=tdoa_flight.PRIOR)
     assert tree.attrs["status"] == "converged"
     truth = tdoa_flight.truth(data, swap)
     found = displaced(tree, truth, [f"anchor_{n}" for n in range(8)], "xyz")

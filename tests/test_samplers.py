@@ -323,7 +323,7 @@ def test_wrong_settings_are_refused():
 
 
 def test_a_flat_prior_on_a_determined_problem_is_the_likelihood():
-    problem, tree, linear = fitted("plane", Collapsed(draws=500, sweeps=1), Flat(), predictive_draws=False)
+    problem, tree, linear = fitted("plane", Collapsed(draws=500, sweeps=1), Flat())
     broad = np.where([label in set(np.array(problem.labels)[problem.surveyed]) for label in linear.labels], 1.0, 1e-9)
     check_exact(tree, reference.dense(linear, broad).z, linear.labels)
 
@@ -408,7 +408,7 @@ def test_a_process_noise_hardly_known_keeps_its_lower_tail():
 
     value = np.asarray(jax.lax.map(evidence, grid))
     mass = np.cumsum(np.exp(value - value.max()))
-    tree = probcal.fit(problem, NUTS(draws=600), prior=Gaussian(), key=1, start=point, predictive_draws=False)
+    tree = probcal.fit(problem, NUTS(draws=600), prior=Gaussian(), key=1, start=point)
     drawn = np.log(tree["posterior"]["level"].values.ravel() / 0.3)
     assert tree.attrs["status"] == "converged", tree.attrs["message"]
     for share in (0.01, 0.05, 0.25, 0.5, 0.75, 0.95):

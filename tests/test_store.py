@@ -30,7 +30,7 @@ def slowly(*_):
     print("chunk", flush=True)
     time.sleep({pause})
 tree = probcal.fit(problem, {method!r}, prior=Gaussian(), start=resting(problem), key=5, store={store!r},
-                   resume=True, progress=slowly, predictive_draws=False)
+                   resume=True, progress=slowly)
 probcal.save(tree, {out!r})
 """
 
@@ -42,7 +42,7 @@ def problem():
 
 def fitted(method=METHOD, key=5, **options):
     p = problem()
-    return probcal.fit(p, method, prior=Gaussian(), start=resting(p), key=key, predictive_draws=False, **options)
+    return probcal.fit(p, method, prior=Gaussian(), start=resting(p), key=key, **options)
 
 
 def killed(tmp_path, method, kills, seed):

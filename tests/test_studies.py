@@ -44,7 +44,7 @@ def test_c1_at_one_share_reproduces_the_trial_and_equals_single_fits():
     assert (found["status"].sel(estimator=["ea", "em-ea", "oracle"]) != "at bound").all()
     problem, truth = radars.setting(5, share=0.3, scenario="C1")
     for name, method, prior in (("ea", EA(), None), ("em-ea", EMEA(), None), ("ml", MAP(), Flat())):
-        tree = probcal.fit(problem, method, prior=prior, predictive_draws=False)
+        tree = probcal.fit(problem, method, prior=prior)
         one = found.sel(scenario="C1", share=0.3, estimator=name, run=5)
         group = tree["calibration"].to_dataset()
         z = group["mean"].values / problem.scales

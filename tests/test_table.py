@@ -84,7 +84,7 @@ def test_track_follows_the_fit_in_fixed_biases_levels_and_with_sensors_missing()
     problem = Problem(built, CV, table, fix={"a.range_offset": 0.0})
     from probcal import EA
 
-    done = fit(problem, EA(), predictive_draws=False)
+    done = fit(problem, EA())
     again = track(Problem(built, CV, table), done)
     for name in ("mean", "sd"):
         np.testing.assert_allclose(again["track"][name].values, done["track"][name].values, rtol=1e-3, atol=1e-3)

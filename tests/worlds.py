@@ -205,8 +205,8 @@ def exact(name):
 def fitted(name):
     """The fit of a world by MAP under a standard normal prior: exact, so that nobody needs to fit it again."""
     problem, _ = linear(name)
-    prior, wanted = probcal.priors.Gaussian(), None if name in DRAWN else False
-    return probcal.fit(problem, probcal.MAP(), prior=prior, start=resting(problem), predictive_draws=wanted)
+    save = ("states", "predictive") if name in DRAWN else ()
+    return probcal.fit(problem, probcal.MAP(), prior=probcal.priors.Gaussian(), start=resting(problem), save=save)
 
 
 @sensor(height=Channel("m", std=1.0))

@@ -3,6 +3,7 @@
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
@@ -19,6 +20,7 @@ from probcal.types import float64
 
 QUARTERS = 4
 COPIES = 2000  # most biases of all pieces together
+MOST = 1000  # draws behind the limits of a NEES
 
 
 @float64
@@ -39,7 +41,10 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     the tree is no fit of the problem.
     """
     fit = take_up(problem, tree)
-    replicas = predictive.check(fit, tree, as_key(key))
+    keys = jax.random.split(as_key(key))
+    many = truth is not None and truth.tracks is not None
+    drawn = predictive.draws_of(fit, tree, keys[0], MOST if many else predictive.DRAWS)
+    replicas = predictive.check(fit, drawn, keys[1])
     found = residuals.innovations(fit, replicas.kurtosis)
     groups: dict[str, xr.Dataset] = {"epoch_check": checks.by_epoch(fit, found.innovations)}
     groups["datum_check"], findings = checks.by_datum(fit, found.innovations, tree)
@@ -66,7 +71,7 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     if scaled is not None:
         groups["sensitivity"] = scaled
     if truth is not None:
-        _score(fit, tree, truth, groups)
+        _score(fit, tree, drawn, truth, groups)
     texts = {name: ("finding", np.array([getattr(f, name) for f in findings], str)) for name in Finding._fields}
     groups["finding"] = xr.Dataset(texts)
     result = tree.copy()
@@ -232,12 +237,14 @@ def _halves(
     return group
 
 
-def _score(fit: Fitted, tree: xr.DataTree, truth: Truth, groups: dict[str, xr.Dataset]) -> None:
+def _score(
+    fit: Fitted, tree: xr.DataTree, drawn: predictive.Drawn, truth: Truth, groups: dict[str, xr.Dataset]
+) -> None:
     """Add NEES of positions by epoch to `epoch_check`, and those of all positions and biases to its attributes."""
     check = groups["epoch_check"]
     for r in range(len(fit.problem.epochs)):
         s = suffix(fit.problem, r)
-        found = nees.of_positions(tree, truth, s, RATE)
+        found = nees.of_positions(tree, np.asarray(drawn.states[r]), truth, s, RATE)
         if found is not None:
             track = tree["track"].to_dataset()
             coords = {

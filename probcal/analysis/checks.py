@@ -94,9 +94,8 @@ def by_channel(
         findings.append(Finding("whiteness", names[order[0]], text))
     first = np.unique(group, return_index=True)[1]
     for kind, of in (("misfit", replicas.misfit), ("mean", replicas.mean)):
-        if of is not None:
-            values[f"p_{kind}"] = of[first]
-            findings += _unlike_replicas(kind, names, of[first])
+        values[f"p_{kind}"] = of[first]
+        findings += _unlike_replicas(kind, names, of[first])
     coords = {name: ("part", labels[name].to_numpy(str)) for name in labels}
     return xr.Dataset({name: ("part", value) for name, value in values.items()}, coords), findings
 

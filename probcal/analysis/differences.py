@@ -126,7 +126,7 @@ def _prediction(methods: dict[str, xr.Dataset]) -> list[Finding]:
     found = list[Finding]()
     known = {name: method.attrs for name, method in methods.items() if "elpd" in method.attrs}
     if missing := [name for name in methods if name not in known]:
-        text = "no elpd, it has no finite log_likelihood of every draw; fit with predictive_draws=True writes one"
+        text = "no elpd, it has no finite log_likelihood of every draw; a row has probability zero at some draw"
         found.append(Finding("elpd", missing[0], f"{', '.join(missing)}: {text}"))
     for name, at in known.items():
         if at["bad_k"] > BAD:

@@ -25,20 +25,20 @@ class Nees(NamedTuple):
     upper: float
 
 
-def of_positions(tree: xr.DataTree, truth: Truth, suffix: str, rate: float) -> Nees | None:
-    """NEES of the positions of one recursion, a dimension; None without draws of states or true positions.
+def of_positions(tree: xr.DataTree, states: np.ndarray, truth: Truth, suffix: str, rate: float) -> Nees | None:
+    """NEES of the positions of one recursion, a dimension, from draws of its states (D, E, n); None without a truth.
 
     Errors of neighbouring epochs are alike: the limits of the mean are those of the posterior's own draws.
     """
-    track, posterior = tree["track"].to_dataset(), tree["posterior"].to_dataset()
+    track = tree["track"].to_dataset()
     axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in track[f"component{suffix}"].values]
-    if f"state{suffix}" not in posterior or truth.tracks is None:
+    if truth.tracks is None:
         return None
     chosen = {f"component{suffix}": axes}
     true = truth.positions(track[f"epoch_time{suffix}"].values, track[f"epoch_target{suffix}"].values, len(axes))
     known = np.isfinite(true).all(1)
-    draws = posterior[f"state{suffix}"].sel(chosen).values
-    draws = draws.reshape(-1, *draws.shape[2:])[:, known]  # (S, E, d)
+    names = track[f"component{suffix}"].values.tolist()
+    draws = states[:, known][:, :, [names.index(axis) for axis in axes]]  # (S, E, d)
     if not known.any() or len(draws) < 10 * len(axes):
         return None
     deviation = draws - draws.mean(0)

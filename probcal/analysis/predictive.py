@@ -16,44 +16,53 @@ from probcal import rows
 from probcal.analysis.fitted import Fitted
 from probcal.noise import Bernoulli, Gaussian
 from probcal.problem import Spec, System
-from probcal.smoothing.draws import predictive
+from probcal.smoothing.draws import draw
 from probcal.tree import suffix
 
 DRAWS = 200
-AT_FIT = 64  # replicas at the fit itself, where a tree holds no draws
+VALUES = 20_000_000  # of all states drawn
+LEAST = 20  # draws, however many states there are
 
 
 class Drawn(NamedTuple):
-    """Draws of biases (D, M) and states (D, E, n), and replicas (D, N, C) of each block at them."""
+    """Draws of biases (D, M), log levels (D, H) and states (D, E, n); replicas (D, N, C) where a tree holds them."""
 
     z: jax.Array
+    levels: jax.Array
     states: tuple[jax.Array, ...]
-    replicas: list[jax.Array]
+    replicas: list[jax.Array] | None
 
 
 class Predictive(NamedTuple):
-    """Of every datum: p-values (D,) of its sensor's channel (None without posterior draws), and excess kurtosis (D,).
+    """Of every datum: p-values (D,) of its sensor's channel, and excess kurtosis (D,) of what is standardised.
 
     `misfit` is the probability that a replica has a larger -log p than the data, `mean` a larger mean residual.
     """
 
-    misfit: np.ndarray | None
-    mean: np.ndarray | None
+    misfit: np.ndarray
+    mean: np.ndarray
     kurtosis: np.ndarray
 
 
 @partial(jax.jit, static_argnames=("spec", "count"))
 def _discrepancies(
-    spec: Spec, system: System, levels: jax.Array, drawn: Drawn, sensors: tuple[jax.Array, ...], count: int
-) -> tuple[list[jax.Array], list[jax.Array]]:
+    spec: Spec, system: System, levels: jax.Array, drawn: Drawn, sensors: tuple[jax.Array, ...], count: int,
+    key: jax.Array,
+) -> tuple[list[jax.Array], list[jax.Array]]:  # fmt: skip
     """By draw, data or replica, sensor and channel (D, 2, 2, S, C): -log p and sum of scores; fourth powers (N, C)."""
 
-    def one(draw):
-        found, fourth = [], []
-        parts = zip(spec.blocks, system.rows, spec.recursion, draw.replicas, sensors, strict=True)
-        for block, data, r, replica, sensor in parts:
+    def one(fourth: list[jax.Array], given: tuple[Drawn, jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
+        draw, seed = given
+        found, powers = [], []
+        for b, (block, data, r, sensor) in enumerate(
+            zip(spec.blocks, system.rows, spec.recursion, sensors, strict=True)
+        ):
             predicted = rows.predict(block, data, draw.states[r], draw.z)
             std = rows.noise_std(data, levels)
+            if draw.replicas is None:
+                replica = rows.sample(block, data, predicted, draw.levels, jax.random.fold_in(seed, b))
+            else:
+                replica = draw.replicas[b]
 
             def of(y, block=block, data=data, predicted=predicted, std=std, sensor=sensor):
                 version = data._replace(y=y)
@@ -62,31 +71,27 @@ def _discrepancies(
                 misfit = -rows.log_likelihood(block, version, predicted, levels)
                 return jax.ops.segment_sum(jnp.stack([misfit, v], 1), sensor, count), v**4
 
-            sums, powers = jax.vmap(of)(jnp.stack([data.y, replica]))
+            sums, power = jax.vmap(of)(jnp.stack([data.y, replica]))
             found.append(sums)
-            fourth.append(powers[1])
-        return found, fourth
+            powers.append(power[1])
+        return [a + b for a, b in zip(fourth, powers, strict=True)], found
 
-    found, fourth = jax.lax.map(one, drawn)
-    return found, [jnp.mean(f, 0) for f in fourth]
+    total = drawn.z.shape[0]
+    nothing = [jnp.zeros(data.y.shape) for data in system.rows]
+    fourth, found = jax.lax.scan(one, nothing, (drawn, jax.random.split(key, total)))
+    return found, [power / total for power in fourth]
 
 
-def check(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Predictive:
-    """P-values by sensor and channel at up to 200 draws, where the tree has states and replicas; and kurtosis."""
-    problem = fit.problem
-    drawn = _of_tree(fit, tree)
-    known = drawn is not None
+def check(fit: Fitted, drawn: Drawn, key: jax.Array) -> Predictive:
+    """P-values by sensor and channel, and kurtosis, at up to 200 draws."""
+    problem, total = fit.problem, drawn.z.shape[0]
+    chosen = np.linspace(0, total - 1, min(DRAWS, total)).astype(int)
+    drawn = jax.tree.map(lambda a: a[chosen], drawn)
     gaussian = all(isinstance(channel.noise, Gaussian) for block in problem.spec.blocks for channel in block.channels)
-    if drawn is None:
-        if gaussian:
-            return Predictive(None, None, np.zeros(len(fit.data)))
-        drawn = _at_fit(fit, key)
     sensors = tuple(jnp.asarray(problem.measurements.sensor[index]) for index in problem.row_index)
     count = len(problem.network.sensors)
-    found, fourth = _discrepancies(problem.spec, problem.system, fit.point.levels, drawn, sensors, count)
+    found, fourth = _discrepancies(problem.spec, problem.system, fit.point.levels, drawn, sensors, count, key)
     kurtosis = np.zeros(len(fit.data)) if gaussian else _exact(fit, fit.flat(fourth) - 3.0)
-    if not known:
-        return Predictive(None, None, kurtosis)
     parts: tuple[list[Any], list[Any]] = ([], [])
     for sensor, values in zip(sensors, map(np.asarray, found), strict=True):
         above = (values[:, 1] > values[:, 0]).mean(0) + 0.5 * (values[:, 1] == values[:, 0]).mean(0)  # (S, 2, C)
@@ -106,32 +111,38 @@ def _exact(fit: Fitted, kurtosis: np.ndarray) -> np.ndarray:
     return np.maximum(np.where(fit.flat(answers), 1 / np.maximum(variance, 1e-12) - 6, kurtosis), -2.0)
 
 
-def _of_tree(fit: Fitted, tree: xr.DataTree) -> Drawn | None:
-    """Some of the draws that a tree holds, or None."""
+def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array, most: int) -> Drawn:
+    """At most so many draws of a fit, biases and levels as its tree has them.
+
+    The states are those of the tree where it holds them; else a trajectory is drawn for each draw of the biases, from
+    the Gaussian of the problem linearised at the fit.
+    """
     posterior, problem = tree["posterior"].to_dataset(), fit.problem
     names = [f"state{suffix(problem, r)}" for r in range(len(problem.epochs))]
-    if not set(names) <= set(posterior.data_vars) or "posterior_predictive" not in tree.children:
-        return None
     total = posterior.sizes["chain"] * posterior.sizes["draw"]
-    chosen = np.linspace(0, total - 1, min(DRAWS, total)).astype(int)
+    most = min(most, total, max(VALUES // sum(part.drift.size for part in problem.system.recursions), LEAST))
+    chosen = np.linspace(0, total - 1, most).astype(int)
 
-    def thin(values: np.ndarray) -> np.ndarray:
+    def thin(values: np.ndarray) -> Any:
         return values.reshape(total, *values.shape[2:])[chosen]
 
-    flat, replicas, start = thin(tree["posterior_predictive"].to_dataset()["y"].values), [], 0
-    for data, (row, channel) in zip(problem.system.rows, fit.picks, strict=True):
-        block = np.zeros((len(chosen), *data.y.shape))
-        block[:, row, channel] = flat[:, start : start + len(row)]
-        replicas.append(jnp.asarray(block))
-        start += len(row)
+    z = jnp.asarray(thin(posterior["bias"].values) / problem.scales)
+    levels = jnp.broadcast_to(fit.point.levels, (most, len(problem.levels)))
+    if "level" in posterior:
+        guess = np.array([level.guess for level in problem.levels])
+        levels = jnp.asarray(np.log(thin(posterior["level"].values) / guess))
+    if not set(names) <= set(posterior.data_vars):
+        covariance = jnp.asarray(fit.covariance)
+        drawn, _ = draw(problem.spec, problem.system, fit.point, covariance, z, levels, key)
+        return Drawn(z, levels, drawn.states, None)
     states = tuple(jnp.asarray(thin(posterior[name].values)) for name in names)
-    return Drawn(jnp.asarray(thin(posterior["bias"].values) / problem.scales), states, replicas)
-
-
-def _at_fit(fit: Fitted, key: jax.Array) -> Drawn:
-    """Replicas at the fit itself."""
-    levels, z, *states = (
-        jnp.asarray(np.tile(x, (AT_FIT,) + (1,) * x.ndim)) for x in (fit.point.levels, fit.point.z, *fit.point.states)
-    )
-    _, replicas = predictive(fit.problem.spec, fit.problem.system, levels, z, tuple(states), key)
-    return Drawn(z, tuple(states), replicas)
+    replicas = tree["posterior_predictive"].to_dataset()["y"] if "posterior_predictive" in tree.children else None
+    if replicas is None or replicas.sizes["draw"] < posterior.sizes["draw"]:
+        return Drawn(z, levels, states, None)
+    flat, blocks, start = thin(replicas.values), [], 0
+    for data, (row, channel) in zip(problem.system.rows, fit.picks, strict=True):
+        block = np.zeros((most, *data.y.shape))
+        block[:, row, channel] = flat[:, start : start + len(row)]
+        blocks.append(jnp.asarray(block))
+        start += len(row)
+    return Drawn(z, levels, states, blocks)

@@ -19,8 +19,9 @@ def power_scaling(tree: xr.DataTree) -> xr.Dataset | None:
     if not {"log_prior", "log_likelihood"} <= set(tree.children):
         return None
     kept = {name: tree[name].to_dataset() for name in ("posterior", "log_prior", "log_likelihood")}
-    kept["posterior"] = kept["posterior"][["bias"]]
-    summed = kept["log_likelihood"]["y"].sum("datum")
+    by_datum = kept["log_likelihood"]["draw"]  # of large data some of the draws only
+    kept |= {name: kept[name][["bias"]].sel(draw=by_datum) for name in ("posterior", "log_prior")}
+    summed = kept["log_likelihood"]["y"].sum("datum", dtype=float)
     kept["log_likelihood"] = xr.Dataset({"y": summed.expand_dims(datum=1, axis=-1)})
     shuffled = dict(kept)
     order = np.random.default_rng(0).permutation(summed.size)

@@ -1,5 +1,6 @@
 """The one verb: `fit(problem, method)` turns a problem into a DataTree, whatever the method."""
 
+from collections.abc import Collection
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,14 @@ from probcal.inference.sampling import sample
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
-from probcal.smoothing.draws import draw, predictive, residuals_of
+from probcal.smoothing.draws import draw, draw_biases, draws_a_chain, residuals_of
 from probcal.smoothing.information import at_levels, moments
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start, follow_states, further_starts, track_mode
 from probcal.types import float64
 
-CHAINS, DRAWS = 4, 250
+CHAINS = 4  # of the draws of a Gaussian, so that ArviZ reads them as it reads a sampler's
+SAVE = ("states", "predictive")
 
 
 @float64
@@ -39,7 +41,7 @@ def fit(
     start: Point | None = None,
     starts: int = 1,
     progress: Progress | None = None,
-    predictive_draws: bool | None = None,
+    save: Collection[str] = (),
     store: str | PathLike[str] | None = None,
     resume: bool = False,
 ) -> xr.DataTree:
@@ -48,18 +50,19 @@ def fit(
     `method` is a value (`EA()` by default); `prior` defaults to the method's own; `key` is a seed or jax key
     of the draws and of further starts; `start` replaces the automatic start. `starts` runs the method from so many
     starts, the further ones with two nodes swapped or a share of the biases drawn: the best optimum is reported,
-    all of them with their evidence in the group `optimum`. `predictive_draws` forces or forbids the groups of
-    draws by datum and of trajectories, by default written up to 2e7 values each. A sampler (`Collapsed()`, `NUTS()`,
-    `SVI()`) writes its draws to the folder `store` while it runs; `resume` goes on where a killed run of the same
-    settings stopped, with the draws of an uninterrupted one; Ctrl-C leaves what was drawn. The attributes `status` and
-    `message` say what the fit is worth. Raises `InputError` for a prior that the method does not take and
-    `FitError` where a flat prior leaves a singular problem without any interval.
+    all of them with their evidence in the group `optimum`. `save` names draws that the tree keeps beside those of the
+    biases and of the log-likelihood: "states" of every epoch (large), "predictive" replicas of the data. A
+    sampler (`Collapsed()`, `NUTS()`, `SVI()`) writes its draws to the folder `store` while it runs; `resume` goes on
+    where a killed run of the same settings stopped, with the draws of an uninterrupted one; Ctrl-C leaves what was
+    drawn. The attributes `status` and `message` say what the fit is worth. Raises `InputError` for a prior that the
+    method does not take and `FitError` where a flat prior leaves a singular problem without any interval.
     """
     method = EA() if method is None else method
     if not isinstance(method, Method):
         raise InputError(f"method must be a value such as EA() or MAP(), got {method!r}")
     prior = choose_prior(method, prior)
     check_problem(problem)
+    kept = _kept(save)
     if starts < 1:
         raise InputError(f"starts={starts}: at least one start is needed")
     given, problem = problem, method.prepare(problem)
@@ -68,17 +71,28 @@ def fit(
     points = [first, *further_starts(problem, starts - 1, keys[2])]
     seed = int(key) if isinstance(key, (int, np.integer)) else -1
     if isinstance(method, Sampler):
-        return _sampled(problem, method, prior, points, keys, seed, progress, predictive_draws, store, resume)
+        return _sampled(problem, method, prior, points, keys, seed, progress, kept, store, resume)
     assert isinstance(method, Maximiser)
     outcomes = [maximise(method, problem, prior, point, progress) for point in points]
     best = max(range(starts), key=lambda k: _rank(prior, outcomes[k]))
-    tree_ = tree.build(problem, _result(problem, method, prior, outcomes[best], keys, seed, predictive_draws))
+    tree_ = tree.build(problem, _result(problem, method, prior, outcomes[best], keys, seed, kept))
     return tree.add_optima(tree_, problem, outcomes, best) if starts > 1 else tree_
+
+
+def _kept(save: Collection[str]) -> tuple[str, ...]:
+    """What is kept of every draw, in the words of `smoothing.draws`; raises `InputError` for what cannot be saved."""
+    names = (save,) if isinstance(save, str) else tuple(save)
+    for name in names:
+        if name not in SAVE:
+            raise InputError(
+                f'fit: save names "{name}", which is no group of draws; give "states", "predictive" or both'
+            )
+    return ("log_likelihood", *(word for name, word in zip(SAVE, ("states", "replicas"), strict=True) if name in names))
 
 
 def _sampled(
     problem: Problem, method: Sampler, prior: Prior, points: list[Point], keys: jax.Array, seed: int,
-    progress: Progress | None, wanted: bool | None, store: str | PathLike[str] | None, resume: bool,
+    progress: Progress | None, keep: tuple[str, ...], store: str | PathLike[str] | None, resume: bool,
 ) -> xr.DataTree:  # fmt: skip
     """The tree of a sampler, from the best of several starts."""
     best, outcomes = 0, []
@@ -90,7 +104,7 @@ def _sampled(
         problem, method, prior, points[best], keys[0], progress=progress,
         store=None if store is None else Path(store), resume=resume, fallback=NUTS(),
     )  # fmt: skip
-    found = tree.build(problem, result(problem, prior, run, keys[1], seed, wanted))
+    found = tree.build(problem, result(problem, prior, run, keys[1], seed, keep))
     return tree.add_optima(found, problem, outcomes, best) if len(points) > 1 else found
 
 
@@ -110,22 +124,16 @@ def _rank(prior: Prior, outcome: Outcome) -> tuple[bool, bool, float]:
 
 
 def _result(
-    problem: Problem, method: Method, prior: Prior, outcome: Outcome, keys: jax.Array, seed: int, wanted: bool | None
+    problem: Problem, method: Method, prior: Prior, outcome: Outcome, keys: jax.Array, seed: int, keep: tuple[str, ...]
 ) -> tree.Result:
     spec, system, point = problem.spec, problem.system, outcome.point
     found = outcome.laplace
     if not bool(jnp.isfinite(found.covariance).all()):  # a flat prior on a singular problem: no interval exists
         raise FitError(outcome.message)
-    z, states, spread = draw(spec, system, point, found.covariance, keys[0], CHAINS * DRAWS)
-    data = sum(int(np.asarray(r.mask).size) for r in system.rows) * CHAINS * DRAWS
-    size = sum(s.size for s in states)
-    by_datum = data <= tree.LARGEST if wanted is None else wanted
-    log_likelihood, replicas = (None, None)
-    if by_datum:
-        levels = jnp.broadcast_to(point.levels, (len(z), *point.levels.shape))
-        log_likelihood, replicas = predictive(spec, system, levels, z, states, keys[1])
+    shape = (CHAINS, draws_a_chain(sum(r.mask.size for r in system.rows), CHAINS))
+    z = draw_biases(point, found.covariance, keys[0], shape[0] * shape[1])
+    drawn, spread = draw(spec, system, point, found.covariance, z, point.levels, keys[1], keep)
     before = track_mode(problem, _uncalibrated(point))
-    shape = (CHAINS, DRAWS)
 
     def split(a: jax.Array) -> np.ndarray:
         return np.asarray(a).reshape(*shape, *a.shape[1:])
@@ -142,9 +150,8 @@ def _result(
         evidence=float(found.evidence) if prior.proper else None, objective=outcome.trace,
         levels=np.asarray(point.levels), directions=outcome.weak, draws=draws,
         log_prior=stats.norm.logpdf(draws, 0.0, 1 / np.sqrt(alpha)) if independent else None,
-        states=[split(s) for s in states] if (size <= tree.LARGEST if wanted is None else wanted) else None,
-        log_likelihood=[split(a) for a in log_likelihood] if log_likelihood is not None else None,
-        replicas=[split(a) for a in replicas] if replicas is not None else None,
+        states=[split(s) for s in drawn.states], kept=np.arange(shape[1]),
+        log_likelihood=[split(a) for a in drawn.log_likelihood], replicas=[split(a) for a in drawn.replicas],
         tracks=_tracks(point, before, spread, found.covariance),
         residuals=residuals_of(spec, system, before, point),
     )  # fmt: skip

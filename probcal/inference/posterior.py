@@ -17,7 +17,7 @@ from probcal.inference.sampling import Sampled
 from probcal.priors import PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.smoothing.directions import weak_directions
-from probcal.smoothing.draws import predictive, residuals_of
+from probcal.smoothing.draws import draws_a_chain, predictive, residuals_of
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import track_mode
@@ -54,8 +54,10 @@ def _both_tails(draws: np.ndarray) -> bool:
     return all(0 < (draws <= q).mean() < 1 for q in np.quantile(draws, (0.05, 0.95)))
 
 
-def result(problem: Problem, prior: Prior, run: Sampled, key: jax.Array, seed: int, wanted: bool | None) -> tree.Result:
-    """The result of a sampler for the tree; `wanted` forces or forbids draws by datum and trajectories."""
+def result(
+    problem: Problem, prior: Prior, run: Sampled, key: jax.Array, seed: int, keep: tuple[str, ...]
+) -> tree.Result:
+    """The result of a sampler for the tree; `keep` names the draws that it holds beside those of the biases."""
     z, levels = run.z, run.levels
     mixed = mixing(run.draws["theta"])
     M = run.form.biases
@@ -71,8 +73,7 @@ def result(problem: Problem, prior: Prior, run: Sampled, key: jax.Array, seed: i
     precision = np.where(problem.surveyed | isinstance(prior, Flat), np.asarray(run.posed.first.alpha), precision)
     information = np.asarray(run.posed.frame.information)[:M, :M]
     status, message = judge(problem, prior, run, mixed)
-    likelihood, replicas = _predictive(problem, run, states, key, wanted)
-    size = sum(s.size for s in states)
+    kept, likelihood, replicas = _by_datum(problem, run, states, key, keep)
     return tree.Result(
         method=run.method.name, prior=type(prior).__name__, seed=seed,
         approximate="exact" if run.method.exact else "variational",
@@ -82,8 +83,8 @@ def result(problem: Problem, prior: Prior, run: Sampled, key: jax.Array, seed: i
         information=information, evidence=None, objective=None, levels=mean_levels,
         directions=weak_directions(problem, information, after), draws=z,
         log_prior=_log_prior(problem, prior, run),
-        states=states if (size <= tree.LARGEST if wanted is None else wanted) else None,
-        log_likelihood=likelihood, replicas=replicas, tracks=_tracks(states, before),
+        states=states if "states" in keep else [], kept=kept, log_likelihood=likelihood, replicas=replicas,
+        tracks=_tracks(states, before),
         residuals=residuals_of(problem.spec, problem.system, before, after), lower=lower, upper=upper,
         columns=_columns(run, mixed, M), posterior=_posterior(problem, run), sample_stats=_stats(run),
         attrs=_attrs(run),
@@ -103,24 +104,24 @@ def _tracks(states: list[np.ndarray], before: Point) -> list[tree.Tracks]:
     return [tree.Tracks(x.mean((0, 1)), x.std((0, 1)), np.asarray(old)) for x, old in parts]
 
 
-def _predictive(
-    problem: Problem, run: Sampled, states: list[np.ndarray], key: jax.Array, wanted: bool | None
-) -> tuple[Any, Any]:
-    """Log-likelihood and replicated data (chain, draw, N, C) of each block, or nothing where they are too many."""
+def _by_datum(
+    problem: Problem, run: Sampled, states: list[np.ndarray], key: jax.Array, keep: tuple[str, ...]
+) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
+    """Which draws (kept,) of each chain have values by datum; log-likelihood and replicas (chain, kept, N, C) there."""
     chains, draws = run.z.shape[:2]
-    size = sum(int(np.asarray(r.mask).size) for r in problem.system.rows) * chains * draws
-    if not (size <= tree.LARGEST if wanted is None else wanted):
-        return None, None
+    most = draws_a_chain(sum(r.mask.size for r in problem.system.rows), chains)
+    kept = np.unique(np.linspace(0, draws - 1, min(draws, most)).round().astype(int))
 
     def flat(a: np.ndarray) -> jax.Array:
-        return jnp.asarray(a.reshape(chains * draws, *a.shape[2:]))
+        return jnp.asarray(a[:, kept].reshape(chains * len(kept), *a.shape[2:]))
 
     found = predictive(
-        problem.spec, problem.system, flat(run.levels), flat(run.z), tuple(flat(s) for s in states), key
+        problem.spec, problem.system, flat(run.levels), flat(run.z), tuple(flat(s) for s in states), key, keep
     )  # fmt: skip
-    shape = (chains, draws)
-    likelihood, replicas = ([np.asarray(a).reshape(*shape, *a.shape[1:]) for a in part] for part in found)
-    return likelihood, replicas
+    likelihood, replicas = (
+        [np.asarray(a).reshape(chains, len(kept), *a.shape[1:]) for a in part] for part in found
+    )  # fmt: skip
+    return kept, likelihood, replicas
 
 
 def _log_prior(problem: Problem, prior: Prior, run: Sampled) -> np.ndarray | None:

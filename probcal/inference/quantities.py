@@ -24,7 +24,7 @@ from probcal.inference.sampling import Sampled, sample
 from probcal.inference.uniformity import NOMINAL, randomised_rank
 from probcal.priors import Prior
 from probcal.problem import Problem, Spec, System
-from probcal.smoothing.draws import draw
+from probcal.smoothing.draws import draw, draw_biases
 from probcal.smoothing.frame import volume
 from probcal.smoothing.mode import Point, log_density, log_likelihood
 
@@ -83,9 +83,11 @@ def gaussian_posterior(
     covariance = outcome.laplace.covariance
     if not bool(jnp.isfinite(covariance).all() & jnp.isfinite(outcome.point.z).all()):
         raise FitError(outcome.message)
-    z, states, _ = draw(prepared.spec, prepared.system, outcome.point, covariance, key, CHAINS * DRAWS)
+    keys, point = jax.random.split(key), outcome.point
+    z = draw_biases(point, covariance, keys[0], CHAINS * DRAWS)
+    drawn, _ = draw(prepared.spec, prepared.system, point, covariance, z, point.levels, keys[1])
     held = np.broadcast_to(np.asarray(outcome.point.levels), (CHAINS * DRAWS, len(problem.levels)))
-    kept = tuple(np.asarray(x) for x in states) if prepared is problem else ()
+    kept = tuple(np.asarray(x) for x in drawn.states) if prepared is problem else ()
     return Posterior(Points(np.asarray(z), held, kept), {}, CHAINS, False, outcome.status)
 
 

@@ -238,7 +238,7 @@ def _of_tree(problem: Problem, tree: xr.DataTree) -> Posterior:
     if not {"bias", *names} <= set(group.data_vars) or set(problem.labels) != set(group["bias_label"].values.tolist()):
         raise InputError(
             "sbc: around must be a fit of this problem that kept its draws of biases and states; fit it again with"
-            " predictive_draws=True"
+            ' save=("states",)'
         )
 
     def flat(values: np.ndarray) -> np.ndarray:
