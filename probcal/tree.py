@@ -198,19 +198,15 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
 
 
 def _rounded(log_likelihood: np.ndarray) -> np.ndarray:
-    """Values (chain, draw, datum) in single precision, rounded to 1/256 of their spread over the draws of a datum.
+    """Values (chain, draw, datum) rounded to 1/256 of their spread over the draws of a datum.
 
-    What is rounded away is noise: the elpd of a datum moves by less than 1e-5 of that spread, and a file needs a byte
-    and a half a value in the place of eight.
+    What is rounded away is noise, and the rest compresses to a byte and a half a value.
     """
-    values = np.array(log_likelihood, np.float32)
     with np.errstate(invalid="ignore"):  # a row of probability zero
-        spread = values.std((0, 1), dtype=float)
-    sure = np.isfinite(spread) & (spread > 0)
-    step = np.exp2(np.floor(np.log2(np.where(sure, np.maximum(spread, 1e-12), 1e-3) / SHARP))).astype(np.float32)
-    np.divide(values, step, out=values)
-    np.rint(values, out=values)
-    return np.multiply(values, step, out=values)
+        spread = log_likelihood.std((0, 1))
+    sure = np.isfinite(spread) & (spread > 1e-9)
+    step = np.exp2(np.floor(np.log2(np.where(sure, spread, 1.0) / SHARP)))
+    return np.where(sure, np.rint(log_likelihood / step) * step, log_likelihood)
 
 
 def direction_group(labels: Sequence[str], directions: Sequence[Any]) -> xr.Dataset:

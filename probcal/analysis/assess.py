@@ -20,7 +20,6 @@ from probcal.types import float64
 
 QUARTERS = 4
 COPIES = 2000  # most biases of all pieces together
-MOST = 1000  # draws behind the limits of a NEES
 
 
 @float64
@@ -42,8 +41,7 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     """
     fit = take_up(problem, tree)
     keys = jax.random.split(as_key(key))
-    many = truth is not None and truth.tracks is not None
-    drawn = predictive.draws_of(fit, tree, keys[0], MOST if many else predictive.DRAWS)
+    drawn = predictive.draws_of(fit, tree, keys[0])
     replicas = predictive.check(fit, drawn, keys[1])
     found = residuals.innovations(fit, replicas.kurtosis)
     groups: dict[str, xr.Dataset] = {"epoch_check": checks.by_epoch(fit, found.innovations)}

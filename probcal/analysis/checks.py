@@ -95,21 +95,23 @@ def by_channel(
     first = np.unique(group, return_index=True)[1]
     for kind, of in (("misfit", replicas.misfit), ("mean", replicas.mean)):
         values[f"p_{kind}"] = of[first]
-        findings += _unlike_replicas(kind, names, of[first])
+        findings += _unlike_replicas(kind, names, of[first], replicas.draws)
     coords = {name: ("part", labels[name].to_numpy(str)) for name in labels}
     return xr.Dataset({name: ("part", value) for name, value in values.items()}, coords), findings
 
 
-def _unlike_replicas(kind: str, names: list[str], p: np.ndarray) -> list[Finding]:
-    """Findings of the predictive p-values (parts,) that are small or near one, one sentence for those alike."""
+def _unlike_replicas(kind: str, names: list[str], p: np.ndarray, draws: int) -> list[Finding]:
+    """Findings of the predictive p-values (parts,) that are small or near one, one sentence for those alike.
+
+    They are shares of so many draws: one more draw must not change the verdict, and few draws show nothing.
+    """
     words, found = {"misfit": ("fit worse", "fit better"), "mean": ("lie higher", "lie lower")}[kind], []
-    for word, extreme in zip(words, (p, 1 - p), strict=True):
+    for word, extreme in zip(words, (p + 1 / draws, 1 - p + 1 / draws), strict=True):
         out = np.flatnonzero(extreme < RATE / 2)
         if len(out):
             listed = ", ".join(names[k] for k in out[:NAMES])
             listed += f" and {len(out) - NAMES} more" if len(out) > NAMES else ""
-            largest = max(extreme[out].max(), 1 / predictive.DRAWS)
-            text = f"{listed}: the data {word} than replicas (posterior predictive p at most {largest:.3f})"
+            text = f"{listed}: the data {word} than replicas (posterior predictive p at most {extreme[out].max():.3f})"
             found.append(Finding("predictive", names[out[0]], text))
     return found
 

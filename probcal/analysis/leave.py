@@ -188,7 +188,7 @@ class Pointwise(NamedTuple):
 
 def psis(tree: xr.DataTree, group: np.ndarray, count: int) -> Pointwise:
     """PSIS-LOO by ArviZ of the log-likelihood in a tree, summed over groups (data,); `az.loo` where each is a datum."""
-    values = tree["log_likelihood"].to_dataset()["y"].values.astype(float)
+    values = tree["log_likelihood"].to_dataset()["y"].values
     values = values.reshape(-1, values.shape[2])
     order = np.argsort(group, kind="stable")
     summed = np.add.reduceat(values[:, order], np.searchsorted(group[order], np.arange(count)), axis=1).T

@@ -38,7 +38,7 @@ def elpd(fits: Mapping[str, xr.DataTree], orders: Mapping[str, np.ndarray]) -> d
     for name, tree in fits.items():
         if "log_likelihood" not in tree.children:
             continue
-        y = tree["log_likelihood"]["y"].isel(datum=orders[name]).reset_coords(drop=True).astype(float).to_dataset()
+        y = tree["log_likelihood"]["y"].isel(datum=orders[name]).reset_coords(drop=True).to_dataset()
         bias = tree["posterior"].to_dataset()["bias"]
         pair = xr.DataTree.from_dict({"posterior": bias.to_dataset(), "log_likelihood": y})
         with warnings.catch_warnings():

@@ -19,7 +19,7 @@ from probcal.problem import Spec, System
 from probcal.smoothing.draws import draw
 from probcal.tree import suffix
 
-DRAWS = 200
+DRAWS = 1000
 VALUES = 20_000_000  # of all states drawn
 LEAST = 20  # draws, however many states there are
 
@@ -42,6 +42,7 @@ class Predictive(NamedTuple):
     misfit: np.ndarray
     mean: np.ndarray
     kurtosis: np.ndarray
+    draws: int  # behind the p-values
 
 
 @partial(jax.jit, static_argnames=("spec", "count"))
@@ -83,10 +84,8 @@ def _discrepancies(
 
 
 def check(fit: Fitted, drawn: Drawn, key: jax.Array) -> Predictive:
-    """P-values by sensor and channel, and kurtosis, at up to 200 draws."""
-    problem, total = fit.problem, drawn.z.shape[0]
-    chosen = np.linspace(0, total - 1, min(DRAWS, total)).astype(int)
-    drawn = jax.tree.map(lambda a: a[chosen], drawn)
+    """P-values by sensor and channel, and kurtosis, at draws of a fit."""
+    problem = fit.problem
     gaussian = all(isinstance(channel.noise, Gaussian) for block in problem.spec.blocks for channel in block.channels)
     sensors = tuple(jnp.asarray(problem.measurements.sensor[index]) for index in problem.row_index)
     count = len(problem.network.sensors)
@@ -97,7 +96,7 @@ def check(fit: Fitted, drawn: Drawn, key: jax.Array) -> Predictive:
         above = (values[:, 1] > values[:, 0]).mean(0) + 0.5 * (values[:, 1] == values[:, 0]).mean(0)  # (S, 2, C)
         for k, part in enumerate(parts):
             part.append(above[np.asarray(sensor), k])
-    return Predictive(fit.flat(parts[0]), fit.flat(parts[1]), kurtosis)
+    return Predictive(fit.flat(parts[0]), fit.flat(parts[1]), kurtosis, drawn.z.shape[0])
 
 
 def _exact(fit: Fitted, kurtosis: np.ndarray) -> np.ndarray:
@@ -111,8 +110,8 @@ def _exact(fit: Fitted, kurtosis: np.ndarray) -> np.ndarray:
     return np.maximum(np.where(fit.flat(answers), 1 / np.maximum(variance, 1e-12) - 6, kurtosis), -2.0)
 
 
-def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array, most: int) -> Drawn:
-    """At most so many draws of a fit, biases and levels as its tree has them.
+def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Drawn:
+    """Up to 1000 draws of a fit, biases and levels as its tree has them.
 
     The states are those of the tree where it holds them; else a trajectory is drawn for each draw of the biases, from
     the Gaussian of the problem linearised at the fit.
@@ -120,7 +119,7 @@ def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array, most: int) -> Drawn
     posterior, problem = tree["posterior"].to_dataset(), fit.problem
     names = [f"state{suffix(problem, r)}" for r in range(len(problem.epochs))]
     total = posterior.sizes["chain"] * posterior.sizes["draw"]
-    most = min(most, total, max(VALUES // sum(part.drift.size for part in problem.system.recursions), LEAST))
+    most = min(DRAWS, total, max(VALUES // sum(part.drift.size for part in problem.system.recursions), LEAST))
     chosen = np.linspace(0, total - 1, most).astype(int)
 
     def thin(values: np.ndarray) -> Any:

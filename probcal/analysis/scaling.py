@@ -21,7 +21,7 @@ def power_scaling(tree: xr.DataTree) -> xr.Dataset | None:
     kept = {name: tree[name].to_dataset() for name in ("posterior", "log_prior", "log_likelihood")}
     by_datum = kept["log_likelihood"]["draw"]  # of large data some of the draws only
     kept |= {name: kept[name][["bias"]].sel(draw=by_datum) for name in ("posterior", "log_prior")}
-    summed = kept["log_likelihood"]["y"].sum("datum", dtype=float)
+    summed = kept["log_likelihood"]["y"].sum("datum")
     kept["log_likelihood"] = xr.Dataset({"y": summed.expand_dims(datum=1, axis=-1)})
     shuffled = dict(kept)
     order = np.random.default_rng(0).permutation(summed.size)

@@ -23,7 +23,7 @@ class Drawn(NamedTuple):
     """Draws of trajectories and of what hangs on them; empty where it was not asked for."""
 
     states: tuple[jax.Array, ...]  # (D, E, n) of each recursion
-    log_likelihood: list[jax.Array]  # (D, N, C) of each block, single precision
+    log_likelihood: list[jax.Array]  # (D, N, C) of each block
     replicas: list[jax.Array]  # (D, N, C) of each block
 
 
@@ -117,7 +117,7 @@ def _by_datum(
         for b, (block, data, r) in enumerate(zip(spec.blocks, system.rows, spec.recursion, strict=True)):
             predicted = rows.predict(block, data, states_d[r], z_d)
             if wanted[0]:
-                density.append(rows.log_likelihood(block, data, predicted, levels_d).astype(jnp.float32))
+                density.append(rows.log_likelihood(block, data, predicted, levels_d))
             if wanted[1]:
                 replicas.append(rows.sample(block, data, predicted, levels_d, jax.random.fold_in(seed, b)))
         return density, replicas
