@@ -195,7 +195,7 @@ class Network:
             if not isinstance(placed, Sensor):
                 raise InputError(f"the network holds {placed!r}; place a sensor with sensor_type.on(node)")
         self.nodes = self._collect_nodes()
-        self.types: tuple[SensorType, ...] = tuple({id(s.type): s.type for s in self.sensors}.values())
+        self.types: tuple[SensorType, ...] = tuple(dict.fromkeys(s.type for s in self.sensors))
         self._check_names()
         self.dimension = self.nodes[0].dimension
         for node in self.nodes:

@@ -273,7 +273,7 @@ class Problem:
         self.system = jax.tree.map(jnp.asarray, System(tuple(recursions), tuple(rows_of), spread))
 
     def _rows_of(self, kind: Any, inside: np.ndarray) -> np.ndarray:
-        ours = [k for k, placed in enumerate(self.network.sensors) if placed.type is kind]
+        ours = [k for k, placed in enumerate(self.network.sensors) if placed.type == kind]
         return np.flatnonzero(inside & np.isin(self.measurements.sensor, ours))
 
     def _chain(
@@ -339,7 +339,7 @@ class Problem:
     def _rows(self, block: Block, chosen: np.ndarray, epoch: np.ndarray, channel_levels: list[int]) -> dict[str, Any]:
         """Numbers of a block of rows, by the names of `Rows`."""
         data, network = self.measurements, self.network
-        ours = [k for k, placed in enumerate(network.sensors) if placed.type is block.type]
+        ours = [k for k, placed in enumerate(network.sensors) if placed.type == block.type]
         sensor = np.searchsorted(ours, data.sensor[chosen])
         nodes = [network.sensors[k].nodes for k in ours]
         entries = pose_entries(network.dimension, block.extras)

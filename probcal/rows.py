@@ -85,7 +85,7 @@ def make_block(network: Network, kind: SensorType, layout: Layout) -> Block:
         if name in asked and name in VECTORS and not per_axis:
             raise InputError(f"sensor {kind.name} reads target.{name} as a vector; declare it with per_axis=True")
     used = tuple(sorted(i for name in asked for i in range(*known[name])))
-    placed = [s for s in network.sensors if s.type is kind]
+    placed = [s for s in network.sensors if s.type == kind]
     extras = tuple(sorted(kind.pose_components - {"position"}))
     for sensor in placed:
         for node in sensor.nodes:

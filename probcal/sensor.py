@@ -1,9 +1,10 @@
 """Declaration of a sensor type: the physics of one sensor that sees one target, as a function."""
 
+import hashlib
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError, nearest
+from probcal.fingerprint import computes
 from probcal.noise import Bernoulli, Family, Gaussian, Level, check_level
 from probcal.types import AXES, PoseView, TargetView
 
@@ -134,6 +136,45 @@ class SensorType:
     target_components: frozenset[str]  # what the function reads; "at" where it extrapolates
     pose_components: frozenset[str]
     dimensions: tuple[int, ...]  # those in which the function works
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """What the type computes and declares: types of equal fingerprint are equal and share compiled kernels.
+
+        It covers the operations and constants of the function, its channels and biases. Raises `InputError` where the
+        function computes something else at every call.
+        """
+        parts = [self._computes(dimension) for dimension in self.dimensions]
+        if parts != [self._computes(dimension) for dimension in self.dimensions]:
+            raise InputError(
+                f"sensor {self.name}: the function computes something else at every call; leave random numbers to the"
+                " noise of its channels"
+            )
+        declared = (self.name, self.arity, sorted(self.target_components), sorted(self.pose_components))
+        text = repr((declared, list(self.channels.items()), list(self.biases.items()), self.dimensions, parts))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def _computes(self, dimension: int) -> str:
+        """Digest of what the function computes in 2-D or 3-D."""
+
+        def stated(names: set[str]) -> dict[str, jax.ShapeDtypeStruct]:
+            return {n: jax.ShapeDtypeStruct((dimension,) if n in VECTORS else (), float) for n in sorted(names)}
+
+        moving = {"velocity", "acceleration"} if "at" in self.target_components else set()
+        target = stated({"position"} | set(self.target_components) - {"at"} | moving)
+        pose = stated({"position", "heading", "pitch", "roll"} | set(self.pose_components))
+
+        def one(target: Any, poses: list[Any], biases: Mapping[str, Any]) -> Mapping[str, Any]:
+            views = [PoseView("the node", parts) for parts in poses]
+            return self.function(TargetView("the target", target), *views, **biases)
+
+        return computes(one, target, [pose] * self.arity, stated(set(self.biases)))
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, SensorType) and self.fingerprint == other.fingerprint)
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint)
 
     def on(self, *nodes: Any, name: str | None = None) -> "Sensor":
         """Place a sensor of this type on its node(s); the name defaults to that of the node(s)."""

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError, nearest
+from probcal.kernels import drop_if_many
 
 AXES = ("x", "y", "z")
 
@@ -17,8 +18,11 @@ def float64[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def entry(*args: P.args, **kwargs: P.kwargs) -> R:
-        with jax.enable_x64(True):
-            return function(*args, **kwargs)
+        try:
+            with jax.enable_x64(True):
+                return function(*args, **kwargs)
+        finally:
+            drop_if_many()
 
     return entry
 

@@ -292,7 +292,7 @@ def _travelled(passes: Any, time: np.ndarray) -> np.ndarray:
 def _with_sensor(problem: Problem, kind: SensorType) -> tuple[Problem, int, jax.Array]:
     """The problem with one more sensor of a type that sees every epoch; its block, and which rows (N,) are its own."""
     network, data = problem.network, problem.measurements
-    like = next(placed for placed in network.sensors if placed.type is kind)
+    like = next(placed for placed in network.sensors if placed.type == kind)
     taken = {placed.name for placed in network.sensors} | {node.name for node in network.nodes}
     name = next(f"new_{k}" for k in range(len(taken) + 1) if f"new_{k}" not in taken)
     stated = {k: v for k, v in like.nodes[0].components.items() if k != "heading"}

@@ -253,7 +253,7 @@ def wrapping(fit: Fitted, innovation: np.ndarray, std: np.ndarray) -> list[tuple
     found = []
     for kind in fit.problem.network.types:
         for name, channel in kind.expand(fit.problem.network.dimension):
-            ours = [s.name for s in fit.problem.network.sensors if s.type is kind]
+            ours = [s.name for s in fit.problem.network.sensors if s.type == kind]
             mine = (fit.data["channel"] == name).to_numpy() & fit.data["sensor"].isin(ours).to_numpy()
             turn = {"rad": 1.0, "deg": np.pi / 180}.get(channel.unit)
             if turn is None or not mine.any():

@@ -1,0 +1,83 @@
+"""Kernels are shared by all that computes the same, and never fill the memory maps of a process."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from probcal import Bias, Channel, InputError, Network, Node, kernels, sensor, sensors
+from probcal.geometry import norm
+
+
+def gauge(factor=1.0, scale=1.0, name="gauge", values=(0.0, 1.0, 2.0)):
+    """A sensor type declared anew at every call."""
+    table = np.asarray(values)
+
+    def read(target, pose, *, shift=Bias("m", scale)):
+        line = norm(target.position - pose.position)
+        return {"range": factor * line + shift + jnp.interp(line, table, table)}
+
+    read.__name__ = name
+    return sensor(range=Channel("m", std=1.0))(read)
+
+
+def test_types_that_compute_the_same_are_equal():
+    assert gauge() == gauge()
+    assert hash(gauge()) == hash(gauge())
+    assert gauge() is not gauge()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        gauge(factor=1.05),
+        gauge(factor=1.0 + 1e-15),
+        gauge(scale=2.0),
+        gauge(name="other"),
+        gauge(values=(0.0, 1.0, 3.0)),
+    ],
+    ids=["factor", "last digit", "scale", "name", "constant array"],
+)
+def test_types_that_differ_in_anything_are_not(other):
+    assert other != gauge()
+    assert other.fingerprint != gauge().fingerprint
+
+
+def test_a_network_knows_equal_types_as_one():
+    network = Network([gauge().on(Node("a", (0.0, 0.0))), gauge().on(Node("b", (9.0, 0.0)))])
+    assert len(network.types) == 1
+    assert network.labels == ("a.shift", "b.shift")
+
+
+def test_the_catalogue_has_no_two_types_alike():
+    found = [value for value in vars(sensors).values() if hasattr(value, "fingerprint")]
+    assert len({kind.fingerprint for kind in found}) == len(found) > 20
+
+
+def test_a_function_that_computes_something_else_at_every_call_is_refused():
+    random = np.random.default_rng(0)
+
+    @sensor(range=Channel("m", std=1.0))
+    def restless(target, pose):
+        return {"range": target.position[0] + random.normal()}
+
+    with pytest.raises(InputError, match="computes something else at every call"):
+        Network([restless.on(Node("a", (0.0, 0.0)))])
+
+
+def test_kernels_are_dropped_before_the_maps_run_out(monkeypatch):
+    dropped = []
+    monkeypatch.setattr(kernels.jax, "clear_caches", lambda: dropped.append(True))
+    monkeypatch.setattr(kernels, "PAUSE", 0.0)
+    monkeypatch.setattr(kernels, "limit", lambda: 10**9)
+    kernels.drop_if_many()
+    assert not dropped
+    monkeypatch.setattr(kernels, "limit", lambda: 1)
+    kernels.drop_if_many()
+    assert dropped or kernels.maps() == 0
+
+
+def test_a_system_that_says_nothing_of_its_maps_is_no_obstacle(monkeypatch, tmp_path):
+    monkeypatch.setattr(kernels, "MAPS", tmp_path / "maps")
+    monkeypatch.setattr(kernels, "LIMIT", tmp_path / "limit")
+    assert kernels.maps() == 0
+    assert kernels.limit() == 65530
