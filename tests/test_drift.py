@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from worlds import LINEAR, resting
+from worlds import exact, fitted, linear, resting
 
 import probcal
 from probcal import (
@@ -29,7 +29,6 @@ from probcal import (
     Problem,
     Target,
     drift_table,
-    log_evidence,
     sensor,
     simulate,
 )
@@ -124,6 +123,7 @@ def test_values_of_a_drifting_bias_are_its_steps_so_far(moved):
         assert pieces["sd"].max() < 0.5, "each piece is known to some share of its noise"
 
 
+@pytest.mark.ci
 def test_pictures_and_report_show_the_drift(moved, tmp_path):
     _, _, tree = moved
     ax = plot_drift(tree)
@@ -141,6 +141,27 @@ def test_nodes_that_drift_are_left_out_of_the_file(moved, tmp_path):
         assert [line.split(",")[0] for line in text.splitlines()] == ["node", "a", "c"]
 
 
+def test_values_hold_fixed_steps_and_steps_before_the_data():
+    """The linear world `drifting`: every piece is the sum of what has begun by then, its sd that of the exact sum."""
+    problem, naive = linear("drifting")
+    (mean, covariance), scale = exact("drifting").z, np.array(list(naive.scales.values()))
+    table = drift_table(fitted("drifting"))
+    gain = table.query("bias == 'gauge_b.gain'").set_index("since")
+    assert list(gain.index) == [0.0, 0.75, 1.7, 3.1]
+    clock = table.query("bias == 'a.clock'")
+    assert list(clock["since"]) == [0.0, 1.7], "what begins before the data is part of the first value"
+    begun = ["gauge_b.gain", "gauge_b.gain@0.75", "gauge_b.gain@3.1"]
+    for since, members, fixed in ((0.75, begun[:2], 0.0), (1.7, begun[:2], 0.6), (3.1, begun, 0.6)):
+        weight = scale * np.isin(naive.labels, members)
+        assert gain["mean"][since] == pytest.approx(weight @ mean + fixed)
+        assert gain["sd"][since] == pytest.approx(np.sqrt(weight @ covariance @ weight))
+    early = scale * np.isin(naive.labels, ["a.clock", "a.clock@-5"])
+    assert "a.clock@-5" in naive.labels
+    assert clock["mean"].iloc[0] == pytest.approx(early @ mean)
+    assert problem.fixed == {"gauge_b.gain@1.7": 0.6}
+
+
+@pytest.mark.ci
 def test_steps_before_and_after_the_data_change_nothing_else():
     network, motion = watched()
     table = simulate(network, motion, np.arange(12.0), 1).table
@@ -164,6 +185,7 @@ def test_steps_before_and_after_the_data_change_nothing_else():
     assert both["b.position_x"] + both["b.position_x@-5"] == pytest.approx(mean["b.position_x"], rel=1e-9)
 
 
+@pytest.mark.ci
 def test_evidence_tells_a_drift_from_a_constant_bias():
     """A Bayes factor has mean 1 under the smaller model: it passes 1 / FALSE_ALARM at most at that rate (Markov)."""
     constant, motion = watched()
@@ -182,6 +204,7 @@ def test_evidence_tells_a_drift_from_a_constant_bias():
             assert elpd[1] - elpd[0] < 5
 
 
+@pytest.mark.ci
 def test_a_sparse_prior_finds_the_jump():
     """One step of a bias is large, the others zero: its inclusion stands out."""
     network, motion = watched(Drift(TIMES, scale=2.0))
@@ -198,14 +221,13 @@ def test_a_sparse_prior_finds_the_jump():
 
 @pytest.mark.slow
 def test_both_samplers_agree_on_a_drift():
-    network, motion, table, fixed = LINEAR["drifting"]()
-    problem = Problem(network, motion, table, fix=fixed)
+    problem, _ = linear("drifting")
     options = {"prior": Gaussian(), "start": resting(problem)}
-    exact = probcal.fit(problem, MAP(), **options)["calibration"].to_dataset()
+    known = fitted("drifting")["calibration"].to_dataset()
     drawn = probcal.fit(problem, Collapsed(chains=4, draws=1000), key=2, **options)["calibration"].to_dataset()
-    error = (drawn["mean"] - exact["mean"]) / (exact["sd"] / np.sqrt(drawn["ess"]))
+    error = (drawn["mean"] - known["mean"]) / (known["sd"] / np.sqrt(drawn["ess"]))
     assert np.abs(error).max() < 6.0
-    np.testing.assert_allclose(drawn["sd"], exact["sd"], rtol=0.15)
+    np.testing.assert_allclose(drawn["sd"], known["sd"], rtol=0.15)
 
 
 def test_a_clock_of_its_own_type_may_drift():
@@ -218,7 +240,6 @@ def test_a_clock_of_its_own_type_may_drift():
     motion = Target(ConstantVelocity(0.1), start={"position": (0.0, 1.0), "velocity": (0.0, 1.0)})
     problem = Problem(network, motion, simulate(network, motion, np.arange(10.0), 0).table)
     assert [m["component"] for m in problem.members] == ["delay", "delay_step"]
-    assert log_evidence(problem, prior=Gaussian()).value < 0
 
 
 @pytest.mark.slow
@@ -243,6 +264,7 @@ def test_the_radios_of_plaza_stand_still():
     assert max(evidence, key=lambda name: evidence[name]) == "constant"
 
 
+@pytest.mark.ci
 def test_fixed_steps_and_steps_before_the_data_count_in_the_values():
     """A step fixed at its true 5 m, one 5 s before the data, one free: each piece has the sum of what began by then."""
     network, motion = watched(Drift((-9.0, -5.0, 4.0, 8.0), scale=3.0))
@@ -258,6 +280,7 @@ def test_fixed_steps_and_steps_before_the_data_count_in_the_values():
     assert set(found["bias"]) == {"b.position_x", "b.position_y"}
 
 
+@pytest.mark.ci
 def test_a_drifting_sensor_is_checked_whole():
     """Noise spoilt after the step is the sensor's, though its first piece is fine; and its node may be written."""
     network, motion = watched()
@@ -275,6 +298,7 @@ def test_a_drifting_sensor_is_checked_whole():
     assert not [name for name in anchors if "@" in str(name)]
 
 
+@pytest.mark.ci
 def test_a_node_stands_still_though_its_sensor_drifts(tmp_path):
     kind = probcal.sensors.flight_time
     wander = replace(kind.biases["range_offset"], drift=Drift((0.0, 4.0), std=1.0))

@@ -117,6 +117,16 @@ def test_models_are_never_imported(module):
     assert not [name for name in names if name.split(".")[0] in ("models", "tests", "benchmarks")]
 
 
+TESTS = sorted(Path(__file__).parent.glob("*.py"))
+
+
+@pytest.mark.parametrize("path", TESTS, ids=lambda path: path.stem)
+def test_no_test_module_is_imported(path):
+    """What tests share stands in modules of its own: worlds, contracts, reference and the like."""
+    names = {name.split(".")[0] for name, _ in imports(ast.parse(path.read_text()), "", False)}
+    assert not [name for name in names if name.startswith("test_")]
+
+
 def test_the_catalogue_uses_the_public_declaration_only():
     assert {name for name, _ in own("sensors", MODULES["sensors"])} <= {"sensor", "geometry", "noise"}
 

@@ -35,7 +35,7 @@ from probcal.cli.models import load_model, load_problem, load_truth
 from probcal.simulate import truth_beside
 from probcal.table import measure
 
-EXAMPLES = int(os.environ.get("PROBCAL_FUZZ", "60"))
+EXAMPLES = int(os.environ.get("PROBCAL_FUZZ", "15"))
 fuzz = settings(
     max_examples=EXAMPLES, derandomize="PROBCAL_FUZZ" not in os.environ, suppress_health_check=list(HealthCheck)
 )

@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from numpyro.infer import MCMC, NUTS, SVI, Predictive, Trace_ELBO
 from numpyro.infer.autoguide import AutoNormal
 from numpyro.infer.util import log_density
+from worlds import posed_of, small, two_motions
 
 import probcal
 from probcal import (
@@ -34,14 +35,10 @@ from probcal import (
     Unknown,
     numpyro_model,
     sensor,
-    simulate,
 )
-from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.nuts import Free, parts
-from probcal.inference.posed import Form, Posed
 from probcal.priors import BernoulliGaussian
-from probcal.smoothing.frame import frame_at, place
-from probcal.smoothing.start import automatic_start
+from probcal.smoothing.frame import place
 
 FALSE_ALARM = 1e-6  # of each statistical test
 radar, fix = probcal.sensors.radar, probcal.sensors.position
@@ -56,30 +53,6 @@ def robust(target, pose, *, range_offset=Bias("m", 5.0)):
     return {"range": jnp.hypot(line[0], line[1]) + range_offset, "azimuth": jnp.arctan2(line[1], line[0])}
 
 
-def small(kind=radar, motion=None, missing=0.2, scans=4):
-    """Two sensors, one of them on a surveyed node, and a few scans of each target."""
-    nodes = [Node("a", (0.0, 0.0), scale={"heading": 0.1}), Node("b", (400.0, 0.0), survey={"position": 3.0})]
-    network = Network([kind.on(node) for node in nodes])
-    start = {"position": ((100.0, 200.0), 5.0), "velocity": ((20.0, 3.0), 2.0)}
-    motion = Target(ConstantVelocity(1.0), start) if motion is None else motion(start)
-    time = np.arange(float(scans))
-    drawn = simulate(network, motion, time, key=1, missing=missing)
-    return Problem(network, motion, drawn.table)
-
-
-def posed_of(problem, prior):
-    """The package's own form of the posterior, its frame at the automatic start."""
-    form = Form(problem.spec, hierarchy_of(prior, problem))
-    frame = frame_at(problem.spec, problem.system, automatic_start(problem))
-    return form, Posed(problem.system, frame, prior.precision(problem.labels, problem.surveyed))
-
-
-def two_motions(start):
-    """Two recursions, and a process noise that is not known."""
-    bent = probcal.ConstantAcceleration(0.5)
-    return {"one": Target(ConstantVelocity(Unknown(1.0)), start), "two": Target(bent, start)}
-
-
 CASES = {
     "horseshoe": (Horseshoe(), {}),
     "gaussian": (Gaussian(correlation={"b.position_*": 0.6}), {}),
@@ -91,7 +64,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+OFTEN = ("horseshoe", "levels and Student-t", "two recursions")
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, marks=[] if c in OFTEN else pytest.mark.ci) for c in CASES])
 def test_its_density_is_that_of_the_samplers(case):
     """log p of the frame's coordinates = log p of the model's sites + log |d sites / d coordinates|, to a constant."""
     prior, settings = CASES[case]
@@ -172,6 +148,7 @@ def test_prior_draws_have_the_moments_of_the_declaration():
     assert (np.abs(flat.std(0) / wide - 1) < width).all()
 
 
+@pytest.mark.ci
 def test_numpyros_own_sampler_finds_the_exact_posterior():
     network, motion, table = linear()
     problem = Problem(network, motion, table)
@@ -209,6 +186,7 @@ def test_other_data_take_the_place_of_the_tables():
             seeded({"y_radar": np.zeros(3)})
 
 
+@pytest.mark.ci
 def test_autoguides_and_log_likelihoods_of_numpyro_take_it():
     problem = small()
     with jax.enable_x64(True), jax.numpy_rank_promotion("allow"):  # numpyro's guides promote ranks
@@ -235,6 +213,7 @@ def test_what_it_refuses():
         numpyro.handlers.seed(numpyro_model(problem), 0)()
 
 
+@pytest.mark.ci
 def test_numpyro_is_whole_after_arviz_has_put_a_lazy_one_in_its_place():
     code = "import arviz_base, probcal, numpyro; numpyro.distributions.distribution.Unit"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -28,9 +28,9 @@ import probcal
 
 after_import = dict(jax.config.values)
 arrays = len(jax.live_arrays())
-import test_precision
-
-problem, tree = test_precision.fitted(test_precision.table())
+import runpy
+here = runpy.run_path("test_precision.py")
+problem, tree = here["fitted"](here["table"]())
 after_fit = dict(jax.config.values)
 kinds = {}
 for node in tree.subtree:
@@ -92,6 +92,7 @@ def start_process(mode):
 
 @pytest.fixture(scope="module")
 def processes():
+    """What a fit leaves in a process as a user's, and in one with x64 on."""
     running = {mode: start_process(mode) for mode in ("plain", "x64")}
     found = {}
     for mode, process in running.items():
@@ -101,6 +102,7 @@ def processes():
     return found
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("mode", ["plain", "x64"])
 def test_the_configuration_of_jax_stays(processes, mode):
     found = processes[mode]
@@ -110,10 +112,32 @@ def test_the_configuration_of_jax_stays(processes, mode):
     assert found["changed_by_fit"] == []
 
 
-def test_import_allocates_no_array(processes):
-    assert processes["plain"]["arrays"] == 0
+def test_an_import_changes_no_configuration_and_allocates_no_array():
+    code = (
+        "import jax; before = dict(jax.config.values); import probcal; from probcal import EA, Problem, fit, sensors;"
+        "after = dict(jax.config.values); assert not [k for k in after if after[k] != before.get(k, after[k])];"
+        "assert not jax.live_arrays(); assert jax.numpy.zeros(1).dtype == 'float32'"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_a_fit_changes_no_configuration_and_answers_in_double_precision():
+    before = dict(jax.config.values)
+    problem, tree = fitted(table())
+    assert dict(jax.config.values) == before
+    assert jax.numpy.zeros(1).dtype == "float32"
+    assert problem.scales.dtype == "float64"
+    for node in tree.subtree:
+        for name, variable in node.dataset.variables.items():
+            assert isinstance(variable.values, np.ndarray), name
+            assert variable.dtype not in (np.float32, np.float16, np.int32), name
+    values = [tree["calibration"]["mean"], tree["track"]["mean"], tree["posterior"]["bias"][:, :3]]
+    for found in values:
+        numbers = found.values.ravel()
+        assert (numbers != numbers.astype(np.float32)).mean() > 0.9
+
+
+@pytest.mark.ci
 def test_results_are_numpy_in_double_precision(processes):
     kinds = processes["plain"]["kinds"]
     assert processes["plain"]["scales"] == "float64"
@@ -123,6 +147,7 @@ def test_results_are_numpy_in_double_precision(processes):
     assert not [name for name, (_, dtype) in kinds.items() if dtype in ("float32", "float16", "int32")]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["mean", "covariance", "precision", "track", "track_sd", "draws", "evidence"])
 def test_results_equal_those_of_an_x64_process(processes, name):
     """The same kernels in the same precision: equal to the last bits (1e-12; float32 would leave 1e-7)."""
@@ -130,6 +155,7 @@ def test_results_equal_those_of_an_x64_process(processes, name):
     np.testing.assert_allclose(plain, double, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.ci
 def test_results_carry_more_digits_than_float32(processes):
     for name in ("mean", "track", "draws"):
         values = np.array(processes["plain"][name]).ravel()

@@ -1,6 +1,6 @@
 """Real recordings: what a fit finds against what is known. They lie beside the project and are skipped where not.
 
-`uv run pytest tests/test_recordings.py -n 0 -s -m "slow or not slow"` prints the figures.
+`uv run pytest tests/test_recordings.py -n 0 -s -m slow` prints the figures.
 """
 
 import sys
@@ -19,6 +19,7 @@ import robots
 import sflab
 import tdoa_flight
 
+pytestmark = pytest.mark.slow
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
@@ -58,7 +59,6 @@ def test_a_swap_of_two_microphones_is_found_and_none_is_made_up():
     assert 0.1 < len(listed) / tree["residual"].sizes["datum"] < 0.3, "the echoes: 14 to 24 % of each microphone"
 
 
-@pytest.mark.slow
 def test_a_swap_across_the_room_needs_several_starts():
     alone, single = fit_sflab((1, 4))
     found, tree = fit_sflab((1, 4), starts=6)
@@ -67,7 +67,6 @@ def test_a_swap_across_the_room_needs_several_starts():
     assert tree.attrs["log_evidence"] > single.attrs["log_evidence"] + 10
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("swap", [(1, 5), (1, 4), (2, 3)])
 def test_a_strict_prior_by_node_finds_swaps_across_the_room_and_nothing_else(swap):
     found, _ = fit_sflab(swap, starts=6, prior=sflab.PRIOR)
@@ -81,7 +80,6 @@ def headings(tree):
     return found
 
 
-@pytest.mark.slow
 def test_robots_know_their_headings():
     data = recording("mrclam/MRCLAM_Dataset6")
     plain = headings(probcal.fit(robots.problem(data), EA()))
@@ -104,7 +102,6 @@ def test_a_turned_robot_is_determined_before_and_after_the_fit():
     print(f"\nrobot_4.heading {np.rad2deg(row['mean']):.2f} deg, {row['verdict']}: {row['reason']}")
 
 
-@pytest.mark.slow
 def test_delays_of_receivers_repeat_over_sets():
     """Delays of the larger group of receivers, a shift common to it apart (nobody can know it), set by set."""
     delays = {}
@@ -125,7 +122,6 @@ def test_delays_of_receivers_repeat_over_sets():
         assert np.sqrt(np.mean(left**2)) < 10.0
 
 
-@pytest.mark.slow
 def test_swapped_anchors_of_a_flight_are_found():
     data, swap = recording("uwb_tdoa"), (3, 4)
     problem = tdoa_flight.problem(data, swap)

@@ -6,6 +6,7 @@ runs 500 simulations of a small radar network, the default suite 40. The statist
 
 import importlib
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -66,7 +67,8 @@ def camera(target, pose, *, drift=Bias("m", 2.0)):
     return {"fix": line + drift, "seen": 0.1 * line[0]}
 
 
-def linear(survey=False):
+@cache
+def linear():
     """Positions measured by displaced sensors: MAP is exact."""
     nodes = [Node(f"n{k}", (4.0 * k, 3.0), scale={"position": 3.0}) for k in range(2)]
     anchor = Node("anchor", (0.0, 0.0), survey={"position": 0.5})
@@ -74,6 +76,7 @@ def linear(survey=False):
     return simulated(network, 8)
 
 
+@cache
 def cameras():
     """Unknown noise levels, missing values, degrees in a header's stead: blanks and a yes-or-no channel."""
     network = Network([camera.on(Node(f"c{k}", (5.0 * k, 1.0), survey={"position": 1.0})) for k in range(3)])
@@ -83,6 +86,7 @@ def cameras():
     return Problem(network, Target(ConstantVelocity(Unknown(0.5, 1.3)), START), table)
 
 
+@cache
 def radars(count=3, epochs=8):
     """A small radar network as in `models/radars.py`, the start of its target known."""
     random = np.random.default_rng(3)
@@ -246,8 +250,8 @@ def test_other_measured_values():
 
 
 def test_a_method_that_is_exact_is_uniform():
-    """MAP on a linear network, 100 runs; coverage within 4 standard errors."""
-    tree = sbc(linear(), MAP(), Gaussian(), 100, threads=2)
+    """MAP on a linear network, 40 runs; coverage within 4 standard errors."""
+    tree = sbc(linear(), MAP(), Gaussian(), 40, threads=2)
     assert tree.attrs["status"] == "uniform", tree.attrs["verdict"]
     table = coverage_table(tree)
     assert (abs(table["all"] - table["nominal"]) < 4 * table["all_se"]).all()
@@ -256,12 +260,14 @@ def test_a_method_that_is_exact_is_uniform():
     assert tree["run"]["position_rmse"].mean() < 4.0  # the start alone leaves 7 m
 
 
+@pytest.mark.ci
 def test_noise_taken_20_per_cent_too_small_is_caught():
     tree = sbc(linear(), Overconfident(), Gaussian(), 100, threads=2)
     assert tree.attrs["status"] == "not uniform"
     assert "not uniform: log likelihood" in tree.attrs["verdict"]
 
 
+@pytest.mark.ci
 def test_coverage_under_another_prior():
     """EA learns its precisions; truths that are mostly zero: the non-zero ones are counted apart."""
     tree = sbc(linear(), EA(), None, 12, simulate_from=BernoulliGaussian(share=0.3), threads=2)
@@ -359,6 +365,7 @@ def fitted():
     return problem, fit(problem, MAP(), prior=Gaussian())
 
 
+@pytest.mark.ci
 def test_around_the_data(fitted):
     """Truths from the posterior, every row measured twice: uniform for an exact method, from data or from a fit."""
     problem, tree = fitted
@@ -494,6 +501,7 @@ def problem(data=None):
 """
 
 
+@pytest.mark.ci
 def test_command_line(tmp_path):
     (tmp_path / "model.py").write_text(MODEL)
     arguments = ["sbc", str(tmp_path / "model.py"), "--method", "map", "--out", str(tmp_path / "out")]

@@ -5,10 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from test_model import posed_of, small, two_motions
-from worlds import LINEAR, resting
+from worlds import linear, posed_of, resting, small, two_motions
 
-import probcal
 from probcal import NUTS, SVI, Gaussian, Horseshoe, InputError
 from probcal.inference.guides import Fitted, LowRank, MeanField, Structured
 from probcal.inference.nuts import Free
@@ -67,12 +65,10 @@ def test_any_point_has_coordinates_in_the_frame():
 
 def solved(name, method, prior):
     """A linear case by a method, and its exact posterior."""
-    network, motion, table, fixed = LINEAR[name]()
-    problem = probcal.Problem(network, motion, table, fix=fixed)
+    problem, naive = linear(name)
     start = track(problem.spec, problem.system, resting(problem))
-    linear = reference.Linear(network, motion, table, fixed)
     run = sample(problem, method, prior, start, jax.random.key(4))
-    return run, reference.dense(linear, np.ones(len(linear.labels)))
+    return run, reference.dense(naive, np.ones(len(naive.labels)))
 
 
 def test_linear_problems_are_exact():
@@ -86,6 +82,7 @@ def test_linear_problems_are_exact():
     np.testing.assert_allclose(np.ptp(run.draws["stats_log_weight"]), 0.0, atol=1e-5)
 
 
+@pytest.mark.ci
 def test_mean_field_is_too_narrow_where_biases_are_correlated():
     """Plain coordinates of a linear problem: its optimum has the conditional variances (Bishop 2006, 10.2)."""
     run, exact = solved("plane", SVI(chains=2, warmup=1500, draws=500, guide="mean-field"), Gaussian())
@@ -95,6 +92,7 @@ def test_mean_field_is_too_narrow_where_biases_are_correlated():
     assert (wide.z.std((0, 1)) / sd).min() > 0.75
 
 
+@pytest.mark.ci
 def test_determined_biases_have_the_sds_of_nuts():
     problem = small(scans=20)
     start = automatic_start(problem)

@@ -25,7 +25,11 @@ from probcal import (
     White,
     sensor,
 )
+from probcal.inference.hierarchy import hierarchy_of
+from probcal.inference.posed import Form, Posed
+from probcal.smoothing.frame import frame_at
 from probcal.smoothing.mode import Point
+from probcal.smoothing.start import automatic_start
 
 fix = probcal.sensors.position
 
@@ -162,9 +166,8 @@ def drifting():
 
 
 def shifted(offset=8.0):
-    """The plane world with all its values, and one bias that is plainly there."""
-    network, motion, _, _ = plane()
-    table = table_of(network, {"one": [0.0, 0.5, 1.5, 2.0, 4.0], "two": [0.2, 0.5, 2.0, 3.5]}, 7, missing=0.0)
+    """The plane world with one bias that is plainly there: of the same form, so that nothing is compiled for it."""
+    network, motion, table, _ = plane()
     table.loc[table["sensor"] == "a", "position_x"] += offset
     return network, motion, table, {}
 
@@ -219,3 +222,28 @@ def heights(run, size=2):
     network = Network([ruler.on(Node(f"n{k}", (0.0, float(k)))) for k in range(size)])
     drawn = probcal.simulate(network, ConstantVelocity(1.0), np.arange(4.0), run)
     return probcal.Problem(network, ConstantVelocity(1.0), drawn.table), drawn.truth
+
+
+@cache
+def small(kind=probcal.sensors.radar, motion=None, missing=0.2, scans=4):
+    """Two radars, one of them on a surveyed node, and a few scans of each target."""
+    nodes = [Node("a", (0.0, 0.0), scale={"heading": 0.1}), Node("b", (400.0, 0.0), survey={"position": 3.0})]
+    network = Network([kind.on(node) for node in nodes])
+    start = {"position": ((100.0, 200.0), 5.0), "velocity": ((20.0, 3.0), 2.0)}
+    motion = Target(ConstantVelocity(1.0), start) if motion is None else motion(start)
+    time = np.arange(float(scans))
+    drawn = probcal.simulate(network, motion, time, key=1, missing=missing)
+    return probcal.Problem(network, motion, drawn.table)
+
+
+def two_motions(start):
+    """Two recursions, and a process noise that is not known."""
+    bent = probcal.ConstantAcceleration(0.5)
+    return {"one": Target(ConstantVelocity(probcal.Unknown(1.0)), start), "two": Target(bent, start)}
+
+
+def posed_of(problem, prior):
+    """The package's own form of the posterior, its frame at the automatic start."""
+    form = Form(problem.spec, hierarchy_of(prior, problem))
+    frame = frame_at(problem.spec, problem.system, automatic_start(problem))
+    return form, Posed(problem.system, frame, prior.precision(problem.labels, problem.surveyed))

@@ -101,6 +101,11 @@ def kernel(method: Any) -> Any:
     return replace(method, iterations=0, tolerance=0.0)
 
 
+def bare(prior: Prior) -> Prior:
+    """The prior without what reaches kernels as arrays (correlations, groups), so that these are compiled once."""
+    return replace(prior, correlation=(), by=None) if isinstance(prior, ARD) else replace(prior, correlation=())
+
+
 def check_method(method: Maximiser) -> None:
     """Raise `InputError` where a method would run no iteration or never know when to stop."""
     if method.iterations < 1:
@@ -157,7 +162,7 @@ def maximise(method: Maximiser, problem: Problem, prior: Prior, start: Point, pr
     state, trace = first_state(given, start), np.zeros(0)
     while len(trace) < method.iterations and not bool(state.done):
         left = method.iterations - len(trace)
-        state, (objective, idle) = chunk(kernel(method), problem.spec, prior, problem.system, given, state, left)
+        state, (objective, idle) = chunk(kernel(method), problem.spec, bare(prior), problem.system, given, state, left)
         trace = np.concatenate([trace, np.asarray(objective)[~np.asarray(idle)]])
         if progress is not None:
             progress(method.name, len(trace), float(trace[-1]))
