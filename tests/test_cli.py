@@ -341,3 +341,11 @@ def test_kernels_are_kept_in_the_cache_folder_of_the_user_unless_jax_has_one(tmp
     finally:
         for name, value in before.items():
             jax.config.update(name, value)
+
+
+def test_draws_of_states_and_replicas_are_saved_where_asked_for(model, rows, tmp_path, monkeypatch, capsys):
+    for words, wanted in (((), set()), (("--save", "states,predictive"), {"state", "posterior_predictive"})):
+        order = ("fit", model, rows, "--method", "map", "--no-assess", "--out", tmp_path / "fit", *words)
+        assert call(monkeypatch, capsys, *order)[0] == 0
+        tree = probcal.load(tmp_path / "fit")
+        assert {"state", "posterior_predictive"} & {*tree["posterior"].data_vars, *tree.children} == wanted

@@ -12,7 +12,8 @@ import pytest
 
 import probcal
 from probcal import analysis, inference, plots
-from probcal.cli.names import METHODS, ORACLE, PRIORS
+from probcal.cli.names import METHODS, ORACLE, PRIORS, SAVE
+from probcal.inference.fit import SAVE as SAVE_OF_FITS
 from probcal.inference.sampler import Sampler
 from probcal.inference.study import ORACLE as ORACLE_OF_STUDIES
 
@@ -32,6 +33,7 @@ ERRORS = [  # of options and arguments, with the end of what is said
     ("fit {plaza} --chains 2", '--chains: "ea" draws no chains; take collapsed, nuts or svi'),
     ("fit {plaza} --method nuts --resume", "--resume needs --out, the folder of the run to go on with"),
     ("fit {plaza} --out pyproject.toml/fit", "pyproject.toml/fit cannot be written: Not a directory"),
+    ("fit {plaza} --save state", '--save "state" is not known; give states, predictive or both, separated by a comma'),
     ("sbc {plaza} --resume", "sbc: --resume needs --out DIR, the folder of the runs to go on with"),
     ("sbc {plaza} --method mop", 'sbc: no method is called "mop"; did you mean "map"?'),
     ("study {plaza} --set share", '--set "share": write name=value,value,... or name=first:last:step'),
@@ -96,7 +98,7 @@ def test_names_on_the_command_line_are_those_of_the_library():
         taken = tuple(key for key, value in probcal.priors.PRIORS.items() if method.takes(value))
         assert METHODS[name] == (method.name, isinstance(method, Sampler), taken)
         assert prior is None or method.takes(prior)
-    assert ORACLE == ORACLE_OF_STUDIES
+    assert (ORACLE, SAVE) == (ORACLE_OF_STUDIES, SAVE_OF_FITS)
 
 
 @pytest.mark.parametrize("package", [probcal, analysis, inference, plots], ids=lambda package: package.__name__)

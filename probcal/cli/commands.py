@@ -55,6 +55,9 @@ def fit_command(
     draws: Annotated[int | None, typer.Option(min=1, help="draws of each chain after warm-up")] = None,
     warmup: Annotated[int | None, typer.Option(min=0, help="steps of each chain before its draws")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with the stopped run of a sampler in --out")] = False,
+    save: Annotated[
+        str, typer.Option(help="draws to keep in fit.nc besides those of the biases: states,predictive")
+    ] = "",
     assessed: Annotated[
         bool, typer.Option("--assess/--no-assess", help="a verdict per bias, and what the residuals say")
     ] = True,
@@ -68,6 +71,7 @@ def fit_command(
     sizes = options.chain_sizes(method, {"chains": chains, "draws": draws, "warmup": warmup})
     if resume and out is None:
         raise InputError("--resume needs --out, the folder of the run to go on with")
+    kept = options.saved_names(save)
     options.check_files(model, data)
     if out is not None:
         files.folder(out)
@@ -76,7 +80,7 @@ def fit_command(
     raise typer.Exit(
         fit.run(
             model, data, method=method, prior=prior, fix=fix or (), starts=starts, seed=seed, out=out, sizes=sizes,
-            resume=resume, assessed=assessed,
+            resume=resume, kept=kept, assessed=assessed,
         )
     )  # fmt: skip
 

@@ -22,7 +22,7 @@ FINDINGS = 8  # sentences of an assessment that are printed
 
 def run(
     model: Path, data: Path | None, *, method: str, prior: str | None, fix: Sequence[str], starts: int, seed: int,
-    out: Path | None, sizes: Mapping[str, int], resume: bool, assessed: bool,
+    out: Path | None, sizes: Mapping[str, int], resume: bool, kept: Sequence[str], assessed: bool,
 ) -> int:  # fmt: skip
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
     keep_kernels()
@@ -36,7 +36,7 @@ def run(
     with line() as progress:
         tree = fit(
             problem, value, prior=chosen, key=seed, starts=starts, progress=progress,
-            store=out / "draws" if out is not None else None, resume=resume,
+            save=kept, store=out / "draws" if out is not None else None, resume=resume,
         )  # fmt: skip
         if out is not None:
             save(tree, out / "fit.nc")  # what is found is safe whatever comes

@@ -15,6 +15,7 @@ class Known(NamedTuple):
 
 
 ORACLE = "oracle"  # of studies: the method that knows which biases are zero
+SAVE = ("states", "predictive")  # draws that a fit writes where asked for
 PRIORS = {  # the class of each
     "flat": "Flat", "gaussian": "Gaussian", "laplace": "Laplace", "ard": "ARD", "ard-node": "ARD", "ard-owner": "ARD",
     "ard-type": "ARD", "ard-component": "ARD", "ard-gamma": "ARD", "horseshoe": "Horseshoe",

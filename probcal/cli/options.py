@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from probcal.cli.names import METHODS, ORACLE, PRIORS
+from probcal.cli.names import METHODS, ORACLE, PRIORS, SAVE
 from probcal.errors import InputError, nearest
 from probcal.inference.settings import check_setting
 
@@ -48,6 +48,15 @@ def chain_sizes(method: str, sizes: Mapping[str, int | None]) -> dict[str, int]:
     if given and not METHODS[method].chains:
         raise InputError(f'--{next(iter(given))}: "{method}" draws no chains; take collapsed, nuts or svi')
     return given
+
+
+def saved_names(text: str) -> list[str]:
+    """Names of the draws that a fit shall save, separated by commas."""
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    for name in names:
+        if name not in SAVE:
+            raise InputError(f'--save "{name}" is not known; give states, predictive or both, separated by a comma')
+    return names
 
 
 def method_names(text: str) -> list[str]:
