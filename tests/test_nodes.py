@@ -2,26 +2,21 @@
 
 import json
 
+import committed
 import numpy as np
 import pandas as pd
 import pyproj
 import pytest
+import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
 from probcal import (
-    MAP,
     Bias,
-    ConstantVelocity,
     LocalFrame,
-    Network,
     Node,
     Path,
-    Problem,
-    fit,
     read_nodes,
-    sensors,
-    simulate,
     write_nodes,
 )
 from probcal.types import PoseView
@@ -206,24 +201,28 @@ def test_geojson_is_what_other_programs_read(tmp_path):
     assert feature["properties"] == {"node": "a", "heading [deg]": pytest.approx(90.0, abs=0.01)}
 
 
+HEADING = -0.7  # stated for `c` in tests/data/small.py
+
+
 def test_the_nodes_of_a_fit_are_written_with_bias_and_sd(tmp_path):
-    frame = LocalFrame(60.0, 20.0)
-    free = {"position": 5.0, "heading": 0.1}
-    nodes = [Node("a", (0, 0)), Node("b", (90, 0), 0.5, scale=free), Node("c", (0, 90), scale=free)]
-    built = Network([sensors.radar.on(node) for node in nodes])
-    path = np.stack([np.linspace(10, 70, 8), np.linspace(60, 20, 8)], 1)
-    run = simulate(built, ConstantVelocity(0.1), np.arange(8.0), 0, tracks={"target": path})
-    tree = fit(Problem(built, ConstantVelocity(0.1), run.table, fix={"c.heading": 0.25}), MAP())
+    """The heading of `b` drifts, so that no one node could be written for it; of `c` all is written."""
+    frame, tree = LocalFrame(60.0, 20.0), committed.tree("ea")
     cells = pd.read_csv(write_nodes(tmp_path / "fit.csv", tree)).set_index("node")
     mean, sd = (tree["calibration"][name].to_series() for name in ("mean", "sd"))
     assert list(cells.columns) == ["x", "y", "heading [deg]", "sd_position_x", "sd_position_y", "sd_heading [deg]"]
-    assert cells.loc["b", "x"] == pytest.approx(90 + mean["b.position_x"], abs=1e-6)
-    assert cells.loc["b", "heading [deg]"] == pytest.approx(np.rad2deg(0.5 + mean["b.heading"]))
-    assert cells.loc["c", "heading [deg]"] == pytest.approx(np.rad2deg(0.25))
+    assert cells.index.tolist() == ["a", "c"]
+    assert cells.loc["c", "x"] == pytest.approx(mean["c.position_x"], abs=1e-6)
+    assert cells.loc["c", "y"] == pytest.approx(50 + mean["c.position_y"], abs=1e-6)
+    assert cells.loc["c", "heading [deg]"] == pytest.approx(np.rad2deg(HEADING + mean["c.heading"]))
     assert cells.loc["c", "sd_position_y"] == pytest.approx(sd["c.position_y"])
-    assert cells.loc["b", "sd_heading [deg]"] == pytest.approx(np.rad2deg(sd["b.heading"]))
+    assert cells.loc["c", "sd_heading [deg]"] == pytest.approx(np.rad2deg(sd["c.heading"]))
     assert cells.loc["a"].drop("heading [deg]").isna().tolist() == [False, False, True, True, True]
     assert (cells.loc["a", ["x", "y"]] == 0).all()
     placed = read_nodes(write_nodes(tmp_path / "fit.geojson", tree, frame=frame), origin=frame)
-    np.testing.assert_allclose(placed["b"].position, cells.loc["b", ["x", "y"]].to_numpy(float), atol=2e-6)
-    assert not placed["b"].spread
+    np.testing.assert_allclose(placed["c"].position, cells.loc["c", ["x", "y"]].to_numpy(float), atol=2e-6)
+    assert not placed["c"].spread
+    constant = tree["constant_data"].to_dataset()  # a heading that was fixed and not estimated counts as well
+    held = constant.drop_vars(["fixed", "fixed_label"]).assign(fixed=("fixed_label", [0.25]))
+    tree["constant_data"] = xr.DataTree(held.assign_coords(fixed_label=["a.heading"]))
+    cells = pd.read_csv(write_nodes(tmp_path / "held.csv", tree)).set_index("node")
+    assert cells.loc["a", "heading [deg]"] == pytest.approx(np.rad2deg(0.25))

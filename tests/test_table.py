@@ -1,5 +1,10 @@
 """Names, times and declarations at the door: what a person's table and network may hold."""
 
+import sys
+from dataclasses import replace
+from functools import cache
+
+import committed
 import numpy as np
 import pandas as pd
 import pytest
@@ -14,7 +19,6 @@ from probcal import (
     Node,
     Path,
     Problem,
-    Unknown,
     White,
     fit,
     read_table,
@@ -24,23 +28,41 @@ from probcal import (
     track,
 )
 from probcal.geometry import norm
-from probcal.table import measure
+from probcal.table import UNITS, factor, measure
+
+sys.path.insert(0, str(committed.DATA))
+import small
 
 CORNERS = [(0, 0), (60, 0), (60, 60), (0, 60)]
 PATH = np.stack([np.linspace(5, 55, 20), 30 + 20 * np.sin(np.linspace(0, 6, 20))], 1)
 CV = ConstantVelocity(0.5)
 
 
-def network(std=1.0, names=("a", "b", "c", "d")):
-    @sensor(range=Channel("m", std=std))
-    def gauge(target, pose, *, range_offset=Bias("m", 2.0)):
-        return dict(range=norm(target.position - pose.position) + range_offset)
+@sensor(range=Channel("m", std=1.0))
+def gauge(target, pose, *, range_offset=Bias("m", 2.0)):
+    return dict(range=norm(target.position - pose.position) + range_offset)
 
+
+@sensor(range=Channel("m", std=1.0))
+def namesake(target, pose):
+    return dict(range=norm(target.position - pose.position))
+
+
+ALIKE = [gauge.on(Node("a", (0, 0))), replace(namesake, name="gauge").on(Node("b", (1, 0)))]
+
+
+def network(names=("a", "b", "c", "d")):
     return Network([gauge.on(Node(name, p)) for name, p in zip(names, CORNERS, strict=True)])
 
 
-def recorded(built=None, **changes):
-    return simulate(built or network(), CV, np.arange(20.0), 1, tracks={"target": PATH}, **changes).table
+@cache
+def run():
+    return simulate(network(), CV, np.arange(20.0), 1, tracks={"target": PATH})
+
+
+def recorded(names=("a", "b", "c", "d")):
+    """A recording, its sensors called otherwise."""
+    return run().table.replace({"sensor": dict(zip("abcd", names, strict=True))})
 
 
 def test_times_may_be_dates_in_text_or_in_a_frame():
@@ -52,13 +74,13 @@ def test_times_may_be_dates_in_text_or_in_a_frame():
 
 
 def test_names_that_are_numbers_are_one_name():
-    table = recorded(network(names=("1", "2", "3", "4")))
+    table = recorded(("1", "2", "3", "4"))
     mixed = table.assign(sensor=table["sensor"].astype(float), target=[7 if k % 2 else " 7" for k in range(len(table))])
     problem = Problem(network(names=("1", "2", "3", "4")), {7: CV}, mixed)
     assert problem.measurements.target_names == ("7",)
     assert len(problem.epochs[0].time) == 20
-    run = simulate(network(), {7: CV}, np.arange(20.0), 1, tracks={7: PATH})
-    np.testing.assert_allclose(run.truth.tracks[["position_x", "position_y"]], PATH)
+    same = simulate(network(), {7: CV}, np.arange(20.0), 1, tracks={7: PATH})
+    np.testing.assert_allclose(same.truth.tracks[["position_x", "position_y"]], PATH)
 
 
 def test_a_sensor_type_needs_only_the_components_of_the_targets_it_sees():
@@ -74,24 +96,20 @@ def test_a_sensor_type_needs_only_the_components_of_the_targets_it_sees():
 
 def test_exact_labels_with_brackets_can_be_fixed_and_rebuilt():
     built = network(names=("a[0]", "a[1]", "c", "d"))
-    problem = Problem(built, CV, recorded(built), fix=["a[0].range_offset"])
+    problem = Problem(built, CV, recorded(("a[0]", "a[1]", "c", "d")), fix=["a[0].range_offset"])
     assert problem.rebuild().labels == problem.labels == ("a[1].range_offset", "c.range_offset", "d.range_offset")
 
 
 def test_track_follows_the_fit_in_fixed_biases_levels_and_with_sensors_missing():
-    built = network(Unknown(0.3, 5.0))
-    table = recorded(network(), biases={"b.range_offset": 3.0})
-    problem = Problem(built, CV, table, fix={"a.range_offset": 0.0})
-    from probcal import EA
-
-    done = fit(problem, EA())
-    again = track(Problem(built, CV, table), done)
+    done, table = committed.tree("ea"), pd.read_csv(committed.ROWS)
+    built, motion = small.network(), ConstantVelocity(0.5)
+    again = track(Problem(built, motion, table), done)  # nothing is fixed here, and the noise level is a guess
     for name in ("mean", "sd"):
         np.testing.assert_allclose(again["track"][name].values, done["track"][name].values, rtol=1e-3, atol=1e-3)
-    part = table[table["sensor"] != "d"]
-    assert track(Problem(built, CV, part), done)["track"].sizes["epoch"] == 20
-    with pytest.raises(InputError, match='no row of sensor "d"'):
-        fit(Problem(built, CV, part), MAP())
+    part = Problem(built, motion, table[table["sensor"] != "c"])
+    assert track(part, done)["track"].sizes["epoch"] == 16
+    with pytest.raises(InputError, match='no row of sensor "c"'):
+        fit(part, MAP())
 
 
 @pytest.mark.parametrize(
@@ -102,7 +120,10 @@ def test_track_follows_the_fit_in_fixed_biases_levels_and_with_sensors_missing()
         (lambda: Node("h", (0, 0), survey=0.0), "survey of position is 0: it must be positive"),
         (lambda: Node("h", (0, 0), survey={"hedding": 1.0}), 'did you mean "heading"'),
         (lambda: Node("h", (0, 0), survey=1.0, scale=1.0), "position has both survey and scale"),
-        (lambda: Network([network().sensors[0], *network(names="efgh").sensors[:1]]), 'types are called "gauge"'),
+        (
+            lambda: Network(ALIKE),
+            'types are called "gauge"',
+        ),
         (lambda: simulate(network(), CV, [2.0, 1.0, 0.0], 1), "time must be one increasing column"),
         (
             lambda: Problem(
@@ -149,3 +170,50 @@ def test_rows_with_more_cells_than_the_header_are_refused(tmp_path):
     path.write_text("time,sensor,range\n0,a,5,1\n1,a,6,1\n")
     with pytest.raises(InputError, match="has rows with more cells than its header; give every column a name"):
         read_table(path)
+
+
+UNIT_SIZES = {  # by the definitions: SI, international foot, statute mile and nautical mile
+    "m": {"m": 1, "km": 1000, "cm": 1 / 100, "mm": 1 / 1000, "ft": 0.3048, "mi": 5280 * 0.3048, "nmi": 1852},
+    "rad": {"rad": 1, "mrad": 1 / 1000, "deg": np.pi / 180, "°": np.pi / 180},
+    "s": {"s": 1, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60, "h": 3600},
+    "m/s": {"m/s": 1, "km/h": 1000 / 3600},
+    "Hz": {"Hz": 1, "kHz": 1000},
+    "dB": {"dB": 1},
+    "dBm": {"dBm": 1},
+    "1": {"1": 1, "%": 1 / 100},
+    "T": {"T": 1, "uT": 1e-6, "nT": 1e-9},
+}
+
+
+def test_every_unit_has_the_size_of_its_definition():
+    assert {unit for sizes in UNIT_SIZES.values() for unit in sizes} == set(UNITS)
+    given = read_table(recorded())
+    for wanted, sizes in UNIT_SIZES.items():
+        for unit, size in sizes.items():
+            assert factor(given, "x", unit, wanted) == pytest.approx(size, rel=1e-12), unit
+        assert factor(given, "x", None, wanted) == 1.0
+
+
+def test_values_and_stds_are_converted_each_by_its_own_unit():
+    frame = pd.DataFrame({"time [min]": [1.0, 2.0], "sensor": ["a", "b"], "range [km]": [0.05, 0.06],
+                          "range_std [cm]": [150.0, np.nan]})  # fmt: skip
+    data = measure(read_table(frame), network())
+    np.testing.assert_allclose(data.time, [60.0, 120.0])
+    np.testing.assert_allclose(data.value[:, 0], [50.0, 60.0])
+    assert data.std[0, 0] == pytest.approx(1.5)
+    assert data.has_std[:, 0].tolist() == [True, False]
+    nautical = measure(read_table(frame.rename(columns={"range_std [cm]": "range_std [nmi]"})), network())
+    assert nautical.std[0, 0] == pytest.approx(150.0 * 1852)
+    plain = measure(read_table(frame.rename(columns={"range_std [cm]": "range_std"})), network())
+    assert plain.std[0, 0] == 150.0, "a std without a unit is in that of the channel"
+
+
+def test_rows_are_named_by_the_line_of_the_file_and_by_the_index_of_a_frame(tmp_path):
+    path = tmp_path / "rows.csv"
+    path.write_text("time,sensor,range\n0,a,5\n1,a,x\n")
+    with pytest.raises(InputError, match=r"rows\.csv row 3 column .range.: .x. is no number"):
+        measure(read_table(path), network())
+    frame = pd.DataFrame({"time": [0.0, 1.0], "sensor": "a", "range": [5.0, "x"]}, index=[70, 80])
+    with pytest.raises(InputError, match=r"data row 80 column .range.: .x. is no number"):
+        measure(read_table(frame), network())
+    assert read_table(path).lines.tolist() == [2, 3]

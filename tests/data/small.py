@@ -25,7 +25,7 @@ def network():
     nodes = [
         Node("a", (0.0, 0.0)),
         Node("b", (50.0, 0.0), 0.5, scale={"position": 2.0, "heading": turns}),
-        Node("c", (0.0, 50.0), survey={"position": 0.3}, scale={"heading": 0.1}),
+        Node("c", (0.0, 50.0), -0.7, survey={"position": 0.3}, scale={"heading": 0.1}),
     ]
     return Network([gauge.on(node) for node in nodes])
 
