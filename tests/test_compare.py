@@ -1,13 +1,15 @@
 """Fits side by side: distances against formulas, scores and predictions against numbers by hand, words, pictures."""
 
 import arviz as az
+import committed
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from probcal.cli.compare import estimates_text, methods_text
+from probcal.errors import InputError
 from scipy import stats
-from test_cli import call
-from worlds import heights
+from terminal import call
 
 import probcal
 from probcal import diagnostics
@@ -15,8 +17,6 @@ from probcal.analysis import compare, interchangeable
 from probcal.analysis.compare import named
 from probcal.analysis.differences import NARROW
 from probcal.analysis.overlap import ZERO, of_draws, of_gaussian, overlap, wasserstein
-from probcal.cli.compare import estimates_text, methods_text
-from probcal.errors import InputError
 
 HALF = stats.norm.ppf(0.5 + 0.89 / 2)
 LABELS = ("a.heading", "a.gain", "b.gain")
@@ -272,73 +272,87 @@ def test_names_are_made_unique():
     assert list(named({"a": GOOD, "b": GOOD})) == ["a", "b"]
 
 
+def without(tree, label):
+    """A result of a network that lacks one bias."""
+    kept = [other for other in tree["calibration"]["bias_label"].values if other != label]
+    pick = {"bias_label": kept, "bias_label_other": kept}
+    return tree.map_over_datasets(lambda d: d.sel({dim: pick[dim] for dim in pick if dim in d.dims}))
+
+
 @pytest.fixture(scope="module")
-def fitted():
+def saved():
     """EA and MAP of one small problem with its truth, and MAP of a network that lacks a bias."""
-    problem, truth = heights(3, 3)
-    trees = [probcal.fit(problem, probcal.EA()), probcal.fit(problem, probcal.MAP())]
-    trees.append(probcal.fit(problem.rebuild(fix={"n0.shift": 0.0}), probcal.MAP()))
-    for tree in trees:
-        probcal.tree.add_scores(tree, diagnostics.scores(tree, truth), truth.biases)
-    return trees
+    trees = [committed.tree("ea"), committed.tree("map")]
+    less = without(trees[1], "c.heading")
+    less.attrs.update(trees[1].attrs)
+    return [*trees, less]
 
 
 @pytest.mark.filterwarnings("ignore:Estimated shape parameter")
-def test_real_fits_and_two_networks(fitted):
-    found = compare(fitted, ["EA", "MAP", "without n0"])
-    assert found["estimate"]["bias_label"].values.tolist() == ["n1.shift", "n2.shift"]
-    assert "3 of MAP" not in sentences(found, "labels")[0]
-    assert "1 of EA (n0.shift), 1 of MAP (n0.shift)" in sentences(found, "labels")[0]
-    mean = fitted[1]["calibration"]["mean"].sel(bias_label="n1.shift").item()
-    assert found["estimate"]["mean"].sel(estimator="MAP", bias_label="n1.shift") == mean
-    both = compare(fitted[:2])
+def test_saved_fits_and_two_networks(saved):
+    found = compare(saved, ["EA", "MAP", "without"])
+    labels = committed.tree("ea")["calibration"]["bias_label"].values.tolist()
+    assert found["estimate"]["bias_label"].values.tolist() == [label for label in labels if label != "c.heading"]
+    assert "1 of EA (c.heading), 1 of MAP (c.heading)" in sentences(found, "labels")[0]
+    mean = saved[1]["calibration"]["mean"].sel(bias_label="c.range_offset").item()
+    assert found["estimate"]["mean"].sel(estimator="MAP", bias_label="c.range_offset") == mean
+    both = compare(saved[:2])
     assert list(both["method"].children) == ["EA (ARD)", "MAP (Gaussian)"]
-    for name, tree in zip(both["method"].children, fitted, strict=False):
+    for name, tree in zip(both["method"].children, saved, strict=False):
         at = both[f"method/{name}"].attrs
         assert at["log_evidence"] == tree.attrs["log_evidence"]
         assert at["bias_rmse"] == pytest.approx(tree.attrs["bias_rmse"])
         assert at["coverage"] == pytest.approx(tree.attrs["coverage"])
-        assert at["elpd"] == pytest.approx(az.loo(tree).elpd, abs=0.05)  # ArviZ takes the states into its efficiency
+        assert at["elpd"] == pytest.approx(az.loo(tree).elpd, abs=0.05)  # ArviZ takes efficiencies into its tails
 
 
-def test_the_command_line_compares_saved_fits(fitted, tmp_path, monkeypatch, capsys):
+def test_a_sampler_is_compared_with_what_it_reports():
+    found = compare([committed.tree("ea"), committed.tree("collapsed")])
+    assert found.attrs["reference"] == "Collapsed (Horseshoe)"
+    at = found["method/Collapsed (Horseshoe)"].attrs
+    tree = committed.tree("collapsed")["calibration"].to_dataset()
+    assert at["largest_r_hat"] == pytest.approx(tree["r_hat"].max().item())
+    assert at["smallest_ess"] == pytest.approx(tree["ess"].min().item())
+
+
+def test_the_command_line_compares_saved_fits(saved, tmp_path):
     folders = [tmp_path / name for name in ("ea", "map", "less")]
-    for folder, tree in zip(folders, fitted, strict=True):
+    for folder, tree in zip(folders, saved, strict=True):
         folder.mkdir()
         probcal.save(tree, folder / "fit.nc")
-    arguments = ["compare", *folders[:2], "--out", tmp_path / "out", "--pair", "n0.shift,n1.shift"]
-    code, out, err = call(monkeypatch, capsys, *arguments)
+    pair = ["--pair", "c.heading,c.range_offset"]
+    code, out, err = call("compare", *folders[:2], "--out", tmp_path / "out", *pair)
     assert code == 0, err
     assert "EA (ARD) gamma MAP (Gaussian) gamma distance" in " ".join(out.splitlines()[0].split())
-    assert (
-        len([line for line in out.splitlines() if ".shift" in line and "±" in line and not line.startswith("-")]) == 3
-    )
+    labels = saved[0]["calibration"]["bias_label"].values
+    table = [line for line in out.splitlines() if "±" in line and not line.startswith("-")]
+    assert [line.split()[0] for line in table if "." in line.split()[0]][: len(labels)] == labels.tolist()
     assert "coverage" in out
     rows = pd.read_csv(tmp_path / "out" / "compare.csv", keep_default_na=False)
     assert set(rows["quantity"]) >= {"mean", "overlap", "wasserstein", "elpd", "log_evidence", "coverage"}
-    with xr.open_datatree(tmp_path / "out" / "compare.nc", engine="h5netcdf") as saved:
-        assert saved["estimate"]["estimator"].values.tolist() == ["EA (ARD)", "MAP (Gaussian)"]
+    with xr.open_datatree(tmp_path / "out" / "compare.nc", engine="h5netcdf") as written:
+        assert written["estimate"]["estimator"].values.tolist() == ["EA (ARD)", "MAP (Gaussian)"]
     assert (tmp_path / "out" / "compare.png").stat().st_size > 10_000
-    code, out, _ = call(monkeypatch, capsys, "compare", *folders, "--name", "one", "--name", "two", "--name", "three")
+    code, out, _ = call("compare", *folders, "--name", "one", "--name", "two", "--name", "three")
     assert code == 0
-    assert "biases that not all fits have are not compared: 1 of one (n0.shift), 1 of two (n0.shift)" in out
+    assert "biases that not all fits have are not compared: 1 of one (c.heading), 1 of two (c.heading)" in out
     for more, text in (
         (folders[:1], "give at least two"),
         ([*folders[:2], "--name", "one"], "1 names for 2 fits"),
-        ([*folders[:2], "--pair", "n0.shift"], 'the pair "n0.shift" must be two labels of biases, LABEL,LABEL'),
+        ([*folders[:2], "--pair", "c.heading"], 'the pair "c.heading" must be two labels of biases, LABEL,LABEL'),
         (
-            [*folders[:2], "--pair", "n0.shift,n9.shift"],
-            'the pair names "n9.shift", which is no bias of all the fits; did',
+            [*folders[:2], "--pair", "c.heading,c.headng"],
+            'the pair names "c.headng", which is no bias of all the fits; did',
         ),
         ([folders[0], tmp_path / "none"], "is not a fit written by probcal"),
     ):
-        code, _, err = call(monkeypatch, capsys, "compare", *more)
+        code, _, err = call("compare", *more)
         assert code == 2
         assert text in err
-    lost = fitted[1].copy()
+    lost = saved[1].copy()
     lost.attrs["status"] = "diverged"
     probcal.save(lost, folders[1] / "fit.nc")
-    code, out, _ = call(monkeypatch, capsys, "compare", *folders[:2])
+    code, out, _ = call("compare", *folders[:2])
     assert code == 1
     assert "MAP (Gaussian) diverged: its numbers are no estimate" in out
 

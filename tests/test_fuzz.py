@@ -1,6 +1,6 @@
 """Whatever a file holds, the door takes it whole or refuses it in one sentence: no other exception, no NaN kept.
 
-`PROBCAL_FUZZ=5000 pytest tests/test_fuzz.py` draws that many new examples a test.
+`PROBCAL_FUZZ=5000 uv run pytest tests/test_fuzz.py` draws that many new examples a test, 15 the default run.
 """
 
 import datetime
