@@ -10,11 +10,11 @@ import pytest
 import xarray as xr
 from committed import MODEL, ROWS
 from matplotlib import image
-from probcal.cli.kernels import keep_kernels
-from probcal.cli.models import choose_prior, load_model, load_problem
 from terminal import call
 
 import probcal
+from probcal.cli.kernels import keep_kernels
+from probcal.cli.models import choose_prior, load_model, load_problem
 from probcal.inference import METHODS
 
 SMALL = """
@@ -94,11 +94,11 @@ def test_a_sampler_writes_the_structure_of_the_committed_one_and_says_what_its_c
 
 
 def test_without_an_assessment_there_is_no_verdict(tmp_path):
-    code, out, err = call("fit", MODEL, ROWS, "--method", "map", "--no-assess", "--out", tmp_path / "fit")
+    code, out, err = call("fit", MODEL, ROWS, "--no-assess", "--out", tmp_path / "fit")
     assert code == 0, err
     assert "verdict" not in out
     assert "verdict" not in pd.read_csv(tmp_path / "fit" / "summary.csv").columns
-    assert probcal.load(tmp_path / "fit").attrs["prior"] == "Gaussian"
+    assert "verdict" not in probcal.load(tmp_path / "fit").children
 
 
 @pytest.mark.parametrize("name", ["ea", "collapsed"])
@@ -131,7 +131,12 @@ def test_a_saved_calibration_is_applied_to_other_data(tmp_path):
 def test_a_check_says_what_the_data_determine_and_draws_it(tmp_path):
     code, out, err = call("check", MODEL, ROWS, "--out", tmp_path / "check")
     assert code == 0, err
-    for words in ("48 rows of 3 sensors, 2 target(s), 16 epochs", "another pass", "one more gauge at", "a survey of"):
+    for words in (
+        f"{len(pd.read_csv(ROWS))} rows of 3 sensors, 2 target(s), 16 epochs",
+        "another pass",
+        "one more gauge at",
+        "a survey of",
+    ):
         assert words in out
     frame = pd.read_csv(tmp_path / "check" / "check.csv")
     assert list(frame.columns) == ["bias", "unit", "scale", "kind", "sd", "share", "verdict"]
@@ -145,7 +150,7 @@ def test_a_scenario_is_simulated_with_its_truth_and_twice_the_same(tmp_path):
     for name in ("one", "two"):
         code, out, err = call("simulate", MODEL, "--seed", 3, "--out", tmp_path / f"{name}.csv")
         assert code == 0, err
-        assert "(48 rows)" in out
+        assert f"({len(pd.read_csv(tmp_path / f'{name}.csv'))} rows)" in out
     for suffix in (".csv", ".tracks.csv", ".biases.csv"):
         assert (tmp_path / f"one{suffix}").read_text() == (tmp_path / f"two{suffix}").read_text()
     assert pd.read_csv(tmp_path / "one.csv").columns.tolist() == pd.read_csv(ROWS).columns.tolist()
