@@ -1,7 +1,6 @@
 """Nodes from and to files (CSV, GeoJSON), and the local frame of places given by latitude and longitude."""
 
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -16,6 +15,7 @@ import pyproj
 import xarray as xr
 
 from probcal.errors import InputError, nearest
+from probcal.files import write_whole
 from probcal.network import ANGLES, POSE_UNITS, Node, step_of
 from probcal.sensor import Bias
 from probcal.table import Table, factor, header, name_of, numbers, read_table
@@ -356,15 +356,7 @@ def write_nodes(
     idle = [c for c in cells.columns if c.split(" ")[0] in OWN and (cells[c].abs() < 1e-12).all()]
     cells = cells.drop(columns=idle)
     text = _geojson(cells) if geojson else cells.to_csv(index=False)
-    draft = path.with_name(f".{path.name}.part")
-    try:
-        draft.write_text(text, encoding="utf-8")
-        os.replace(draft, path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}") from None
-    finally:
-        draft.unlink(missing_ok=True)
-    return path
+    return write_whole(path, text)
 
 
 def _stated(nodes: Iterable[Node]) -> list[_Record]:

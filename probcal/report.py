@@ -3,7 +3,6 @@
 import base64
 import io
 import json
-import os
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
@@ -17,6 +16,7 @@ from matplotlib.axes import Axes
 
 from probcal import plots
 from probcal.diagnostics import drift_table
+from probcal.files import write_whole
 from probcal.tree import outliers
 
 NONE = "–"  # where there is no finite number
@@ -136,15 +136,7 @@ gamma: how well the data determine a bias (0 prior only, 1 data only).</caption>
 
 def write_report(tree: xr.DataTree, path: str | PathLike[str]) -> Path:
     """Write the report of a fit as one HTML file; a file of that name is whole or absent."""
-    path = Path(path)
-    page = _render(tree)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        draft.write_text(page, encoding="utf-8")
-        os.replace(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
-    return path
+    return write_whole(path, _render(tree))
 
 
 def _render(tree: xr.DataTree) -> str:

@@ -13,6 +13,7 @@ import pandas as pd
 
 from probcal import rows
 from probcal.errors import InputError, nearest
+from probcal.files import write_whole
 from probcal.network import Network
 from probcal.noise import Bernoulli
 from probcal.problem import Epochs, Problem
@@ -101,7 +102,7 @@ class Simulation:
             (biases, pd.DataFrame({"bias": list(self.truth.biases), "value": list(self.truth.biases.values())}))
         )
         for target, frame in tables:
-            frame.to_csv(target, index=False)
+            write_whole(target, frame.to_csv(index=False))
         return [target for target, _ in tables]
 
 

@@ -1,8 +1,7 @@
 """The only writer of results: one labelled DataTree from every method, and its netCDF file."""
 
+import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -16,12 +15,27 @@ import xarray as xr
 from scipy import stats
 
 from probcal.errors import InputError
+from probcal.files import write_whole
 from probcal.problem import Problem
 
 INTERVAL = 0.89  # probability of lower to upper
 SHARP = 256  # steps to which the spread of a log-likelihood over the draws is rounded, so that its file is small
+RESULTS_VERSION = 1  # of the groups and variables that a fit writes; a reader refuses any other
 MORE = ("r_hat", "ess", "ess_tail", "inclusion", "included", "contraction")  # columns of samplers
 SUMMARY = ("bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma")
+
+SEAL = b"probcal sha256:"  # behind the content of a file, before its digest
+NEEDED = {  # what readers of a fit take for granted
+    "posterior": ("bias",),
+    "calibration": (*SUMMARY[1:], "bias_label", "covariance", "information", "precision", "status", "kind"),
+    "track": (),
+    "observed_data": ("y", "sensor", "channel", "target", "time", "row"),
+    "residual": ("before", "after", "std", "weight"),
+    "constant_data": ("node_position", "node_heading", "moving", "stated", "stated_node", "stated_component"),
+}
+TRACKED = ("mean", "sd", "before", "epoch_time", "epoch_target", "component")  # of each recursion
+JUDGED = {"verdict": ("verdict", "reason"), "finding": ("sentence",), "level": ("std", "guess")}  # where they are
+ATTRIBUTES = ("method", "prior", "seed", "status", "message", "intervals", "settings", "interval_probability", "data")
 
 
 @dataclass(frozen=True)
@@ -184,7 +198,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
     attrs = {
         "method": result.method, "prior": result.prior, "seed": result.seed, "approximate": result.approximate,
         "intervals": result.intervals, "settings": result.settings, "correlated": int(result.correlated),
-        "interval_probability": INTERVAL,
+        "interval_probability": INTERVAL, "results_version": RESULTS_VERSION,
         "status": result.status, "message": result.message, "data": problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
     } | dict(result.attrs)  # fmt: skip
@@ -362,35 +376,91 @@ def summary(tree: xr.DataTree) -> Any:
 
 
 def save(tree: xr.DataTree, path: str | PathLike[str]) -> Path:
-    """Write netCDF in one step: a file of that name is whole or absent."""
-    path = Path(path)
-    handle, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    os.close(handle)
-    try:
-        tree.to_netcdf(draft, engine="h5netcdf")
-        os.chmod(draft, 0o666 & ~_umask())
-        os.replace(draft, path)
-    finally:
-        Path(draft).unlink(missing_ok=True)
-    return path
+    """Write netCDF in one step, compressed and with checksums: a file of that name is whole or absent.
+
+    Raises `InputError` where it cannot be written.
+    """
+    content = tree.to_netcdf(engine="h5netcdf", encoding=_encoding(tree))  # in memory: HDF5 dies on a full disk
+    return write_whole(path, b"".join([content, SEAL, hashlib.sha256(content).digest()]))
 
 
-def _umask() -> int:
-    """The process's mask of file modes, which `mkstemp` does not follow."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _encoding(tree: xr.DataTree) -> dict[str, Any]:
+    """Compression and a checksum for every array of every group; texts as characters, which alone can have them."""
+    packed = {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
+    found: dict[str, Any] = {}
+    for node in tree.subtree:
+        variables = node.to_dataset(inherit=False).variables.items()
+        found[node.path] = {
+            name: packed | ({"dtype": "S1"} if _is_text(variable) else {})
+            for name, variable in variables
+            if variable.ndim and variable.size
+        }
+    return found
+
+
+def _is_text(variable: xr.Variable) -> bool:
+    return variable.dtype.kind in "UO" and all(isinstance(value, str) for value in variable.values.ravel())
 
 
 def load(path: str | PathLike[str]) -> xr.DataTree:
-    """Read a fit back from its file, or from the folder that holds `fit.nc`."""
+    """Read a fit back from its file, or from the folder that holds `fit.nc`.
+
+    Raises `InputError` where the file is damaged, foreign, or written by another version.
+    """
     path = Path(path)
+    path = path / "fit.nc" if path.is_dir() else path
     try:
-        path = path / "fit.nc" if path.is_dir() else path
+        sealed = _sealed(path)
+    except OSError as error:
+        raise InputError(f"{path} is not a fit written by probcal ({type(error).__name__}: {error})") from None
+    if not sealed:
+        raise InputError(f"{path} is damaged: its checksum does not match its content; fit again")
+    try:
         with xr.open_datatree(path, engine="h5netcdf") as tree:
             tree = tree.load()
     except Exception as error:  # whatever the netCDF and HDF5 libraries say of foreign bytes
         raise InputError(f"{path} is not a fit written by probcal ({type(error).__name__}: {error})") from None
+    _check_content(tree, path)
+    return tree
+
+
+def _sealed(path: Path) -> bool:
+    """Whether the digest behind the content matches it; a file that another program wrote has none."""
+    tail = len(SEAL) + hashlib.sha256().digest_size
+    with path.open("rb") as file:
+        left = file.seek(0, 2) - tail
+        if left < 0:
+            return True
+        file.seek(left)
+        seal, found = file.read(tail), hashlib.sha256()
+        if not seal.startswith(SEAL):
+            return True
+        file.seek(0)
+        while left > 0:
+            found.update(piece := file.read(min(left, 2**20)))
+            left -= len(piece)
+    return seal.endswith(found.digest())
+
+
+def _check_content(tree: xr.DataTree, path: Path) -> None:
+    """Raise `InputError` where a fit lacks what its readers need."""
     if "calibration" not in tree.children or not set(SUMMARY[1:]) <= set(tree["calibration"].data_vars):
         raise InputError(f"{path} is not a fit written by probcal: its group calibration is missing or incomplete")
-    return tree
+    if (found := tree.attrs.get("results_version")) != RESULTS_VERSION:
+        age = "a newer" if isinstance(found, (int, np.integer)) and found > RESULTS_VERSION else "an older"
+        raise InputError(f"{path} was written by {age} probcal; fit again")
+    for group, names in NEEDED.items():
+        if group not in tree.children or not set(names) <= set(tree[group].variables):
+            raise InputError(f"{path} is incomplete: its group {group} lacks what a fit holds; fit again")
+    for group, names in JUDGED.items():
+        if group in tree.children and not set(names) <= set(tree[group].variables):
+            raise InputError(f"{path} is incomplete: its group {group} lacks what a fit holds; fit again")
+    tracked = {str(name) for name in tree["track"].variables}
+    means = [name.removeprefix("mean") for name in tracked if name.startswith("mean")]
+    if not means or any(f"{name}{s}" not in tracked for s in means for name in TRACKED):
+        raise InputError(f"{path} is incomplete: its group track lacks what a fit holds; fit again")
+    if missing := [name for name in ATTRIBUTES if name not in tree.attrs]:
+        raise InputError(f"{path} is incomplete: it has no attribute {missing[0]}; fit again")
+    calibration = tree["calibration"].to_dataset()
+    if not all(np.isfinite(calibration[name].values).all() for name in ("mean", "sd", "covariance")):
+        raise InputError(f"{path}: its means or sds are not finite; fit again")

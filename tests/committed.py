@@ -6,6 +6,7 @@ structure with what `probcal fit` writes today.
 
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import probcal
 
@@ -57,7 +58,9 @@ def make():
     simulation.write(ROWS)
     problem = small.problem(ROWS)
     for name, (method, draws) in METHODS.items():
-        found = probcal.assess(problem, probcal.fit(problem, method), truth=simulation.truth)
+        with TemporaryDirectory() as folder:  # as the command line does
+            found = probcal.fit(problem, method, store=folder)
+        found = probcal.assess(problem, found, truth=simulation.truth)
         found.attrs["model"] = "small"
         probcal.tree.add_scores(found, probcal.scores(found, simulation.truth), simulation.truth.biases)
         probcal.save(shortened(found, draws), DATA / f"{name}.nc")

@@ -10,7 +10,7 @@ import probcal
 
 ROOT = Path(probcal.__file__).parent
 FLOORS = {
-    0: ("linalg", "geometry", "types", "errors", "lazy", "kernels", "fingerprint"),
+    0: ("linalg", "geometry", "types", "errors", "lazy", "kernels", "fingerprint", "files"),
     1: ("sensor", "motion", "priors", "noise"),
     2: ("sensors",),
     3: ("network", "table", "nodes", "rows"),
@@ -21,7 +21,7 @@ FLOORS = {
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
 METHODS = ("inference.ea", "inference.em")  # algorithms: they share what lies below, never each other
-LOW = {"jax", "numpy"}  # third parties of floor 0, besides the standard library
+LOW = {"jax", "numpy", "filelock"}  # third parties of floor 0, besides the standard library
 FACTORISE = {
     "cho_factor", "cho_solve", "cholesky", "eigh", "eig", "eigvalsh", "inv", "lu", "lu_factor", "lu_solve",
     "lstsq", "matrix_rank", "pinv", "qr", "slogdet", "svd", "solve_triangular", "triangular_solve",

@@ -5,6 +5,7 @@ runs 500 simulations of a small radar network, the default suite 40. The statist
 """
 
 import importlib
+import os
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -418,17 +419,19 @@ def test_runs_are_resumed(tmp_path):
     assert part.attrs["interrupted"] == 1
     assert 2 <= part.attrs["runs"] < 40
     assert "resume to go on" in part.attrs["message"]
-    (tmp_path / ".batch-000099.1.part.npz").write_bytes(b"half written")
+    (tmp_path / ".runs-000099.npz.probcal-0123abcd.part").write_bytes(b"half written")
     seen = []
     rest = dict(store=tmp_path, resume=True, threads=1)
     again = sbc(problem, method, Gaussian(), 42, **rest, progress=lambda *at: seen.append(at))
     assert seen[-1] == (42, 42)
     xr.testing.assert_identical(whole["sbc"].to_dataset(), again["sbc"].to_dataset())
-    assert whole.attrs == again.attrs
-    with pytest.raises(InputError, match="have another seed; go on as they began"):
+    assert again.attrs == whole.attrs | {"identity": part.attrs["identity"]}
+    with pytest.raises(InputError, match="the seed has changed since the run there began; resume it as it began"):
         sbc(problem, method, Gaussian(), 42, store=tmp_path, resume=True, key=1)
-    fresh = sbc(problem, method, Gaussian(), 3, store=tmp_path, key=1)
-    assert len(list(tmp_path.glob("*"))) == 3
+    with pytest.raises(InputError, match=r"holds the runs of an sbc \(MAP.* already; give --resume"):
+        sbc(problem, method, Gaussian(), 42, store=tmp_path)
+    fresh = sbc(problem, method, Gaussian(), 3, store=tmp_path, key=1, overwrite=True)
+    assert sorted(os.listdir(tmp_path)) == [".probcal.lock", "probcal-run.json", "runs-000000.npz", "runs-000001.npz"]
     assert not np.allclose(fresh["sbc"]["truth"], whole["sbc"]["truth"][:3])
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from worlds import heights
 
 import probcal
@@ -103,6 +104,39 @@ def test_errors_of_studies(call, text):
     with pytest.raises(InputError) as error:
         call()
     assert text in str(error.value)
+
+
+def test_a_study_is_resumed_with_the_same_numbers(tmp_path):
+    """Stopped, taken up for more runs, a file lost; an edited model is refused."""
+    whole = study(heights, {}, ["em", "ml"], runs=25)
+
+    def stop(done, total):
+        if done >= 20:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        study(heights, {}, ["em", "ml"], runs=21, store=tmp_path, progress=stop)
+    assert (tmp_path / "fits-000000.npz").exists()
+    seen = []
+    for lost in ("fits-000020.npz", "fits-000000.npz"):
+        again = study(
+            heights, {}, ["em", "ml"], runs=25, store=tmp_path, resume=True, progress=lambda *at: seen.append(at)
+        )
+        xr.testing.assert_equal(again, whole)
+        (tmp_path / lost).unlink()
+    assert seen[-1] == (50, 50)
+    with pytest.raises(InputError, match="the list of methods has changed since the run there began"):
+        study(heights, {}, ["em"], runs=25, store=tmp_path, resume=True)
+    with pytest.raises(InputError, match=r"holds the fits of a study already; give --resume"):
+        study(heights, {}, ["em", "ml"], runs=25, store=tmp_path)
+
+    def edited(run, size=2):
+        return heights(run + 1, size)
+
+    with pytest.raises(InputError, match=r"gives another problem than .* began: the model has changed"):
+        study(edited, {}, ["em", "ml"], runs=25, store=tmp_path, resume=True)
+    fresh = study(edited, {}, ["em", "ml"], runs=2, store=tmp_path, overwrite=True)
+    assert fresh["error"].sel(run=0).equals(whole["error"].sel(run=1).assign_coords(run=0))
 
 
 def test_a_study_without_a_number_has_no_picture():

@@ -10,6 +10,7 @@ from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.cli import files, options
 from probcal.cli.names import METHODS, ORACLE, PRIORS
 from probcal.errors import FitError, InputError, nearest
+from probcal.files import make_folder
 
 app = typer.Typer(
     help="Bayesian calibration of sensor networks from targets of opportunity.",
@@ -74,7 +75,7 @@ def fit_command(
     kept = options.saved_names(save)
     options.check_files(model, data)
     if out is not None:
-        files.folder(out)
+        make_folder(out)
     from probcal.cli import fit
 
     raise typer.Exit(
@@ -94,7 +95,7 @@ def simulate_command(
     """Simulate a model's scenario: the table, and beside it its true tracks and biases."""
     options.check_files(model)
     path = Path(f"{model.stem}-{seed}.csv") if out is None else out
-    files.folder(path.parent)
+    make_folder(path.parent)
     from probcal.cli import simulate
 
     raise typer.Exit(simulate.run(model, seed, path))
@@ -110,7 +111,7 @@ def check_command(
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
     options.check_files(model, data)
     if out is not None:
-        files.folder(out)
+        make_folder(out)
     from probcal.cli import check
 
     raise typer.Exit(check.run(model, data, fix or (), out))
@@ -128,7 +129,7 @@ def track_command(
         raise InputError("track needs --calibration DIR, the folder of a fit")
     options.check_fit(calibration)
     options.check_files(model, data)
-    files.folder(out.parent)
+    make_folder(out.parent)
     from probcal.cli import track
 
     raise typer.Exit(track.run(model, data, calibration, out))
@@ -151,7 +152,7 @@ def study_command(
     grid = options.grid(setting or ())
     options.check_files(model)
     if out is not None:
-        files.folder(out)
+        make_folder(out)
     from probcal.cli import study
 
     raise typer.Exit(study.run(model, grid, chosen, runs, seed, out))
@@ -176,7 +177,7 @@ def compare_command(
         check_names(name, len(folders))
     pairs = [split_pair(text.split(",")) for text in pair or ()]
     if out is not None:
-        files.folder(out)
+        make_folder(out)
     from probcal.cli import compare
 
     raise typer.Exit(compare.run(folders, name, pairs, out))
@@ -227,7 +228,7 @@ def sbc_command(
         raise InputError("sbc: --resume needs --out DIR, the folder of the runs to go on with")
     options.check_files(model, data)
     if out is not None:
-        files.folder(out)
+        make_folder(out)
     from probcal.cli import sbc
 
     raise typer.Exit(

@@ -1,27 +1,17 @@
 """What the commands write: folders checked before any work, tables in one step, the report."""
 
 import importlib.util
-import os
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probcal.errors import InputError
+from probcal.files import write_whole
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
-
-
-def folder(path: Path) -> Path:
-    """Make a folder and check that it can be written, before any work is done."""
-    with writing(path):
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    return path
 
 
 @contextmanager
@@ -35,13 +25,7 @@ def writing(path: Path) -> Iterator[None]:
 
 def write_csv(frame: "pd.DataFrame", path: Path) -> None:
     """Write a table in one step."""
-    draft = path.with_name(f".{path.name}.part")
-    try:
-        with writing(path):
-            frame.to_csv(draft, index=False)
-            os.replace(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
+    write_whole(path, frame.to_csv(index=False))
 
 
 def can_plot() -> bool:

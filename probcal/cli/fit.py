@@ -1,6 +1,5 @@
 """`fit`: calibrate, print one row a bias and what the fit is worth, write fit.nc, summary.csv and report.html."""
 
-import shutil
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -15,6 +14,7 @@ from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import choose_prior, load_problem, load_truth
 from probcal.cli.progress import line
 from probcal.inference import METHODS, fit
+from probcal.inference.storage import remove_run
 from probcal.tree import add_scores, outliers, save, summary
 
 FINDINGS = 8  # sentences of an assessment that are printed
@@ -41,7 +41,7 @@ def run(
         if out is not None:
             save(tree, out / "fit.nc")  # what is found is safe whatever comes
             if "Interrupted" not in tree.attrs["message"]:
-                shutil.rmtree(out / "draws", ignore_errors=True)  # they are in fit.nc now
+                remove_run(out / "draws", tree.attrs["identity"])  # its draws are in fit.nc now
         if assessed:
             from probcal.analysis import assess
 

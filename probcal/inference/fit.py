@@ -2,7 +2,6 @@
 
 from collections.abc import Collection
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,11 +12,13 @@ from scipy import stats
 
 from probcal import tree
 from probcal.errors import FitError, InputError
+from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.methods import EA, MAP, NUTS, check_problem, choose_prior
 from probcal.inference.posterior import result
 from probcal.inference.run import Maximiser, Method, Outcome, Progress, maximise
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import sample
+from probcal.inference.storage import Storage, stored_run
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
@@ -44,6 +45,7 @@ def fit(
     save: Collection[str] = (),
     store: str | PathLike[str] | None = None,
     resume: bool = False,
+    overwrite: bool = False,
 ) -> xr.DataTree:
     """Calibrate: estimate the biases of a problem and the tracks of its targets.
 
@@ -53,29 +55,64 @@ def fit(
     all of them with their evidence in the group `optimum`. `save` names draws that the tree keeps beside those of the
     biases and of the log-likelihood: "states" of every epoch (large), "predictive" replicas of the data. A
     sampler (`Collapsed()`, `NUTS()`, `SVI()`) writes its draws to the folder `store` while it runs; `resume` goes on
-    where a killed run of the same settings stopped, with the draws of an uninterrupted one; Ctrl-C leaves what was
-    drawn. The attributes `status` and `message` say what the fit is worth. Raises `InputError` for a prior that the
-    method does not take and `FitError` where a flat prior leaves a singular problem without any interval.
+    where a killed run of the same model, data and settings stopped, with the draws of an uninterrupted one; Ctrl-C
+    leaves what was drawn. A folder that holds a run is refused without `resume` or `overwrite`. The attributes `status`
+    and `message` say what the fit is worth. Raises `InputError` for a prior that the method does not take and
+    `FitError` where a flat prior leaves a singular problem without any interval.
     """
     method = EA() if method is None else method
     if not isinstance(method, Method):
         raise InputError(f"method must be a value such as EA() or MAP(), got {method!r}")
     prior = choose_prior(method, prior)
     check_problem(problem)
-    kept = _kept(save)
+    keep = _kept(save)
     if starts < 1:
         raise InputError(f"starts={starts}: at least one start is needed")
+    if not isinstance(method, Sampler):
+        _check_store(method, store, resume, overwrite)
+    identity: dict[str, str] = {}
+    if store is not None:
+        identity = identity_of(
+            problem, method=method, prior=prior, seed=seed_text(as_key(key)), number_of_starts=starts,
+            start="" if start is None else points_digest(start),
+        )  # fmt: skip
+    folder = store if isinstance(method, Sampler) else None
+    with Storage(folder, "draws", identity, resume=resume, overwrite=overwrite) as storage:
+        found = _fit(problem, method, prior, key, start, starts, progress, keep, storage)
+    if store is not None:
+        found.attrs["identity"] = storage.digest
+    return found
+
+
+def _check_store(method: Method, store: str | PathLike[str] | None, resume: bool, overwrite: bool) -> None:
+    """A method that keeps no draws neither goes on with a run nor stands in the place of one."""
+    if resume:
+        raise InputError(
+            f"{method.name} has nothing to resume: samplers (collapsed, nuts, svi) keep their draws; leave --resume"
+            " (resume=True) out"
+        )
+    if store is not None and not overwrite and (other := stored_run(store)):
+        raise InputError(
+            f"{store} holds {other}: go on with it by its own method, give another folder, or give --overwrite"
+            " (overwrite=True) to let it lie"
+        )
+
+
+def _fit(
+    problem: Problem, method: Method, prior: Prior, key: Key, start: Point | None, starts: int,
+    progress: Progress | None, keep: tuple[str, ...], storage: Storage,
+) -> xr.DataTree:  # fmt: skip
     given, problem = problem, method.prepare(problem)
     keys = jax.random.split(as_key(key), 3)
     first = automatic_start(problem) if start is None else _suited(given, problem, start)
     points = [first, *further_starts(problem, starts - 1, keys[2])]
     seed = int(key) if isinstance(key, (int, np.integer)) else -1
     if isinstance(method, Sampler):
-        return _sampled(problem, method, prior, points, keys, seed, progress, kept, store, resume)
+        return _sampled(problem, method, prior, points, keys, seed, progress, keep, storage)
     assert isinstance(method, Maximiser)
     outcomes = [maximise(method, problem, prior, point, progress) for point in points]
     best = max(range(starts), key=lambda k: _rank(prior, outcomes[k]))
-    tree_ = tree.build(problem, _result(problem, method, prior, outcomes[best], keys, seed, kept))
+    tree_ = tree.build(problem, _result(problem, method, prior, outcomes[best], keys, seed, keep))
     return tree.add_optima(tree_, problem, outcomes, best) if starts > 1 else tree_
 
 
@@ -92,7 +129,7 @@ def _kept(save: Collection[str]) -> tuple[str, ...]:
 
 def _sampled(
     problem: Problem, method: Sampler, prior: Prior, points: list[Point], keys: jax.Array, seed: int,
-    progress: Progress | None, keep: tuple[str, ...], store: str | PathLike[str] | None, resume: bool,
+    progress: Progress | None, keep: tuple[str, ...], storage: Storage,
 ) -> xr.DataTree:  # fmt: skip
     """The tree of a sampler, from the best of several starts."""
     best, outcomes = 0, []
@@ -100,10 +137,7 @@ def _sampled(
         outcomes = [maximise(MAP(), problem, Gaussian(), point, progress) for point in points]
         best = max(range(len(points)), key=lambda k: _rank(Gaussian(), outcomes[k]))
         points = [outcome.point for outcome in outcomes]
-    run = sample(
-        problem, method, prior, points[best], keys[0], progress=progress,
-        store=None if store is None else Path(store), resume=resume, fallback=NUTS(),
-    )  # fmt: skip
+    run = sample(problem, method, prior, points[best], keys[0], progress=progress, storage=storage, fallback=NUTS())
     found = tree.build(problem, result(problem, prior, run, keys[1], seed, keep))
     return tree.add_optima(found, problem, outcomes, best) if len(points) > 1 else found
 

@@ -1,26 +1,24 @@
 """Runs a sampler: chains in jitted chunks, each chain on its own thread, with progress, checkpoints and resume."""
 
-import hashlib
 import os
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.errors import FitError
+from probcal.errors import FitError, InputError
 from probcal.inference.collapsed import Collapsed
 from probcal.inference.nuts import NUTS
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Posed
 from probcal.inference.run import Progress
 from probcal.inference.sampler import Draw, Sampler, run_chunk, run_chunks
-from probcal.inference.store import Store
+from probcal.inference.storage import Chunks, Storage
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.smoothing.mode import Point
@@ -68,17 +66,17 @@ def sample(
     key: jax.Array,
     *,
     progress: Progress | None = None,
-    store: Path | None = None,
-    resume: bool = False,
+    storage: Storage | None = None,
     threads: int | None = None,
     fallback: NUTS | None = None,
 ) -> Sampled:
     """Draws of a method from the posterior of a problem.
 
-    `store` is a folder for draws and state, taken up again by `resume`. `fallback` takes over where the frame does not
-    fit and has its prior. Raises `FitError` where no draw is finite, `InputError` where the stored run is another.
+    `storage` keeps draws and state, and what it holds is gone on with. `fallback` takes over where the frame does not
+    fit and has its prior. Raises `FitError` where no draw is finite, `InputError` where a stored chunk is damaged.
     """
     began = time.perf_counter()
+    box = Chunks(Storage(None, "draws", {}) if storage is None else storage)
     keys = jax.random.split(key)
     form, posed, found, worth = pose(problem, prior, start, keys[0])
     note = ""
@@ -91,7 +89,6 @@ def sample(
         )
         method = taken
     runs = _Run(method, form, posed, found, keys[1])
-    box = Store(store, _name(problem, method, prior, key), resume=resume)
     state = runs.restored(box.state) if box.state is not None else runs.first()
     total, interrupted = method.warmup + method.draws, False
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
@@ -106,8 +103,7 @@ def sample(
             interrupted = True
             if box.count * method.chunk <= method.warmup:
                 raise
-    chunks = box.chunks()
-    joined = {n: np.concatenate([c[n] for c in chunks], 1)[:, : method.draws] for n in chunks[-1]}
+    joined = {name: array[:, : method.draws] for name, array in box.joined().items()}
     if not np.isfinite(joined["theta"]).all():
         raise FitError(
             f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them"
@@ -122,17 +118,6 @@ def named(draws: Draw) -> dict[str, np.ndarray]:
     found |= {f"stats_{name}": value for name, value in draws.stats.items()}
     found |= {f"states_{r}": value for r, value in enumerate(draws.states)}
     return {name: np.asarray(value) for name, value in found.items()}
-
-
-def _name(problem: Problem, method: Sampler, prior: Prior, key: jax.Array) -> dict[str, str]:
-    """What a stored run must share with the one that resumes it."""
-    numbers = hashlib.sha256()
-    for leaf in jax.tree.leaves(problem.system):
-        numbers.update(np.ascontiguousarray(leaf).tobytes())
-    return {
-        "method": repr(method), "prior": repr(prior), "data": numbers.hexdigest(), "biases": " ".join(problem.labels),
-        "seed": str(np.asarray(jax.random.key_data(key)).tolist()),
-    }  # fmt: skip
 
 
 class _Run:
@@ -155,8 +140,14 @@ class _Run:
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
 
     def restored(self, leaves: list[np.ndarray]) -> Any:
-        """The state of saved leaves."""
-        return jax.tree.unflatten(jax.tree.structure(jax.eval_shape(self.first)), [jnp.asarray(a) for a in leaves])
+        """The state of saved leaves; raises `InputError` where they are those of another."""
+        form = jax.eval_shape(self.first)
+        if [leaf.shape for leaf in jax.tree.leaves(form)] != [leaf.shape for leaf in leaves]:
+            raise InputError(
+                "the state of the stored run has another form than this run's: begin anew with --overwrite"
+                " (overwrite=True)"
+            )
+        return jax.tree.unflatten(jax.tree.structure(form), [jnp.asarray(leaf) for leaf in leaves])
 
     def advance(self, state: Any, pool: ThreadPoolExecutor) -> tuple[Any, Draw]:
         """All chains one chunk further."""

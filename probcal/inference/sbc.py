@@ -7,14 +7,12 @@ and what is checked is the method where it will be used. It is the right tool wh
 target whose start is not declared would pass many network sizes away.
 """
 
-import hashlib
 import os
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from copy import copy
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -23,15 +21,16 @@ import numpy as np
 import xarray as xr
 
 from probcal.errors import FitError, InputError
-from probcal.inference.batches import Batches
 from probcal.inference.coverage import judge
 from probcal.inference.hierarchy import hierarchy_of
+from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.methods import MAP, NUTS, check_problem, choose_prior
 from probcal.inference.posed import Form
 from probcal.inference.prior_draws import check_drawable, draw_data, draw_prior, far_start
 from probcal.inference.quantities import TAKEN, Points, Posterior, Trial, gaussian_posterior, ranked, sampled_posterior
 from probcal.inference.run import Maximiser, Method, maximise
 from probcal.inference.sampler import Sampler
+from probcal.inference.storage import Records, Storage
 from probcal.inference.uniformity import NOMINAL
 from probcal.priors import Gaussian, Precision, Prior
 from probcal.problem import Problem
@@ -63,6 +62,7 @@ def sbc(
     draws: int = 100,
     store: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     fallback: bool = True,
     threads: int | None = None,
     progress: Advance | None = None,
@@ -74,13 +74,15 @@ def sbc(
     `start="truth"` starts each fit near the simulated truth: cheaper, and of no account to a sampler that mixes.
     The truth is ranked among at most `draws` nearly independent draws, thinned by their effective sample size.
     Without `fallback` a sampler stands alone: the joint sampler does not take over where its collapse does not fit.
-    `store` is a folder that keeps finished runs, `resume` goes on with it, for more `runs` too; results depend neither
-    on an interruption nor on the number of `threads`. Ctrl-C leaves what was finished.
+    `store` is a folder that keeps finished runs, `resume` goes on with it, for more `runs` too, `overwrite` replaces
+    what it holds; results depend neither on an interruption nor on the number of `threads`. Ctrl-C leaves what was
+    finished.
 
     Groups: `sbc` by run and quantity (`truth`, `mean`, `sd`, `rank` among `draws`, `place` in (0, 1), `inside` by
     nominal interval), `run` (`status`, `seconds`, ...), `uniformity` (p-values), `coverage` (see `coverage_table`).
     Attributes: `status` ("uniform", "not uniform"), `verdict`, `false_alarm_rate` of all quantities together.
-    Raises `InputError` for a prior that cannot be drawn from, and `FitError` where no run left a posterior.
+    Raises `InputError` for a prior that cannot be drawn from and a folder that holds another run, and `FitError` where
+    no run left a posterior.
     """
     if not isinstance(method, Method):
         raise InputError(f"sbc: method must be a value such as NUTS() or EA(), got {method!r}")
@@ -92,7 +94,21 @@ def sbc(
     check_problem(problem)
     key = as_key(key)
     engine = _Engine(problem, method, prior, simulate_from or prior, around, start, draws, fallback, key)
-    box = Batches(None if store is None else Path(store), engine.name(), resume=resume)
+    identity = {} if store is None else engine.identity()
+    with Storage(store, "sbc", identity, resume=resume, overwrite=overwrite) as storage:
+        kept = Records(storage)
+        engine.prepare()
+        records, interrupted = _runs(engine, kept, runs, threads, progress)
+    tree = _tree(engine, {k: records[k] for k in range(runs) if k in records}, interrupted)
+    if store is not None:
+        tree.attrs["identity"] = storage.digest
+    return tree
+
+
+def _runs(
+    engine: "_Engine", box: Records, runs: int, threads: int | None, progress: Advance | None
+) -> tuple[dict[int, dict[str, np.ndarray]], bool]:
+    """Records of all runs, those kept and those made now, and whether Ctrl-C stopped them."""
     missing = [k for k in range(runs) if k not in box.records]
     batches = [missing[:1], *(missing[k : k + BATCH] for k in range(1, len(missing), BATCH))] if missing else []
 
@@ -121,7 +137,7 @@ def sbc(
         interrupted = True
         if len(box.records) < 2:
             raise
-    return _tree(engine, {k: box.records[k] for k in range(runs) if k in box.records}, interrupted)
+    return box.records, interrupted
 
 
 def short(method: Method) -> Method:
@@ -151,21 +167,21 @@ class _Engine:
             self.form = Form(problem.spec, hierarchy_of(source, problem))
         elif isinstance(around, xr.DataTree):
             self.pool = _of_tree(problem, around)
-        elif around == "data":
-            self.pool = self._fit(problem, None, jax.random.fold_in(key, 2**31 - 1))
-        else:
+        elif around != "data":
             raise InputError(f'sbc: around is "{around}"; give "data", or a tree of fit()')
 
-    def name(self) -> dict[str, str]:
+    def prepare(self) -> None:
+        """Fit the data at hand, where the truths come from their posterior."""
+        if self.around == "data":
+            self.pool = self._fit(self.problem, None, jax.random.fold_in(self.key, 2**31 - 1))
+
+    def identity(self) -> dict[str, str]:
         """What runs must share to be counted together."""
-        numbers = hashlib.sha256()
-        for leaf in jax.tree.leaves((self.problem.system, self.pool.points if self.pool else ())):
-            numbers.update(np.ascontiguousarray(leaf).tobytes())
-        return {
-            "method": repr(self.method), "prior": repr(self.prior), "source": repr(self.source), "start": self.start,
-            "around": self.around, "draws": str(self.draws), "fallback": repr(self.other), "data": numbers.hexdigest(),
-            "biases": " ".join(self.problem.labels), "seed": str(np.asarray(jax.random.key_data(self.key)).tolist()),
-        }  # fmt: skip
+        around = self.around + (points_digest(self.pool.points) if self.pool else "")
+        return identity_of(
+            self.problem, method=self.method, prior=self.prior, prior_of_the_truths=self.source, start=self.start,
+            posterior=around, draws=self.draws, fallback=self.other, seed=seed_text(self.key),
+        )  # fmt: skip
 
     def trial(self, key: jax.Array) -> Trial:
         """A truth, and the problem with its data."""

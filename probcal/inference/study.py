@@ -1,10 +1,12 @@
 """Studies: methods side by side over settings and simulated runs, many fits in one compiled kernel."""
 
 import itertools
+import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from os import PathLike
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +16,7 @@ import xarray as xr
 from scipy import stats
 
 from probcal.errors import InputError, nearest
+from probcal.inference.identity import identity, problem_digest
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
 from probcal.inference.posterior import judge, mixing
 from probcal.inference.run import (
@@ -31,6 +34,7 @@ from probcal.inference.run import (
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import sample
 from probcal.inference.settings import check_setting
+from probcal.inference.storage import Records, Storage
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import Truth
@@ -39,6 +43,7 @@ from probcal.smoothing.start import automatic_start
 from probcal.tree import INTERVAL
 
 BATCH = 10  # runs that one compiled call solves
+CHECKED = 20  # stored problems that a resumed study makes anew, to see whether the model is still the same
 ORACLE = "oracle"  # MAP whose prior knows which biases are zero
 VECTORS = ("error", "lower", "upper", "true", "sd", "gamma")  # by bias, over its scale; the interval less the truth
 Setting = Callable[..., tuple[Problem, Truth]]
@@ -120,12 +125,13 @@ def _form(run: _Run) -> tuple[Any, ...]:
 
 
 def _batch(
-    setting: Setting, cases: Sequence[tuple[dict[str, Any], int]], methods: Mapping[str, tuple[Method, Prior]]
-) -> list[dict[str, Any]]:
-    """Records of all methods on some cases (grid point, run)."""
+    setting: Setting, cases: Sequence[tuple[dict[str, Any], int]], methods: Mapping[str, tuple[Method, Prior]], *,
+    stored: bool = False,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Records of all methods on some cases (grid point, run); one of them says what its problem was, if `stored`."""
     with jax.enable_x64(True):
         whole = [_simulated(setting, point, run) for point, run in cases]
-        found = []
+        found: list[dict[str, Any]] = []
         for name, (method, prior) in methods.items():
             if isinstance(method, Sampler):
                 found += [
@@ -153,11 +159,20 @@ def _batch(
                 for j, k in enumerate(members):
                     one = jax.tree.map(lambda leaf, j=j: leaf[j], solved)
                     found.append({"case": cases[k], "method": name} | _record(chosen[j], prior, one))
+        if stored:
+            first = next(record for record in found if record["case"] == cases[0])
+            first["problem"] = problem_digest(whole[0].problem, whole[0].truth.biases)
         return found
 
 
 def _simulated(setting: Setting, point: dict[str, Any], number: int) -> _Run:
     """One problem with its start; raises `InputError` where a setting does not return what a study needs."""
+    problem, truth = _made(setting, point, number)
+    return _Run(problem, truth, automatic_start(problem), number)
+
+
+def _made(setting: Setting, point: dict[str, Any], number: int) -> tuple[Problem, Truth]:
+    """A problem and its truth, checked."""
     made = setting(number, **point)
     if not (isinstance(made, tuple) and len(made) == 2 and isinstance(made[0], Problem) and isinstance(made[1], Truth)):
         raise InputError("study: setting(run, ...) must return a pair, the Problem and its Truth")
@@ -166,7 +181,7 @@ def _simulated(setting: Setting, point: dict[str, Any], number: int) -> _Run:
     unknown = [label for label in problem.labels if label not in truth.biases]
     if unknown:
         raise InputError(f'study: the truth of setting(run, ...) does not name the bias "{unknown[0]}"; give its value')
-    return _Run(problem, truth, automatic_start(problem), number)
+    return problem, truth
 
 
 def _prepared(method: Method, run: _Run) -> _Run:
@@ -252,6 +267,9 @@ def study(
     methods: Sequence[str] | Mapping[str, Any] = ("ml", "em-ea", "ea", ORACLE),
     runs: int | Sequence[int] = 20,
     *,
+    store: str | PathLike[str] | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
     progress: Advance | None = None,
 ) -> xr.Dataset:
     """Fit every run of every setting by every method: errors, coverage and status by setting, method and run.
@@ -263,8 +281,10 @@ def study(
     `bias_rmse` (root mean square of the errors over their scales), `position_rmse` in m, `coverage` of the
     intervals, `status`, `iterations`; with `bias_label`: `error`, `lower` and `upper` end of the interval less the
     truth, `true`, `sd` (all over their scales) and `gamma`.
-    Raises `InputError` for an unknown method or settings whose biases differ. Runs are solved in batches by
-    compiled kernels, on as many threads as there are processors.
+    `store` is a folder that keeps finished fits, `resume` goes on with it, for more runs and settings too, `overwrite`
+    replaces what it holds; an interruption changes no result.
+    Raises `InputError` for an unknown method, settings whose biases differ and a folder that holds another study. Runs
+    are solved in batches by compiled kernels, on as many threads as there are processors.
     """
     chosen = _pairs(methods) if isinstance(methods, Mapping) else choose_methods(methods)
     numbers = list(range(int(runs))) if isinstance(runs, (int, np.integer)) else [int(number) for number in runs]
@@ -274,21 +294,96 @@ def study(
     if len(set(numbers)) < len(numbers):
         raise InputError("study: a run is given twice; give every run once")
     points = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
-    batches = [
-        [(point, run) for run in numbers[k : k + BATCH]] for point in points for k in range(0, len(numbers), BATCH)
-    ]
-    total, records = len(points) * len(numbers) * len(chosen), []
+    made = {} if store is None else identity(list_of_methods=chosen)
+    with Storage(store, "study", made, resume=resume, overwrite=overwrite) as storage:
+        kept = _Kept(storage, setting)
+        records = _fits(setting, points, numbers, chosen, kept, progress)
+    found = _dataset(records, axes, list(chosen), numbers)
+    if store is not None:
+        found.attrs["identity"] = storage.digest
+    return found
+
+
+def _fits(
+    setting: Setting, points: list[dict[str, Any]], numbers: list[int],
+    methods: Mapping[str, tuple[Method, Prior]], kept: "_Kept", progress: Advance | None,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Records of all methods at all points and runs, those kept and those made now."""
+    wanted = {_case(point, run) for point in points for run in numbers}
+    records = [record for record in kept.records() if _case(*record["case"]) in wanted]
+    there = {_case(*record["case"]) for record in records}
+    batches = []
+    for point in points:
+        missing = [(point, run) for run in numbers if _case(point, run) not in there]
+        batches += [missing[k : k + BATCH] for k in range(0, len(missing), BATCH)]
+    firsts = [kept.next + k * BATCH * len(methods) for k in range(len(batches))]
+    total = len(wanted) * len(methods)
+
+    def one(cases: list[tuple[dict[str, Any], int]], first: int) -> list[dict[str, Any]]:
+        found = _batch(setting, cases, methods, stored=kept.stored)
+        kept.add(first, found)
+        return found
 
     def take(found: list[dict[str, Any]]) -> None:
         records.extend(found)
         if progress is not None:
             progress(len(records), total)
 
-    take(_batch(setting, batches[0], chosen))  # compiles
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for found in pool.map(lambda cases: _batch(setting, cases, chosen), batches[1:]):
-            take(found)
-    return _dataset(records, axes, list(chosen), numbers)
+    if batches:
+        take(one(batches[0], firsts[0]))  # compiles
+        pool = ThreadPoolExecutor(os.cpu_count())
+        try:
+            for found in pool.map(one, batches[1:], firsts[1:]):
+                take(found)
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return records
+
+
+def _case(point: Mapping[str, Any], run: int) -> str:
+    """A grid point and a run as text."""
+    return json.dumps([dict(point), run], sort_keys=True)
+
+
+class _Kept:
+    """Records of a study in a storage, where there is one; raises `InputError` where the model is another by now."""
+
+    def __init__(self, storage: Storage, setting: Setting):
+        self.stored = storage.path is not None
+        self.box = Records(storage)
+        marked = [record for record in self.box.records.values() if "problem" in record]
+        for record in marked[:: -(-len(marked) // CHECKED) or 1]:
+            point, run = json.loads(str(record["case"]))
+            with jax.enable_x64(True):
+                problem, truth = _made(setting, point, run)
+                same = problem_digest(problem, truth.biases) == str(record["problem"])
+            if not same:
+                raise InputError(
+                    f"{storage.path}: setting(run={run}, ...) gives another problem than when the study there began:"
+                    " the model has changed; go on with it as it was, give another folder, or --overwrite"
+                    " (overwrite=True)"
+                )
+
+    @property
+    def next(self) -> int:
+        """The first number that no record has."""
+        return max(self.box.records, default=-1) + 1
+
+    def records(self) -> list[dict[str, Any]]:
+        """What is kept, as `_batch` gave it."""
+        found = []
+        for record in self.box.records.values():
+            point, run = json.loads(str(record["case"]))
+            texts = {name: str(record[name]) for name in ("method", "status")}
+            labels = tuple(record["labels"].tolist())
+            found.append(record | texts | {"case": (point, run), "labels": labels})
+        return found
+
+    def add(self, first: int, records: list[dict[str, Any]]) -> None:
+        """Keep the records of a batch, from a number on."""
+        if self.stored:
+            named = [record | {"case": _case(*record["case"])} for record in records]
+            self.box.add(range(first, first + len(records)), named)
 
 
 def _dataset(

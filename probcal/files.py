@@ -1,0 +1,187 @@
+"""Files that appear whole or not at all, and the note of which files in a folder this package wrote."""
+
+import hashlib
+import json
+import os
+import re
+import secrets
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from os import PathLike
+from pathlib import Path
+
+from probcal.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # Windows: drafts of a killed write stay
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = ".probcal.lock"
+NOTE = ".probcal.json"
+_DRAFT = re.compile(r"\..+\.probcal-[0-9a-f]{8}\.part")
+
+
+def write_whole(path: str | PathLike[str], data: bytes | memoryview | str) -> Path:
+    """Write a file in one step: it is whole or absent, on a full disk too.
+
+    What a killed write left in the folder is cleared. Raises `InputError` where the folder cannot be written.
+    """
+    path = Path(path)
+    content = data.encode() if isinstance(data, str) else data
+    try:
+        clear_drafts(path.parent)
+        draft, handle = _draft(path)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+                if fcntl is not None:  # while the draft is still locked, so that nobody takes it for a leftover
+                    os.replace(draft, path)
+            if fcntl is None:
+                os.replace(draft, path)
+        finally:
+            draft.unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(path, error) from None
+    return path
+
+
+def cannot_write(path: Path, error: OSError) -> InputError:
+    """The sentence of a file or folder that cannot be written."""
+    return InputError(f"{path} cannot be written: {error.strerror or error}")
+
+
+def _draft(path: Path) -> tuple[Path, int]:
+    """A new locked file beside the one to write, and its open handle."""
+    while True:
+        draft = path.with_name(f".{path.name[:100]}.probcal-{secrets.token_hex(4)}.part")
+        try:
+            handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
+        except FileExistsError:
+            continue
+        if _locked(handle) and os.fstat(handle).st_nlink == 0:  # cleared before it was locked
+            os.close(handle)
+            continue
+        return draft, handle
+
+
+def _locked(handle: int) -> bool:
+    """Lock an open draft; False where the file system has no locks."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
+def clear_drafts(folder: Path) -> None:
+    """Remove the drafts that a killed write left in a folder; those of a living process are locked and stay."""
+    if fcntl is None:
+        return
+    for name in os.listdir(folder):
+        if _DRAFT.fullmatch(name):
+            with suppress(OSError):
+                handle = os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW)
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    os.unlink(folder / name)
+                finally:
+                    os.close(handle)
+
+
+def make_folder(path: str | PathLike[str]) -> Path:
+    """Make a folder and check that it can be written, before any work is done."""
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except FileExistsError:
+        raise InputError(f"{path} is a file; give the name of a folder") from None
+    except OSError as error:
+        raise cannot_write(path, error) from None
+    return path
+
+
+class Lock:
+    """The right to work in a folder, held by one process at a time; `release` gives it back, a kill too."""
+
+    def __init__(self, folder: Path):
+        import filelock  # slow to load, and only writers of folders need it
+
+        self.path = folder / LOCK
+        self._lock = filelock.FileLock(self.path)
+        try:
+            self._lock.acquire(timeout=0)
+        except filelock.Timeout:
+            raise InputError(
+                f"{folder}: another process is working there; wait until it has ended, or give another folder"
+            ) from None
+        except OSError as error:
+            raise cannot_write(folder, error) from None
+
+    def release(self, *, remove: bool = False) -> None:
+        """Give the folder back; `remove` takes the lock file away too."""
+        if remove:
+            self.path.unlink(missing_ok=True)
+        self._lock.release()
+
+
+class Outputs:
+    """Files that a command writes into one folder.
+
+    A file is replaced only where this package wrote it and nobody changed it since: a hidden file notes the digest of
+    each.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def check(self, names: Sequence[str]) -> None:
+        """Raise `InputError` where one of the files is there and is not this package's own."""
+        noted = self._noted()
+        for name in names:
+            path = self.folder / name
+            if path.is_dir() or (os.path.lexists(path) and noted.get(name) not in ("", _digest(path))):
+                raise InputError(
+                    f"{path} is no file that probcal wrote, or it was changed since; move it away, or give another"
+                    " --out"
+                )
+
+    @contextmanager
+    def writing(self, names: Sequence[str]) -> Iterator[None]:
+        """Note these files as this package's own while they are written."""
+        self.check(names)
+        self._note(dict.fromkeys(names, ""))
+        yield
+        self._note({name: _digest(self.folder / name) for name in names})
+
+    def remove(self, name: str) -> None:
+        """Remove a file that this package wrote; any other stays."""
+        path = self.folder / name
+        if path.is_file() and self._noted().get(name) in ("", _digest(path)):
+            path.unlink()
+
+    def _noted(self) -> dict[str, str]:
+        try:
+            found = json.loads((self.folder / NOTE).read_text())
+        except (OSError, ValueError):
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def _note(self, digests: dict[str, str | None]) -> None:
+        noted = self._noted() | digests
+        kept = {name: digest for name, digest in noted.items() if digest is not None}
+        write_whole(self.folder / NOTE, json.dumps(kept, indent=1))
+
+
+def _digest(path: Path) -> str | None:
+    """Digest of a file's bytes, None where there is none."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return None

@@ -1,0 +1,103 @@
+"""What a run is: digests of model and data, with the settings and versions under which its results were made."""
+
+import hashlib
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.fingerprint import ADDRESS, computes
+from probcal.problem import Problem
+from probcal.rows import Block, Rows, information, log_likelihood, noise_std, weigh
+from probcal.tree import RESULTS_VERSION
+
+
+def identity_of(problem: Problem, **settings: Any) -> dict[str, str]:
+    """What runs must share to be one run, by the name that an error gives it."""
+    labels = " ".join(problem.labels)
+    return identity(**settings) | {
+        "data": data_digest(problem), "list of biases": labels, "model": model_digest(problem),
+    }  # fmt: skip
+
+
+def identity(**settings: Any) -> dict[str, str]:
+    """Settings as texts, with the versions of package and results."""
+    versions = {"version of probcal": version("probcal"), "version of the results": str(RESULTS_VERSION)}
+    return versions | {name.replace("_", " "): _text(value) for name, value in settings.items()}
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else ADDRESS.sub("", repr(value))
+
+
+def seed_text(key: jax.Array) -> str:
+    """A key as text."""
+    return str(np.asarray(jax.random.key_data(key)).tolist())
+
+
+def points_digest(points: Any) -> str:
+    """Digest of the arrays of a pytree."""
+    found = hashlib.sha256()
+    for leaf in jax.tree.leaves(points):
+        _add(found, leaf)
+    return found.hexdigest()
+
+
+def problem_digest(problem: Problem, truth: Mapping[str, float]) -> str:
+    """Digest of a simulated problem and its true biases."""
+    text = data_digest(problem) + model_digest(problem) + repr(sorted((k, float(v)) for k, v in truth.items()))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def data_digest(problem: Problem) -> str:
+    """Digest of what was measured: values, times, sensors and targets."""
+    data = problem.measurements
+    found = hashlib.sha256()
+    own = np.where(data.has_std, data.std, 0.0)  # else the model's
+    for array in (data.value, data.measured, data.time, data.sensor, data.target, own):
+        _add(found, array)
+    found.update(repr((data.channels, data.target_names)).encode())
+    return found.hexdigest()
+
+
+def model_digest(problem: Problem) -> str:
+    """Digest of sensors (functions and their constants), noise, motion, network, biases and what is fixed."""
+    found = hashlib.sha256()
+    for block, rows in zip(problem.spec.blocks, problem.system.rows, strict=True):
+        found.update(_code(block, rows, len(problem.levels)).encode())
+        for name, leaf in rows._asdict().items():
+            if name not in ("y", "mask"):
+                _add(found, leaf)
+    for leaf in jax.tree.leaves((problem.system.recursions, problem.system.level_spread)):
+        _add(found, leaf)
+    spec = problem.spec
+    stated = [(n.name, n.position.tolist(), {k: np.asarray(v).tolist() for k, v in n.components.items()})
+              for n in problem.network.nodes]  # fmt: skip
+    words = (
+        problem.biases, problem.fixed, problem.levels, spec.recursion, spec.biases, stated,
+        [(e.components, e.layout) for e in problem.epochs],
+    )  # fmt: skip
+    found.update(_text(words).encode())
+    return found.hexdigest()
+
+
+def _code(block: Block, rows: Rows, levels: int) -> str:
+    """What a block computes: its sensors, and the densities and weights of its noise."""
+
+    def noise(rows: Rows, predicted: jax.Array, levels: jax.Array) -> Any:
+        weights = weigh(block, rows, predicted, noise_std(rows, levels), expected=False)
+        return (
+            log_likelihood(block, rows, predicted, levels), weights, information(block, rows, predicted, levels)
+        )  # fmt: skip
+
+    return block.type.fingerprint + computes(noise, rows, rows.y, jnp.zeros(levels))
+
+
+def _add(found: Any, value: Any) -> None:
+    """Take up the form and the bytes of an array."""
+    array = np.ascontiguousarray(value)
+    found.update(f"{array.dtype}{array.shape}".encode())
+    found.update(repr(array.tolist()).encode() if array.dtype.hasobject else array.tobytes())

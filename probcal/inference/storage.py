@@ -1,0 +1,288 @@
+"""Work on its way to disk: a folder with the numbered parts of one run, each whole or absent, safe against a kill.
+
+A folder holds the manifest of a run (what it is, see `identity`) and a file for every part: a chunk of a sampler's
+draws with the state after it, or the records of some runs of `sbc` or `study`. Every part carries its number, the
+digest of its run and a checksum, and is written in one step. One process at a time works in a folder. Nothing is
+removed but files that carry the names made here, in a folder with a manifest.
+"""
+
+import hashlib
+import io
+import json
+import os
+import re
+import zipfile
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from probcal.errors import InputError
+from probcal.files import Lock, cannot_write, clear_drafts, make_folder, write_whole
+
+MANIFEST = "probcal-run.json"
+KINDS = {"draws": "chunk", "sbc": "runs", "study": "fits"}  # what a folder holds: the name of its parts
+OLDER = re.compile(r"state\.npz|chunk-\d+\.nc|batch-\d+\.npz|runs\.json")  # of probcal before the manifest
+REMEDY = "give --resume (resume=True) to go on with it, --overwrite (overwrite=True) to replace it, or another folder"
+Arrays = Mapping[str, Any]
+
+
+class Storage:
+    """Parts of one run by number; in memory, or in a folder where `path` is given. Threads may add at once.
+
+    `resume` takes up what the folder holds, `overwrite` replaces it. Raises `InputError` where the folder holds a run
+    and neither is given, where its run is another, where a part is damaged, and where another process works there.
+    """
+
+    def __init__(
+        self, path: str | PathLike[str] | None, kind: str, identity: Mapping[str, str], *, resume: bool = False,
+        overwrite: bool = False,
+    ):  # fmt: skip
+        if resume and overwrite:
+            raise InputError("resume and overwrite exclude each other: go on with the run that is there, or replace it")
+        self.path = None if path is None else Path(path)
+        self.kind, self.identity = kind, dict(identity)
+        self.digest = digest_of(kind, identity)
+        self._numbers: set[int] = set()
+        self._parts: dict[int, dict[str, np.ndarray]] = {}  # of a run in memory
+        self._lock: Lock | None = None
+        if self.path is None:
+            return
+        self._made = not self.path.exists()
+        make_folder(self.path)
+        self._lock = Lock(self.path)
+        try:
+            self._open(self.path, resume, overwrite)
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def _open(self, path: Path, resume: bool, overwrite: bool) -> None:
+        clear_drafts(path)
+        there = (path / MANIFEST).exists()
+        files = _parts_of(path)
+        if not there and (files or any(OLDER.fullmatch(name) for name in os.listdir(path))):
+            raise InputError(
+                f"{path} holds parts of a run without its manifest {MANIFEST} (it was lost, or written by an older"
+                " probcal): move them away, or give another folder"
+            )
+        if there and files and not overwrite:
+            if not resume:
+                raise InputError(f"{path} holds {_described(path)} already; {REMEDY}")
+            self._take_up(path)
+            return
+        _clear(path)
+        manifest = {"kind": self.kind, "digest": self.digest, "identity": self.identity}
+        write_whole(path / MANIFEST, json.dumps(manifest, indent=1))
+
+    def _take_up(self, path: Path) -> None:
+        kind, other = _manifest(path)
+        if kind != self.kind:
+            raise InputError(f"{path} holds a run of another kind ({kind}); give another folder, or {_OVERWRITE}")
+        for name in sorted(self.identity.keys() | other.keys(), key=[*self.identity, *other].index):
+            if self.identity.get(name) != other.get(name):
+                raise InputError(
+                    f"{path}: the {name} has changed since the run there began; resume it as it began, give another"
+                    f" folder, or {_OVERWRITE}"
+                )
+        self._numbers = set(_parts_of(path))
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the parts that are there."""
+        return sorted(self._numbers)
+
+    def read(self, number: int) -> dict[str, np.ndarray]:
+        """Arrays of one part by name; raises `InputError` where its file is missing, damaged or another's."""
+        if self.path is None:
+            return self._parts[number]
+        file = self._file(number)
+        remedy = f"delete it{self._later} and --resume (resume=True) makes it anew, or {_OVERWRITE}"
+        if not file.is_file():
+            raise InputError(f"{file} is missing: {remedy}")
+        try:
+            with zipfile.ZipFile(file) as whole:
+                broken = whole.testzip()
+            with np.load(file, allow_pickle=False) as saved:
+                found = {name: saved[name] for name in saved.files}
+        except Exception as error:  # whatever zip, zlib and NumPy say of foreign bytes
+            raise InputError(f"{file} is damaged ({type(error).__name__}): {remedy}") from None
+        mark = found.pop("probcal", np.array(""))
+        if broken is not None or str(mark) != self._mark(number):
+            raise InputError(f"{file} is damaged or does not belong to the run of its folder: {remedy}")
+        return found
+
+    @property
+    def _later(self) -> str:
+        return " and every later chunk" if self.kind == "draws" else ""
+
+    def _mark(self, number: int) -> str:
+        """What the file of a part says of itself."""
+        return f"{KINDS[self.kind]} {number} of {self.digest}"
+
+    def _file(self, number: int) -> Path:
+        assert self.path is not None
+        return self.path / f"{KINDS[self.kind]}-{number:06d}.npz"
+
+    def add(self, number: int, arrays: Arrays) -> None:
+        """Keep a part: its arrays by name."""
+        values = {name: np.asarray(value) for name, value in arrays.items()}
+        if self.path is None:
+            self._parts[number] = values
+        else:
+            content = io.BytesIO()
+            marked: dict[str, Any] = values | {"probcal": np.array(self._mark(number))}
+            np.savez(content, **marked)
+            write_whole(self._file(number), content.getbuffer())
+        self._numbers.add(number)
+
+    def close(self) -> None:
+        """Let another process work in the folder; one without any part is left as it was found."""
+        if self.path is None or self._lock is None:
+            return
+        if not self._numbers:
+            _remove(self.path, self._lock, folder=self._made)
+        else:
+            self._lock.release()
+        self._lock = None
+
+
+_OVERWRITE = "give --overwrite (overwrite=True) to begin anew"
+
+
+def digest_of(kind: str, identity: Mapping[str, str]) -> str:
+    """Digest of what a run is."""
+    return hashlib.sha256(json.dumps([kind, dict(identity)], sort_keys=True).encode()).hexdigest()
+
+
+def _parts_of(path: Path) -> dict[int, Path]:
+    """Files that have the name of a part, by number."""
+    pattern = re.compile(rf"({'|'.join(KINDS.values())})-(\d{{6,}})\.npz")
+    matches = ((pattern.fullmatch(name), name) for name in os.listdir(path))
+    return {int(match[2]): path / name for match, name in matches if match}
+
+
+def _manifest(path: Path) -> tuple[str, dict[str, str]]:
+    """Kind and identity of the run in a folder."""
+    file = path / MANIFEST
+    try:
+        found = json.loads(file.read_text())
+        kind, identity = str(found["kind"]), dict(found["identity"])
+        if found["digest"] != digest_of(kind, identity):
+            raise ValueError("wrong digest")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{file} is damaged; give another folder, or {_OVERWRITE}") from None
+    return kind, identity
+
+
+def _described(path: Path) -> str:
+    """What runs in a folder, for a sentence."""
+    kind, identity = _manifest(path)
+    words = {"draws": "a sampler's run", "sbc": "the runs of an sbc", "study": "the fits of a study"}.get(kind, kind)
+    return f"{words} ({identity['method']})" if "method" in identity else words
+
+
+def _clear(path: Path) -> None:
+    """Remove all parts, the last first: what a kill leaves is a run that stopped earlier."""
+    try:
+        for _, file in sorted(_parts_of(path).items(), reverse=True):
+            file.unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+def _remove(path: Path, lock: Lock, *, folder: bool) -> None:
+    """Remove parts, manifest and lock, and the folder too where nothing else is in it."""
+    try:
+        _clear(path)
+        (path / MANIFEST).unlink(missing_ok=True)
+        lock.release(remove=True)
+    except OSError as error:
+        raise cannot_write(path, error) from None
+    if folder:
+        with suppress(OSError):  # it holds something else
+            path.rmdir()
+
+
+def remove_run(path: str | PathLike[str], digest: str) -> None:
+    """Remove the parts of the run with this digest; any other run and any other file stay."""
+    path = Path(path)
+    if not (path / MANIFEST).exists():
+        return
+    lock = Lock(path)
+    if digest_of(*_manifest(path)) == digest:
+        _remove(path, lock, folder=True)
+    else:
+        lock.release()
+
+
+def stored_run(path: str | PathLike[str]) -> str:
+    """What the run in a folder is, in a few words; empty where there is none."""
+    path = Path(path)
+    if not path.is_dir() or not (path / MANIFEST).exists() or not _parts_of(path):
+        return ""
+    return _described(path)
+
+
+class Chunks:
+    """Draws of a sampler in order, (chains, draws, ...) by name, and the state after the last."""
+
+    def __init__(self, storage: Storage):
+        self.storage = storage
+        self.state: list[np.ndarray] | None = None
+        for number in range(self.count):  # all of them, so that a damaged or missing one is told before any work
+            found = storage.read(number)
+            self.state = [found[f"state_{k}"] for k in range(sum(name.startswith("state_") for name in found))]
+
+    @property
+    def count(self) -> int:
+        """How many chunks there are."""
+        return len(self.storage.numbers)
+
+    def add(self, chunk: Arrays, state: Sequence[Any]) -> None:
+        """Append a chunk and the leaves of the state after it."""
+        leaves = {f"state_{k}": np.asarray(leaf) for k, leaf in enumerate(state)}
+        self.storage.add(self.count, {f"draws_{name}": array for name, array in chunk.items()} | leaves)
+        self.state = list(leaves.values())
+
+    def joined(self) -> dict[str, np.ndarray]:
+        """All draws, (chains, draws, ...) by name."""
+        prefix = "draws_"
+        chunks = [
+            {name.removeprefix(prefix): array for name, array in part.items() if name.startswith(prefix)}
+            for part in map(self.storage.read, self.storage.numbers)
+        ]
+        return {name: np.concatenate([chunk[name] for chunk in chunks], 1) for name in chunks[-1]}
+
+
+class Records:
+    """Records of numbered runs, arrays by field; several runs share a part."""
+
+    def __init__(self, storage: Storage):
+        self.storage = storage
+        self.records: dict[int, dict[str, np.ndarray]] = {}
+        for number in storage.numbers:
+            for name, array in storage.read(number).items():
+                run, _, field = name.partition(" ")
+                self.records.setdefault(int(run), {})[field] = array
+
+    def add(self, runs: Sequence[int], records: Sequence[Arrays]) -> None:
+        """Keep the records of some runs, in one part."""
+        named = {
+            f"{run} {field}": np.asarray(value)
+            for run, record in zip(runs, records, strict=True)
+            for field, value in record.items()
+        }
+        self.storage.add(runs[0], named)
+        for run, record in zip(runs, records, strict=True):
+            self.records[run] = {field: np.asarray(value) for field, value in record.items()}

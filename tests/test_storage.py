@@ -1,0 +1,570 @@
+"""Files whole or absent, folders of parts, and what a fit read back from disk must hold: no command destroys work."""
+
+import errno
+import os
+import re
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+
+import committed
+import h5py
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from worlds import plane, resting
+
+import probcal
+from probcal import (
+    EA,
+    MAP,
+    Bias,
+    Channel,
+    Collapsed,
+    Gaussian,
+    InputError,
+    Network,
+    Node,
+    Problem,
+    StudentT,
+    files,
+    sensor,
+)
+from probcal.files import LOCK, NOTE, Lock, Outputs, make_folder, write_whole
+from probcal.geometry import norm
+from probcal.inference import identity
+from probcal.inference.fit import _check_store
+from probcal.inference.storage import MANIFEST, Chunks, Records, Storage, remove_run, stored_run
+
+RUN = {"method": "NUTS()", "seed": "1", "model": "abc"}
+
+
+def listing(folder):
+    """Visible files of a folder, and hidden ones that are neither lock nor note."""
+    return sorted(name for name in os.listdir(folder) if name not in (LOCK, NOTE))
+
+
+def chunks(path, count=4, identity=RUN, **options):
+    """A run of a sampler that stops after some chunks."""
+    with Storage(path, "draws", identity, **options) as storage:
+        box = Chunks(storage)
+        while box.count < count:
+            k = 0 if box.state is None else int(box.state[0])
+            x = np.random.default_rng(k).standard_normal((2, 3, 4))
+            box.add({"x": x}, [np.array(k + 1), np.array([1, 2], np.uint32)])
+        return box.joined()["x"]
+
+
+# files
+
+
+def test_a_file_is_whole_or_absent_whatever_happens(tmp_path, monkeypatch):
+    path = tmp_path / "a.csv"
+    write_whole(path, "old\n")
+    (tmp_path / "plain").touch()
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+    (tmp_path / "plain").unlink()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    for call in ("fsync", "replace"):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, call, full)
+            with pytest.raises(InputError, match=r"a\.csv cannot be written: No space left on device"):
+                write_whole(path, "new\n")
+        assert listing(tmp_path) == ["a.csv"]
+        assert path.read_text() == "old\n"
+    write_whole(path, b"new\n")
+    assert path.read_text() == "new\n"
+
+
+def test_drafts_of_a_killed_write_are_cleared_by_the_next(tmp_path):
+    left = tmp_path / ".fit.nc.probcal-0123abcd.part"
+    others = [".fit.nc.part", ".mine.probcal-xyz.part", "thesis.part"]
+    for name in (left.name, *others):
+        (tmp_path / name).write_text("half")
+    draft, handle = files._draft(tmp_path / "living.csv")  # of another process, that still writes
+    write_whole(tmp_path / "b.csv", "b")
+    assert listing(tmp_path) == sorted([*others, draft.name, "b.csv"])
+    os.close(handle)
+    write_whole(tmp_path / "b.csv", "b")
+    assert listing(tmp_path) == sorted([*others, "b.csv"])
+
+
+def test_a_folder_that_cannot_be_is_one_sentence(tmp_path):
+    (tmp_path / "draws").write_text("a file")
+    with pytest.raises(InputError, match="draws is a file; give the name of a folder"):
+        make_folder(tmp_path / "draws")
+    with pytest.raises(InputError, match="cannot be written: Not a directory"):
+        make_folder(tmp_path / "draws" / "deeper")
+    with pytest.raises(InputError, match="is a file; give the name of a folder"):
+        chunks(tmp_path / "draws")
+
+
+def test_one_process_at_a_time_works_in_a_folder(tmp_path):
+    lock = Lock(tmp_path)
+    text = "another process is working there; wait until it has ended, or give another folder"
+    with pytest.raises(InputError, match=text):
+        chunks(tmp_path)
+    lock.release()
+    chunks(tmp_path)
+    with Storage(tmp_path, "draws", RUN, resume=True), pytest.raises(InputError, match=text):
+        chunks(tmp_path, overwrite=True)
+    assert len(chunks(tmp_path, resume=True)) == 2
+
+
+def test_only_files_that_probcal_wrote_and_nobody_changed_are_replaced(tmp_path):
+    outputs, path = Outputs(tmp_path), tmp_path / "summary.csv"
+    for text in ("first", "second"):
+        with outputs.writing(["summary.csv"]):
+            path.write_text(text)
+    path.write_text("with my remarks")
+    with pytest.raises(InputError, match=r"summary\.csv is no file that probcal wrote, or it was changed since; mov"):
+        outputs.check(["summary.csv"])
+    outputs.remove("summary.csv")
+    assert path.read_text() == "with my remarks"
+    path.unlink()
+    with suppress(RuntimeError), outputs.writing(["summary.csv"]):  # killed on the way
+        path.write_text("half")
+        raise RuntimeError
+    outputs.check(["summary.csv"])
+    outputs.remove("summary.csv")
+    assert listing(tmp_path) == []
+    (tmp_path / "fit.nc").mkdir()
+    (tmp_path / NOTE).write_text("[garbage")
+    with pytest.raises(InputError, match=r"fit\.nc is no file that probcal wrote"):
+        outputs.check(["fit.nc"])
+
+
+# runs
+
+
+def test_a_stop_before_any_rename_loses_one_chunk_at_most(tmp_path, monkeypatch):
+    wanted = chunks(None)
+    genuine = os.replace
+    for moment in range(5):
+        folder, left = tmp_path / str(moment), [moment]
+
+        def stop(a, b, left=left):
+            if left[0] == 0:
+                raise OSError(errno.EIO, "stopped")
+            left[0] -= 1
+            genuine(a, b)
+
+        monkeypatch.setattr(os, "replace", stop)
+        with pytest.raises(InputError, match="cannot be written: stopped"):
+            chunks(folder, resume=True)
+        monkeypatch.setattr(os, "replace", genuine)
+        there = listing(folder) if folder.exists() else []
+        assert len(there) == (moment if moment > 1 else 0), "the manifest, then a file a chunk; nothing without a chunk"
+        assert np.array_equal(chunks(folder, resume=True), wanted)
+
+
+def test_a_folder_with_a_run_is_refused_unless_it_is_resumed_or_replaced(tmp_path):
+    first = chunks(tmp_path)
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"holds a sampler's run \(NUTS\(\)\) already; give --resume \(resume=True\)"):
+        chunks(tmp_path)
+    for name in RUN:
+        with pytest.raises(
+            InputError, match=f"the {name} has changed since the run there began; resume it as it began"
+        ):
+            chunks(tmp_path, identity=RUN | {name: "other"}, resume=True)
+    with pytest.raises(InputError, match="the start has changed since the run there began"):
+        chunks(tmp_path, identity=RUN | {"start": "x"}, resume=True)
+    with pytest.raises(InputError, match=r"holds a run of another kind \(draws\); give another folder"):
+        Storage(tmp_path, "sbc", RUN, resume=True)
+    with pytest.raises(InputError, match="resume and overwrite exclude each other: go on"):
+        chunks(tmp_path, resume=True, overwrite=True)
+    assert np.array_equal(chunks(tmp_path, resume=True), first)
+    chunks(tmp_path, 2, identity=RUN | {"seed": "2"}, overwrite=True)
+    assert listing(tmp_path) == sorted(["chunk-000000.npz", "chunk-000001.npz", MANIFEST, "thesis.txt"])
+    assert stored_run(tmp_path) == "a sampler's run (NUTS())"
+
+
+def test_a_run_removes_its_own_parts_only(tmp_path):
+    folder = tmp_path / "draws"
+    with Storage(folder, "draws", RUN):
+        pass
+    assert not folder.exists(), "without a part nothing is left"
+    chunks(folder)
+    digest = Storage(None, "draws", RUN).digest
+    remove_run(folder, Storage(None, "draws", RUN | {"seed": "2"}).digest)
+    assert len(listing(folder)) == 5
+    (folder / "thesis.txt").write_text("mine")
+    remove_run(folder, digest)
+    assert listing(folder) == ["thesis.txt"]
+    remove_run(folder, digest)
+    (folder / "thesis.txt").unlink()
+    chunks(folder)
+    remove_run(folder, digest)
+    assert not folder.exists()
+    assert stored_run(folder) == ""
+
+
+def copied(folder):
+    (folder / "chunk-000001.npz").write_bytes((folder / "chunk-000002.npz").read_bytes())
+
+
+def truncated(folder):
+    file = folder / "chunk-000001.npz"
+    file.write_bytes(file.read_bytes()[:-40])
+
+
+def zeroed(folder):
+    file = folder / "chunk-000001.npz"
+    content = bytearray(file.read_bytes())
+    content[200:260] = bytes(60)
+    file.write_bytes(content)
+
+
+def foreign(folder):
+    np.savez(folder / "chunk-000001.npz", x=np.zeros(3))
+
+
+def pickled(folder):
+    np.savez(folder / "chunk-000001.npz", x=np.array([{}], object))
+
+
+def of_another_run(folder):
+    chunks(folder / "other", identity=RUN | {"seed": "2"})
+    (folder / "chunk-000001.npz").write_bytes((folder / "other" / "chunk-000001.npz").read_bytes())
+
+
+DAMAGED = r"chunk-000001\.npz is damaged .*: delete it and every later chunk and --resume \(resume=True\) makes it anew"
+DAMAGES = [
+    (lambda f: (f / "chunk-000001.npz").unlink(), r"chunk-000001\.npz is missing: delete it and every later chunk"),
+    (lambda f: (f / "chunk-000000.npz").unlink(), r"chunk-000000\.npz is missing: "),
+    (copied, r"chunk-000001\.npz is damaged or does not belong to the run of its folder: delete it"),
+    (of_another_run, "is damaged or does not belong to the run of its folder"),
+    (foreign, "is damaged or does not belong to the run of its folder"),
+    (truncated, DAMAGED),
+    (zeroed, DAMAGED),
+    (pickled, DAMAGED),
+    (lambda f: (f / "chunk-000001.npz").write_bytes(b""), DAMAGED),
+    (lambda f: (f / "chunk-000001.npz").write_bytes(b"garbage" * 99), DAMAGED),
+    (lambda f: (f / MANIFEST).write_bytes(b""), r"probcal-run\.json is damaged; give another folder, or give --overwr"),
+    (lambda f: (f / MANIFEST).write_text("[]"), r"probcal-run\.json is damaged; "),
+    (lambda f: (f / MANIFEST).write_text('{"kind": 1}'), r"probcal-run\.json is damaged; "),
+    (
+        lambda f: (f / MANIFEST).write_text((f / MANIFEST).read_text().replace("NUTS", "EA")),
+        r"probcal-run\.json is damaged; ",
+    ),
+    (lambda f: (f / MANIFEST).unlink(), r"holds parts of a run without its manifest probcal-run\.json"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("damage", "text"), DAMAGES, ids=[re.sub(r"\W+", "-", text)[:40] for _, text in DAMAGES])
+def test_damage_is_one_sentence_and_never_a_shorter_run(damage, text, tmp_path):
+    wanted = chunks(tmp_path / "run")
+    damage(tmp_path / "run")
+    before = listing(tmp_path / "run")
+    with pytest.raises(InputError, match=text) as caught:
+        chunks(tmp_path / "run", resume=True)
+    assert "\n" not in str(caught.value)
+    assert listing(tmp_path / "run") == before
+    if MANIFEST in before:
+        assert np.array_equal(chunks(tmp_path / "run", overwrite=True), wanted)
+
+
+def test_a_run_that_lost_its_end_goes_on(tmp_path):
+    wanted = chunks(tmp_path)
+    (tmp_path / "chunk-000003.npz").unlink()
+    (tmp_path / "chunk-000002.npz").unlink()
+    assert np.array_equal(chunks(tmp_path, resume=True), wanted)
+
+
+@pytest.mark.parametrize("name", ["state.npz", "chunk-000000.nc", "batch-000000.npz", "runs.json"])
+def test_a_run_of_an_older_version_is_refused(name, tmp_path):
+    (tmp_path / name).write_text("old")
+    for options in ({}, {"resume": True}, {"overwrite": True}):
+        with pytest.raises(
+            InputError, match="or written by an older probcal\\): move them away, or give another folder"
+        ):
+            chunks(tmp_path, **options)
+    assert listing(tmp_path) == [name]
+
+
+def test_records_come_from_threads_and_missing_ones_are_made_anew(tmp_path):
+    def record(run):
+        return {"rank": np.arange(3) + run, "status": np.array("fine")}
+
+    with Storage(tmp_path, "sbc", RUN) as storage:
+        box = Records(storage)
+        work = [threading.Thread(target=box.add, args=([k, k + 1], [record(k), record(k + 1)])) for k in (0, 2, 4, 6)]
+        for thread in work:
+            thread.start()
+        for thread in work:
+            thread.join()
+    (tmp_path / "runs-000002.npz").unlink()
+    with Storage(tmp_path, "sbc", RUN, resume=True) as storage:
+        box = Records(storage)
+        assert sorted(box.records) == [0, 1, 4, 5, 6, 7]
+        assert box.records[5]["rank"].tolist() == [5, 6, 7]
+        assert box.records[5]["status"] == "fine"
+    (tmp_path / "runs-000004.npz").write_bytes(b"garbage")
+    text = r"runs-000004\.npz is damaged \(BadZipFile\): delete it and --resume \(resume=True\) makes it anew"
+    with Storage(tmp_path, "sbc", RUN, resume=True) as storage, pytest.raises(InputError, match=text):
+        Records(storage)
+
+
+# identity
+
+
+def gauge(scale=1.0, offset=1.0, std=1.0, noise=None, table=(0.0, 1.0)):
+    """A gauge declared in a function: the same source gives another object every time."""
+    constants = np.array(table)
+
+    @sensor(range=Channel("m", std=std, noise=noise or StudentT(4.0)))
+    def ranger(target, pose, *, shift=Bias("m", offset)):
+        return {"range": norm(target.position - pose.position) * scale + shift + (constants * pose.heading).sum()}
+
+    return ranger
+
+
+def world(x=0.0, power=1.0, value=5.0, fix=(), **changes):
+    kind = gauge(**changes)
+    network = Network([kind.on(Node(f"n{k}", (4.0 * k + x, 3.0 * k), scale={"position": 1.0})) for k in range(3)])
+    frame = {"time": [0.0, 0.0, 1.0, 1.0], "sensor": ["n0", "n1", "n2", "n0"], "range": [value, 4.0, 3.0, 4.5]}
+    return Problem(network, probcal.ConstantVelocity(power), pd.DataFrame(frame), fix=fix)
+
+
+CHANGES = [
+    ({"value": 5.1}, "data"),
+    ({"fix": ["n1.shift"]}, "list of biases"),
+    ({"scale": 1.05}, "model"),
+    ({"table": (0.0, 1.5)}, "model"),
+    ({"offset": 2.0}, "model"),
+    ({"std": 1.1}, "model"),
+    ({"noise": StudentT(5.0)}, "model"),
+    ({"x": 0.1}, "model"),
+    ({"power": 2.0}, "model"),
+]
+
+
+@pytest.mark.parametrize(("change", "name"), CHANGES, ids=[str(change) for change, _ in CHANGES])
+def test_what_is_changed_is_named(change, name):
+    with jax.enable_x64(True):
+        mine = identity.identity_of(world(), method=EA())
+        assert mine == identity.identity_of(world(), method=EA()), "the same content is the same run"
+        other = identity.identity_of(world(**change), method=EA())
+    assert next(key for key in mine if mine[key] != other[key]) == name
+
+
+def test_identity_holds_settings_and_versions(monkeypatch):
+    found = identity.identity(method=EA(), prior_of_the_truths=Gaussian(), seed="3")
+    assert found["method"] == repr(EA())
+    assert list(found)[:2] == ["version of probcal", "version of the results"]
+    assert "prior of the truths" in found
+    assert "0x" not in identity.identity(prior=object())["prior"]
+
+
+# fits
+
+
+METHOD = Collapsed(chains=2, warmup=50, draws=200, sweeps=1)
+
+
+def fitted(method=METHOD, key=5, **options):
+    network, motion, table, _ = plane()
+    p = Problem(network, motion, table)
+    return probcal.fit(p, method, prior=Gaussian(), start=resting(p), key=key, **options)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return fitted()
+
+
+def test_an_interrupted_fit_is_resumed_with_the_same_draws(tmp_path, whole):
+    def stop(name, count, value):
+        if count >= 150:
+            raise KeyboardInterrupt
+
+    tree = fitted(progress=stop, store=tmp_path)
+    assert tree.attrs["status"] == "not converged"
+    assert "Interrupted after 100 of 200 draws" in tree.attrs["message"]
+    assert tree["posterior"].sizes["draw"] == 100
+    with pytest.raises(InputError, match=r"holds a sampler's run \(Collapsed.* already; give --resume"):
+        fitted(store=tmp_path)
+    with pytest.raises(InputError, match="the seed has changed"):
+        fitted(store=tmp_path, key=6, resume=True)
+    again = fitted(store=tmp_path, resume=True)
+    assert again.attrs["identity"] == tree.attrs["identity"]
+    for found in (again, fitted(store=tmp_path, resume=True)):  # the second reads a finished run back
+        assert np.array_equal(found["posterior"]["bias"], whole["posterior"]["bias"])
+        assert np.array_equal(found["sample_stats"]["lp"], whole["sample_stats"]["lp"])
+
+
+def test_ctrl_c_in_the_warm_up_leaves_nothing_to_report():
+    def early(name, count, value):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fitted(Collapsed(chains=2, warmup=100, draws=200, sweeps=1), progress=early)
+
+
+def test_a_method_without_draws_neither_resumes_nor_replaces(tmp_path):
+    chunks(tmp_path)
+    with pytest.raises(InputError, match="MAP has nothing to resume: samplers"):
+        fitted(MAP(), store=tmp_path, resume=True)
+    with pytest.raises(InputError, match=r"holds .* \(NUTS\(\)\): go on with it by its own method, give another f"):
+        fitted(MAP(), store=tmp_path)
+    assert _check_store(MAP(), tmp_path, resume=False, overwrite=True) is None, "it lets the draws lie"
+
+
+def test_a_state_of_another_form_is_refused(tmp_path, monkeypatch):
+    fitted(store=tmp_path)
+    monkeypatch.setattr(Chunks, "count", property(lambda self: len(self.storage.numbers)))
+    genuine = Chunks.__init__
+
+    def shortened(self, storage):
+        genuine(self, storage)
+        self.state = self.state[1:]
+
+    monkeypatch.setattr(Chunks, "__init__", shortened)
+    with pytest.raises(InputError, match="the state of the stored run has another form than this run's"):
+        fitted(store=tmp_path, resume=True)
+
+
+# results
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """A saved fit, and its bytes."""
+    path = tmp_path_factory.mktemp("saved") / "fit.nc"
+    tree = committed.tree("ea")
+    probcal.save(tree, path)
+    return tree, path.read_bytes()
+
+
+def test_a_saved_fit_is_read_back_as_it_was(saved, tmp_path):
+    tree, content = saved
+    (tmp_path / "fit.nc").write_bytes(content)
+    again = probcal.load(tmp_path)
+    xr.testing.assert_identical(again, tree)
+    probcal.save(again, tmp_path / "again.nc")
+    xr.testing.assert_identical(probcal.load(tmp_path / "again.nc"), tree)
+    for group in again.subtree:
+        for name, variable in group.to_dataset(inherit=False).variables.items():
+            packed = variable.encoding
+            if variable.ndim:
+                assert packed["fletcher32"], name
+                assert packed["zlib"], name
+
+
+def test_every_damaged_stretch_of_a_fit_is_noticed(saved, tmp_path):
+    _, content = saved
+    length = len(content) // 20 + 1
+    for at in range(0, len(content), length):
+        damaged = bytearray(content)
+        damaged[at : at + length] = bytes(min(length, len(content) - at))
+        (tmp_path / "fit.nc").write_bytes(damaged)
+        with pytest.raises(InputError, match=r"fit\.nc is (damaged: its checksum does not match|not a fit written by)"):
+            probcal.load(tmp_path)
+
+
+def test_an_array_has_its_own_checksum(saved, tmp_path):
+    """A file that other programs rewrote has no digest of the whole; HDF5's stand for every array."""
+    tree, _ = saved
+    tree.to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    xr.testing.assert_identical(probcal.load(tmp_path / "other.nc"), tree)
+    probcal.save(tree, tmp_path / "fit.nc")
+    content = bytearray((tmp_path / "fit.nc").read_bytes()[:-47])
+    with h5py.File(tmp_path / "fit.nc") as file:
+        chunk = file["calibration/mean"].id.get_chunk_info(0)
+    content[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
+    (tmp_path / "fit.nc").write_bytes(content)
+    with pytest.raises(InputError, match=r"fit\.nc is not a fit written by probcal \(OSError"):
+        probcal.load(tmp_path / "fit.nc")
+
+
+def without(group, *names):
+    def change(tree):
+        if not names:
+            del tree[group]
+        else:
+            tree[group] = xr.DataTree(tree[group].to_dataset().drop_vars(names))
+
+    return change
+
+
+def unset(name):
+    return lambda tree: tree.attrs.pop(name)
+
+
+def set_to(group, name, value):
+    def change(tree):
+        tree[group] = xr.DataTree(tree[group].to_dataset().assign({name: tree[group][name] * 0 + value}))
+
+    return change
+
+
+LACKS = [
+    (without("calibration"), "is not a fit written by probcal: its group calibration is missing"),
+    (without("constant_data"), "is incomplete: its group constant_data lacks what a fit holds; fit again"),
+    (without("observed_data"), "is incomplete: its group observed_data lacks"),
+    (without("posterior"), "is incomplete: its group posterior lacks"),
+    (without("residual", "weight"), "is incomplete: its group residual lacks"),
+    (without("calibration", "covariance"), "is incomplete: its group calibration lacks"),
+    (without("constant_data", "moving"), "is incomplete: its group constant_data lacks"),
+    (without("track", "sd"), "is incomplete: its group track lacks"),
+    (without("verdict", "reason"), "is incomplete: its group verdict lacks"),
+    (unset("method"), "is incomplete: it has no attribute method; fit again"),
+    (unset("interval_probability"), "is incomplete: it has no attribute interval_probability"),
+    (unset("results_version"), "was written by an older probcal; fit again"),
+    (lambda tree: tree.attrs.update(results_version=99), "was written by a newer probcal; fit again"),
+    (set_to("calibration", "mean", np.nan), "its means or sds are not finite; fit again"),
+    (set_to("calibration", "sd", np.inf), "its means or sds are not finite"),
+    (set_to("calibration", "covariance", np.nan), "its means or sds are not finite"),
+]
+
+
+@pytest.mark.parametrize(("change", "text"), LACKS, ids=range(len(LACKS)))
+def test_what_a_fit_lacks_is_one_sentence(change, text, saved, tmp_path):
+    tree = saved[0].copy(deep=True)
+    change(tree)
+    probcal.save(tree, tmp_path / "fit.nc")
+    with pytest.raises(InputError, match=text):
+        probcal.load(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", b"\x89HDF\r\n\x1a\n" + bytes(100), None])
+def test_what_is_no_fit_is_one_sentence(content, tmp_path):
+    if content is None:
+        (tmp_path / "fit.nc").mkdir()
+    else:
+        (tmp_path / "fit.nc").write_bytes(content)
+    with pytest.raises(InputError, match="is not a fit written by probcal"):
+        probcal.load(tmp_path)
+
+
+FULL = """
+import resource, sys
+import probcal
+from probcal import tree
+import numpy as np, xarray as xr
+big = xr.DataTree.from_dict({"a": xr.Dataset({"x": ("n", np.random.default_rng(0).standard_normal(20000))})})
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+import signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+try:
+    tree.save(big, sys.argv[1])
+except probcal.InputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.ci
+def test_a_full_disk_is_one_sentence(tmp_path):
+    """A process that may not write more than 4 kB, in the place of a full disk."""
+    done = subprocess.run([sys.executable, "-c", FULL, str(tmp_path / "fit.nc")], capture_output=True, text=True)
+    assert done.returncode == 0
+    assert done.stderr == ""
+    assert re.fullmatch(r".*fit\.nc cannot be written: File too large\n", done.stdout)
+    assert listing(tmp_path) == []
