@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 
 from probcal import plots
 from probcal.diagnostics import drift_table
+from probcal.errors import INVALID
 from probcal.files import write_whole
 from probcal.tree import outliers
 
@@ -44,7 +45,7 @@ CHECKS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
          "white": "Ljung-Box p", "p_misfit": "predictive p, misfit", "p_mean": "predictive p, mean"},
     ),
 }  # fmt: skip
-COLOURS = {"converged": "good", "not converged": "warn", "at bound": "bad", "diverged": "bad"}
+COLOURS = {"converged": "good", "not converged": "warn", "at bound": "bad", "diverged": "bad", "misfit": "bad"}
 
 PAGE = """<!DOCTYPE html>
 <html lang="en">
@@ -159,7 +160,7 @@ def _render(tree: xr.DataTree) -> str:
         source=data if model else "",
         evidence=_number(attrs["log_evidence"], 7) if "log_evidence" in attrs else "",
         colour=COLOURS.get(str(attrs["status"]), "plain"),
-        invalid=attrs["status"] in plots.INVALID,
+        invalid=attrs["status"] in INVALID,
         rmse=_rmse(attrs),
         probability=f"{float(attrs.get('interval_probability', plots.INTERVAL)):.0%}",
         columns=columns,
@@ -240,7 +241,7 @@ def _biases(tree: xr.DataTree) -> tuple[list[str], list[dict[str, Any]]]:
         cells += [(_number(one[name], 4), False) for name in extra]
         if known:
             cells.append((_rounded(known[label], sd) if label in known else "", False))
-        colour = "bad" if status in plots.INVALID else "pruned" if status == "pruned" else ""
+        colour = "bad" if status in INVALID else "pruned" if status == "pruned" else ""
         rows.append({"label": label, "cells": cells, "colour": colour})
     return columns, rows
 

@@ -16,6 +16,7 @@ from probcal.errors import InputError, nearest
 from probcal.geometry import wrap
 from probcal.motion import view
 from probcal.network import ANGLES, Network, Node
+from probcal.noise import Bernoulli
 from probcal.sensor import VECTORS, Channel, Sensor, SensorType
 from probcal.types import PoseView
 
@@ -237,6 +238,19 @@ def standardised(score: jax.Array, information: jax.Array) -> jax.Array:
     """Scores over the root of their information, of mean 0 and variance 1 under the model; zero where missing."""
     there = information > 0
     return jnp.where(there, score / jnp.sqrt(jnp.where(there, information, 1.0)), 0.0)
+
+
+def square(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
+    """Square of each standardised score, 1 expected, zero where missing, shape (N, C).
+
+    A yes-or-no channel has twice the negative log probability where that is smaller: nothing to do with a scale.
+    """
+    score, information = weigh(block, rows, predicted, noise_std(rows, levels), expected=True)
+    found = standardised(score, information) ** 2
+    events = np.array([isinstance(channel.noise, Bernoulli) for channel in block.channels])
+    if not events.any():
+        return found
+    return jnp.where(events, jnp.minimum(found, -2.0 * log_likelihood(block, rows, predicted, levels)), found)
 
 
 def weigh(

@@ -13,6 +13,7 @@ from probcal.analysis.checks import Finding
 from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.pieces import Change, Pieces
 from probcal.analysis.verdict import RATE, limit_of
+from probcal.errors import INVALID
 from probcal.problem import Problem
 from probcal.simulate import Key, Truth, as_key
 from probcal.tree import suffix
@@ -60,11 +61,12 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     columns = [groups["verdict"][name].values.tolist() for name in ("verdict", "bias_label", "reason")]
     alarms = [row for row in zip(*columns, strict=True) if row[0] in ("drifting", "conflicting")]
     findings += [Finding(word, label, f"{label}: {reason}") for word, label, reason in alarms]
-    if tree.attrs["status"] in ("at bound", "diverged"):
+    if tree.attrs["status"] in INVALID:
         text = (
             f"the fit ended {tree.attrs['status']}, which is no answer: what is left of the data says nothing of them"
         )
-        findings = [Finding("status", "fit", text)]
+        kept = [f for f in findings if f.kind == "nis"] if tree.attrs["status"] == "misfit" else []
+        findings = [Finding("status", "fit", text), *kept]
     scaled = scaling.power_scaling(tree)
     if scaled is not None:
         groups["sensitivity"] = scaled
@@ -107,8 +109,8 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
         verdict.contraction(calibration["information"].values), square,
         verdict.pull(z, alpha, calibration["gamma"].values, inflation), float(np.sqrt(limit_of(M))),
     )  # fmt: skip
-    pruned = calibration["status"].values == "pruned"
-    words, reasons = verdict.judge(problem, str(tree.attrs["status"]), pruned, known, drifts, disagreements, first)
+    ended = calibration["status"].values.tolist()
+    words, reasons = verdict.judge(problem, str(tree.attrs["status"]), ended, known, drifts, disagreements, first)
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}
     labels = {"bias_label": list(problem.labels)}

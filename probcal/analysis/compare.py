@@ -12,7 +12,7 @@ from probcal.analysis.checks import Finding
 from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.analysis.differences import findings
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
-from probcal.errors import InputError, nearest
+from probcal.errors import INVALID, InputError, nearest
 from probcal.network import label_parts
 
 Fits = Mapping[str, xr.DataTree] | Sequence[xr.DataTree]
@@ -130,7 +130,7 @@ def chosen_pair(fits: Mapping[str, xr.DataTree], labels: Sequence[str]) -> tuple
 
 
 def _sound(tree: xr.DataTree) -> bool:
-    return tree.attrs["status"] not in ("at bound", "diverged")
+    return tree.attrs["status"] not in INVALID
 
 
 def _common(fits: Mapping[str, xr.DataTree]) -> list[str]:

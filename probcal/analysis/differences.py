@@ -12,17 +12,18 @@ import xarray as xr
 
 from probcal.analysis.checks import NAMES, Finding
 from probcal.analysis.overlap import ZERO
+from probcal.errors import INVALID
 
 NARROW = 0.7  # ratio of sds beyond which, either way, a method is not enough
 GAMMA = 0.05  # by which a gamma must lie above the interval of the reference's to be a finding
 CERTAIN = 4.0  # nats of elpd below which a difference is none, whatever its error
 MIXED = 1.01  # r_hat above which chains disagree
-INVALID = {"at bound", "diverged"}
 BAD = 0.01  # share of bad Pareto k that is a finding
 ENDED = {
     "not converged": "did not converge",
     "at bound": "ended at bound: its numbers are no estimate",
     "diverged": "diverged: its numbers are no estimate",
+    "misfit": "explains nothing: its numbers are no estimate",
 }
 
 
@@ -35,7 +36,7 @@ def findings(comparison: xr.DataTree) -> list[Finding]:
     methods = {name: comparison[f"method/{name}"].to_dataset() for name in names}
     found = [finding for name in names for finding in _doubts(name, methods[name])]
     for name in names:
-        if name != reference and not {methods[n].attrs["status"] for n in (name, reference)} & INVALID:
+        if name != reference and not {methods[n].attrs["status"] for n in (name, reference)} & set(INVALID):
             found += _against(comparison, name, reference)
     return [*found, *_coverage(comparison, methods), *_prediction(methods), *_evidence(methods)]
 

@@ -7,7 +7,8 @@ drifting     the halves of the recording differ on it beyond the limit, after wh
 conflicting  it lies beyond the limit of its survey (or of its scale under a prior that does not learn), or the
              targets disagree on it beyond the limit, after what stronger changes explain
 prior only   s < 0.05
-weak         s < 0.5 (information below 1), or the fit is no answer (at bound, diverged)
+weak         s < 0.5 (information below 1), or the fit is no answer (not converged, at bound, diverged), or the chains
+             of the bias have not mixed; "conflicting" where the fit explains nothing (misfit)
 determined   none of these
 
 Limits have a false-alarm rate of 1 % over all biases together, and the standard deviations behind them carry the
@@ -15,7 +16,7 @@ overdispersion of the innovations and their correlation in time. A sensor whose 
 whose data fit the rest badly, is a finding of its own: it widens those standard deviations and is no verdict.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -64,13 +65,16 @@ def limit_of(count: int, freedom: int = 1) -> float:
 def judge(
     problem: Problem,
     status: str,
-    pruned: np.ndarray,
+    ended: Sequence[str],
     known: Evidence,
     drifts: Mapping[int, str],
     disagreements: Mapping[int, str],
     first: str,
 ) -> tuple[list[str], list[str]]:
-    """Verdict and reason of every bias, from the evidence and the reasons of those that change, `first` most."""
+    """Verdict and reason of every bias, from the evidence and the reasons of those that change, `first` most.
+
+    `status` is that of the fit, `ended` that of each bias.
+    """
     verdicts, sentences = [], []
     for m, bias in enumerate(problem.biases):
         s, unit = known.contraction[m], bias.unit if bias.unit != "1" else ""
@@ -89,11 +93,15 @@ def judge(
             verdict, reason = "prior only", f"the data hardly narrow its {declared} ({information})"
         elif s < WEAK:
             verdict, reason = "weak", f"the data narrow its {sizes} only ({information})"
-        elif status in ("at bound", "diverged"):
+        elif status == "misfit":
+            verdict, reason = "conflicting", "the fit ended misfit: model and data contradict each other"
+        elif status != "converged":
             verdict, reason = "weak", f"the fit ended {status}, which is no answer"
+        elif ended[m] == "not mixed":
+            verdict, reason = "weak", "its chains have not mixed, which is no answer"
         else:
             verdict, reason = "determined", f"the data narrow its {sizes}"
-            reason += "; learnt to be zero" if pruned[m] else ""
+            reason += "; learnt to be zero" if ended[m] == "pruned" else ""
         if verdict != "drifting" and known.square[m] > known.limit**2 and first not in ("", bias.label):
             reason += f"; its halves differ by {np.sqrt(known.square[m]):.1f} sd, which {first} explains"
         verdicts.append(verdict)

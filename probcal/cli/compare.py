@@ -12,6 +12,7 @@ from probcal.analysis import compare
 from probcal.analysis.compare import chosen_pair, named
 from probcal.cli.files import can_plot, say_written, write_csv, writing
 from probcal.diagnostics import comparison_rows
+from probcal.errors import INVALID
 from probcal.tree import load, save
 
 
@@ -28,7 +29,7 @@ def run(
         print(f"- {sentence}")
     if out is not None:
         _write(comparison, fits, drawn, out)
-    return 1 if any(tree.attrs["status"] in ("at bound", "diverged") for tree in fits.values()) else 0
+    return 1 if any(tree.attrs["status"] in INVALID for tree in fits.values()) else 0
 
 
 def estimates_text(comparison: xr.DataTree) -> str:

@@ -10,7 +10,7 @@ from probcal.cli.files import write_csv
 from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem, load_truth
 from probcal.diagnostics import scores
-from probcal.errors import InputError
+from probcal.errors import INVALID, InputError
 from probcal.inference import track
 from probcal.tree import load
 
@@ -18,7 +18,7 @@ from probcal.tree import load
 def run(model: Path, data: Path | None, calibration: Path, out: Path) -> int:
     """Tracks of other data with a calibration applied: time, target, each state component with its sd."""
     known = load(calibration)
-    if known.attrs.get("status") in ("at bound", "diverged"):
+    if known.attrs.get("status") in INVALID:
         raise InputError(
             f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first"
         )

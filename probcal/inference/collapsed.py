@@ -125,6 +125,7 @@ def swing(
     momentum = jax.tree.unflatten(
         shape, [jax.random.normal(k, leaf.shape) for k, leaf in zip(seeds, leaves, strict=True)]
     )
+    momentum = (momentum[0] * given.active, momentum[1])  # what is out stays at 0
     longest = STEP * sum(leaf.size for leaf in leaves) ** -0.25
     count = max(1, round(0.5 * float(np.pi) / longest))
     size = longest * (1.0 - 0.3 * jax.random.uniform(keys[1]))

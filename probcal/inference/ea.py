@@ -42,7 +42,8 @@ def _iterate(spec: Spec, system: System, prior: Prior, given: Given, state: Stat
     # where a target grazes a sensor the density has a cusp: no step lowers the cost, and none is needed
     settled = mode.converged | (cost(spec, system, state.point, now) - mode.cost < given.tolerance)
     done = still & settled if prior.learns or mode.point.levels.shape[0] else mode.converged
-    return State(mode.point, state.alpha, found, objective, done)
+    best = jnp.fmax(state.best, found.evidence)
+    return State(mode.point, state.alpha, found, objective, best, state.refused & mode.refused, done)
 
 
 def _density(spec: Spec, system: System, prior: Prior, given: Given, point: Point) -> jax.Array:
@@ -57,9 +58,11 @@ def _iterate_paper_b(spec: Spec, system: System, prior: Prior, given: Given, sta
     state = _learnt(spec, system, prior, given, state, rule)
     point = track(spec, system, state.point)
     found, step = paper_b(spec, system, point, given.prior._replace(alpha=state.alpha))
+    refused = state.refused & ~jnp.all(jnp.isfinite(step))
     step = jnp.where(jnp.isfinite(step), jnp.clip(step, -1.0, 1.0), 0.0)
     done = (jnp.abs(found.evidence - state.objective) < given.tolerance) & (jnp.max(jnp.abs(step)) < 1e-3)
-    return State(point._replace(z=point.z + step), state.alpha, found, found.evidence, done)
+    best = jnp.fmax(state.best, found.evidence)
+    return State(point._replace(z=point.z + step), state.alpha, found, found.evidence, best, refused, done)
 
 
 @dataclass(frozen=True)

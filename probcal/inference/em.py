@@ -19,8 +19,13 @@ HALVINGS = 8
 LINEARISATIONS = ("extended", "unscented", "cubature")
 
 
-def _shorten(spec: Spec, system: System, point: Point, proposal: Point, prior: Precision, slack: float) -> Point:
-    """The longest of the halved steps that leaves the cost finite and at most `slack` above the old one."""
+def _shorten(
+    spec: Spec, system: System, point: Point, proposal: Point, prior: Precision, slack: float
+) -> tuple[Point, jax.Array]:
+    """The longest of the halved steps that leaves the cost finite and at most `slack` above the old one.
+
+    Also whether there was none.
+    """
     bound = cost(spec, system, point, prior) + slack
 
     def worse(state):
@@ -29,14 +34,20 @@ def _shorten(spec: Spec, system: System, point: Point, proposal: Point, prior: P
 
     t, tries = jax.lax.while_loop(worse, lambda s: (0.5 * s[0], s[1] + 1), (jnp.ones(()), 0))
     found = between(point, proposal, jnp.where(tries < HALVINGS, t, 0.0))
-    return jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), found, point)
+    return jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), found, point), jnp.asarray(
+        tries >= HALVINGS
+    )
 
 
-def _inner(spec: Spec, system: System, point: Point, prior: Precision, rule: str) -> tuple[Point, jax.Array]:
-    """One E and one M step (Paper A 15-21, Paper C 2c and 35); also the variances of z at fixed trajectories (36)."""
+def _inner(spec: Spec, system: System, point: Point, prior: Precision, rule: str) -> tuple[Point, jax.Array, jax.Array]:
+    """One E and one M step (Paper A 15-21, Paper C 2c and 35); also the variances of z at fixed trajectories (36).
+
+    Last, whether both steps were refused.
+    """
     slack = 0.0
     if rule == "extended":  # one damped pass of the extended smoother, linearised at the last trajectory
-        point = find_mode(spec, system, point, prior, 1, 0.0, joint=False).point
+        mode = find_mode(spec, system, point, prior, 1, 0.0, joint=False)
+        point, refused = mode.point, mode.refused
         information, score = of_biases(spec, system, linearise(spec, system, point, expected=False))
     else:
         spread = sigma.state_covariances(spec, system, point)
@@ -46,15 +57,15 @@ def _inner(spec: Spec, system: System, point: Point, prior: Precision, rule: str
         )
         # the mean of a density lies off its mode, by half a unit of cost a dimension at most in the Gaussian case
         slack = 0.5 * sum(u.size for u in point.noises)
-        point = _shorten(spec, system, point, smoothed, prior, slack)
+        point, refused = _shorten(spec, system, point, smoothed, prior, slack)
         spread = sigma.state_covariances(spec, system, point)
         information, score = sigma.expect_biases(spec, system, point, spread, rule)
     matrix = information + prior.matrix() + 1e-12 * jnp.eye(spec.biases)
     step = linalg.solve_positive(matrix, score - prior.pull(point.z))
+    finite = jnp.all(jnp.isfinite(step))
     step = jnp.where(jnp.isfinite(step), step, 0.0)
-    return _shorten(spec, system, point, point._replace(z=point.z + step), prior, slack), linalg.inverse_diagonal(
-        matrix
-    )
+    point, stuck = _shorten(spec, system, point, point._replace(z=point.z + step), prior, slack)
+    return point, linalg.inverse_diagonal(matrix), refused & (stuck | ~finite)
 
 
 def _iterate(
@@ -62,9 +73,10 @@ def _iterate(
 ) -> State:
     """`inner` E and M steps, then the update of the precisions (Paper C 40) and of the levels."""
     now = given.prior._replace(alpha=state.alpha)
-    point, variance = state.point, jnp.zeros_like(state.alpha)
+    point, variance, refused = state.point, jnp.zeros_like(state.alpha), state.refused
     for _ in range(inner):
-        point, variance = _inner(spec, system, point, now, linearisation)
+        point, variance, stuck = _inner(spec, system, point, now, linearisation)
+        refused = refused & stuck
     alpha = learn(prior, given, state.alpha, jnp.zeros_like(variance), variance, point.z, "em")
     if point.levels.shape[0]:
         point = update_levels(spec, system, point, jnp.diag(variance))
@@ -73,7 +85,8 @@ def _iterate(
     value = -cost(spec, system, point, after) - jnp.sum(free)
     if prior.proper:
         value = value + 0.5 * after.log_determinant()
-    return State(point, alpha, state.found, value, jnp.abs(value - state.objective) < given.tolerance)
+    done = jnp.abs(value - state.objective) < given.tolerance
+    return State(point, alpha, state.found, value, state.best, refused, done)
 
 
 @dataclass(frozen=True)
@@ -108,7 +121,8 @@ class EM(Maximiser):
 
     def close(self, spec: Spec, system: System, given: Given, state: State) -> State:
         """Covariance and evidence at the point, trajectories marginalised."""
-        return state._replace(found=laplace(spec, system, state.point, given.prior._replace(alpha=state.alpha)))
+        found = laplace(spec, system, state.point, given.prior._replace(alpha=state.alpha))
+        return state._replace(found=found, best=jnp.fmax(state.best, found.evidence))
 
 
 @dataclass(frozen=True)

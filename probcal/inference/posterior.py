@@ -12,13 +12,13 @@ from scipy import stats
 from probcal import tree
 from probcal.inference.hierarchy import LEAST, MOST, SpikeAndSlab
 from probcal.inference.pose import pareto_khat
-from probcal.inference.run import FAR
+from probcal.inference.run import ABSURD, FAR, misfit_sentence
 from probcal.inference.sampling import Sampled
 from probcal.priors import PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.smoothing.directions import weak_directions
 from probcal.smoothing.draws import draws_a_chain, predictive, residuals_of
-from probcal.smoothing.information import at_levels
+from probcal.smoothing.information import at_levels, mean_square
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import track_mode
 
@@ -63,7 +63,8 @@ def result(
     M = run.form.biases
     mean, mean_levels = z.mean((0, 1)), levels.mean((0, 1))
     covariance = np.atleast_2d(np.cov(z.reshape(-1, M), rowvar=False))
-    before, after = _points(problem, run, mean, mean_levels)
+    after = mean_point(problem, run)
+    before = track_mode(problem, after._replace(z=jnp.zeros_like(after.z)))
     states = run.states
     half = 50 * (1 - tree.INTERVAL)
     lower, upper = np.percentile(z, [half, 100 - half], axis=(0, 1))
@@ -72,7 +73,7 @@ def result(
     precision = np.clip((1 - gamma.mean((0, 1))) / np.maximum(variance, 1e-300), *PRECISION_BOUNDS)
     precision = np.where(problem.surveyed | isinstance(prior, Flat), np.asarray(run.posed.first.alpha), precision)
     information = np.asarray(run.posed.frame.information)[:M, :M]
-    status, message = judge(problem, prior, run, mixed)
+    status, message = judge(problem, prior, run, mixed, after)
     kept, likelihood, replicas = _by_datum(problem, run, states, key, keep)
     return tree.Result(
         method=run.method.name, prior=type(prior).__name__, seed=seed,
@@ -91,12 +92,10 @@ def result(
     )  # fmt: skip
 
 
-def _points(problem: Problem, run: Sampled, z: np.ndarray, levels: np.ndarray) -> tuple[Point, Point]:
-    """Trajectories at their mode without calibration, and at the posterior means."""
-    frame = run.posed.frame.point
-    start = at_levels(problem.system, frame, jnp.asarray(levels))
-    after = track_mode(problem, start._replace(z=jnp.asarray(z)))
-    return track_mode(problem, after._replace(z=jnp.zeros_like(after.z))), after
+def mean_point(problem: Problem, run: Sampled) -> Point:
+    """Posterior means of biases and levels, trajectories at their mode there."""
+    start = at_levels(problem.system, run.posed.frame.point, jnp.asarray(run.levels.mean((0, 1))))
+    return track_mode(problem, start._replace(z=jnp.asarray(run.z.mean((0, 1)))))
 
 
 def _tracks(states: list[np.ndarray], before: Point) -> list[tree.Tracks]:
@@ -192,8 +191,10 @@ def _bias_status(problem: Problem, mixed: Mapping[str, np.ndarray], M: int) -> t
     return tuple("not mixed" if bad else "survey" if own else "estimated" for own, bad in pairs)
 
 
-def judge(problem: Problem, prior: Prior, run: Sampled, mixed: Mapping[str, np.ndarray]) -> tuple[str, str]:
-    """Status of a run, and one or more sentences on what hurts and what to do."""
+def judge(
+    problem: Problem, prior: Prior, run: Sampled, mixed: Mapping[str, np.ndarray], mean: Point
+) -> tuple[str, str]:
+    """Status of a run whose posterior has this mean, and one or more sentences on what hurts and what to do."""
     said = [run.note] if run.note else []
     chains, draws = run.z.shape[:2]
     good = True
@@ -211,6 +212,9 @@ def judge(problem: Problem, prior: Prior, run: Sampled, mixed: Mapping[str, np.n
     if mixed["ess"][worst] < ESS * chains:
         said.append(f"Only {mixed['ess'][worst]:.0f} effective draws of {names[worst]}; take more draws.")
         good = False
+    square = float(mean_square(problem.spec, problem.system, mean))
+    if not square <= ABSURD:
+        return "misfit", " ".join([misfit_sentence(problem, mean, square), *said])
     good = _say_steps(run, said) and good
     if not run.method.exact:
         khat = pareto_khat(run.draws["stats_log_weight"].ravel())

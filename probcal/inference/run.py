@@ -20,11 +20,13 @@ from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Precision, Prior
 from probcal.priors import Laplace as LaplacePrior
 from probcal.problem import Problem, Spec, System
 from probcal.smoothing.directions import Direction, weak_directions
-from probcal.smoothing.information import Laplace
+from probcal.smoothing.information import Laplace, mean_square, squares_of
 from probcal.smoothing.mode import Point
 
 CHUNK = 5  # outer iterations between two reports of progress
 FAR = 10.0  # scales from the stated value beyond which a bias without prior has diverged
+FALL = 1.0  # nats below its best at which an evidence may end
+ABSURD = 100.0  # mean square a datum, 1 expected, beyond which a fit explains nothing
 Progress = Callable[[str, int, float], None]  # method, iterations done, current objective
 
 
@@ -44,6 +46,8 @@ class State(NamedTuple):
     alpha: jax.Array  # (M,)
     found: Laplace
     objective: jax.Array  # ()
+    best: jax.Array  # () the best evidence so far
+    refused: jax.Array  # () whether no step of any search has lowered the cost yet, though one promised to
     done: jax.Array  # ()
 
 
@@ -90,7 +94,7 @@ class Outcome(NamedTuple):
     alpha: np.ndarray  # (M,)
     laplace: Laplace
     trace: np.ndarray  # objective of every outer iteration
-    status: str  # converged, at bound, not converged, diverged
+    status: str  # converged, not converged, at bound, misfit, diverged
     message: str  # one sentence on the status and what to do; empty where nothing is to be said
     bias_status: tuple[str, ...]
     weak: tuple[Direction, ...]
@@ -127,9 +131,8 @@ def first_state(given: Given, start: Point) -> State:
     """State before the first iteration."""
     alpha, low = given.prior.alpha, jnp.full((), -jnp.inf, float)
     M = alpha.shape[0]
-    return State(
-        start, alpha, Laplace(jnp.zeros((M, M)), jnp.zeros((M, M)), jnp.zeros(M), low), low, jnp.zeros((), bool)
-    )
+    nothing = Laplace(jnp.zeros((M, M)), jnp.zeros((M, M)), jnp.zeros(M), low)
+    return State(start, alpha, nothing, low, low, jnp.ones((), bool), jnp.zeros((), bool))
 
 
 def learn(prior: Prior, given: Given, alpha: jax.Array, gamma: Any, variance: Any, z: jax.Array, rule: str) -> Any:
@@ -167,7 +170,7 @@ def maximise(method: Maximiser, problem: Problem, prior: Prior, start: Point, pr
         if progress is not None:
             progress(method.name, len(trace), float(trace[-1]))
     converged = bool(state.done) or method.tolerance == 0.0
-    outcome = finish(problem, prior, state.point, state.alpha, state.found, converged, trace)
+    outcome = finish(problem, prior, state, converged, trace)
     if method.tolerance > 0.0 or outcome.status != "converged" or len(trace) < 2:
         return outcome
     note = (
@@ -176,22 +179,23 @@ def maximise(method: Maximiser, problem: Problem, prior: Prior, start: Point, pr
     return outcome._replace(message=f"{note} {outcome.message}".strip())
 
 
-def finish(
-    problem: Problem,
-    prior: Prior,
-    point: Point,
-    precisions: jax.Array,
-    found: Laplace,
-    converged: bool,
-    trace: np.ndarray,
-) -> Outcome:
+def finish(problem: Problem, prior: Prior, state: State, converged: bool, trace: np.ndarray) -> Outcome:
     """Say in words what the point and the Laplace approximation are worth where a method ended."""
-    alpha, z = np.asarray(precisions), np.asarray(point.z)
+    point, found = state.point, state.found
+    alpha, z = np.asarray(state.alpha), np.asarray(point.z)
     information = np.asarray(found.information)
     weak = weak_directions(problem, information, point) if np.isfinite(information).all() else ()
     low, far = low_and_far(prior, alpha, z, problem.surveyed)
-    sound = all(np.isfinite(np.asarray(part)).all() for part in (found.covariance, found.evidence, point.z))
-    status = verdict(converged, bool(low.any()), bool(far.any()) or not sound)
+    end = End(
+        converged,
+        bool(low.any()),
+        bool(far.any()),
+        all(np.isfinite(np.asarray(part)).all() for part in (found.covariance, found.evidence, point.z)),
+        bool(state.refused),
+        fallen(prior, len(problem.levels), state.best, found.evidence),
+        float(mean_square(problem.spec, problem.system, point)),
+    )
+    status = verdict(end)
     bias_status = tuple(
         "survey"
         if s
@@ -204,7 +208,7 @@ def finish(
         else "estimated"
         for s, b, f, g in zip(problem.surveyed, low, far, np.asarray(found.gamma), strict=True)
     )
-    message = _message(problem, status, low, far, weak, len(trace))
+    message = _message(problem, point, status, end, low, far, weak, len(trace))
     return Outcome(point, alpha, found, trace, status, message, bias_status, weak)
 
 
@@ -216,13 +220,57 @@ def low_and_far(prior: Prior, alpha: np.ndarray, z: np.ndarray, surveyed: np.nda
     return low, far
 
 
-def verdict(converged: bool, low: bool, lost: bool) -> str:
+def fallen(prior: Prior, levels: int, best: Any, evidence: Any) -> float:
+    """Nats by which the last evidence lies below the best, where a method maximises it: precisions or levels learnt."""
+    return max(float(best) - float(evidence), 0.0) if prior.proper and (prior.learns or levels) else 0.0
+
+
+class End(NamedTuple):
+    """What the status of a fit follows from."""
+
+    still: bool  # the method says that it is done
+    low: bool  # a precision stands at its lower bound
+    far: bool  # a bias without prior ran away
+    sound: bool  # everything is finite
+    refused: bool  # the search never left its start, though a step promised to
+    fallen: float  # nats that the evidence lost
+    square: float  # mean square a datum of what is left
+
+
+def verdict(end: End) -> str:
     """Status of a fit in words."""
-    return "diverged" if lost else "at bound" if low else "converged" if converged else "not converged"
+    if not end.square <= ABSURD:
+        return "misfit"
+    if end.far or not end.sound or end.refused:
+        return "diverged"
+    if end.low:
+        return "at bound"
+    return "converged" if end.still and end.fallen <= FALL else "not converged"
+
+
+def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
+    """What to check where a fit explains nothing, and the datum that is worst explained."""
+    squares = [np.asarray(part) for part in squares_of(problem.spec, problem.system, point)]
+    block = int(np.argmax([np.nan_to_num(part, nan=np.inf).max() for part in squares]))
+    n, c = np.unravel_index(np.argmax(np.nan_to_num(squares[block], nan=np.inf)), squares[block].shape)
+    row, data = problem.row_index[block][n], problem.measurements
+    sensor = problem.network.sensors[data.sensor[row]].name
+    channel = problem.spec.blocks[block].type.expand(problem.network.dimension)[c][0]
+    return (
+        f"The fit explains nothing: mean square a datum {square:.2g} where 1 is expected, worst {sensor}.{channel} at"
+        f" {data.time[row]:.6g} s. Check units, the time column, sentinels such as -9999 and the noise std."
+    )
 
 
 def _message(
-    problem: Problem, status: str, low: np.ndarray, far: np.ndarray, weak: tuple[Direction, ...], iterations: int
+    problem: Problem,
+    point: Point,
+    status: str,
+    end: End,
+    low: np.ndarray,
+    far: np.ndarray,
+    weak: tuple[Direction, ...],
+    iterations: int,
 ) -> str:
     def listed(mask: np.ndarray) -> str:
         labels = [label for label, hit in zip(problem.labels, mask, strict=True) if hit]
@@ -231,6 +279,13 @@ def _message(
     advice = f" The data do not fix: {'; '.join(d.sentence for d in weak[:4])}." if weak else ""
     if status == "at bound":
         return f"The precision of {listed(low)} stands at its lower bound: the estimate is invalid.{advice}"
+    if status == "misfit":
+        return misfit_sentence(problem, point, end.square)
+    if status == "diverged" and end.sound and end.refused and not end.far:
+        return (
+            "The fit diverged: it never left its start, since no step fitted better; the estimate is invalid. Check"
+            " units, the time column, sentinels such as -9999 and the noise std, or give a start."
+        )
     if status == "diverged":
         where = (
             f"{listed(far)} lie more than {FAR:g} scales from the stated value"
@@ -238,6 +293,11 @@ def _message(
             else "the information matrix is singular"
         )
         return f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases.{advice}"
+    if status == "not converged" and end.fallen > FALL:
+        return (
+            f"The evidence fell by {end.fallen:.3g} nats below its best on the way: the fit ran to a place that the"
+            f" data as a whole do not favour. Survey or fix more, state narrower scales, or take a sampler.{advice}"
+        )
     if status == "not converged":
         return (
             f"The fit did not converge in {iterations} iterations: allow more, or fix what the data leave open.{advice}"

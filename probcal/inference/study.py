@@ -18,13 +18,15 @@ from scipy import stats
 from probcal.errors import InputError, nearest
 from probcal.inference.identity import identity, problem_digest
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
-from probcal.inference.posterior import judge, mixing
+from probcal.inference.posterior import judge, mean_point, mixing
 from probcal.inference.run import (
+    End,
     Given,
     Maximiser,
     Method,
     State,
     check_method,
+    fallen,
     first_state,
     given_of,
     kernel,
@@ -38,6 +40,7 @@ from probcal.inference.storage import Records, Storage
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import Truth
+from probcal.smoothing.information import mean_square
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start
 from probcal.tree import INTERVAL
@@ -59,6 +62,10 @@ class _Solved(NamedTuple):
     alpha: jax.Array  # (runs, M)
     states: tuple[jax.Array, ...]  # (runs, E, n) of each recursion
     done: jax.Array  # (runs,)
+    refused: jax.Array  # (runs,)
+    best: jax.Array  # (runs,) evidence on the way
+    evidence: jax.Array  # (runs,)
+    square: jax.Array  # (runs,) of what is left, a datum
     iterations: jax.Array  # (runs,)
 
 
@@ -82,7 +89,11 @@ def _solve(
         state = method.close(spec, system, given, state)
         sd = jnp.sqrt(jnp.diagonal(state.found.covariance))
         done = state.done | (given.tolerance == 0.0)
-        return _Solved(state.point.z, sd, state.found.gamma, state.alpha, state.point.states, done, count)
+        found, point = state.found, state.point
+        return _Solved(
+            point.z, sd, found.gamma, state.alpha, point.states, done, state.refused, state.best, found.evidence,
+            mean_square(spec, system, point), count,
+        )  # fmt: skip
 
     pieces = (systems, givens, starts)
     return jax.lax.map(one, pieces) if jax.default_backend() == "cpu" else jax.vmap(one)(pieces)
@@ -194,13 +205,16 @@ def _record(run: _Run, prior: Prior, one: Any) -> dict[str, Any]:
     true = np.array([run.truth.biases[label] for label in problem.labels]) / problem.scales
     error = one.z - true
     low, far = low_and_far(prior, one.alpha, one.z, problem.surveyed)
-    sound = bool(np.isfinite(one.z).all() and np.isfinite(one.sd).all())
+    end = End(
+        bool(one.done), bool(low.any()), bool(far.any()), bool(np.isfinite(one.z).all() and np.isfinite(one.sd).all()),
+        bool(one.refused), fallen(prior, len(problem.levels), one.best, one.evidence), float(one.square),
+    )  # fmt: skip
     half = stats.norm.ppf(0.5 + INTERVAL / 2)
     return {
         "bias_rmse": float(np.sqrt(np.mean(error**2))),
         "coverage": float((np.abs(error) <= half * one.sd).mean()),
         "position_rmse": _position_rmse(run, one.states),
-        "status": verdict(bool(one.done), bool(low.any()), bool(far.any()) or not sound),
+        "status": verdict(end),
         "iterations": int(one.iterations),
         "error": error, "true": true, "gamma": one.gamma, "sd": one.sd,
         "lower": error - half * one.sd, "upper": error + half * one.sd, "labels": problem.labels,
@@ -215,7 +229,7 @@ def _drawn(run: _Run, method: Sampler, prior: Prior) -> dict[str, Any]:
     z = drawn.z.reshape(-1, len(true))
     half = 50 * (1 - INTERVAL)
     lower, upper = np.percentile(z, [half, 100 - half], axis=0)
-    status, _ = judge(problem, prior, drawn, mixing(drawn.draws["theta"]))
+    status, _ = judge(problem, prior, drawn, mixing(drawn.draws["theta"]), mean_point(problem, drawn))
     error = z.mean(0) - true
     return {
         "bias_rmse": float(np.sqrt(np.mean(error**2))),

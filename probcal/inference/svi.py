@@ -83,8 +83,8 @@ class SVI(Sampler):
     `guide`: "structured" (in the frame's coordinates: full rank over biases and hyper-parameters, given which each
     trajectory has a block-tridiagonal precision), "mean-field" or "low-rank" (in plain coordinates, for comparison).
     Each of `chains` takes `warmup` Adam steps of length `rate` with `particles` draws each, then `draws` from its
-    guide. Sample statistics: `log_weight`, log p - log q of each draw, and `elbo`, the running bound along the warm-up,
-    spread over the draws. Raises `InputError` for settings outside their ranges.
+    guide. Sample statistics: `log_weight`, log p - log q of each draw, and `elbo`, the running lower bound of the log
+    evidence along the warm-up, spread over the draws. Raises `InputError` for settings outside their ranges.
     """
 
     chains: int = 4
@@ -185,18 +185,34 @@ class SVI(Sampler):
         """Log density of flat coordinates."""
         back = ravel_pytree(_template(form, posed))[1]
         of = parts if self.guide == "structured" else plain
-        return lambda x: of(form, posed, back(x)).density
+
+        def density(x: jax.Array) -> jax.Array:
+            found = of(form, posed, back(x))
+            return found.density + _constant(form, posed, found.phi)
+
+        return density
 
     def _sample(self, form: Form, posed: Posed, x: jax.Array) -> tuple[Sample, jax.Array]:
         """What coordinates stand for, and their log density."""
         free = ravel_pytree(_template(form, posed))[1](x)
         if self.guide == "structured":
             found = parts(form, posed, free)
-            return Sample(found.theta, free.eps, found.phi, found.joint, {}), found.density
+            density = found.density + _constant(form, posed, found.phi)
+            return Sample(found.theta, free.eps, found.phi, found.joint, {}), density
         at = plain(form, posed, free)
         eps = driving(posed.system, posed.frame, at.point)
         joint = log_joint(form.spec, posed.system, posed.frame, at.theta, eps)
-        return Sample(at.theta, eps, at.phi, joint, {}), at.density
+        return Sample(at.theta, eps, at.phi, joint, {}), at.density + _constant(form, posed, at.phi)
+
+
+def _constant(form: Form, posed: Posed, phi: Phi) -> jax.Array:
+    """What the log densities of theta and of the noises leave out: with it the bound is one of the log evidence.
+
+    A flat prior counts as one.
+    """
+    alpha, _ = prior_precision(form, posed, phi)
+    normal = jnp.sum(alpha > 0) + sum(x.size for x in posed.frame.point.states)
+    return 0.5 * posed.first.logdet - 0.5 * np.log(2 * np.pi) * normal
 
 
 def _template(form: Form, posed: Posed) -> Free:

@@ -6,7 +6,7 @@ from probcal.lazy import lazy
 
 if TYPE_CHECKING:
     from probcal.plots.assess import plot_halves, plot_left_out, plot_nis, plot_shrinkage
-    from probcal.plots.base import INTERVAL, INVALID
+    from probcal.plots.base import INTERVAL
     from probcal.plots.bounds import plot_bound_map, plot_sensitivity
     from probcal.plots.compare import draw_compare, plot_gammas, plot_methods, plot_pair
     from probcal.plots.fit import (
@@ -26,7 +26,7 @@ __all__ = lazy(
     __name__,
     {
         "probcal.plots.assess": "plot_halves plot_left_out plot_nis plot_shrinkage",
-        "probcal.plots.base": "INTERVAL INVALID",
+        "probcal.plots.base": "INTERVAL",
         "probcal.plots.bounds": "plot_bound_map plot_sensitivity",
         "probcal.plots.compare": "draw_compare plot_gammas plot_methods plot_pair",
         "probcal.plots.fit": "plot_biases plot_drift plot_gamma plot_map plot_objective plot_outliers plot_residuals",

@@ -17,7 +17,6 @@ POINTS = 3_000  # of one track
 ALL_POINTS = 40_000  # of all tracks together
 ROWS = 120  # biases in one forest
 NAMED = 60  # nodes, targets or biases above which names are left out
-INVALID = ("at bound", "diverged")  # status of a fit or a bias whose numbers are no estimate
 LINEAR = 12.0  # scales up to which the axis of the forest stays linear
 
 

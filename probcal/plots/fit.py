@@ -16,13 +16,13 @@ from matplotlib.patches import FancyArrowPatch
 from matplotlib.ticker import MaxNLocator
 
 from probcal.diagnostics import drift_table
+from probcal.errors import INVALID
 from probcal.network import label_parts
 from probcal.plots.base import (
     ALL_POINTS,
     BEFORE,
     COLOURS,
     GAMMA,
-    INVALID,
     LINEAR,
     NAMED,
     POINTS,

@@ -87,6 +87,23 @@ def paper_b(spec: Spec, system: System, point: Point, prior: Precision) -> tuple
     return Laplace(information, covariance, gamma, evidence), step
 
 
+@partial(jax.jit, static_argnames="spec")
+def squares_of(spec: Spec, system: System, point: Point) -> list[jax.Array]:
+    """Square of what a point leaves of every datum (N, C) of each block, 1 expected, zero where missing."""
+    return [
+        rows.square(block, data, rows.predict(block, data, point.states[r], point.z), point.levels)
+        for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True)
+    ]
+
+
+@partial(jax.jit, static_argnames="spec")
+def mean_square(spec: Spec, system: System, point: Point) -> jax.Array:
+    """Squares of all data and whitened noises a datum: about 1 at most where the model is right."""
+    count = sum(jnp.sum(data.mask) for data in system.rows)
+    squares = sum(jnp.sum(part) for part in squares_of(spec, system, point))
+    return (squares + sum(jnp.sum(u**2) for u in point.noises)) / jnp.maximum(count, 1)
+
+
 class Moments(NamedTuple):
     """Posterior moments of one recursion with the biases integrated out."""
 

@@ -18,6 +18,7 @@ from probcal.smoothing import recursion as rec
 
 HALVINGS = 12  # step lengths tried before the damping grows
 DAMPING = 1e10  # damping at which the iteration gives up
+ROUNDING = 1e-12  # of the cost: what a step that promises less cannot show
 
 
 class Point(NamedTuple):
@@ -43,6 +44,7 @@ class Eliminated(NamedTuple):
 
     information: jax.Array  # (M, M) of the biases
     score: jax.Array  # (M,)
+    pull: jax.Array  # (M,) the score at fixed trajectories
     logdet: jax.Array  # log det of the posterior precision of all whitened noises
     parts: tuple["Kept", ...]  # of each recursion, what a step of its states needs
 
@@ -193,17 +195,26 @@ def eliminate_compressed(
         kept.append(Kept(J, pull, cross, gain))
         logdet = logdet + gain.logdet
     information = 0.5 * (information + information.T)
-    return Eliminated(information, score, logdet, tuple(kept))
+    return Eliminated(information, score, compressed.score, logdet, tuple(kept))
 
 
-def _proposal(spec: Spec, system: System, point: Point, prior: Precision, damping: jax.Array, joint: bool) -> Point:
-    """Full Gauss-Newton step from a point."""
+def _proposal(
+    spec: Spec, system: System, point: Point, prior: Precision, damping: jax.Array, joint: bool
+) -> tuple[Point, jax.Array]:
+    """Full Gauss-Newton step from a point, and the decrease of the cost that it promises."""
     solved = eliminate(spec, system, point, expected=False, joint=joint)
     dz = jnp.zeros_like(point.z)
     if joint and spec.biases:  # an arrowhead: the tip first, then the trajectories follow
         matrix = solved.information + prior.matrix() + damping * jnp.eye(spec.biases)
         dz = linalg.solve_positive(matrix, solved.score - prior.pull(point.z))
-    return follow(system, point, solved, dz)
+    proposal = follow(system, point, solved, dz)
+    slope = -prior.pull(point.z) @ dz
+    slope = slope + (solved.pull @ dz if joint and spec.biases else 0.0)
+    for kept, x, new, u, moved in zip(
+        solved.parts, point.states, proposal.states, point.noises, proposal.noises, strict=True
+    ):
+        slope = slope + jnp.sum(kept.pull * (new - x)) - jnp.sum(u * (moved - u))
+    return proposal, 0.5 * slope
 
 
 def follow(system: System, point: Point, solved: Eliminated, dz: jax.Array) -> Point:
@@ -228,6 +239,8 @@ class _Search(NamedTuple):
     cost: jax.Array
     damping: jax.Array
     change: jax.Array
+    still: jax.Array  # no step lowers the cost, and none promised to
+    moved: jax.Array  # some step lowered the cost
     iteration: jax.Array
     done: jax.Array
 
@@ -239,6 +252,7 @@ class Mode(NamedTuple):
     cost: jax.Array
     iterations: jax.Array
     converged: jax.Array
+    refused: jax.Array  # every step was refused though it promised a lower cost: the start is no mode
 
 
 @partial(jax.jit, static_argnames=("spec", "joint"))
@@ -248,11 +262,12 @@ def find_mode(
     """Damped Gauss-Newton (iterated EKS, with the biases if `joint`) until the cost changes by less than `tolerance`.
 
     The start must be a consistent trajectory (states made of its whitened noises). A step that does not
-    lower the cost, or reaches a non-finite one, is halved, then damped.
+    lower the cost, or reaches a non-finite one, is halved, then damped. It has converged too where no step lowers
+    the cost and the first promised less than `tolerance`, or than the rounding of the cost.
     """
 
     def body(s: _Search) -> _Search:
-        proposal = _proposal(spec, system, s.point, prior, s.damping, joint)
+        proposal, promised = _proposal(spec, system, s.point, prior, s.damping, joint)
 
         def shorter(state):
             t, _, tries = state
@@ -269,19 +284,25 @@ def find_mode(
         damping = jnp.where(better & (tries <= 2), s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
         damping = jnp.where(damping < 1e-6, 0.0, damping)
         change = jnp.where(better, s.cost - value, jnp.inf)
-        done = (better & (change < tolerance) & (s.damping <= 1.0)) | (damping > DAMPING)
-        return _Search(point, jnp.where(better, value, s.cost), damping, change, s.iteration + 1, done)
+        small = jnp.abs(promised) <= jnp.maximum(tolerance, ROUNDING * jnp.abs(s.cost))
+        still = ~better & (s.damping <= 1.0) & small & jnp.isfinite(s.cost)
+        done = (better & (change < tolerance) & (s.damping <= 1.0)) | (damping > DAMPING) | still
+        moved = s.moved | (better & (change > 0))
+        return _Search(point, jnp.where(better, value, s.cost), damping, change, still, moved, s.iteration + 1, done)
 
     first = _Search(
         start,
         cost(spec, system, start, prior),
         jnp.zeros(()),
         jnp.full((), jnp.inf, float),
+        jnp.zeros((), bool),
+        jnp.zeros((), bool),
         jnp.zeros((), int),
         jnp.zeros((), bool),
     )
     last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations), body, first)
-    return Mode(last.point, last.cost, last.iteration, last.done & (last.change < tolerance))
+    converged = last.done & ((last.change < tolerance) | last.still)
+    return Mode(last.point, last.cost, last.iteration, converged, ~last.moved & ~converged)
 
 
 def track(spec: Spec, system: System, point: Point, iterations: int = 20) -> Point:
