@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal.analysis import checks, nees, pieces, predictive, residuals, scaling, verdict
+from probcal.analysis import checks, leave, nees, pieces, predictive, residuals, scaling, verdict
 from probcal.analysis.checks import Finding
 from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.pieces import Change, Pieces
@@ -37,11 +37,20 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     - `verdict`: `verdict` and `reason` of every bias (rules in `probcal.analysis.verdict`); `finding`: sentences.
 
     Limits have a false-alarm rate of 1 %: of one epoch in `epoch_check`, else of all comparisons of a kind together.
-    Refits of large networks are one step from the fit (attribute `refits` of the group). Raises `InputError` where
-    the tree is no fit of the problem.
+    Refits of large networks are one step from the fit (attribute `refits` of the group). Of a misfit nothing is left
+    out and no halves are compared. Raises `InputError` where the tree is no fit of the problem.
     """
     fit = take_up(problem, tree)
-    keys = jax.random.split(as_key(key))
+    with np.errstate(all="ignore" if _absurd(tree) else None):  # squares of absurd residuals overflow
+        return _assessed(fit, tree, truth, as_key(key))
+
+
+def _absurd(tree: xr.DataTree) -> bool:
+    return bool(tree.attrs["status"] == "misfit")
+
+
+def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Array) -> xr.DataTree:
+    keys = jax.random.split(key)
     drawn = predictive.draws_of(fit, tree, keys[0])
     replicas = predictive.check(fit, drawn, keys[1])
     found = residuals.innovations(fit, replicas.kurtosis)
@@ -56,7 +65,7 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     findings += [
         Finding("wrapping", *pair) for pair in residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     ]
-    findings += checks.left_out(fit, tree, groups)
+    findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups)
     groups["verdict"] = _verdicts(fit, tree, found, groups)
     columns = [groups["verdict"][name].values.tolist() for name in ("verdict", "bias_label", "reason")]
     alarms = [row for row in zip(*columns, strict=True) if row[0] in ("drifting", "conflicting")]
@@ -65,9 +74,9 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
         text = (
             f"the fit ended {tree.attrs['status']}, which is no answer: what is left of the data says nothing of them"
         )
-        kept = [f for f in findings if f.kind == "nis"] if tree.attrs["status"] == "misfit" else []
+        kept = [f for f in findings if f.kind == "nis"] if _absurd(tree) else []
         findings = [Finding("status", "fit", text), *kept]
-    scaled = scaling.power_scaling(tree)
+    scaled = scaling.power_scaling(tree) if leave.tailed(tree) else None
     if scaled is not None:
         groups["sensitivity"] = scaled
     if truth is not None:
@@ -86,7 +95,7 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
     M, inflation, square = problem.spec.biases, np.ones(problem.spec.biases), np.zeros(problem.spec.biases)
     drifts, disagreements, first = dict[int, str](), dict[int, str](), ""
     grid = _grid(problem)
-    if grid.patterns:
+    if grid.patterns and not _absurd(tree):
         divided = pieces.divide(fit, grid.piece, grid.pieces)
         wide = {name: _inflation(fit, found, divided, grid, member) for name, member in grid.members.items()}
         inflation = wide.get("halves", inflation)

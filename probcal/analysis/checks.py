@@ -143,7 +143,10 @@ def by_datum(fit: Fitted, found: residuals.Innovations, tree: xr.DataTree) -> tu
     values: dict[str, Any] = {"innovation": found.value}
     used, findings = float(found.used.sum()), list[Finding]()
     attrs = {"nis": float((found.value**2).sum()) / max(len(data) - used, 1e-9), "used": used}
-    if "log_likelihood" in tree.children:
+    if "log_likelihood" in tree.children and not leave.tailed(tree):
+        text = f"PSIS-LOO and power scaling are left out: they need {leave.TAILED} draws at least, take more"
+        findings.append(Finding("loo", "rows", text))
+    if leave.tailed(tree):
         group, labels = codes(data, ["row", "sensor", "target", "time"])
         row = leave.psis(tree, group, len(labels))
         values |= {"elpd": row.elpd[group], "pareto_k": row.pareto_k[group]}
@@ -163,7 +166,7 @@ def left_out(fit: Fitted, tree: xr.DataTree, groups: dict[str, xr.Dataset]) -> l
     findings = list[Finding]()
     for name, found in (("sensor", leave.leave_sensors(fit)), ("target", leave.leave_targets(fit))):
         check = groups[f"{name}_check"]
-        if "log_likelihood" in tree.children and check.sizes[name] > 1:
+        if leave.tailed(tree) and check.sizes[name] > 1:
             group, labels = codes(fit.data, [name])
             check["pareto_k"] = (name, leave.psis(tree, group, len(labels)).pareto_k)
         if found is None:

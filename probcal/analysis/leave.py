@@ -19,6 +19,7 @@ from scipy import special
 
 from probcal import linalg
 from probcal.analysis.fitted import Fitted, eliminate_rows, linearise
+from probcal.inference.pose import TAILED
 from probcal.priors import Precision
 from probcal.problem import Spec, System
 from probcal.rows import Linearised, standardised
@@ -197,6 +198,14 @@ def psis(tree: xr.DataTree, group: np.ndarray, count: int) -> Pointwise:
         weights, pareto_k = array_stats.psislw(summed)
     k = np.where(np.isfinite(pareto_k), pareto_k, np.inf)  # tails too heavy to be fitted
     return Pointwise(special.logsumexp(weights + summed, axis=1), k)
+
+
+def tailed(tree: xr.DataTree) -> bool:
+    """Whether a tree has a log-likelihood, of draws enough for a Pareto tail."""
+    if "log_likelihood" not in tree.children:
+        return False
+    sizes = tree["log_likelihood"].to_dataset().sizes
+    return sizes["chain"] * sizes["draw"] >= TAILED
 
 
 def good_k(tree: xr.DataTree) -> float:

@@ -11,6 +11,7 @@ import arviz as az
 import numpy as np
 import xarray as xr
 
+from probcal.analysis.leave import tailed
 from probcal.errors import InputError
 
 
@@ -36,7 +37,7 @@ def elpd(fits: Mapping[str, xr.DataTree], orders: Mapping[str, np.ndarray]) -> d
     """By fit with a log-likelihood: elpd, its error, p_loo, share of bad Pareto k, and difference to the best."""
     found, pointwise = dict[str, dict[str, Any]](), dict[str, np.ndarray]()
     for name, tree in fits.items():
-        if "log_likelihood" not in tree.children:
+        if not tailed(tree):
             continue
         y = tree["log_likelihood"]["y"].isel(datum=orders[name]).reset_coords(drop=True).to_dataset()
         bias = tree["posterior"].to_dataset()["bias"]

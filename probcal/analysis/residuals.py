@@ -139,7 +139,8 @@ def innovations(fit: Fitted, kurtosis: np.ndarray) -> Filtered:
     """
     spec, system = fit.problem.spec, fit.problem.system
     filters = prepare(spec, system, fit.point, fit.lins)
-    root = np.asarray(linalg.factor(jnp.asarray(fit.covariance)))
+    values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(fit.covariance)))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))  # that of few draws is singular
     chunk = min(COLUMNS, spec.biases)
     root = np.pad(root, ((0, 0), (0, -spec.biases % chunk)))
     roots = [jnp.asarray(part) for part in np.split(root, root.shape[1] // chunk, axis=1)]

@@ -21,6 +21,7 @@ BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, swe
 MOVES = 4  # most times that the frame is moved
 GOOD, LOST = 0.5, 0.7  # Pareto k-hat at which a frame is left alone, and above which it has failed
 SCARCE = 0.2  # acceptance of independent draws below which it has failed too
+TAILED = 25  # draws below which a Pareto tail cannot be fitted
 FITTINGS, FITTED = 2, 20  # rounds and draws (with mirror images) that a frame is fitted to
 SPREAD = 1.5  # by how much chains start further out than the pilot's draws
 
@@ -94,7 +95,7 @@ def moved(spec: Spec, system: System, frame: Frame, theta: jax.Array, key: jax.A
 
 def pareto_khat(log_weights: np.ndarray) -> float:
     """Pareto k-hat of log weights (D,); 0 where they are all equal, infinite where it cannot be told."""
-    if not np.isfinite(log_weights).all():
+    if len(log_weights) < TAILED or not np.isfinite(log_weights).all():
         return np.inf
     if np.ptp(log_weights) < 1e-6:
         return 0.0

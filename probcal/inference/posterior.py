@@ -62,7 +62,8 @@ def result(
     mixed = mixing(run.draws["theta"])
     M = run.form.biases
     mean, mean_levels = z.mean((0, 1)), levels.mean((0, 1))
-    covariance = np.atleast_2d(np.cov(z.reshape(-1, M), rowvar=False))
+    flat = z.reshape(-1, M)  # one draw has no spread: then its variances given the hyper-parameters
+    covariance = np.atleast_2d(np.cov(flat, rowvar=False)) if len(flat) > 1 else np.diag(run.draws["variance"][0, 0])
     after = mean_point(problem, run)
     before = track_mode(problem, after._replace(z=jnp.zeros_like(after.z)))
     states = run.states
@@ -237,7 +238,7 @@ def _say_steps(run: Sampled, said: list[str]) -> bool:
             said.append(
                 f"{share:.0%} of the trees reached the greatest depth: the step is short (dense=True may help)."
             )
-    if "energy" in found:
+    if "energy" in found and np.ptp(found["energy"], axis=1).min() > 0:
         energy = found["energy"]
         bfmi = (np.diff(energy, axis=1) ** 2).mean(1) / energy.var(1)
         if bfmi.min() < BFMI:
