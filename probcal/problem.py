@@ -358,11 +358,20 @@ class Problem:
         pick = np.ix_(chosen, columns)
         declared = np.array([1.0 if isinstance(c.noise, Bernoulli) else guess_of(c.std) for c in block.channels])
         own = data.has_std[pick]
+        std = np.where(own, data.std[pick], declared)
+        coarse = np.argwhere(data.measured[pick] & (np.spacing(np.abs(data.value[pick])) > std))
+        if len(coarse):
+            n, c = coarse[0]
+            where, value = data.table.where(chosen[n]), data.value[pick][n, c]
+            raise InputError(
+                f'{where} column "{names[c]}": {value:g} is too coarse a number for noise of {std[n, c]:g}; leave the'
+                f" cell blank, or check its unit and the std"
+            )
         return dict(
             epoch=epoch, sensor=sensor, pose=pose, **local,
             y=np.where(data.measured[pick], data.value[pick], 0.0),
             mask=data.measured[pick].astype(float),
-            std=np.where(own, data.std[pick], declared),
+            std=std,
             level=np.where(own, -1, np.asarray(channel_levels)),
         )  # fmt: skip
 

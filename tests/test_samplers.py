@@ -16,6 +16,8 @@ from worlds import LINEAR, linear, resting
 
 import probcal
 from probcal import ARD, NUTS, SVI, BernoulliGaussian, Collapsed, Flat, Gaussian, Horseshoe, InputError, Laplace
+from probcal.analysis.assess import assess
+from probcal.inference.collapsed import Chain, swing
 from probcal.inference.draws import inverse_gaussian, slice_step
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.pose import pareto_khat
@@ -270,6 +272,45 @@ def test_both_samplers_draw_from_one_posterior(prior):
     scale = one["calibration"]["sd"].values
     assert np.abs(quantiles[0] - quantiles[1]).max() < 0.25 * scale.max()
     assert two["sample_stats"]["diverging"].sum() == 0
+
+
+def test_what_a_spike_keeps_out_has_no_part_in_a_swing(monkeypatch):
+    """An excluded bias may be given any momentum: it stays at 0 and leaves the energy alone."""
+    _, form, posed, _ = made("plane", BernoulliGaussian())
+    phi = form.hierarchy.draw(jax.random.key(0)) | {"included": jnp.zeros(len(form.hierarchy.learnt), bool)}
+    given = conditional(form, posed, phi)
+    out = ~np.asarray(given.active)
+    assert out.any()
+    eps = tuple(0.3 * jnp.ones_like(x) for x in posed.frame.point.states)
+    theta = jnp.where(given.active, given.mean, 0.0)
+    weight = log_weight(form.spec, posed.system, posed.frame, theta, eps)
+    normal = jax.random.normal
+
+    def pushed(key, shape, dtype=float):
+        drawn = normal(key, shape, dtype)
+        return jnp.where(out, 1e3, drawn) if shape == theta.shape else drawn
+
+    monkeypatch.setattr(jax.random, "normal", pushed)
+    chain = Chain(theta, eps, phi, weight, jax.random.key(1))
+    ends = [swing(form, posed, chain, given, jax.random.key(k)) for k in range(5)]
+    assert all((np.asarray(end[0])[out] == 0).all() for end in ends)
+    moved = [not np.array_equal(end[1][0], eps[0]) for end in ends]
+    assert np.mean(moved) > 0.5, "their kinetic energy counts against no move"
+
+
+@pytest.mark.parametrize(("chains", "draws"), [(1, 1), (1, 3), (2, 10)])
+def test_a_run_of_few_draws_has_numbers_and_can_be_assessed(chains, draws):
+    problem, tree, _ = fitted("plane", Collapsed(chains=chains, draws=draws, warmup=0), Gaussian())
+    assert tree.attrs["status"] == "not converged"
+    out = assess(problem, tree)
+    for name, group in out.children.items():
+        for values in group.to_dataset().data_vars.values():
+            assert values.dtype.kind in "USbO" or np.isfinite(values.values).all(), (name, values.name)
+    assert (tree["calibration"]["sd"] > 0).all()
+    assert set(out["verdict"]["verdict"].values) <= {"weak", "prior only", "drifting", "conflicting"}
+    assert any("PSIS-LOO and power scaling are left out" in text for text in out["finding"]["sentence"].values)
+    assert "elpd" not in out["datum_check"].data_vars
+    assert "sensitivity" not in out.children
 
 
 def test_the_tree_of_a_sampler_is_whole_and_arviz_reads_it():

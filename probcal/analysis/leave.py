@@ -201,8 +201,8 @@ def psis(tree: xr.DataTree, group: np.ndarray, count: int) -> Pointwise:
 
 
 def tailed(tree: xr.DataTree) -> bool:
-    """Whether a tree has a log-likelihood, of draws enough for a Pareto tail."""
-    if "log_likelihood" not in tree.children:
+    """Whether a tree has a log-likelihood, of draws enough for a Pareto tail, and is no misfit."""
+    if "log_likelihood" not in tree.children or tree.attrs["status"] == "misfit":
         return False
     sizes = tree["log_likelihood"].to_dataset().sizes
     return sizes["chain"] * sizes["draw"] >= TAILED

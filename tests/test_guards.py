@@ -1,0 +1,298 @@
+"""Fits that are no answer say so: absurd data, a search that never moved, an evidence that fell; and verdicts obey."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import exact, linear, resting, ruler
+
+import probcal
+from probcal import (
+    ARD,
+    EA,
+    EM,
+    EMEA,
+    MAP,
+    Bias,
+    Channel,
+    ConstantVelocity,
+    Gaussian,
+    InputError,
+    Known,
+    Mixture,
+    Network,
+    Node,
+    Problem,
+    StudentT,
+    assess,
+    sensor,
+    simulate,
+)
+from probcal.analysis import verdict
+from probcal.analysis.differences import ENDED
+from probcal.diagnostics import study_table
+from probcal.geometry import bearing, norm
+from probcal.inference.run import End, finish, first_state, given_of, maximise
+from probcal.inference.run import verdict as status_of
+from probcal.noise import Bernoulli
+from probcal.priors import Precision
+from probcal.report import COLOURS
+from probcal.smoothing.information import laplace, mean_square, squares_of
+from probcal.smoothing.mode import _proposal, find_mode
+from probcal.smoothing.start import automatic_start
+from probcal.types import INVALID
+
+
+@sensor(range=Channel("m", std=0.5), azimuth=Channel("rad", std=0.02, wrap=True))
+def gauge(target, pose, *, range_offset=Bias("m", 2.0)):
+    line = target.position - pose.position
+    return {"range": norm(line) + range_offset, "azimuth": bearing(line)}
+
+
+@sensor(azimuth=Channel("rad", std=0.0174, wrap=True))
+def finder(target, pose):
+    return {"azimuth": bearing(target.position - pose.position) - pose.heading}
+
+
+@sensor(
+    height=Channel("m", std=1.0, noise=StudentT(4.0)),
+    echo=Channel("m", std=1.0, noise=Mixture()),
+    seen=Channel("1", noise=Bernoulli()),
+)
+def heavy(target, pose, *, shift=Bias("m", 1.0)):
+    height = target.position[1] - pose.position[1] + shift
+    return {"height": height, "echo": height, "seen": height}
+
+
+def gauges():
+    """Three gauges around a bent path, the second 3 m off: the network and its table."""
+    nodes = [Node(f"gauge_{k}", p) for k, p in enumerate([(0, 0), (50, 0), (0, 50)])]
+    network = Network([gauge.on(node) for node in nodes])
+    path = np.stack([np.linspace(5, 40, 12), 10 + 20 * np.sin(np.linspace(0, 3, 12))], 1)
+    biases = {label: 3.0 if label.startswith("gauge_1") else 0.0 for label in network.labels}
+    drawn = simulate(network, ConstantVelocity(0.5), np.arange(12.0), 3, tracks={"target": path}, biases=biases)
+    return network, drawn.table
+
+
+def cell(name, value):
+    def change(table):
+        changed = table.copy()
+        changed.loc[5, name] = value
+        return changed
+
+    return change
+
+
+ABSURD = {
+    "time in ns": lambda t: t.assign(time=(t["time"] * 1e9).astype("int64") + 1_700_000_000_000_000_000),
+    "a sentinel": cell("range", -9999.0),
+    "a sentinel of 1e14": cell("range", 1e14),
+    "azimuth in degrees": lambda t: t.assign(azimuth=np.rad2deg(t["azimuth"])),
+    "stds of 1e-15": lambda t: t.assign(range_std=1e-13, azimuth_std=1e-15),
+    "time gaps of 1e-300 s": lambda t: t.assign(time=t["time"] * 1e-300),
+    "time gaps of 1e15 s": lambda t: t.assign(time=t["time"] * 1e15),
+}
+COARSE = {
+    "a cell of 1e30": cell("range", 1e30),
+    "stds of 1e-99": lambda t: t.assign(range_std=1e-99, azimuth_std=1e-99),
+    "azimuths of 1e20": lambda t: t.assign(azimuth=t["azimuth"] + 1e20),
+    "one std of 1e-30": lambda t: cell("range_std", 1e-30)(t.assign(range_std=0.5)),
+}
+
+
+@pytest.mark.parametrize("change", ABSURD.values(), ids=ABSURD.keys())
+def test_absurd_data_end_in_no_answer(change):
+    network, table = gauges()
+    problem = Problem(network, ConstantVelocity(0.5), change(table))
+    tree = probcal.fit(problem, EA())
+    assert tree.attrs["status"] in ("misfit", "diverged")
+    assert "Check units, the time column, sentinels such as -9999 and the noise std" in " ".join(
+        tree.attrs["message"].split()
+    )
+    judged = assess(problem, tree)
+    assert "determined" not in judged["verdict"]["verdict"].values
+    assert judged["finding"]["kind"].values[0] == "status"
+
+
+@pytest.mark.parametrize("change", COARSE.values(), ids=COARSE.keys())
+def test_a_number_without_digits_at_the_size_of_its_noise_is_refused(change):
+    network, table = gauges()
+    with pytest.raises(InputError, match="is too coarse a number for noise of"):
+        Problem(network, ConstantVelocity(0.5), change(table))
+
+
+def test_a_misfit_names_the_worst_datum():
+    network, table = gauges()
+    problem = Problem(network, ConstantVelocity(0.5), cell("range", -9999.0)(table))
+    tree = probcal.fit(problem, EA())
+    row = table.loc[5]
+    assert tree.attrs["status"] == "misfit"
+    assert "The fit explains nothing: mean square a datum" in tree.attrs["message"]
+    assert f"worst {row['sensor']}.range at {row['time']:g} s" in tree.attrs["message"]
+    clean = probcal.fit(Problem(network, ConstantVelocity(0.5), table), EA())
+    assert clean.attrs["status"] == "converged"
+    assert abs(clean["calibration"]["mean"].values[1] - 3.0) < 1.0
+
+
+def test_a_search_that_never_moved_has_diverged_and_one_at_the_mode_has_not():
+    network, table = gauges()
+    problem = Problem(network, ConstantVelocity(0.5), ABSURD["time in ns"](table))
+    tree = probcal.fit(problem, EA())
+    assert tree.attrs["status"] == "diverged"
+    assert "it never left its start, since no step fitted better" in tree.attrs["message"]
+    with jax.enable_x64(True):
+        problem = Problem(network, ConstantVelocity(0.5), table)
+        spec, system, prior = problem.spec, problem.system, Precision.single(jnp.ones(3))
+        point = automatic_start(problem)
+        for _ in range(3):
+            point = find_mode(spec, system, point, prior, 30, 1e-13).point
+        again = find_mode(spec, system, point, prior, 30, 0.0)  # the cost cannot fall below its rounding
+        assert bool(again.converged)
+        assert not bool(again.refused)
+        outcome = maximise(MAP(tolerance=1e-13), problem, Gaussian(), point, None)
+        assert outcome.status == "converged"
+    for method in (EM(), EMEA()):
+        problem, _ = linear("plane")
+        assert probcal.fit(problem, method, start=resting(problem)).attrs["status"] == "converged"
+
+
+def test_the_promise_of_a_step_is_what_it_keeps_on_a_linear_problem():
+    """A step to the mode of a quadratic cost promises the whole decrease: where it is refused, that tells why."""
+    problem, _ = linear("plane")
+    with jax.enable_x64(True):
+        spec, system, start = problem.spec, problem.system, resting(problem)
+        prior = Precision.single(jnp.ones(len(problem.labels)))
+        step = jax.jit(_proposal, static_argnums=(0, 5))
+        promised = step(spec, system, start, prior, jnp.zeros(()), True)[1]
+        first = find_mode(spec, system, start, prior, 0, 1e-9).cost
+        assert float(promised) == pytest.approx(float(first - find_mode(spec, system, start, prior, 30, 1e-9).cost))
+
+
+def test_an_evidence_below_its_best_is_no_answer():
+    problem, _ = linear("plane")
+    with jax.enable_x64(True):
+        given = given_of(EA(), problem, ARD())
+        start = first_state(given, resting(problem))
+        found = laplace(problem.spec, problem.system, start.point, given.prior)
+        state = start._replace(found=found, best=found.evidence + 5.0, refused=jnp.zeros((), bool))
+        fallen = finish(problem, ARD(), state, True, np.zeros(3))
+        held = finish(problem, Gaussian(), state, True, np.zeros(3))  # nothing is learnt: the evidence is no objective
+    assert fallen.status == "not converged"
+    assert "The evidence fell by 5 nats below its best on the way" in fallen.message
+    assert held.status == "converged"
+
+
+@pytest.mark.ci
+def test_a_scene_that_collapses_is_no_answer():
+    """Five direction finders, one of them known: only the motion fixes the scale, and the joint mode gives it up."""
+    places = [(0, 0), (200, 0), (200, 150), (0, 150), (100, -40)]
+    spread = {"position": 30.0, "heading": np.deg2rad(3)}
+    network = Network([finder.on(Node(f"d{k}", p, scale=spread if k else None)) for k, p in enumerate(places)])
+    biases = dict.fromkeys(network.labels, 0.0) | {"d1.heading": np.deg2rad(4), "d2.position_x": 15.0}
+    time = np.arange(0.0, 80.0, 2.0)
+    path = np.stack([100 + 80 * np.cos(time / 12), 75 + 50 * np.sin(time / 7)], 1)
+    drawn = simulate(network, ConstantVelocity(0.5), time, 1, biases=biases, tracks={"target": path})
+    problem = Problem(network, ConstantVelocity(0.5), drawn.table)
+    tree = probcal.fit(problem, EA())
+    trace = tree["optimisation"]["objective"].values
+    assert trace.max() - trace[-1] > 10.0, "the scene collapses"
+    assert tree.attrs["status"] == "not converged"
+    assert "nats below its best on the way" in tree.attrs["message"]
+
+
+def end(**changed):
+    sound = {"still": True, "low": False, "far": False, "sound": True, "refused": False, "fallen": 0.0, "square": 1.0}
+    return End(**(sound | changed))
+
+
+def test_status_follows_the_gravest():
+    cases = [
+        ({}, "converged"), ({"fallen": 0.9}, "converged"), ({"fallen": 1.1}, "not converged"),
+        ({"still": False}, "not converged"), ({"low": True, "still": False}, "at bound"),
+        ({"far": True, "low": True}, "diverged"), ({"sound": False}, "diverged"), ({"refused": True}, "diverged"),
+        ({"square": 101.0, "far": True}, "misfit"), ({"square": np.nan}, "misfit"), ({"square": 99.0}, "converged"),
+    ]  # fmt: skip
+    for changed, status in cases:
+        assert status_of(end(**changed)) == status, changed
+
+
+@pytest.mark.parametrize(
+    ("status", "ended", "word", "reason"),
+    [
+        ("converged", "estimated", "determined", "the data narrow its"),
+        ("converged", "pruned", "determined", "learnt to be zero"),
+        ("converged", "not mixed", "weak", "its chains have not mixed"),
+        ("not converged", "estimated", "weak", "the fit ended not converged, which is no answer"),
+        ("at bound", "estimated", "weak", "the fit ended at bound"),
+        ("diverged", "estimated", "weak", "the fit ended diverged"),
+        ("misfit", "estimated", "conflicting", "model and data contradict each other"),
+    ],
+)
+def test_verdicts_stand_no_higher_than_the_status(status, ended, word, reason):
+    problem, _ = linear("plane")
+    M = len(problem.labels)
+    known = verdict.Evidence(np.full(M, 0.9), np.zeros(M), np.zeros(M), 3.0)
+    words, reasons = verdict.judge(problem, status, [ended] * M, known, {}, {}, "")
+    assert set(words) == {word}
+    assert all(reason in text for text in reasons)
+
+
+def test_a_study_counts_misfits():
+    def setting(run, spoilt):
+        network = Network([ruler.on(Node(f"n{k}", (0.0, float(k)))) for k in range(2)])
+        drawn = simulate(network, ConstantVelocity(1.0), np.arange(4.0), run)
+        table = drawn.table.copy()
+        if spoilt:
+            table.loc[0, "height"] = -9999.0
+        return Problem(network, ConstantVelocity(1.0), table), drawn.truth
+
+    found = probcal.study(setting, {"spoilt": [False, True]}, ["ea"], 2)
+    assert found["status"].sel(spoilt=True).values.ravel().tolist() == ["misfit"] * 2
+    assert "misfit" not in found["status"].sel(spoilt=False).values
+    assert study_table(found)["misfit"].tolist() == [0, 2]
+
+
+def test_outliers_of_heavy_noise_and_rare_events_are_no_misfit():
+    network = Network([heavy.on(Node("n", (0.0, 0.0)))])
+    time = np.arange(8.0)
+    drawn = simulate(
+        network, ConstantVelocity(1.0), time, 0, tracks={"target": np.zeros((8, 2))}, biases={"n.shift": 0.0}
+    )
+    table = drawn.table.assign(height=0.0, echo=0.0, seen=1.0)
+    table.loc[3, ["height", "echo"]] = 500.0
+    known = Known((time, np.stack([time, np.full(8, -40.0)], 1)))
+    with jax.enable_x64(True):
+        problem = Problem(network, known, table)
+        point = resting(problem)
+        (square,) = squares_of(problem.spec, problem.system, point)
+        assert square.shape == (8, 3)
+        assert float(square[:, 0].max()) < 3.0, "the score of a Student-t is bounded"
+        assert float(square[3, 1]) < 100.0, "an echo counts by its own width"
+        np.testing.assert_allclose(square[:, 2], 80.0, rtol=1e-6)  # -2 log p of an event at log odds -40
+
+
+def test_the_mean_square_counts_residuals_and_process_noises():
+    """Against the reference's posterior mean: residuals over their stds, and jumps of the states over theirs."""
+    problem, naive = linear("plane")
+    with jax.enable_x64(True):
+        prior = Precision.single(jnp.ones(len(problem.labels)))
+        mode = find_mode(problem.spec, problem.system, resting(problem), prior, 30, 1e-9)
+        square = float(mean_square(problem.spec, problem.system, mode.point)) * len(naive.data)
+    z, rest = exact("plane").z[0], exact("plane").states[0]
+    chains, expected = [], 0.0
+    for chain in naive.chains:
+        size = len(chain.names) * len(chain.times)
+        chains.append(rest[:size].reshape(len(chain.times), -1))
+        rest, before = rest[size:], np.zeros(len(chain.names))
+        for x, (F, c, Q) in zip(chains[-1], chain.steps, strict=True):
+            jump = x - F @ before - c
+            before, expected = x, expected + jump @ np.linalg.solve(Q, jump)
+    for d in naive.data:
+        expected += ((d.y - d.offset - d.G @ z - d.H @ chains[d.chain][d.epoch]) / d.std) ** 2
+    assert square == pytest.approx(expected, rel=1e-8)
+
+
+def test_every_list_of_statuses_knows_a_misfit():
+    assert set(INVALID) == {"at bound", "diverged", "misfit"}
+    assert set(INVALID) <= set(ENDED)
+    assert set(INVALID) <= set(COLOURS)
