@@ -31,6 +31,7 @@ from probcal import (
 from probcal.analysis import verdict
 from probcal.analysis.differences import ENDED
 from probcal.diagnostics import study_table
+from probcal.errors import INVALID, FitError
 from probcal.geometry import bearing, norm
 from probcal.inference.run import End, finish, first_state, given_of, maximise
 from probcal.inference.run import verdict as status_of
@@ -40,7 +41,6 @@ from probcal.report import COLOURS
 from probcal.smoothing.information import laplace, mean_square, squares_of
 from probcal.smoothing.mode import _proposal, find_mode
 from probcal.smoothing.start import automatic_start
-from probcal.types import INVALID
 
 
 @sensor(range=Channel("m", std=0.5), azimuth=Channel("rad", std=0.02, wrap=True))
@@ -86,7 +86,6 @@ def cell(name, value):
 ABSURD = {
     "time in ns": lambda t: t.assign(time=(t["time"] * 1e9).astype("int64") + 1_700_000_000_000_000_000),
     "a sentinel": cell("range", -9999.0),
-    "a sentinel of 1e14": cell("range", 1e14),
     "azimuth in degrees": lambda t: t.assign(azimuth=np.rad2deg(t["azimuth"])),
     "stds of 1e-15": lambda t: t.assign(range_std=1e-13, azimuth_std=1e-15),
     "time gaps of 1e-300 s": lambda t: t.assign(time=t["time"] * 1e-300),
@@ -112,6 +111,13 @@ def test_absurd_data_end_in_no_answer(change):
     judged = assess(problem, tree)
     assert "determined" not in judged["verdict"]["verdict"].values
     assert judged["finding"]["kind"].values[0] == "status"
+
+
+def test_a_fit_that_leaves_no_covariance_says_what_to_check():
+    network, table = gauges()
+    problem = Problem(network, ConstantVelocity(0.5), cell("range", 1e14)(table))
+    with pytest.raises(FitError, match="sentinels such as -9999 and the noise std"):
+        probcal.fit(problem, EA())
 
 
 @pytest.mark.parametrize("change", COARSE.values(), ids=COARSE.keys())

@@ -281,7 +281,7 @@ def test_what_a_spike_keeps_out_has_no_part_in_a_swing(monkeypatch):
     given = conditional(form, posed, phi)
     out = ~np.asarray(given.active)
     assert out.any()
-    eps = tuple(0.3 * jnp.ones_like(x) for x in posed.frame.point.states)
+    eps = tuple(jnp.ones_like(x) for x in posed.frame.point.states)
     theta = jnp.where(given.active, given.mean, 0.0)
     weight = log_weight(form.spec, posed.system, posed.frame, theta, eps)
     normal = jax.random.normal
