@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from probcal import InputError, plots, report
+from probcal.errors import INVALID
 from probcal.plots import base
 
 AXES = ("x", "y", "z")
@@ -75,7 +76,7 @@ def make(dimension=2, nodes=("north", "south"), status="converged", recursions=1
     labels = [f"{node}.{name}" for node in nodes for name in names]
     states = np.full(len(labels), "estimated", dtype="U12")
     states[1] = "pruned"
-    if status in ("at bound", "diverged"):
+    if status in INVALID:
         states[0] = status
     tracks = [track(dimension, np.where(np.arange(EPOCHS) % 2, "car", "lorry"), "" if recursions == 1 else "_0")]
     tracks += [track(dimension, np.array(["tree_a", "tree_b"]), "_1")] if recursions == 2 else []
@@ -185,7 +186,7 @@ def test_extras_are_shown_where_the_tree_has_them(tmp_path):
         assert absent not in plain
 
 
-@pytest.mark.parametrize("status", ["at bound", "diverged"])
+@pytest.mark.parametrize("status", INVALID)
 def test_a_fit_that_is_no_answer_is_marked_invalid(tmp_path, status):
     page = page_of(make(status=status), tmp_path)
     assert '<table class="biases invalid">' in page

@@ -59,7 +59,7 @@ def test_c1_at_one_share_reproduces_the_trial_and_equals_single_fits():
     table = study_table(found)
     assert list(table["method"]) == ["ml", "em-ea", "ea", "oracle"]
     assert table["runs"].tolist() == [8] * 4
-    assert (table[["converged", "not converged", "at bound", "diverged"]].sum(axis=1) == 8).all()
+    assert (table[["converged", "not converged", "at bound", "diverged", "misfit"]].sum(axis=1) == 8).all()
 
 
 def test_values_of_settings():
