@@ -86,7 +86,7 @@ def hessian(problem, precision):
     return covariance[:M, :M], np.split(variances, np.cumsum(sizes)[:-1])
 
 
-@pytest.mark.parametrize("name", ["extras", "mixed"])
+@pytest.mark.parametrize("name", [pytest.param("extras", marks=pytest.mark.ci), "mixed"])
 def test_the_bound_of_a_linear_problem_is_the_inverse_hessian(name):
     network, motion, table, fixed = LINEAR[name]()
     gauge = {"mixed": {"box.clock": 0.3}}.get(name, {})  # beside a free difference_offset

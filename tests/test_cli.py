@@ -5,6 +5,7 @@ import shutil
 
 import committed
 import jax
+import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
@@ -126,6 +127,19 @@ def test_a_saved_calibration_is_applied_to_other_data(tmp_path):
     code, _, err = call("track", MODEL, ROWS, "--calibration", tmp_path / "bad.nc", "--out", tmp_path / "t.csv")
     assert code == 2
     assert "the fit ended at bound, its estimate is invalid; fit again first" in err
+
+
+def test_track_follows_the_fit_in_fixed_biases_levels_and_with_sensors_missing():
+    done, table = committed.tree("ea"), pd.read_csv(ROWS)
+    built, motion = load_model(MODEL).network(), probcal.ConstantVelocity(0.5)
+    whole = probcal.Problem(built, motion, table)  # in which nothing is fixed and the noise level is a guess
+    again = probcal.track(whole, done)
+    for name in ("mean", "sd"):
+        np.testing.assert_allclose(again["track"][name].values, done["track"][name].values, rtol=1e-3, atol=1e-3)
+    part = probcal.Problem(built, motion, table[table["sensor"] != "c"])
+    assert probcal.track(part, done)["track"].sizes["epoch"] == 16
+    with pytest.raises(probcal.InputError, match='no row of sensor "c"'):
+        probcal.fit(part, probcal.MAP())
 
 
 def test_a_check_says_what_the_data_determine_and_draws_it(tmp_path):

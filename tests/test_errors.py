@@ -262,6 +262,7 @@ CASES = [
      "is not a fit written by probcal: its group calibration is missing or incomplete"),
     # inference, command line
     (lambda _: fit(problem(), EA), "method must be a value such as EA() or MAP(), got <class"),
+    (lambda _: fit(problem(), save=("tracks",)), 'which is no group of draws; give "states", "predictive" or both'),
     (lambda _: track(problem(), calibrated("other")), "; fit the same network, or fix that bias"),
     (lambda f: load_model(written(f, "model.txt", "")), "model.txt is not a Python file; a model file defines"),
     (lambda f: commands.simulate_command(written(f, "model.py", "def scenario(key): return 3")),

@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 
 from probcal import (
-    MAP,
     Bias,
     Channel,
     ConstantVelocity,
@@ -20,18 +19,15 @@ from probcal import (
     Path,
     Problem,
     White,
-    fit,
     read_table,
     sensor,
     sensors,
     simulate,
-    track,
 )
 from probcal.geometry import norm
 from probcal.table import UNITS, factor, measure
 
 sys.path.insert(0, str(committed.DATA))
-import small
 
 CORNERS = [(0, 0), (60, 0), (60, 60), (0, 60)]
 PATH = np.stack([np.linspace(5, 55, 20), 30 + 20 * np.sin(np.linspace(0, 6, 20))], 1)
@@ -98,18 +94,6 @@ def test_exact_labels_with_brackets_can_be_fixed_and_rebuilt():
     built = network(names=("a[0]", "a[1]", "c", "d"))
     problem = Problem(built, CV, recorded(("a[0]", "a[1]", "c", "d")), fix=["a[0].range_offset"])
     assert problem.rebuild().labels == problem.labels == ("a[1].range_offset", "c.range_offset", "d.range_offset")
-
-
-def test_track_follows_the_fit_in_fixed_biases_levels_and_with_sensors_missing():
-    done, table = committed.tree("ea"), pd.read_csv(committed.ROWS)
-    built, motion = small.network(), ConstantVelocity(0.5)
-    again = track(Problem(built, motion, table), done)  # nothing is fixed here, and the noise level is a guess
-    for name in ("mean", "sd"):
-        np.testing.assert_allclose(again["track"][name].values, done["track"][name].values, rtol=1e-3, atol=1e-3)
-    part = Problem(built, motion, table[table["sensor"] != "c"])
-    assert track(part, done)["track"].sizes["epoch"] == 16
-    with pytest.raises(InputError, match='no row of sensor "c"'):
-        fit(part, MAP())
 
 
 @pytest.mark.parametrize(
