@@ -332,9 +332,9 @@ def test_kernels_are_kept_in_the_cache_folder_of_the_user_unless_jax_has_one(tmp
             jax.config.update(name, value)
 
 
-def test_draws_of_states_and_replicas_are_saved_where_asked_for(model, rows, tmp_path, monkeypatch, capsys):
-    for words, wanted in (((), set()), (("--save", "states,predictive"), {"state", "posterior_predictive"})):
-        order = ("fit", model, rows, "--method", "map", "--no-assess", "--out", tmp_path / "fit", *words)
-        assert call(monkeypatch, capsys, *order)[0] == 0
-        tree = probcal.load(tmp_path / "fit")
+def test_draws_of_states_and_replicas_are_saved_where_asked_for(fitted, tmp_path):
+    code, _, err = call("fit", MODEL, ROWS, "--no-assess", "--save", "states,predictive", "--out", tmp_path / "fit")
+    assert code == 0, err
+    for folder, wanted in ((fitted[0], set()), (tmp_path / "fit", {"state", "posterior_predictive"})):
+        tree = probcal.load(folder)
         assert {"state", "posterior_predictive"} & {*tree["posterior"].data_vars, *tree.children} == wanted
