@@ -19,7 +19,7 @@ from probcal.problem import Spec, System
 from probcal.smoothing.draws import draw
 from probcal.tree import suffix
 
-DRAWS = 1000
+DRAWS = 400
 VALUES = 20_000_000  # of all states drawn
 LEAST = 20  # draws, however many states there are
 
@@ -111,7 +111,7 @@ def _exact(fit: Fitted, kurtosis: np.ndarray) -> np.ndarray:
 
 
 def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Drawn:
-    """Up to 1000 draws of a fit, biases and levels as its tree has them.
+    """Up to 400 draws of a fit, biases and levels as its tree has them.
 
     The states are those of the tree where it holds them; else a trajectory is drawn for each draw of the biases, from
     the Gaussian of the problem linearised at the fit.
