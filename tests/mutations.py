@@ -1,0 +1,219 @@
+"""Do the tests see a wrong line? One mutation at a time in a copy of the working tree, and the tests named for it.
+
+`uv run python tests/mutations.py` prints killed or SURVIVED and the seconds of each; `--all` runs the whole default run
+where the named tests pass, `--only 3 7` or `--only frame.py` picks some, `--list` runs nothing. The exit code is the
+number of survivors. To add one, write a line in MUTATIONS; the old text must stand in its file once.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+LIMIT = 1800  # seconds of one run of tests; one that never ends has seen the mutation
+
+
+class Mutation(NamedTuple):
+    file: str  # in probcal/
+    old: str
+    new: str
+    tests: str  # in tests/, those that should see it
+
+
+MUTATIONS = [
+    # smoothing/recursion.py
+    Mutation("smoothing/recursion.py", "(alone - root.mT @ predicted)", "(alone + root.mT @ predicted)", "test_exact.py"),
+    Mutation("smoothing/recursion.py", "state - multiply(state, multiply(ahead, state))", "state", "test_exact.py"),
+    Mutation("smoothing/recursion.py", "filtered + (covariance @ F_next.mT)", "filtered - (covariance @ F_next.mT)", "test_exact.py"),
+    Mutation("smoothing/recursion.py", "-2.0 * jnp.sum(jnp.log(diagonals))", "-1.0 * jnp.sum(jnp.log(diagonals))", "test_exact.py"),
+    Mutation("smoothing/recursion.py", "pulls = pulls - loss @ c", "pulls = pulls + loss @ c", "test_exact.py"),
+    Mutation("smoothing/recursion.py", "eye[None] - L.mT @ adjoint @ L", "eye[None] + 0 * L", "test_levels.py"),
+    # smoothing/mode.py
+    Mutation("smoothing/mode.py", "signed = jnp.concatenate([-alone, new])", "signed = jnp.concatenate([alone, new])", "test_exact.py"),
+    Mutation("smoothing/mode.py", "0.5 * known + widening(system, point.levels)", "0.5 * known", "test_levels.py test_model.py"),
+    Mutation("smoothing/mode.py", "return proposal, 0.5 * slope", "return proposal, slope", "test_guards.py"),
+    Mutation("smoothing/mode.py", "~last.moved & ~converged", "last.moved & ~converged", "test_guards.py"),
+    # smoothing/information.py
+    Mutation("smoothing/information.py", "spread - 0.5 * (solved.logdet + logdet)", "spread - 0.5 * solved.logdet", "test_exact.py"),
+    Mutation("smoothing/information.py", "return Moments(-response.states,", "return Moments(response.states,", "test_exact.py test_observability.py"),
+    Mutation("smoothing/information.py", "pull - (point.levels + step) / system.level_spread**2", "pull", "test_levels.py"),
+    Mutation("smoothing/information.py", "variances.append(own + jnp", "variances.append(jnp", "test_levels.py"),
+    Mutation("smoothing/information.py", "@ root[index] + by_state", "@ root[index] - by_state", "test_observability.py"),
+    Mutation("smoothing/information.py", "jnp.exp(point.levels - levels)", "jnp.exp(levels - point.levels)", "test_levels.py test_samplers.py"),
+    Mutation("smoothing/information.py", "(squares + sum(jnp.sum(u**2) for u in point.noises))", "squares", "test_guards.py"),
+    # smoothing/draws.py
+    Mutation("smoothing/draws.py", "free = prior - smooth.states", "free = prior + smooth.states", "test_exact.py"),
+    Mutation("smoothing/draws.py", "jax.random.normal(key, (count, M)) @ root.T", "jax.random.normal(key, (count, M)) @ root", "test_exact.py"),
+    Mutation("smoothing/draws.py", "J @ prior + half @ noise[1]", "J @ prior", "test_exact.py"),
+    # smoothing/gauge.py
+    Mutation("smoothing/gauge.py", "information = information - linalg.gram(flat, flat)", "information = information", "test_observability.py"),
+    Mutation("smoothing/gauge.py", " + near.T @ (survey[:, None] * near)", "", "test_observability.py"),
+    # smoothing/frame.py
+    Mutation("smoothing/frame.py", "own - jnp.einsum(\"eij,ej->ei\", at.feedback, before))", "own + jnp.einsum(\"eij,ej->ei\", at.feedback, before))", "test_samplers.py test_model.py"),
+    Mutation("smoothing/frame.py", "self.score @ step - 0.5 * step", "self.score @ step + 0.5 * step", "test_samplers.py"),
+    Mutation("smoothing/frame.py", "loops.append(Loop(-smooth.states,", "loops.append(Loop(smooth.states,", "test_samplers.py"),
+    Mutation("smoothing/frame.py", "cross = -(slopes", "cross = (slopes", "test_samplers.py"),
+    Mutation("smoothing/frame.py", "jnp.expm1(-2 * step)", "jnp.expm1(2 * step)", "test_samplers.py"),
+    # smoothing/sigma.py
+    Mutation("smoothing/sigma.py", "np.full(2 * u, 0.5 / (u + kappa))", "np.full(2 * u, 1.0 / (u + kappa))", "test_methods.py"),
+    Mutation("smoothing/sigma.py", " - jnp.sum(slope**2, -1)", "", "test_methods.py"),
+    # rows.py
+    Mutation("rows.py", "rows.base + rows.scale * padded", "rows.base - rows.scale * padded", "test_exact.py"),
+    Mutation("rows.py", "by_bias * rows.scale[rows.sensor][:, None, :]", "by_bias", "test_exact.py"),
+    Mutation("rows.py", "return rows.std * factors[rows.level]", "return rows.std", "test_levels.py"),
+    Mutation("rows.py", "score / jnp.sqrt(jnp.where(there, information, 1.0))", "score / jnp.where(there, information, 1.0)", "test_assess.py"),
+    Mutation("rows.py", "jnp.mod(value + channel.period / 2, channel.period)", "jnp.mod(value, channel.period)", "test_catalogue.py test_model.py"),
+    # noise.py
+    Mutation("noise.py", "return -0.5 * r**2 - jnp.log(std) - 0.5 * np.log(2 * np.pi)", "return -0.5 * r**2 - jnp.log(std)", "test_exact.py"),
+    Mutation("noise.py", "(self.df + 1) / (self.df + 3)", "(self.df + 1) / (self.df + 2)", "test_methods.py"),
+    Mutation("noise.py", "(self.df + 1) / (self.df * std**2", "(self.df + 3) / (self.df * std**2", "test_methods.py"),
+    Mutation("noise.py", "np.log(self.share / self.scale)", "np.log(self.share)", "test_methods.py"),
+    # motion.py
+    Mutation("motion.py", "[root * np.sqrt(3) / 2, root / 2]", "[root * np.sqrt(3) / 2, root / 3]", "test_exact.py"),
+    Mutation("motion.py", "[[dt**2 / 2], [dt]], dimension", "[[dt**2], [dt]], dimension", "test_exact.py"),
+    Mutation("motion.py", "dt / np.sqrt(48)", "dt / np.sqrt(24)", "test_catalogue.py"),
+    Mutation("motion.py", "** 2 - 0.5j * angle * g", "** 2 + 0.5j * angle * g", "test_catalogue.py"),
+    # problem.py
+    Mutation("problem.py", "epoch_of[rows] += offset", "epoch_of[rows] += 0", "test_exact.py"),
+    Mutation("problem.py", "side=\"right\") - 1", "side=\"left\") - 1", "test_exact.py test_drift.py"),
+    Mutation("problem.py", "level=np.where(own, -1,", "level=np.where(own, 0,", "test_levels.py"),
+    Mutation("problem.py", "pace, wander = DIFFUSE * extent / duration", "pace, wander = DIFFUSE * extent", "test_model.py test_levels.py test_catalogue.py"),
+    Mutation("problem.py", "\"position\": (self.node_positions.mean(0), DIFFUSE * extent)", "\"position\": (self.node_positions.mean(0), extent)", "test_model.py test_levels.py test_catalogue.py"),
+    # table.py
+    Mutation("table.py", "np.arange(2, len(frame) + 2)", "np.arange(1, len(frame) + 1)", "test_table.py test_cli.py"),
+    Mutation("table.py", "in ((name, value), (f\"{name}_std\", std)):", "in ((name, value),):", "test_table.py"),
+    Mutation("table.py", "(\"length\", 1852.0)", "(\"length\", 1853.0)", "test_table.py"),
+    Mutation("table.py", "(\"length\", 1609.344)", "(\"length\", 1609.0)", "test_table.py"),
+    Mutation("table.py", "return size / UNITS[wanted][1]", "return size * UNITS[wanted][1]", "test_table.py"),
+    # nodes.py
+    Mutation("nodes.py", "@ _axes(self.latitude, self.longitude).T", "@ _axes(self.latitude, self.longitude)", "test_nodes.py"),
+    Mutation("nodes.py", "turn = np.arctan2(axes[:, 0, 1], axes[:, 0, 0])", "turn = -np.arctan2(axes[:, 0, 1], axes[:, 0, 0])", "test_nodes.py"),
+    Mutation("nodes.py", "round(float(np.rad2deg(value)), 12)", "round(float(value), 12)", "test_nodes.py"),
+    # geometry.py
+    Mutation("geometry.py", "jnp.round(angle / period)", "jnp.floor(angle / period)", "test_catalogue.py"),
+    Mutation("geometry.py", "jnp.stack([norm(line[:2]), line[2]])", "jnp.stack([norm(line), line[2]])", "test_catalogue.py"),
+    # priors.py
+    Mutation("priors.py", "+ 2 * self.rate + 1e-300", "+ self.rate + 1e-300", "test_levels.py"),
+    Mutation("priors.py", "total(z**2 + variance)", "total(z**2)", "test_methods.py"),
+    Mutation("priors.py", "jnp.where(self.alpha > 0, self.alpha, 1.0))) + self.logdet", "jnp.where(self.alpha > 0, self.alpha, 1.0)))", "test_methods.py"),
+    # inference/
+    Mutation("inference/ea.py", "alpha=jnp.where(fresh, state.alpha, alpha)", "alpha=alpha", "test_methods.py test_exact.py"),
+    Mutation("inference/ea.py", "-cost(spec, system, point, held) - jnp.sum(penalty)", "-cost(spec, system, point, held)", "test_methods.py"),
+    Mutation("inference/em.py", "information + prior.matrix() + 1e-12", "information + 1e-12", "test_methods.py"),
+    Mutation("inference/em.py", "- 0.5 * alpha * point.z**2)", ")", "test_methods.py"),
+    Mutation("inference/run.py", "max(float(best) - float(evidence), 0.0)", "0.0", "test_guards.py"),
+    Mutation("inference/run.py", "ABSURD = 100.0", "ABSURD = 1e40", "test_guards.py"),
+    Mutation("inference/run.py", "return jnp.where(given.surveyed, alpha, learnt)", "return learnt", "test_methods.py test_exact.py"),
+    Mutation("inference/posterior.py", "half = 50 * (1 - tree.INTERVAL)", "half = 25 * (1 - tree.INTERVAL)", "test_samplers.py"),
+    Mutation("inference/posterior.py", "mixed[\"r_hat\"][:M] > 1.05", "mixed[\"r_hat\"][:M] > 10.5", "test_samplers.py"),
+    Mutation("inference/collapsed.py", "momentum = (momentum[0] * given.active, momentum[1])", "momentum = (momentum[0], momentum[1])", "test_samplers.py"),
+    Mutation("inference/collapsed.py", "level = chain.weight - jax.random.exponential(keys[2])", "level = chain.weight + jax.random.exponential(keys[2])", "test_samplers.py"),
+    Mutation("inference/nuts.py", "hyper + volume + log_prior", "hyper + log_prior", "test_model.py test_samplers.py"),
+    Mutation("inference/hierarchy.py", "self.prior.shape + 0.5 * number", "self.prior.shape + number", "test_samplers.py"),
+    Mutation("inference/hierarchy.py", "self.prior.b + out", "self.prior.b + number", "test_samplers.py"),
+    Mutation("inference/hierarchy.py", "(1.0 / auxiliary + 0.5 * z**2 / tau2)", "(1.0 / auxiliary + z**2 / tau2)", "test_samplers.py"),
+    Mutation("inference/svi.py", " - 0.5 * np.log(2 * np.pi) * normal", "", "test_svi.py"),
+    Mutation("inference/sampling.py", "kept = max(0, min((box.count + 1) * method.chunk", "kept = max(0, min(box.count * method.chunk", "test_samplers.py"),
+    Mutation("inference/storage.py", "for part in map(self.storage.read, self.storage.numbers)", "for part in map(self.storage.read, self.storage.numbers[:-1] or self.storage.numbers)", "test_storage.py"),
+    # analysis/
+    Mutation("analysis/verdict.py", "elif status != \"converged\":", "elif status == \"diverged\":", "test_guards.py"),
+    Mutation("analysis/verdict.py", "(gamma + inflation * (1.0 - gamma))", "gamma", "test_assess.py"),
+    Mutation("analysis/leave.py", "-least - 0.5 * (solved.logdet + logdet)", "-least - 0.5 * solved.logdet", "test_assess.py"),
+    Mutation("analysis/leave.py", "solved.score - prior.pull(point.z) - matrix @ away", "solved.score - prior.pull(point.z)", "test_assess.py"),
+    Mutation("analysis/pieces.py", "slope[:M] -= prior @ pieces.z", "slope[:M] += prior @ pieces.z", "test_assess.py"),
+    Mutation("analysis/pieces.py", "np.eye(q) + np.ones((q, q))", "np.eye(q)", "test_assess.py"),
+    Mutation("analysis/residuals.py", "expected = np.maximum(data - used, 1e-9)", "expected = np.maximum(data, 1e-9)", "test_assess.py"),
+    Mutation("analysis/residuals.py", "* (n + 2) / n", "* n / (n + 2)", "test_assess.py"),
+    Mutation("analysis/residuals.py", "max(2.0 * np.sum(couples", "max(np.sum(couples", "test_assess.py"),
+]  # fmt: skip
+
+
+def tree_of(root: Path, to: Path) -> None:
+    """Copy what git tracks, and what it does not ignore, as it stands."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-co", "--exclude-standard", "-z"], cwd=root, capture_output=True, check=True
+    )
+    for name in filter(None, listed.stdout.decode().split("\0")):
+        if (root / name).is_file():
+            (to / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(root / name, to / name)
+
+
+def passes(copy: Path, tests: list[str]) -> tuple[bool, str]:
+    """Whether tests pass in the copy, and the first line that says why not."""
+    kernels = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".pytest_cache" / "kernels"))
+    environment = os.environ | {
+        "PYTHONPATH": str(copy),
+        "JAX_COMPILATION_CACHE_DIR": kernels,
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    found = subprocess.run(
+        [sys.executable, "-c", "import probcal; print(probcal.__file__)"],
+        cwd=copy,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    if found.returncode == 0 and not Path(found.stdout.strip()).is_relative_to(copy):
+        sys.exit(f"the tests would import {found.stdout.strip()} instead of the mutated copy")
+    command = [sys.executable, "-m", "pytest", *tests, "-x", "-q", "-p", "no:cacheprovider", "--durations=0"]
+    command += ["-n", "0"] if tests else []
+    try:
+        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, timeout=LIMIT)
+    except subprocess.TimeoutExpired:
+        return False, f"no end after {LIMIT} s"
+    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    if done.returncode not in (0, 1, 2, 3):
+        sys.exit(done.stdout + done.stderr)
+    return done.returncode == 0, failed[0] if failed else ""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--all", action="store_true", help="the whole default run where the named tests see nothing")
+    parser.add_argument("--only", nargs="+", default=[], help="numbers of mutations, or parts of names of files")
+    parser.add_argument("--list", action="store_true", help="print the table, run nothing")
+    given = parser.parse_args()
+    chosen = [
+        (k, m) for k, m in enumerate(MUTATIONS)
+        if not given.only or any(word == str(k) or (not word.isdigit() and word in m.file) for word in given.only)
+    ]  # fmt: skip
+    texts = {m.file: (ROOT / "probcal" / m.file).read_text() for _, m in chosen}
+    for k, m in chosen:
+        if texts[m.file].count(m.old) != 1 or m.old == m.new:
+            sys.exit(
+                f'mutation {k}: "{m.old}" stands {texts[m.file].count(m.old)} times in {m.file}; it must stand once'
+            )
+    survivors = 0
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder).resolve()
+        tree_of(ROOT, copy)
+        for k, m in chosen:
+            line = f"{k:3d} {m.file}: {m.old} -> {m.new or 'nothing'}"
+            if given.list:
+                print(line)
+                continue
+            began, place = time.monotonic(), copy / "probcal" / m.file
+            place.write_text(texts[m.file].replace(m.old, m.new))
+            alive, why = passes(copy, [f"tests/{name}" for name in m.tests.split()])
+            if alive and given.all:
+                alive, why = passes(copy, [])
+            place.write_text(texts[m.file])
+            survivors += alive
+            print(
+                f"{'SURVIVED' if alive else 'killed':8} {time.monotonic() - began:5.0f} s {line}  {why[:120]}",
+                flush=True,
+            )
+    if not given.list:
+        print(f"{len(chosen) - survivors} of {len(chosen)} killed")
+    return survivors
+
+
+if __name__ == "__main__":
+    sys.exit(main())
