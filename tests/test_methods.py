@@ -373,8 +373,8 @@ def test_precisions_follow_from_what_was_found():
         np.testing.assert_allclose(Laplace().learn(*arguments, "mackay"), np.sqrt(2) / np.abs(z))
 
 
-def test_the_table_of_pairs_is_that_of_the_readme():
-    text = (Path(__file__).parents[1] / "README.md").read_text()
+def test_the_table_of_pairs_is_that_of_the_guide():
+    text = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text()
     for name, row in table().iterrows():
         cells = " | ".join(row)
         assert f"| `{name}()` | {cells} |" in text
