@@ -319,10 +319,8 @@ def test_a_sampler_is_compared_with_what_it_reports():
 
 
 def test_the_command_line_compares_saved_fits(saved, tmp_path):
-    folders = [tmp_path / name for name in ("ea", "map", "less")]
-    for folder, tree in zip(folders, saved, strict=True):
-        folder.mkdir()
-        probcal.save(tree, folder / "fit.nc")
+    folders = [committed.DATA / "ea.nc", committed.DATA / "map.nc", tmp_path / "less.nc"]
+    probcal.save(saved[2], folders[2])
     pair = ["--pair", "c.heading,c.range_offset"]
     code, out, err = call("compare", *folders[:2], "--out", tmp_path / "out", *pair)
     assert code == 0, err
@@ -354,8 +352,9 @@ def test_the_command_line_compares_saved_fits(saved, tmp_path):
         assert text in err
     lost = saved[1].copy()
     lost.attrs["status"] = "diverged"
-    probcal.save(lost, folders[1] / "fit.nc")
-    code, out, _ = call("compare", *folders[:2])
+    (tmp_path / "lost").mkdir()
+    probcal.save(lost, tmp_path / "lost" / "fit.nc")
+    code, out, _ = call("compare", folders[0], tmp_path / "lost")
     assert code == 1
     assert "MAP (Gaussian) diverged: its numbers are no estimate" in out
 
