@@ -1,13 +1,18 @@
 """What a truth says of a saved fit or study: position and bias error, coverage; tables of studies, comparisons."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from probcal.errors import INVALID
-from probcal.network import step_of
-from probcal.simulate import Truth
-from probcal.types import AXES
+from probcal.labels import AXES, step_of
+
+if TYPE_CHECKING:
+    from probcal.simulate import Truth
 
 
 def position_rmse(tree: xr.DataTree, truth: Truth) -> tuple[float, float] | None:

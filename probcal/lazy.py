@@ -1,4 +1,4 @@
-"""Packages whose names are imported when they are first used (PEP 562, by a class of module)."""
+"""Names that are imported when they are first used: those of a package (PEP 562), and heavy modules."""
 
 import sys
 from collections.abc import Mapping
@@ -42,3 +42,21 @@ def lazy(package: str, homes: Mapping[str, str], submodules: str = "") -> list[s
     module.__dict__["_homes"] = {name: home for home, names in homes.items() for name in names.split()}
     module.__class__ = LazyPackage
     return sorted([*module.__dict__["_homes"], *submodules.split()])
+
+
+class Later:
+    """A module, or a namespace in one, that is imported when a name of it is first used."""
+
+    def __init__(self, path: str):
+        self._path = path
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        # the whole package first, its parts as attributes: ArviZ puts a lazy numpyro into sys.modules, of which
+        # `import numpyro.infer` would run the parts twice
+        root, *parts = self._path.split(".")
+        found: Any = import_module(root)
+        for part in parts:
+            found = getattr(found, part)
+        return getattr(found, name)

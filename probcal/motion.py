@@ -4,18 +4,26 @@ A component knows its names, its transition over a time step and its noise facto
 To add one, write a frozen dataclass with the members of `Component` and compose it.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
-import pandas as pd
 
 from probcal.errors import InputError, nearest
 from probcal.geometry import slopes
+from probcal.labels import AXES
+from probcal.lazy import Later
 from probcal.noise import Level, check_level
-from probcal.types import AXES, TargetView
+from probcal.types import TargetView
+
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = Later("pandas")
 
 
 class Component(Protocol):
@@ -44,15 +52,15 @@ class _Composable:
     memoryless: ClassVar[bool] = False
 
     @property
-    def driven(self: "Component") -> str:
+    def driven(self: Component) -> str:
         """State component that the noise drives: the last one."""
         return self.names()[-1][0]
 
-    def means(self: "Component", time: np.ndarray, dimension: int) -> np.ndarray:
+    def means(self: Component, time: np.ndarray, dimension: int) -> np.ndarray:
         """Zero: what has a memory is known by its start alone, shape (E, s)."""
         return np.zeros((len(time), sum(dimension if per_axis else 1 for _, per_axis in self.names())))
 
-    def __add__(self, other: Any) -> "Motion":
+    def __add__(self, other: Any) -> Motion:
         return Motion((*_components(self), *_components(other)))
 
 
@@ -405,7 +413,7 @@ class Motion:
         if twice:
             raise InputError(f'motion: component "{twice[0]}" is declared twice')
 
-    def __add__(self, other: Any) -> "Motion":
+    def __add__(self, other: Any) -> Motion:
         return Motion((*self.components, *_components(other)))
 
     @property

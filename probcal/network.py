@@ -1,6 +1,6 @@
 """Nodes and placed sensors, and the table of biases that follows from them."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.geometry import slopes
+from probcal.labels import AXES
 from probcal.sensor import VECTORS, Bias, Drift, Sensor, SensorType
-from probcal.types import AXES
 
 POSE_UNITS = {"position": "m", "heading": "rad", "pitch": "rad", "roll": "rad", "clock": "m", "time_offset": "s"}
 ANGLES = ("heading", "pitch", "roll")
@@ -158,27 +158,6 @@ class BiasRecord:
             )
             for time, size in drift.steps
         ] if drift else []  # fmt: skip
-
-
-def label_parts(label: str) -> tuple[str, str]:
-    """Owner and bias of a label: `mic_3` and `position_x`, `radar_2` and `heading@0.5` of a step."""
-    constant, _, time = label.rpartition("@")
-    try:
-        float(time)
-    except ValueError:
-        constant = label
-    constant = constant if "." in constant else label
-    owner, _, name = constant.rpartition(".")
-    return owner, name + label[len(constant) :]
-
-
-def step_of(label: str, labels: Collection[str]) -> tuple[str, float] | None:
-    """The drifting bias that a label is a step of, and the time of the step in s; None for any other bias."""
-    owner, _, time = label.rpartition("@")
-    try:
-        return (owner, float(time)) if owner in labels else None
-    except ValueError:
-        return None
 
 
 class Network:

@@ -1,5 +1,7 @@
 """Nodes from and to files (CSV, GeoJSON), and the local frame of places given by latitude and longitude."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -7,19 +9,26 @@ from difflib import get_close_matches
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas as pd
-import pyproj
-import xarray as xr
 
 from probcal.errors import InputError, nearest
 from probcal.files import write_whole
-from probcal.network import ANGLES, POSE_UNITS, Node, step_of
+from probcal.labels import AXES, step_of
+from probcal.lazy import Later
+from probcal.network import ANGLES, POSE_UNITS, Node
 from probcal.sensor import Bias
 from probcal.table import Table, factor, header, name_of, numbers, read_table
-from probcal.types import AXES
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyproj
+    import xarray as xr
+else:
+    pd = Later("pandas")
+    pyproj = Later("pyproj")
+    xr = Later("xarray")
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563  # WGS84: radius in m
 LOCAL, GEODETIC = ("x", "y", "z"), ("latitude", "longitude", "height")

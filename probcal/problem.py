@@ -1,16 +1,17 @@
 """Problem = network + motion + table (+ fixed biases): labels above, arrays below."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from os import PathLike
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 
 from probcal.errors import InputError, nearest
 from probcal.motion import Motion, Static, Target, White, as_motion
@@ -20,6 +21,9 @@ from probcal.rows import Block, Layout, Rows, addresses, make_block, pose_entrie
 from probcal.sensor import VECTORS
 from probcal.table import Measurements, Table, factor, header, measure, read_table
 from probcal.types import float64
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
 
@@ -122,7 +126,7 @@ class Problem:
             found.append({"owner": bias.owner, "node": node, "type": types, "component": bias.component})
         return found
 
-    def unlinked(self) -> "Problem":
+    def unlinked(self) -> Problem:
         """The same problem without motion: the state of every epoch is free, but for known and static targets."""
         names = self.measurements.target_names
         motion = {name: self._unlinked(name, self.target(name)) for name in names}
@@ -165,18 +169,18 @@ class Problem:
         """Stated positions of all nodes (a path's points for a moving one), shape (points, d)."""
         return np.concatenate([n.position[None] if n.path is None else n.path.position for n in self.network.nodes])
 
-    def rebuild(self, data: Any = None, **changes: Any) -> "Problem":
+    def rebuild(self, data: Any = None, **changes: Any) -> Problem:
         """The same problem with other data or fixed biases."""
         settings: dict[str, Any] = {"fix": self.fixed} | changes
         return Problem(self.network, self.motion, self.measurements.table if data is None else data, **settings)
 
-    def select(self, rows: np.ndarray) -> "Problem":
+    def select(self, rows: np.ndarray) -> Problem:
         """The same problem with some rows of its table only: a mask or numbers (N,)."""
         table = self.measurements.table
         frame = table.frame.iloc[rows].reset_index(drop=True)
         return self.rebuild(Table(frame, table.source, table.lines[rows], table.word))
 
-    def redrawn(self, y: Sequence[Any]) -> "Problem":
+    def redrawn(self, y: Sequence[Any]) -> Problem:
         """The same rows with other measured values: y (N, C) of each block, read where a value is measured.
 
         Shapes and static form stay, so that kernels compiled for this problem serve the other.
@@ -277,7 +281,7 @@ class Problem:
         return np.flatnonzero(inside & np.isin(self.measurements.sensor, ours))
 
     def _chain(
-        self, name: str, target: Target, motion: Motion, time: np.ndarray, levels: "_Levels"
+        self, name: str, target: Target, motion: Motion, time: np.ndarray, levels: _Levels
     ) -> tuple[np.ndarray, ...]:
         """Arrays of one target's epochs: F, L, level, drift."""
         d = self.network.dimension

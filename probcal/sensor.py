@@ -13,8 +13,9 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.fingerprint import computes
+from probcal.labels import AXES
 from probcal.noise import Bernoulli, Family, Gaussian, Level, check_level
-from probcal.types import AXES, PoseView, TargetView
+from probcal.types import PoseView, TargetView
 
 VECTORS = ("position", "velocity", "acceleration", "moment")  # components with one value an axis
 PERIODS = {"rad": 2 * np.pi, "deg": 360.0}

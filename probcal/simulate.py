@@ -1,24 +1,32 @@
 """Simulated recordings with their truth, and truth read from files; truth is used for scoring only."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 
 from probcal import rows
 from probcal.errors import InputError, nearest
 from probcal.files import write_whole
+from probcal.labels import AXES
+from probcal.lazy import Later
 from probcal.network import Network
 from probcal.noise import Bernoulli
 from probcal.problem import Epochs, Problem
 from probcal.table import Table, factor, header, name_of, numbers, read_table
-from probcal.types import AXES, float64
+from probcal.types import float64
+
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = Later("pandas")
 
 Key = int | jax.Array
 

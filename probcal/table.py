@@ -1,18 +1,25 @@
 """The long table of rows, `time, sensor, [target], <a column a channel>`, checked at the door."""
 
+from __future__ import annotations
+
 import warnings
 from dataclasses import dataclass
 from numbers import Number
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from probcal.errors import InputError, nearest
+from probcal.lazy import Later
 from probcal.network import Network
 from probcal.noise import Bernoulli
+
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = Later("pandas")
 
 # unit -> (quantity, factor to its base); offsets do not occur
 UNITS = {

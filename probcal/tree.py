@@ -1,5 +1,7 @@
 """The only writer of results: one labelled DataTree from every method, and its netCDF file."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -7,16 +9,22 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
-import xarray as xr
-from scipy import stats
 
 from probcal.errors import InputError
 from probcal.files import write_whole
-from probcal.problem import Problem
+from probcal.lazy import Later
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+    from probcal.problem import Problem
+else:
+    xr = Later("xarray")
 
 INTERVAL = 0.89  # probability of lower to upper
 SHARP = 256  # steps to which the spread of a log-likelihood over the draws is rounded, so that its file is small
@@ -149,7 +157,7 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         further |= own[0] if own else {}
     z = ("bias_label", labels)
     sd = np.sqrt(np.diag(result.covariance))
-    half = stats.norm.ppf(0.5 + INTERVAL / 2)
+    half = NormalDist().inv_cdf(0.5 + INTERVAL / 2)
     calibration = {
         "mean": result.z * scales, "sd": sd * scales,
         "lower": (result.z - half * sd if result.lower is None else result.lower) * scales,

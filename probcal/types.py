@@ -10,8 +10,6 @@ import jax.numpy as jnp
 from probcal.errors import InputError, nearest
 from probcal.kernels import drop_if_many
 
-AXES = ("x", "y", "z")
-
 
 def float64[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Run a public entry point in double precision without touching the global configuration of jax."""

@@ -32,7 +32,7 @@ from probcal import (
     sensor,
     simulate,
 )
-from probcal.network import label_parts
+from probcal.labels import label_parts
 from probcal.plots import plot_drift, plot_gamma
 from probcal.report import write_report
 

@@ -10,7 +10,7 @@ import probcal
 
 ROOT = Path(probcal.__file__).parent
 FLOORS = {
-    0: ("linalg", "geometry", "types", "errors", "lazy", "kernels", "fingerprint", "files"),
+    0: ("linalg", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files"),
     1: ("sensor", "motion", "priors", "noise"),
     2: ("sensors",),
     3: ("network", "table", "nodes", "rows"),

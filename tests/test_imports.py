@@ -3,6 +3,7 @@
 import ast
 import importlib
 import pkgutil
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +19,11 @@ from probcal.inference.sampler import Sampler
 from probcal.inference.study import ORACLE as ORACLE_OF_STUDIES
 
 ROOT = Path(__file__).parents[1]
-HEAVY = ("jax", "numpy", "pandas", "xarray", "scipy.stats", "arviz", "arviz_stats", "numpyro", "matplotlib", "pyproj")
+# jax and numpyro by a part of each: ArviZ puts empty ones into sys.modules
+HEAVY = ("jax.numpy", "numpy", "pandas", "xarray", "scipy.special", "scipy.stats", "arviz", "arviz_stats",
+         "numpyro.infer", "matplotlib", "pyproj")  # fmt: skip
+DATA = ROOT / "tests" / "data"
+MODEL, ROWS = DATA / "small.py", DATA / "small.csv"
 PLAZA = str(ROOT / "models" / "plaza.py")
 ERRORS = [  # of options and arguments, with the end of what is said
     ("fit none.py", "none.py: no such model file"),
@@ -61,8 +66,12 @@ def fresh(code):
 LOADED = f"""
 import sys
 def loaded():
-    return " ".join(name for name in {HEAVY} if name in sys.modules) or "nothing"
+    names = [name for name in {HEAVY} if name in sys.modules]
+    return " ".join(names) or "nothing"
 """
+
+
+COMMANDS = LOADED + "import contextlib, io\nfrom probcal.cli import main\n"
 
 
 def test_importing_the_package_loads_nothing_heavy():
@@ -70,13 +79,12 @@ def test_importing_the_package_loads_nothing_heavy():
         "import probcal\nprint(loaded())\nprobcal.InputError, probcal.analysis, probcal.inference, dir(probcal.plots)\n"
         "print(loaded())\nimport jax\nprint(loaded())"
     )
-    assert fresh(code) == ["nothing", "nothing", "jax numpy"]
+    assert fresh(code) == ["nothing", "nothing", "jax.numpy numpy"]
 
 
 def test_help_and_errors_of_options_load_nothing_heavy():
     orders = [order.format(plaza=PLAZA) for order, _ in ERRORS]
-    code = LOADED + (
-        "import contextlib, io\nfrom probcal.cli import main\n"
+    code = COMMANDS + (
         f"for order in {['--help', 'fit --help', 'sbc --help', *orders]!r}:\n"
         "    sys.argv, said = ['probcal', *order.split()], io.StringIO()\n"
         "    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):\n"
@@ -88,6 +96,31 @@ def test_help_and_errors_of_options_load_nothing_heavy():
     for line, (order, text) in zip(lines[3:], ERRORS, strict=True):
         assert line.startswith("nothing 2 probcal: "), order
         assert text in line, order
+
+
+def order(*arguments):
+    """Code that runs a command, its output dropped, and prints its exit code and what is loaded."""
+    return (
+        f"sys.argv = ['probcal', *{[str(argument) for argument in arguments]!r}]\n"
+        "with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):\n"
+        "    try:\n        main()\n    except SystemExit as end:\n        code = end.code\n"
+        "print(code, loaded())\n"
+    )
+
+
+def test_declaring_a_problem_loads_jax_alone():
+    code = "from probcal import EA, NUTS, Bias, Network, Node, Problem, Truth, fit, load, read_nodes, sensor\n"
+    assert fresh(LOADED + code + "print(loaded())") == ["jax.numpy numpy"]
+
+
+def test_a_fit_without_assessment_loads_neither_arviz_nor_scipy_nor_plots():
+    run = order("fit", MODEL, ROWS, "--method", "map", "--no-assess")
+    assert fresh(COMMANDS + run) == ["0 jax.numpy numpy pandas xarray"]
+
+
+def test_a_report_loads_no_jax(tmp_path):
+    shutil.copy(DATA / "ea.nc", tmp_path / "fit.nc")
+    assert fresh(COMMANDS + order("report", tmp_path)) == ["0 numpy pandas xarray matplotlib"]
 
 
 def test_names_on_the_command_line_are_those_of_the_library():

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.analysis import checks, leave, nees, pieces, predictive, residuals, scaling, verdict
-from probcal.analysis.checks import Finding
+from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.pieces import Change, Pieces
 from probcal.analysis.verdict import RATE, limit_of

@@ -1,29 +1,21 @@
 """What the innovations and the replicas of a fit say, labelled: groups of a tree, and findings in words."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
-from scipy import stats
+from scipy import special
 
 from probcal.analysis import leave, predictive, residuals
+from probcal.analysis.findings import NAMES, Finding
 from probcal.analysis.fitted import Fitted
 from probcal.analysis.verdict import RATE
 from probcal.tree import suffix
 
 PRACTICAL = 1.25  # factor from 1 within which a NIS beyond its limits is no finding
 NOTABLE = 0.1  # lag-1 correlation, and mean, of innovations within which neither is
-NAMES = 4  # that a sentence on several channels lists
 GAIN = 5.0  # nats that a calibration must win before it is a finding
-
-
-class Finding(NamedTuple):
-    """One thing to know about a fit: its kind, what it concerns, and a sentence."""
-
-    kind: str
-    subject: str
-    sentence: str
 
 
 def codes(frame: pd.DataFrame, names: list[str]) -> tuple[np.ndarray, pd.DataFrame]:
@@ -81,7 +73,7 @@ def by_channel(
         judged = residuals.enough(found.kurtosis[mine])
         white = residuals.whiteness(found.value[mine], target[mine], time[mine]) if judged else None
         extra[k] = (0.0, float(np.mean(found.value[mine])), 1.0) if white is None else white
-        name, mean, limit = f"{sensor}.{channel}", extra[k, 1], stats.norm.isf(RATE / (2 * count)) / np.sqrt(mine.sum())
+        name, mean, limit = f"{sensor}.{channel}", extra[k, 1], -special.ndtri(RATE / (2 * count)) / np.sqrt(mine.sum())
         if judged and abs(mean) > max(limit, NOTABLE):
             text = f"{name}: innovations have mean {mean:.2f} noise std (limit {limit:.2f}): a bias is left"
             findings.append(Finding("mean", name, text))

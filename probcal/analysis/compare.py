@@ -8,12 +8,12 @@ import numpy as np
 import xarray as xr
 
 from probcal.analysis import loo
-from probcal.analysis.checks import Finding
 from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.analysis.differences import findings
+from probcal.analysis.findings import Finding
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
 from probcal.errors import INVALID, InputError, nearest
-from probcal.network import label_parts
+from probcal.labels import label_parts
 
 Fits = Mapping[str, xr.DataTree] | Sequence[xr.DataTree]
 COLUMNS = ("mean", "sd", "lower", "upper", "gamma", "status")  # of every fit

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import xarray as xr
 
-from probcal.analysis.checks import NAMES, Finding
+from probcal.analysis.findings import NAMES, Finding
 from probcal.analysis.overlap import ZERO
 from probcal.errors import INVALID
 

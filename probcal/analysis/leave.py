@@ -5,25 +5,32 @@ masked (shapes stay, one compiled kernel serves all), the mode is found again at
 predictive density of what was left out is the difference of two Laplace evidences: exact on a linear problem.
 """
 
+from __future__ import annotations
+
 import warnings
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import xarray as xr
-from arviz_stats.base import array_stats
 from scipy import special
 
 from probcal import linalg
 from probcal.analysis.fitted import Fitted, eliminate_rows, linearise
 from probcal.inference.pose import TAILED
+from probcal.lazy import Later
 from probcal.priors import Precision
 from probcal.problem import Spec, System
 from probcal.rows import Linearised, standardised
 from probcal.smoothing.mode import Eliminated, Point, cost, find_mode, follow
+
+if TYPE_CHECKING:
+    from arviz_stats.base import array_stats
+else:
+    array_stats = Later("arviz_stats.base.array_stats")
 
 STEPS = 20  # Gauss-Newton steps of a refit
 TOLERANCE = 1e-5  # nats

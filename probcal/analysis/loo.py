@@ -3,16 +3,23 @@
 Vehtari, Gelman and Gabry 2017; they are what `arviz.loo` and `arviz.compare` give.
 """
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import arviz as az
 import numpy as np
 import xarray as xr
 
 from probcal.analysis.leave import tailed
 from probcal.errors import InputError
+from probcal.lazy import Later
+
+if TYPE_CHECKING:
+    import arviz_stats
+else:
+    arviz_stats = Later("arviz_stats")
 
 
 def same_data(fits: Mapping[str, xr.DataTree]) -> dict[str, np.ndarray]:
@@ -44,7 +51,7 @@ def elpd(fits: Mapping[str, xr.DataTree], orders: Mapping[str, np.ndarray]) -> d
         pair = xr.DataTree.from_dict({"posterior": bias.to_dataset(), "log_likelihood": y})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a large Pareto k is reported, not warned about
-            loo = az.loo(pair, pointwise=True, reff=_efficiency(bias))
+            loo = arviz_stats.loo(pair, pointwise=True, reff=_efficiency(bias))
         if not np.isfinite(loo.elpd_i).all():
             continue
         pointwise[name] = loo.elpd_i.values
@@ -67,5 +74,5 @@ def _efficiency(draws: xr.DataArray) -> float:
     varying = draws.isel(bias_label=(draws.std(("chain", "draw")) > 0).values)
     if draws.sizes["chain"] == 1 or not varying.sizes["bias_label"]:
         return 1.0
-    ess = az.ess(varying.to_dataset(), method="mean")["bias"].values
+    ess = arviz_stats.ess(varying.to_dataset(), method="mean")["bias"].values
     return float(ess.mean()) / (draws.sizes["chain"] * draws.sizes["draw"])

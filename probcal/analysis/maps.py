@@ -12,10 +12,11 @@ import xarray as xr
 
 from probcal import linalg, tree
 from probcal.errors import InputError, nearest
+from probcal.labels import AXES
 from probcal.problem import Problem, Spec, System
 from probcal.simulate import blank
 from probcal.smoothing.mode import Point, compress, factors, linearise
-from probcal.types import AXES, float64
+from probcal.types import float64
 
 BATCH = (256, 200_000)  # cells worked on at once, and entries of their matrices
 LOST = 1e-13  # share of the information of a position below which a direction counts as open

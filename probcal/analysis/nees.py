@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from scipy import stats
+from scipy import special
 
 from probcal import linalg
+from probcal.labels import AXES
 from probcal.simulate import Truth
-from probcal.types import AXES
 
 EXACT = 1e-9  # sd over the size of the scene below which a position is known: it has no error to be judged
 
@@ -66,5 +66,5 @@ def of_biases(tree: xr.DataTree, truth: Truth, rate: float) -> tuple[float, int,
     error = (chosen["mean"].values - np.array([truth.biases[label] for label in labels])) / chosen["scale"].values
     covariance = chosen["covariance"].values / np.outer(chosen["scale"].values, chosen["scale"].values)
     value = float(error @ np.linalg.solve(covariance, error))
-    lower, upper = stats.chi2.ppf([rate / 2, 1 - rate / 2], len(labels))
+    lower, upper = special.chdtri(len(labels), [1 - rate / 2, rate / 2])
     return value, len(labels), float(lower), float(upper)

@@ -6,12 +6,21 @@ where either has one, what lies within `ZERO` scales of zero counts as zero for 
 density.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from arviz_stats.base import array_stats
-from scipy import stats
+
+from probcal.lazy import Later
+
+if TYPE_CHECKING:
+    from arviz_stats.base import array_stats
+    from scipy import stats
+else:
+    array_stats = Later("arviz_stats.base.array_stats")
+    stats = Later("scipy.stats")
 
 ZERO = 0.05  # scales from zero that count as zero beside a point mass
 POINTS = 1000  # quantiles that stand for a Gaussian

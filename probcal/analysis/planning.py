@@ -15,6 +15,7 @@ import xarray as xr
 
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
+from probcal.labels import AXES
 from probcal.network import Network, Node
 from probcal.problem import Epochs, Problem, Spec, System
 from probcal.sensor import SensorType
@@ -23,7 +24,7 @@ from probcal.smoothing.directions import WEAK
 from probcal.smoothing.information import marginal_information
 from probcal.smoothing.mode import Point
 from probcal.table import Table, header
-from probcal.types import AXES, float64
+from probcal.types import float64
 
 LONGEST = 300  # epochs of the pass that stands as a pattern
 HEADINGS, LANES = 8, (-0.5, 0.0, 0.5)  # candidate lines: directions, and distances from the centre in radii

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from probcal import linalg
 from probcal.analysis.fitted import Fitted
@@ -180,7 +180,7 @@ def squares(found: Innovations, group: Any, count: int, rate: float) -> Squares:
     expected = np.maximum(data - used, 1e-9)
     variance = np.maximum(2.0 * expected + kurtosis, 1e-9 * expected)
     scale, freedom = variance / (2.0 * expected), 2.0 * expected**2 / variance
-    lower, upper = (scale * stats.chi2.ppf(p, freedom) / expected for p in (rate / 2, 1 - rate / 2))
+    lower, upper = (scale * special.chdtri(freedom, p) / expected for p in (1 - rate / 2, rate / 2))
     judged = freedom >= 1.0  # below, as with events that hardly ever happen, there is no limit
     return Squares(data.astype(int), total / expected, np.where(judged, lower, 0.0), np.where(judged, upper, np.inf))
 
@@ -224,7 +224,7 @@ def whiteness(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> Whiten
     if not lags:
         return None
     statistic = np.sum(pairs[:lags] * r[:lags] ** 2) * (n + 2) / n
-    return Whiteness(float(r[0]), float(np.mean(value)), float(stats.chi2.sf(statistic, lags)))
+    return Whiteness(float(r[0]), float(np.mean(value)), float(special.chdtrc(lags, statistic)))
 
 
 def memory(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> float:

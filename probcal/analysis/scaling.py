@@ -1,10 +1,19 @@
 """Power scaling: how prior and likelihood move the posterior of every bias (Kallioinen et al. 2024), by ArviZ."""
 
-import warnings
+from __future__ import annotations
 
-import arviz as az
+import warnings
+from typing import TYPE_CHECKING
+
 import numpy as np
 import xarray as xr
+
+from probcal.lazy import Later
+
+if TYPE_CHECKING:
+    import arviz_stats
+else:
+    arviz_stats = Later("arviz_stats")
 
 THRESHOLD = 0.05  # of the distance a power, ArviZ's own
 
@@ -45,4 +54,4 @@ def _distance(groups: dict[str, xr.Dataset], way: str) -> np.ndarray:
     """Sensitivity (M,) of every bias to the prior or the likelihood."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return az.psense(xr.DataTree.from_dict(groups), var_names=["bias"], group=way)["bias"].values
+        return arviz_stats.psense(xr.DataTree.from_dict(groups), var_names=["bias"], group=way)["bias"].values

@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from probcal.problem import Problem
 
@@ -59,7 +59,7 @@ def pull(z: np.ndarray, alpha: np.ndarray, gamma: np.ndarray, inflation: np.ndar
 
 def limit_of(count: int, freedom: int = 1) -> float:
     """Chi-square beyond which one of `count` statistics may go at the false-alarm rate of all."""
-    return float(stats.chi2.isf(RATE / max(count, 1), freedom))
+    return float(special.chdtri(freedom, RATE / max(count, 1)))
 
 
 def judge(

@@ -1,23 +1,30 @@
 """The evidence of a problem under a prior, hyper-parameters integrated: which sensor model, prior, drift or none."""
 
+from __future__ import annotations
+
 from itertools import pairwise
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from arviz_stats.base import array_stats
 
 from probcal.errors import InputError
 from probcal.inference.methods import check_problem
 from probcal.inference.pose import PILOTS, Pilot, pareto_khat, pilot, pose, weights
 from probcal.inference.posed import Form, Posed
+from probcal.lazy import Later
 from probcal.priors import Flat, Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start
 from probcal.types import float64
+
+if TYPE_CHECKING:
+    from arviz_stats.base import array_stats
+else:
+    array_stats = Later("arviz_stats.base.array_stats")
 
 RUNGS, BEND = 24, 4.0  # temperatures, and the power by which they crowd towards the prior
 

@@ -1,20 +1,20 @@
 """The one verb: `fit(problem, method)` turns a problem into a DataTree, whatever the method."""
 
+from __future__ import annotations
+
 from collections.abc import Collection
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
-from scipy import stats
 
 from probcal import tree
 from probcal.errors import INVALID, FitError, InputError
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.methods import EA, MAP, NUTS, check_problem, choose_prior
-from probcal.inference.posterior import result
+from probcal.inference.posterior import log_normal, result
 from probcal.inference.run import Maximiser, Method, Outcome, Progress, maximise
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import sample
@@ -27,6 +27,9 @@ from probcal.smoothing.information import at_levels, moments
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start, follow_states, further_starts, track_mode
 from probcal.types import float64
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 CHAINS = 4  # of the draws of a Gaussian, so that ArviZ reads them as it reads a sampler's
 SAVE = ("states", "predictive")
@@ -183,7 +186,7 @@ def _result(
         bias_status=outcome.bias_status, information=np.asarray(found.information),
         evidence=float(found.evidence) if prior.proper else None, objective=outcome.trace,
         levels=np.asarray(point.levels), directions=outcome.weak, draws=draws,
-        log_prior=stats.norm.logpdf(draws, 0.0, 1 / np.sqrt(alpha)) if independent else None,
+        log_prior=log_normal(draws, alpha) if independent else None,
         states=[split(s) for s in drawn.states], kept=np.arange(shape[1]),
         log_likelihood=[split(a) for a in drawn.log_likelihood], replicas=[split(a) for a in drawn.replicas],
         tracks=_tracks(point, before, spread, found.covariance),

@@ -5,20 +5,27 @@ Given them the biases are Gaussian of precision `alpha(phi)`, so that every prio
 add one: a class here with its `hyper` distributions and its `updates`, and a line in `hierarchy_of`.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpyro import distributions as dist  # not `import numpyro.distributions`: ArviZ's lazy numpyro runs it twice
 
 from probcal.errors import InputError
 from probcal.inference.draws import inverse_gaussian, slice_step
+from probcal.lazy import Later
 from probcal.priors import ARD, BernoulliGaussian, Horseshoe, Laplace, Prior
 from probcal.problem import Problem
+
+if TYPE_CHECKING:
+    from numpyro import distributions as dist
+else:
+    dist = Later("numpyro.distributions")
 
 LEAST, MOST = 1e-12, 1e16  # precisions outside carry no mass that a draw could show
 Phi = dict[str, jax.Array]

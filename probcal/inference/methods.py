@@ -3,7 +3,9 @@
 To add one: a module beside this one with a frozen dataclass that inherits `inference.run.Method`, entered here.
 """
 
-import pandas as pd
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from probcal.errors import InputError
 from probcal.inference.collapsed import Collapsed
@@ -12,8 +14,14 @@ from probcal.inference.em import EM, EMEA
 from probcal.inference.nuts import NUTS
 from probcal.inference.run import Method
 from probcal.inference.svi import SVI
+from probcal.lazy import Later
 from probcal.priors import PRIORS, BernoulliGaussian, Flat, Laplace, Prior
 from probcal.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = Later("pandas")
 
 # names on the command line: method, and the prior it means where that is not the method's first
 METHODS: dict[str, tuple[Method, Prior | None]] = {

@@ -1,18 +1,25 @@
 """The joint sampler: NUTS over biases, hyper-parameters and every trajectory, in coordinates that the frame whitens."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from numpyro.infer.hmc import hmc
 
 from probcal.errors import InputError
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior, prior_precision, whiten
 from probcal.inference.sampler import Sample, Sampler
+from probcal.lazy import Later
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
 from probcal.smoothing.frame import log_joint
+
+if TYPE_CHECKING:
+    from numpyro.infer import hmc
+else:
+    hmc = Later("numpyro.infer.hmc")
 
 
 class Free(NamedTuple):
@@ -72,7 +79,7 @@ class NUTS(Sampler):
             )
 
     def _kernels(self, form: Form, posed: Posed) -> tuple[Any, Any]:
-        return hmc(lambda free: -parts(form, posed, free).density, algo="NUTS")
+        return hmc.hmc(lambda free: -parts(form, posed, free).density, algo="NUTS")
 
     def _started(self, kernels: tuple[Any, Any], free: Free, key: jax.Array) -> Any:
         return kernels[0](

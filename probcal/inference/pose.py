@@ -1,20 +1,27 @@
 """From a problem to a posed posterior: a start, a frame that is moved to where a pilot finds the mass, its worth."""
 
+from __future__ import annotations
+
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from arviz_stats.base import array_stats
 
 from probcal.inference.collapsed import sweep
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.posed import Form, Posed, activity, conditional
+from probcal.lazy import Later
 from probcal.priors import Prior
 from probcal.problem import Problem, Spec, System
 from probcal.smoothing.frame import Frame, frame_at, log_weight, place, refined
 from probcal.smoothing.mode import Point, track
+
+if TYPE_CHECKING:
+    from arviz_stats.base import array_stats
+else:
+    array_stats = Later("arviz_stats.base.array_stats")
 
 PILOTS = 4  # chains of the pilot
 BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, sweeps between two

@@ -1,19 +1,20 @@
 """What the draws of a sampler say: estimates, intervals, gamma, inclusion, how well the chains mixed, in words."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from arviz_stats.base import array_stats
-from scipy import stats
 
 from probcal import tree
 from probcal.inference.hierarchy import LEAST, MOST, SpikeAndSlab
 from probcal.inference.pose import pareto_khat
 from probcal.inference.run import ABSURD, FAR, misfit_sentence
 from probcal.inference.sampling import Sampled
+from probcal.lazy import Later
 from probcal.priors import PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.smoothing.directions import weak_directions
@@ -21,6 +22,11 @@ from probcal.smoothing.draws import draws_a_chain, predictive, residuals_of
 from probcal.smoothing.information import at_levels, mean_square
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import track_mode
+
+if TYPE_CHECKING:
+    from arviz_stats.base import array_stats
+else:
+    array_stats = Later("arviz_stats.base.array_stats")
 
 ROPE = 0.1  # scales within which a bias is practically zero
 R_HAT = 1.01  # above which chains have not mixed
@@ -124,12 +130,17 @@ def _by_datum(
     return kept, likelihood, replicas
 
 
+def log_normal(z: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """Log density of each entry of z, Gaussian around zero with its precision."""
+    return 0.5 * (np.log(precision / (2 * np.pi)) - precision * z**2)
+
+
 def _log_prior(problem: Problem, prior: Prior, run: Sampled) -> np.ndarray | None:
     """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
     if isinstance(prior, Flat) or prior.correlation or isinstance(run.form.hierarchy, SpikeAndSlab):
         return None
     alpha = _alpha(run)
-    return stats.norm.logpdf(run.z, 0.0, 1 / np.sqrt(np.clip(alpha, LEAST, MOST)))
+    return log_normal(run.z, np.clip(alpha, LEAST, MOST))
 
 
 def _alpha(run: Sampled) -> np.ndarray:

@@ -4,15 +4,16 @@ The density of the data is a quantity that depends on them: ranks of parameters 
 part of the data (Modrak et al. 2023).
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from arviz_stats.base import array_stats
 
 from probcal.errors import FitError
 from probcal.inference.hierarchy import Phi
@@ -22,11 +23,17 @@ from probcal.inference.run import Maximiser, maximise
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import Sampled, sample
 from probcal.inference.uniformity import NOMINAL, randomised_rank
+from probcal.lazy import Later
 from probcal.priors import Prior
 from probcal.problem import Problem, Spec, System
 from probcal.smoothing.draws import draw, draw_biases
 from probcal.smoothing.frame import volume
 from probcal.smoothing.mode import Point, log_density, log_likelihood
+
+if TYPE_CHECKING:
+    from arviz_stats.base import array_stats
+else:
+    array_stats = Later("arviz_stats.base.array_stats")
 
 CHAINS, DRAWS = 4, 250  # of a Gaussian
 TAKEN = "taken over"  # status of a run whose method gave way to another

@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from os import PathLike
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from scipy import stats
 
 from probcal.errors import InputError, nearest
 from probcal.inference.identity import identity, problem_digest
@@ -209,7 +209,7 @@ def _record(run: _Run, prior: Prior, one: Any) -> dict[str, Any]:
         bool(one.done), bool(low.any()), bool(far.any()), bool(np.isfinite(one.z).all() and np.isfinite(one.sd).all()),
         bool(one.refused), fallen(prior, len(problem.levels), one.best, one.evidence), float(one.square),
     )  # fmt: skip
-    half = stats.norm.ppf(0.5 + INTERVAL / 2)
+    half = NormalDist().inv_cdf(0.5 + INTERVAL / 2)
     return {
         "bias_rmse": float(np.sqrt(np.mean(error**2))),
         "coverage": float((np.abs(error) <= half * one.sd).mean()),

@@ -8,7 +8,7 @@ as a bias that is exactly zero, leaves the randomised rank (rank + u) / (L + 1) 
 from functools import lru_cache
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 NOMINAL = (0.5, 0.8, 0.89, 0.9, 0.95)
 POINTS = 100  # at most so many points of a distribution function are looked at
@@ -32,20 +32,25 @@ def _table(runs: int, points: int) -> np.ndarray:
     return np.minimum(1.0, 2.0 * np.minimum(special.bdtr(count, runs, z), above))
 
 
+def _poisson(count: np.ndarray, rate: float) -> np.ndarray:
+    """Probability of a count."""
+    return np.exp(special.xlogy(count, rate) - special.gammaln(count + 1.0) - rate)
+
+
 def _escape(runs: int, points: int, level: float) -> float:
     """Probability that a uniform sample's counts leave the band of pointwise probability `level` somewhere.
 
     The count as k grows is a Poisson walk held to `runs` at the end, so that its paths are summed exactly.
     """
     inside = _table(runs, points) > level
-    steps = stats.poisson.pmf(np.arange(runs + 1), runs / points)
+    steps = _poisson(np.arange(runs + 1), runs / points)
     steps = steps[: int(np.flatnonzero(steps > 1e-300)[-1]) + 1]
     walk = np.zeros(runs + 1)
     walk[0] = 1.0
     for k in range(points - 1):
         walk = np.convolve(walk, steps)[: runs + 1] * inside[k]
     last = float(np.convolve(walk, steps)[runs])
-    return float(np.clip(1.0 - last / stats.poisson.pmf(runs, runs), 0.0, 1.0))
+    return float(np.clip(1.0 - last / _poisson(np.array(runs), runs), 0.0, 1.0))
 
 
 def p_value(places: np.ndarray) -> float:
@@ -77,7 +82,7 @@ def spread_p_value(places: np.ndarray) -> float:
     """
     found = np.abs(places - 0.5).mean(1) - 0.25
     error = found.std(ddof=1) / np.sqrt(len(found))
-    return float(2 * stats.t.sf(abs(found.mean()) / max(error, 1e-12), len(found) - 1))
+    return float(2 * special.stdtr(len(found) - 1, -abs(found.mean()) / max(error, 1e-12)))
 
 
 def shape(places: np.ndarray) -> str:

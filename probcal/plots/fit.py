@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from probcal.diagnostics import drift_table
 from probcal.errors import INVALID
-from probcal.network import label_parts
+from probcal.labels import label_parts
 from probcal.plots.base import (
     ALL_POINTS,
     BEFORE,

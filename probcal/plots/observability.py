@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from probcal.network import label_parts
+from probcal.labels import label_parts
 from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, new_axes, plain
 from probcal.plots.bounds import plot_bound_map
 

@@ -9,13 +9,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg as dense
 
-from probcal.network import label_parts
+from probcal.labels import AXES, label_parts
 from probcal.problem import Problem
 from probcal.smoothing.gauge import Gauge
 from probcal.smoothing.mode import Point
-from probcal.types import AXES
 
 WEAK = 1.0  # marginal information below which a direction is left to the prior
 RIDGE = 1e-2  # keeps the completion of a pattern from running along other weak directions
@@ -362,6 +360,8 @@ def _readable(space: np.ndarray) -> Iterator[np.ndarray]:
     """Unit vectors that span a space (F, k), each with a bias of its own that the others leave alone."""
     if not space.shape[1]:
         return
+    from scipy import linalg as dense  # here, that a fit without weak directions does not load it
+
     pivots = dense.qr(space.T, mode="r", pivoting=True)[1][: space.shape[1]]
     for vector in np.linalg.solve(space[pivots].T, space.T):
         yield vector / np.linalg.norm(vector)

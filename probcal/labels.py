@@ -1,0 +1,26 @@
+"""The labels of biases and what they are made of; text only."""
+
+from collections.abc import Collection
+
+AXES = ("x", "y", "z")
+
+
+def label_parts(label: str) -> tuple[str, str]:
+    """Owner and bias of a label: `mic_3` and `position_x`, `radar_2` and `heading@0.5` of a step."""
+    constant, _, time = label.rpartition("@")
+    try:
+        float(time)
+    except ValueError:
+        constant = label
+    constant = constant if "." in constant else label
+    owner, _, name = constant.rpartition(".")
+    return owner, name + label[len(constant) :]
+
+
+def step_of(label: str, labels: Collection[str]) -> tuple[str, float] | None:
+    """The drifting bias that a label is a step of, and the time of the step in s; None for any other bias."""
+    owner, _, time = label.rpartition("@")
+    try:
+        return (owner, float(time)) if owner in labels else None
+    except ValueError:
+        return None
