@@ -416,10 +416,10 @@ def load(path: str | PathLike[str]) -> xr.DataTree:
     Raises `InputError` where the file is damaged, foreign, or written by another version.
     """
     path = Path(path)
-    path = path / "fit.nc" if path.is_dir() else path
     try:
+        path = path / "fit.nc" if path.is_dir() else path
         sealed = _sealed(path)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # nor is a name that no file can have
         raise InputError(f"{path} is not a fit written by probcal ({type(error).__name__}: {error})") from None
     if not sealed:
         raise InputError(f"{path} is damaged: its checksum does not match its content; fit again")
