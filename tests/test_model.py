@@ -78,7 +78,7 @@ def test_its_density_is_that_of_the_samplers(case):
         form, posed = posed_of(problem, prior)
         model, M = numpyro_model(problem, prior), form.biases
         eps = tuple(jnp.zeros_like(x) for x in posed.frame.point.states)
-        phi = form.hierarchy.relax(form.hierarchy.draw(jax.random.key(0)))
+        phi = jax.jit(lambda key: form.hierarchy.relax(form.hierarchy.draw(key)))(jax.random.key(0))
         flat, back = ravel_pytree(Free(phi, jnp.zeros_like(posed.frame.theta), eps))
 
         def sites(x):

@@ -33,13 +33,19 @@ PRIORS = [ARD(shape=2.0, rate=0.7), ARD(by="node", rate=0.5), Laplace(), Horsesh
 ALARM = 1e-4  # rate at which a right sampler fails one of these tests, for each comparison
 
 
+# one kernel each, where every operation alone would be one
+PLACE, DRIVING, VOLUME = jax.jit(place), jax.jit(driving), jax.jit(volume)
+WEIGHT, CONDITIONAL = jax.jit(log_weight, static_argnums=0), jax.jit(conditional, static_argnums=0)
+
+
 @pytest.fixture(autouse=True)
 def double():
     with jax.enable_x64(True):
         yield
 
 
-def made(name, prior, **options):
+@cache
+def made(name, prior):
     problem, naive = linear(name)
     point = track(problem.spec, problem.system, resting(problem))
     posed = Posed(problem.system, frame_at(problem.spec, problem.system, point),
@@ -60,8 +66,8 @@ def test_inverse_gaussian_draws_have_their_law():
 
 def test_slice_steps_leave_a_density_alone():
     keys = jax.random.split(jax.random.key(1), 20000)
-    start = jax.vmap(lambda k: jnp.log(jax.random.gamma(k, 0.7)))(keys)
-    move = jax.vmap(lambda k, x: slice_step(jax.random.fold_in(k, 1), x, lambda t: 0.7 * t - jnp.exp(t)))
+    start = jax.jit(jax.vmap(lambda k: jnp.log(jax.random.gamma(k, 0.7))))(keys)
+    move = jax.jit(jax.vmap(lambda k, x: slice_step(jax.random.fold_in(k, 1), x, lambda t: 0.7 * t - jnp.exp(t))))
     moved = move(keys, start)
     assert stats.kstest(np.exp(np.asarray(moved)), stats.gamma(0.7).cdf).pvalue > ALARM
     assert np.corrcoef(start, moved)[0, 1] < 0.5, "it moves"
@@ -83,9 +89,10 @@ def test_updates_leave_the_joint_prior_of_scales_and_biases_alone(prior):
             new = update(new, z, jax.random.fold_in(keys[2], k))
         return phi, new, z
 
-    phi, new, _z = jax.vmap(one)(jax.random.split(jax.random.key(2), 8000))
+    phi, new, _z = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(2), 8000))
+    again = jax.jit(jax.vmap(kind.draw))(jax.random.split(jax.random.key(3), 8000))
     for name in kind.hyper():
-        fresh = jax.vmap(kind.draw)(jax.random.split(jax.random.key(3), 8000))[name]
+        fresh = again[name]
         for k in range((np.ndim(fresh[0]) and fresh.shape[1]) or 1):
             old, after = (np.asarray(a).reshape(8000, -1)[:, k] for a in (fresh, new[name]))
             same_law(np.log(old), np.log(after))
@@ -134,14 +141,14 @@ def test_a_frame_is_exact_on_linear_problems(name):
     keys = jax.random.split(jax.random.key(4), 3)
     theta = posed.frame.theta + 3 * jax.random.normal(keys[0], posed.frame.theta.shape)
     eps = tuple(2 * jax.random.normal(keys[1], x.shape) for x in posed.frame.point.states)
-    weight = log_weight(problem.spec, problem.system, posed.frame, theta, eps)
+    weight = WEIGHT(problem.spec, problem.system, posed.frame, theta, eps)
     assert abs(float(weight)) < 1e-8 * max(1.0, abs(float(posed.frame.log_likelihood(theta))))
     exact = reference.dense(linear, np.ones(len(linear.labels)))
     order = [list(problem.labels).index(label) for label in linear.labels]
-    found = conditional(form, posed, {})
+    found = CONDITIONAL(form, posed, {})
     np.testing.assert_allclose(np.asarray(found.mean)[order], exact.z[0], rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(np.asarray(found.variance)[order], np.diag(exact.z[1]), rtol=1e-7)
-    point = place(problem.system, posed.frame, theta, eps)
+    point = PLACE(problem.system, posed.frame, theta, eps)
     for part, x, u in zip(problem.system.recursions, point.states, point.noises, strict=True):
         before = np.concatenate([np.zeros_like(x[:1]), x[:-1]])
         made_of = np.einsum("eij,ej->ei", part.F, before) + part.drift + np.einsum("eij,ej->ei", part.L, u)
@@ -161,21 +168,28 @@ def test_a_frame_follows_its_levels():
     frame = frame_at(problem.spec, problem.system, track(problem.spec, problem.system, start))
     keys = jax.random.split(jax.random.key(9), 200)
 
-    def spread(frame, theta):
+    @jax.jit
+    def spread(theta):
         def one(key):
             eps = tuple(jax.random.normal(key, x.shape) for x in frame.point.states)
             return log_weight(problem.spec, problem.system, frame, theta, eps)
 
-        return float(jnp.std(jax.lax.map(one, keys)))
+        return jnp.std(jax.lax.map(one, keys))
+
+    @jax.jit
+    def slopes(theta, e):
+        return jax.jacfwd(
+            lambda e: jnp.concatenate([u.ravel() for u in place(problem.system, frame, theta, (e,)).noises])
+        )(e)
 
     H = len(problem.levels)
     assert H == 2
     for step in np.concatenate([np.zeros((1, H)), np.eye(H), -3 * np.eye(H)]):
         theta = frame.theta.at[-H:].add(step)
-        assert spread(frame, theta) < 1e-6
+        assert spread(theta) < 1e-6
         eps = tuple(jax.random.normal(keys[0], x.shape) for x in frame.point.states)
-        point = place(problem.system, frame, theta, eps)
-        for again, e in zip(driving(problem.system, frame, point), eps, strict=True):
+        point = PLACE(problem.system, frame, theta, eps)
+        for again, e in zip(DRIVING(problem.system, frame, point), eps, strict=True):
             np.testing.assert_allclose(again, e, rtol=1e-7, atol=1e-7)
         for part, x, u in zip(problem.system.recursions, point.states, point.noises, strict=True):
             before = np.concatenate([np.zeros_like(x[:1]), x[:-1]])
@@ -183,11 +197,8 @@ def test_a_frame_follows_its_levels():
             made_of += np.einsum("eij,ej->ei", factors(part, point.levels), u)
             np.testing.assert_allclose(x, made_of, rtol=1e-8, atol=1e-8)
 
-        def noises(e, theta=theta):
-            return jnp.concatenate([u.ravel() for u in place(problem.system, frame, theta, (e,)).noises])
-
-        slope = jax.jacfwd(noises)(eps[0]).reshape(eps[0].size, -1)
-        assert np.linalg.slogdet(slope)[1] == pytest.approx(float(volume(problem.system, frame, theta)), abs=1e-8)
+        slope = slopes(theta, eps[0]).reshape(eps[0].size, -1)
+        assert np.linalg.slogdet(slope)[1] == pytest.approx(float(VOLUME(problem.system, frame, theta)), abs=1e-8)
 
 
 def test_whitening_has_the_derivative_of_its_value():
@@ -196,11 +207,12 @@ def test_whitening_has_the_derivative_of_its_value():
     matrix, alpha = root @ root.T, jax.random.uniform(keys[1], (20,)) + 0.1
     pull, eta = jax.random.normal(keys[2], (20,)), jax.random.normal(keys[3], (20,))
 
+    @jax.jit
     def value(alpha, eta):
         theta, volume = whiten(matrix, alpha, pull, eta)
         return jnp.sum(jnp.sin(theta)) + 0.3 * volume
 
-    slopes = jax.grad(value, (0, 1))(alpha, eta)
+    slopes = jax.jit(jax.grad(value, (0, 1)))(alpha, eta)
     for k, slope in enumerate(slopes):
         turn = jax.random.normal(keys[4], (20,))
         step = [1e-6 * turn if j == k else 0.0 for j in range(2)]

@@ -54,10 +54,13 @@ def test_any_point_has_coordinates_in_the_frame():
     problem = small(motion=two_motions)
     form, posed = posed_of(problem, Horseshoe())
     keys = jax.random.split(jax.random.key(3), 3)
-    phi = form.hierarchy.relax(form.hierarchy.draw(keys[0]))
+    phi = jax.jit(lambda key: form.hierarchy.relax(form.hierarchy.draw(key)))(keys[0])
     noises = tuple(0.1 * jax.random.normal(keys[1], x.shape) + x for x in posed.frame.point.noises)
-    at = plain(form, posed, Free(phi, 0.1 * jax.random.normal(keys[2], posed.frame.theta.shape), noises))
-    again = place(posed.system, posed.frame, at.theta, driving(posed.system, posed.frame, at.point))
+    at = jax.jit(plain, static_argnums=0)(
+        form, posed, Free(phi, 0.1 * jax.random.normal(keys[2], posed.frame.theta.shape), noises)
+    )
+    driven = jax.jit(driving)(posed.system, posed.frame, at.point)
+    again = jax.jit(place)(posed.system, posed.frame, at.theta, driven)
     assert len(again.states) == 2
     assert again.levels.shape == (1,)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), again, at.point)

@@ -29,7 +29,6 @@ from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.posed import Form, Posed
 from probcal.smoothing.frame import frame_at
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import automatic_start
 
 fix = probcal.sensors.position
 
@@ -186,7 +185,7 @@ def resting(problem):
             track.append(x)
         states.append(np.array(track))
     zeros = tuple(np.zeros_like(x) for x in states)
-    return Point(tuple(states), zeros, np.zeros(len(problem.labels)), np.zeros(0))
+    return Point(tuple(states), zeros, np.zeros(len(problem.labels)), np.zeros(len(problem.levels)))
 
 
 @cache
@@ -243,7 +242,7 @@ def two_motions(start):
 
 
 def posed_of(problem, prior):
-    """The package's own form of the posterior, its frame at the automatic start."""
+    """The package's own form of the posterior, its frame where the motion leads without noise."""
     form = Form(problem.spec, hierarchy_of(prior, problem))
-    frame = frame_at(problem.spec, problem.system, automatic_start(problem))
+    frame = frame_at(problem.spec, problem.system, resting(problem))
     return form, Posed(problem.system, frame, prior.precision(problem.labels, problem.surveyed))
