@@ -22,8 +22,9 @@ BUDGET = 3000  # kernels of a whole default run, all workers together; a new cap
 MOST_MAPS = 20_000  # memory maps of a process, which may have 65530: past them XLA fails without a word
 KERNELS = Path(__file__).parents[1] / ".pytest_cache" / "kernels"
 MOST_BYTES = 1_000_000_000  # of kernels kept there
-TOGETHER = {  # files that share a world run in one worker
+TOGETHER = {  # files that share worlds run in one worker, one after the other; these begin, the longest first
     "test_exact.py": "linear", "test_methods.py": "linear", "test_samplers.py": "linear", "test_svi.py": "linear",
+    "test_drift.py": "linear", "test_metamorphic.py": "bent", "test_bounds.py": "bent",
 }  # fmt: skip
 compiled = {"here": 0, "workers": 0}
 
@@ -58,6 +59,8 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.path.name == "README.md":
             item.add_marker("ci")
+    order = list(TOGETHER)
+    items.sort(key=lambda item: order.index(item.path.name) if item.path.name in TOGETHER else len(order))
 
 
 class ByWorld(LoadFileScheduling):

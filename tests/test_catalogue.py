@@ -192,7 +192,7 @@ def test_a_small_mixed_network_is_fitted_from_the_table_alone():
     run = simulate(network, {"car": CV, "mast": Static()}, np.arange(15.0), 5, tracks=tracks, missing=0.2)
     late = (run.table["sensor"].str.contains("-")) & (run.table["time"] % 2 == 1)
     problem = Problem(network, {"car": CV, "mast": Static()}, run.table[~late])
-    tree = fit(problem, EA(), predictive_draws=False)
+    tree = fit(problem, EA())
     check_tree(tree, problem)
     check_fixed_point(tree, problem)
     # radars of std 1 m and 1 degree at 60 m, five of them: about 1 m

@@ -5,7 +5,7 @@ compared are checked not to be near zero, and the mode is searched from the star
 """
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +15,14 @@ import pytest
 from bent import WORLDS, turn
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from worlds import resting
 
 import probcal
 from probcal import Bias, Channel, sensor
 from probcal.geometry import norm
 from probcal.priors import Precision
 from probcal.smoothing.information import laplace, moments
-from probcal.smoothing.mode import Point, find_mode
+from probcal.smoothing.mode import find_mode
 
 TOLERANCE = 1e-6  # in z, and in metres for tracks of sd near one metre
 AXES = "xyz"
@@ -44,36 +45,37 @@ class Estimate:
     evidence: float
 
 
+@partial(jax.jit, static_argnums=0)
+def solved(spec, system, start):
+    """Whether the mode was reached, its point, covariance and evidence, and the variance of every state."""
+    alone = Precision.single(jnp.ones(spec.biases))
+    mode = find_mode(spec, system, start, alone, 500, 1e-11)
+    found = laplace(spec, system, mode.point, alone)
+    variance = [
+        jnp.einsum("eni,ij,enj->en", moment.response, found.covariance, moment.response)
+        + jnp.diagonal(moment.states, axis1=1, axis2=2)
+        for moment in moments(spec, system, mode.point, found.covariance)
+    ]
+    return mode.converged, mode.point, found.covariance, found.evidence, variance
+
+
 def estimate(problem):
     """The joint mode and its Laplace moments, searched from the start prior: no grid, no truth, no seed."""
     with jax.enable_x64(True):
-        states = []
-        for part in problem.system.recursions:
-            x, track = np.zeros(part.drift.shape[1]), []
-            for F, drift in zip(np.asarray(part.F), np.asarray(part.drift), strict=True):
-                x = F @ x + drift
-                track.append(x)
-            states.append(jnp.asarray(np.array(track)))
-        M = len(problem.labels)
-        start = Point(tuple(states), tuple(jnp.zeros_like(x) for x in states), jnp.zeros(M), jnp.zeros(0))
-        mode = find_mode(problem.spec, problem.system, start, Precision.single(jnp.ones(M)), 500, 1e-11)
-        assert bool(mode.converged)
-        point = mode.point
-        found = laplace(problem.spec, problem.system, point, Precision.single(jnp.ones(M)))
-        spread = moments(problem.spec, problem.system, point, found.covariance)
-        value, sd = {}, {}
-        for x, moment, epochs in zip(point.states, spread, problem.epochs, strict=True):
-            variance = np.einsum("eni,ij,enj->en", moment.response, found.covariance, moment.response)
-            variance = variance + np.diagonal(moment.states, axis1=1, axis2=2)
-            for e, (time, target) in enumerate(zip(epochs.time, epochs.target, strict=True)):
-                for k, component in enumerate(epochs.components):
-                    value[str(target), float(time), component] = float(x[e, k])
-                    sd[str(target), float(time), component] = float(np.sqrt(variance[e, k]))
-        z, z_sd = np.asarray(point.z), np.sqrt(np.diag(found.covariance))
+        found = solved(problem.spec, problem.system, resting(problem))
+    converged, point, covariance, evidence, variances = jax.tree.map(np.asarray, found)
+    assert converged
+    value, sd = {}, {}
+    for x, variance, epochs in zip(point.states, variances, problem.epochs, strict=True):
+        for e, (time, target) in enumerate(zip(epochs.time, epochs.target, strict=True)):
+            for k, component in enumerate(epochs.components):
+                value[str(target), float(time), component] = float(x[e, k])
+                sd[str(target), float(time), component] = float(np.sqrt(variance[e, k]))
+    z, z_sd = point.z, np.sqrt(np.diag(covariance))
     assert np.abs(z).max() > 0.3, "nothing to compare: every bias is near zero"
     assert z_sd.min() > 1e3 * TOLERANCE, "a tolerance wider than the quantity"
     means, sds = (dict(zip(problem.labels, values, strict=True)) for values in (z, z_sd))
-    return Estimate(means, sds, value, sd, float(found.evidence))
+    return Estimate(means, sds, value, sd, float(evidence))
 
 
 @cache

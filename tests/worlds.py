@@ -150,7 +150,7 @@ def mixed():
 
 def drifting():
     """Drifting position, survey, clock, gain and shared bias, each with times of its own; one step fixed."""
-    walk, jumps = Drift((0.0, 1.0, 2.5), std=0.7), Drift((-5.0, 1.7), scale=1.3)
+    walk, jumps = Drift((0.0, 1.0, 2.5), std=0.7), Drift((-9.0, -5.0, 1.7), scale=1.3)
     nodes = [
         Node("a", (0.0, 1.0), scale={"position": Bias("m", 2.0, drift=walk), "clock": Bias("m", 1.0, drift=jumps)}),
         Node("b", (5.0, -2.0), survey={"position": Bias("m", 0.5, drift=Drift((0.0, 3.0), std=0.2)), "clock": 0.3}),
