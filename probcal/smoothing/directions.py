@@ -184,7 +184,8 @@ class _Naming:
         if kind == "gauge" and strength >= WEAK:
             words += "; only the start of the motion holds it"
         self.found.append(Direction(pattern.name, words, kind, strength, whole, others, remedy))
-        self.anchors.append(anchors)
+        own = (tuple(label for label in group if label in self.labels) for group in anchors)  # a survey is not fixed
+        self.anchors.append(tuple(group for group in own if group))
 
     def _moved_along(self, along: np.ndarray, largest: float) -> list[str]:
         """Components other than those of a pattern that a direction moves most, by name."""
