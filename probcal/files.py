@@ -44,14 +44,14 @@ def write_whole(path: str | PathLike[str], data: bytes | memoryview | str) -> Pa
                 os.replace(draft, path)
         finally:
             draft.unlink(missing_ok=True)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # a ValueError of a name that no file can have
         raise cannot_write(path, error) from None
     return path
 
 
-def cannot_write(path: Path, error: OSError) -> InputError:
+def cannot_write(path: Path, error: OSError | ValueError) -> InputError:
     """The sentence of a file or folder that cannot be written."""
-    return InputError(f"{path} cannot be written: {error.strerror or error}")
+    return InputError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}")
 
 
 def _draft(path: Path) -> tuple[Path, int]:
@@ -101,7 +101,7 @@ def make_folder(path: str | PathLike[str]) -> Path:
             pass
     except FileExistsError:
         raise InputError(f"{path} is a file; give the name of a folder") from None
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise cannot_write(path, error) from None
     return path
 
@@ -123,59 +123,73 @@ class Lock:
         except OSError as error:
             raise cannot_write(folder, error) from None
 
-    def release(self, *, remove: bool = False) -> None:
-        """Give the folder back; `remove` takes the lock file away too."""
-        if remove:
-            self.path.unlink(missing_ok=True)
+    def release(self) -> None:
+        """Give the folder back, without a trace."""
+        with suppress(OSError):  # while it is locked: whoever waits for it sees that it is gone
+            self.path.unlink()
         self._lock.release()
 
 
 class Outputs:
     """Files that a command writes into one folder.
 
-    A file is replaced only where this package wrote it and nobody changed it since: a hidden file notes the digest of
-    each.
+    A file is replaced only where this package wrote it and nobody changed it since: a hidden file beside them notes
+    the digest of each, and the run that it came from.
     """
 
-    def __init__(self, folder: Path):
-        self.folder = folder
+    def __init__(self, folder: Path, names: Sequence[str]):
+        self.folder, self.names = folder, tuple(names)
 
-    def check(self, names: Sequence[str]) -> None:
-        """Raise `InputError` where one of the files is there and is not this package's own."""
+    @property
+    def there(self) -> list[str]:
+        """Those of the files that are there."""
+        return [name for name in self.names if os.path.lexists(self.folder / name)]
+
+    def runs(self) -> set[str]:
+        """The runs that the files there came from; one that is being written has none."""
         noted = self._noted()
-        for name in names:
-            path = self.folder / name
-            if path.is_dir() or (os.path.lexists(path) and noted.get(name) not in ("", _digest(path))):
+        return {noted[name][1] for name in self.there if name in noted} - {""}
+
+    def check(self) -> None:
+        """Raise `InputError` where one of the files is there and is not this package's own."""
+        for name in self.there:
+            if not self._own(name):
                 raise InputError(
-                    f"{path} is no file that probcal wrote, or it was changed since; move it away, or give another"
-                    " --out"
+                    f"{self.folder / name} is no file that probcal wrote here, or it was changed since; move it away,"
+                    " or write elsewhere"
                 )
 
+    def begin(self) -> None:
+        """Note all files as about to be written: a kill leaves them to the next run."""
+        self.check()
+        self._note({name: ["", ""] for name in self.names})
+
     @contextmanager
-    def writing(self, names: Sequence[str]) -> Iterator[None]:
-        """Note these files as this package's own while they are written."""
-        self.check(names)
-        self._note(dict.fromkeys(names, ""))
+    def writing(self, run: str = "") -> Iterator[None]:
+        """Note the files as this package's own, written by a run."""
+        self.begin()
         yield
-        self._note({name: _digest(self.folder / name) for name in names})
+        self._note({name: [_digest(self.folder / name) or "", run] for name in self.there})
 
     def remove(self, name: str) -> None:
         """Remove a file that this package wrote; any other stays."""
-        path = self.folder / name
-        if path.is_file() and self._noted().get(name) in ("", _digest(path)):
-            path.unlink()
+        if self._own(name):
+            (self.folder / name).unlink(missing_ok=True)
 
-    def _noted(self) -> dict[str, str]:
+    def _own(self, name: str) -> bool:
+        path, noted = self.folder / name, self._noted()
+        return not path.is_dir() and name in noted and noted[name][0] in ("", _digest(path))
+
+    def _noted(self) -> dict[str, list[str]]:
         try:
             found = json.loads((self.folder / NOTE).read_text())
-        except (OSError, ValueError):
+            return {str(name): [str(digest), str(run)] for name, (digest, run) in found.items()}
+        except (OSError, ValueError, TypeError, AttributeError):
             return {}
-        return found if isinstance(found, dict) else {}
 
-    def _note(self, digests: dict[str, str | None]) -> None:
-        noted = self._noted() | digests
-        kept = {name: digest for name, digest in noted.items() if digest is not None}
-        write_whole(self.folder / NOTE, json.dumps(kept, indent=1))
+    def _note(self, changed: dict[str, list[str]]) -> None:
+        others = {name: entry for name, entry in self._noted().items() if name not in self.names}
+        write_whole(self.folder / NOTE, json.dumps(others | changed, indent=1))
 
 
 def _digest(path: Path) -> str | None:

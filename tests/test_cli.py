@@ -62,7 +62,7 @@ def test_the_main_job_writes_a_table_a_report_and_a_tree(fitted):
     assert out.splitlines()[0].split()[-2:] == ["status", "verdict"]
     assert "position RMSE before" in out, "the truth stands beside the table"
     assert "estimated gauge.range_std" in out
-    assert sorted(path.name for path in folder.iterdir()) == ["fit.nc", "report.html", "summary.csv"]
+    assert sorted(path.name for path in folder.glob("[!.]*")) == ["fit.nc", "report.html", "summary.csv"]
     summary = pd.read_csv(folder / "summary.csv")
     assert list(summary.columns[:8]) == ["bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma"]
     assert summary.columns[-2:].tolist() == ["verdict", "reason"]

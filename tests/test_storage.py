@@ -33,11 +33,13 @@ from probcal import (
     files,
     sensor,
 )
+from probcal.cli.outputs import FIT, results_of_a_run
 from probcal.files import LOCK, NOTE, Lock, Outputs, make_folder, write_whole
 from probcal.geometry import norm
 from probcal.inference import identity
 from probcal.inference.fit import _check_store
-from probcal.inference.storage import MANIFEST, Chunks, Records, Storage, remove_run, stored_run
+from probcal.inference.manifest import MANIFEST, remove_run, stored_run
+from probcal.inference.storage import Chunks, Records, Storage
 
 RUN = {"method": "NUTS()", "seed": "1", "model": "abc"}
 
@@ -118,26 +120,70 @@ def test_one_process_at_a_time_works_in_a_folder(tmp_path):
 
 
 def test_only_files_that_probcal_wrote_and_nobody_changed_are_replaced(tmp_path):
-    outputs, path = Outputs(tmp_path), tmp_path / "summary.csv"
+    outputs, path = Outputs(tmp_path, ["summary.csv", "fit.nc"]), tmp_path / "summary.csv"
     for text in ("first", "second"):
-        with outputs.writing(["summary.csv"]):
+        with outputs.writing("run 1"):
             path.write_text(text)
+    assert outputs.runs() == {"run 1"}
+    assert outputs.there == ["summary.csv"]
     path.write_text("with my remarks")
-    with pytest.raises(InputError, match=r"summary\.csv is no file that probcal wrote, or it was changed since; mov"):
-        outputs.check(["summary.csv"])
+    with pytest.raises(InputError, match=r"summary\.csv is no file that probcal wrote here, or it was changed since"):
+        outputs.check()
     outputs.remove("summary.csv")
     assert path.read_text() == "with my remarks"
     path.unlink()
-    with suppress(RuntimeError), outputs.writing(["summary.csv"]):  # killed on the way
+    with suppress(RuntimeError), outputs.writing("run 2"):  # killed on the way
         path.write_text("half")
         raise RuntimeError
-    outputs.check(["summary.csv"])
+    outputs.check()
+    assert outputs.runs() == set()
     outputs.remove("summary.csv")
     assert listing(tmp_path) == []
-    (tmp_path / "fit.nc").mkdir()
-    (tmp_path / NOTE).write_text("[garbage")
+    with outputs.writing("run 3"):
+        path.write_text("third")
+    (tmp_path / "fit.nc").write_text("mine")
     with pytest.raises(InputError, match=r"fit\.nc is no file that probcal wrote"):
-        outputs.check(["fit.nc"])
+        outputs.check()
+    (tmp_path / "fit.nc").unlink()
+    (tmp_path / NOTE).write_text("[garbage")
+    with pytest.raises(InputError, match=r"summary\.csv is no file that probcal wrote"):
+        outputs.check()
+
+
+def test_results_of_another_run_are_not_replaced(tmp_path):
+    def enter(**options):
+        with results_of_a_run(tmp_path, FIT, "draws", **{"resume": False, "overwrite": False} | options) as outputs:
+            return outputs
+
+    digest = Storage(None, "draws", RUN).digest
+    with enter().writing(digest):
+        (tmp_path / "fit.nc").write_text("a fit")
+    with pytest.raises(InputError, match=r"fit\.nc is the result of another run; give --resume \(resume=True\)"):
+        enter()
+    text = r"fit\.nc is the result of a run that is finished, or of another than the one to go on with; give --ov"
+    with pytest.raises(InputError, match=text):
+        enter(resume=True)
+    chunks(tmp_path / "draws", identity=RUN | {"seed": "2"})
+    with pytest.raises(InputError, match=text):
+        enter(resume=True)
+    chunks(tmp_path / "draws", overwrite=True)
+    enter(resume=True)
+    with pytest.raises(InputError, match="resume and overwrite exclude each other"):
+        enter(resume=True, overwrite=True)
+    enter(overwrite=True).begin()
+    (tmp_path / "fit.nc").unlink()
+    with pytest.raises(InputError, match=r"draws holds a sampler's run \(NUTS\(\)\) already; give --resume"):
+        enter()
+    with (
+        pytest.raises(InputError, match="--overwrite needs --out, the folder whose run it replaces"),
+        results_of_a_run(None, FIT, "draws", resume=False, overwrite=True),
+    ):
+        pass
+    lock = Lock(tmp_path)
+    with pytest.raises(InputError, match="another process is working there"):
+        enter(overwrite=True)
+    lock.release()
+    assert listing(tmp_path) == ["draws"]
 
 
 # runs

@@ -8,10 +8,11 @@ import pandas as pd
 import xarray as xr
 
 from probcal.analysis import bound_map, next_anchors, next_passes, next_sensors, observability
-from probcal.cli.files import can_plot, say_written, write_csv, writing
+from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem
 from probcal.cli.progress import line
+from probcal.files import Outputs
 from probcal.problem import Problem
 from probcal.smoothing.start import automatic_start
 from probcal.tree import save
@@ -24,7 +25,7 @@ STATUS = {
 }
 
 
-def run(model: Path, data: Path | None, fix: Sequence[str], out: Path | None) -> int:
+def run(model: Path, data: Path | None, fix: Sequence[str], outputs: Outputs | None) -> int:
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
     keep_kernels()
     _, problem = load_problem(model, data, fix)
@@ -37,8 +38,9 @@ def run(model: Path, data: Path | None, fix: Sequence[str], out: Path | None) ->
         plans = (passes, next_anchors(problem, point=start), next_sensors(problem, point=start))
     tree.attrs["model"] = model.stem
     _print_check(problem, tree, plans)
-    if out is not None:
-        _write(problem, tree, passes, out)
+    if outputs is not None:
+        with outputs.writing():
+            _write(problem, tree, passes, outputs.folder)
     return 1 if tree.attrs["status"] == "open" else 0
 
 
@@ -103,18 +105,17 @@ def check_table(tree: xr.DataTree) -> pd.DataFrame:
 
 def _write(problem: Problem, tree: xr.DataTree, passes: xr.Dataset, out: Path) -> None:
     files = [out / "check.nc", out / "check.csv"]
-    with writing(out):
-        save(tree, files[0])
-        columns = ["unit", "scale", "kind", "sd", "share", "verdict"]
-        frame = tree["bias"].to_dataset()[columns].to_dataframe().reset_index().rename(columns={"bias_label": "bias"})
-        write_csv(frame[["bias", *columns]], files[1])
-        if can_plot():
-            from probcal.plots import draw_check  # the plot packages are an extra
+    save(tree, files[0])
+    columns = ["unit", "scale", "kind", "sd", "share", "verdict"]
+    frame = tree["bias"].to_dataset()[columns].to_dataframe().reset_index().rename(columns={"bias_label": "bias"})
+    write_csv(frame[["bias", *columns]], files[1])
+    if can_plot():
+        from probcal.plots import draw_check  # the plot packages are an extra
 
-            files.append(out / "check.png")
-            low, high = passes["path"].values.min((0, 1)), passes["path"].values.max((0, 1))
-            height = float((low + high)[2] / 2) if len(low) == 3 else None
-            sides = [(a, b) for a, b in zip(low[:2], high[:2], strict=True)]
-            bound = bound_map(problem, sides, MAP_CELLS, biases="unknown", z=height)
-            draw_check(tree, passes, bound, files[-1])
+        files.append(out / "check.png")
+        low, high = passes["path"].values.min((0, 1)), passes["path"].values.max((0, 1))
+        height = float((low + high)[2] / 2) if len(low) == 3 else None
+        sides = [(a, b) for a, b in zip(low[:2], high[:2], strict=True)]
+        bound = bound_map(problem, sides, MAP_CELLS, biases="unknown", z=height)
+        draw_check(tree, passes, bound, files[-1])
     say_written(files)

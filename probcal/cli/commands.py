@@ -7,10 +7,9 @@ from typing import Annotated
 import typer
 
 from probcal.analysis.choices import check_count, check_names, split_pair
-from probcal.cli import files, options
+from probcal.cli import files, options, outputs
 from probcal.cli.names import METHODS, ORACLE, PRIORS
 from probcal.errors import FitError, InputError, nearest
-from probcal.files import make_folder
 
 app = typer.Typer(
     help="Bayesian calibration of sensor networks from targets of opportunity.",
@@ -21,7 +20,9 @@ Model = Annotated[Path, typer.Argument(help="model file that defines problem(dat
 Data = Annotated[Path | None, typer.Argument(help="table of rows (CSV); the model's own data if left out")]
 Method = Annotated[str, typer.Option(help=" | ".join(METHODS))]
 Fix = Annotated[list[str] | None, typer.Option(help="hold biases at 0, by label or pattern (repeat)")]
-Seed = Annotated[int, typer.Option(min=0, help="seed of everything random")]
+LARGEST_SEED = 2**62
+Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="seed of everything random")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace the run in --out: the files that probcal wrote")]
 
 
 def main() -> None:
@@ -56,6 +57,7 @@ def fit_command(
     draws: Annotated[int | None, typer.Option(min=1, help="draws of each chain after warm-up")] = None,
     warmup: Annotated[int | None, typer.Option(min=0, help="steps of each chain before its draws")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with the stopped run of a sampler in --out")] = False,
+    overwrite: Overwrite = False,
     save: Annotated[
         str, typer.Option(help="draws to keep in fit.nc besides those of the biases: states,predictive")
     ] = "",
@@ -72,18 +74,18 @@ def fit_command(
     sizes = options.chain_sizes(method, {"chains": chains, "draws": draws, "warmup": warmup})
     if resume and out is None:
         raise InputError("--resume needs --out, the folder of the run to go on with")
+    options.check_resumed(method, resume)
     kept = options.saved_names(save)
     options.check_files(model, data)
-    if out is not None:
-        make_folder(out)
-    from probcal.cli import fit
+    with outputs.results_of_a_run(out, outputs.FIT, "draws", resume=resume, overwrite=overwrite) as results:
+        from probcal.cli import fit
 
-    raise typer.Exit(
-        fit.run(
-            model, data, method=method, prior=prior, fix=fix or (), starts=starts, seed=seed, out=out, sizes=sizes,
-            resume=resume, kept=kept, assessed=assessed,
-        )
-    )  # fmt: skip
+        raise typer.Exit(
+            fit.run(
+                model, data, method=method, prior=prior, fix=fix or (), starts=starts, seed=seed, outputs=results,
+                sizes=sizes, resume=resume, overwrite=overwrite, kept=kept, assessed=assessed,
+            )
+        )  # fmt: skip
 
 
 @app.command(name="simulate")
@@ -95,10 +97,11 @@ def simulate_command(
     """Simulate a model's scenario: the table, and beside it its true tracks and biases."""
     options.check_files(model)
     path = Path(f"{model.stem}-{seed}.csv") if out is None else out
-    make_folder(path.parent)
+    names = (path.name, *(path.with_suffix(f".{what}.csv").name for what in ("tracks", "biases")))
+    results = outputs.replaceable(path.parent, names)
     from probcal.cli import simulate
 
-    raise typer.Exit(simulate.run(model, seed, path))
+    raise typer.Exit(simulate.run(model, seed, results))
 
 
 @app.command(name="check")
@@ -110,11 +113,10 @@ def check_command(
 ) -> None:
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
     options.check_files(model, data)
-    if out is not None:
-        make_folder(out)
+    results = None if out is None else outputs.replaceable(out, outputs.CHECK)
     from probcal.cli import check
 
-    raise typer.Exit(check.run(model, data, fix or (), out))
+    raise typer.Exit(check.run(model, data, fix or (), results))
 
 
 @app.command(name="track")
@@ -129,10 +131,10 @@ def track_command(
         raise InputError("track needs --calibration DIR, the folder of a fit")
     options.check_fit(calibration)
     options.check_files(model, data)
-    make_folder(out.parent)
+    results = outputs.replaceable(out.parent, (out.name,))
     from probcal.cli import track
 
-    raise typer.Exit(track.run(model, data, calibration, out))
+    raise typer.Exit(track.run(model, data, calibration, results))
 
 
 @app.command(name="study")
@@ -144,18 +146,27 @@ def study_command(
     ] = None,
     methods: Annotated[str, typer.Option(help=", ".join([*METHODS, ORACLE]))] = f"ml,em-ea,ea,{ORACLE}",
     runs: Annotated[int, typer.Option(min=1, help="simulated runs of every setting")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="number of the first run")] = 0,
-    out: Annotated[Path | None, typer.Option(help="folder for study.nc, study.csv, study.png")] = None,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="number of the first run")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="folder for study.nc, study.csv, study.png, and finished fits")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on with the finished fits in --out")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
     chosen = options.method_names(methods)
     grid = options.grid(setting or ())
     options.check_files(model)
-    if out is not None:
-        make_folder(out)
-    from probcal.cli import study
+    if resume and out is None:
+        raise InputError("study: --resume needs --out DIR, the folder of the fits to go on with")
+    with outputs.results_of_a_run(out, outputs.STUDY, "runs", resume=resume, overwrite=overwrite) as results:
+        from probcal.cli import study
 
-    raise typer.Exit(study.run(model, grid, chosen, runs, seed, out))
+        raise typer.Exit(
+            study.run(
+                model, grid, chosen, runs=runs, seed=seed, outputs=results, resume=resume, overwrite=overwrite
+            )
+        )  # fmt: skip
 
 
 @app.command(name="compare")
@@ -176,11 +187,10 @@ def compare_command(
     if name:
         check_names(name, len(folders))
     pairs = [split_pair(text.split(",")) for text in pair or ()]
-    if out is not None:
-        make_folder(out)
+    results = None if out is None else outputs.replaceable(out, outputs.COMPARE)
     from probcal.cli import compare
 
-    raise typer.Exit(compare.run(folders, name, pairs, out))
+    raise typer.Exit(compare.run(folders, name, pairs, results))
 
 
 @app.command(name="report")
@@ -191,9 +201,10 @@ def report_command(
     if not files.can_plot():
         raise InputError('the report needs plot packages: pip install "probcal[plot]"')
     options.check_fit(folder)
+    results = outputs.replaceable(folder if folder.is_dir() else folder.parent, ("report.html",))
     from probcal.cli import report
 
-    raise typer.Exit(report.run(folder))
+    raise typer.Exit(report.run(folder, results))
 
 
 @app.command(name="sbc")
@@ -216,6 +227,7 @@ def sbc_command(
     ] = False,
     out: Annotated[Path | None, typer.Option(help="folder for sbc.nc, sbc.csv, sbc.png, and finished runs")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with the finished runs in --out")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Check a method on a model by simulation: do its intervals hold the truth as often as they say?"""
     if method not in METHODS:
@@ -227,13 +239,12 @@ def sbc_command(
     if resume and out is None:
         raise InputError("sbc: --resume needs --out DIR, the folder of the runs to go on with")
     options.check_files(model, data)
-    if out is not None:
-        make_folder(out)
-    from probcal.cli import sbc
+    with outputs.results_of_a_run(out, outputs.SBC, "runs", resume=resume, overwrite=overwrite) as results:
+        from probcal.cli import sbc
 
-    raise typer.Exit(
-        sbc.run(
-            model, data, method=method, prior=prior, truths=truths, fix=fix or (), runs=runs, seed=seed,
-            posterior=posterior, full=full, out=out, resume=resume,
-        )
-    )  # fmt: skip
+        raise typer.Exit(
+            sbc.run(
+                model, data, method=method, prior=prior, truths=truths, fix=fix or (), runs=runs, seed=seed,
+                posterior=posterior, full=full, outputs=results, resume=resume, overwrite=overwrite,
+            )
+        )  # fmt: skip

@@ -10,14 +10,18 @@ import xarray as xr
 
 from probcal.analysis import compare
 from probcal.analysis.compare import chosen_pair, named
-from probcal.cli.files import can_plot, say_written, write_csv, writing
+from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.diagnostics import comparison_rows
 from probcal.errors import INVALID
+from probcal.files import Outputs
 from probcal.tree import load, save
 
 
 def run(
-    folders: Sequence[Path], names: Sequence[str] | None, pairs: Sequence[tuple[str, str]], out: Path | None
+    folders: Sequence[Path],
+    names: Sequence[str] | None,
+    pairs: Sequence[tuple[str, str]],
+    outputs: Outputs | None,
 ) -> int:
     """Put fits of the same data side by side: estimates, distances, gamma, coverage, prediction, evidence, cost."""
     fits = named([load(path) for path in folders], names)
@@ -27,8 +31,9 @@ def run(
     print(methods_text(comparison))
     for sentence in comparison["finding"].to_dataset()["sentence"].values:
         print(f"- {sentence}")
-    if out is not None:
-        _write(comparison, fits, drawn, out)
+    if outputs is not None:
+        with outputs.writing():
+            _write(comparison, fits, drawn, outputs.folder)
     return 1 if any(tree.attrs["status"] in INVALID for tree in fits.values()) else 0
 
 
@@ -83,12 +88,11 @@ def methods_text(comparison: xr.DataTree) -> str:
 
 def _write(comparison: xr.DataTree, fits: dict[str, xr.DataTree], pairs: list[tuple[str, str]], out: Path) -> None:
     files = [out / "compare.nc", out / "compare.csv"]
-    with writing(out):
-        save(comparison, files[0])
-        write_csv(comparison_rows(comparison), files[1])
-        if can_plot():
-            from probcal.plots import draw_compare  # the plot packages are an extra
+    save(comparison, files[0])
+    write_csv(comparison_rows(comparison), files[1])
+    if can_plot():
+        from probcal.plots import draw_compare  # the plot packages are an extra
 
-            files.append(out / "compare.png")
-            draw_compare(comparison, fits, files[-1], pairs)
+        files.append(out / "compare.png")
+        draw_compare(comparison, fits, files[-1], pairs)
     say_written(files)

@@ -1,26 +1,15 @@
-"""What the commands write: folders checked before any work, tables in one step, the report."""
+"""What the commands write: tables in one step, the report."""
 
 import importlib.util
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probcal.errors import InputError
 from probcal.files import write_whole
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
-
-
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """An `InputError` where a disk is full or a folder cannot be written."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def write_csv(frame: "pd.DataFrame", path: Path) -> None:
@@ -37,10 +26,7 @@ def report_of(tree: "xr.DataTree", out: Path) -> Path:
     """Write the report.html of a fit."""
     from probcal.report import write_report  # the plot packages are an extra
 
-    path = out / "report.html"
-    with writing(path):
-        write_report(tree, path)
-    return path
+    return write_report(tree, out / "report.html")
 
 
 def say_written(files: Sequence[Path]) -> None:

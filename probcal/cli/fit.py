@@ -9,12 +9,13 @@ from typing import Any
 
 import xarray as xr
 
-from probcal.cli.files import can_plot, report_of, say_written, write_csv, writing
+from probcal.cli.files import can_plot, report_of, say_written, write_csv
 from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import choose_prior, load_problem, load_truth
 from probcal.cli.progress import line
+from probcal.files import Outputs
 from probcal.inference import METHODS, fit
-from probcal.inference.storage import remove_run
+from probcal.inference.manifest import remove_run
 from probcal.tree import add_scores, outliers, save, summary
 
 FINDINGS = 8  # sentences of an assessment that are printed
@@ -22,7 +23,8 @@ FINDINGS = 8  # sentences of an assessment that are printed
 
 def run(
     model: Path, data: Path | None, *, method: str, prior: str | None, fix: Sequence[str], starts: int, seed: int,
-    out: Path | None, sizes: Mapping[str, int], resume: bool, kept: Sequence[str], assessed: bool,
+    outputs: Outputs | None, sizes: Mapping[str, int], resume: bool, overwrite: bool, kept: Sequence[str],
+    assessed: bool,
 ) -> int:  # fmt: skip
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
     keep_kernels()
@@ -33,15 +35,17 @@ def run(
     module, problem = load_problem(model, data, fix)
     chosen = choose_prior(module, value, implied, prior)
     truth = load_truth(module, model, data, problem)
+    store = None if outputs is None else outputs.folder / "draws"
+    if outputs is not None and overwrite:
+        outputs.begin()
     with line() as progress:
         tree = fit(
-            problem, value, prior=chosen, key=seed, starts=starts, progress=progress,
-            save=kept, store=out / "draws" if out is not None else None, resume=resume,
+            problem, value, prior=chosen, key=seed, starts=starts, progress=progress, save=kept, store=store,
+            resume=resume, overwrite=overwrite,
         )  # fmt: skip
-        if out is not None:
-            save(tree, out / "fit.nc")  # what is found is safe whatever comes
-            if "Interrupted" not in tree.attrs["message"]:
-                remove_run(out / "draws", tree.attrs["identity"])  # its draws are in fit.nc now
+        if outputs is not None:
+            outputs.begin()
+            save(tree, outputs.folder / "fit.nc")  # what is found is safe whatever comes
         if assessed:
             from probcal.analysis import assess
 
@@ -53,8 +57,11 @@ def run(
         add_scores(tree, scores(tree, truth), truth.biases)
     print(table_text(tree))
     _print_verdict(tree, time.perf_counter() - began)
-    if out is not None:
-        _write(tree, out)
+    if outputs is not None and store is not None:
+        with outputs.writing(tree.attrs["identity"]):
+            _write(tree, outputs)
+        if "Interrupted" not in tree.attrs["message"]:
+            remove_run(store, tree.attrs["identity"])  # its draws are in fit.nc now
     return 0 if tree.attrs["status"] == "converged" else 1
 
 
@@ -110,16 +117,16 @@ def _print_findings(tree: xr.DataTree) -> None:
         print(f"- and {len(sentences) - FINDINGS} more (group finding of fit.nc, report.html)")
 
 
-def _write(tree: xr.DataTree, out: Path) -> None:
-    with writing(out):
-        save(tree, out / "fit.nc")
+def _write(tree: xr.DataTree, outputs: Outputs) -> None:
+    out = outputs.folder
+    save(tree, out / "fit.nc")
     files = [out / "fit.nc", out / "summary.csv"]
     write_csv(summary(tree), files[1])
     if (tree["residual"]["weight"] < 1).any():  # some noise has heavy tails
         files.append(out / "outliers.csv")
         write_csv(outliers(tree), files[2])
     else:
-        (out / "outliers.csv").unlink(missing_ok=True)  # of an earlier fit
+        outputs.remove("outliers.csv")  # of an earlier fit
     if can_plot():
         files.append(report_of(tree, out))
     say_written(files)

@@ -9,6 +9,8 @@ from probcal.cli.names import METHODS, ORACLE, PRIORS, SAVE
 from probcal.errors import InputError, nearest
 from probcal.inference.settings import check_setting
 
+MOST_VALUES = 10_000  # of a setting of a study
+
 
 def check_files(model: Path, data: Path | None = None) -> None:
     """Raise `InputError` where the model file, or the table given with it, is not there."""
@@ -59,6 +61,12 @@ def saved_names(text: str) -> list[str]:
     return names
 
 
+def check_resumed(method: str, resume: bool) -> None:
+    """Raise `InputError` where a method that keeps no draws is to go on with a run."""
+    if resume and not METHODS[method].chains:
+        raise InputError(f'--resume: "{method}" keeps no draws to go on with; take collapsed, nuts or svi')
+
+
 def method_names(text: str) -> list[str]:
     """Names of the methods of a study, separated by commas."""
     names = [name.strip() for name in text.split(",")]
@@ -92,6 +100,8 @@ def parse_values(text: str) -> tuple[str, list[Any]]:
             if not all(map(math.isfinite, numbers)) or not step or (last - first) / step < 0:
                 raise InputError(f'--set "{text}": the step does not lead from {first} to {last}')
             count = math.floor((last - first) / step + 1e-9) + 1
+            if count > MOST_VALUES:
+                raise InputError(f'--set "{text}": these are {count} values; give {MOST_VALUES} at most')
             found += [round(first + k * step, 12) for k in range(count)]
         else:
             found.append(_number(part))

@@ -7,10 +7,11 @@ from pathlib import Path
 import pandas as pd
 import xarray as xr
 
-from probcal.cli.files import can_plot, say_written, write_csv, writing
+from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import choose_prior, load_problem
 from probcal.cli.progress import bar
+from probcal.files import Outputs
 from probcal.inference import METHODS, sbc
 from probcal.inference.coverage import coverage_table
 from probcal.inference.sbc import short
@@ -20,7 +21,8 @@ from probcal.tree import save
 
 def run(
     model: Path, data: Path | None, *, method: str, prior: str | None, truths: str | None, fix: Sequence[str],
-    runs: int, seed: int, posterior: bool, full: bool, out: Path | None, resume: bool,
+    runs: int, seed: int, posterior: bool, full: bool, outputs: Outputs | None,
+    resume: bool, overwrite: bool,
 ) -> int:  # fmt: skip
     """Check a method on a model by simulation: do its intervals hold the truth as often as they say?"""
     keep_kernels()
@@ -29,11 +31,13 @@ def run(
     module, problem = load_problem(model, data, fix)
     chosen = choose_prior(module, value, implied, prior)
     began = time.perf_counter()
+    if outputs is not None and overwrite:
+        outputs.begin()
     with bar() as advance:
         tree = sbc(
             problem, value, chosen, runs, simulate_from=PRIORS[truths] if truths is not None else None,
             around="data" if posterior else None, key=seed, progress=advance, resume=resume,
-            store=None if out is None else out / "runs",
+            overwrite=overwrite, store=None if outputs is None else outputs.folder / "runs",
         )  # fmt: skip
     tree.attrs["model"] = model.stem
     table = coverage_table(tree)
@@ -43,19 +47,19 @@ def run(
     print(tree.attrs["verdict"])
     if tree.attrs["message"]:
         print(tree.attrs["message"])
-    if out is not None:
-        _write(tree, table, out)
+    if outputs is not None:
+        with outputs.writing(tree.attrs["identity"]):
+            _write(tree, table, outputs.folder)
     return 0 if tree.attrs["status"] == "uniform" else 1
 
 
 def _write(tree: xr.DataTree, table: pd.DataFrame, out: Path) -> None:
     files = [out / "sbc.nc", out / "sbc.csv"]
-    with writing(out):
-        save(tree, files[0])
-        write_csv(table, files[1])
-        if can_plot():
-            from probcal.plots.sbc import draw_sbc  # the plot packages are an extra
+    save(tree, files[0])
+    write_csv(table, files[1])
+    if can_plot():
+        from probcal.plots.sbc import draw_sbc  # the plot packages are an extra
 
-            files.append(out / "sbc.png")
-            draw_sbc(tree, files[-1])
+        files.append(out / "sbc.png")
+        draw_sbc(tree, files[-1])
     say_written(files)

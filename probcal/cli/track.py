@@ -11,11 +11,12 @@ from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem, load_truth
 from probcal.diagnostics import scores
 from probcal.errors import INVALID, InputError
+from probcal.files import Outputs
 from probcal.inference import track
 from probcal.tree import load
 
 
-def run(model: Path, data: Path | None, calibration: Path, out: Path) -> int:
+def run(model: Path, data: Path | None, calibration: Path, outputs: Outputs) -> int:
     """Tracks of other data with a calibration applied: time, target, each state component with its sd."""
     known = load(calibration)
     if known.attrs.get("status") in INVALID:
@@ -27,7 +28,9 @@ def run(model: Path, data: Path | None, calibration: Path, out: Path) -> int:
     truth = load_truth(module, model, data, problem)
     tree = track(problem, known)
     frame = track_table(tree)
-    write_csv(frame, out)
+    out = outputs.folder / outputs.names[0]
+    with outputs.writing():
+        write_csv(frame, out)
     found = scores(tree, truth) if truth is not None else {}
     if "position_rmse_after" in found:
         print(f"position RMSE before {found['position_rmse_before']:.3f} m, after {found['position_rmse_after']:.3f} m")

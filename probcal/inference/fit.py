@@ -13,12 +13,13 @@ import numpy as np
 from probcal import tree
 from probcal.errors import INVALID, FitError, InputError
 from probcal.inference.identity import identity_of, points_digest, seed_text
+from probcal.inference.manifest import stored_run
 from probcal.inference.methods import EA, MAP, NUTS, check_problem, choose_prior
 from probcal.inference.posterior import log_normal, result
 from probcal.inference.run import Maximiser, Method, Outcome, Progress, maximise
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import sample
-from probcal.inference.storage import Storage, stored_run
+from probcal.inference.storage import Storage
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key

@@ -6,14 +6,10 @@ digest of its run and a checksum, and is written in one step. One process at a t
 removed but files that carry the names made here, in a folder with a manifest.
 """
 
-import hashlib
 import io
-import json
 import os
-import re
 import zipfile
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -22,12 +18,23 @@ from typing import Any, Self
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.files import Lock, cannot_write, clear_drafts, make_folder, write_whole
+from probcal.files import Lock, clear_drafts, make_folder, write_whole
+from probcal.inference.manifest import (
+    KINDS,
+    MANIFEST,
+    OLDER,
+    OVERWRITE,
+    REMEDY,
+    check_choice,
+    clear_parts,
+    described,
+    digest_of,
+    parts_of,
+    read_manifest,
+    remove_parts,
+    write_manifest,
+)
 
-MANIFEST = "probcal-run.json"
-KINDS = {"draws": "chunk", "sbc": "runs", "study": "fits"}  # what a folder holds: the name of its parts
-OLDER = re.compile(r"state\.npz|chunk-\d+\.nc|batch-\d+\.npz|runs\.json")  # of probcal before the manifest
-REMEDY = "give --resume (resume=True) to go on with it, --overwrite (overwrite=True) to replace it, or another folder"
 Arrays = Mapping[str, Any]
 
 
@@ -42,8 +49,7 @@ class Storage:
         self, path: str | PathLike[str] | None, kind: str, identity: Mapping[str, str], *, resume: bool = False,
         overwrite: bool = False,
     ):  # fmt: skip
-        if resume and overwrite:
-            raise InputError("resume and overwrite exclude each other: go on with the run that is there, or replace it")
+        check_choice(resume, overwrite)
         self.path = None if path is None else Path(path)
         self.kind, self.identity = kind, dict(identity)
         self.digest = digest_of(kind, identity)
@@ -70,7 +76,7 @@ class Storage:
     def _open(self, path: Path, resume: bool, overwrite: bool) -> None:
         clear_drafts(path)
         there = (path / MANIFEST).exists()
-        files = _parts_of(path)
+        files = parts_of(path)
         if not there and (files or any(OLDER.fullmatch(name) for name in os.listdir(path))):
             raise InputError(
                 f"{path} holds parts of a run without its manifest {MANIFEST} (it was lost, or written by an older"
@@ -78,24 +84,23 @@ class Storage:
             )
         if there and files and not overwrite:
             if not resume:
-                raise InputError(f"{path} holds {_described(path)} already; {REMEDY}")
+                raise InputError(f"{path} holds {described(path)} already; {REMEDY}")
             self._take_up(path)
             return
-        _clear(path)
-        manifest = {"kind": self.kind, "digest": self.digest, "identity": self.identity}
-        write_whole(path / MANIFEST, json.dumps(manifest, indent=1))
+        clear_parts(path)
+        write_manifest(path, self.kind, self.identity)
 
     def _take_up(self, path: Path) -> None:
-        kind, other = _manifest(path)
+        kind, other = read_manifest(path)
         if kind != self.kind:
-            raise InputError(f"{path} holds a run of another kind ({kind}); give another folder, or {_OVERWRITE}")
+            raise InputError(f"{path} holds a run of another kind ({kind}); give another folder, or {OVERWRITE}")
         for name in sorted(self.identity.keys() | other.keys(), key=[*self.identity, *other].index):
             if self.identity.get(name) != other.get(name):
                 raise InputError(
                     f"{path}: the {name} has changed since the run there began; resume it as it began, give another"
-                    f" folder, or {_OVERWRITE}"
+                    f" folder, or {OVERWRITE}"
                 )
-        self._numbers = set(_parts_of(path))
+        self._numbers = set(parts_of(path))
 
     @property
     def numbers(self) -> list[int]:
@@ -107,7 +112,7 @@ class Storage:
         if self.path is None:
             return self._parts[number]
         file = self._file(number)
-        remedy = f"delete it{self._later} and --resume (resume=True) makes it anew, or {_OVERWRITE}"
+        remedy = f"delete it{self._later} and --resume (resume=True) makes it anew, or {OVERWRITE}"
         if not file.is_file():
             raise InputError(f"{file} is missing: {remedy}")
         try:
@@ -151,87 +156,10 @@ class Storage:
         if self.path is None or self._lock is None:
             return
         if not self._numbers:
-            _remove(self.path, self._lock, folder=self._made)
+            remove_parts(self.path, self._lock, folder=self._made)
         else:
             self._lock.release()
         self._lock = None
-
-
-_OVERWRITE = "give --overwrite (overwrite=True) to begin anew"
-
-
-def digest_of(kind: str, identity: Mapping[str, str]) -> str:
-    """Digest of what a run is."""
-    return hashlib.sha256(json.dumps([kind, dict(identity)], sort_keys=True).encode()).hexdigest()
-
-
-def _parts_of(path: Path) -> dict[int, Path]:
-    """Files that have the name of a part, by number."""
-    pattern = re.compile(rf"({'|'.join(KINDS.values())})-(\d{{6,}})\.npz")
-    matches = ((pattern.fullmatch(name), name) for name in os.listdir(path))
-    return {int(match[2]): path / name for match, name in matches if match}
-
-
-def _manifest(path: Path) -> tuple[str, dict[str, str]]:
-    """Kind and identity of the run in a folder."""
-    file = path / MANIFEST
-    try:
-        found = json.loads(file.read_text())
-        kind, identity = str(found["kind"]), dict(found["identity"])
-        if found["digest"] != digest_of(kind, identity):
-            raise ValueError("wrong digest")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(f"{file} is damaged; give another folder, or {_OVERWRITE}") from None
-    return kind, identity
-
-
-def _described(path: Path) -> str:
-    """What runs in a folder, for a sentence."""
-    kind, identity = _manifest(path)
-    words = {"draws": "a sampler's run", "sbc": "the runs of an sbc", "study": "the fits of a study"}.get(kind, kind)
-    return f"{words} ({identity['method']})" if "method" in identity else words
-
-
-def _clear(path: Path) -> None:
-    """Remove all parts, the last first: what a kill leaves is a run that stopped earlier."""
-    try:
-        for _, file in sorted(_parts_of(path).items(), reverse=True):
-            file.unlink(missing_ok=True)
-    except OSError as error:
-        raise cannot_write(path, error) from None
-
-
-def _remove(path: Path, lock: Lock, *, folder: bool) -> None:
-    """Remove parts, manifest and lock, and the folder too where nothing else is in it."""
-    try:
-        _clear(path)
-        (path / MANIFEST).unlink(missing_ok=True)
-        lock.release(remove=True)
-    except OSError as error:
-        raise cannot_write(path, error) from None
-    if folder:
-        with suppress(OSError):  # it holds something else
-            path.rmdir()
-
-
-def remove_run(path: str | PathLike[str], digest: str) -> None:
-    """Remove the parts of the run with this digest; any other run and any other file stay."""
-    path = Path(path)
-    if not (path / MANIFEST).exists():
-        return
-    lock = Lock(path)
-    if digest_of(*_manifest(path)) == digest:
-        _remove(path, lock, folder=True)
-    else:
-        lock.release()
-
-
-def stored_run(path: str | PathLike[str]) -> str:
-    """What the run in a folder is, in a few words; empty where there is none."""
-    path = Path(path)
-    if not path.is_dir() or not (path / MANIFEST).exists() or not _parts_of(path):
-        return ""
-    return _described(path)
 
 
 class Chunks:

@@ -1,6 +1,9 @@
 """What all pictures share: colours, limits, plain texts, axes without pyplot."""
 
+import io
 from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,6 +11,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+
+from probcal.files import write_whole
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#5d3a9b")
 BEFORE = "#a6a6a6"
@@ -23,6 +28,13 @@ LINEAR = 12.0  # scales up to which the axis of the forest stays linear
 def new_axes(ax: Axes | None, width: float, height: float) -> Axes:
     """The axes given, or new ones of a size in inches."""
     return Figure(figsize=(width, height), layout="compressed").subplots() if ax is None else ax
+
+
+def write_figure(figure: Figure, path: str | PathLike[str], dpi: float) -> None:
+    """Write a figure in one step, in the format that the name ends with."""
+    sheet = io.BytesIO()
+    figure.savefig(sheet, format=Path(path).suffix.removeprefix(".") or "png", dpi=dpi)
+    write_whole(path, sheet.getvalue())
 
 
 def colour(k: int) -> str:

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from probcal.analysis.compare import Fits, chosen_pair, interchangeable, named, plugged_in
 from probcal.errors import INVALID
-from probcal.plots.base import LINEAR, ROWS, colour, ellipse, new_axes, plain, probability
+from probcal.plots.base import LINEAR, ROWS, colour, ellipse, new_axes, plain, probability, write_figure
 
 SCATTER = 2_000  # draws of one fit in the picture of a pair
 PAIRS = 2  # of interchangeable biases that are drawn where none is asked for
@@ -150,4 +150,4 @@ def draw_compare(
     plot_gammas(comparison, axes[0])
     for ax, pair in zip(axes[1:], pairs, strict=True):
         plot_pair(known, pair, ax=ax)
-    figure.savefig(path, dpi=110)
+    write_figure(figure, path, 110)

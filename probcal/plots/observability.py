@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from probcal.labels import label_parts
-from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, new_axes, plain
+from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, new_axes, plain, write_figure
 from probcal.plots.bounds import plot_bound_map
 
 REACH = 0.12  # longest arrow of a direction, in widths of the map
@@ -89,7 +89,7 @@ def draw_check(tree: xr.DataTree, passes: xr.Dataset, bound: xr.Dataset, path: s
     left, right = parts[1].subplots(1, 2)
     plot_passes(tree, passes, left)
     plot_bound_map(bound, right)
-    figure.savefig(path, dpi=100)
+    write_figure(figure, path, 100)
 
 
 def _draw_scene(ax: Axes, tree: xr.DataTree) -> list[Line2D]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure, FigureBase
 
 from probcal.errors import InputError, nearest
 from probcal.inference.uniformity import band
-from probcal.plots.base import BEFORE, colour, new_axes, plain
+from probcal.plots.base import BEFORE, colour, new_axes, plain, write_figure
 
 COLUMNS = 5
 WIDTH, HEIGHT = 13.0, 2.3  # of the picture and of a row of panels, inches
@@ -110,4 +110,4 @@ def draw_sbc(tree: xr.DataTree, path: str | PathLike[str]) -> None:
     for ax in lower.axes[::2]:
         ax.remove()
     figure.suptitle(plain(f"{tree.attrs['method']}, {tree.attrs['prior']}: {tree.attrs['status']}", 80))
-    figure.savefig(path, dpi=120)
+    write_figure(figure, path, 120)

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from probcal.errors import InputError
-from probcal.plots.base import colour, plain
+from probcal.plots.base import colour, plain, write_figure
 
 
 def plot_study(study: xr.Dataset, variable: str = "bias_rmse", axes: Sequence[Axes] | None = None) -> list[Axes]:
@@ -49,4 +49,4 @@ def draw_study(study: xr.Dataset, path: str | PathLike[str]) -> None:
     """Write the picture of a study to a file."""
     figure = plot_study(study)[0].get_figure(root=True)
     assert isinstance(figure, Figure)
-    figure.savefig(path, dpi=150)
+    write_figure(figure, path, 150)

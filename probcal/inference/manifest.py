@@ -1,0 +1,110 @@
+"""What run a folder holds: its manifest, the names of its parts, and their removal; nothing heavy is loaded."""
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from os import PathLike
+from pathlib import Path
+
+from probcal.errors import InputError
+from probcal.files import Lock, cannot_write, write_whole
+
+MANIFEST = "probcal-run.json"
+KINDS = {"draws": "chunk", "sbc": "runs", "study": "fits"}  # what a folder holds: the name of its parts
+OLDER = re.compile(r"state\.npz|chunk-\d+\.nc|batch-\d+\.npz|runs\.json")  # of probcal before the manifest
+OVERWRITE = "give --overwrite (overwrite=True) to begin anew"
+REMEDY = "give --resume (resume=True) to go on with it, --overwrite (overwrite=True) to replace it, or another folder"
+
+
+def check_choice(resume: bool, overwrite: bool) -> None:
+    """Raise `InputError` where both are asked for."""
+    if resume and overwrite:
+        raise InputError("resume and overwrite exclude each other: go on with the run that is there, or replace it")
+
+
+def write_manifest(path: Path, kind: str, identity: Mapping[str, str]) -> None:
+    """Say what run the parts in a folder belong to."""
+    content = {"kind": kind, "digest": digest_of(kind, identity), "identity": dict(identity)}
+    write_whole(path / MANIFEST, json.dumps(content, indent=1))
+
+
+def digest_of(kind: str, identity: Mapping[str, str]) -> str:
+    """Digest of what a run is."""
+    return hashlib.sha256(json.dumps([kind, dict(identity)], sort_keys=True).encode()).hexdigest()
+
+
+def parts_of(path: Path) -> dict[int, Path]:
+    """Files that have the name of a part, by number."""
+    pattern = re.compile(rf"({'|'.join(KINDS.values())})-(\d{{6,}})\.npz")
+    matches = ((pattern.fullmatch(name), name) for name in os.listdir(path))
+    return {int(match[2]): path / name for match, name in matches if match}
+
+
+def read_manifest(path: Path) -> tuple[str, dict[str, str]]:
+    """Kind and identity of the run in a folder."""
+    file = path / MANIFEST
+    try:
+        found = json.loads(file.read_text())
+        kind, identity = str(found["kind"]), dict(found["identity"])
+        if found["digest"] != digest_of(kind, identity):
+            raise ValueError("wrong digest")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{file} is damaged; give another folder, or {OVERWRITE}") from None
+    return kind, identity
+
+
+def described(path: Path) -> str:
+    """What runs in a folder, for a sentence."""
+    kind, identity = read_manifest(path)
+    words = {"draws": "a sampler's run", "sbc": "the runs of an sbc", "study": "the fits of a study"}.get(kind, kind)
+    return f"{words} ({identity['method']})" if "method" in identity else words
+
+
+def clear_parts(path: Path) -> None:
+    """Remove all parts, the last first: what a kill leaves is a run that stopped earlier."""
+    try:
+        for _, file in sorted(parts_of(path).items(), reverse=True):
+            file.unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+def remove_parts(path: Path, lock: Lock, *, folder: bool) -> None:
+    """Remove parts, manifest and lock, and the folder too where nothing else is in it."""
+    try:
+        clear_parts(path)
+        (path / MANIFEST).unlink(missing_ok=True)
+        lock.release()
+    except OSError as error:
+        raise cannot_write(path, error) from None
+    if folder:
+        with suppress(OSError):  # it holds something else
+            path.rmdir()
+
+
+def remove_run(path: str | PathLike[str], digest: str) -> None:
+    """Remove the parts of the run with this digest; any other run and any other file stay."""
+    path = Path(path)
+    if not (path / MANIFEST).exists():
+        return
+    lock = Lock(path)
+    if digest_of(*read_manifest(path)) == digest:
+        remove_parts(path, lock, folder=True)
+    else:
+        lock.release()
+
+
+def stored_digest(path: str | PathLike[str]) -> str:
+    """Digest of the run in a folder; empty where there is none."""
+    return digest_of(*read_manifest(Path(path))) if stored_run(path) else ""
+
+
+def stored_run(path: str | PathLike[str]) -> str:
+    """What the run in a folder is, in a few words; empty where there is none."""
+    path = Path(path)
+    if not path.is_dir() or not (path / MANIFEST).exists() or not parts_of(path):
+        return ""
+    return described(path)
