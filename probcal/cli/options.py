@@ -101,7 +101,7 @@ def parse_values(text: str) -> tuple[str, list[Any]]:
                 raise InputError(f'--set "{text}": the step does not lead from {first} to {last}')
             count = math.floor((last - first) / step + 1e-9) + 1
             if count > MOST_VALUES:
-                raise InputError(f'--set "{text}": these are {count} values; give {MOST_VALUES} at most')
+                raise InputError(f'--set "{text}": these are {count} values; give {MOST_VALUES} of them at most')
             found += [round(first + k * step, 12) for k in range(count)]
         else:
             found.append(_number(part))
