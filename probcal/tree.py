@@ -28,6 +28,7 @@ else:
 
 INTERVAL = 0.89  # probability of lower to upper
 SHARP = 256  # steps to which the spread of a log-likelihood over the draws is rounded, so that its file is small
+AT_ONCE = 10_000  # data that are rounded at once
 RESULTS_VERSION = 1  # of the groups and variables that a fit writes; a reader refuses any other
 MORE = ("r_hat", "ess", "ess_tail", "inclusion", "included", "contraction")  # columns of samplers
 SUMMARY = ("bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma")
@@ -133,9 +134,8 @@ def datum_of(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
 
 def gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """Measured data of all blocks, last axis datum, from arrays (..., N, C)."""
-    return np.concatenate(
-        [np.asarray(p)[..., rows, channels] for p, (rows, channels) in zip(parts, picks, strict=True)], -1
-    )
+    found = [np.asarray(p)[..., rows, channels] for p, (rows, channels) in zip(parts, picks, strict=True)]
+    return np.concatenate(found, -1) if len(found) > 1 else found[0]
 
 
 def build(problem: Problem, result: Result) -> xr.DataTree:
@@ -220,15 +220,18 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
 
 
 def _rounded(log_likelihood: np.ndarray) -> np.ndarray:
-    """Values (chain, draw, datum) rounded to 1/256 of their spread over the draws of a datum.
+    """Values (chain, draw, datum), rounded in place to 1/256 of their spread over the draws of a datum.
 
     What is rounded away is noise, and the rest compresses to a byte and a half a value.
     """
-    with np.errstate(invalid="ignore"):  # a row of probability zero
-        spread = log_likelihood.std((0, 1))
-    sure = np.isfinite(spread) & (spread > 1e-9)
-    step = np.exp2(np.floor(np.log2(np.where(sure, spread, 1.0) / SHARP)))
-    return np.where(sure, np.rint(log_likelihood / step) * step, log_likelihood)
+    for start in range(0, log_likelihood.shape[2], AT_ONCE):
+        part = log_likelihood[:, :, start : start + AT_ONCE]
+        with np.errstate(invalid="ignore"):  # a row of probability zero
+            spread = part.std((0, 1))
+        sure = np.isfinite(spread) & (spread > 1e-9)
+        step = np.exp2(np.floor(np.log2(spread[sure] / SHARP)))
+        part[:, :, sure] = np.rint(part[:, :, sure] / step) * step
+    return log_likelihood
 
 
 def direction_group(labels: Sequence[str], directions: Sequence[Any]) -> xr.Dataset:

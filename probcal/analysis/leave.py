@@ -7,9 +7,8 @@ predictive density of what was left out is the difference of two Laplace evidenc
 
 from __future__ import annotations
 
-import warnings
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,16 +20,11 @@ from scipy import special
 from probcal import linalg
 from probcal.analysis.fitted import Fitted, eliminate_rows, linearise
 from probcal.inference.pose import TAILED
-from probcal.lazy import Later
+from probcal.inference.psis import smoothed
 from probcal.priors import Precision
 from probcal.problem import Spec, System
 from probcal.rows import Linearised, standardised
 from probcal.smoothing.mode import Eliminated, Point, cost, find_mode, follow
-
-if TYPE_CHECKING:
-    from arviz_stats.base import array_stats
-else:
-    array_stats = Later("arviz_stats.base.array_stats")
 
 STEPS = 20  # Gauss-Newton steps of a refit
 TOLERANCE = 1e-5  # nats
@@ -195,16 +189,13 @@ class Pointwise(NamedTuple):
 
 
 def psis(tree: xr.DataTree, group: np.ndarray, count: int) -> Pointwise:
-    """PSIS-LOO by ArviZ of the log-likelihood in a tree, summed over groups (data,); `az.loo` where each is a datum."""
+    """PSIS-LOO of the log-likelihood in a tree, summed over groups (data,); `az.loo` where each is a datum."""
     values = tree["log_likelihood"].to_dataset()["y"].values
     values = values.reshape(-1, values.shape[2])
     order = np.argsort(group, kind="stable")
     summed = np.add.reduceat(values[:, order], np.searchsorted(group[order], np.arange(count)), axis=1).T
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a large Pareto k is reported, not warned about
-        weights, pareto_k = array_stats.psislw(summed)
-    k = np.where(np.isfinite(pareto_k), pareto_k, np.inf)  # tails too heavy to be fitted
-    return Pointwise(special.logsumexp(weights + summed, axis=1), k)
+    weights, pareto_k = smoothed(-summed)
+    return Pointwise(special.logsumexp(weights + summed, axis=1), pareto_k)
 
 
 def tailed(tree: xr.DataTree) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,18 +13,13 @@ from probcal.errors import InputError
 from probcal.inference.methods import check_problem
 from probcal.inference.pose import PILOTS, Pilot, pareto_khat, pilot, pose, weights
 from probcal.inference.posed import Form, Posed
-from probcal.lazy import Later
+from probcal.inference.psis import smoothed
 from probcal.priors import Flat, Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start
 from probcal.types import float64
-
-if TYPE_CHECKING:
-    from arviz_stats.base import array_stats
-else:
-    array_stats = Later("arviz_stats.base.array_stats")
 
 RUNGS, BEND = 24, 4.0  # temperatures, and the power by which they crowd towards the prior
 
@@ -55,7 +50,7 @@ def log_evidence(problem: Problem, prior: Prior | None = None, *, key: Key = 0, 
     logs = np.asarray(weights(form, posed, found.theta, keys[1]))
     khat = pareto_khat(logs)
     if khat > 0:
-        smooth = np.asarray(array_stats.psislw(-logs)[0])
+        smooth = smoothed(logs[None])[0][0]
         logs = smooth + (logs - smooth)[logs.argmin()]  # smoothing leaves the small weights alone
     relative = np.exp(logs - logs.max())
     correction = float(logs.max() + np.log(relative.mean()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,16 +12,11 @@ import numpy as np
 from probcal.inference.collapsed import sweep
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.posed import Form, Posed, activity, conditional
-from probcal.lazy import Later
+from probcal.inference.psis import smoothed
 from probcal.priors import Prior
 from probcal.problem import Problem, Spec, System
 from probcal.smoothing.frame import Frame, frame_at, log_weight, place, refined
 from probcal.smoothing.mode import Point, track
-
-if TYPE_CHECKING:
-    from arviz_stats.base import array_stats
-else:
-    array_stats = Later("arviz_stats.base.array_stats")
 
 PILOTS = 4  # chains of the pilot
 BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, sweeps between two
@@ -106,8 +101,7 @@ def pareto_khat(log_weights: np.ndarray) -> float:
         return np.inf
     if np.ptp(log_weights) < 1e-6:
         return 0.0
-    found = float(array_stats.psislw(-log_weights)[1])  # it takes log-likelihoods, inverse weights
-    return found if np.isfinite(found) else np.inf  # one draw has all the weight: no tail is left to fit
+    return float(smoothed(log_weights[None])[1][0])
 
 
 def acceptance(log_weights: np.ndarray) -> float:

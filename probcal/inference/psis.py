@@ -1,0 +1,67 @@
+"""Pareto smoothed importance sampling of many rows at once (Vehtari, Simpson, Gelman, Yao and Gabry 2024).
+
+What `arviz_stats` does row after row, a millisecond each, is done for all rows in arrays: the same numbers.
+"""
+
+import numpy as np
+from scipy import special
+
+ROWS = 2000  # smoothed at once
+PRIOR_DRAWS, PRIOR_K = 10, 0.5  # weight and place of the weak prior of the shape
+
+
+def smoothed(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normalised smoothed log weights (rows, draws) and Pareto k (rows,) of log importance ratios (rows, draws).
+
+    k is infinite where the tail is no generalised Pareto distribution; rows whose ratios are all the same have k 0.
+    """
+    parts = [_smoothed(log_ratios[start : start + ROWS]) for start in range(0, len(log_ratios), ROWS)]
+    return np.concatenate([weights for weights, _ in parts]), np.concatenate([k for _, k in parts])
+
+
+def _smoothed(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    rows, draws = log_ratios.shape
+    values = log_ratios - log_ratios.max(1, keepdims=True)
+    tail = min(int(3 * draws**0.5 if draws > 225 else draws / 5), draws - 1)
+    if tail < 5:
+        return values - special.logsumexp(values, axis=1, keepdims=True), np.full(rows, np.inf)
+    order = np.argsort(values, axis=1)[:, draws - tail - 1 :]
+    last = np.take_along_axis(values, order, 1)
+    cutoff, ordered = np.exp(last[:, :1]), np.exp(last[:, 1:])
+    k, sigma = _pareto_fit(ordered - cutoff)
+    same = last[:, -1] - last[:, 1] < np.finfo(float).tiny
+    good = np.isfinite(k) & (sigma > 0) & ~same
+    probability = (np.arange(0.5, tail) / tail)[None]
+    shape, scale = np.where(good, k, 1.0)[:, None], np.where(good, sigma, 1.0)[:, None]
+    flat = np.where(shape == 0, 1.0, shape)
+    curve = np.where(shape == 0, -np.log1p(-probability), np.expm1(-flat * np.log1p(-probability)) / flat)
+    fitted = np.minimum(np.log(cutoff + scale * curve), last[:, -1:])
+    np.put_along_axis(values, order[:, 1:], np.where(good[:, None], fitted, last[:, 1:]), 1)
+    values -= special.logsumexp(values, axis=1, keepdims=True)
+    return values, np.where(same, 0.0, np.where(np.isfinite(k), k, np.inf))
+
+
+def _pareto_fit(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shape and scale (rows,) of a generalised Pareto distribution from sorted excesses (rows, tail).
+
+    The empirical Bayes estimate of Zhang and Stephens (2009); NaN where the first quartile is the minimum.
+    """
+    rows, tail = excess.shape
+    count = 30 + int(tail**0.5)
+    quartile = excess[:, int((tail / 4 + 0.5) - 1)]
+    told = quartile > excess[:, 0]
+    grid = 1 - np.sqrt(count / (np.arange(1, count + 1) - 0.5))
+    k, sigma = np.full(rows, np.nan), np.full(rows, np.nan)
+    x = excess[told]
+    with np.errstate(all="ignore"):  # what is not finite is told by its k
+        b = grid[None] / (3 * quartile[told][:, None]) + 1 / x[:, -1:]
+        means = np.stack([np.log1p(-b[:, j, None] * x).mean(1) for j in range(count)], 1)
+        score = tail * (np.log(-b / means) - means - 1)
+        weights = np.exp(score - special.logsumexp(score, axis=1, keepdims=True))
+        weights = np.where(weights >= 10 * np.finfo(float).eps, weights, 0.0)
+        weights /= weights.sum(1, keepdims=True)
+        place = (b * weights).sum(1)
+        shape = np.log1p(-place[:, None] * x).mean(1)
+        sigma[told] = -shape / place
+        k[told] = (tail * shape + PRIOR_DRAWS * PRIOR_K) / (tail + PRIOR_DRAWS)
+    return k, sigma
