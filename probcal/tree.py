@@ -29,6 +29,7 @@ else:
 INTERVAL = 0.89  # probability of lower to upper
 SHARP = 256  # steps to which the spread of a log-likelihood over the draws is rounded, so that its file is small
 AT_ONCE = 10_000  # data that are rounded at once
+SMALL = 1024  # bytes up to which an array of a file has no chunk of its own
 RESULTS_VERSION = 1  # of the groups and variables that a fit writes; a reader refuses any other
 MORE = ("r_hat", "ess", "ess_tail", "inclusion", "included", "contraction")  # columns of samplers
 SUMMARY = ("bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma")
@@ -396,7 +397,10 @@ def save(tree: xr.DataTree, path: str | PathLike[str]) -> Path:
 
 
 def _encoding(tree: xr.DataTree) -> dict[str, Any]:
-    """Compression and a checksum for every array of every group; texts as characters, which alone can have them."""
+    """Compression and a checksum for every array of every group; texts as characters, which alone can have them.
+
+    Small ones stay plain, an HDF5 chunk would cost more than it holds: the digest of the whole file covers them.
+    """
     packed = {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
     found: dict[str, Any] = {}
     for node in tree.subtree:
@@ -404,7 +408,7 @@ def _encoding(tree: xr.DataTree) -> dict[str, Any]:
         found[node.path] = {
             name: packed | ({"dtype": "S1"} if _is_text(variable) else {})
             for name, variable in variables
-            if variable.ndim and variable.size
+            if variable.nbytes > SMALL
         }
     return found
 

@@ -2,7 +2,8 @@
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from probcal.inference.manifest import remove_run
 from probcal.tree import add_scores, outliers, save, summary
 
 FINDINGS = 8  # sentences of an assessment that are printed
+LONG = 10.0  # s of a fit that is written before it is assessed
 
 
 def run(
@@ -43,13 +45,11 @@ def run(
             problem, value, prior=chosen, key=seed, starts=starts, progress=progress, save=kept, store=store,
             resume=resume, overwrite=overwrite,
         )  # fmt: skip
-        if outputs is not None:
-            outputs.begin()
-            save(tree, outputs.folder / "fit.nc")  # what is found is safe whatever comes
         if assessed:
             from probcal.analysis import assess
 
-            tree = assess(problem, tree, truth=truth, key=seed)
+            with _safe(tree, outputs, time.perf_counter() - began > LONG):
+                tree = assess(problem, tree, truth=truth, key=seed)
     tree.attrs["model"] = model.stem
     if truth is not None:
         from probcal.diagnostics import scores
@@ -63,6 +63,26 @@ def run(
         if "Interrupted" not in tree.attrs["message"]:
             remove_run(store, tree.attrs["identity"])  # its draws are in fit.nc now
     return 0 if tree.attrs["status"] == "converged" else 1
+
+
+@contextmanager
+def _safe(tree: xr.DataTree, outputs: Outputs | None, long: bool) -> Iterator[None]:
+    """What is found is safe whatever comes: written first where it took long, else where its assessment fails."""
+    written = False
+
+    def write() -> None:
+        if outputs is not None and not written:
+            outputs.begin()
+            save(tree, outputs.folder / "fit.nc")
+
+    if long:
+        write()
+        written = True
+    try:
+        yield
+    except BaseException:
+        write()
+        raise
 
 
 def table_text(tree: xr.DataTree) -> str:
