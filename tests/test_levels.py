@@ -52,6 +52,9 @@ def test_unknown_noise_and_process_noise_are_estimated_along():
     assert abs(level["gauge.range_std"] / 2.0 - 1) < 0.15
     # the process noise rests on far fewer effective draws (about 60): a factor 1.6 is more than 4 sd
     assert 1 / 1.6 < level["motion.velocity_std"] / 1.5 < 1.6
+    held = fit(Problem(gauges(Unknown(0.8, 1.002)), guess, run.table), EA())
+    kept = held["level"].to_dataset()["std"].to_series()["gauge.range_std"]
+    assert abs(kept / 0.8 - 1) < 0.05, "what is known to 0.2 % stays, whatever the ranges tell"
 
 
 @pytest.mark.slow
