@@ -1,11 +1,27 @@
 """Kernels are shared by all that computes the same, and never fill the memory maps of a process."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from probcal import Bias, Channel, InputError, Network, Node, kernels, sensor, sensors
+from probcal import (
+    MAP,
+    Bias,
+    Channel,
+    ConstantVelocity,
+    InputError,
+    Network,
+    Node,
+    Problem,
+    fit,
+    kernels,
+    sensor,
+    sensors,
+    simulate,
+)
 from probcal.geometry import norm
+from probcal.priors import Gaussian
 
 
 def gauge(factor=1.0, scale=1.0, name="gauge", values=(0.0, 1.0, 2.0)):
@@ -46,6 +62,33 @@ def test_a_network_knows_equal_types_as_one():
     network = Network([gauge().on(Node("a", (0.0, 0.0))), gauge().on(Node("b", (9.0, 0.0)))])
     assert len(network.types) == 1
     assert network.labels == ("a.shift", "b.shift")
+
+
+def test_a_sensor_declared_again_compiles_nothing_new():
+    """As a model file loaded twice, or a sensor declared in a function: the second fit makes no kernel at all."""
+
+    def solve():
+        network = Network([gauge().on(Node(f"n{k}", (30.0 * k, 7.0 * k * k))) for k in range(3)])
+        time = np.arange(6.0)
+        path = np.stack([5.0 + 4.0 * time, 20.0 - 2.0 * time], 1)
+        run = simulate(network, ConstantVelocity(0.5), time, key=0, tracks={"target": path})
+        return fit(Problem(network, ConstantVelocity(0.5), run.table), MAP(), prior=Gaussian())
+
+    made = []
+
+    def count(event, duration, **_):
+        made.append(event == "/jax/core/compile/backend_compile_duration")
+
+    first = solve()
+    jax.monitoring.register_event_duration_secs_listener(count)
+    try:
+        second = solve()
+        assert sum(made) == 0
+        jax.jit(lambda x: x + 1.25)(jnp.ones(3))
+        assert sum(made) > 0, "what is counted is kernels"
+    finally:
+        jax.monitoring.unregister_event_duration_listener(count)
+    np.testing.assert_array_equal(first["calibration"]["mean"], second["calibration"]["mean"])
 
 
 def test_the_catalogue_has_no_two_types_alike():
