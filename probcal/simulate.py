@@ -33,7 +33,12 @@ Key = int | jax.Array
 
 def as_key(key: Key) -> jax.Array:
     """A jax key from a seed or a key."""
-    return jax.random.key(key) if isinstance(key, (int, np.integer)) else key
+    if not isinstance(key, (int, np.integer)):
+        return key
+    try:
+        return jax.random.key(key)
+    except OverflowError:
+        raise InputError(f"key={key}: a seed is a whole number below 2**63") from None
 
 
 @dataclass(frozen=True, eq=False)

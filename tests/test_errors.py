@@ -261,6 +261,7 @@ CASES = [
     (lambda f: load(calibrated("a").to_netcdf(f / "fit.nc", engine="h5netcdf") or f),
      "is not a fit written by probcal: its group calibration is missing or incomplete"),
     # inference, command line
+    (lambda _: fit(problem(), key=2**63), "key=9223372036854775808: a seed is a whole number below 2**63"),
     (lambda _: fit(problem(), EA), "method must be a value such as EA() or MAP(), got <class"),
     (lambda _: fit(problem(), save=("tracks",)), 'which is no group of draws; give "states", "predictive" or both'),
     (lambda _: track(problem(), calibrated("other")), "; fit the same network, or fix that bias"),

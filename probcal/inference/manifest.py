@@ -88,13 +88,12 @@ def remove_parts(path: Path, lock: Lock, *, folder: bool) -> None:
 def remove_run(path: str | PathLike[str], digest: str) -> None:
     """Remove the parts of the run with this digest; any other run and any other file stay."""
     path = Path(path)
-    if not (path / MANIFEST).exists():
+    try:
+        mine = digest_of(*read_manifest(path)) == digest
+    except InputError:  # there is none, or a damaged one that is no business of this run
         return
-    lock = Lock(path)
-    if digest_of(*read_manifest(path)) == digest:
-        remove_parts(path, lock, folder=True)
-    else:
-        lock.release()
+    if mine:
+        remove_parts(path, Lock(path), folder=True)
 
 
 def stored_digest(path: str | PathLike[str]) -> str:
