@@ -164,6 +164,7 @@ def anchored(clock):
     return Problem(network, motion, table), Truth(path)
 
 
+@pytest.mark.ci
 def test_a_bias_without_a_bound_is_named_and_left_out():
     problem, truth = anchored(clock=True)
     whole, _ = anchored(clock=False)
@@ -525,6 +526,7 @@ def shifted():
     return sensitivity(fixes(), {"a.*": [0.0, 3.0], "[bc].position_x": [0.0, 2.0, 8.0]}, runs=300)
 
 
+@pytest.mark.ci
 def test_sensitivity_of_a_linear_network_is_the_predicted_one():
     """At zero stds it is the tracking error without biases. 5 standard errors, 6 cells: 1 of 10^5 seeds would fail."""
     problem = fixes()

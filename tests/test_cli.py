@@ -129,6 +129,7 @@ def test_a_saved_calibration_is_applied_to_other_data(tmp_path):
     assert "the fit ended at bound, its estimate is invalid; fit again first" in err
 
 
+@pytest.mark.ci
 def test_track_follows_the_fit_in_fixed_biases_levels_and_with_sensors_missing():
     done, table = committed.tree("ea"), pd.read_csv(ROWS)
     built, motion = load_model(MODEL).network(), probcal.ConstantVelocity(0.5)

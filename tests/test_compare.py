@@ -318,6 +318,7 @@ def test_a_sampler_is_compared_with_what_it_reports():
     assert at["smallest_ess"] == pytest.approx(tree["ess"].min().item())
 
 
+@pytest.mark.ci
 def test_the_command_line_compares_saved_fits(saved, tmp_path):
     folders = [committed.DATA / "ea.nc", committed.DATA / "map.nc", tmp_path / "less.nc"]
     probcal.save(saved[2], folders[2])

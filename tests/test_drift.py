@@ -104,6 +104,7 @@ def moved():
     return problem, recording, probcal.fit(problem, MAP(), prior=Gaussian())
 
 
+@pytest.mark.ci
 def test_values_of_a_drifting_bias_are_its_steps_so_far(moved):
     problem, recording, tree = moved
     table = drift_table(tree)

@@ -243,6 +243,7 @@ def test_verdicts_stand_no_higher_than_the_status(status, ended, word, reason):
     assert all(reason in text for text in reasons)
 
 
+@pytest.mark.ci
 def test_a_study_counts_misfits():
     def setting(run, spoilt):
         network = Network([ruler.on(Node(f"n{k}", (0.0, float(k)))) for k in range(2)])
