@@ -1,13 +1,21 @@
 """Formulas by hand, where a whole fit would hide a wrong constant: starts, learnt precisions, statuses, intervals."""
 
+from dataclasses import replace
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from worlds import linear, ruler
+from worlds import exact, linear, resting, ruler
 
-from probcal import ARD, ConstantVelocity, Network, Node, Problem
+from probcal import ARD, Channel, ConstantVelocity, Network, Node, Problem, Unknown
 from probcal.inference.posterior import _bias_status
+from probcal.priors import Precision
+from probcal.rows import noise_std
+from probcal.smoothing.information import at_levels, moments, predicted_variances
+from probcal.smoothing.mode import Point, cost, factors
+from probcal.smoothing.recursion import trajectory
 
 
 def test_an_undeclared_start_is_as_wide_as_network_and_recording():
@@ -40,3 +48,55 @@ def test_a_bias_whose_chains_disagree_is_not_mixed():
     found = _bias_status(problem, {"r_hat": r_hat}, len(r_hat))
     assert found[1] == "not mixed"
     assert set(found[:1] + found[2:]) == {"estimated", "survey"}
+
+
+def test_a_wider_process_noise_costs_its_logarithm_and_leaves_the_trajectory_alone():
+    """Two epochs of a ruler: four noises of unit prior at the start, four of the unknown level after it."""
+    network = Network([ruler.on(Node("a", (0.0, 0.0)))])
+    table = pd.DataFrame({"time": [0.0, 1.0], "sensor": "a", "height": [0.5, 1.0]})
+    problem = Problem(network, ConstantVelocity(Unknown(0.5, 2.0)), table)
+    with jax.enable_x64(True):
+        part = problem.system.recursions[0]
+        noises = 0.1 * np.arange(1.0, 9.0).reshape(2, 4)
+        states = trajectory(part.F, part.L, part.drift[:, :, None], noises[:, :, None])[:, :, 0]
+        here = Point((states,), (noises,), np.zeros(1), np.zeros(1))
+        there = at_levels(problem.system, here, np.array([0.3]))
+        np.testing.assert_allclose(there.noises[0], noises * [[1.0], [np.exp(-0.3)]])
+        again = trajectory(part.F, factors(part, there.levels), part.drift[:, :, None], there.noises[0][:, :, None])
+        np.testing.assert_allclose(again[:, :, 0], states)
+        prior = Precision.single(np.ones(1))
+        change = cost(problem.spec, problem.system, there, prior) - cost(problem.spec, problem.system, here, prior)
+    wider = 4 * 0.3 + 0.5 * (np.exp(-0.6) - 1) * np.sum(noises[1] ** 2)
+    assert float(change) == pytest.approx(wider + 0.5 * (0.3 / np.log(2.0)) ** 2)
+
+
+def test_a_predicted_value_is_as_uncertain_as_biases_and_trajectory_make_it():
+    problem, naive = linear("plane")
+    order = [naive.labels.index(label) for label in problem.labels]
+    whole, starts = exact("plane").covariance, []
+    first = len(naive.labels)
+    for chain in naive.chains:
+        starts.append(first)
+        first += len(chain.names) * len(chain.times)
+    expected = []
+    for d in naive.data:
+        n = len(naive.chains[d.chain].names)
+        row = np.zeros(len(whole))
+        row[: len(d.G)], row[starts[d.chain] + n * d.epoch :][:n] = d.G, d.H
+        expected.append(row @ whole @ row)
+    with jax.enable_x64(True):
+        spec, system, point = problem.spec, problem.system, resting(problem)
+        covariance = jnp.asarray(exact("plane").z[1][np.ix_(order, order)])
+        found = moments(spec, system, point, covariance)
+        (variance,) = predicted_variances(spec, system, point, covariance, found)
+    np.testing.assert_allclose(np.asarray(variance)[np.asarray(system.rows[0].mask) > 0], expected, rtol=1e-8)
+
+
+def test_a_row_with_a_std_of_its_own_does_not_feel_the_unknown_level():
+    kind = replace(ruler, channels={"height": Channel("m", std=Unknown(2.0))})
+    network = Network([kind.on(Node("a", (0.0, 0.0)))])
+    table = pd.DataFrame({"time": [0.0, 1.0], "sensor": "a", "height": 1.0, "height_std": [0.5, np.nan]})
+    (rows,) = Problem(network, ConstantVelocity(0.5), table).system.rows
+    assert rows.level.ravel().tolist() == [1, 0], "one level: its number is 0, and 1 stands for none"
+    found = noise_std(rows, jnp.log(jnp.array([3.0])))
+    np.testing.assert_allclose(found.ravel(), [0.5, 6.0], rtol=1e-6)
