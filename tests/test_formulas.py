@@ -98,5 +98,6 @@ def test_a_row_with_a_std_of_its_own_does_not_feel_the_unknown_level():
     table = pd.DataFrame({"time": [0.0, 1.0], "sensor": "a", "height": 1.0, "height_std": [0.5, np.nan]})
     (rows,) = Problem(network, ConstantVelocity(0.5), table).system.rows
     assert rows.level.ravel().tolist() == [1, 0], "one level: its number is 0, and 1 stands for none"
-    found = noise_std(rows, jnp.log(jnp.array([3.0])))
+    with jax.enable_x64(True):
+        found = noise_std(rows, jnp.log(jnp.array([3.0])))
     np.testing.assert_allclose(found.ravel(), [0.5, 6.0], rtol=1e-6)
