@@ -58,7 +58,7 @@ MUTATIONS = [
     Mutation("smoothing/frame.py", "own - jnp.einsum(\"eij,ej->ei\", at.feedback, before))", "own + jnp.einsum(\"eij,ej->ei\", at.feedback, before))", "test_samplers.py test_model.py"),
     Mutation("smoothing/frame.py", "self.score @ step - 0.5 * step", "self.score @ step + 0.5 * step", "test_samplers.py"),
     Mutation("smoothing/frame.py", "loops.append(Loop(-smooth.states,", "loops.append(Loop(smooth.states,", "test_samplers.py"),
-    Mutation("smoothing/frame.py", "cross = -(slopes", "cross = (slopes", "test_samplers.py"),
+    Mutation("smoothing/frame.py", "cross = -(slopes", "cross = (slopes", "test_formulas.py"),
     Mutation("smoothing/frame.py", "jnp.expm1(-2 * step)", "jnp.expm1(2 * step)", "test_samplers.py"),
     # smoothing/sigma.py
     Mutation("smoothing/sigma.py", "np.full(2 * u, 0.5 / (u + kappa))", "np.full(2 * u, 1.0 / (u + kappa))", "test_methods.py"),

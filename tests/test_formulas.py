@@ -13,6 +13,7 @@ from probcal import ARD, Channel, ConstantVelocity, Network, Node, Problem, Unkn
 from probcal.inference.posterior import _bias_status
 from probcal.priors import Precision
 from probcal.rows import noise_std
+from probcal.smoothing.frame import _moves, _with_levels
 from probcal.smoothing.information import at_levels, moments, predicted_variances
 from probcal.smoothing.mode import Point, cost, factors
 from probcal.smoothing.recursion import trajectory
@@ -101,3 +102,18 @@ def test_a_row_with_a_std_of_its_own_does_not_feel_the_unknown_level():
     with jax.enable_x64(True):
         found = noise_std(rows, jnp.log(jnp.array([3.0])))
     np.testing.assert_allclose(found.ravel(), [0.5, 6.0], rtol=1e-6)
+
+
+def test_levels_border_a_frame_by_differences_of_its_likelihood():
+    """Of a quadratic log-likelihood of three biases and two levels the differences give its matrix and slope."""
+    random = np.random.default_rng(0)
+    root = random.standard_normal((5, 5))
+    matrix, slope = root @ root.T + 3.0 * np.eye(5), random.standard_normal(5)
+    moved = np.pad(_moves(2), ((0, 0), (3, 0)))
+    values = moved @ slope - 0.5 * np.sum((moved @ matrix) * moved, 1)
+    slopes = slope[:3] - moved @ matrix[:, :3]
+    with jax.enable_x64(True):
+        given = (jnp.asarray(part) for part in (matrix[:3, :3], slope[:3], values, slopes))
+        information, score = _with_levels(*given, 2)
+    np.testing.assert_allclose(information, matrix, rtol=1e-6)
+    np.testing.assert_allclose(score, slope, rtol=1e-6)
