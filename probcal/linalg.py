@@ -137,6 +137,7 @@ def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:
     return inverse.T @ (inverse @ right)
 
 
+@jax.jit
 def inverse_and_logdet(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Inverse and log determinant of a symmetric positive definite matrix."""
     lower, inverse = factor_and_inverse(matrix)

@@ -274,7 +274,8 @@ class Problem:
         spread: Any = np.array([np.log(level.factor) for level in self.levels])
         recursions = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in recursions]
         rows_of = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in rows_of]
-        self.system = jax.tree.map(jnp.asarray, System(tuple(recursions), tuple(rows_of), spread))
+        # put, not `asarray`: that compiles a copy for every new shape
+        self.system = jax.device_put(System(tuple(recursions), tuple(rows_of), spread), may_alias=False)
 
     def _rows_of(self, kind: Any, inside: np.ndarray) -> np.ndarray:
         ours = [k for k, placed in enumerate(self.network.sensors) if placed.type == kind]

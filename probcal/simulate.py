@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from probcal import rows
@@ -196,12 +196,11 @@ def simulate(
     z = _biases(problem, share, biases, keys[0])
     states = [_states(problem, r, tracks, keys[1]) for r in range(len(problem.epochs))]
     columns = {name: np.full(len(plan), np.nan) for name in network.channel_names}
-    levels = jnp.zeros(len(problem.levels))
+    levels = np.zeros(len(problem.levels))
     pieces = zip(problem.spec.blocks, problem.system.rows, problem.spec.recursion, problem.row_index, strict=True)
     for b, (block, data, r, index) in enumerate(pieces):
-        predicted = rows.predict(block, data, jnp.asarray(states[r]), jnp.asarray(z))
         seed = jax.random.split(jax.random.fold_in(keys[2], b), 3)
-        drawn = np.array(rows.sample(block, data, predicted, levels, seed[0]))
+        drawn = np.array(_drawn(block, data, states[r], z, levels, seed[0]))
         drawn = _spoil(block, data, drawn, outliers, outlier_scale, seed[1])
         gone = np.asarray(jax.random.uniform(seed[2], drawn.shape)) < missing
         for c, (name, _) in enumerate(block.type.expand(network.dimension)):
@@ -216,6 +215,14 @@ def simulate(
     track = track[["time", "target", *(c for c in track.columns if c not in ("time", "target"))]]
     values = dict(zip(problem.labels, (z * problem.scales).tolist(), strict=True))
     return Simulation(table, Truth(track, values))
+
+
+@partial(jax.jit, static_argnums=0)
+def _drawn(
+    block: rows.Block, data: rows.Rows, states: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array
+) -> jax.Array:
+    """Measured values (N, C) of a block, drawn around what its sensors predict."""
+    return rows.sample(block, data, rows.predict(block, data, states, z), levels, key)
 
 
 def _plan(network: Network, time: np.ndarray, targets: list[str]) -> pd.DataFrame:

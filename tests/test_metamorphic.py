@@ -255,6 +255,7 @@ def test_units_of_a_declaration():
     assert found.evidence == pytest.approx(expected.evidence + jacobian, abs=1e-6)
 
 
+@pytest.mark.ci
 def test_the_fit_as_a_whole():
     """`fit` with its automatic start: a moved and turned world in shuffled rows has the same calibration."""
     world, table, expected = base("pair")

@@ -290,12 +290,12 @@ def test_what_a_spike_keeps_out_has_no_part_in_a_swing(monkeypatch):
     """An excluded bias may be given any momentum: it stays at 0 and leaves the energy alone."""
     _, form, posed, _ = made("plane", BernoulliGaussian())
     phi = form.hierarchy.draw(jax.random.key(0)) | {"included": jnp.zeros(len(form.hierarchy.learnt), bool)}
-    given = conditional(form, posed, phi)
+    given = CONDITIONAL(form, posed, phi)
     out = ~np.asarray(given.active)
     assert out.any()
     eps = tuple(jnp.ones_like(x) for x in posed.frame.point.states)
     theta = jnp.where(given.active, given.mean, 0.0)
-    weight = log_weight(form.spec, posed.system, posed.frame, theta, eps)
+    weight = WEIGHT(form.spec, posed.system, posed.frame, theta, eps)
     normal = jax.random.normal
 
     def pushed(key, shape, dtype=float):
@@ -304,7 +304,8 @@ def test_what_a_spike_keeps_out_has_no_part_in_a_swing(monkeypatch):
 
     monkeypatch.setattr(jax.random, "normal", pushed)
     chain = Chain(theta, eps, phi, weight, jax.random.key(1))
-    ends = [swing(form, posed, chain, given, jax.random.key(k)) for k in range(5)]
+    move = jax.jit(lambda key: swing(form, posed, chain, given, key))
+    ends = [move(jax.random.key(k)) for k in range(5)]
     assert all((np.asarray(end[0])[out] == 0).all() for end in ends)
     moved = [not np.array_equal(end[1][0], eps[0]) for end in ends]
     assert np.mean(moved) > 0.5, "their kinetic energy counts against no move"

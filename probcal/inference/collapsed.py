@@ -6,7 +6,7 @@ posterior; the hyper-parameters are drawn anew; biases and trajectories then mov
 MacKay 2010).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -181,6 +181,10 @@ class Collapsed(Sampler):
         super().__post_init__()
         if self.move not in MOVES or (self.sweeps is not None and self.sweeps < 1):
             raise InputError(f'Collapsed(sweeps={self.sweeps}, move="{self.move}"): move is one of {", ".join(MOVES)}')
+
+    def kernel(self) -> "Collapsed":
+        """The method whatever the number of its chains and draws."""
+        return replace(self, chains=1, warmup=0, draws=1)
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Chain:
         """A chain at a draw of the frame's posterior."""

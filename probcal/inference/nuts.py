@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
@@ -86,6 +86,10 @@ class NUTS(Sampler):
             free, self.warmup, step_size=0.3, dense_mass=self.dense, target_accept_prob=self.target,
             max_tree_depth=self.depth, rng_key=key,
         )  # fmt: skip
+
+    def kernel(self) -> NUTS:
+        """The method whatever the number of its chains and draws; its adaptation knows the length of the warm-up."""
+        return replace(self, chains=1, draws=1)
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
         """A chain at theta and phi, its trajectories drawn from the frame."""

@@ -57,6 +57,10 @@ class Sampler(Method, ABC):
         """Whether there is a posterior to draw from: a flat hyper-prior of ARD leaves none."""
         return super().takes(prior) and not (isinstance(prior, ARD) and prior.rate == 0.0)
 
+    def kernel(self) -> "Sampler":
+        """The method without what does not change its kernels, so that these are compiled once."""
+        return self
+
     @abstractmethod
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
         """State of a chain that starts at theta and phi."""

@@ -152,12 +152,12 @@ class _Run:
     def advance(self, state: Any, pool: ThreadPoolExecutor) -> tuple[Any, Draw]:
         """All chains one chunk further."""
         if not self.apart:
-            return run_chunks(self.method, self.form, self.posed, state)
+            return run_chunks(self.method.kernel(), self.form, self.posed, state)
 
         def one(k: int) -> tuple[Any, Draw]:
             with jax.enable_x64(True):
                 own = jax.tree.map(lambda leaf: leaf[k], state)
-                return jax.block_until_ready(run_chunk(self.method, self.form, self.posed, own))
+                return jax.block_until_ready(run_chunk(self.method.kernel(), self.form, self.posed, own))
 
         found = list(pool.map(one, range(self.method.chains)))
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)

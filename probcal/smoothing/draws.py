@@ -38,6 +38,7 @@ def _passes(system: System, count: int) -> int:
     return next(k for k in range(1, count + 1) if count % k == 0 and count // k <= most)
 
 
+@partial(jax.jit, static_argnames="count")
 def draw_biases(point: Point, covariance: jax.Array, key: jax.Array, count: int) -> jax.Array:
     """Draws (D, M) of the biases from a Gaussian around a point."""
     M = point.z.shape[0]
