@@ -143,6 +143,7 @@ def test_track_follows_the_fit_in_fixed_biases_levels_and_with_sensors_missing()
         probcal.fit(part, probcal.MAP())
 
 
+@pytest.mark.ci
 def test_a_check_says_what_the_data_determine_and_draws_it(tmp_path):
     code, out, err = call("check", MODEL, ROWS, "--out", tmp_path / "check")
     assert code == 0, err

@@ -99,6 +99,7 @@ COARSE = {
 }
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("change", ABSURD.values(), ids=ABSURD.keys())
 def test_absurd_data_end_in_no_answer(change):
     network, table = gauges()

@@ -157,7 +157,7 @@ def test_em_reaches_the_mode_and_the_maximum_likelihood(prior):
     np.testing.assert_allclose(z_of(by_em, linear)[0], z_of(by_mode, linear)[0], atol=1e-4)
 
 
-@pytest.mark.parametrize("rule", ["unscented", "cubature"])
+@pytest.mark.parametrize("rule", ["unscented", pytest.param("cubature", marks=pytest.mark.ci)])
 @pytest.mark.parametrize("name", ["plane", pytest.param("extras", marks=pytest.mark.slow)])
 def test_sigma_points_change_nothing_where_sensors_are_linear(name, rule):
     problem, _ = linear(name)
@@ -285,7 +285,7 @@ NOISES = (Mixture(0.1, 5.0, delay=15.0), StudentT(4.0), Mixture(0.1, 10.0))
 @pytest.mark.parametrize(
     ("noise", "method"),
     [
-        pytest.param(noise, method, id=f"{noise!r}-{method.name}", marks=[pytest.mark.slow] if n or m else [])
+        pytest.param(noise, method, id=f"{noise!r}-{method.name}", marks=pytest.mark.slow if n or m else pytest.mark.ci)
         for n, noise in enumerate(NOISES)
         for m, method in enumerate((EA(), EM(), EMEA()))
     ],

@@ -64,7 +64,7 @@ CASES = {
 }
 
 
-OFTEN = ("horseshoe", "levels and Student-t")
+OFTEN = ("horseshoe",)
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=[] if c in OFTEN else pytest.mark.ci) for c in CASES])

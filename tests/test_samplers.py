@@ -155,6 +155,7 @@ def test_a_frame_is_exact_on_linear_problems(name):
         np.testing.assert_allclose(x, made_of, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.ci
 def test_a_frame_follows_its_levels():
     """At any levels the track of a linear problem has the frame's law, exactly."""
     network, motion, table, _ = LINEAR["plane"]()
@@ -311,7 +312,9 @@ def test_what_a_spike_keeps_out_has_no_part_in_a_swing(monkeypatch):
     assert np.mean(moved) > 0.5, "their kinetic energy counts against no move"
 
 
-@pytest.mark.parametrize(("chains", "draws"), [(1, 1), (1, 3), (2, 10)])
+@pytest.mark.parametrize(
+    ("chains", "draws"), [(1, 1), *(pytest.param(*n, marks=pytest.mark.ci) for n in ((1, 3), (2, 10)))]
+)
 def test_a_run_of_few_draws_has_numbers_and_can_be_assessed(chains, draws):
     problem, tree, _ = fitted("plane", Collapsed(chains=chains, draws=draws, warmup=0), Gaussian())
     assert tree.attrs["status"] == "not converged"
@@ -326,6 +329,7 @@ def test_a_run_of_few_draws_has_numbers_and_can_be_assessed(chains, draws):
     assert "sensitivity" not in out.children
 
 
+@pytest.mark.ci
 def test_the_tree_of_a_sampler_is_whole_and_arviz_reads_it():
     _, tree, _ = fitted("plane", SPIKE, BernoulliGaussian(), key=3)
     for group in tree.children.values():

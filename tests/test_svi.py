@@ -49,6 +49,7 @@ def test_pareto_khat_is_that_of_the_large_weights():
     assert pareto_khat(np.zeros(100)) == 0.0
 
 
+@pytest.mark.ci
 def test_any_point_has_coordinates_in_the_frame():
     """Plain coordinates placed, turned into those of the frame and placed again: with a level, two recursions."""
     problem = small(motion=two_motions)
