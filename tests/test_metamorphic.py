@@ -28,7 +28,9 @@ TOLERANCE = 1e-6  # in z, and in metres for tracks of sd near one metre
 AXES = "xyz"
 
 
-worlds = pytest.mark.parametrize("name", ["plane", "waves", "space"])
+worlds = pytest.mark.parametrize(
+    "name", ["plane", *(pytest.param(n, marks=pytest.mark.ci) for n in ("waves", "space"))]
+)
 few = settings(max_examples=8)
 angles = st.floats(-4.0, 4.0)
 lengths = st.floats(-500.0, 500.0)
