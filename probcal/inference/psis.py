@@ -4,7 +4,6 @@ What `arviz_stats` does row after row, a millisecond each, is done for all rows 
 """
 
 import numpy as np
-from scipy import special
 
 ROWS = 2000  # smoothed at once
 PRIOR_DRAWS, PRIOR_K = 10, 0.5  # weight and place of the weak prior of the shape
@@ -24,7 +23,7 @@ def _smoothed(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     values = log_ratios - log_ratios.max(1, keepdims=True)
     tail = min(int(3 * draws**0.5 if draws > 225 else draws / 5), draws - 1)
     if tail < 5:
-        return values - special.logsumexp(values, axis=1, keepdims=True), np.full(rows, np.inf)
+        return values - _log_sum(values), np.full(rows, np.inf)
     order = np.argsort(values, axis=1)[:, draws - tail - 1 :]
     last = np.take_along_axis(values, order, 1)
     cutoff, ordered = np.exp(last[:, :1]), np.exp(last[:, 1:])
@@ -37,7 +36,7 @@ def _smoothed(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     curve = np.where(shape == 0, -np.log1p(-probability), np.expm1(-flat * np.log1p(-probability)) / flat)
     fitted = np.minimum(np.log(cutoff + scale * curve), last[:, -1:])
     np.put_along_axis(values, order[:, 1:], np.where(good[:, None], fitted, last[:, 1:]), 1)
-    values -= special.logsumexp(values, axis=1, keepdims=True)
+    values -= _log_sum(values)
     return values, np.where(same, 0.0, np.where(np.isfinite(k), k, np.inf))
 
 
@@ -57,7 +56,7 @@ def _pareto_fit(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         b = grid[None] / (3 * quartile[told][:, None]) + 1 / x[:, -1:]
         means = np.stack([np.log1p(-b[:, j, None] * x).mean(1) for j in range(count)], 1)
         score = tail * (np.log(-b / means) - means - 1)
-        weights = np.exp(score - special.logsumexp(score, axis=1, keepdims=True))
+        weights = np.exp(score - _log_sum(score))
         weights = np.where(weights >= 10 * np.finfo(float).eps, weights, 0.0)
         weights /= weights.sum(1, keepdims=True)
         place = (b * weights).sum(1)
@@ -65,3 +64,9 @@ def _pareto_fit(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         sigma[told] = -shape / place
         k[told] = (tail * shape + PRIOR_DRAWS * PRIOR_K) / (tail + PRIOR_DRAWS)
     return k, sigma
+
+
+def _log_sum(values: np.ndarray) -> np.ndarray:
+    """Log of the summed exponentials of every row, (rows, 1)."""
+    most = values.max(1, keepdims=True)
+    return most + np.log(np.exp(values - most).sum(1, keepdims=True))
