@@ -175,6 +175,7 @@ def test_every_unit_has_the_size_of_its_definition():
     for wanted, sizes in UNIT_SIZES.items():
         for unit, size in sizes.items():
             assert factor(given, "x", unit, wanted) == pytest.approx(size, rel=1e-12), unit
+            assert factor(given, "x", wanted, unit) == pytest.approx(1 / size, rel=1e-12), unit
         assert factor(given, "x", None, wanted) == 1.0
 
 
