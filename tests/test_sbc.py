@@ -363,7 +363,7 @@ def test_a_hopeless_frame_is_never_taken_for_a_good_one():
 @pytest.fixture(scope="module")
 def fitted():
     problem = linear()
-    return problem, fit(problem, MAP(), prior=Gaussian())
+    return problem, fit(problem, MAP(), prior=Gaussian(), save=("states",))
 
 
 @pytest.mark.ci
