@@ -24,7 +24,7 @@ KERNELS = Path(__file__).parents[1] / ".pytest_cache" / "kernels"
 MOST_BYTES = 1_000_000_000  # of kernels kept there
 TOGETHER = {  # files that share worlds run in one worker, one after the other; these begin, the longest first
     "test_exact.py": "linear", "test_methods.py": "linear", "test_samplers.py": "linear", "test_svi.py": "linear",
-    "test_drift.py": "linear", "test_metamorphic.py": "bent", "test_bounds.py": "bent",
+    "test_drift.py": "linear", "test_kernels.py": "linear", "test_metamorphic.py": "bent", "test_bounds.py": "bent",
 }  # fmt: skip
 compiled = {"here": 0, "workers": 0}
 

@@ -554,7 +554,7 @@ def small(sensors_=3, **spread):
     return network, path, run.table
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_target_that_nobody_measured_is_no_obstacle():
     network, _, table = small()
     ghost = table[table["time"] < 2].assign(target="ghost", range=np.nan)
@@ -563,7 +563,7 @@ def test_a_target_that_nobody_measured_is_no_obstacle():
     assert out["verdict"].sizes["bias_label"] == 6
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_known_target_has_no_error_to_be_judged():
     network, path, table = small()
     both = pd.concat([table, table.assign(target="plane")], ignore_index=True)
@@ -578,7 +578,7 @@ def test_a_known_target_has_no_error_to_be_judged():
     assert set(check["nees_target"].values) == {"car"}
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_events_that_hardly_ever_happen_raise_no_alarm():
     """Presence sensors of which some never answer: a replica without an event is no evidence of anything."""
     places = [(0.0, 0.0), (100.0, 0.0), (0.0, 100.0), (900.0, 900.0), (-900.0, 900.0)]
@@ -594,7 +594,7 @@ def test_events_that_hardly_ever_happen_raise_no_alarm():
     assert check["upper"].sel(sensor="q3").item() == np.inf
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_single_sensor_has_no_rest_to_be_judged_by():
     network, path, table = small(1)
     problem = probcal.Problem(network, probcal.Known((np.arange(30.0), path)), table)

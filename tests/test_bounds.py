@@ -86,7 +86,7 @@ def hessian(problem, precision):
     return covariance[:M, :M], np.split(variances, np.cumsum(sizes)[:-1])
 
 
-@pytest.mark.parametrize("name", [pytest.param("extras", marks=pytest.mark.ci), "mixed"])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.ci) for name in ("extras", "mixed")])
 def test_the_bound_of_a_linear_problem_is_the_inverse_hessian(name):
     network, motion, table, fixed = LINEAR[name]()
     gauge = {"mixed": {"box.clock": 0.3}}.get(name, {})  # beside a free difference_offset
@@ -164,7 +164,7 @@ def anchored(clock):
     return Problem(network, motion, table), Truth(path)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_bias_without_a_bound_is_named_and_left_out():
     problem, truth = anchored(clock=True)
     whole, _ = anchored(clock=False)
@@ -205,7 +205,7 @@ def test_tracks_are_taken_as_they_are_given():
         bounds(problem, truth=Truth(track.assign(time=[0.0, 1.5])))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_the_parametric_bound_without_tracks_takes_the_automatic_start():
     problem, truth = radars.setting(0, share=0.0, scenario="C2")
     problem = problem.rebuild(fix=["radar_0.*", "radar_1.*"])
@@ -526,7 +526,7 @@ def shifted():
     return sensitivity(fixes(), {"a.*": [0.0, 3.0], "[bc].position_x": [0.0, 2.0, 8.0]}, runs=300)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_sensitivity_of_a_linear_network_is_the_predicted_one():
     """At zero stds it is the tracking error without biases. 5 standard errors, 6 cells: 1 of 10^5 seeds would fail."""
     problem = fixes()

@@ -140,7 +140,7 @@ SLOWER = (
 @pytest.mark.parametrize(
     ("method", "d"),
     [
-        *(pytest.param(EA(), d, marks=pytest.mark.ci) for d in (2, 3)),
+        *(pytest.param(EA(), d, marks=pytest.mark.slow) for d in (2, 3)),
         *(pytest.param(method, d, marks=pytest.mark.slow) for method, d in SLOWER),
     ],
     ids=lambda v: getattr(v, "name", v),
@@ -229,7 +229,7 @@ def frame(d, K=25):
     return pd.DataFrame(path(d, K), columns=[f"position_{axis}" for axis in "xyz"[:d]]).assign(time=np.arange(float(K)))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize(("d", "std"), [(2, 0.0), (3, 4.0), (2, Unknown(1.0))], ids=str)
 def test_a_known_track_calibrates(d, std):
     """A reported target, one known at one instant only and a free one share a recursion; the biases are found."""
@@ -562,7 +562,7 @@ def test_a_camera_sees_nothing_behind_it():
     assert seen[3] > 10
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_microphone_and_a_geophone_share_the_displacement_of_their_node():
     nodes = [Node(f"node_{k}", p, scale={"position": 5.0} if k == 3 else None) for k, p in enumerate(CORNERS[2])]
     network = Network(
@@ -623,7 +623,7 @@ def test_motions_move_as_their_sources_say():
     np.testing.assert_allclose(straight.noise_factor(T, 2), ConstantVelocity(1.0).noise_factor(T, 2))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_gradients_are_finite_where_a_target_stands_on_a_node():
     """One epoch on every node: beside, before or behind the others."""
     for name, d in CASES:

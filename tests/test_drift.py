@@ -135,6 +135,7 @@ def test_pictures_and_report_show_the_drift(moved, tmp_path):
     assert "Values of the drifting biases over time" in page
 
 
+@pytest.mark.ci
 def test_nodes_that_drift_are_left_out_of_the_file(moved, tmp_path):
     problem, _, tree = moved
     for given in (tree, problem.network.nodes):
@@ -162,7 +163,7 @@ def test_values_hold_fixed_steps_and_steps_before_the_data():
     assert problem.fixed == {"gauge_b.gain@1.7": 0.6}
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_steps_before_and_after_the_data_change_nothing_else():
     network, motion = watched()
     table = simulate(network, motion, np.arange(12.0), 1).table
@@ -186,7 +187,7 @@ def test_steps_before_and_after_the_data_change_nothing_else():
     assert both["b.position_x"] + both["b.position_x@-5"] == pytest.approx(mean["b.position_x"], rel=1e-9)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_evidence_tells_a_drift_from_a_constant_bias():
     """A Bayes factor has mean 1 under the smaller model: it passes 1 / FALSE_ALARM at most at that rate (Markov)."""
     constant, motion = watched()
@@ -205,7 +206,7 @@ def test_evidence_tells_a_drift_from_a_constant_bias():
             assert elpd[1] - elpd[0] < 5
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_sparse_prior_finds_the_jump():
     """One step of a bias is large, the others zero: its inclusion stands out."""
     network, motion = watched(Drift(TIMES, scale=2.0))
@@ -265,7 +266,7 @@ def test_the_radios_of_plaza_stand_still():
     assert max(evidence, key=lambda name: evidence[name]) == "constant"
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_fixed_steps_and_steps_before_the_data_count_in_the_values():
     """A step fixed at its true 5 m, one 5 s before the data, one free: each piece has the sum of what began by then."""
     network, motion = watched(Drift((-9.0, -5.0, 4.0, 8.0), scale=3.0))
@@ -299,7 +300,7 @@ def test_a_drifting_sensor_is_checked_whole():
     assert not [name for name in anchors if "@" in str(name)]
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_node_stands_still_though_its_sensor_drifts(tmp_path):
     kind = probcal.sensors.flight_time
     wander = replace(kind.biases["range_offset"], drift=Drift((0.0, 4.0), std=1.0))

@@ -16,6 +16,7 @@ import probcal
 from probcal.priors import Precision
 from probcal.smoothing.mode import find_mode
 
+WORLDS = [pytest.param(name, marks=pytest.mark.ci if name == "extras" else ()) for name in LINEAR]
 FALSE_ALARM = 1e-6  # of each statistical test below, all its comparisons together
 
 
@@ -24,7 +25,7 @@ def solved(name):
     return linear(name)[1], exact(name), linear(name)[0], fitted(name)
 
 
-@pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.parametrize("name", WORLDS)
 def test_reference_agrees_with_itself(name):
     """Loop Kalman filter with RTS smoother against the dense Gaussian: two naive forms, one answer."""
     linear, exact, _, _ = solved(name)
@@ -37,14 +38,14 @@ def test_reference_agrees_with_itself(name):
     close(np.concatenate([np.sqrt(np.diag(P)[M:]) for _, P in smoothed]), exact.states[1], 1e-9)
 
 
-@pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.parametrize("name", WORLDS)
 def test_labels_and_scales(name):
     linear, _, problem, _ = solved(name)
     assert sorted(problem.labels) == sorted(linear.labels)
     assert dict(zip(problem.labels, problem.scales, strict=True)) == linear.scales
 
 
-@pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.parametrize("name", WORLDS)
 def test_biases(name):
     """Mean, sd, covariance and gamma = 1 - alpha Sigma of the biases."""
     linear, exact, _, tree = solved(name)
@@ -61,7 +62,7 @@ def test_biases(name):
     assert tree.attrs["status"] == "converged"
 
 
-@pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.parametrize("name", WORLDS)
 def test_tracks(name):
     """Mean and sd of every state, biases integrated out; and the mean without calibration (z held at 0)."""
     linear, exact, _, tree = solved(name)
@@ -71,7 +72,7 @@ def test_tracks(name):
     close(*by_epoch(tree, linear, held.states[0], "before"))
 
 
-@pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.parametrize("name", WORLDS)
 def test_evidence(name):
     """log p(data | alpha) with all its normalising constants."""
     _, exact, _, tree = solved(name)

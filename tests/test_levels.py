@@ -41,6 +41,7 @@ def gauges(std):
     return Network([kind.on(Node(f"gauge_{k}", p)) for k, p in enumerate(CORNERS)])
 
 
+@pytest.mark.ci
 def test_unknown_noise_and_process_noise_are_estimated_along():
     motion = probcal.Target(ConstantVelocity(1.5), {"position": ((30.0, 30.0), 1.0), "velocity": (0.0, 1.0)})
     run = simulate(gauges(2.0), motion, np.arange(0, 60, 0.5), 3, share=0.3)
@@ -74,7 +75,7 @@ def test_every_method_estimates_an_unknown_level(method):
     assert low < std < 1.25
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_gamma_hyper_prior_moves_the_fixed_point():
     path = np.stack([np.linspace(5, 55, 40), 30 + 20 * np.sin(np.linspace(0, 6, 40))], 1)
     run = simulate(gauges(1.0), ConstantVelocity(0.5), np.arange(40.0), 1, tracks={"target": path})
@@ -89,7 +90,7 @@ def test_a_gamma_hyper_prior_moves_the_fixed_point():
         np.testing.assert_allclose(group["precision"].values[kept], wanted[kept], rtol=1e-3)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_the_start_finds_the_track_without_any_hint():
     """No declared start, targets at both ends of the area, far outside and inside: within the noise of the truth."""
     far = np.stack([np.linspace(150, 260, 40), np.linspace(-120, 80, 40)], 1)

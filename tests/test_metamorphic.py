@@ -150,7 +150,7 @@ def with_axis(key, axis):
     return key[:-1] + axis if isinstance(key, str) else (*key[:-1], key[-1][:-1] + axis)
 
 
-@pytest.mark.parametrize("name", ["plane", "space"])
+@pytest.mark.parametrize("name", ["plane", pytest.param("space", marks=pytest.mark.ci)])
 @few
 @given(data=st.data())
 def test_whole_turns_change_nothing(name, data):
@@ -210,6 +210,7 @@ def test_a_header_unit_equals_the_channels_own():
     same_estimate(estimate(world.problem(written)), expected)
 
 
+@pytest.mark.ci
 def test_splitting_a_row_into_its_channels_changes_nothing():
     world, table, expected = base("pair")
     parts = [table.assign(azimuth=np.nan), table.assign(range=np.nan)]

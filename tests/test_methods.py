@@ -131,7 +131,7 @@ def test_iterations_are_a_cap_and_what_is_reported_belongs_together(method):
         assert tree.attrs["message"].startswith("All 3 iterations were run, as asked; the last moved the objective by")
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_least_squares_does_not_know_the_origin():
     """Shifting the world to a map's northings moves nothing: the free positions are centred on the nodes."""
     kind, found = probcal.sensors.ranger, []
@@ -157,7 +157,7 @@ def test_em_reaches_the_mode_and_the_maximum_likelihood(prior):
     np.testing.assert_allclose(z_of(by_em, linear)[0], z_of(by_mode, linear)[0], atol=1e-4)
 
 
-@pytest.mark.parametrize("rule", ["unscented", pytest.param("cubature", marks=pytest.mark.ci)])
+@pytest.mark.parametrize("rule", ["unscented", pytest.param("cubature", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["plane", pytest.param("extras", marks=pytest.mark.slow)])
 def test_sigma_points_change_nothing_where_sensors_are_linear(name, rule):
     problem, _ = linear(name)
@@ -285,9 +285,9 @@ NOISES = (Mixture(0.1, 5.0, delay=15.0), StudentT(4.0), Mixture(0.1, 10.0))
 @pytest.mark.parametrize(
     ("noise", "method"),
     [
-        pytest.param(noise, method, id=f"{noise!r}-{method.name}", marks=pytest.mark.slow if n or m else pytest.mark.ci)
-        for n, noise in enumerate(NOISES)
-        for m, method in enumerate((EA(), EM(), EMEA()))
+        pytest.param(noise, method, id=f"{noise!r}-{method.name}", marks=pytest.mark.slow)
+        for noise in NOISES
+        for method in (EA(), EM(), EMEA())
     ],
 )
 def test_outlying_rows_are_listed(noise, method):
@@ -382,7 +382,7 @@ def test_the_table_of_pairs_is_that_of_the_guide():
         assert f"| `{name}()` | {cells} |" in text
 
 
-@pytest.mark.parametrize("tied", [True, pytest.param(False, marks=pytest.mark.ci)])
+@pytest.mark.parametrize("tied", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_least_squares_with_known_targets_is_the_closed_form(tied):
     """Known targets: the normal equations; with an unknown target beside them, its states are free at every epoch."""
     kind = probcal.sensors.position

@@ -67,7 +67,7 @@ CASES = {
 OFTEN = ("horseshoe",)
 
 
-@pytest.mark.parametrize("case", [pytest.param(c, marks=[] if c in OFTEN else pytest.mark.ci) for c in CASES])
+@pytest.mark.parametrize("case", [pytest.param(c, marks=[] if c in OFTEN else pytest.mark.slow) for c in CASES])
 def test_its_density_is_that_of_the_samplers(case):
     """log p of the frame's coordinates = log p of the model's sites + log |d sites / d coordinates|, to a constant."""
     prior, settings = CASES[case]

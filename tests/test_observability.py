@@ -195,7 +195,7 @@ def test_gauge_directions_are_counted_and_named(name):
     assert tree.attrs["status"] == "open"
 
 
-@tiers((), ("radars", "ranges of one scale"))
+@tiers((), ("radars",))
 def test_a_gauge_is_no_answer_until_anchored_as_advised(name):
     kinds, dimension, scale, motion, expected = CASES[name]
     free = problem_of(kinds, dimension, scale, motion)
@@ -427,8 +427,8 @@ def test_the_gain_of_a_sensor_is_what_its_rows_tell():
 @pytest.mark.parametrize(
     ("kinds", "dimension", "scale", "motion"),
     [
-        pytest.param([sensors.radar_3d], 3, FREE, None, marks=pytest.mark.ci),
-        pytest.param([difference], 2, {"clock": 10.0, "position": 5.0}, None, marks=pytest.mark.ci),
+        pytest.param([sensors.radar_3d], 3, FREE, None, marks=pytest.mark.slow),
+        pytest.param([difference], 2, {"clock": 10.0, "position": 5.0}, None, marks=pytest.mark.slow),
         pytest.param([arrival, compass], 2, {"position": 5.0}, EMITTED, marks=pytest.mark.slow),
         pytest.param([plain_range], 2, {"position": 5.0}, Static(), marks=pytest.mark.slow),
     ],

@@ -155,7 +155,7 @@ def test_a_frame_is_exact_on_linear_problems(name):
         np.testing.assert_allclose(x, made_of, rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_frame_follows_its_levels():
     """At any levels the track of a linear problem has the frame's law, exactly."""
     network, motion, table, _ = LINEAR["plane"]()
@@ -313,7 +313,7 @@ def test_what_a_spike_keeps_out_has_no_part_in_a_swing(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("chains", "draws"), [(1, 1), *(pytest.param(*n, marks=pytest.mark.ci) for n in ((1, 3), (2, 10)))]
+    ("chains", "draws"), [(1, 1), *(pytest.param(*n, marks=pytest.mark.slow) for n in ((1, 3), (2, 10)))]
 )
 def test_a_run_of_few_draws_has_numbers_and_can_be_assessed(chains, draws):
     problem, tree, _ = fitted("plane", Collapsed(chains=chains, draws=draws, warmup=0), Gaussian())
@@ -329,7 +329,7 @@ def test_a_run_of_few_draws_has_numbers_and_can_be_assessed(chains, draws):
     assert "sensitivity" not in out.children
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_the_tree_of_a_sampler_is_whole_and_arviz_reads_it():
     _, tree, _ = fitted("plane", SPIKE, BernoulliGaussian(), key=3)
     for group in tree.children.values():
@@ -422,7 +422,7 @@ def test_khat_is_that_of_the_heavy_right_tail():
 @pytest.mark.parametrize(
     ("method", "prior"),
     [
-        pytest.param(Collapsed(draws=60), ARD(by="node", rate=0.5), marks=pytest.mark.ci),
+        pytest.param(Collapsed(draws=60), ARD(by="node", rate=0.5), marks=pytest.mark.slow),
         *(
             pytest.param(method, prior, marks=pytest.mark.slow)
             for method in (Collapsed(draws=60), NUTS(draws=60, warmup=100), SVI(draws=60, warmup=200))

@@ -97,7 +97,7 @@ LATE = (lambda: study(heights, {"size": [1, 2]}, ["em"], runs=1), "the settings 
 
 @pytest.mark.parametrize(
     ("call", "text"),
-    [*ERRORS, pytest.param(*LATE, marks=pytest.mark.ci)],
+    [*ERRORS, pytest.param(*LATE, marks=pytest.mark.slow)],
     ids=[text[:40] for _, text in (*ERRORS, LATE)],
 )
 def test_errors_of_studies(call, text):
@@ -106,6 +106,7 @@ def test_errors_of_studies(call, text):
     assert text in str(error.value)
 
 
+@pytest.mark.ci
 def test_a_study_is_resumed_with_the_same_numbers(tmp_path):
     """Stopped, taken up for more runs, a file lost; an edited model is refused."""
     whole = study(heights, {}, ["em", "ml"], runs=25)

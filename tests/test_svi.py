@@ -49,7 +49,7 @@ def test_pareto_khat_is_that_of_the_large_weights():
     assert pareto_khat(np.zeros(100)) == 0.0
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_any_point_has_coordinates_in_the_frame():
     """Plain coordinates placed, turned into those of the frame and placed again: with a level, two recursions."""
     problem = small(motion=two_motions)
@@ -87,7 +87,7 @@ def test_linear_problems_are_exact():
     np.testing.assert_allclose(run.draws["stats_elbo"][:, -1], exact.evidence, atol=1e-5)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_mean_field_is_too_narrow_where_biases_are_correlated():
     """Plain coordinates of a linear problem: its optimum has the conditional variances (Bishop 2006, 10.2)."""
     run, exact = solved("plane", SVI(chains=2, warmup=1500, draws=500, guide="mean-field"), Gaussian())
@@ -99,7 +99,7 @@ def test_mean_field_is_too_narrow_where_biases_are_correlated():
     assert bounds[0] < bounds[1] < exact.evidence + 0.2, "a narrower family bounds the evidence less tightly"
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_determined_biases_have_the_sds_of_nuts():
     problem = small(scans=20)
     start = automatic_start(problem)
