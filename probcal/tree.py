@@ -435,7 +435,7 @@ def load(path: str | PathLike[str]) -> xr.DataTree:
             tree = tree.load()
     except Exception as error:  # whatever the netCDF and HDF5 libraries say of foreign bytes
         raise InputError(f"{path} is not a fit written by probcal ({type(error).__name__}: {error})") from None
-    _check_content(tree, path)
+    check_content(tree, path)
     return tree
 
 
@@ -457,7 +457,7 @@ def _sealed(path: Path) -> bool:
     return seal.endswith(found.digest())
 
 
-def _check_content(tree: xr.DataTree, path: Path) -> None:
+def check_content(tree: xr.DataTree, path: Path) -> None:
     """Raise `InputError` where a fit lacks what its readers need."""
     if "calibration" not in tree.children or not set(SUMMARY[1:]) <= set(tree["calibration"].data_vars):
         raise InputError(f"{path} is not a fit written by probcal: its group calibration is missing or incomplete")

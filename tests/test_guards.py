@@ -114,6 +114,7 @@ def test_absurd_data_end_in_no_answer(change):
     assert judged["finding"]["kind"].values[0] == "status"
 
 
+@pytest.mark.ci
 def test_a_fit_that_leaves_no_covariance_says_what_to_check():
     network, table = gauges()
     problem = Problem(network, ConstantVelocity(0.5), cell("range", 1e14)(table))

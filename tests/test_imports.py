@@ -117,6 +117,7 @@ def test_declaring_a_problem_loads_jax_alone():
     assert fresh(LOADED + code + "print(loaded())") == ["jax.numpy numpy"]
 
 
+@pytest.mark.ci
 def test_a_fit_without_assessment_loads_neither_arviz_nor_scipy_nor_plots():
     run = order("fit", MODEL, ROWS, "--method", "map", "--no-assess")
     assert fresh(COMMANDS + run) == ["0 jax.numpy numpy pandas xarray"]

@@ -382,7 +382,9 @@ def test_the_table_of_pairs_is_that_of_the_guide():
         assert f"| `{name}()` | {cells} |" in text
 
 
-@pytest.mark.parametrize("tied", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "tied", [pytest.param(True, marks=pytest.mark.ci), pytest.param(False, marks=pytest.mark.slow)]
+)
 def test_least_squares_with_known_targets_is_the_closed_form(tied):
     """Known targets: the normal equations; with an unknown target beside them, its states are free at every epoch."""
     kind = probcal.sensors.position

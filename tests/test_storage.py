@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from contextlib import suppress
+from pathlib import Path
 
 import committed
 import h5py
@@ -40,7 +41,7 @@ from probcal.inference import identity
 from probcal.inference.fit import _check_store
 from probcal.inference.manifest import MANIFEST, remove_run, stored_run
 from probcal.inference.storage import Chunks, Records, Storage
-from probcal.tree import SEAL, SMALL
+from probcal.tree import SEAL, SMALL, check_content
 
 RUN = {"method": "NUTS()", "seed": "1", "model": "abc"}
 
@@ -578,7 +579,15 @@ LACKS = [
 
 
 @pytest.mark.parametrize(("change", "text"), LACKS, ids=range(len(LACKS)))
-def test_what_a_fit_lacks_is_one_sentence(change, text, saved, tmp_path):
+def test_what_a_fit_lacks_is_one_sentence(change, text, saved):
+    tree = saved[0].copy(deep=True)
+    change(tree)
+    with pytest.raises(InputError, match=text):
+        check_content(tree, Path("fit.nc"))
+
+
+@pytest.mark.parametrize(("change", "text"), [LACKS[5], LACKS[9]], ids=["array", "attribute"])
+def test_a_saved_fit_that_lacks_something_is_one_sentence(change, text, saved, tmp_path):
     tree = saved[0].copy(deep=True)
     change(tree)
     probcal.save(tree, tmp_path / "fit.nc")

@@ -140,6 +140,7 @@ def test_a_study_is_resumed_with_the_same_numbers(tmp_path):
     assert fresh["error"].sel(run=0).equals(whole["error"].sel(run=1).assign_coords(run=0))
 
 
+@pytest.mark.ci
 def test_a_study_without_a_number_has_no_picture():
     found = study(heights, {}, ["em"], runs=2)
     with pytest.raises(InputError, match="no setting of the study is a number"):
