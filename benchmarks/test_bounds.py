@@ -46,7 +46,7 @@ def test_a_map_of_100_x_100_cells(benchmark, biases):
         root = None if biases == "unknown" else jnp.zeros((0, 0))
 
         def cell(place):
-            return spectra(at.spec, at.system, (0, 2), point, root, jnp.asarray(place)).block_until_ready()
+            return spectra(at.model, (0, 2), point, root, jnp.asarray(place)).block_until_ready()
 
         cell(places[0])  # compiles
         began = time.perf_counter()

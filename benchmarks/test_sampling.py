@@ -60,11 +60,11 @@ def test_c1(benchmark, name):
 
 def plain(problem):
     """The same posterior by hand: C1 has one target, one scan a second, radars with four biases each."""
-    block, data = problem.spec.blocks[0], problem.system.rows[0]
-    part = problem.system.recursions[0]
-    from probcal import rows
+    block, data = problem.model.blocks[0], problem.model.rows[0]
+    part = problem.model.recursions[0]
+    from probcal.model import rows
 
-    biases = problem.spec.biases
+    biases = problem.model.biases
 
     def model():
         local = numpyro.sample("local", dist.HalfCauchy(jax.numpy.ones(biases)))

@@ -54,7 +54,7 @@ SIZES = [(10, 100), (20, 100), (40, 100), (100, 1000), (300, 300)]  # GTSAM: gts
 def mode(problem, start):
     """Joint MAP of all poses and states."""
     prior = Precision.single(jnp.ones(len(problem.labels)))
-    found = find_mode(problem.spec, problem.system, start, prior, 50, 1e-5)
+    found = find_mode(problem.model, start, prior, 50, 1e-5)
     return jax.block_until_ready(found.point)
 
 
@@ -62,7 +62,7 @@ def mode_and_marginals(problem, start):
     """Joint MAP and the marginal covariances of all biases."""
     prior = Precision.single(jnp.ones(len(problem.labels)))
     point = mode(problem, start)
-    return jax.block_until_ready(laplace(problem.spec, problem.system, point, prior).covariance)
+    return jax.block_until_ready(laplace(problem.model, point, prior).covariance)
 
 
 @pytest.mark.parametrize("work", [mode, mode_and_marginals], ids=lambda work: work.__name__)
@@ -81,7 +81,7 @@ def test_one_elimination_grows_with_epochs_and_rows(benchmark, K):
     problem, start = network(10, K)
     with jax.enable_x64(True):
         alpha = Precision.single(jnp.ones(len(problem.labels)))
-        benchmark(lambda: jax.block_until_ready(laplace(problem.spec, problem.system, start, alpha).covariance))
+        benchmark(lambda: jax.block_until_ready(laplace(problem.model, start, alpha).covariance))
 
 
 @pytest.mark.parametrize("pieces", [1, 5, 20, 50])
@@ -123,7 +123,7 @@ def test_one_smoothing_pass_of_c1(benchmark):
     with jax.enable_x64(True):
         start: Point = track_mode(problem, automatic_start(problem))
         alpha = Precision.single(jnp.ones(len(problem.labels)))
-        arguments = (problem.spec, problem.system, start, alpha, 1, 0.0)
+        arguments = (problem.model, start, alpha, 1, 0.0)
         benchmark(lambda: jax.block_until_ready(find_mode(*arguments, joint=False).cost))
 
 

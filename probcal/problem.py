@@ -7,17 +7,17 @@ from copy import copy
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from os import PathLike
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError, nearest
+from probcal.model.model import Model, Recursion
+from probcal.model.rows import Block, Layout, Rows, addresses, make_block, pose_entries, pose_vector
 from probcal.motion import Motion, Static, Target, White, as_motion
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, Level, Unknown, guess_of
-from probcal.rows import Block, Layout, Rows, addresses, make_block, pose_entries, pose_vector
 from probcal.sensor import VECTORS
 from probcal.table import Measurements, Table, factor, header, measure, read_table
 from probcal.types import float64
@@ -26,33 +26,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
-
-
-class Recursion(NamedTuple):
-    """Arrays of one recursion: E epochs of targets that share a state layout of n entries."""
-
-    F: jax.Array  # (E, n, n) transitions, 0 at the first epoch of a target
-    L: jax.Array  # (E, n, n) noise factors (start factors at a first epoch), unused columns 0
-    level: jax.Array  # (E, n) which unknown level multiplies a column of L, H where known
-    drift: jax.Array  # (E, n) known part: start means, means of white components
-
-
-class System(NamedTuple):
-    """All numbers of a problem, as one pytree that jitted kernels take as an argument."""
-
-    recursions: tuple[Recursion, ...]
-    rows: tuple[Rows, ...]
-    level_spread: jax.Array  # (H,) standard deviation of each log level
-
-
-@dataclass(frozen=True)
-class Spec:
-    """Static form of a problem: its blocks, and the recursion that each reads."""
-
-    blocks: tuple[Block, ...]
-    recursion: tuple[int, ...]
-    biases: int  # M, number of free biases
-    driven: bool = False  # whether a process noise has an unknown level
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,9 +160,9 @@ class Problem:
         """
         data, frame = self.measurements, self.measurements.table.frame.copy()
         value = data.value.copy()
-        for block, index, numbers, new in zip(self.spec.blocks, self.row_index, self.system.rows, y, strict=True):
-            there = np.asarray(numbers.mask) > 0
-            for c, (name, _) in enumerate(block.type.expand(self.network.dimension)):
+        for channels, index, mask, new in zip(self.columns, self.row_index, self.model.measured, y, strict=True):
+            there = np.asarray(mask) > 0
+            for c, name in enumerate(channels):
                 value[index[there[:, c]], data.channels.index(name)] = np.asarray(new)[there[:, c], c]
         names, units = header(data.table)
         for j, name in enumerate(data.channels):
@@ -202,11 +175,7 @@ class Problem:
                 frame[frame.columns[names.index(name)]] = column
         other = copy(self)
         other.measurements = replace(data, value=value, table=replace(data.table, frame=frame))
-        rows = [
-            r._replace(y=jnp.where(r.mask > 0, jnp.asarray(new, r.y.dtype), 0.0))
-            for r, new in zip(self.system.rows, y, strict=True)
-        ]
-        other.system = self.system._replace(rows=tuple(rows))
+        other.model = self.model.with_values(y)
         return other
 
     def target(self, name: str) -> Target:
@@ -258,6 +227,7 @@ class Problem:
         rows_of: list[Any] = []
         recursion_index: list[int] = []
         self.row_index: list[np.ndarray] = []  # rows of the table behind each block
+        self.columns: list[tuple[str, ...]] = []  # their channels
         for kind in self.network.types:
             channel_levels = _channel_levels(kind, self.network.dimension, levels)
             for r, epochs in enumerate(self.epochs):
@@ -268,14 +238,25 @@ class Problem:
                     rows_of.append(Rows(**self._rows(block, chosen, epoch_of[chosen], channel_levels)))
                     recursion_index.append(r)
                     self.row_index.append(chosen)
+                    self.columns.append(tuple(name for name, _ in kind.expand(self.network.dimension)))
         self.levels = tuple(levels.records)
         driven = any((r.level >= 0).any() for r in recursions)
-        self.spec = Spec(tuple(blocks), tuple(recursion_index), len(self.biases), driven)
         spread: Any = np.array([np.log(level.factor) for level in self.levels])
         recursions = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in recursions]
         rows_of = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in rows_of]
         # put, not `asarray`: that compiles a copy for every new shape
-        self.system = jax.device_put(System(tuple(recursions), tuple(rows_of), spread), may_alias=False)
+        self.model = jax.device_put(
+            Model(
+                tuple(blocks),
+                tuple(recursion_index),
+                len(self.biases),
+                driven,
+                tuple(recursions),
+                tuple(rows_of),
+                spread,
+            ),
+            may_alias=False,
+        )
 
     def _rows_of(self, kind: Any, inside: np.ndarray) -> np.ndarray:
         ours = [k for k, placed in enumerate(self.network.sensors) if placed.type == kind]

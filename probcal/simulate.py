@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from probcal import rows
 from probcal.errors import InputError, nearest
 from probcal.files import write_whole
 from probcal.labels import AXES
 from probcal.lazy import Later
+from probcal.model import rows
 from probcal.network import Network
 from probcal.noise import Bernoulli
 from probcal.problem import Epochs, Problem
@@ -197,7 +197,7 @@ def simulate(
     states = [_states(problem, r, tracks, keys[1]) for r in range(len(problem.epochs))]
     columns = {name: np.full(len(plan), np.nan) for name in network.channel_names}
     levels = np.zeros(len(problem.levels))
-    pieces = zip(problem.spec.blocks, problem.system.rows, problem.spec.recursion, problem.row_index, strict=True)
+    pieces = zip(problem.model.blocks, problem.model.rows, problem.model.recursion, problem.row_index, strict=True)
     for b, (block, data, r, index) in enumerate(pieces):
         seed = jax.random.split(jax.random.fold_in(keys[2], b), 3)
         drawn = np.array(_drawn(block, data, states[r], z, levels, seed[0]))
@@ -260,7 +260,7 @@ def _biases(problem: Problem, share: float, given: Mapping[str, float] | None, k
 
 def _states(problem: Problem, r: int, tracks: Mapping[str, Any], key: jax.Array) -> np.ndarray:
     """States (E, n) of one recursion: drawn from the motion, given components put over."""
-    part, epochs = problem.system.recursions[r], problem.epochs[r]
+    part, epochs = problem.model.recursions[r], problem.epochs[r]
     noise = np.asarray(jax.random.normal(jax.random.fold_in(key, r), part.drift.shape))
     F, L, drift = (np.asarray(a) for a in (part.F, part.L, part.drift))
     states = np.zeros_like(noise)

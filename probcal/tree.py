@@ -116,11 +116,11 @@ def datum_of(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
     data, network = problem.measurements, problem.network
     picks: list[Any] = []
     columns = []
-    for block, index, numbers in zip(problem.spec.blocks, problem.row_index, problem.system.rows, strict=True):
-        where = np.nonzero(np.asarray(numbers.mask))
+    parts = zip(problem.columns, problem.row_index, problem.model.measured, problem.model.values, strict=True)
+    for names_, index, there, values in parts:
+        where = np.nonzero(np.asarray(there))
         picks.append(where)
-        rows, channels = index[where[0]], np.array([name for name, _ in block.type.expand(network.dimension)])[where[1]]
-        columns.append((rows, channels, np.asarray(numbers.y)[where]))
+        columns.append((index[where[0]], np.array(names_)[where[1]], np.asarray(values)[where]))
     row = np.concatenate([c[0] for c in columns])
     names = np.array([s.name for s in network.sensors])
     coords = {

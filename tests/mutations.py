@@ -36,15 +36,15 @@ MUTATIONS = [
     Mutation("smoothing/recursion.py", "eye[None] - L.mT @ adjoint @ L", "eye[None] + 0 * L", "test_levels.py"),
     # smoothing/mode.py
     Mutation("smoothing/mode.py", "signed = jnp.concatenate([-alone, new])", "signed = jnp.concatenate([alone, new])", "test_exact.py"),
-    Mutation("smoothing/mode.py", "0.5 * known + widening(system, point.levels)", "0.5 * known", "test_formulas.py test_levels.py"),
+    Mutation("smoothing/mode.py", "0.5 * known + widening(model, point.levels)", "0.5 * known", "test_formulas.py test_levels.py"),
     Mutation("smoothing/mode.py", "return proposal, 0.5 * slope", "return proposal, slope", "test_guards.py"),
     Mutation("smoothing/mode.py", "~last.moved & ~converged", "last.moved & ~converged", "test_guards.py"),
     # smoothing/information.py
     Mutation("smoothing/information.py", "spread - 0.5 * (solved.logdet + logdet)", "spread - 0.5 * solved.logdet", "test_exact.py"),
     Mutation("smoothing/information.py", "return Moments(-response.states,", "return Moments(response.states,", "test_exact.py test_observability.py"),
-    Mutation("smoothing/information.py", "pull - (point.levels + step) / system.level_spread**2", "pull", "test_levels.py"),
-    Mutation("smoothing/information.py", "variances.append(own + jnp", "variances.append(jnp", "test_formulas.py"),
-    Mutation("smoothing/information.py", "@ root[index] + by_state", "@ root[index] - by_state", "test_observability.py"),
+    Mutation("smoothing/information.py", "pull - (point.levels + step) / model.level_spread**2", "pull", "test_levels.py"),
+    Mutation("smoothing/information.py", "jnp.add, alone, model.spread(", "lambda a, b: b, alone, model.spread(", "test_formulas.py"),
+    Mutation("model/model.py", "@ moved[epoch] + by_bias", "@ moved[epoch] - by_bias", "test_formulas.py test_observability.py"),
     Mutation("smoothing/information.py", "jnp.exp(point.levels - levels)", "jnp.exp(levels - point.levels)", "test_formulas.py test_levels.py"),
     Mutation("smoothing/information.py", "(squares + sum(jnp.sum(u**2) for u in point.noises))", "squares", "test_guards.py"),
     # smoothing/draws.py
@@ -60,15 +60,15 @@ MUTATIONS = [
     Mutation("smoothing/frame.py", "loops.append(Loop(-smooth.states,", "loops.append(Loop(smooth.states,", "test_samplers.py"),
     Mutation("smoothing/frame.py", "cross = -(slopes", "cross = (slopes", "test_formulas.py"),
     Mutation("smoothing/frame.py", "jnp.expm1(-2 * step)", "jnp.expm1(2 * step)", "test_samplers.py"),
-    # smoothing/sigma.py
-    Mutation("smoothing/sigma.py", "np.full(2 * u, 0.5 / (u + kappa))", "np.full(2 * u, 1.0 / (u + kappa))", "test_methods.py"),
-    Mutation("smoothing/sigma.py", " - jnp.sum(slope**2, -1)", "", "test_methods.py"),
-    # rows.py
-    Mutation("rows.py", "rows.base + rows.scale * padded", "rows.base - rows.scale * padded", "test_exact.py"),
-    Mutation("rows.py", "by_bias * rows.scale[rows.sensor][:, None, :]", "by_bias", "test_exact.py"),
-    Mutation("rows.py", "return rows.std * factors[rows.level]", "return rows.std", "test_levels.py"),
-    Mutation("rows.py", "score / jnp.sqrt(jnp.where(there, information, 1.0))", "score / jnp.where(there, information, 1.0)", "test_assess.py"),
-    Mutation("rows.py", "jnp.mod(value + channel.period / 2, channel.period)", "jnp.mod(value, channel.period)", "test_catalogue.py test_model.py"),
+    # model/sigma.py
+    Mutation("model/sigma.py", "np.full(2 * u, 0.5 / (u + kappa))", "np.full(2 * u, 1.0 / (u + kappa))", "test_methods.py"),
+    Mutation("model/sigma.py", " - jnp.sum(slope**2, -1)", "", "test_methods.py"),
+    # model/rows.py
+    Mutation("model/rows.py", "rows.base + rows.scale * padded", "rows.base - rows.scale * padded", "test_exact.py"),
+    Mutation("model/rows.py", "by_bias * rows.scale[rows.sensor][:, None, :]", "by_bias", "test_exact.py"),
+    Mutation("model/rows.py", "return rows.std * factors[rows.level]", "return rows.std", "test_levels.py"),
+    Mutation("model/rows.py", "score / jnp.sqrt(jnp.where(there, information, 1.0))", "score / jnp.where(there, information, 1.0)", "test_assess.py"),
+    Mutation("model/rows.py", "jnp.mod(value + channel.period / 2, channel.period)", "jnp.mod(value, channel.period)", "test_catalogue.py test_model.py"),
     # noise.py
     Mutation("noise.py", "return -0.5 * r**2 - jnp.log(std) - 0.5 * np.log(2 * np.pi)", "return -0.5 * r**2 - jnp.log(std)", "test_exact.py"),
     Mutation("noise.py", "(self.df + 1) / (self.df + 3)", "(self.df + 1) / (self.df + 2)", "test_methods.py"),
@@ -104,7 +104,7 @@ MUTATIONS = [
     Mutation("priors.py", "jnp.where(self.alpha > 0, self.alpha, 1.0))) + self.logdet", "jnp.where(self.alpha > 0, self.alpha, 1.0)))", "test_methods.py"),
     # inference/
     Mutation("inference/ea.py", "alpha=jnp.where(fresh, state.alpha, alpha)", "alpha=alpha", "test_methods.py test_exact.py"),
-    Mutation("inference/ea.py", "-cost(spec, system, point, held) - jnp.sum(penalty)", "-cost(spec, system, point, held)", "test_methods.py"),
+    Mutation("inference/ea.py", "-cost(model, point, held) - jnp.sum(penalty)", "-cost(model, point, held)", "test_methods.py"),
     Mutation("inference/em.py", "information + prior.matrix() + 1e-12", "information + 1e-12", "test_methods.py"),
     Mutation("inference/em.py", "- 0.5 * alpha * point.z**2)", ")", "test_methods.py"),
     Mutation("inference/run.py", "max(float(best) - float(evidence), 0.0)", "0.0", "test_guards.py"),

@@ -4,7 +4,8 @@ Statistical tests say how often they would fail by chance; their seeds are fixed
 """
 
 import sys
-from functools import cache, partial
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -65,9 +66,9 @@ def suffixes(problem):
 
 def hessian(problem, precision):
     """Covariance of z and variances (E n,) of the states: the inverse Hessian of the negative log joint density."""
-    spec, system, levels = problem.spec, problem.system, jnp.zeros(len(problem.levels))
-    shapes = [part.drift.shape for part in system.recursions]
-    M, sizes = spec.biases, [np.prod(shape) for shape in shapes]
+    model, levels = problem.model, jnp.zeros(len(problem.levels))
+    shapes = [part.drift.shape for part in model.recursions]
+    M, sizes = model.biases, [np.prod(shape) for shape in shapes]
     prior = Precision.single(jnp.asarray(precision))
 
     def split(v):
@@ -75,12 +76,12 @@ def hessian(problem, precision):
         noises = tuple(p.reshape(shape) for p, shape in zip(parts, shapes, strict=True))
         states = tuple(
             rec.trajectory(part.F, factors(part, levels), part.drift[:, :, None], u[:, :, None])[:, :, 0]
-            for part, u in zip(system.recursions, noises, strict=True)
+            for part, u in zip(model.recursions, noises, strict=True)
         )
         return Point(states, noises, v[:M], levels)
 
     at = jnp.zeros(M + sum(sizes))
-    covariance = np.linalg.inv(jax.jit(jax.hessian(lambda v: cost(spec, system, split(v), prior)))(at))
+    covariance = np.linalg.inv(jax.jit(jax.hessian(lambda v: cost(model, split(v), prior)))(at))
     by_noise = jax.jit(jax.jacfwd(lambda v: jnp.concatenate([x.ravel() for x in split(v).states])))(at)
     variances = np.einsum("ij,jk,ik->i", by_noise, covariance, by_noise)
     return covariance[:M, :M], np.split(variances, np.cumsum(sizes)[:-1])
@@ -236,18 +237,18 @@ def test_more_data_never_raise_a_bound(seed):
     assert (sd[1] < sd[0] * (1 - 1e-3)).any()
 
 
-@partial(jax.jit, static_argnames=("spec",))
-def likeliest(spec, system, true, precision, keys):
+@jax.jit
+def likeliest(model, true, precision, keys):
     """Biases (runs, M) that maximise the joint density of runs simulated at one point."""
 
     def one(key):
         drawn = []
-        for b, (block, data) in enumerate(zip(spec.blocks, system.rows, strict=True)):
+        for b, (block, data) in enumerate(zip(model.blocks, model.rows, strict=True)):
             predicted = rows.predict(block, data, true.states[0], true.z)
             y = rows.sample(block, data, predicted, true.levels, jax.random.fold_in(key, b))
             drawn.append(data._replace(y=data.mask * y))
-        measured = system._replace(rows=tuple(drawn))
-        return find_mode(spec, measured, true, Precision.single(precision), 30, 1e-7).point.z
+        measured = replace(model, rows=tuple(drawn))
+        return find_mode(measured, true, Precision.single(precision), 30, 1e-7).point.z
 
     return jax.lax.map(one, keys)
 
@@ -274,7 +275,7 @@ def test_errors_of_maximum_likelihood_at_low_noise_reach_the_parametric_bound():
         point = project(problem, [states], [np.full_like(states, 1e8)])._replace(z=jnp.asarray(z))
         assert np.abs(point.states[0][:, :2] - path).max() < 1e-3
         precision, keys = jnp.asarray(problem.surveyed.astype(float)), jax.random.split(jax.random.key(0), runs)
-        found = np.asarray(likeliest(problem.spec, problem.system, point, precision, keys))
+        found = np.asarray(likeliest(problem.model, point, precision, keys))
     ratio = np.sqrt(((found - z) ** 2).mean(0)) * problem.scales / tree["bias"]["sd"].values
     assert np.abs(ratio - 1).max() < 0.05, dict(zip(problem.labels, ratio.round(3), strict=True))
 

@@ -397,7 +397,7 @@ def evaluated(kind, nodes, state, biases, time=5.0):
     problem, x = one_row(kind, nodes, state, time)
     assert set(biases) <= set(problem.labels)
     z = np.array([biases.get(label, 0.0) for label in problem.labels]) / problem.scales
-    block, data = problem.spec.blocks[0], problem.system.rows[0]
+    block, data = problem.model.blocks[0], problem.model.rows[0]
 
     def call(x, z):
         with jax.enable_x64(True):
@@ -524,7 +524,7 @@ def test_every_formula_is_that_of_its_source(name):
     np.testing.assert_allclose(lin.state, slopes[:, used], rtol=1e-5, atol=scale)
     assert np.abs(np.delete(slopes[:, : len(x)], used, 1)).max(initial=0.0) == 0.0, "what is not read has no slope"
     by_bias = np.zeros((len(found), len(z)))
-    there = one_row(kind, nodes, {"position": P[d], "velocity": V[d]} | extra)[0].system.rows[0].bias[0]
+    there = one_row(kind, nodes, {"position": P[d], "velocity": V[d]} | extra)[0].model.rows[0].bias[0]
     for column, m in enumerate(np.asarray(there)):
         if m < len(z):
             by_bias[:, m] += lin.bias[:, column]
@@ -635,10 +635,10 @@ def test_gradients_are_finite_where_a_target_stands_on_a_node():
             for placed in network.sensors
         ]
         problem = Problem(network, CV + EXTRAS[name] if name in EXTRAS else CV, pd.DataFrame(plan))
-        states = np.full(problem.system.recursions[0].drift.shape, 60.0)
+        states = np.full(problem.model.recursions[0].drift.shape, 60.0)
         states[:, :d] = CORNERS[d]
-        b = [block.type for block in problem.spec.blocks].index(kind)
+        b = [block.type for block in problem.model.blocks].index(kind)
         with jax.enable_x64(True):
             arrays = (jax.numpy.asarray(states), jax.numpy.zeros(len(problem.labels)), jax.numpy.zeros(0))
-            lin = LINEARISE(problem.spec.blocks[b], problem.system.rows[b], *arrays, expected=True)
+            lin = LINEARISE(problem.model.blocks[b], problem.model.rows[b], *arrays, expected=True)
         assert all(np.isfinite(np.asarray(part)).all() for part in lin), name

@@ -86,8 +86,8 @@ def test_iterating_changes_nothing(name):
     with jax.enable_x64(True):
         alpha = Precision.single(jnp.ones(len(problem.labels)))
         start = jax.tree.map(jnp.asarray, resting(problem))
-        one = find_mode(problem.spec, problem.system, start, alpha, 1, 0.0)
-        many = find_mode(problem.spec, problem.system, start, alpha, 30, 0.0)
+        one = find_mode(problem.model, start, alpha, 1, 0.0)
+        many = find_mode(problem.model, start, alpha, 30, 0.0)
     assert float(many.cost) == pytest.approx(float(one.cost), rel=1e-12)
     order = [problem.labels.index(label) for label in solved(name)[0].labels]
     for mode in (one, many):

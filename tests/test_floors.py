@@ -13,8 +13,8 @@ FLOORS = {
     0: ("linalg", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files"),
     1: ("sensor", "motion", "priors", "noise"),
     2: ("sensors",),
-    3: ("network", "table", "nodes", "rows"),
-    4: ("problem", "simulate", "tree"),
+    3: ("network", "table", "nodes"),
+    4: ("model", "problem", "simulate", "tree"),
     5: ("smoothing",),
     6: ("inference", "analysis"),
     7: ("cli", "report", "plots", "diagnostics"),
@@ -69,15 +69,15 @@ def floor(module):
 
 
 def test_the_walk_finds_the_package():
-    assert {"linalg", "rows", "smoothing.mode", "inference.fit", "inference"} <= set(MODULES)
+    assert {"linalg", "model.rows", "smoothing.mode", "inference.fit", "inference"} <= set(MODULES)
     found = {name for name, _ in own("smoothing.mode", MODULES["smoothing.mode"])}
-    assert {"linalg", "problem", "smoothing.recursion"} <= found
+    assert {"linalg", "model.model", "smoothing.recursion"} <= found
 
 
 def test_imports_inside_functions_and_relative_ones_are_seen():
-    text = "def f():\n    from ..problem import Spec\n    import probcal.cli\n    from . import mode\n"
+    text = "def f():\n    from ..problem import Epochs\n    import probcal.cli\n    from . import mode\n"
     found = [name for name, _ in imports(ast.parse(text), "smoothing.start", False)]
-    assert found == ["probcal.problem.Spec", "probcal.cli", "probcal.smoothing.mode"]
+    assert found == ["probcal.problem.Epochs", "probcal.cli", "probcal.smoothing.mode"]
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if m], ids=str)

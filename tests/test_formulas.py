@@ -11,8 +11,8 @@ from worlds import exact, linear, resting, ruler
 
 from probcal import ARD, Channel, ConstantVelocity, Network, Node, Problem, Unknown
 from probcal.inference.posterior import _bias_status
+from probcal.model.rows import noise_std
 from probcal.priors import Precision
-from probcal.rows import noise_std
 from probcal.smoothing.frame import _moves, _with_levels
 from probcal.smoothing.information import at_levels, moments, predicted_variances
 from probcal.smoothing.mode import Point, cost, factors
@@ -23,7 +23,7 @@ def test_an_undeclared_start_is_as_wide_as_network_and_recording():
     """Ten diagonals of the network around its middle; velocities that cross it in the time of the recording."""
     network = Network([ruler.on(Node("a", (0.0, 0.0))), ruler.on(Node("b", (30.0, 40.0)))])
     table = pd.DataFrame({"time": [0.0, 4.0, 0.0, 4.0], "sensor": ["a", "a", "b", "b"], "height": 1.0})
-    part = Problem(network, ConstantVelocity(0.5), table).system.recursions[0]
+    part = Problem(network, ConstantVelocity(0.5), table).model.recursions[0]
     speed = 10 * 50.0 / 4.0 + 0.5 * 2.0
     np.testing.assert_allclose(np.diag(part.L[0]), [500.0, 500.0, speed, speed], rtol=1e-6)
     np.testing.assert_allclose(part.drift[0], [15.0, 20.0, 0.0, 0.0])
@@ -57,16 +57,16 @@ def test_a_wider_process_noise_costs_its_logarithm_and_leaves_the_trajectory_alo
     table = pd.DataFrame({"time": [0.0, 1.0], "sensor": "a", "height": [0.5, 1.0]})
     problem = Problem(network, ConstantVelocity(Unknown(0.5, 2.0)), table)
     with jax.enable_x64(True):
-        part = problem.system.recursions[0]
+        part = problem.model.recursions[0]
         noises = 0.1 * np.arange(1.0, 9.0).reshape(2, 4)
         states = trajectory(part.F, part.L, part.drift[:, :, None], noises[:, :, None])[:, :, 0]
         here = Point((states,), (noises,), np.zeros(1), np.zeros(1))
-        there = at_levels(problem.system, here, np.array([0.3]))
+        there = at_levels(problem.model, here, np.array([0.3]))
         np.testing.assert_allclose(there.noises[0], noises * [[1.0], [np.exp(-0.3)]])
         again = trajectory(part.F, factors(part, there.levels), part.drift[:, :, None], there.noises[0][:, :, None])
         np.testing.assert_allclose(again[:, :, 0], states)
         prior = Precision.single(np.ones(1))
-        change = cost(problem.spec, problem.system, there, prior) - cost(problem.spec, problem.system, here, prior)
+        change = cost(problem.model, there, prior) - cost(problem.model, here, prior)
     wider = 4 * 0.3 + 0.5 * (np.exp(-0.6) - 1) * np.sum(noises[1] ** 2)
     assert float(change) == pytest.approx(wider + 0.5 * (0.3 / np.log(2.0)) ** 2)
 
@@ -86,18 +86,18 @@ def test_a_predicted_value_is_as_uncertain_as_biases_and_trajectory_make_it():
         row[: len(d.G)], row[starts[d.chain] + n * d.epoch :][:n] = d.G, d.H
         expected.append(row @ whole @ row)
     with jax.enable_x64(True):
-        spec, system, point = problem.spec, problem.system, resting(problem)
+        model, point = problem.model, resting(problem)
         covariance = jnp.asarray(exact("plane").z[1][np.ix_(order, order)])
-        found = moments(spec, system, point, covariance)
-        (variance,) = predicted_variances(spec, system, point, covariance, found)
-    np.testing.assert_allclose(np.asarray(variance)[np.asarray(system.rows[0].mask) > 0], expected, rtol=1e-8)
+        found = moments(model, point, covariance)
+        (variance,) = predicted_variances(model, point, covariance, found)
+    np.testing.assert_allclose(np.asarray(variance)[np.asarray(model.rows[0].mask) > 0], expected, rtol=1e-8)
 
 
 def test_a_row_with_a_std_of_its_own_does_not_feel_the_unknown_level():
     kind = replace(ruler, channels={"height": Channel("m", std=Unknown(2.0))})
     network = Network([kind.on(Node("a", (0.0, 0.0)))])
     table = pd.DataFrame({"time": [0.0, 1.0], "sensor": "a", "height": 1.0, "height_std": [0.5, np.nan]})
-    (rows,) = Problem(network, ConstantVelocity(0.5), table).system.rows
+    (rows,) = Problem(network, ConstantVelocity(0.5), table).model.rows
     assert rows.level.ravel().tolist() == [1, 0], "one level: its number is 0, and 1 stands for none"
     with jax.enable_x64(True):
         found = noise_std(rows, jnp.log(jnp.array([3.0])))

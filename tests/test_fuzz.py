@@ -93,7 +93,7 @@ def check_table(source):
     assert all(isinstance(name, str) and name for name in data.target_names)
     problem = refused(lambda: Problem(NETWORK, ConstantVelocity(1.0), source))
     if problem is not None:
-        for recursion in problem.system.recursions:
+        for recursion in problem.model.recursions:
             assert all(np.isfinite(np.asarray(part)).all() for part in recursion)
 
 

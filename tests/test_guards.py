@@ -150,11 +150,11 @@ def test_a_search_that_never_moved_has_diverged_and_one_at_the_mode_has_not():
     assert "it never left its start, since no step fitted better" in tree.attrs["message"]
     with jax.enable_x64(True):
         problem = Problem(network, ConstantVelocity(0.5), table)
-        spec, system, prior = problem.spec, problem.system, Precision.single(jnp.ones(3))
+        model, prior = problem.model, Precision.single(jnp.ones(3))
         point = automatic_start(problem)
         for _ in range(3):
-            point = find_mode(spec, system, point, prior, 30, 1e-13).point
-        again = find_mode(spec, system, point, prior, 30, 0.0)  # the cost cannot fall below its rounding
+            point = find_mode(model, point, prior, 30, 1e-13).point
+        again = find_mode(model, point, prior, 30, 0.0)  # the cost cannot fall below its rounding
         assert bool(again.converged)
         assert not bool(again.refused)
         outcome = maximise(MAP(tolerance=1e-13), problem, Gaussian(), point, None)
@@ -168,12 +168,12 @@ def test_the_promise_of_a_step_is_what_it_keeps_on_a_linear_problem():
     """A step to the mode of a quadratic cost promises the whole decrease: where it is refused, that tells why."""
     problem, _ = linear("plane")
     with jax.enable_x64(True):
-        spec, system, start = problem.spec, problem.system, resting(problem)
+        model, start = problem.model, resting(problem)
         prior = Precision.single(jnp.ones(len(problem.labels)))
-        step = jax.jit(_proposal, static_argnums=(0, 5))
-        promised = step(spec, system, start, prior, jnp.zeros(()), True)[1]
-        first = find_mode(spec, system, start, prior, 0, 1e-9).cost
-        assert float(promised) == pytest.approx(float(first - find_mode(spec, system, start, prior, 30, 1e-9).cost))
+        step = jax.jit(_proposal, static_argnums=4)
+        promised = step(model, start, prior, jnp.zeros(()), True)[1]
+        first = find_mode(model, start, prior, 0, 1e-9).cost
+        assert float(promised) == pytest.approx(float(first - find_mode(model, start, prior, 30, 1e-9).cost))
 
 
 def test_an_evidence_below_its_best_is_no_answer():
@@ -181,7 +181,7 @@ def test_an_evidence_below_its_best_is_no_answer():
     with jax.enable_x64(True):
         given = given_of(EA(), problem, ARD())
         start = first_state(given, resting(problem))
-        found = laplace(problem.spec, problem.system, start.point, given.prior)
+        found = laplace(problem.model, start.point, given.prior)
         state = start._replace(found=found, best=found.evidence + 5.0, refused=jnp.zeros((), bool))
         fallen = finish(problem, ARD(), state, True, np.zeros(3))
         held = finish(problem, Gaussian(), state, True, np.zeros(3))  # nothing is learnt: the evidence is no objective
@@ -273,7 +273,7 @@ def test_outliers_of_heavy_noise_and_rare_events_are_no_misfit():
     with jax.enable_x64(True):
         problem = Problem(network, known, table)
         point = resting(problem)
-        (square,) = squares_of(problem.spec, problem.system, point)
+        (square,) = squares_of(problem.model, point)
         assert square.shape == (8, 3)
         assert float(square[:, 0].max()) < 3.0, "the score of a Student-t is bounded"
         assert float(square[3, 1]) < 100.0, "an echo counts by its own width"
@@ -285,8 +285,8 @@ def test_the_mean_square_counts_residuals_and_process_noises():
     problem, naive = linear("plane")
     with jax.enable_x64(True):
         prior = Precision.single(jnp.ones(len(problem.labels)))
-        mode = find_mode(problem.spec, problem.system, resting(problem), prior, 30, 1e-9)
-        square = float(mean_square(problem.spec, problem.system, mode.point)) * len(naive.data)
+        mode = find_mode(problem.model, resting(problem), prior, 30, 1e-9)
+        square = float(mean_square(problem.model, mode.point)) * len(naive.data)
     z, rest = exact("plane").z[0], exact("plane").states[0]
     chains, expected = [], 0.0
     for chain in naive.chains:

@@ -5,7 +5,7 @@ compared are checked not to be near zero, and the mode is searched from the star
 """
 
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -47,16 +47,16 @@ class Estimate:
     evidence: float
 
 
-@partial(jax.jit, static_argnums=0)
-def solved(spec, system, start):
+@jax.jit
+def solved(model, start):
     """Whether the mode was reached, its point, covariance and evidence, and the variance of every state."""
-    alone = Precision.single(jnp.ones(spec.biases))
-    mode = find_mode(spec, system, start, alone, 500, 1e-11)
-    found = laplace(spec, system, mode.point, alone)
+    alone = Precision.single(jnp.ones(model.biases))
+    mode = find_mode(model, start, alone, 500, 1e-11)
+    found = laplace(model, mode.point, alone)
     variance = [
         jnp.einsum("eni,ij,enj->en", moment.response, found.covariance, moment.response)
         + jnp.diagonal(moment.states, axis1=1, axis2=2)
-        for moment in moments(spec, system, mode.point, found.covariance)
+        for moment in moments(model, mode.point, found.covariance)
     ]
     return mode.converged, mode.point, found.covariance, found.evidence, variance
 
@@ -64,7 +64,7 @@ def solved(spec, system, start):
 def estimate(problem):
     """The joint mode and its Laplace moments, searched from the start prior: no grid, no truth, no seed."""
     with jax.enable_x64(True):
-        found = solved(problem.spec, problem.system, resting(problem))
+        found = solved(problem.model, resting(problem))
     converged, point, covariance, evidence, variances = jax.tree.map(np.asarray, found)
     assert converged
     value, sd = {}, {}

@@ -194,10 +194,8 @@ def test_paper_b_marginalises_each_epoch_alone():
     problem, naive = linear("shifted")
     alpha, M = np.full(len(naive.labels), 0.7), len(naive.labels)
     with jax.enable_x64(True):
-        point = track(problem.spec, problem.system, jax.tree.map(jnp.asarray, resting(problem)))
-        found, step = jax.jit(paper_b, static_argnums=0)(
-            problem.spec, problem.system, point, Precision.single(jnp.asarray(alpha))
-        )
+        point = track(problem.model, jax.tree.map(jnp.asarray, resting(problem)))
+        found, step = jax.jit(paper_b)(problem.model, point, Precision.single(jnp.asarray(alpha)))
     held = reference.dense(naive, None, hold=np.zeros(M))
     order = [problem.labels.index(label) for label in naive.labels]
     information, pull = np.zeros((M, M)), np.zeros(M)

@@ -72,7 +72,7 @@ def test_its_density_is_that_of_the_samplers(case):
     """log p of the frame's coordinates = log p of the model's sites + log |d sites / d coordinates|, to a constant."""
     prior, settings = CASES[case]
     problem = small(**settings)
-    several = len(problem.system.recursions) > 1
+    several = len(problem.model.recursions) > 1
     names = [f"noise_{r}" for r in range(2)] if several else ["noise"]
     with jax.enable_x64(True):
         form, posed = posed_of(problem, prior)
@@ -84,7 +84,7 @@ def test_its_density_is_that_of_the_samplers(case):
         def sites(x):
             free = back(x)
             found = parts(form, posed, free)
-            point = place(posed.system, posed.frame, found.theta, free.eps)
+            point = place(posed.model, posed.frame, found.theta, free.eps)
             given = {"z": found.theta[:M], **dict(zip(names, point.noises, strict=True))} | dict(found.phi)
             return given | ({"level": found.theta[M:]} if problem.levels else {})
 
@@ -130,7 +130,7 @@ def test_prior_draws_have_the_moments_of_the_declaration():
         free = Predictive(model, num_samples=2)(jax.random.key(5))
     drawn = {name: np.asarray(values) for name, values in drawn.items()}
     np.testing.assert_allclose(drawn["bias"], drawn["z"] * problem.scales)
-    np.testing.assert_array_equal(free["y_position"][0], problem.system.rows[0].y)  # conditioned by default
+    np.testing.assert_array_equal(free["y_position"][0], problem.model.rows[0].y)  # conditioned by default
     mean, sd = prior.states
     width = 6.0 / np.sqrt(D)  # normal quantile of FALSE_ALARM over fewer than 100 comparisons
     states = drawn["state"].reshape(D, -1)
@@ -142,7 +142,7 @@ def test_prior_draws_have_the_moments_of_the_declaration():
     A = np.array([[*d.G, *np.eye(3)[d.epoch].repeat(4) * np.tile(d.H, 3)] for d in observed])
     wide = np.sqrt(np.einsum("ij,jk,ik->i", A, prior.covariance, A) + np.array([d.std**2 for d in observed]))
     centre = A @ prior.mean + np.array([d.offset for d in observed])
-    there = np.asarray(problem.system.rows[0].mask) > 0
+    there = np.asarray(problem.model.rows[0].mask) > 0
     flat = y[:, there]
     assert (np.abs(flat.mean(0) - centre) < width * wide).all()
     assert (np.abs(flat.std(0) / wide - 1) < width).all()
@@ -168,9 +168,9 @@ def test_numpyros_own_sampler_finds_the_exact_posterior():
 def test_other_data_take_the_place_of_the_tables():
     problem = small()
     with jax.enable_x64(True):
-        model, y = numpyro_model(problem, Gaussian()), problem.system.rows[0].y
+        model, y = numpyro_model(problem, Gaussian()), problem.model.rows[0].y
         seeded = numpyro.handlers.seed(model, jax.random.key(0))
-        mask = np.asarray(problem.system.rows[0].mask)
+        mask = np.asarray(problem.model.rows[0].mask)
         same = log_density(seeded, (), {}, {})[0]
         blank = np.where(mask > 0, y, np.nan)
         assert log_density(seeded, ({"y_radar": blank},), {}, {})[0] == same
@@ -199,7 +199,7 @@ def test_autoguides_and_log_likelihoods_of_numpyro_take_it():
         again = Predictive(model, drawn)(jax.random.key(2), observed=False)["y_radar"]
     assert float(fitted.losses[-1]) < float(fitted.losses[0])
     assert drawn["z"].shape == (3, len(problem.labels))
-    mask = np.asarray(problem.system.rows[0].mask)
+    mask = np.asarray(problem.model.rows[0].mask)
     assert likely.shape == again.shape == (3, *mask.shape)
     assert ((np.asarray(likely) != 0) == (mask > 0)).all()
     assert np.isfinite(np.asarray(again)).all()

@@ -29,10 +29,10 @@ from probcal import (
     sensors,
     simulate,
 )
-from probcal import rows as waist
 from probcal.analysis import next_anchors, next_passes, next_sensors, observability
 from probcal.geometry import bearing, norm
 from probcal.inference.run import maximise
+from probcal.model import rows as waist
 from probcal.smoothing.directions import weak_directions
 from probcal.smoothing.gauge import gauge
 from probcal.smoothing.information import marginal_information
@@ -152,7 +152,7 @@ def dense_gauge(problem, point):
     """Null space of the rows with free positions, by a dense singular value decomposition; its dimension."""
     jacobians = []
     (x,), z = point.states, point.z
-    for block, data in zip(problem.spec.blocks, problem.system.rows, strict=True):
+    for block, data in zip(problem.model.blocks, problem.model.rows, strict=True):
 
         def predicted(x, z, block=block, data=data):
             return (waist.predict(block, data, x, z) / data.std).ravel()
@@ -161,7 +161,7 @@ def dense_gauge(problem, point):
         jacobians.append(np.hstack([np.asarray(by_x).reshape(len(by_x), -1), np.asarray(by_z)]))
     whole = np.concatenate(jacobians)
     states = whole[:, : x.size]
-    return problem.spec.biases - (np.linalg.matrix_rank(whole, rtol=1e-9) - np.linalg.matrix_rank(states, rtol=1e-9))
+    return problem.model.biases - (np.linalg.matrix_rank(whole, rtol=1e-9) - np.linalg.matrix_rank(states, rtol=1e-9))
 
 
 ALWAYS, SECOND = ("radars",), ("trackers", "bearings", "ranges of one scale", "arrivals", "clocks")
@@ -298,7 +298,7 @@ def test_asynchronous_rows_are_not_counted_but_named():
 
 @float64
 def spectrum(problem, point):
-    return np.asarray(marginal_information(problem.spec, problem.system, point))
+    return np.asarray(marginal_information(problem.model, point))
 
 
 def turned(angle, moved):
@@ -364,7 +364,7 @@ def test_leverages_are_those_of_a_dense_regression():
 
 @float64
 def by_bias(problem, point):
-    (block,), (data,) = problem.spec.blocks, problem.system.rows
+    (block,), (data,) = problem.model.blocks, problem.model.rows
     return np.asarray(
         jax.jacfwd(lambda z: (waist.predict(block, data, point.states[0], z) / data.std).ravel())(point.z)
     )

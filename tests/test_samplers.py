@@ -35,7 +35,7 @@ ALARM = 1e-4  # rate at which a right sampler fails one of these tests, for each
 
 # one kernel each, where every operation alone would be one
 PLACE, DRIVING, VOLUME = jax.jit(place), jax.jit(driving), jax.jit(volume)
-WEIGHT, CONDITIONAL = jax.jit(log_weight, static_argnums=0), jax.jit(conditional, static_argnums=0)
+WEIGHT, CONDITIONAL = jax.jit(log_weight), jax.jit(conditional, static_argnums=0)
 
 
 @pytest.fixture(autouse=True)
@@ -47,10 +47,10 @@ def double():
 @cache
 def made(name, prior):
     problem, naive = linear(name)
-    point = track(problem.spec, problem.system, resting(problem))
-    posed = Posed(problem.system, frame_at(problem.spec, problem.system, point),
+    point = track(problem.model, resting(problem))
+    posed = Posed(problem.model, frame_at(problem.model, point),
                   prior.precision(problem.labels, problem.surveyed))  # fmt: skip
-    return problem, Form(problem.spec, hierarchy_of(prior, problem)), posed, naive
+    return problem, Form(problem.model.biases, hierarchy_of(prior, problem)), posed, naive
 
 
 def same_law(a, b):
@@ -141,15 +141,15 @@ def test_a_frame_is_exact_on_linear_problems(name):
     keys = jax.random.split(jax.random.key(4), 3)
     theta = posed.frame.theta + 3 * jax.random.normal(keys[0], posed.frame.theta.shape)
     eps = tuple(2 * jax.random.normal(keys[1], x.shape) for x in posed.frame.point.states)
-    weight = WEIGHT(problem.spec, problem.system, posed.frame, theta, eps)
+    weight = WEIGHT(problem.model, posed.frame, theta, eps)
     assert abs(float(weight)) < 1e-8 * max(1.0, abs(float(posed.frame.log_likelihood(theta))))
     exact = reference.dense(linear, np.ones(len(linear.labels)))
     order = [list(problem.labels).index(label) for label in linear.labels]
     found = CONDITIONAL(form, posed, {})
     np.testing.assert_allclose(np.asarray(found.mean)[order], exact.z[0], rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(np.asarray(found.variance)[order], np.diag(exact.z[1]), rtol=1e-7)
-    point = PLACE(problem.system, posed.frame, theta, eps)
-    for part, x, u in zip(problem.system.recursions, point.states, point.noises, strict=True):
+    point = PLACE(problem.model, posed.frame, theta, eps)
+    for part, x, u in zip(problem.model.recursions, point.states, point.noises, strict=True):
         before = np.concatenate([np.zeros_like(x[:1]), x[:-1]])
         made_of = np.einsum("eij,ej->ei", part.F, before) + part.drift + np.einsum("eij,ej->ei", part.L, u)
         np.testing.assert_allclose(x, made_of, rtol=1e-8, atol=1e-8)
@@ -166,21 +166,21 @@ def test_a_frame_follows_its_levels():
     network = probcal.Network([placed.on(s.nodes[0]) for s in network.sensors])
     problem = probcal.Problem(network, unknown, table.filter(regex="^(?!.*_std)"))
     start = resting(problem)._replace(levels=jnp.zeros(len(problem.levels)))
-    frame = frame_at(problem.spec, problem.system, track(problem.spec, problem.system, start))
+    frame = frame_at(problem.model, track(problem.model, start))
     keys = jax.random.split(jax.random.key(9), 200)
 
     @jax.jit
     def spread(theta):
         def one(key):
             eps = tuple(jax.random.normal(key, x.shape) for x in frame.point.states)
-            return log_weight(problem.spec, problem.system, frame, theta, eps)
+            return log_weight(problem.model, frame, theta, eps)
 
         return jnp.std(jax.lax.map(one, keys))
 
     @jax.jit
     def slopes(theta, e):
         return jax.jacfwd(
-            lambda e: jnp.concatenate([u.ravel() for u in place(problem.system, frame, theta, (e,)).noises])
+            lambda e: jnp.concatenate([u.ravel() for u in place(problem.model, frame, theta, (e,)).noises])
         )(e)
 
     H = len(problem.levels)
@@ -189,17 +189,17 @@ def test_a_frame_follows_its_levels():
         theta = frame.theta.at[-H:].add(step)
         assert spread(theta) < 1e-6
         eps = tuple(jax.random.normal(keys[0], x.shape) for x in frame.point.states)
-        point = PLACE(problem.system, frame, theta, eps)
-        for again, e in zip(DRIVING(problem.system, frame, point), eps, strict=True):
+        point = PLACE(problem.model, frame, theta, eps)
+        for again, e in zip(DRIVING(problem.model, frame, point), eps, strict=True):
             np.testing.assert_allclose(again, e, rtol=1e-7, atol=1e-7)
-        for part, x, u in zip(problem.system.recursions, point.states, point.noises, strict=True):
+        for part, x, u in zip(problem.model.recursions, point.states, point.noises, strict=True):
             before = np.concatenate([np.zeros_like(x[:1]), x[:-1]])
             made_of = np.einsum("eij,ej->ei", part.F, before) + part.drift
             made_of += np.einsum("eij,ej->ei", factors(part, point.levels), u)
             np.testing.assert_allclose(x, made_of, rtol=1e-8, atol=1e-8)
 
         slope = slopes(theta, eps[0]).reshape(eps[0].size, -1)
-        assert np.linalg.slogdet(slope)[1] == pytest.approx(float(VOLUME(problem.system, frame, theta)), abs=1e-8)
+        assert np.linalg.slogdet(slope)[1] == pytest.approx(float(VOLUME(problem.model, frame, theta)), abs=1e-8)
 
 
 def test_whitening_has_the_derivative_of_its_value():
@@ -296,7 +296,7 @@ def test_what_a_spike_keeps_out_has_no_part_in_a_swing(monkeypatch):
     assert out.any()
     eps = tuple(jnp.ones_like(x) for x in posed.frame.point.states)
     theta = jnp.where(given.active, given.mean, 0.0)
-    weight = WEIGHT(form.spec, posed.system, posed.frame, theta, eps)
+    weight = WEIGHT(posed.model, posed.frame, theta, eps)
     normal = jax.random.normal
 
     def pushed(key, shape, dtype=float):
@@ -459,8 +459,8 @@ def test_a_process_noise_hardly_known_keeps_its_lower_tail():
     grid = jnp.linspace(-9.0, 2.5, 400)
 
     def evidence(level):
-        found = find_mode(problem.spec, problem.system, at_levels(problem.system, point, level[None]), prior, 2, 1e-9)
-        return laplace(problem.spec, problem.system, found.point, prior).evidence
+        found = find_mode(problem.model, at_levels(problem.model, point, level[None]), prior, 2, 1e-9)
+        return laplace(problem.model, found.point, prior).evidence
 
     value = np.asarray(jax.lax.map(evidence, grid))
     mass = np.cumsum(np.exp(value - value.max()))

@@ -6,7 +6,7 @@ runs 500 simulations of a small radar network, the default suite 40. The statist
 
 import importlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -107,9 +107,9 @@ def simulated(network, epochs, target=None):
 class Overconfident(MAP):
     """MAP that takes the noise to be 20 % smaller than it is: what depends on the data shows it first."""
 
-    def iterate(self, spec, system, prior, given, state):
-        rows = tuple(part._replace(std=0.8 * part.std) for part in system.rows)
-        return super().iterate(spec, system._replace(rows=rows), prior, given, state)
+    def iterate(self, model, prior, given, state):
+        rows = tuple(part._replace(std=0.8 * part.std) for part in model.rows)
+        return super().iterate(replace(model, rows=rows), prior, given, state)
 
 
 @dataclass(frozen=True)
@@ -180,10 +180,10 @@ def test_words_for_the_shape_of_ranks():
 
 def drawn_from(problem, prior, count):
     with jax.enable_x64(True):
-        form = Form(problem.spec, hierarchy_of(prior, problem))
+        form = Form(problem.model.biases, hierarchy_of(prior, problem))
         first = prior.precision(problem.labels, problem.surveyed)
         keys = jax.random.split(jax.random.key(5), count)
-        found = jax.vmap(lambda k: draw_prior(form, problem.system, first, k))(keys)
+        found = jax.vmap(lambda k: draw_prior(form, problem.model, first, k))(keys)
         return jax.tree.map(np.asarray, found)
 
 
@@ -198,7 +198,7 @@ def test_truths_have_the_moments_of_the_prior():
     assert np.abs(z.T @ z / 4000 - expected).max() < 5 * np.sqrt(2 / 4000)
     spread = np.log([level.factor for level in problem.levels])
     assert np.abs(found.point.levels.std(0) / spread - 1).max() < 5 * np.sqrt(0.5 / 4000)
-    block, rows, y = problem.spec.blocks[0], problem.system.rows[0], found.y[0]
+    block, rows, y = problem.model.blocks[0], problem.model.rows[0], found.y[0]
     channel = [name for name, _ in block.type.expand(2)].index("fix_y")
     e, names = np.asarray(rows.epoch), list(problem.labels)
     bias = np.stack([z[:, [names.index(f"c{k}.position_y"), names.index(f"c{k}.drift")]] for k in range(3)], 1)
@@ -235,14 +235,14 @@ def test_other_measured_values():
     frame.loc[2, "range"] = np.nan
     problem = problem.rebuild(frame)
     with jax.enable_x64(True):
-        y = [np.where(np.asarray(rows.mask) > 0, np.asarray(rows.y) + 0.25, 7.0) for rows in problem.system.rows]
+        y = [np.where(np.asarray(rows.mask) > 0, np.asarray(rows.y) + 0.25, 7.0) for rows in problem.model.rows]
         other = problem.redrawn(y)
     again = other.rebuild()
-    for old, mine, theirs in zip(problem.system.rows, other.system.rows, again.system.rows, strict=True):
+    for old, mine, theirs in zip(problem.model.rows, other.model.rows, again.model.rows, strict=True):
         np.testing.assert_allclose(mine.y, np.where(np.asarray(old.mask) > 0, np.asarray(old.y) + 0.25, 0.0))
         np.testing.assert_allclose(theirs.y, mine.y, atol=1e-12)
         np.testing.assert_array_equal(theirs.mask, old.mask)
-    assert other.spec == problem.spec
+    assert other.model == problem.model
     assert other.measurements.value.shape == problem.measurements.value.shape
     assert np.isnan(again.measurements.table.frame.loc[2, "range"])
 

@@ -60,8 +60,8 @@ def test_any_point_has_coordinates_in_the_frame():
     at = jax.jit(plain, static_argnums=0)(
         form, posed, Free(phi, 0.1 * jax.random.normal(keys[2], posed.frame.theta.shape), noises)
     )
-    driven = jax.jit(driving)(posed.system, posed.frame, at.point)
-    again = jax.jit(place)(posed.system, posed.frame, at.theta, driven)
+    driven = jax.jit(driving)(posed.model, posed.frame, at.point)
+    again = jax.jit(place)(posed.model, posed.frame, at.theta, driven)
     assert len(again.states) == 2
     assert again.levels.shape == (1,)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), again, at.point)
@@ -70,7 +70,7 @@ def test_any_point_has_coordinates_in_the_frame():
 def solved(name, method, prior):
     """A linear case by a method, and its exact posterior."""
     problem, naive = linear(name)
-    start = track(problem.spec, problem.system, resting(problem))
+    start = track(problem.model, resting(problem))
     run = sample(problem, method, prior, start, jax.random.key(4))
     return run, reference.dense(naive, np.ones(len(naive.labels)))
 

@@ -178,7 +178,7 @@ DRAWN = ("plane", "mixed")  # worlds whose fit keeps its draws
 def resting(problem):
     """A start for a fit: trajectories without process noise, biases zero."""
     states = []
-    for part in problem.system.recursions:
+    for part in problem.model.recursions:
         x, track = np.zeros(part.drift.shape[1]), []
         for F, drift in zip(np.asarray(part.F), np.asarray(part.drift), strict=True):
             x = F @ x + drift
@@ -243,6 +243,6 @@ def two_motions(start):
 
 def posed_of(problem, prior):
     """The package's own form of the posterior, its frame where the motion leads without noise."""
-    form = Form(problem.spec, hierarchy_of(prior, problem))
-    frame = frame_at(problem.spec, problem.system, resting(problem))
-    return form, Posed(problem.system, frame, prior.precision(problem.labels, problem.surveyed))
+    form = Form(problem.model.biases, hierarchy_of(prior, problem))
+    frame = frame_at(problem.model, resting(problem))
+    return form, Posed(problem.model, frame, prior.precision(problem.labels, problem.surveyed))

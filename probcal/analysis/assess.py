@@ -92,7 +92,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
 def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups: dict[str, xr.Dataset]) -> xr.Dataset:
     """Group `verdict`; adds the group `halves` where the recording can be divided."""
     problem, calibration = fit.problem, tree["calibration"].to_dataset()
-    M, inflation, square = problem.spec.biases, np.ones(problem.spec.biases), np.zeros(problem.spec.biases)
+    M, inflation, square = problem.model.biases, np.ones(problem.model.biases), np.zeros(problem.model.biases)
     drifts, disagreements, first = dict[int, str](), dict[int, str](), ""
     grid = _grid(problem)
     if grid.patterns and not _absurd(tree):
@@ -141,7 +141,7 @@ class _Grid(NamedTuple):
 
 def _grid(problem: Problem) -> _Grid:
     """Quarters of equal numbers of rows (halves where biases are many) by targets (in groups where they are many)."""
-    M, time = problem.spec.biases, problem.measurements.time
+    M, time = problem.model.biases, problem.measurements.time
     edges = _edges(time[problem.measurements.measured.any(1)], QUARTERS if QUARTERS * M <= COPIES else 2)
     parts = len(edges)
     groups = _groups(problem, parts)
@@ -159,7 +159,7 @@ def _grid(problem: Problem) -> _Grid:
 
 def _groups(problem: Problem, parts: int) -> int:
     """Number of groups of targets: every target alone while the biases of all pieces are not too many."""
-    return max(1, min(len(problem.measurements.target_names), COPIES // (parts * problem.spec.biases)))
+    return max(1, min(len(problem.measurements.target_names), COPIES // (parts * problem.model.biases)))
 
 
 def _edges(time: np.ndarray, count: int) -> np.ndarray:
@@ -181,8 +181,8 @@ def _inflation(fit: Fitted, found: residuals.Filtered, divided: Pieces, grid: _G
     own, piece = pieces.own_biases(divided, member), grid.piece
     step = np.concatenate([own, np.zeros((len(own), 1))], 1)
     shift = [
-        jnp.asarray(step[piece[index][:, None], np.asarray(data.bias)[np.asarray(data.sensor)]])
-        for index, data in zip(fit.problem.row_index, fit.problem.system.rows, strict=True)
+        jnp.asarray(step[piece[index][:, None], np.asarray(bias)])
+        for index, bias in zip(fit.problem.row_index, fit.problem.model.read, strict=True)
     ]
     value = residuals.moved_innovations(fit, found, shift)
     group, labels = checks.codes(fit.data, ["sensor", "channel"])

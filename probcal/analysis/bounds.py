@@ -6,8 +6,6 @@ bound of van Trees (1968, 2.4.3) for biases and whitened motion noise together, 
 Schultheiss 1987). Averages of eliminated systems would be no bound.
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,10 +13,11 @@ import xarray as xr
 
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
 from probcal.errors import InputError, nearest
-from probcal.problem import Problem, Spec, System
+from probcal.model.model import At, Model
+from probcal.problem import Problem
 from probcal.simulate import Key, Truth, as_key
 from probcal.smoothing.information import moments_compressed
-from probcal.smoothing.mode import Compressed, Point, compress, eliminate_compressed, linearise
+from probcal.smoothing.mode import Compressed, compress, eliminate_compressed
 from probcal.tree import by_epoch
 from probcal.types import float64
 
@@ -56,31 +55,31 @@ def bounds(
         raise InputError(f"bounds: draws={draws}; take at least one")
     given = Truth() if truth is None else truth
     keys = jax.random.split(as_key(key))
-    spec, system, levels = problem.spec, problem.system, jnp.zeros(len(problem.levels))
+    model, levels = problem.model, jnp.zeros(len(problem.levels))
     if kind == "parametric":
         z, states = true_point(problem, truth)
     else:
         states = on_tracks_of(problem, given, draw_states(problem, draws, keys[0]))
-        z = jnp.broadcast_to(true_biases(problem, given), (draws, spec.biases))
+        z = jnp.broadcast_to(true_biases(problem, given), (draws, model.biases))
         z = jax.random.normal(keys[1], z.shape) if kind == "posterior" else z
-    compressed = average(spec, system, levels, z, states)
+    compressed = average(model, levels, z, states)
     if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(compressed)):
         raise InputError("bounds: a sensor is not finite at the trajectories drawn; give truth=Truth(tracks)")
-    prior = np.ones(spec.biases) if kind == "posterior" else problem.surveyed.astype(float)
-    information, alone = _information(spec, system, levels, compressed, jnp.asarray(prior))
+    prior = np.ones(model.biases) if kind == "posterior" else problem.surveyed.astype(float)
+    information, alone = _information(model, levels, compressed, jnp.asarray(prior))
     covariance, bounded = invert(np.asarray(information), np.asarray(alone))
-    spread = _variances(system, levels, compressed, jnp.asarray(covariance))
+    spread = _variances(model, levels, compressed, jnp.asarray(covariance))
     return _tree(problem, kind, len(z), covariance, bounded, [np.asarray(v) for v in spread])
 
 
-@partial(jax.jit, static_argnames="spec")
-def average(spec: Spec, system: System, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...]) -> Compressed:
+@jax.jit
+def average(model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...]) -> Compressed:
     """Expected information of compressed rows, averaged over points z (D, M) and states (D, E, n)."""
 
     def at(z_d: jax.Array, states_d: tuple[jax.Array, ...]) -> Compressed:
-        lins = linearise(spec, system, Point(states_d, (), z_d, levels), expected=True)
-        lins = [lin._replace(score=jnp.zeros_like(lin.score)) for lin in lins]  # a bound does not see the data
-        return compress(spec, system, lins, states_d)
+        lins = model.linearise(At(states_d, z_d, levels), expected=True)
+        blind = [lin._replace(score=jnp.zeros_like(lin.score)) for lin in lins]  # a bound does not see the data
+        return compress(model, blind)
 
     def add(total: Compressed, point: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[Compressed, None]:
         return jax.tree.map(jnp.add, total, at(*point)), None
@@ -90,13 +89,13 @@ def average(spec: Spec, system: System, levels: jax.Array, z: jax.Array, states:
     return jax.tree.map(lambda leaf: leaf / z.shape[0], total)
 
 
-@partial(jax.jit, static_argnames="spec")
+@jax.jit
 def _information(
-    spec: Spec, system: System, levels: jax.Array, compressed: Compressed, prior: jax.Array
+    model: Model, levels: jax.Array, compressed: Compressed, prior: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Information (M, M) of z with a prior (M,), trajectories marginalised; and that of each with all else known."""
-    noises = tuple(jnp.zeros_like(part.drift) for part in system.recursions)
-    solved = eliminate_compressed(spec, system, noises, levels, compressed)
+    noises = tuple(jnp.zeros_like(part.drift) for part in model.recursions)
+    solved = eliminate_compressed(model, noises, levels, compressed)
     return solved.information + jnp.diag(prior), jnp.diagonal(compressed.information) + prior
 
 
@@ -118,10 +117,10 @@ def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 @jax.jit
-def _variances(system: System, levels: jax.Array, compressed: Compressed, covariance: jax.Array) -> list[jax.Array]:
+def _variances(model: Model, levels: jax.Array, compressed: Compressed, covariance: jax.Array) -> list[jax.Array]:
     """Variance (E, n) of the states of each recursion, for a covariance (M, M) of z."""
     found = []
-    for moment in moments_compressed(system, levels, compressed, covariance):
+    for moment in moments_compressed(model, levels, compressed, covariance):
         own = jnp.diagonal(moment.states, axis1=1, axis2=2)
         found.append(own + jnp.einsum("eni,ij,enj->en", moment.response, covariance, moment.response))
     return [jnp.maximum(variance, 0.0) for variance in found]

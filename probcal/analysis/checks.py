@@ -112,10 +112,12 @@ def by_epoch(fit: Fitted, found: residuals.Innovations) -> xr.Dataset:
     """NIS of every epoch with data, its number of data and limits (false-alarm rate 1 % of each epoch)."""
     values: dict[str, Any] = {}
     coords: dict[str, Any] = {}
-    places = [np.zeros(data.y.shape, int) + np.asarray(data.epoch)[:, None] for data in fit.problem.system.rows]
-    owners = [
-        np.full(data.y.shape, r) for data, r in zip(fit.problem.system.rows, fit.problem.spec.recursion, strict=True)
-    ]
+    model = fit.problem.model
+    pairs = zip(model.measured, model.epochs, model.recursion, strict=True)
+    places, owners = zip(
+        *((np.broadcast_to(np.asarray(e)[:, None], there.shape), np.full(there.shape, r)) for there, e, r in pairs),
+        strict=True,
+    )
     epoch, owner = fit.flat(places), fit.flat(owners)
     for r, epochs in enumerate(fit.problem.epochs):
         s, mine = suffix(fit.problem, r), owner == r

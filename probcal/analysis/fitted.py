@@ -1,6 +1,6 @@
 """A fit taken up again: the problem at the point where a DataTree says that its fit ended, linearised there."""
 
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,9 +11,10 @@ import xarray as xr
 
 from probcal import linalg, tree
 from probcal.errors import InputError
+from probcal.model.model import Model
+from probcal.model.rows import Linearised
 from probcal.priors import Precision
 from probcal.problem import Problem
-from probcal.rows import Linearised
 from probcal.smoothing import mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import Point
@@ -27,7 +28,7 @@ class Fitted(NamedTuple):
     point: Point
     prior: Precision
     covariance: np.ndarray  # (M, M) of z
-    lins: list[Linearised]  # with the expected information
+    lins: Sequence[Linearised]  # with the expected information
     picks: list[Any]  # where each block keeps its data
     data: pd.DataFrame  # sensor, channel, target, time, row of every datum
 
@@ -38,26 +39,29 @@ class Fitted(NamedTuple):
     @property
     def readers(self) -> np.ndarray:
         """Which sensors read which bias, (sensors, M) boolean, sensors in the order of the network."""
-        found = np.zeros((len(self.problem.network.sensors), self.problem.spec.biases + 1), bool)
-        for index, numbers in zip(self.problem.row_index, self.problem.system.rows, strict=True):
-            sensor = self.problem.measurements.sensor[index]
-            found[sensor[:, None], np.asarray(numbers.bias)[np.asarray(numbers.sensor)]] = True
+        found = np.zeros((len(self.problem.network.sensors), self.problem.model.biases + 1), bool)
+        for index, bias in zip(self.problem.row_index, self.problem.model.read, strict=True):
+            found[self.problem.measurements.sensor[index][:, None], np.asarray(bias)] = True
         return found[:, :-1]
 
     def share(self, group: np.ndarray, count: int) -> np.ndarray:
         """Information (M, count) about each bias alone in groups (data,) of data, trajectories held."""
-        found, start, M = np.zeros((self.problem.spec.biases + 1) * count), 0, self.problem.spec.biases
-        for numbers, lin, (row, channel) in zip(self.problem.system.rows, self.lins, self.picks, strict=True):
+        found, start, M = np.zeros((self.problem.model.biases + 1) * count), 0, self.problem.model.biases
+        for read, lin, (row, channel) in zip(self.problem.model.read, self.lins, self.picks, strict=True):
             own = (np.asarray(lin.weight)[:, :, None] * np.asarray(lin.bias) ** 2)[row, channel]  # (data, p)
-            bias = np.asarray(numbers.bias)[np.asarray(numbers.sensor)[row]]
-            index = bias * count + group[start : start + len(row)][:, None]
+            index = np.asarray(read)[row] * count + group[start : start + len(row)][:, None]
             found += np.bincount(index.ravel(), own.ravel(), len(found))
             start += len(row)
         return found.reshape(M + 1, count)[:M]
 
 
-linearise = partial(jax.jit, static_argnames="spec")(partial(mode.linearise, expected=True))
-eliminate_rows = partial(jax.jit, static_argnames="spec")(mode.eliminate_rows)
+@jax.jit
+def linearise(model: Model, point: Point) -> tuple[Linearised, ...]:
+    """All rows linearised at a point with the expected information."""
+    return model.linearise(point, expected=True)
+
+
+eliminate_rows = jax.jit(mode.eliminate_rows)
 
 
 def take_up(problem: Problem, fit: xr.DataTree) -> Fitted:
@@ -77,7 +81,7 @@ def take_up(problem: Problem, fit: xr.DataTree) -> Fitted:
         raise InputError("assess: the tree was fitted to other data; give the problem as it was fitted")
     covariance = group["covariance"].values / np.outer(problem.scales, problem.scales)
     point = _point(problem, fit)
-    lins = linearise(problem.spec, problem.system, point)
+    lins = linearise(problem.model, point)
     data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
     return Fitted(problem, point, _prior(fit, group, covariance), covariance, lins, picks, data)
 
@@ -89,7 +93,7 @@ def _point(problem: Problem, fit: xr.DataTree) -> Point:
     point = follow_states(problem, saved)
     if problem.levels:
         level = fit["level"].to_dataset()
-        point = at_levels(problem.system, point, jnp.asarray(np.log(level["std"].values / level["guess"].values)))
+        point = at_levels(problem.model, point, jnp.asarray(np.log(level["std"].values / level["guess"].values)))
     z = jnp.asarray(fit["calibration"].to_dataset()["mean"].values / problem.scales)
     return track_mode(problem, point._replace(z=z))
 

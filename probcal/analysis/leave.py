@@ -7,7 +7,7 @@ predictive density of what was left out is the difference of two Laplace evidenc
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -21,9 +21,9 @@ from probcal import linalg
 from probcal.analysis.fitted import Fitted, eliminate_rows, linearise
 from probcal.inference.pose import TAILED
 from probcal.inference.psis import smoothed
+from probcal.model.model import Model, scaled
+from probcal.model.rows import Linearised, standardised
 from probcal.priors import Precision
-from probcal.problem import Spec, System
-from probcal.rows import Linearised, standardised
 from probcal.smoothing.mode import Eliminated, Point, cost, find_mode, follow
 
 STEPS = 20  # Gauss-Newton steps of a refit
@@ -39,9 +39,9 @@ class Refit(NamedTuple):
     square: jax.Array  # least squares of all innovations, noises and biases in the linearised problem
 
 
-@partial(jax.jit, static_argnames="spec")
+@jax.jit
 def _stepped(
-    spec: Spec, system: System, point: Point, prior: Precision, lins: list[Linearised], solved: Eliminated, held: Any
+    model: Model, point: Point, prior: Precision, lins: Sequence[Linearised], solved: Eliminated, held: Any
 ) -> Refit:
     """One Fisher-scoring step from a point to the mode, and Laplace's evidence there; biases in `held` (M,) go to 0.
 
@@ -54,18 +54,14 @@ def _stepped(
     slope = jnp.where(held, away, solved.score - prior.pull(point.z) - matrix @ away)
     inverse, logdet = linalg.inverse_and_logdet(jnp.where(both, eye, matrix))
     start = point._replace(z=point.z + away)
-    moved = follow(system, point, solved, inverse @ slope)
+    moved = follow(model, point, solved, inverse @ slope)
     ends = jax.tree.map(lambda a, b: jnp.stack([a, b]), start, moved)
-    before, after = jax.vmap(lambda end: cost(spec, system, end, prior))(ends)
+    before, after = jax.vmap(lambda end: cost(model, end, prior))(ends)
     least = jnp.where(after < before, after, before)
     square = sum(jnp.sum(u**2) for u in moved.noises) + prior.square(moved.z)
-    padded = jnp.append(moved.z - point.z, 0.0)
-    for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
-        score = standardised(lin.score, lin.weight)
-        dx = (moved.states[r] - point.states[r])[data.epoch][:, jnp.asarray(block.used, int)]
-        change = jnp.einsum("ncu,nu->nc", lin.state, dx)
-        change = change + jnp.einsum("ncp,np->nc", lin.bias, padded[data.bias][data.sensor])
-        square = square + jnp.sum((score - jnp.sqrt(lin.weight) * change) ** 2)
+    dx = [(x - before_)[:, :, None] for x, before_ in zip(moved.states, point.states, strict=True)]
+    for lin, change in zip(lins, model.responses(lins, dx, (moved.z - point.z)[:, None]), strict=True):
+        square = square + jnp.sum((standardised(lin.score, lin.weight) - jnp.sqrt(lin.weight) * change[:, :, 0]) ** 2)
     return Refit(-least - 0.5 * (solved.logdet + logdet), square)
 
 
@@ -73,54 +69,37 @@ class _Refits:
     """Refits of a problem with data masked, precisions changed or biases held at 0."""
 
     def __init__(self, fit: Fitted, jobs: int):
-        spec, system = fit.problem.spec, fit.problem.system
-        sizes = sum(part.drift.size for part in system.recursions)
-        self.fit, self.quick = fit, 2.0 * jobs * sizes * spec.biases**2 > WORK
+        model = fit.problem.model
+        sizes = model.state_size
+        self.fit, self.quick = fit, 2.0 * jobs * sizes * model.biases**2 > WORK
         self._solved: Eliminated | None = None
 
     def run(self, out: np.ndarray | None, alpha: np.ndarray, held: np.ndarray) -> tuple[float, float]:
         """Evidence and least squares without the rows (of the table) in `out`, at precisions alpha (M,)."""
-        fit, spec = self.fit, self.fit.problem.spec
+        fit, model = self.fit, self.fit.problem.model
         prior = fit.prior._replace(alpha=jnp.asarray(alpha))
-        system = fit.problem.system if out is None else masked(fit, out)
+        model = fit.problem.model if out is None else masked(fit, out)
         point, lins = fit.point, fit.lins
         if not self.quick:
-            frozen = _frozen(system, held)
+            frozen = model.without(held)
             start = point._replace(z=jnp.asarray(np.where(held, 0.0, point.z)))
-            point = find_mode(spec, frozen, start, prior, STEPS, TOLERANCE).point
-            lins = linearise(spec, frozen, point)
-            solved, system = eliminate_rows(spec, frozen, point, lins), frozen
+            point = find_mode(frozen, start, prior, STEPS, TOLERANCE).point
+            lins = linearise(frozen, point)
+            solved, model = eliminate_rows(frozen, point, lins), frozen
         elif out is None:
             if self._solved is None:
-                self._solved = eliminate_rows(spec, system, point, lins)
+                self._solved = eliminate_rows(model, point, lins)
             solved = self._solved
         else:
-            pairs = [(lin, np.asarray(new.mask)) for lin, new in zip(lins, system.rows, strict=True)]
-            lins = [
-                lin._replace(
-                    score=jnp.asarray(np.asarray(lin.score) * mask), weight=jnp.asarray(np.asarray(lin.weight) * mask)
-                )
-                for lin, mask in pairs
-            ]
-            solved = eliminate_rows(spec, system, point, lins)
-        found = _stepped(spec, system, point, prior, lins, solved, jnp.asarray(held))
+            lins = scaled(lins, model.measured)
+            solved = eliminate_rows(model, point, lins)
+        found = _stepped(model, point, prior, lins, solved, jnp.asarray(held))
         return float(found.evidence) + 0.5 * _logdet(fit.prior.coupling, alpha, held), float(found.square)
 
 
-def masked(fit: Fitted, out: np.ndarray) -> System:
-    """The system without the rows of the table in `out` (rows,) boolean."""
-    pairs = zip(fit.problem.system.rows, fit.problem.row_index, strict=True)
-    rows = tuple(data._replace(mask=jnp.asarray(np.asarray(data.mask) * ~out[index][:, None])) for data, index in pairs)
-    return fit.problem.system._replace(rows=rows)
-
-
-def _frozen(system: System, held: np.ndarray) -> System:
-    """The system that does not feel the biases in `held` (M,)."""
-    felt = np.append(~held, True)
-    rows = [
-        data._replace(scale=jnp.asarray(np.asarray(data.scale) * felt[np.asarray(data.bias)])) for data in system.rows
-    ]
-    return system._replace(rows=tuple(rows))
+def masked(fit: Fitted, out: np.ndarray) -> Model:
+    """The model without the rows of the table in `out` (rows,) boolean."""
+    return fit.problem.model.weighted([~out[index][:, None] for index in fit.problem.row_index])
 
 
 def _logdet(coupling: jax.Array, alpha: np.ndarray, held: np.ndarray) -> float:
@@ -146,7 +125,7 @@ def leave_sensors(fit: Fitted) -> Left | None:
     `elpd` less `stated` says how much better the sensor fits the rest calibrated than as stated.
     """
     problem, readers = fit.problem, fit.readers
-    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.spec.biases, bool)
+    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.model.biases, bool)
     sensor = problem.measurements.sensor
     present = np.unique(sensor[problem.measurements.measured.any(1)])
     if len(present) < 2:
@@ -166,7 +145,7 @@ def leave_targets(fit: Fitted) -> Left | None:
     present = np.unique(target[problem.measurements.measured.any(1)])
     if not 1 < len(present) <= TARGETS:
         return None
-    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.spec.biases, bool)
+    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.model.biases, bool)
     refits = _Refits(fit, len(present))
     whole = refits.run(None, alpha, none)
     rows = [[refits.run(target == t, alpha, none), whole, whole] for t in present]

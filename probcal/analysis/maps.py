@@ -13,9 +13,10 @@ import xarray as xr
 from probcal import linalg, tree
 from probcal.errors import InputError, nearest
 from probcal.labels import AXES
-from probcal.problem import Problem, Spec, System
+from probcal.model.model import At, Model
+from probcal.problem import Problem
 from probcal.simulate import blank
-from probcal.smoothing.mode import Point, compress, factors, linearise
+from probcal.smoothing.mode import compress, factors
 from probcal.types import float64
 
 BATCH = (256, 200_000)  # cells worked on at once, and entries of their matrices
@@ -67,8 +68,8 @@ def bound_map(
     flat = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     places = flat if z is None else np.column_stack([flat, np.full(len(flat), float(z))])
     span = at.epochs[0].position
-    point = Point((), (), jnp.asarray(mean), jnp.asarray(levels))
-    values = np.asarray(spectra(at.spec, at.system, span, point, root, jnp.asarray(places)))
+    point = At((), jnp.asarray(mean), jnp.asarray(levels))
+    values = np.asarray(spectra(at.model, span, point, root, jnp.asarray(places)))
     with np.errstate(divide="ignore"):
         rmse = np.sqrt((1.0 / values).sum(1))
     largest = float(np.hypot(*np.ptp(np.asarray(area, float), axis=1)))
@@ -122,8 +123,8 @@ def snapshot(problem: Problem, target: str | None = None, time: float | None = N
     return Problem(problem.network, motion, table, fix=problem.fixed)
 
 
-@partial(jax.jit, static_argnames=("spec", "span"))
-def spectra(spec: Spec, system: System, span: tuple[int, int], point: Point, root: Any, places: jax.Array) -> jax.Array:
+@partial(jax.jit, static_argnames="span")
+def spectra(model: Model, span: tuple[int, int], point: At, root: Any, places: jax.Array) -> jax.Array:
     """Eigenvalues (cells, d) of the information about the position at places (cells, d).
 
     The biases have covariance root root' (M, M), the identity if None; without columns, (0, 0), they are known.
@@ -131,14 +132,14 @@ def spectra(spec: Spec, system: System, span: tuple[int, int], point: Point, roo
     What else is unknown is v = V e with e of unit covariance: A - C V (I + V'BV)^-1 V'C', with A, C and B the
     information of the position, with v and of v. No covariance is inverted, so that any of them may be singular.
     """
-    part, place = system.recursions[0], slice(*span)
+    part, place = model.recursions[0], slice(*span)
     own = factors(part, point.levels)[0].at[place].set(0.0)
     joint = root is None or root.shape[1] > 0
 
     def cell(position: jax.Array) -> jax.Array:
         states = (part.drift.at[0, place].set(position),)
-        lins = linearise(spec, system, point._replace(states=states), expected=True)
-        rows = compress(spec, system, lins, states, joint=joint)
+        lins = model.linearise(point._replace(states=states), expected=True)
+        rows = compress(model, lins, joint=joint)
         J, G, cross = rows.states[0][0][0], rows.information, rows.crosses[0][0]
         if root is not None:
             G, cross = root.T @ G @ root, cross @ root
@@ -149,5 +150,5 @@ def spectra(spec: Spec, system: System, span: tuple[int, int], point: Point, roo
         values, _ = linalg.spectrum(0.5 * (left + left.T))
         return jnp.where(values > LOST * jnp.trace(J[place, place]), values, 0.0)
 
-    width = own.shape[1] + (spec.biases if joint else 0)
+    width = own.shape[1] + (model.biases if joint else 0)
     return jax.lax.map(cell, places, batch_size=max(1, min(BATCH[0], BATCH[1] // width**2)))

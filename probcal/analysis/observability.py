@@ -39,7 +39,7 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     found = _information(problem, point)
     null = gauge(problem, point)
     directions = weak_directions(problem, found.information, point, null)
-    spread = moments(problem.spec, problem.system, point, jnp.asarray(found.covariance))
+    spread = moments(problem.model, point, jnp.asarray(found.covariance))
     groups = {
         "bias": _biases(problem, found),
         "spectrum": _spectrum(found.information),
@@ -75,7 +75,7 @@ class Information:
 
 
 def _information(problem: Problem, point: Point) -> Information:
-    information = np.asarray(marginal_information(problem.spec, problem.system, point))
+    information = np.asarray(marginal_information(problem.model, point))
     if not np.isfinite(information).all():
         raise InputError(
             "observability: the rows have no finite derivatives at the start; is a target at the place of a sensor?"
@@ -114,7 +114,7 @@ def _leverage_groups(
     problem: Problem, point: Point, found: Information, spread: list[Moments]
 ) -> dict[str, xr.Dataset]:
     """How many biases each datum, sensor and target determines; the motion tells the rest."""
-    parts = leverages(problem.spec, problem.system, point, jnp.asarray(found.covariance), spread)
+    parts = leverages(problem.model, point, jnp.asarray(found.covariance), spread)
     datum, picks = tree.datum_of(problem)
     values = tree.gather([np.asarray(part) for part in parts], picks)
     each = xr.Dataset({"leverage": ("datum", values)}, coords=datum["coords"])

@@ -6,14 +6,13 @@ between the pieces while all others stay common: exact on a linear problem.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from probcal.analysis.fitted import Fitted, eliminate_rows
-from probcal.problem import Spec, System
+from probcal.model.model import Model
 
 Limit = Callable[[int], float]  # chi-square by degrees of freedom
 Patterns = dict[str, np.ndarray]
@@ -57,9 +56,9 @@ class Contrast(NamedTuple):
 
 def divide(fit: Fitted, piece: np.ndarray, count: int) -> Pieces:
     """Give every piece its own biases; `piece` (rows,) is that of each row of the table, below `count`."""
-    spec, system = copied(fit, piece, count)
+    model = copied(fit, piece, count)
     point = fit.point._replace(z=jnp.asarray(np.tile(fit.point.z, count)))
-    solved = eliminate_rows(spec, system, point, fit.lins)
+    solved = eliminate_rows(model, point, fit.lins)
     return Pieces(
         np.asarray(solved.information),
         np.asarray(solved.score),
@@ -68,22 +67,9 @@ def divide(fit: Fitted, piece: np.ndarray, count: int) -> Pieces:
     )
 
 
-def copied(fit: Fitted, piece: np.ndarray, count: int) -> tuple[Spec, System]:
+def copied(fit: Fitted, piece: np.ndarray, count: int) -> Model:
     """The problem with a table of sensors for every piece, each pointing to its own biases."""
-    spec, system = fit.problem.spec, fit.problem.system
-    M, parts = spec.biases, []
-    for index, data in zip(fit.problem.row_index, system.rows, strict=True):
-        S, bias = data.bias.shape[0], np.asarray(data.bias)
-        copies = [np.where(bias < M, bias + p * M, count * M) for p in range(count)]
-        parts.append(
-            data._replace(
-                sensor=jnp.asarray(np.asarray(data.sensor) + S * piece[index]),
-                bias=jnp.asarray(np.concatenate(copies)),
-                scale=jnp.asarray(np.tile(data.scale, (count, 1))),
-                base=jnp.asarray(np.tile(data.base, (count, 1))),
-            )
-        )
-    return replace(spec, biases=count * M), system._replace(rows=tuple(parts))
+    return fit.problem.model.split([piece[index] for index in fit.problem.row_index], count)
 
 
 def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.ndarray]] = ()) -> dict[int, Contrast]:

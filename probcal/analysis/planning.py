@@ -16,8 +16,9 @@ import xarray as xr
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
 from probcal.labels import AXES
+from probcal.model.model import Model
 from probcal.network import Network, Node
-from probcal.problem import Epochs, Problem, Spec, System
+from probcal.problem import Epochs, Problem
 from probcal.sensor import SensorType
 from probcal.simulate import Truth
 from probcal.smoothing.directions import WEAK
@@ -52,7 +53,7 @@ def next_passes(
     if paths.ndim != 3 or paths.shape[2] != problem.network.dimension:
         raise InputError(f"passes has shape {np.shape(passes)}; give (passes, points, {problem.network.dimension})")
     states = jnp.asarray(np.stack([_state(epochs, start, path) for path in paths]))
-    added = np.asarray(_of_states(part.spec, part.system, states, point.z, _levels(problem, part, point)))
+    added = np.asarray(_of_states(part.model, states, point.z, _levels(problem, part, point)))
     known = _information(problem, point)
     gains, left = _gains(problem, known, known + added)
     order = np.argsort(-gains, kind="stable")
@@ -140,7 +141,7 @@ def next_sensors(
         z = jnp.concatenate([point.z, jnp.zeros(len(wider.labels) - M)])
         there = _levels(problem, wider, point)
         moved = point._replace(z=z, levels=there)
-        matrices = np.asarray(_of_places(wider.spec, wider.system, moved, jnp.asarray(places), block, mine))
+        matrices = np.asarray(_of_places(wider.model, moved, jnp.asarray(places), block, mine))
         inner = matrices[:, M:, M:] + np.eye(matrices.shape[1] - M)
         cross = matrices[:, M:, :M]
         gains, _ = _gains(problem, known, matrices[:, :M, :M] - cross.mT @ np.linalg.solve(inner, cross))
@@ -156,31 +157,20 @@ def next_sensors(
 # Information
 
 
-@partial(jax.jit, static_argnames="spec")
-def _of_states(spec: Spec, system: System, states: jax.Array, z: jax.Array, levels: jax.Array) -> jax.Array:
+@jax.jit
+def _of_states(model: Model, states: jax.Array, z: jax.Array, levels: jax.Array) -> jax.Array:
     """Information (C, M, M) of one target along each of the states (C, E, n)."""
-    return jax.lax.map(
-        lambda x: marginal_information(spec, system, Point((x,), (jnp.zeros_like(x),), z, levels)), states
-    )
+    return jax.lax.map(lambda x: marginal_information(model, Point((x,), (jnp.zeros_like(x),), z, levels)), states)
 
 
-@partial(jax.jit, static_argnames=("spec", "block"))
-def _of_places(spec: Spec, system: System, point: Point, places: jax.Array, block: int, mine: jax.Array) -> jax.Array:
+@partial(jax.jit, static_argnames="block")
+def _of_places(model: Model, point: Point, places: jax.Array, block: int, mine: jax.Array) -> jax.Array:
     """Information (C, M, M) with the first node of the rows `mine` (N,) of a block at each of the places (C, d)."""
-    data = system.rows[block]
-    d = places.shape[1]
-
-    def one(place: jax.Array) -> jax.Array:
-        first = jnp.where(mine[:, None], place[None], data.pose[:, 0, :d])
-        moved = data._replace(pose=data.pose.at[:, 0, :d].set(first))
-        changed = tuple(moved if b == block else other for b, other in enumerate(system.rows))
-        return marginal_information(spec, system._replace(rows=changed), point)
-
-    return jax.lax.map(one, places)
+    return jax.lax.map(lambda place: marginal_information(model.placed(block, mine, place), point), places)
 
 
 def _information(problem: Problem, point: Point) -> np.ndarray:
-    return np.asarray(marginal_information(problem.spec, problem.system, point))
+    return np.asarray(marginal_information(problem.model, point))
 
 
 def _gains(problem: Problem, known: np.ndarray, with_it: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

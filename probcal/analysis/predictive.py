@@ -4,6 +4,7 @@ A discrepancy of the data is compared with that of a replica at the same draw of
 Meng and Stern 1996). The draws have seen the data: a p-value lies nearer to one half than a uniform one would.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal import rows
 from probcal.analysis.fitted import Fitted
+from probcal.model.model import At, Model
+from probcal.model.rows import standardised
 from probcal.noise import Bernoulli, Gaussian
-from probcal.problem import Spec, System
 from probcal.smoothing.draws import draw
 from probcal.tree import suffix
 
@@ -30,7 +31,7 @@ class Drawn(NamedTuple):
     z: jax.Array
     levels: jax.Array
     states: tuple[jax.Array, ...]
-    replicas: list[jax.Array] | None
+    replicas: Sequence[jax.Array] | None
 
 
 class Predictive(NamedTuple):
@@ -45,40 +46,32 @@ class Predictive(NamedTuple):
     draws: int  # behind the p-values
 
 
-@partial(jax.jit, static_argnames=("spec", "count"))
+@partial(jax.jit, static_argnames="count")
 def _discrepancies(
-    spec: Spec, system: System, levels: jax.Array, drawn: Drawn, sensors: tuple[jax.Array, ...], count: int,
+    model: Model, levels: jax.Array, drawn: Drawn, sensors: tuple[jax.Array, ...], count: int,
     key: jax.Array,
 ) -> tuple[list[jax.Array], list[jax.Array]]:  # fmt: skip
     """By draw, data or replica, sensor and channel (D, 2, 2, S, C): -log p and sum of scores; fourth powers (N, C)."""
 
     def one(fourth: list[jax.Array], given: tuple[Drawn, jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
         draw, seed = given
-        found, powers = [], []
-        for b, (block, data, r, sensor) in enumerate(
-            zip(spec.blocks, system.rows, spec.recursion, sensors, strict=True)
-        ):
-            predicted = rows.predict(block, data, draw.states[r], draw.z)
-            std = rows.noise_std(data, levels)
-            if draw.replicas is None:
-                replica = rows.sample(block, data, predicted, draw.levels, jax.random.fold_in(seed, b))
-            else:
-                replica = draw.replicas[b]
+        at = At(draw.states, draw.z, draw.levels)
+        replicas = model.sample(at, seed) if draw.replicas is None else draw.replicas
+        here = at._replace(levels=levels)  # what is compared is judged at one noise level
 
-            def of(y, block=block, data=data, predicted=predicted, std=std, sensor=sensor):
-                version = data._replace(y=y)
-                score, weight = rows.weigh(block, version, predicted, std, expected=True)
-                v = rows.standardised(score, weight)
-                misfit = -rows.log_likelihood(block, version, predicted, levels)
-                return jax.ops.segment_sum(jnp.stack([misfit, v], 1), sensor, count), v**4
+        def of(version: Model) -> tuple[list[jax.Array], list[jax.Array]]:
+            v = [standardised(score, weight) for score, weight in version.score(here)]
+            pairs = zip(version.log_likelihood(here), v, sensors, strict=True)
+            sums = [jax.ops.segment_sum(jnp.stack([-own, value], 1), sensor, count) for own, value, sensor in pairs]
+            return sums, [value**4 for value in v]
 
-            sums, power = jax.vmap(of)(jnp.stack([data.y, replica]))
-            found.append(sums)
-            powers.append(power[1])
+        data, _ = of(model)
+        replica, powers = of(model.with_values(replicas))
+        found = [jnp.stack(pair) for pair in zip(data, replica, strict=True)]
         return [a + b for a, b in zip(fourth, powers, strict=True)], found
 
     total = drawn.z.shape[0]
-    nothing = [jnp.zeros(data.y.shape) for data in system.rows]
+    nothing = [jnp.zeros(there.shape) for there in model.measured]
     fourth, found = jax.lax.scan(one, nothing, (drawn, jax.random.split(key, total)))
     return found, [power / total for power in fourth]
 
@@ -86,10 +79,10 @@ def _discrepancies(
 def check(fit: Fitted, drawn: Drawn, key: jax.Array) -> Predictive:
     """P-values by sensor and channel, and kurtosis, at draws of a fit."""
     problem = fit.problem
-    gaussian = all(isinstance(channel.noise, Gaussian) for block in problem.spec.blocks for channel in block.channels)
+    gaussian = all(isinstance(noise, Gaussian) for noises in problem.model.noises for noise in noises)
     sensors = tuple(jnp.asarray(problem.measurements.sensor[index]) for index in problem.row_index)
     count = len(problem.network.sensors)
-    found, fourth = _discrepancies(problem.spec, problem.system, fit.point.levels, drawn, sensors, count, key)
+    found, fourth = _discrepancies(problem.model, fit.point.levels, drawn, sensors, count, key)
     kurtosis = np.zeros(len(fit.data)) if gaussian else _exact(fit, fit.flat(fourth) - 3.0)
     parts: tuple[list[Any], list[Any]] = ([], [])
     for sensor, values in zip(sensors, map(np.asarray, found), strict=True):
@@ -101,10 +94,9 @@ def check(fit: Fitted, drawn: Drawn, key: jax.Array) -> Predictive:
 
 def _exact(fit: Fitted, kurtosis: np.ndarray) -> np.ndarray:
     """Excess kurtosis (D,), that of yes-or-no data in closed form, 1 / (p q) - 6: replicas may lack a rare event."""
-    lins = zip(fit.problem.spec.blocks, fit.lins, strict=True)
     answers = [
-        np.broadcast_to([isinstance(c.noise, Bernoulli) for c in block.channels], lin.weight.shape)
-        for block, lin in lins
+        np.broadcast_to([isinstance(noise, Bernoulli) for noise in noises], lin.weight.shape)
+        for noises, lin in zip(fit.problem.model.noises, fit.lins, strict=True)
     ]
     variance = fit.flat([lin.weight for lin in fit.lins])
     return np.maximum(np.where(fit.flat(answers), 1 / np.maximum(variance, 1e-12) - 6, kurtosis), -2.0)
@@ -119,7 +111,7 @@ def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Drawn:
     posterior, problem = tree["posterior"].to_dataset(), fit.problem
     names = [f"state{suffix(problem, r)}" for r in range(len(problem.epochs))]
     total = posterior.sizes["chain"] * posterior.sizes["draw"]
-    most = min(DRAWS, total, max(VALUES // sum(part.drift.size for part in problem.system.recursions), LEAST))
+    most = min(DRAWS, total, max(VALUES // problem.model.state_size, LEAST))
     chosen = np.linspace(0, total - 1, most).astype(int)
 
     def thin(values: np.ndarray) -> Any:
@@ -132,15 +124,15 @@ def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Drawn:
         levels = jnp.asarray(np.log(thin(posterior["level"].values) / guess))
     if not set(names) <= set(posterior.data_vars):
         covariance = jnp.asarray(fit.covariance)
-        drawn, _ = draw(problem.spec, problem.system, fit.point, covariance, z, levels, key)
+        drawn, _ = draw(problem.model, fit.point, covariance, z, levels, key)
         return Drawn(z, levels, drawn.states, None)
     states = tuple(jnp.asarray(thin(posterior[name].values)) for name in names)
     replicas = tree["posterior_predictive"].to_dataset()["y"] if "posterior_predictive" in tree.children else None
     if replicas is None or replicas.sizes["draw"] < posterior.sizes["draw"]:
         return Drawn(z, levels, states, None)
     flat, blocks, start = thin(replicas.values), [], 0
-    for data, (row, channel) in zip(problem.system.rows, fit.picks, strict=True):
-        block = np.zeros((most, *data.y.shape))
+    for there, (row, channel) in zip(problem.model.measured, fit.picks, strict=True):
+        block = np.zeros((most, *there.shape))
         block[:, row, channel] = flat[:, start : start + len(row)]
         blocks.append(jnp.asarray(block))
         start += len(row)

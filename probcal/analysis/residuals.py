@@ -6,7 +6,7 @@ The innovations of an epoch are whitened by the symmetric root of their covarian
 squares add up to the NIS of the epoch, and each stays with its sensor and channel.
 """
 
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,10 +16,10 @@ from scipy import special
 
 from probcal import linalg
 from probcal.analysis.fitted import Fitted
-from probcal.problem import Spec, System
-from probcal.rows import Linearised, standardised
+from probcal.model.model import Data, Model
+from probcal.model.rows import Linearised, standardised
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Point, factors, of_states
+from probcal.smoothing.mode import Point, factors
 
 COLUMNS = 16  # bias directions that are filtered together
 LAGS = 10  # of the Ljung-Box statistic
@@ -43,11 +43,11 @@ class Innovations(NamedTuple):
     kurtosis: np.ndarray  # (D,) excess over a Gaussian's
 
 
-@partial(jax.jit, static_argnames="spec")
-def prepare(spec: Spec, system: System, point: Point, lins: list[Linearised]) -> list[Filter]:
+@jax.jit
+def prepare(model: Model, point: Point, lins: Sequence[Linearised]) -> list[Filter]:
     """Covariance pass of every recursion: with U the data's responses to the whitened prediction, S = I + U U'."""
     found = []
-    for part, (J, _) in zip(system.recursions, of_states(spec, system, lins, point.states), strict=True):
+    for part, (J, _) in zip(model.recursions, model.of_states(lins), strict=True):
         gain = rec.gains(part.F, factors(part, point.levels), J)
         root = gain.predicted
         values, vectors = linalg.spectrum(root.mT @ J @ root)
@@ -58,21 +58,17 @@ def prepare(spec: Spec, system: System, point: Point, lins: list[Linearised]) ->
 
 
 def _whiten(
-    spec: Spec,
-    system: System,
-    lins: list[Linearised],
+    model: Model,
+    lins: Sequence[Linearised],
     filters: list[Filter],
-    columns: list[jax.Array],
+    columns: Sequence[jax.Array],
     drifts: list[jax.Array],
-) -> list[jax.Array]:
+) -> Data:
     """Innovations (N, C, K) of columns of unit-noise data (N, C, K) with drifts (E, n, K) of the states."""
-    seen = [jnp.sqrt(lin.weight)[:, :, None] * lin.state for lin in lins]
-    pulls = [jnp.zeros_like(drift) for drift in drifts]
-    for block, data, own, column, r in zip(spec.blocks, system.rows, seen, columns, spec.recursion, strict=True):
-        summed = jax.ops.segment_sum(jnp.einsum("ncu,nck->nuk", own, column), data.epoch, drifts[r].shape[0])
-        pulls[r] = pulls[r].at[:, jnp.asarray(block.used, int)].add(summed)
+    unit = [lin._replace(state=jnp.sqrt(lin.weight)[:, :, None] * lin.state) for lin in lins]
+    pulls = model.onto_states(unit, columns)
     predicted, corrected = [], []
-    for part, known, pull, drift in zip(system.recursions, filters, pulls, drifts, strict=True):
+    for part, known, pull, drift in zip(model.recursions, filters, pulls, drifts, strict=True):
         keep, covariance = known.gain.keep, known.gain.updated @ known.gain.updated.mT
 
         def forward(x, epoch):
@@ -86,40 +82,34 @@ def _whiten(
         x = part.F @ before + drift
         predicted.append(x)
         corrected.append(x - known.mix @ (pull - known.J @ x))  # what S^-1/2 takes off each datum
-    return [
-        column - jnp.einsum("ncu,nuk->nck", own, corrected[r][data.epoch][:, jnp.asarray(block.used, int)])
-        for block, data, own, column, r in zip(spec.blocks, system.rows, seen, columns, spec.recursion, strict=True)
-    ]
+    return jax.tree.map(jnp.subtract, columns, model.by_state(unit, corrected))
 
 
-@partial(jax.jit, static_argnames="spec")
+@jax.jit
 def _innovations(
-    spec: Spec,
-    system: System,
+    model: Model,
     point: Point,
-    lins: list[Linearised],
+    lins: Sequence[Linearised],
     filters: list[Filter],
     shift: list[jax.Array],
     root: jax.Array,
 ) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
     """Of each block: innovations with the biases of every row moved by `shift` (N, p) in z, the sum of squares of their
     responses to bias directions `root` (M, K), and the share of itself that S^-1/2 leaves a datum; each (N, C)."""
-    columns, kept = [], []
-    padded = jnp.concatenate([root, jnp.zeros((1, root.shape[1]))])
-    for block, data, lin, dz, r in zip(spec.blocks, system.rows, lins, shift, spec.recursion, strict=True):
-        size = jnp.sqrt(lin.weight)
-        score = standardised(lin.score, lin.weight)
-        moved = jnp.einsum("ncp,np->nc", lin.bias, dz)
-        responses = jnp.einsum("nc,ncp,npk->nck", size, lin.bias, padded[data.bias[data.sensor]])
-        columns.append(jnp.concatenate([(score - size * moved)[:, :, None], responses], 2))
-        used = jnp.asarray(block.used, int)
-        mix = filters[r].mix[:, used[:, None], used[None, :]][data.epoch]
-        kept.append(1.0 + lin.weight * jnp.einsum("ncu,nuv,ncv->nc", lin.state, mix, lin.state))
+    columns = []
+    for lin, dz, along in zip(lins, shift, model.by_bias(lins, root), strict=True):
+        size = jnp.sqrt(lin.weight)[:, :, None]
+        moved = jnp.einsum("ncp,np->nc", lin.bias, dz)[:, :, None]
+        columns.append(
+            jnp.concatenate([standardised(lin.score, lin.weight)[:, :, None] - size * moved, size * along], 2)
+        )
+    mixed = model.state_variance(lins, [known.mix for known in filters])
+    kept = [1.0 + lin.weight * own for lin, own in zip(lins, mixed, strict=True)]
     drifts = [
         jnp.pad(-(factors(part, point.levels) @ u[:, :, None]), ((0, 0), (0, 0), (0, root.shape[1])))
-        for part, u in zip(system.recursions, point.noises, strict=True)
+        for part, u in zip(model.recursions, point.noises, strict=True)
     ]
-    white = _whiten(spec, system, lins, filters, columns, drifts)
+    white = _whiten(model, lins, filters, tuple(columns), drifts)
     return [(c[:, :, 0], jnp.sum(c[:, :, 1:] ** 2, 2), k) for c, k in zip(white, kept, strict=True)]
 
 
@@ -137,15 +127,15 @@ def innovations(fit: Fitted, kurtosis: np.ndarray) -> Filtered:
     A sum of squares over some data expects their number less what the biases used: over all data the sum of gamma,
     over a share of them the trace of B (G + A)^-1 B', B their responses to the biases.
     """
-    spec, system = fit.problem.spec, fit.problem.system
-    filters = prepare(spec, system, fit.point, fit.lins)
+    model = fit.problem.model
+    filters = prepare(model, fit.point, fit.lins)
     values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(fit.covariance)))
     root = vectors * np.sqrt(np.maximum(values, 0.0))  # that of few draws is singular
-    chunk = min(COLUMNS, spec.biases)
-    root = np.pad(root, ((0, 0), (0, -spec.biases % chunk)))
+    chunk = min(COLUMNS, model.biases)
+    root = np.pad(root, ((0, 0), (0, -model.biases % chunk)))
     roots = [jnp.asarray(part) for part in np.split(root, root.shape[1] // chunk, axis=1)]
     still = [jnp.asarray(np.zeros((lin.bias.shape[0], lin.bias.shape[2]))) for lin in fit.lins]
-    found = [_innovations(spec, system, fit.point, fit.lins, filters, still, part) for part in roots]
+    found = [_innovations(model, fit.point, fit.lins, filters, still, part) for part in roots]
     value, _, kept = (fit.flat(parts) for parts in zip(*found[0], strict=True))
     used = np.sum([fit.flat([own for _, own, _ in part]) for part in found], axis=0)
     return Filtered(filters, Innovations(value, used, kurtosis * kept**4), roots)
@@ -153,8 +143,8 @@ def innovations(fit: Fitted, kurtosis: np.ndarray) -> Filtered:
 
 def moved_innovations(fit: Fitted, known: Filtered, shift: list[jax.Array]) -> np.ndarray:
     """Innovations (D,) with the biases of every row of each block moved by `shift` (N, p) in z."""
-    spec, system = fit.problem.spec, fit.problem.system
-    found = _innovations(spec, system, fit.point, fit.lins, known.filters, shift, known.roots[0])
+    model = fit.problem.model
+    found = _innovations(model, fit.point, fit.lins, known.filters, shift, known.roots[0])
     return fit.flat([value for value, _, _ in found])
 
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal import rows
 from probcal.analysis.standpoint import draw_states, on_tracks_of
 from probcal.errors import InputError, nearest
-from probcal.problem import Problem, Spec, System
+from probcal.model.model import At, Model
+from probcal.problem import Problem
 from probcal.simulate import Key, Truth, as_key
 from probcal.smoothing.information import moments
 from probcal.smoothing.mode import Point, track
@@ -55,8 +55,8 @@ def sensitivity(
     starts = [follow_states(problem, [np.asarray(x[k]) for x in true]) for k in range(runs)]
     start = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
     spans = tuple(epochs.position for epochs in problem.epochs)
-    unit = jax.random.normal(keys[1], (runs, problem.spec.biases))
-    arguments = (problem.spec, problem.system, spans)
+    unit = jax.random.normal(keys[1], (runs, problem.model.biases))
+    arguments = (problem.model, spans)
     errors = _errors(*arguments, jnp.asarray(spread), unit, true, start, jax.random.split(keys[2], runs))
     alone, gain = _first_order(*arguments, true)
     shape = tuple(len(v) for v in values.values())
@@ -96,10 +96,9 @@ def _spread(problem: Problem, values: Mapping[str, np.ndarray]) -> np.ndarray:
     return spread.reshape(-1, len(problem.labels))
 
 
-@partial(jax.jit, static_argnames=("spec", "spans"))
+@partial(jax.jit, static_argnames="spans")
 def _errors(
-    spec: Spec,
-    system: System,
+    model: Model,
     spans: Spans,
     spread: jax.Array,
     unit: jax.Array,
@@ -113,13 +112,8 @@ def _errors(
     def one(pair: jax.Array) -> jax.Array:
         cell, run = pair[0], pair[1]
         states, z = tuple(x[run] for x in true), spread[cell] * unit[run]
-        drawn = []
-        for b, (block, data, r) in enumerate(zip(spec.blocks, system.rows, spec.recursion, strict=True)):
-            predicted = rows.predict(block, data, states[r], z)
-            y = rows.sample(block, data, predicted, start.levels[run], jax.random.fold_in(keys[run], b))
-            drawn.append(data._replace(y=data.mask * y))
-        measured = system._replace(rows=tuple(drawn))
-        found = track(spec, measured, jax.tree.map(lambda leaf: leaf[run], start), ITERATIONS)
+        measured = model.with_values(model.sample(At(states, z, start.levels[run]), keys[run]))
+        found = track(measured, jax.tree.map(lambda leaf: leaf[run], start), ITERATIONS)
         pairs = zip(found.states, states, spans, strict=True)
         squares = [jnp.sum((x - x_true)[:, a:b] ** 2) for x, x_true, (a, b) in pairs]
         return jnp.sum(jnp.stack(squares)) / sum(x.shape[0] for x in states)
@@ -129,15 +123,15 @@ def _errors(
     return jax.lax.map(one, pairs, batch_size=together).reshape(cells, runs)
 
 
-@partial(jax.jit, static_argnames=("spec", "spans"))
-def _first_order(spec: Spec, system: System, spans: Spans, true: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+@partial(jax.jit, static_argnames="spans")
+def _first_order(model: Model, spans: Spans, true: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
     """Mean squared position error without biases, and by the square of each z (M,), averaged over runs and epochs."""
-    M, levels = spec.biases, jnp.zeros(system.level_spread.shape)
+    M, levels = model.biases, jnp.zeros(model.level_spread.shape)
 
     def one(states: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
         point = Point(states, tuple(jnp.zeros_like(x) for x in states), jnp.zeros(M), levels)
         alone, gain = jnp.zeros(()), jnp.zeros(M)
-        for moment, (a, b) in zip(moments(spec, system, point, jnp.zeros((M, M))), spans, strict=True):
+        for moment, (a, b) in zip(moments(model, point, jnp.zeros((M, M))), spans, strict=True):
             alone = alone + jnp.sum(jnp.diagonal(moment.states, axis1=1, axis2=2)[:, a:b])
             gain = gain + jnp.sum(moment.response[:, a:b] ** 2, (0, 1))
         epochs = sum(x.shape[0] for x in states)

@@ -58,7 +58,7 @@ def true_point(problem: Problem, truth: Truth | None) -> tuple[jax.Array, tuple[
 def draw_states(problem: Problem, count: int, key: jax.Array | None) -> tuple[jax.Array, ...]:
     """Trajectories (D, E, n) of each recursion drawn from the motion, or its means where there is no key."""
     found = []
-    for r, part in enumerate(problem.system.recursions):
+    for r, part in enumerate(problem.model.recursions):
         shape = (*part.drift.shape, count)
         noise = jnp.zeros(shape) if key is None else jax.random.normal(jax.random.fold_in(key, r), shape)
         L = factors(part, jnp.zeros(len(problem.levels)))

@@ -91,7 +91,7 @@ def ellipse(
         low, high, key, tries, _, _ = state
         key, draw = jax.random.split(key)
         angle = low + (high - low) * jax.random.uniform(draw)
-        weight = log_weight(form.spec, posed.system, posed.frame, *at(angle))
+        weight = log_weight(posed.model, posed.frame, *at(angle))
         return jnp.where(angle < 0, angle, low), jnp.where(angle < 0, high, angle), key, tries + 1, angle, weight
 
     start = 2 * jnp.pi * jax.random.uniform(keys[3])
@@ -116,7 +116,7 @@ def swing(
         return jnp.where(given.active, given.mean + given.inverse.T @ free[0], 0.0)
 
     def energy(free: Any) -> tuple[jax.Array, jax.Array]:
-        weight = log_weight(form.spec, posed.system, posed.frame, place(free), free[1])
+        weight = log_weight(posed.model, posed.frame, place(free), free[1])
         return 0.5 * sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(free)) - weight, weight
 
     slope = jax.value_and_grad(energy, has_aux=True)
@@ -191,14 +191,14 @@ class Collapsed(Sampler):
         keys = jax.random.split(key, len(posed.frame.loops) + 1)
         pairs = zip(keys, posed.frame.point.states, strict=False)
         eps = tuple(jax.random.normal(k, x.shape) for k, x in pairs)
-        weight = log_weight(form.spec, posed.system, posed.frame, theta, eps)
+        weight = log_weight(posed.model, posed.frame, theta, eps)
         return Chain(theta, eps, phi, weight, keys[-1])
 
     def step(self, form: Form, posed: Posed, chain: Chain) -> tuple[Chain, Sample]:
         """One draw."""
         key, *keys = jax.random.split(chain.key, 6)
         theta, phi = surrogate(form, posed, chain.theta, chain.phi, keys[0], self.sweeps or form.hierarchy.sweeps)
-        weight = log_weight(form.spec, posed.system, posed.frame, theta, chain.eps)
+        weight = log_weight(posed.model, posed.frame, theta, chain.eps)
         rate = jnp.exp(jnp.minimum(weight - chain.weight, 0.0))
         taken = jax.random.uniform(keys[1]) < rate
         proposed = chain._replace(theta=theta, phi=phi, weight=weight)

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 
 from probcal.errors import InputError
 from probcal.inference.run import Given, Maximiser, State, learn
+from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Prior
-from probcal.problem import Problem, Spec, System
+from probcal.problem import Problem
 from probcal.smoothing.information import laplace, paper_b, update_levels
 from probcal.smoothing.mode import Point, between, cost, find_mode, track
 
@@ -18,7 +19,7 @@ RULES = ("mackay", "em")
 TRAJECTORIES = ("exact", "smoothed")
 
 
-def _learnt(spec: Spec, system: System, prior: Prior, given: Given, state: State, rule: str) -> State:
+def _learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -> State:
     """The state with precisions and levels that follow from what the last iteration found, if there was one."""
     fresh = jnp.isneginf(state.objective)
     alpha = learn(
@@ -26,38 +27,38 @@ def _learnt(spec: Spec, system: System, prior: Prior, given: Given, state: State
     )
     point = state.point
     if point.levels.shape[0]:
-        moved = update_levels(spec, system, point, state.found.covariance)
+        moved = update_levels(model, point, state.found.covariance)
         point = between(moved, point, jnp.where(fresh, 1.0, 0.0))
     return state._replace(point=point, alpha=jnp.where(fresh, state.alpha, alpha))
 
 
-def _iterate(spec: Spec, system: System, prior: Prior, given: Given, state: State, rule: str) -> State:
+def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str) -> State:
     """New precisions and levels, then the mode and the evidence at that mode: all of one state belongs together."""
-    state = _learnt(spec, system, prior, given, state, rule)
+    state = _learnt(model, prior, given, state, rule)
     now = given.prior._replace(alpha=state.alpha)
-    mode = find_mode(spec, system, state.point, now, MODE_STEPS, 1e-2 * given.tolerance)
-    found = laplace(spec, system, mode.point, now)
-    objective = found.evidence if prior.proper or not prior.learns else _density(spec, system, prior, given, mode.point)
+    mode = find_mode(model, state.point, now, MODE_STEPS, 1e-2 * given.tolerance)
+    found = laplace(model, mode.point, now)
+    objective = found.evidence if prior.proper or not prior.learns else _density(model, prior, given, mode.point)
     still = jnp.abs(objective - state.objective) < given.tolerance
     # where a target grazes a sensor the density has a cusp: no step lowers the cost, and none is needed
-    settled = mode.converged | (cost(spec, system, state.point, now) - mode.cost < given.tolerance)
+    settled = mode.converged | (cost(model, state.point, now) - mode.cost < given.tolerance)
     done = still & settled if prior.learns or mode.point.levels.shape[0] else mode.converged
     best = jnp.fmax(state.best, found.evidence)
     return State(mode.point, state.alpha, found, objective, best, state.refused & mode.refused, done)
 
 
-def _density(spec: Spec, system: System, prior: Prior, given: Given, point: Point) -> jax.Array:
+def _density(model: Model, prior: Prior, given: Given, point: Point) -> jax.Array:
     """Log joint density with the prior's own penalty."""
     held = given.prior._replace(alpha=jnp.where(given.surveyed, given.prior.alpha, 0.0))
     penalty = jnp.where(given.surveyed, 0.0, prior.penalty(point.z, 0.0))
-    return -cost(spec, system, point, held) - jnp.sum(penalty)
+    return -cost(model, point, held) - jnp.sum(penalty)
 
 
-def _iterate_paper_b(spec: Spec, system: System, prior: Prior, given: Given, state: State, rule: str) -> State:
+def _iterate_paper_b(model: Model, prior: Prior, given: Given, state: State, rule: str) -> State:
     """Smooth at the current biases, then their posterior (16)-(17) for the precisions (25) of Paper B."""
-    state = _learnt(spec, system, prior, given, state, rule)
-    point = track(spec, system, state.point)
-    found, step = paper_b(spec, system, point, given.prior._replace(alpha=state.alpha))
+    state = _learnt(model, prior, given, state, rule)
+    point = track(model, state.point)
+    found, step = paper_b(model, point, given.prior._replace(alpha=state.alpha))
     refused = state.refused & ~jnp.all(jnp.isfinite(step))
     step = jnp.where(jnp.isfinite(step), jnp.clip(step, -1.0, 1.0), 0.0)
     done = (jnp.abs(found.evidence - state.objective) < given.tolerance) & (jnp.max(jnp.abs(step)) < 1e-3)
@@ -96,10 +97,10 @@ class EA(Maximiser):
         twice = "; the data count twice (Paper B as printed)" if self.trajectory == "smoothed" else ""
         return self.intervals + twice
 
-    def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
+    def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Mode (or smoothed trajectory), evidence, new precisions."""
         step = _iterate if self.trajectory == "exact" else _iterate_paper_b
-        return step(spec, system, prior, given, state, self.update)
+        return step(model, prior, given, state, self.update)
 
 
 @dataclass(frozen=True)
@@ -116,9 +117,9 @@ class MAP(Maximiser):
     priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat, Laplace)
     intervals: ClassVar[str] = "Laplace: exact for a Gaussian or flat prior where the problem is linear and Gaussian"
 
-    def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
+    def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Mode and its covariance."""
-        return _iterate(spec, system, prior, given, state, "mackay")
+        return _iterate(model, prior, given, state, "mackay")
 
 
 @dataclass(frozen=True)

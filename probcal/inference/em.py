@@ -9,28 +9,26 @@ import jax.numpy as jnp
 from probcal import linalg
 from probcal.errors import InputError
 from probcal.inference.run import Given, Maximiser, State, learn
+from probcal.model import sigma
+from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
-from probcal.problem import Spec, System
-from probcal.smoothing import sigma
-from probcal.smoothing.information import laplace, update_levels
-from probcal.smoothing.mode import Point, between, cost, eliminate_rows, find_mode, follow, linearise, of_biases
+from probcal.smoothing.information import laplace, state_covariances, update_levels
+from probcal.smoothing.mode import Point, between, cost, eliminate_rows, find_mode, follow
 
 HALVINGS = 8
 LINEARISATIONS = ("extended", "unscented", "cubature")
 
 
-def _shorten(
-    spec: Spec, system: System, point: Point, proposal: Point, prior: Precision, slack: float
-) -> tuple[Point, jax.Array]:
+def _shorten(model: Model, point: Point, proposal: Point, prior: Precision, slack: float) -> tuple[Point, jax.Array]:
     """The longest of the halved steps that leaves the cost finite and at most `slack` above the old one.
 
     Also whether there was none.
     """
-    bound = cost(spec, system, point, prior) + slack
+    bound = cost(model, point, prior) + slack
 
     def worse(state):
         t, tries = state
-        return ~(cost(spec, system, between(point, proposal, t), prior) <= bound) & (tries < HALVINGS)
+        return ~(cost(model, between(point, proposal, t), prior) <= bound) & (tries < HALVINGS)
 
     t, tries = jax.lax.while_loop(worse, lambda s: (0.5 * s[0], s[1] + 1), (jnp.ones(()), 0))
     found = between(point, proposal, jnp.where(tries < HALVINGS, t, 0.0))
@@ -39,50 +37,46 @@ def _shorten(
     )
 
 
-def _inner(spec: Spec, system: System, point: Point, prior: Precision, rule: str) -> tuple[Point, jax.Array, jax.Array]:
+def _inner(model: Model, point: Point, prior: Precision, rule: str) -> tuple[Point, jax.Array, jax.Array]:
     """One E and one M step (Paper A 15-21, Paper C 2c and 35); also the variances of z at fixed trajectories (36).
 
     Last, whether both steps were refused.
     """
     slack = 0.0
     if rule == "extended":  # one damped pass of the extended smoother, linearised at the last trajectory
-        mode = find_mode(spec, system, point, prior, 1, 0.0, joint=False)
+        mode = find_mode(model, point, prior, 1, 0.0, joint=False)
         point, refused = mode.point, mode.refused
-        information, score = of_biases(spec, system, linearise(spec, system, point, expected=False))
+        information, score = model.of_biases(model.linearise(point, expected=False))
     else:
-        spread = sigma.state_covariances(spec, system, point)
-        lins = sigma.regress(spec, system, point, spread, rule)
-        smoothed = follow(
-            system, point, eliminate_rows(spec, system, point, lins, joint=False), jnp.zeros_like(point.z)
-        )
+        spread = state_covariances(model, point)
+        lins = sigma.regress(model, point, spread, rule)
+        smoothed = follow(model, point, eliminate_rows(model, point, lins, joint=False), jnp.zeros_like(point.z))
         # the mean of a density lies off its mode, by half a unit of cost a dimension at most in the Gaussian case
         slack = 0.5 * sum(u.size for u in point.noises)
-        point, refused = _shorten(spec, system, point, smoothed, prior, slack)
-        spread = sigma.state_covariances(spec, system, point)
-        information, score = sigma.expect_biases(spec, system, point, spread, rule)
-    matrix = information + prior.matrix() + 1e-12 * jnp.eye(spec.biases)
+        point, refused = _shorten(model, point, smoothed, prior, slack)
+        spread = state_covariances(model, point)
+        information, score = sigma.expect_biases(model, point, spread, rule)
+    matrix = information + prior.matrix() + 1e-12 * jnp.eye(model.biases)
     step = linalg.solve_positive(matrix, score - prior.pull(point.z))
     finite = jnp.all(jnp.isfinite(step))
     step = jnp.where(jnp.isfinite(step), step, 0.0)
-    point, stuck = _shorten(spec, system, point, point._replace(z=point.z + step), prior, slack)
+    point, stuck = _shorten(model, point, point._replace(z=point.z + step), prior, slack)
     return point, linalg.inverse_diagonal(matrix), refused & (stuck | ~finite)
 
 
-def _iterate(
-    spec: Spec, system: System, prior: Prior, given: Given, state: State, inner: int, linearisation: str
-) -> State:
+def _iterate(model: Model, prior: Prior, given: Given, state: State, inner: int, linearisation: str) -> State:
     """`inner` E and M steps, then the update of the precisions (Paper C 40) and of the levels."""
     now = given.prior._replace(alpha=state.alpha)
     point, variance, refused = state.point, jnp.zeros_like(state.alpha), state.refused
     for _ in range(inner):
-        point, variance, stuck = _inner(spec, system, point, now, linearisation)
+        point, variance, stuck = _inner(model, point, now, linearisation)
         refused = refused & stuck
     alpha = learn(prior, given, state.alpha, jnp.zeros_like(variance), variance, point.z, "em")
     if point.levels.shape[0]:
-        point = update_levels(spec, system, point, jnp.diag(variance))
+        point = update_levels(model, point, jnp.diag(variance))
     after = given.prior._replace(alpha=alpha)
     free = jnp.where(given.surveyed, 0.0, prior.penalty(point.z, alpha) - 0.5 * alpha * point.z**2)
-    value = -cost(spec, system, point, after) - jnp.sum(free)
+    value = -cost(model, point, after) - jnp.sum(free)
     if prior.proper:
         value = value + 0.5 * after.log_determinant()
     done = jnp.abs(value - state.objective) < given.tolerance
@@ -115,13 +109,13 @@ class EM(Maximiser):
         if self.inner < 1:
             raise InputError(f"{self.name}(inner={self.inner}): at least one inner iteration is needed")
 
-    def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
+    def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Inner EM steps, then new precisions."""
-        return _iterate(spec, system, prior, given, state, self.inner, self.linearisation)
+        return _iterate(model, prior, given, state, self.inner, self.linearisation)
 
-    def close(self, spec: Spec, system: System, given: Given, state: State) -> State:
+    def close(self, model: Model, given: Given, state: State) -> State:
         """Covariance and evidence at the point, trajectories marginalised."""
-        found = laplace(spec, system, state.point, given.prior._replace(alpha=state.alpha))
+        found = laplace(model, state.point, given.prior._replace(alpha=state.alpha))
         return state._replace(found=found, best=jnp.fmax(state.best, found.evidence))
 
 

@@ -164,13 +164,13 @@ def _rank(prior: Prior, outcome: Outcome) -> tuple[bool, bool, float]:
 def _result(
     problem: Problem, method: Method, prior: Prior, outcome: Outcome, keys: jax.Array, seed: int, keep: tuple[str, ...]
 ) -> tree.Result:
-    spec, system, point = problem.spec, problem.system, outcome.point
+    model, point = problem.model, outcome.point
     found = outcome.laplace
     if not bool(jnp.isfinite(found.covariance).all()):  # a flat prior on a singular problem: no interval exists
         raise FitError(outcome.message)
-    shape = (CHAINS, draws_a_chain(sum(r.mask.size for r in system.rows), CHAINS))
+    shape = (CHAINS, draws_a_chain(model.size, CHAINS))
     z = draw_biases(point, found.covariance, keys[0], shape[0] * shape[1])
-    drawn, spread = draw(spec, system, point, found.covariance, z, point.levels, keys[1], keep)
+    drawn, spread = draw(model, point, found.covariance, z, point.levels, keys[1], keep)
     before = track_mode(problem, _uncalibrated(point))
 
     def split(a: jax.Array) -> np.ndarray:
@@ -191,7 +191,7 @@ def _result(
         states=[split(s) for s in drawn.states], kept=np.arange(shape[1]),
         log_likelihood=[split(a) for a in drawn.log_likelihood], replicas=[split(a) for a in drawn.replicas],
         tracks=_tracks(point, before, spread, found.covariance),
-        residuals=residuals_of(spec, system, before, point),
+        residuals=residuals_of(model, before, point),
     )  # fmt: skip
 
 
@@ -217,8 +217,8 @@ def track(problem: Problem, calibration: xr.DataTree) -> xr.DataTree:
     """
     found = tree.apply(problem, calibration)
     problem, covariance = found.problem, jnp.asarray(found.covariance)
-    start = at_levels(problem.system, automatic_start(problem), jnp.asarray(found.levels))
+    start = at_levels(problem.model, automatic_start(problem), jnp.asarray(found.levels))
     before = track_mode(problem, _uncalibrated(start))
     after = track_mode(problem, start._replace(z=jnp.asarray(found.z)))
-    spread = moments(problem.spec, problem.system, after, covariance)
+    spread = moments(problem.model, after, covariance)
     return tree.build_tracks(problem, _tracks(after, before, spread, covariance))

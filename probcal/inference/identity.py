@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.fingerprint import ADDRESS, computes
+from probcal.model.rows import Block, Rows, information, log_likelihood, noise_std, weigh
 from probcal.problem import Problem
-from probcal.rows import Block, Rows, information, log_likelihood, noise_std, weigh
 from probcal.tree import RESULTS_VERSION
 
 
@@ -66,18 +66,18 @@ def data_digest(problem: Problem) -> str:
 def model_digest(problem: Problem) -> str:
     """Digest of sensors (functions and their constants), noise, motion, network, biases and what is fixed."""
     found = hashlib.sha256()
-    for block, rows in zip(problem.spec.blocks, problem.system.rows, strict=True):
+    for block, rows in zip(problem.model.blocks, problem.model.rows, strict=True):
         found.update(_code(block, rows, len(problem.levels)).encode())
         for name, leaf in rows._asdict().items():
             if name not in ("y", "mask"):
                 _add(found, leaf)
-    for leaf in jax.tree.leaves((problem.system.recursions, problem.system.level_spread)):
+    for leaf in jax.tree.leaves((problem.model.recursions, problem.model.level_spread)):
         _add(found, leaf)
-    spec = problem.spec
+    model = problem.model
     stated = [(n.name, n.position.tolist(), {k: np.asarray(v).tolist() for k, v in n.components.items()})
               for n in problem.network.nodes]  # fmt: skip
     words = (
-        problem.biases, problem.fixed, problem.levels, spec.recursion, spec.biases, stated,
+        problem.biases, problem.fixed, problem.levels, model.recursion, model.biases, stated,
         [(e.components, e.layout) for e in problem.epochs],
     )  # fmt: skip
     found.update(_text(words).encode())

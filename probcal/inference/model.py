@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpyro
 from numpyro import distributions as dist
 
-from probcal import rows
 from probcal.errors import InputError, nearest
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
+from probcal.model import rows
+from probcal.model.rows import Block, Rows
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
-from probcal.rows import Block, Rows
 from probcal.smoothing.mode import factors
 from probcal.smoothing.recursion import trajectory
 from probcal.types import float64
@@ -86,11 +86,11 @@ def numpyro_model(problem: Problem, prior: Prior | None = None) -> Callable[...,
         )
     hierarchy = hierarchy_of(prior, problem)
     first = prior.precision(problem.labels, problem.surveyed)
-    spec, system, scales = problem.spec, problem.system, jnp.asarray(problem.scales)
-    suffixes = [f"_{r}" for r in range(len(system.recursions))] if len(system.recursions) > 1 else [""]
-    kinds = [block.type.name for block in spec.blocks]
+    of, scales = problem.model, jnp.asarray(problem.scales)
+    suffixes = [f"_{r}" for r in range(len(of.recursions))] if len(of.recursions) > 1 else [""]
+    kinds = [block.type.name for block in of.blocks]
     sites = [
-        f"y_{name}{suffixes[r] if kinds.count(name) > 1 else ''}" for name, r in zip(kinds, spec.recursion, strict=True)
+        f"y_{name}{suffixes[r] if kinds.count(name) > 1 else ''}" for name, r in zip(kinds, of.recursion, strict=True)
     ]
 
     def model(data: Mapping[str, Any] | None = None, *, observed: bool = True) -> None:
@@ -99,20 +99,20 @@ def numpyro_model(problem: Problem, prior: Prior | None = None) -> Callable[...,
                 "a numpyro_model runs in double precision only: call numpyro.enable_x64() before,"
                 " or run numpyro inside `with jax.enable_x64(True):`"
             )
-        given = _given(data, sites, system.rows)
+        given = _given(data, sites, of.rows)
         phi = {name: numpyro.sample(name, d.to_event()) for name, d in hierarchy.hyper().items()}
         z = _biases(hierarchy, first, phi)
         numpyro.deterministic("bias", scales * z)
         levels = jnp.zeros(0)
         if problem.levels:
-            levels = numpyro.sample("level", dist.Normal(0.0, system.level_spread).to_event())
+            levels = numpyro.sample("level", dist.Normal(0.0, of.level_spread).to_event())
         states = []
-        for part, suffix in zip(system.recursions, suffixes, strict=True):
+        for part, suffix in zip(of.recursions, suffixes, strict=True):
             unit = dist.Normal(jnp.zeros_like(part.drift), 1.0).to_event()
             u = numpyro.sample(f"noise{suffix}", unit)
             x = trajectory(part.F, factors(part, levels), part.drift[:, :, None], u[:, :, None])[:, :, 0]
             states.append(numpyro.deterministic(f"state{suffix}", x))
-        for site, block, own, r in zip(sites, spec.blocks, system.rows, spec.recursion, strict=True):
+        for site, block, own, r in zip(sites, of.blocks, of.rows, of.recursion, strict=True):
             predicted = rows.predict(block, own, states[r], z)
             numpyro.sample(site, Measured(block, own, predicted, levels), obs=given[site] if observed else None)
 

@@ -48,7 +48,7 @@ def parts(form: Form, posed: Posed, free: Free) -> Parts:
     phi, hyper = form.hierarchy.constrain(free.phi)
     alpha, coupling = prior_precision(form, posed, phi)
     theta, volume = whiten(posed.frame.information + coupling, alpha, posed.frame.pull, free.eta)
-    joint = log_joint(form.spec, posed.system, posed.frame, theta, free.eps)
+    joint = log_joint(posed.model, posed.frame, theta, free.eps)
     return Parts(theta, phi, joint, hyper + volume + log_prior(form, posed, theta, phi) + joint)
 
 

@@ -13,8 +13,9 @@ from probcal.inference.collapsed import sweep
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.posed import Form, Posed, activity, conditional
 from probcal.inference.psis import smoothed
+from probcal.model.model import Model
 from probcal.priors import Prior
-from probcal.problem import Problem, Spec, System
+from probcal.problem import Problem
 from probcal.smoothing.frame import Frame, frame_at, log_weight, place, refined
 from probcal.smoothing.mode import Point, track
 
@@ -77,21 +78,21 @@ def weights(form: Form, posed: Posed, theta: jax.Array, key: jax.Array) -> jax.A
         keys = jax.random.split(pair[1], len(posed.frame.loops))
         pairs = zip(keys, posed.frame.point.states, strict=True)
         eps = tuple(jax.random.normal(k, x.shape) for k, x in pairs)
-        return log_weight(form.spec, posed.system, posed.frame, pair[0], eps)
+        return log_weight(posed.model, posed.frame, pair[0], eps)
 
     return jax.lax.map(one, (theta, jax.random.split(key, theta.shape[0])))
 
 
-@partial(jax.jit, static_argnames="spec")
-def moved(spec: Spec, system: System, frame: Frame, theta: jax.Array, key: jax.Array) -> Frame:
+@jax.jit
+def moved(model: Model, frame: Frame, theta: jax.Array, key: jax.Array) -> Frame:
     """The frame at the mean of draws theta (D, Q), trajectories at their mode, then fitted to the draws."""
     resting = tuple(jnp.zeros_like(x) for x in frame.point.states)
     mean = jnp.mean(theta, 0)
-    frame = frame_at(spec, system, track(spec, system, place(system, frame, mean, resting)))
+    frame = frame_at(model, track(model, place(model, frame, mean, resting)))
     for k in range(FITTINGS):
         keys = jax.random.split(jax.random.fold_in(key, k), len(resting))
         eps = tuple(jax.random.normal(s, (FITTED, *x.shape)) for s, x in zip(keys, resting, strict=True))
-        frame = refined(spec, system, frame, theta[:: theta.shape[0] // FITTED][:FITTED], eps)
+        frame = refined(model, frame, theta[:: theta.shape[0] // FITTED][:FITTED], eps)
     return frame
 
 
@@ -117,9 +118,9 @@ def pose(problem: Problem, prior: Prior, start: Point, key: jax.Array) -> tuple[
 
     The frame is moved to the mean of the pilot's draws, by their weights, until these say that it fits.
     """
-    spec, system = problem.spec, problem.system
-    form = Form(spec, hierarchy_of(prior, problem))
-    posed = Posed(system, frame_at(spec, system, start), prior.precision(problem.labels, problem.surveyed))
+    model = problem.model
+    form = Form(model.biases, hierarchy_of(prior, problem))
+    posed = Posed(model, frame_at(model, start), prior.precision(problem.labels, problem.surveyed))
     best: tuple[Posed, Pilot, Worth] | None = None
     for move in range(MOVES + 1):
         keys = jax.random.split(jax.random.fold_in(key, move), 3)
@@ -131,7 +132,7 @@ def pose(problem: Problem, prior: Prior, start: Point, key: jax.Array) -> tuple[
         if move and worth.khat < GOOD:
             break
         draws = found.theta
-        frame = moved(spec, system, posed.frame, draws, keys[2])
+        frame = moved(model, posed.frame, draws, keys[2])
         if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(frame)):
             break
         posed = posed._replace(frame=frame)

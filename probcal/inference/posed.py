@@ -11,8 +11,8 @@ import jax.numpy as jnp
 
 from probcal import linalg
 from probcal.inference.hierarchy import Hierarchy, Phi, SpikeAndSlab
+from probcal.model.model import Model
 from probcal.priors import Precision
-from probcal.problem import Spec, System
 from probcal.smoothing.frame import Frame
 
 
@@ -20,19 +20,14 @@ from probcal.smoothing.frame import Frame
 class Form:
     """The static part: what kernels are compiled for."""
 
-    spec: Spec
+    biases: int  # M, the number of biases
     hierarchy: Hierarchy
-
-    @property
-    def biases(self) -> int:
-        """M, the number of biases."""
-        return self.spec.biases
 
 
 class Posed(NamedTuple):
     """The numbers: data, frame, and the prior of the biases that no hierarchy governs."""
 
-    system: System
+    model: Model
     frame: Frame
     first: Precision
 
@@ -62,15 +57,15 @@ class Conditional(NamedTuple):
 
 def prior_precision(form: Form, posed: Posed, phi: Phi) -> tuple[jax.Array, jax.Array]:
     """Precisions (Q,) of theta given phi, and what correlations add to them (Q, Q)."""
-    H = posed.system.level_spread.shape[0]
+    H = posed.model.level_spread.shape[0]
     alpha = form.hierarchy.alpha(phi, posed.first.alpha)
-    alpha = jnp.concatenate([alpha, 1.0 / posed.system.level_spread**2])
+    alpha = jnp.concatenate([alpha, 1.0 / posed.model.level_spread**2])
     return alpha, jnp.pad(posed.first.coupling, (0, H))
 
 
 def activity(form: Form, posed: Posed, phi: Phi) -> jax.Array:
     """Which entries of theta are not exactly zero, (Q,)."""
-    H = posed.system.level_spread.shape[0]
+    H = posed.model.level_spread.shape[0]
     return jnp.concatenate([form.hierarchy.active(phi, form.biases), jnp.ones(H, bool)])
 
 

@@ -93,7 +93,7 @@ def result(
         log_prior=_log_prior(problem, prior, run),
         states=states if "states" in keep else [], kept=kept, log_likelihood=likelihood, replicas=replicas,
         tracks=_tracks(states, before),
-        residuals=residuals_of(problem.spec, problem.system, before, after), lower=lower, upper=upper,
+        residuals=residuals_of(problem.model, before, after), lower=lower, upper=upper,
         columns=_columns(run, mixed, M), posterior=_posterior(problem, run), sample_stats=_stats(run),
         attrs=_attrs(run),
     )  # fmt: skip
@@ -101,7 +101,7 @@ def result(
 
 def mean_point(problem: Problem, run: Sampled) -> Point:
     """Posterior means of biases and levels, trajectories at their mode there."""
-    start = at_levels(problem.system, run.posed.frame.point, jnp.asarray(run.levels.mean((0, 1))))
+    start = at_levels(problem.model, run.posed.frame.point, jnp.asarray(run.levels.mean((0, 1))))
     return track_mode(problem, start._replace(z=jnp.asarray(run.z.mean((0, 1)))))
 
 
@@ -115,14 +115,14 @@ def _by_datum(
 ) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
     """Which draws (kept,) of each chain have values by datum; log-likelihood and replicas (chain, kept, N, C) there."""
     chains, draws = run.z.shape[:2]
-    most = draws_a_chain(sum(r.mask.size for r in problem.system.rows), chains)
+    most = draws_a_chain(problem.model.size, chains)
     kept = np.unique(np.linspace(0, draws - 1, min(draws, most)).round().astype(int))
 
     def flat(a: np.ndarray) -> jax.Array:
         return jnp.asarray(a[:, kept].reshape(chains * len(kept), *a.shape[2:]))
 
     found = predictive(
-        problem.spec, problem.system, flat(run.levels), flat(run.z), tuple(flat(s) for s in states), key, keep
+        problem.model, flat(run.levels), flat(run.z), tuple(flat(s) for s in states), key, keep
     )  # fmt: skip
     likelihood, replicas = (
         [np.asarray(a).reshape(chains, len(kept), *a.shape[1:]) for a in part] for part in found
@@ -224,7 +224,7 @@ def judge(
     if mixed["ess"][worst] < ESS * chains:
         said.append(f"Only {mixed['ess'][worst]:.0f} effective draws of {names[worst]}; take more draws.")
         good = False
-    square = float(mean_square(problem.spec, problem.system, mean))
+    square = float(mean_square(problem.model, mean))
     if not square <= ABSURD:
         return "misfit", " ".join([misfit_sentence(problem, mean, square), *said])
     good = _say_steps(run, said) and good

@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg, rows
+from probcal import linalg
 from probcal.errors import InputError
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form
+from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Precision, Prior
-from probcal.problem import Problem, Spec, System
+from probcal.problem import Problem
 from probcal.smoothing.mode import Point, factors
 from probcal.smoothing.recursion import trajectory
 
@@ -37,7 +38,7 @@ def check_drawable(prior: Prior, problem: Problem) -> None:
 
 
 @partial(jax.jit, static_argnames="form")
-def draw_prior(form: Form, system: System, first: Precision, key: jax.Array) -> Drawn:
+def draw_prior(form: Form, model: Model, first: Precision, key: jax.Array) -> Drawn:
     """A truth from the prior and its data: hyper-parameters, biases given them, levels, trajectories, every row."""
     keys = jax.random.split(key, 5)
     phi = form.hierarchy.draw(keys[0])
@@ -45,32 +46,27 @@ def draw_prior(form: Form, system: System, first: Precision, key: jax.Array) -> 
     _, inverse = linalg.factor_and_inverse(jnp.diag(alpha) + first.coupling)
     z = inverse.T @ jax.random.normal(keys[1], alpha.shape)
     z = jnp.where(form.hierarchy.active(phi, form.biases), z, 0.0)
-    levels = system.level_spread * jax.random.normal(keys[2], system.level_spread.shape)
+    levels = model.level_spread * jax.random.normal(keys[2], model.level_spread.shape)
     states, noises = [], []
-    for r, part in enumerate(system.recursions):
+    for r, part in enumerate(model.recursions):
         noise = jax.random.normal(jax.random.fold_in(keys[3], r), part.drift.shape)
         path = trajectory(part.F, factors(part, levels), part.drift[:, :, None], noise[:, :, None])
         states.append(path[:, :, 0])
         noises.append(noise)
     point = Point(tuple(states), tuple(noises), z, levels)
-    return Drawn(phi, point, draw_data(form.spec, system, point, keys[4]))
+    return Drawn(phi, point, draw_data(model, point, keys[4]))
 
 
-@partial(jax.jit, static_argnames="spec")
-def draw_data(spec: Spec, system: System, point: Point, key: jax.Array) -> tuple[jax.Array, ...]:
+@jax.jit
+def draw_data(model: Model, point: Point, key: jax.Array) -> tuple[jax.Array, ...]:
     """Measured values (N, C) of each block at a point; 0 where the problem has none."""
-    found = []
-    for b, (block, data, r) in enumerate(zip(spec.blocks, system.rows, spec.recursion, strict=True)):
-        predicted = rows.predict(block, data, point.states[r], point.z)
-        drawn = rows.sample(block, data, predicted, point.levels, jax.random.fold_in(key, b))
-        found.append(jnp.where(data.mask > 0, drawn, 0.0))
-    return tuple(found)
+    return model.with_values(model.sample(point, key)).values
 
 
 def far_start(problem: Problem) -> float:
     """How wide the start of a target is, in extents of the network: above 1 the prior's tracks pass far from it."""
     widest = 0.0
-    for part, epochs in zip(problem.system.recursions, problem.epochs, strict=True):
+    for part, epochs in zip(problem.model.recursions, problem.epochs, strict=True):
         begins = ~np.asarray(part.F).any((1, 2))
         spread = np.sqrt((np.asarray(part.L) ** 2).sum(2))[begins][:, slice(*epochs.position)]
         widest = max(widest, float(spread.max(initial=0.0)))

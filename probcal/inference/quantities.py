@@ -24,8 +24,9 @@ from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import Sampled, sample
 from probcal.inference.uniformity import NOMINAL, randomised_rank
 from probcal.lazy import Later
+from probcal.model.model import At, Model
 from probcal.priors import Prior
-from probcal.problem import Problem, Spec, System
+from probcal.problem import Problem
 from probcal.smoothing.draws import draw, draw_biases
 from probcal.smoothing.frame import volume
 from probcal.smoothing.mode import Point, log_density, log_likelihood
@@ -92,24 +93,24 @@ def gaussian_posterior(
         raise FitError(outcome.message)
     keys, point = jax.random.split(key), outcome.point
     z = draw_biases(point, covariance, keys[0], CHAINS * DRAWS)
-    drawn, _ = draw(prepared.spec, prepared.system, point, covariance, z, point.levels, keys[1])
+    drawn, _ = draw(prepared.model, point, covariance, z, point.levels, keys[1])
     held = np.broadcast_to(np.asarray(outcome.point.levels), (CHAINS * DRAWS, len(problem.levels)))
     kept = tuple(np.asarray(x) for x in drawn.states) if prepared is problem else ()
     return Posterior(Points(np.asarray(z), held, kept), {}, CHAINS, False, outcome.status)
 
 
-@partial(jax.jit, static_argnames="spec")
-def _likelihoods(spec: Spec, system: System, z: jax.Array, levels: jax.Array, states: Any) -> jax.Array:
+@jax.jit
+def _likelihoods(model: Model, z: jax.Array, levels: jax.Array, states: Any) -> jax.Array:
     """Log-likelihood of all data at draws, (D,)."""
-    return jax.lax.map(lambda d: log_likelihood(spec, system, Point(d[2], (), d[0], d[1])), (z, levels, states))
+    return jax.lax.map(lambda d: log_likelihood(model, At(d[2], d[0], d[1])), (z, levels, states))
 
 
 @partial(jax.jit, static_argnames="form")
 def _joint(form: Form, posed: Posed, point: Point, phi: Phi) -> jax.Array:
     """Log joint density of data, noises and biases at the truth, as samplers keep it of each draw."""
     theta = jnp.concatenate([point.z, point.levels])
-    spread = volume(posed.system, posed.frame, theta)
-    return log_density(form.spec, posed.system, point) + spread + log_prior(form, posed, theta, phi)
+    spread = volume(posed.model, posed.frame, theta)
+    return log_density(posed.model, point) + spread + log_prior(form, posed, theta, phi)
 
 
 class Trial(NamedTuple):
@@ -160,8 +161,8 @@ def _quantities(trial: Trial, found: Posterior) -> dict[str, _Quantity]:
         all_ |= _middle(problem, point, points)
         args = jax.tree.map(jnp.asarray, tuple(points))
         true = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (point.z, point.levels, point.states))
-        draws = np.asarray(_likelihoods(problem.spec, problem.system, *args))
-        truth = float(_likelihoods(problem.spec, problem.system, *true)[0])
+        draws = np.asarray(_likelihoods(problem.model, *args))
+        truth = float(_likelihoods(problem.model, *true)[0])
         all_["log likelihood"] = _Quantity("density", truth, draws)
     if sampled is not None and trial.joint:
         phi = {name: jnp.asarray(value) for name, value in trial.phi.items()}

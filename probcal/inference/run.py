@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.model.model import Model
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Precision, Prior
 from probcal.priors import Laplace as LaplacePrior
-from probcal.problem import Problem, Spec, System
+from probcal.problem import Problem
 from probcal.smoothing.directions import Direction, weak_directions
 from probcal.smoothing.information import Laplace, mean_square, squares_of
 from probcal.smoothing.mode import Point
@@ -79,10 +80,10 @@ class Maximiser(Method, ABC):
     tolerance: float  # change of the objective at which it stops
 
     @abstractmethod
-    def iterate(self, spec: Spec, system: System, prior: Prior, given: Given, state: State) -> State:
+    def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """One outer iteration."""
 
-    def close(self, spec: Spec, system: System, given: Given, state: State) -> State:
+    def close(self, model: Model, given: Given, state: State) -> State:
         """What is computed once a chunk."""
         return state
 
@@ -143,19 +144,19 @@ def learn(prior: Prior, given: Given, alpha: jax.Array, gamma: Any, variance: An
     return jnp.where(given.surveyed, alpha, learnt)
 
 
-@partial(jax.jit, static_argnames=("method", "spec", "prior"))
+@partial(jax.jit, static_argnames=("method", "prior"))
 def chunk(
-    method: Any, spec: Spec, prior: Prior, system: System, given: Given, state: State, left: int
+    method: Any, model: Model, prior: Prior, given: Given, state: State, left: int
 ) -> tuple[State, tuple[jax.Array, jax.Array]]:
     """A few outer iterations, at most `left`; stops when done. Returns objectives and which steps were idle."""
 
     def body(state: State, k: jax.Array) -> tuple[State, tuple[jax.Array, jax.Array]]:
         idle = state.done | (k >= left)
-        after = jax.lax.cond(idle, lambda s: s, lambda s: method.iterate(spec, system, prior, given, s), state)
+        after = jax.lax.cond(idle, lambda s: s, lambda s: method.iterate(model, prior, given, s), state)
         return after, (after.objective, idle)
 
     state, trace = jax.lax.scan(body, state, jnp.arange(CHUNK))
-    return method.close(spec, system, given, state), trace
+    return method.close(model, given, state), trace
 
 
 def maximise(method: Maximiser, problem: Problem, prior: Prior, start: Point, progress: Progress | None) -> Outcome:
@@ -165,7 +166,7 @@ def maximise(method: Maximiser, problem: Problem, prior: Prior, start: Point, pr
     state, trace = first_state(given, start), np.zeros(0)
     while len(trace) < method.iterations and not bool(state.done):
         left = method.iterations - len(trace)
-        state, (objective, idle) = chunk(kernel(method), problem.spec, bare(prior), problem.system, given, state, left)
+        state, (objective, idle) = chunk(kernel(method), problem.model, bare(prior), given, state, left)
         trace = np.concatenate([trace, np.asarray(objective)[~np.asarray(idle)]])
         if progress is not None:
             progress(method.name, len(trace), float(trace[-1]))
@@ -193,7 +194,7 @@ def finish(problem: Problem, prior: Prior, state: State, converged: bool, trace:
         all(np.isfinite(np.asarray(part)).all() for part in (found.covariance, found.evidence, point.z)),
         bool(state.refused),
         fallen(prior, len(problem.levels), state.best, found.evidence),
-        float(mean_square(problem.spec, problem.system, point)),
+        float(mean_square(problem.model, point)),
     )
     status = verdict(end)
     bias_status = tuple(
@@ -250,12 +251,12 @@ def verdict(end: End) -> str:
 
 def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
     """What to check where a fit explains nothing, and the datum that is worst explained."""
-    squares = [np.asarray(part) for part in squares_of(problem.spec, problem.system, point)]
+    squares = [np.asarray(part) for part in squares_of(problem.model, point)]
     block = int(np.argmax([np.nan_to_num(part, nan=np.inf).max() for part in squares]))
     n, c = np.unravel_index(np.argmax(np.nan_to_num(squares[block], nan=np.inf)), squares[block].shape)
     row, data = problem.row_index[block][n], problem.measurements
     sensor = problem.network.sensors[data.sensor[row]].name
-    channel = problem.spec.blocks[block].type.expand(problem.network.dimension)[c][0]
+    channel = problem.columns[block][c]
     return (
         f"The fit explains nothing: mean square a datum {square:.2g} where 1 is expected, worst {sensor}.{channel} at"
         f" {data.time[row]:.6g} s. Check units, the time column, sentinels such as -9999 and the noise std."

@@ -76,7 +76,7 @@ def keep(form: Form, posed: Posed, sample: Sample) -> Draw:
     given = conditional(form, posed, sample.phi)
     variance = given.variance[:M]
     gamma = jnp.where(given.active[:M], jnp.clip(1.0 - given.alpha[:M] * variance, 0.0, 1.0), 0.0)
-    point = place(posed.system, posed.frame, sample.theta, sample.eps)
+    point = place(posed.model, posed.frame, sample.theta, sample.eps)
     density = sample.joint + log_prior(form, posed, sample.theta, sample.phi)
     return Draw(sample.theta, sample.phi, gamma, variance, point.states, density, sample.stats)
 

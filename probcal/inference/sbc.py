@@ -164,7 +164,7 @@ class _Engine:
         self.pool: Posterior | None = None
         if around is None:
             check_drawable(source, problem)
-            self.form = Form(problem.spec, hierarchy_of(source, problem))
+            self.form = Form(problem.model.biases, hierarchy_of(source, problem))
         elif isinstance(around, xr.DataTree):
             self.pool = _of_tree(problem, around)
         elif around != "data":
@@ -186,16 +186,16 @@ class _Engine:
     def trial(self, key: jax.Array) -> Trial:
         """A truth, and the problem with its data."""
         if self.pool is None:
-            drawn = draw_prior(self.form, self.problem.system, self.first, key)
+            drawn = draw_prior(self.form, self.problem.model, self.first, key)
             same = self.prior == self.source
             return Trial(self.problem.redrawn(drawn.y), drawn.point, drawn.phi if same else {}, same)
         pick, seed = jax.random.split(key)
         k = int(jax.random.randint(pick, (), 0, self.pool.count))
         z, levels, states = jax.tree.map(lambda leaf: leaf[k], self.pool.points)
         flat = follow_states(self.problem, list(states))._replace(z=jnp.asarray(z))
-        point = at_levels(self.problem.system, flat, jnp.asarray(levels))
+        point = at_levels(self.problem.model, flat, jnp.asarray(levels))
         point = point._replace(states=tuple(jnp.asarray(x) for x in states))
-        y = draw_data(self.problem.spec, self.problem.system, point, seed)
+        y = draw_data(self.problem.model, point, seed)
         phi = {name: leaf[k] for name, leaf in self.pool.phi.items()}
         return Trial(_twice(self.problem, y), point, phi, joint=False)
 
@@ -203,8 +203,8 @@ class _Engine:
         """Near the truth, or None for a start from the data."""
         if self.start == "automatic":
             return None
-        wide = Precision.single(jnp.ones(trial.problem.spec.biases))
-        return find_mode(trial.problem.spec, trial.problem.system, trial.point, wide, 30, 1e-3).point
+        wide = Precision.single(jnp.ones(trial.problem.model.biases))
+        return find_mode(trial.problem.model, trial.point, wide, 30, 1e-3).point
 
     def _fit(self, problem: Problem, start: Point | None, key: jax.Array) -> Posterior:
         """The method's answer, started as `fit` starts it where no start is given."""
@@ -235,14 +235,7 @@ class _Engine:
 def _twice(problem: Problem, y: tuple[jax.Array, ...]) -> Problem:
     """The problem whose every row is measured twice, the second time as y (N, C) of each block."""
     other = copy(problem)
-    rows = []
-    for data, new in zip(problem.system.rows, y, strict=True):
-        mine = {
-            name: jnp.concatenate([getattr(data, name), getattr(data, name)])
-            for name in ("epoch", "sensor", "pose", "mask", "std", "level")
-        }
-        rows.append(data._replace(y=jnp.concatenate([data.y, new]), **mine))
-    other.system = problem.system._replace(rows=tuple(rows))
+    other.model = problem.model.measured_twice(y)
     other.row_index = [np.concatenate([index, index]) for index in problem.row_index]
     return other
 

@@ -37,8 +37,9 @@ from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import sample
 from probcal.inference.settings import check_setting
 from probcal.inference.storage import Records, Storage
+from probcal.model.model import Model
 from probcal.priors import PRECISION_BOUNDS, Prior
-from probcal.problem import Problem, Spec, System
+from probcal.problem import Problem
 from probcal.simulate import Truth
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.mode import Point
@@ -69,33 +70,31 @@ class _Solved(NamedTuple):
     iterations: jax.Array  # (runs,)
 
 
-@partial(jax.jit, static_argnames=("method", "spec", "prior"))
-def _solve(
-    method: Any, spec: Spec, prior: Prior, iterations: int, systems: System, givens: Given, starts: Point
-) -> _Solved:
+@partial(jax.jit, static_argnames=("method", "prior"))
+def _solve(method: Any, models: Model, prior: Prior, iterations: int, givens: Given, starts: Point) -> _Solved:
     """Run a method on many problems of one form: one after the other on a CPU, together on an accelerator."""
 
-    def one(pieces: tuple[System, Given, Point]) -> _Solved:
-        system, given, start = pieces
+    def one(pieces: tuple[Model, Given, Point]) -> _Solved:
+        model, given, start = pieces
 
         def step(carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
             state, count = carry
-            return method.iterate(spec, system, prior, given, state), count + 1
+            return method.iterate(model, prior, given, state), count + 1
 
         def on(carry: tuple[State, jax.Array]) -> jax.Array:
             return ~carry[0].done & (carry[1] < iterations)
 
         state, count = jax.lax.while_loop(on, step, (first_state(given, start), jnp.zeros((), int)))
-        state = method.close(spec, system, given, state)
+        state = method.close(model, given, state)
         sd = jnp.sqrt(jnp.diagonal(state.found.covariance))
         done = state.done | (given.tolerance == 0.0)
         found, point = state.found, state.point
         return _Solved(
             point.z, sd, found.gamma, state.alpha, point.states, done, state.refused, state.best, found.evidence,
-            mean_square(spec, system, point), count,
+            mean_square(model, point), count,
         )  # fmt: skip
 
-    pieces = (systems, givens, starts)
+    pieces = (models, givens, starts)
     return jax.lax.map(one, pieces) if jax.default_backend() == "cpu" else jax.vmap(one)(pieces)
 
 
@@ -132,7 +131,7 @@ def _position_rmse(run: _Run, states: Sequence[np.ndarray]) -> float:
 
 def _form(run: _Run) -> tuple[Any, ...]:
     """Runs of one form are solved by one kernel: the same static part and the same shapes."""
-    return (run.problem.spec, *(leaf.shape for leaf in jax.tree.leaves(run.problem.system)))
+    return (jax.tree.structure(run.problem.model), *(leaf.shape for leaf in jax.tree.leaves(run.problem.model)))
 
 
 def _batch(
@@ -160,12 +159,12 @@ def _batch(
                 stacked = [
                     jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
                     for parts in (
-                        [run.problem.system for run in chosen],
+                        [run.problem.model for run in chosen],
                         [_given(method, prior, run, name == ORACLE) for run in chosen],
                         [run.start for run in chosen],
                     )
                 ]
-                solved = _solve(kernel(method), chosen[0].problem.spec, prior, method.iterations, *stacked)
+                solved = _solve(kernel(method), stacked[0], prior, method.iterations, *stacked[1:])
                 solved = jax.tree.map(np.asarray, solved)
                 for j, k in enumerate(members):
                     one = jax.tree.map(lambda leaf, j=j: leaf[j], solved)

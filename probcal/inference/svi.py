@@ -58,15 +58,15 @@ def plain(form: Form, posed: Posed, free: Free) -> Plain:
 
     eta is theta over its prior sd (a declared scale where the prior is flat), eps the whitened noises of the problem.
     """
-    system = posed.system
+    model = posed.model
     phi, hyper = form.hierarchy.constrain(free.phi)
     matrix, alpha = _prior_matrix(form, posed, phi)
     theta, volume = whiten(matrix, alpha, jnp.zeros_like(alpha), free.eta)
     levels = theta[form.biases :]
-    tracks = zip(system.recursions, free.eps, strict=True)
+    tracks = zip(model.recursions, free.eps, strict=True)
     states = tuple(trajectory(p.F, factors(p, levels), p.drift[:, :, None], u[:, :, None])[:, :, 0] for p, u in tracks)
     point = Point(states, free.eps, theta[: form.biases], levels)
-    density = hyper + volume + log_prior(form, posed, theta, phi) + log_density(form.spec, system, point)
+    density = hyper + volume + log_prior(form, posed, theta, phi) + log_density(model, point)
     return Plain(theta, phi, point, jnp.where(jnp.isfinite(density), density, -jnp.inf))
 
 
@@ -122,7 +122,7 @@ class SVI(Sampler):
             resting = tuple(jnp.zeros_like(x) for x in posed.frame.point.states)
             coupling, alpha = _prior_matrix(form, posed, phi)
             eta = linalg.factor(coupling + jnp.diag(alpha)).T @ theta
-            noises = place(posed.system, posed.frame, theta, resting).noises
+            noises = place(posed.model, posed.frame, theta, resting).noises
             mean, log_scale = Free(form.hierarchy.relax(phi), eta, noises), float(np.log(NARROW))
         flat = ravel_pytree(mean)[0]
         rest = self._guide(form, posed).first(flat.shape[0], keys[0])
@@ -200,8 +200,8 @@ class SVI(Sampler):
             density = found.density + _constant(form, posed, found.phi)
             return Sample(found.theta, free.eps, found.phi, found.joint, {}), density
         at = plain(form, posed, free)
-        eps = driving(posed.system, posed.frame, at.point)
-        joint = log_joint(form.spec, posed.system, posed.frame, at.theta, eps)
+        eps = driving(posed.model, posed.frame, at.point)
+        joint = log_joint(posed.model, posed.frame, at.theta, eps)
         return Sample(at.theta, eps, at.phi, joint, {}), at.density + _constant(form, posed, at.phi)
 
 

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg, rows
-from probcal.problem import Spec, System
+from probcal import linalg
+from probcal.model.model import At, Data, Model
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.information import Moments, moments_of
-from probcal.smoothing.mode import Point, factors, linearise, of_both, of_states
+from probcal.smoothing.mode import Point, factors
 from probcal.tree import Residuals
 
 VALUES = 4_000_000  # of all states that are drawn at once
@@ -23,8 +23,8 @@ class Drawn(NamedTuple):
     """Draws of trajectories and of what hangs on them; empty where it was not asked for."""
 
     states: tuple[jax.Array, ...]  # (D, E, n) of each recursion
-    log_likelihood: list[jax.Array]  # (D, N, C) of each block
-    replicas: list[jax.Array]  # (D, N, C) of each block
+    log_likelihood: Data  # (D, N, C) of each block
+    replicas: Data  # (D, N, C) of each block
 
 
 def draws_a_chain(data: int, chains: int) -> int:
@@ -32,9 +32,9 @@ def draws_a_chain(data: int, chains: int) -> int:
     return int(np.clip(DATA // max(chains * data, 1), LEAST, MOST))
 
 
-def _passes(system: System, count: int) -> int:
+def _passes(model: Model, count: int) -> int:
     """The least divisor of `count` that keeps the draws of one pass within `VALUES`."""
-    most = max(1, VALUES // sum(part.drift.size for part in system.recursions))
+    most = max(1, VALUES // model.state_size)
     return next(k for k in range(1, count + 1) if count % k == 0 and count // k <= most)
 
 
@@ -47,7 +47,7 @@ def draw_biases(point: Point, covariance: jax.Array, key: jax.Array, count: int)
 
 
 def draw(
-    spec: Spec, system: System, point: Point, covariance: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array,
+    model: Model, point: Point, covariance: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array,
     keep: tuple[str, ...] = ("states",),
 ) -> tuple[Drawn, list[Moments]]:  # fmt: skip
     """A trajectory for each draw of the biases z (D, M), what is to be kept of them, and their exact moments.
@@ -56,22 +56,22 @@ def draw(
     "replicas". Many draws of many epochs are made in passes, of which only what is kept stays.
     """
     levels = jnp.broadcast_to(levels, (z.shape[0], point.levels.shape[0]))
-    return _draw(spec, system, point, covariance, z, levels, key, keep, _passes(system, z.shape[0]))
+    return _draw(model, point, covariance, z, levels, key, keep, _passes(model, z.shape[0]))
 
 
-@partial(jax.jit, static_argnames=("spec", "keep", "passes"))
+@partial(jax.jit, static_argnames=("keep", "passes"))
 def _draw(
-    spec: Spec, system: System, point: Point, covariance: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array,
+    model: Model, point: Point, covariance: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array,
     keep: tuple[str, ...], passes: int,
 ) -> tuple[Drawn, list[Moments]]:  # fmt: skip
     """Trajectories given z by the simulation smoother (draw from the prior, subtract its smoothed self).
 
     All draws are columns of one pass. The response of the trajectory to z is linear.
     """
-    lins = linearise(spec, system, point, expected=True)
-    compressed, crosses = of_states(spec, system, lins, point.states), of_both(spec, system, lins, point.states)
+    lins = model.linearise(point, expected=True)
+    compressed, crosses = model.of_states(lins), model.of_both(lins)
     known, found = [], []
-    for part, (J, _), cross in zip(system.recursions, compressed, crosses, strict=True):
+    for part, (J, _), cross in zip(model.recursions, compressed, crosses, strict=True):
         L = factors(part, point.levels)
         gain = rec.gains(part.F, L, J)
         response = rec.smooth(part.F, L, J, gain, cross)
@@ -93,7 +93,7 @@ def _draw(
     def one_pass(given: tuple[jax.Array, jax.Array, jax.Array]) -> Drawn:
         z, levels, seed = given
         states = trajectories(z - point.z[None, :], seed)
-        log_likelihood, replicas = _by_datum(spec, system, levels, z, states, jax.random.fold_in(seed, 2**31 - 1), keep)
+        log_likelihood, replicas = _by_datum(model, levels, z, states, jax.random.fold_in(seed, 2**31 - 1), keep)
         return Drawn(states if "states" in keep else (), log_likelihood, replicas)
 
     def split(a: jax.Array) -> jax.Array:
@@ -104,61 +104,45 @@ def _draw(
 
 
 def _by_datum(
-    spec: Spec, system: System, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...], key: jax.Array,
+    model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...], key: jax.Array,
     keep: tuple[str, ...],
-) -> tuple[list[jax.Array], list[jax.Array]]:  # fmt: skip
+) -> tuple[Data, Data]:  # fmt: skip
     """Log-likelihood and replicas (D, N, C) of each block at draws, one draw after the other; empty if not kept."""
     wanted = "log_likelihood" in keep, "replicas" in keep
     if not any(wanted):
-        return [], []
+        return (), ()
 
-    def one(draw: Any) -> tuple[list[jax.Array], list[jax.Array]]:
-        levels_d, z_d, states_d, seed = draw
-        density, replicas = [], []
-        for b, (block, data, r) in enumerate(zip(spec.blocks, system.rows, spec.recursion, strict=True)):
-            predicted = rows.predict(block, data, states_d[r], z_d)
-            if wanted[0]:
-                density.append(rows.log_likelihood(block, data, predicted, levels_d))
-            if wanted[1]:
-                replicas.append(rows.sample(block, data, predicted, levels_d, jax.random.fold_in(seed, b)))
-        return density, replicas
+    def one(draw: Any) -> tuple[Data, Data]:
+        levels, z, states, seed = draw
+        at = At(states, z, levels)
+        return model.log_likelihood(at) if wanted[0] else (), model.sample(at, seed) if wanted[1] else ()
 
     return jax.lax.map(one, (levels, z, states, jax.random.split(key, z.shape[0])))
 
 
-predictive = partial(jax.jit, static_argnames=("spec", "keep"))(_by_datum)
+predictive = partial(jax.jit, static_argnames="keep")(_by_datum)
 
 
 class Remainder(NamedTuple):
-    """What is left of every datum of a block at a point, each (N, C), zero where missing."""
+    """What is left of every datum at a point, zero where missing."""
 
-    innovation: jax.Array
-    std: jax.Array  # noise level
-    reliance: jax.Array  # 1 inlying, towards 0 outlying
-
-
-@partial(jax.jit, static_argnames="spec")
-def residuals(spec: Spec, system: System, point: Point) -> list[Remainder]:
-    """Innovation, noise level and reliance of every datum of each block at a point."""
-    found = []
-    for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True):
-        predicted = rows.predict(block, data, point.states[r], point.z)
-        found.append(
-            Remainder(
-                rows.innovation(block, data, predicted),
-                rows.noise_std(data, point.levels),
-                rows.reliance(block, data, predicted, point.levels),
-            )
-        )
-    return found
+    innovation: Data
+    std: Data  # noise level
+    reliance: Data  # 1 inlying, towards 0 outlying
 
 
-def residuals_of(spec: Spec, system: System, before: Point, after: Point) -> Residuals:
+@jax.jit
+def residuals(model: Model, point: Point) -> Remainder:
+    """Innovation, noise level and reliance of every datum at a point."""
+    return Remainder(model.innovation(point), model.noise_std(point.levels), model.reliance(point))
+
+
+def residuals_of(model: Model, before: Point, after: Point) -> Residuals:
     """Residuals without and with calibration, at two points."""
-    old, new = residuals(spec, system, before), residuals(spec, system, after)
+    old, new = residuals(model, before), residuals(model, after)
     return Residuals(
-        before=[np.asarray(r.innovation) for r in old],
-        after=[np.asarray(r.innovation) for r in new],
-        std=[np.asarray(r.std) for r in new],
-        weight=[np.asarray(r.reliance) for r in new],
+        before=[np.asarray(part) for part in old.innovation],
+        after=[np.asarray(part) for part in new.innovation],
+        std=[np.asarray(part) for part in new.std],
+        weight=[np.asarray(part) for part in new.reliance],
     )

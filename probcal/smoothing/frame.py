@@ -9,17 +9,17 @@ the trajectories marginalised the data have a Gaussian log-likelihood of theta. 
 linear and Gaussian and no level is unknown; elsewhere `log_weight` says by how much they are wrong at a point.
 """
 
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg, rows
+from probcal import linalg
 from probcal.linalg import inverse_cholesky, multiply
-from probcal.problem import Recursion, Spec, System
-from probcal.rows import Linearised
+from probcal.model.model import Model, Recursion, scaled
+from probcal.model.rows import Linearised
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import (
@@ -28,9 +28,7 @@ from probcal.smoothing.mode import (
     eliminate_compressed,
     factors,
     follow,
-    linearise,
     log_density,
-    of_states,
     track,
     widening,
 )
@@ -109,22 +107,15 @@ def closed_loop(part: Recursion, L: jax.Array, J: jax.Array, score: jax.Array, u
     return Closed(feedback, factor / size[:, None, :], jnp.log(size), shift)
 
 
-def averaged(
-    spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]
-) -> list[Linearised]:
+def averaged(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> list[Linearised]:
     """Every block linearised at the frame's point, with score and curvature averaged over draws.
 
     These are the moments of the best Gaussian approximation of the joint posterior (Opper, Archambeau 2009). Draws
     theta (D, Q), eps (D, E, n) are taken with their mirror images, so that what is linear stays exact.
     """
 
-    def at(theta: jax.Array, eps: tuple[jax.Array, ...]) -> list[tuple[jax.Array, jax.Array]]:
-        point = place(system, frame, theta, eps)
-        found = []
-        for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True):
-            predicted = rows.predict(block, data, point.states[r], point.z)
-            found.append(rows.slopes(block, data, predicted, point.levels))
-        return found
+    def at(theta: jax.Array, eps: tuple[jax.Array, ...]) -> tuple[tuple[jax.Array, jax.Array], ...]:
+        return model.slopes(place(model, frame, theta, eps))
 
     def pair(draw: tuple[jax.Array, tuple[jax.Array, ...]]) -> list[tuple[jax.Array, jax.Array]]:
         theta, eps = draw
@@ -132,54 +123,54 @@ def averaged(
         return jax.tree.map(lambda a, b: 0.5 * (a + b), at(theta, eps), mirrored)
 
     means = jax.tree.map(lambda leaf: jnp.mean(leaf, 0), jax.lax.map(pair, (theta, eps)))
-    lins = linearise(spec, system, frame.point, expected=True)
+    lins = model.linearise(frame.point, expected=True)
     return [
         lin._replace(score=score, weight=jnp.maximum(curvature, 0.0))
         for lin, (score, curvature) in zip(lins, means, strict=True)
     ]
 
 
-@partial(jax.jit, static_argnames="spec")
-def _at(spec: Spec, system: System, point: Point, levels: jax.Array) -> tuple[jax.Array, jax.Array]:
+@jax.jit
+def _at(model: Model, point: Point, levels: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Marginal log-likelihood (D,) and its slope by z (D, M) at levels (D, H), trajectories at their mode."""
 
     def one(levels: jax.Array) -> tuple[jax.Array, jax.Array]:
-        moved = track(spec, system, at_levels(system, point, levels))
-        lins = linearise(spec, system, moved, expected=True)
-        solved = eliminate_compressed(spec, system, moved.noises, levels, compress(spec, system, lins, moved.states))
-        return log_density(spec, system, moved) - 0.5 * solved.logdet, solved.score
+        moved = track(model, at_levels(model, point, levels))
+        lins = model.linearise(moved, expected=True)
+        solved = eliminate_compressed(model, moved.noises, levels, compress(model, lins))
+        return log_density(model, moved) - 0.5 * solved.logdet, solved.score
 
     return jax.lax.map(one, levels)
 
 
-@partial(jax.jit, static_argnames="spec")
-def frame_at(spec: Spec, system: System, point: Point) -> Frame:
+@jax.jit
+def frame_at(model: Model, point: Point) -> Frame:
     """The frame at a point whose trajectories are at their mode for its biases and levels."""
-    return _frame(spec, system, point, linearise(spec, system, point, expected=True))
+    return _frame(model, point, model.linearise(point, expected=True))
 
 
-@partial(jax.jit, static_argnames="spec")
-def refined(spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> Frame:
+@jax.jit
+def refined(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> Frame:
     """The frame with trajectories and curvature fitted to draws theta (D, Q), eps (D, E, n) of it (see `averaged`)."""
-    lins = averaged(spec, system, frame, theta, eps)
-    compressed = compress(spec, system, lins, frame.point.states)
-    solved = eliminate_compressed(spec, system, frame.point.noises, frame.point.levels, compressed)
-    point = follow(system, frame.point, solved, jnp.zeros_like(frame.point.z))
-    return _frame(spec, system, point, averaged(spec, system, frame._replace(point=point), theta, eps))
+    lins = averaged(model, frame, theta, eps)
+    compressed = compress(model, lins)
+    solved = eliminate_compressed(model, frame.point.noises, frame.point.levels, compressed)
+    point = follow(model, frame.point, solved, jnp.zeros_like(frame.point.z))
+    return _frame(model, point, averaged(model, frame._replace(point=point), theta, eps))
 
 
-def _frame(spec: Spec, system: System, point: Point, lins: list[Linearised]) -> Frame:
+def _frame(model: Model, point: Point, lins: Sequence[Linearised]) -> Frame:
     """The frame of rows linearised at a point. By the log levels, differences of the marginal log-likelihood."""
-    compressed = compress(spec, system, lins, point.states)
-    solved = eliminate_compressed(spec, system, point.noises, point.levels, compressed)
+    compressed = compress(model, lins)
+    solved = eliminate_compressed(model, point.noises, point.levels, compressed)
     H = point.levels.shape[0]
     information, score = solved.information, solved.score
     if H:
-        values, slopes = _at(spec, system, point, point.levels[None] + _moves(H))
+        values, slopes = _at(model, point, point.levels[None] + _moves(H))
         information, score = _with_levels(information, score, values, slopes, H)
-    by_level = [_share(spec, system, point, lins, h) for h in range(H if spec.driven else 0)]
+    by_level = [_share(model, point, lins, h) for h in range(H if model.driven else 0)]
     loops = []
-    parts = zip(system.recursions, compressed.states, compressed.crosses, strict=True)
+    parts = zip(model.recursions, compressed.states, compressed.crosses, strict=True)
     for r, (part, (J, pull), cross) in enumerate(parts):
         L = factors(part, point.levels)
         smooth = rec.smooth(part.F, L, J, rec.gains(part.F, L, J), cross)
@@ -191,17 +182,13 @@ def _frame(spec: Spec, system: System, point: Point, lins: list[Linearised]) -> 
             jnp.stack([pull_h for _, pull_h in own]) if own else jnp.zeros((0, *pull.shape)),
         )
         loops.append(Loop(-smooth.states, -smooth.noises, closed, (J, pull), shares))
-    height = log_density(spec, system, point) - 0.5 * solved.logdet
+    height = log_density(model, point) - 0.5 * solved.logdet
     return Frame(point, information, score, height, tuple(loops))
 
 
-def _share(
-    spec: Spec, system: System, point: Point, lins: list[Linearised], h: int
-) -> list[tuple[jax.Array, jax.Array]]:
+def _share(model: Model, point: Point, lins: Sequence[Linearised], h: int) -> list[tuple[jax.Array, jax.Array]]:
     """Information and score of the states of each recursion by the data whose noise has unknown level h."""
-    pairs = ((lin, data.level == h) for lin, data in zip(lins, system.rows, strict=True))
-    own = [lin._replace(weight=lin.weight * mine, score=lin.score * mine) for lin, mine in pairs]
-    return of_states(spec, system, own, point.states)
+    return model.of_states(scaled(lins, [data.level == h for data in model.rows]))
 
 
 def _moves(H: int) -> np.ndarray:
@@ -234,14 +221,14 @@ def _with_levels(
     return jnp.block([[G, cross.T], [cross, 0.5 * (corner + corner.T)]]), jnp.concatenate([g, slope])
 
 
-def _closed(system: System, frame: Frame, theta: jax.Array) -> list[Closed]:
+def _closed(model: Model, frame: Frame, theta: jax.Array) -> list[Closed]:
     """The closed loops of all recursions at the levels of theta (Q,): stable whatever these are."""
     step = theta[frame.point.z.shape[0] :] - frame.point.levels
     if frame.loops[0].shares[0].shape[0] == 0:
         return [loop.closed for loop in frame.loops]
     found = []
     change = jnp.concatenate([step, jnp.zeros(1)])
-    for part, loop, u in zip(system.recursions, frame.loops, frame.point.noises, strict=True):
+    for part, loop, u in zip(model.recursions, frame.loops, frame.point.noises, strict=True):
         J, pull = (
             whole + jnp.tensordot(jnp.expm1(-2 * step), own, 1)
             for whole, own in zip(loop.data, loop.shares, strict=True)
@@ -254,16 +241,16 @@ def _closed(system: System, frame: Frame, theta: jax.Array) -> list[Closed]:
     return found
 
 
-def place(system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> Point:
+def place(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> Point:
     """The point of theta (Q,) and unit normals eps (E, n) of each recursion."""
-    return _placed(system, frame, theta, eps, _closed(system, frame, theta))
+    return _placed(model, frame, theta, eps, _closed(model, frame, theta))
 
 
-def _placed(system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...], loops: list[Closed]) -> Point:
+def _placed(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...], loops: list[Closed]) -> Point:
     M = frame.point.z.shape[0]
     step = theta[:M] - frame.point.z
     states, noises = [], []
-    parts = zip(system.recursions, frame.loops, loops, frame.point.states, frame.point.noises, eps, strict=True)
+    parts = zip(model.recursions, frame.loops, loops, frame.point.states, frame.point.noises, eps, strict=True)
     for part, loop, at, x, u, e in parts:
         L = factors(part, frame.point.levels)
         own = at.shift + jnp.einsum("eij,ej->ei", at.factor, jnp.exp(at.size) * e)
@@ -279,15 +266,15 @@ def _placed(system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array
         states.append(x + loop.states @ step + deviations)
         noises.append(u + loop.noises @ step + own - jnp.einsum("eij,ej->ei", at.feedback, before))
     point = Point(tuple(states), tuple(noises), theta[:M], frame.point.levels)
-    return at_levels(system, point, theta[M:]) if theta.shape[0] > M else point
+    return at_levels(model, point, theta[M:]) if theta.shape[0] > M else point
 
 
-def driving(system: System, frame: Frame, point: Point) -> tuple[jax.Array, ...]:
+def driving(model: Model, frame: Frame, point: Point) -> tuple[jax.Array, ...]:
     """The unit normals eps (E, n) of each recursion that `place` makes a consistent point of."""
     step = point.z - frame.point.z
-    noises = at_levels(system, point, frame.point.levels).noises
+    noises = at_levels(model, point, frame.point.levels).noises
     found = []
-    loops = _closed(system, frame, jnp.concatenate([point.z, point.levels]))
+    loops = _closed(model, frame, jnp.concatenate([point.z, point.levels]))
     parts = zip(frame.loops, loops, frame.point.states, frame.point.noises, point.states, noises, strict=True)
     for loop, at, x0, u0, x, u in parts:
         deviations = x - x0 - loop.states @ step
@@ -298,25 +285,25 @@ def driving(system: System, frame: Frame, point: Point) -> tuple[jax.Array, ...]
     return tuple(found)
 
 
-def volume(system: System, frame: Frame, theta: jax.Array) -> jax.Array:
+def volume(model: Model, frame: Frame, theta: jax.Array) -> jax.Array:
     """Log determinant by which `place` spreads eps over the whitened noises at theta (Q,)."""
-    return _volume(system, frame, theta, _closed(system, frame, theta))
+    return _volume(model, frame, theta, _closed(model, frame, theta))
 
 
-def _volume(system: System, frame: Frame, theta: jax.Array, loops: list[Closed]) -> jax.Array:
-    change = widening(system, frame.point.levels) - widening(system, theta[frame.point.z.shape[0] :])
+def _volume(model: Model, frame: Frame, theta: jax.Array, loops: list[Closed]) -> jax.Array:
+    change = widening(model, frame.point.levels) - widening(model, theta[frame.point.z.shape[0] :])
     return sum((jnp.sum(at.size) for at in loops), change)
 
 
-def log_joint(spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:
+def log_joint(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:
     """Log density of data and eps given theta, less that of independent unit normals' constant; -inf if not finite."""
-    loops = _closed(system, frame, theta)
-    point = _placed(system, frame, theta, eps, loops)
-    value = log_density(spec, system, point) + _volume(system, frame, theta, loops)
+    loops = _closed(model, frame, theta)
+    point = _placed(model, frame, theta, eps, loops)
+    value = log_density(model, point) + _volume(model, frame, theta, loops)
     return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
 
-def log_weight(spec: Spec, system: System, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:
+def log_weight(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:
     """Log of the joint density of data and trajectories over the frame's: zero where the frame is exact."""
     squares = sum(jnp.sum(e**2) for e in eps)
-    return log_joint(spec, system, frame, theta, eps) + 0.5 * squares - frame.log_likelihood(theta)
+    return log_joint(model, frame, theta, eps) + 0.5 * squares - frame.log_likelihood(theta)

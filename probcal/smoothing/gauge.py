@@ -4,7 +4,6 @@ The rule of rank is free of scales: a direction is a gauge where freeing the sta
 information that known states would give about it.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -12,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.model.model import Model
 from probcal.motion import Known, as_motion
-from probcal.problem import Problem, Spec, System
-from probcal.smoothing.mode import Point, compress, linearise
+from probcal.problem import Problem
+from probcal.smoothing.mode import Point, compress
 
 NULL = 1e-10  # share of information left below which a direction is a gauge
 CLOSE = 1e-6  # share below which a direction is looked at again, without cancellation
@@ -39,11 +39,11 @@ class Gauge(NamedTuple):
     countable: bool  # whether enough epochs have more data than unknowns
 
 
-@partial(jax.jit, static_argnames="spec")
-def free_states(spec: Spec, system: System, point: Point, hold: tuple[jax.Array, ...]) -> Free:
+@jax.jit
+def free_states(model: Model, point: Point, hold: tuple[jax.Array, ...]) -> Free:
     """Information about the biases with the state of every epoch free but for the precisions `hold` (E, n)."""
-    lins = linearise(spec, system, point, expected=True)
-    compressed = compress(spec, system, lins, point.states)
+    lins = model.linearise(point, expected=True)
+    compressed = compress(model, lins)
     known = information = compressed.information
     ranks = []
     for (J, _), cross, precision in zip(compressed.states, compressed.crosses, hold, strict=True):
@@ -54,21 +54,17 @@ def free_states(spec: Spec, system: System, point: Point, hold: tuple[jax.Array,
     return Free(information, known, tuple(ranks))
 
 
-@partial(jax.jit, static_argnames="spec")
-def within(spec: Spec, system: System, point: Point, hold: tuple[jax.Array, ...], basis: jax.Array) -> jax.Array:
+@jax.jit
+def within(model: Model, point: Point, hold: tuple[jax.Array, ...], basis: jax.Array) -> jax.Array:
     """Information (k, k) of combinations (M, k) with free states, from the residuals of rows: no cancellation."""
-    lins = linearise(spec, system, point, expected=True)
-    compressed = compress(spec, system, lins, point.states)
-    k = basis.shape[1]
-    padded = jnp.concatenate([basis, jnp.zeros((1, k), basis.dtype)])
+    lins = model.linearise(point, expected=True)
+    compressed = compress(model, lins)
     moved = [
         linalg.semi_solve(J + jax.vmap(jnp.diag)(precision), cross @ basis)
         for (J, _), cross, precision in zip(compressed.states, compressed.crosses, hold, strict=True)
     ]
-    total = jnp.zeros((k, k))
-    for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
-        own = jnp.einsum("ncp,npk->nck", lin.bias, padded[data.bias[data.sensor]])
-        left = own - jnp.einsum("ncu,nuk->nck", lin.state, moved[r][:, jnp.asarray(block.used, int)][data.epoch])
+    total = jnp.zeros((basis.shape[1], basis.shape[1]))
+    for lin, left in zip(lins, model.responses(lins, [-x for x in moved], basis), strict=True):
         total = total + jnp.einsum("nck,nc,ncl->kl", left, lin.weight, left)
     for x, precision in zip(moved, hold, strict=True):
         total = total + jnp.einsum("enk,en,enl->kl", x, precision, x)
@@ -78,7 +74,7 @@ def within(spec: Spec, system: System, point: Point, hold: tuple[jax.Array, ...]
 def held_states(problem: Problem) -> tuple[jax.Array, ...]:
     """Precision (E, n) of the states that are known beforehand: those of `Known` targets."""
     found = []
-    for epochs, part in zip(problem.epochs, problem.system.recursions, strict=True):
+    for epochs, part in zip(problem.epochs, problem.model.recursions, strict=True):
         precision = np.zeros(part.drift.shape)
         spread = np.asarray(jnp.sum(part.L**2, 2))
         for name in dict.fromkeys(epochs.target):
@@ -101,15 +97,15 @@ def gauge(problem: Problem, point: Point) -> Gauge:
     Surveys count as rows. The count is exact where the epochs have more data than unknowns; where most have not,
     as with one range at a time, `countable` is False: what is fixed there hangs on the motion.
     """
-    spec, system, hold = problem.spec, problem.system, held_states(problem)
-    free = free_states(spec, system, point, hold)
+    model, hold = problem.model, held_states(problem)
+    free = free_states(model, point, hold)
     survey = problem.surveyed.astype(float)
     information = np.asarray(free.information) + np.diag(survey)
     alone = np.diag(np.asarray(free.known)) + survey
     unit = 1 / np.sqrt(np.where(alone > 0, alone, 1.0))
     values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
     near = unit[:, None] * vectors[:, values < CLOSE]
-    exact = np.asarray(within(spec, system, point, hold, jnp.asarray(near))) + near.T @ (survey[:, None] * near)
+    exact = np.asarray(within(model, point, hold, jnp.asarray(near))) + near.T @ (survey[:, None] * near)
     values, turned = np.linalg.eigh(0.5 * (exact + exact.T))
     basis, _ = np.linalg.qr(near @ turned[:, values < NULL])
     return Gauge(basis, information, alone, _countable(problem, free))
@@ -118,9 +114,7 @@ def gauge(problem: Problem, point: Point) -> Gauge:
 def _countable(problem: Problem, free: Free) -> bool:
     """Whether at least half of the data stand in epochs with more data than unknowns."""
     inside = total = 0.0
-    counts = [np.zeros(len(epochs.time)) for epochs in problem.epochs]
-    for rows, r in zip(problem.system.rows, problem.spec.recursion, strict=True):
-        np.add.at(counts[r], np.asarray(rows.epoch), np.asarray(rows.mask).sum(1))
+    counts = [np.asarray(count) for count in problem.model.by_epoch(problem.model.measured)]
     for count, rank in zip(counts, free.ranks, strict=True):
         inside += count[count > np.asarray(rank)].sum()
         total += count.sum()

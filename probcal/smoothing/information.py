@@ -1,14 +1,13 @@
 """The Laplace approximation at a point: information of the biases, gamma, evidence, noise levels."""
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from probcal import linalg, rows
+from probcal import linalg
+from probcal.model.model import Data, Model, Recursion
 from probcal.priors import Precision
-from probcal.problem import Recursion, Spec, System
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import (
     Compressed,
@@ -16,11 +15,8 @@ from probcal.smoothing.mode import (
     compress,
     eliminate,
     factors,
-    linearise,
     log_likelihood,
 )
-
-BATCH = 512  # rows whose leverage is formed at once
 
 
 class Laplace(NamedTuple):
@@ -32,39 +28,39 @@ class Laplace(NamedTuple):
     evidence: jax.Array  # log p(data | alpha, levels), Laplace (exact on a linear-Gaussian problem)
 
 
-@partial(jax.jit, static_argnames="spec")
-def marginal_information(spec: Spec, system: System, point: Point) -> jax.Array:
+@jax.jit
+def marginal_information(model: Model, point: Point) -> jax.Array:
     """Expected information (M, M) of the data about the biases at a point, trajectories marginalised."""
-    return eliminate(spec, system, point, expected=True).information
+    return eliminate(model, point, expected=True).information
 
 
-@partial(jax.jit, static_argnames="spec")
-def laplace(spec: Spec, system: System, point: Point, prior: Precision) -> Laplace:
+@jax.jit
+def laplace(model: Model, point: Point, prior: Precision) -> Laplace:
     """Evidence and covariance with every trajectory marginalised exactly, at the mode for a prior.
 
     A precision of 0 is a flat prior: its density counts as one. The expected information is used throughout.
     """
-    solved = eliminate(spec, system, point, expected=True)
+    solved = eliminate(model, point, expected=True)
     covariance, logdet = linalg.inverse_and_logdet(solved.information + prior.matrix())
-    fit = log_likelihood(spec, system, point) - 0.5 * sum(jnp.sum(u**2) for u in point.noises)
+    fit = log_likelihood(model, point) - 0.5 * sum(jnp.sum(u**2) for u in point.noises)
     own = 0.5 * prior.log_determinant() - 0.5 * prior.square(point.z)
-    spread = -0.5 * jnp.sum((point.levels / system.level_spread) ** 2)
+    spread = -0.5 * jnp.sum((point.levels / model.level_spread) ** 2)
     evidence = fit + own + spread - 0.5 * (solved.logdet + logdet)
     gamma = jnp.clip(1.0 - prior.alpha * jnp.diagonal(covariance), 0.0, 1.0)
     return Laplace(solved.information, covariance, gamma, evidence)
 
 
-def paper_b(spec: Spec, system: System, point: Point, prior: Precision) -> tuple[Laplace, jax.Array]:
+def paper_b(model: Model, point: Point, prior: Precision) -> tuple[Laplace, jax.Array]:
     """Paper B (10)-(17), (22)-(23) at smoothed trajectories: the posterior of z, and the step to its mean.
 
     The smoothed density of each epoch alone is taken as the prior of its state, R-bar = R + H_x P H_x'; what
     epochs share is dropped and the data count twice. By Woodbury no matrix of the size of the data is formed.
     """
-    lins = linearise(spec, system, point, expected=True)
-    compressed = compress(spec, system, lins, point.states)
+    lins = model.linearise(point, expected=True)
+    compressed = compress(model, lins)
     information, score = compressed.information, compressed.score
-    likelihood, logdet = log_likelihood(spec, system, point), jnp.zeros(())
-    for part, (J, pull), cross in zip(system.recursions, compressed.states, compressed.crosses, strict=True):
+    likelihood, logdet = log_likelihood(model, point), jnp.zeros(())
+    for part, (J, pull), cross in zip(model.recursions, compressed.states, compressed.crosses, strict=True):
         L = factors(part, point.levels)
         P, _ = rec.covariances(part.F, L, J, rec.gains(part.F, L, J))
         values, vectors = linalg.spectrum(P)
@@ -82,25 +78,22 @@ def paper_b(spec: Spec, system: System, point: Point, prior: Precision) -> tuple
     step = covariance @ slope
     own = 0.5 * prior.log_determinant() - 0.5 * prior.square(point.z)
     evidence = likelihood + own + 0.5 * slope @ step - 0.5 * (logdet + spread)
-    evidence = evidence - 0.5 * jnp.sum((point.levels / system.level_spread) ** 2)
+    evidence = evidence - 0.5 * jnp.sum((point.levels / model.level_spread) ** 2)
     gamma = jnp.clip(1.0 - prior.alpha * jnp.diagonal(covariance), 0.0, 1.0)
     return Laplace(information, covariance, gamma, evidence), step
 
 
-@partial(jax.jit, static_argnames="spec")
-def squares_of(spec: Spec, system: System, point: Point) -> list[jax.Array]:
+@jax.jit
+def squares_of(model: Model, point: Point) -> Data:
     """Square of what a point leaves of every datum (N, C) of each block, 1 expected, zero where missing."""
-    return [
-        rows.square(block, data, rows.predict(block, data, point.states[r], point.z), point.levels)
-        for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True)
-    ]
+    return model.square(point)
 
 
-@partial(jax.jit, static_argnames="spec")
-def mean_square(spec: Spec, system: System, point: Point) -> jax.Array:
+@jax.jit
+def mean_square(model: Model, point: Point) -> jax.Array:
     """Squares of all data and whitened noises a datum: about 1 at most where the model is right."""
-    count = sum(jnp.sum(data.mask) for data in system.rows)
-    squares = sum(jnp.sum(part) for part in squares_of(spec, system, point))
+    count = sum(jnp.sum(there) for there in model.measured)
+    squares = sum(jnp.sum(part) for part in squares_of(model, point))
     return (squares + sum(jnp.sum(u**2) for u in point.noises)) / jnp.maximum(count, 1)
 
 
@@ -112,19 +105,17 @@ class Moments(NamedTuple):
     noises: jax.Array  # (E, n) variance of each whitened noise, biases included
 
 
-@partial(jax.jit, static_argnames="spec")
-def moments(spec: Spec, system: System, point: Point, covariance: jax.Array) -> list[Moments]:
+@jax.jit
+def moments(model: Model, point: Point, covariance: jax.Array) -> list[Moments]:
     """Trajectory moments of each recursion at a point, for a covariance (M, M) of z."""
-    lins = linearise(spec, system, point, expected=True)
-    return moments_compressed(system, point.levels, compress(spec, system, lins, point.states), covariance)
+    lins = model.linearise(point, expected=True)
+    return moments_compressed(model, point.levels, compress(model, lins), covariance)
 
 
-def moments_compressed(
-    system: System, levels: jax.Array, compressed: Compressed, covariance: jax.Array
-) -> list[Moments]:
+def moments_compressed(model: Model, levels: jax.Array, compressed: Compressed, covariance: jax.Array) -> list[Moments]:
     """Trajectory moments of each recursion from compressed rows, for a covariance (M, M) of z."""
     found = []
-    for part, (J, _), cross in zip(system.recursions, compressed.states, compressed.crosses, strict=True):
+    for part, (J, _), cross in zip(model.recursions, compressed.states, compressed.crosses, strict=True):
         L = factors(part, levels)
         gain = rec.gains(part.F, L, J)
         response = rec.smooth(part.F, L, J, gain, cross)
@@ -141,65 +132,48 @@ def moments_of(
     return Moments(-response.states, states, jnp.diagonal(noises, axis1=1, axis2=2) + spread)
 
 
-@partial(jax.jit, static_argnames="spec")
-def predicted_variances(
-    spec: Spec, system: System, point: Point, covariance: jax.Array, found: list[Moments]
-) -> list[jax.Array]:
+def state_covariances(model: Model, point: Point) -> list[jax.Array]:
+    """Covariances (E, n, n) of every smoothed state at held biases, linearised at a point."""
+    compressed = model.of_states(model.linearise(point, expected=True))
+    found = []
+    for part, (J, _) in zip(model.recursions, compressed, strict=True):
+        L = factors(part, point.levels)
+        found.append(rec.covariances(part.F, L, J, rec.gains(part.F, L, J))[0])
+    return found
+
+
+@jax.jit
+def predicted_variances(model: Model, point: Point, covariance: jax.Array, found: list[Moments]) -> Data:
     """Posterior variance (N, C) of each predicted value, biases and trajectories both uncertain."""
-    variances = []
-    lins = linearise(spec, system, point, expected=True)
-    for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
-        used = jnp.asarray(block.used, int)
-        P = found[r].states[:, used[:, None], used[None, :]][data.epoch]
-        N, C, p = lin.bias.shape
-        columns = jnp.einsum("ncu,num->ncm", lin.state, found[r].response[:, used][data.epoch])
-        columns = jnp.concatenate([columns, jnp.zeros((N, C, 1))], 2)
-        index = jnp.broadcast_to(data.bias[data.sensor][:, None, :], (N, C, p))
-        columns = columns.at[jnp.arange(N)[:, None, None], jnp.arange(C)[None, :, None], index].add(lin.bias)[:, :, :-1]
-        own = jnp.einsum("ncu,nuv,ncv->nc", lin.state, P, lin.state)
-        variances.append(own + jnp.einsum("ncm,ml,ncl->nc", columns, covariance, columns))
-    return variances
+    lins, root = model.linearise(point, expected=True), linalg.factor(covariance)
+    alone = model.state_variance(lins, [moment.states for moment in found])
+    return jax.tree.map(jnp.add, alone, model.spread(lins, [moment.response @ root for moment in found], root))
 
 
-@partial(jax.jit, static_argnames="spec")
-def leverages(spec: Spec, system: System, point: Point, covariance: jax.Array, found: list[Moments]) -> list[jax.Array]:
+@jax.jit
+def leverages(model: Model, point: Point, covariance: jax.Array, found: list[Moments]) -> Data:
     """What every datum (N, C) of each block tells about the biases at a point, trajectories marginalised.
 
     The leverage is w c' Sigma c, c the derivative of the predicted value by z with the trajectory following. Those of
     all data and a rest, what the motion tells, add up to tr(Sigma G), the number of biases that are determined.
     """
-    lins = linearise(spec, system, point, expected=True)
-    root = jnp.concatenate([linalg.factor(covariance), jnp.zeros((1, spec.biases))])
-    told = []
-    for block, data, lin, r in zip(spec.blocks, system.rows, lins, spec.recursion, strict=True):
-        following = (found[r].response @ root[:-1])[:, jnp.asarray(block.used, int)]
-
-        def one(row: tuple[jax.Array, ...], following: jax.Array = following) -> jax.Array:
-            by_bias, by_state, weight, index, epoch = row
-            return weight * jnp.sum((by_bias @ root[index] + by_state @ following[epoch]) ** 2, 1)
-
-        columns = (lin.bias, lin.state, lin.weight, data.bias[data.sensor], data.epoch)
-        told.append(jax.lax.map(one, columns, batch_size=BATCH))
-    return told
+    lins, root = model.linearise(point, expected=True), linalg.factor(covariance)
+    spread = model.spread(lins, [moment.response @ root for moment in found], root)
+    return tuple(lin.weight * own for lin, own in zip(lins, spread, strict=True))
 
 
-def update_levels(spec: Spec, system: System, point: Point, covariance: jax.Array) -> Point:
+def update_levels(model: Model, point: Point, covariance: jax.Array) -> Point:
     """One MacKay step of every unknown noise level, kept within its declared factor by its log-normal prior.
 
     A level sigma of N whitened residuals v solves N - sum Var v = sum v^2 (Paper B 25, for noise). The
     trajectory stays; its whitened noises are rescaled.
     """
     H = point.levels.shape[0]
-    count, square, variance = jnp.zeros(H + 1), jnp.zeros(H + 1), jnp.zeros(H + 1)
-    found = moments(spec, system, point, covariance)
-    spread = predicted_variances(spec, system, point, covariance, found)
-    for block, data, r, var in zip(spec.blocks, system.rows, spec.recursion, spread, strict=True):
-        predicted = rows.predict(block, data, point.states[r], point.z)
-        weight = rows.information(block, data, predicted, point.levels)
-        count = count.at[data.level].add(data.mask)
-        square = square.at[data.level].add(rows.level_score(block, data, predicted, point.levels))
-        variance = variance.at[data.level].add(weight * var)
-    for part, u, moment in zip(system.recursions, point.noises, found, strict=True):
+    found = moments(model, point, covariance)
+    spread = predicted_variances(model, point, covariance, found)
+    count, square = model.by_level(model.measured), model.by_level(model.level_score(point))
+    variance = model.by_level(jax.tree.map(jnp.multiply, model.information(point), spread))
+    for part, u, moment in zip(model.recursions, point.noises, found, strict=True):
         active = jnp.any(part.L != 0, 1)
         count = count.at[part.level].add(active)
         square = square.at[part.level].add(active * u**2)
@@ -208,13 +182,13 @@ def update_levels(spec: Spec, system: System, point: Point, covariance: jax.Arra
     step = jnp.zeros(H)
     for _ in range(8):  # Newton: -free t - square/2 exp(-2 t) - (level + t)^2 / (2 spread^2) is concave
         pull = square[:H] * jnp.exp(-2 * step)
-        gradient = -free + pull - (point.levels + step) / system.level_spread**2
-        step = step + gradient / (2 * pull + 1 / system.level_spread**2)
-    return at_levels(system, point, point.levels + jnp.clip(step, -1.0, 1.0))
+        gradient = -free + pull - (point.levels + step) / model.level_spread**2
+        step = step + gradient / (2 * pull + 1 / model.level_spread**2)
+    return at_levels(model, point, point.levels + jnp.clip(step, -1.0, 1.0))
 
 
-def at_levels(system: System, point: Point, levels: jax.Array) -> Point:
+def at_levels(model: Model, point: Point, levels: jax.Array) -> Point:
     """The same trajectories and biases at other noise levels: the whitened noises are rescaled."""
     ratio = jnp.concatenate([jnp.exp(point.levels - levels), jnp.ones(1)])
-    noises = tuple(u * ratio[part.level] for part, u in zip(system.recursions, point.noises, strict=True))
+    noises = tuple(u * ratio[part.level] for part, u in zip(model.recursions, point.noises, strict=True))
     return point._replace(levels=levels, noises=noises)

@@ -13,9 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg, rows
+from probcal import linalg
+from probcal.model.model import At, Model, Recursion
+from probcal.model.rows import Linearised
 from probcal.priors import Precision
-from probcal.problem import Problem, Recursion, Spec, System
+from probcal.problem import Problem
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Point, cost, factors, find_mode, track
 from probcal.types import float64
@@ -54,27 +56,32 @@ def candidates(problem: Problem) -> np.ndarray:
     return np.concatenate([grid, *rings])
 
 
-def _widened(lin: rows.Linearised) -> jax.Array:
-    """Data precision with the prior spread of the biases (one scale each) added to the noise, (N, C)."""
-    spread = jnp.sum(lin.bias**2, -1)
-    return lin.weight / (1.0 + lin.weight * spread)
+def _widened(lin: Linearised) -> Linearised:
+    """The rows with the prior spread of the biases (one scale each) added to their noise."""
+    factor = jnp.where(lin.weight > 0, 1.0 / (1.0 + lin.weight * jnp.sum(lin.bias**2, -1)), 0.0)
+    return lin._replace(score=lin.score * factor, weight=lin.weight * factor)
 
 
-@partial(jax.jit, static_argnames=("spec", "r", "span"))
+def _misfit(lin: Linearised) -> jax.Array:
+    """Robust misfit (N, C) of every datum, with the prior spread of the biases added to its noise."""
+    residual = lin.score / jnp.maximum(lin.weight, 1e-300) * (lin.weight > 0)
+    each = 0.5 * (ROBUST + 1) * jnp.log1p(_widened(lin).weight * residual**2 / ROBUST)
+    return jnp.where(jnp.isfinite(each), each, 1e6)
+
+
+@partial(jax.jit, static_argnames=("r", "span"))
 def _profile(
-    spec: Spec, system: System, r: int, span: tuple[int, int], z: jax.Array, place: jax.Array
+    model: Model, r: int, span: tuple[int, int], z: jax.Array, place: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Loss (E,) and states (E, n) of recursion r with the position at `place` (E, d), other components profiled."""
-    part = system.recursions[r]
-    E, n = part.drift.shape
-    levels = jnp.zeros(system.level_spread.shape)
+    part = model.recursions[r]
+    n = part.drift.shape[1]
+    levels = jnp.zeros(model.level_spread.shape)
     resting = jax.lax.scan(lambda x, k: ((y := k[0] @ x + k[1]), y), jnp.zeros(n), (part.F, part.drift))[1]
     states = resting.at[:, span[0] : span[1]].set(place)
-    mine = [
-        (block, data) for block, data, own in zip(spec.blocks, system.rows, spec.recursion, strict=True) if own == r
-    ]
+    mine = model.part(r)
     held = np.zeros(n, bool)
-    for name, start, stop, _ in mine[0][0].layout if mine else ():
+    for name, start, stop, _ in mine.blocks[0].layout if mine.blocks else ():
         held[start:stop] = name in ("position", "velocity", "acceleration")
     first = part.F[:, 0, 0] == 0
     precision = 1.0 / jnp.maximum(jnp.sum(factors(part, levels) ** 2, 2), 1e-12)
@@ -82,33 +89,22 @@ def _profile(
     loose = jnp.asarray(np.flatnonzero(~held), int)
     for _ in range(2 if len(loose) else 0):
         A, b = jax.vmap(jnp.diag)(precision), precision * (resting - states) * ~held[None, :]
-        for block, data in mine:
-            lin = rows.linearise(block, data, states, z, levels, expected=False)
-            weight = _widened(lin)
-            pull = lin.score / jnp.maximum(lin.weight, 1e-300) * (lin.weight > 0) * weight
-            used = jnp.asarray(block.used, int)
-            A = A.at[:, used[:, None], used[None, :]].add(
-                jax.ops.segment_sum(jnp.einsum("ncu,nc,ncv->nuv", lin.state, weight, lin.state), data.epoch, E)
-            )
-            b = b.at[:, used].add(jax.ops.segment_sum(jnp.einsum("ncu,nc->nu", lin.state, pull), data.epoch, E))
+        ((J, score),) = mine.of_states(
+            [_widened(lin) for lin in mine.linearise(At((states,), z, levels), expected=False)]
+        )
+        A, b = A + J, b + score
         step = linalg.solve_batched(A[:, loose[:, None], loose[None, :]], b[:, loose])
         states = states.at[:, loose].add(step)
-    loss = jnp.zeros(E)
-    for block, data in mine:
-        lin = rows.linearise(block, data, states, z, levels, expected=False)
-        weight = _widened(lin)
-        residual = lin.score / jnp.maximum(lin.weight, 1e-300) * (lin.weight > 0)
-        each = 0.5 * (ROBUST + 1) * jnp.log1p(weight * residual**2 / ROBUST)
-        loss = loss + jax.ops.segment_sum(jnp.sum(jnp.where(jnp.isfinite(each), each, 1e6), 1), data.epoch, E)
+    (loss,) = mine.by_epoch([_misfit(lin) for lin in mine.linearise(At((states,), z, levels), expected=False)])
     return loss, states
 
 
-@partial(jax.jit, static_argnames=("spec", "r", "span"))
-def _losses(spec: Spec, system: System, r: int, span: tuple[int, int], z: jax.Array, places: jax.Array) -> jax.Array:
+@partial(jax.jit, static_argnames=("r", "span"))
+def _losses(model: Model, r: int, span: tuple[int, int], z: jax.Array, places: jax.Array) -> jax.Array:
     """Loss of every candidate at every epoch, (candidates, E)."""
-    E = system.recursions[r].drift.shape[0]
+    E = model.recursions[r].drift.shape[0]
     width = span[1] - span[0]
-    return jax.lax.map(lambda c: _profile(spec, system, r, span, z, jnp.broadcast_to(c, (E, width)))[0], places)
+    return jax.lax.map(lambda c: _profile(model, r, span, z, jnp.broadcast_to(c, (E, width)))[0], places)
 
 
 def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -132,29 +128,17 @@ def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndar
     return kept[np.arange(len(loss)), path[::-1]]
 
 
-def _thinned(problem: Problem, r: int) -> System:
-    """The system with enough rows of every window of recursion r for a place, evenly spaced over its epochs."""
-    epochs, counts = problem.epochs[r], np.zeros(len(problem.epochs[r].time))
-    for rows_, own in zip(problem.system.rows, problem.spec.recursion, strict=True):
-        if own == r:
-            np.add.at(counts, np.asarray(rows_.epoch), np.asarray(rows_.mask).any(1))
+def _thinned(problem: Problem, r: int) -> Model:
+    """The model with enough rows of every window of recursion r for a place, evenly spaced over its epochs."""
+    epochs = problem.epochs[r]
+    seen = [jnp.any(there > 0, 1, keepdims=True).astype(float) for there in problem.model.measured]
+    counts = np.asarray(problem.model.by_epoch(seen)[r])
     kept = np.zeros(len(counts), bool)
     for name in dict.fromkeys(epochs.target):
         for window in _windows(np.flatnonzero(epochs.target == name)):
             stride = max(1, int(min(counts[window].sum() / WINDOW_ROWS, len(window) / 2)))
             kept[window[::stride]] = True
-    thin = tuple(
-        _some(data, kept) if own == r else data
-        for data, own in zip(problem.system.rows, problem.spec.recursion, strict=True)
-    )
-    return problem.system._replace(rows=thin)
-
-
-def _some(data: rows.Rows, kept: np.ndarray) -> rows.Rows:
-    """The rows of the epochs that are kept (E,)."""
-    mine = np.flatnonzero(kept[np.asarray(data.epoch)])
-    by_row = {name: getattr(data, name)[mine] for name in ("epoch", "sensor", "pose", "y", "mask", "std", "level")}
-    return data._replace(**by_row)
+    return problem.model.of_epochs(r, kept)
 
 
 def _windows(epochs: np.ndarray) -> list[np.ndarray]:
@@ -177,7 +161,7 @@ def _path(problem: Problem, time: np.ndarray, loss: np.ndarray, places: np.ndarr
 
 def _known(problem: Problem, r: int, span: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Mean positions (E, d) by the motion alone, and the epochs (E,) where they are better than the grid's."""
-    part, place = problem.system.recursions[r], slice(*span)
+    part, place = problem.model.recursions[r], slice(*span)
     memory = np.asarray(part.F)[:, place].any((1, 2))
     std = np.linalg.norm(np.asarray(part.L)[:, place], axis=2).max(1)
     return np.array(part.drift)[:, place], ~memory & (std < NEAR * problem.extent)
@@ -200,9 +184,9 @@ def project(problem: Problem, tracks: list[np.ndarray], precision: list[np.ndarr
     levels = jnp.zeros(len(problem.levels))
     pairs = [
         _consistent(part, jnp.asarray(states), jnp.asarray(weight), levels)
-        for part, states, weight in zip(problem.system.recursions, tracks, precision, strict=True)
+        for part, states, weight in zip(problem.model.recursions, tracks, precision, strict=True)
     ]
-    return Point(tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), jnp.zeros(problem.spec.biases), levels)
+    return Point(tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), jnp.zeros(problem.model.biases), levels)
 
 
 def follow_states(problem: Problem, states: list[np.ndarray]) -> Point:
@@ -219,13 +203,13 @@ def _grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
         path, known = _known(problem, r, span)
         unknown = [name for name in dict.fromkeys(epochs.target) if not known[epochs.target == name].all()]
         if unknown:
-            loss = np.asarray(_losses(problem.spec, _thinned(problem, r), r, span, z, jnp.asarray(places)))
+            loss = np.asarray(_losses(_thinned(problem, r), r, span, z, jnp.asarray(places)))
         for name in unknown:
             mine = epochs.target == name
             path[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)
-        _, states = _profile(problem.spec, problem.system, r, span, z, jnp.asarray(path))
+        _, states = _profile(problem.model, r, span, z, jnp.asarray(path))
         states = np.array(states)
-        spread = np.asarray(jnp.sum(problem.system.recursions[r].L ** 2, 2))
+        spread = np.asarray(jnp.sum(problem.model.recursions[r].L ** 2, 2))
         precision = np.where(spread > 0, 1e4 / np.maximum(spread, 1e-300), 1e-9)
         for name, start, stop, _ in epochs.layout:
             if name == "position":
@@ -243,14 +227,14 @@ def automatic_start(problem: Problem, iterations: int = 30) -> Point:
 
     Grid, Viterbi path, motion model, iterated EKS at zero biases, then a few joint steps.
     """
-    tracked = _grid_start(problem, jnp.zeros(problem.spec.biases), iterations)
-    prior = Precision.single(jnp.ones(problem.spec.biases))
-    return find_mode(problem.spec, problem.system, tracked, prior, iterations, 1e-3).point
+    tracked = _grid_start(problem, jnp.zeros(problem.model.biases), iterations)
+    prior = Precision.single(jnp.ones(problem.model.biases))
+    return find_mode(problem.model, tracked, prior, iterations, 1e-3).point
 
 
 def track_mode(problem: Problem, point: Point, iterations: int = 100) -> Point:
     """Trajectories at held biases: iterated EKS from a point."""
-    return track(problem.spec, problem.system, point, iterations)
+    return track(problem.model, point, iterations)
 
 
 def _swaps(problem: Problem) -> np.ndarray:
@@ -285,11 +269,11 @@ def further_starts(problem: Problem, count: int, key: jax.Array) -> list[Point]:
     drawn = np.where(moved, 2.0 * np.asarray(jax.random.normal(seeds[2], shape)), 0.0)
     points = [_grid_start(problem, jnp.asarray(z), 30) for z in np.concatenate([swaps, drawn])]
     flat = Precision.single(jnp.zeros(len(problem.labels)))
-    costs = [float(_cost(problem.spec, problem.system, point, flat)) for point in points]
+    costs = [float(_cost(problem.model, point, flat)) for point in points]
     value = np.nan_to_num(costs, nan=np.inf)
     pairs, others = np.argsort(value[: len(swaps)]), len(swaps) + np.argsort(value[len(swaps) :])
     half = min(len(pairs), (count + 1) // 2)
     return [points[k] for k in (*pairs[:half], *others[: count - half])]
 
 
-_cost = jax.jit(cost, static_argnames="spec")
+_cost = jax.jit(cost)

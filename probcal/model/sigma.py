@@ -5,17 +5,18 @@ et al. 2015; the unscented transform of Julier and Uhlmann, the cubature rule of
 Where a sensor is linear the result is that of the extended smoother.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg, rows
-from probcal.problem import Spec, System
-from probcal.rows import Block, Linearised, Rows
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Point, factors, linearise, of_biases, of_states
+from probcal import linalg
+from probcal.model import rows
+from probcal.model.model import Model, Where
+from probcal.model.rows import Block, Linearised, Rows
 
 FLOOR = 1e-10  # least variance along an axis of the sigma points
 
@@ -25,16 +26,6 @@ class _Points(NamedTuple):
     unit: jax.Array  # (S, u) the same points for unit covariance
     weight: jax.Array  # (S,)
     whiten: jax.Array  # (E, u, u) from state entries to unit covariance
-
-
-def state_covariances(spec: Spec, system: System, point: Point) -> list[jax.Array]:
-    """Covariances (E, n, n) of every smoothed state at held biases, linearised at a point."""
-    compressed = of_states(spec, system, linearise(spec, system, point, expected=True), point.states)
-    found = []
-    for part, (J, _) in zip(system.recursions, compressed, strict=True):
-        L = factors(part, point.levels)
-        found.append(rec.covariances(part.F, L, J, rec.gains(part.F, L, J))[0])
-    return found
 
 
 def _points(block: Block, states: jax.Array, covariance: jax.Array, rule: str) -> _Points:
@@ -52,7 +43,7 @@ def _points(block: Block, states: jax.Array, covariance: jax.Array, rule: str) -
     return _Points(moved, jnp.asarray(unit), jnp.asarray(weight), vectors.mT / root[:, :, None])
 
 
-def _block(block: Block, data: Rows, point: Point, states: jax.Array, covariance: jax.Array, rule: str) -> Linearised:
+def _block(block: Block, data: Rows, point: Where, states: jax.Array, covariance: jax.Array, rule: str) -> Linearised:
     if not block.used:
         return rows.linearise(block, data, states, point.z, point.levels, expected=False)
     points = _points(block, states, covariance, rule)
@@ -71,25 +62,25 @@ def _block(block: Block, data: Rows, point: Point, states: jax.Array, covariance
     return Linearised(score, weight, by_state, jnp.einsum("s,sncp->ncp", points.weight, by_bias))
 
 
-def regress(spec: Spec, system: System, point: Point, covariances: list[jax.Array], rule: str) -> list[Linearised]:
+def regress(model: Model, point: Where, covariances: Sequence[jax.Array], rule: str) -> list[Linearised]:
     """Every block regressed on the states over their smoothed densities; what is left over widens the noise."""
     return [
         _block(block, data, point, point.states[r], covariances[r], rule)
-        for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True)
+        for block, data, r in zip(model.blocks, model.rows, model.recursion, strict=True)
     ]
 
 
 def expect_biases(
-    spec: Spec, system: System, point: Point, covariances: list[jax.Array], rule: str
+    model: Model, point: Where, covariances: Sequence[jax.Array], rule: str
 ) -> tuple[jax.Array, jax.Array]:
     """Information (M, M) and score (M,) of the biases, expected over the smoothed states (Paper A 15-21)."""
-    M = spec.biases
+    M = model.biases
     information, score = jnp.zeros((M, M)), jnp.zeros(M)
-    for block, data, r in zip(spec.blocks, system.rows, spec.recursion, strict=True):
-        alone = system._replace(rows=(data,))
+    for block, data, r in zip(model.blocks, model.rows, model.recursion, strict=True):
+        alone = replace(model, rows=(data,))  # the biases of one block
 
-        def at(x: jax.Array, block: Block = block, data: Rows = data, alone: System = alone) -> tuple:
-            return of_biases(spec, alone, [rows.linearise(block, data, x, point.z, point.levels, expected=False)])
+        def at(x: jax.Array, block: Block = block, data: Rows = data, alone: Model = alone) -> tuple:
+            return alone.of_biases([rows.linearise(block, data, x, point.z, point.levels, expected=False)])
 
         if not block.used:
             G, g = at(point.states[r])

@@ -1,0 +1,362 @@
+"""The waist: a problem as one pytree of arrays, with its static form inside, equal by content.
+
+What belongs to every datum is a tuple of arrays, (N, C) of N rows by C channels for each block (rows of one sensor
+type that see targets of one state layout). Loops over blocks stand here and nowhere above.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.model import rows as waist
+from probcal.model.rows import Block, Linearised, Rows
+
+BY_ROW = ("epoch", "sensor", "pose", "y", "mask", "std", "level")  # arrays of `Rows` that have an entry a row
+BATCH = 512  # rows whose responses to all biases are formed at once
+
+Data = tuple[jax.Array, ...]  # of every datum: (N, C), or (N, C, ...), for each block
+
+
+class Where(Protocol):
+    """What a model is evaluated at: a `Point`, or `At`."""
+
+    @property
+    def states(self) -> tuple[jax.Array, ...]:
+        """States (E, n) of each recursion."""
+
+    @property
+    def z(self) -> jax.Array:
+        """Biases (M,) in units of their scales."""
+
+    @property
+    def levels(self) -> jax.Array:
+        """Log factors (H,) of the unknown noise levels."""
+
+
+class At(NamedTuple):
+    """States, biases and noise levels where a model is evaluated."""
+
+    states: tuple[jax.Array, ...]  # (E, n) of each recursion
+    z: jax.Array  # (M,)
+    levels: jax.Array  # (H,)
+
+
+class Recursion(NamedTuple):
+    """Arrays of one recursion: E epochs of targets that share a state layout of n entries."""
+
+    F: jax.Array  # (E, n, n) transitions, 0 at the first epoch of a target
+    L: jax.Array  # (E, n, n) noise factors (start factors at a first epoch), unused columns 0
+    level: jax.Array  # (E, n) which unknown level multiplies a column of L, H where known
+    drift: jax.Array  # (E, n) known part: start means, means of white components
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["recursions", "rows", "level_spread"],
+    meta_fields=["blocks", "recursion", "biases", "driven"],
+)
+@dataclass(frozen=True)
+class Model:
+    """All numbers of a problem and what is computed from them: a kernel compiled for one serves all of its form."""
+
+    blocks: tuple[Block, ...]
+    recursion: tuple[int, ...]  # which recursion each block reads
+    biases: int  # M, number of free biases
+    driven: bool  # whether a process noise has an unknown level
+    recursions: tuple[Recursion, ...]
+    rows: tuple[Rows, ...]  # of each block
+    level_spread: jax.Array  # (H,) standard deviation of each log level
+
+    # at a point
+
+    def predict(self, at: Where) -> Data:
+        """Predicted value of every datum."""
+        return tuple(waist.predict(block, data, at.states[r], at.z) for block, data, r in self._blocks())
+
+    def innovation(self, at: Where) -> Data:
+        """Measured minus predicted, wrapped, zero where missing."""
+        return self._each(waist.innovation, self.predict(at))
+
+    def log_likelihood(self, at: Where) -> Data:
+        """Log density of every datum, zero where missing."""
+        return self._each(waist.log_likelihood, self.predict(at), levels=at.levels)
+
+    def square(self, at: Where) -> Data:
+        """Square of what a point leaves of every datum, 1 expected, zero where missing."""
+        return self._each(waist.square, self.predict(at), levels=at.levels)
+
+    def reliance(self, at: Where) -> Data:
+        """How much each datum counts against one that fits: 1 inlying, towards 0 outlying."""
+        return self._each(waist.reliance, self.predict(at), levels=at.levels)
+
+    def information(self, at: Where) -> Data:
+        """Expected information of every datum about its predicted value, zero where missing."""
+        return self._each(waist.information, self.predict(at), levels=at.levels)
+
+    def level_score(self, at: Where) -> Data:
+        """One plus the derivative of each log density by log std, zero where missing."""
+        return self._each(waist.level_score, self.predict(at), levels=at.levels)
+
+    def slopes(self, at: Where) -> tuple[tuple[jax.Array, jax.Array], ...]:
+        """Score of every datum by its predicted value and its observed information, a pair for each block."""
+        return self._each(waist.slopes, self.predict(at), levels=at.levels)
+
+    def score(self, at: Where) -> tuple[tuple[jax.Array, jax.Array], ...]:
+        """Score of every datum by its predicted value and the expected information, a pair for each block."""
+        return tuple(
+            waist.weigh(block, data, predicted, waist.noise_std(data, at.levels), expected=True)
+            for block, data, predicted in zip(self.blocks, self.rows, self.predict(at), strict=True)
+        )
+
+    def noise_std(self, levels: jax.Array) -> Data:
+        """Noise std of every datum at log levels (H,)."""
+        return tuple(waist.noise_std(data, levels) for data in self.rows)
+
+    def sample(self, at: Where, key: jax.Array) -> Data:
+        """Measured values drawn at a point, for missing ones too; angles are wrapped."""
+        return tuple(
+            waist.sample(block, data, predicted, at.levels, jax.random.fold_in(key, b))
+            for b, (block, data, predicted) in enumerate(zip(self.blocks, self.rows, self.predict(at), strict=True))
+        )
+
+    def linearise(self, at: Where, *, expected: bool) -> tuple[Linearised, ...]:
+        """Every block linearised at a point, with step weights or the expected information."""
+        return tuple(
+            waist.linearise(block, data, at.states[r], at.z, at.levels, expected=expected)
+            for block, data, r in self._blocks()
+        )
+
+    # rows linearised at a point
+
+    def of_states(self, lins: Sequence[Linearised]) -> list[tuple[jax.Array, jax.Array]]:
+        """Rows compressed onto the states: information J (E, n, n) and score (E, n) of each recursion."""
+        shapes = [part.drift.shape for part in self.recursions]
+        parts = [(jnp.zeros((E, n, n)), jnp.zeros((E, n))) for E, n in shapes]
+        for (block, data, r), lin in zip(self._blocks(), lins, strict=True):
+            used, E = jnp.asarray(block.used, int), shapes[r][0]
+            J = jax.ops.segment_sum(jnp.einsum("ncu,nc,ncv->nuv", lin.state, lin.weight, lin.state), data.epoch, E)
+            score = jax.ops.segment_sum(jnp.einsum("ncu,nc->nu", lin.state, lin.score), data.epoch, E)
+            before = parts[r]
+            parts[r] = (before[0].at[:, used[:, None], used[None, :]].add(J), before[1].at[:, used].add(score))
+        return parts
+
+    def of_biases(self, lins: Sequence[Linearised]) -> tuple[jax.Array, jax.Array]:
+        """Rows compressed onto the biases at fixed trajectories: information (M, M), score (M,) (Paper C 35-36)."""
+        M = self.biases
+        G, g = jnp.zeros((M + 1, M + 1)), jnp.zeros(M + 1)
+        for data, lin in zip(self.rows, lins, strict=True):
+            S = data.bias.shape[0]
+            own = jax.ops.segment_sum(jnp.einsum("ncp,nc,ncq->npq", lin.bias, lin.weight, lin.bias), data.sensor, S)
+            pull = jax.ops.segment_sum(jnp.einsum("ncp,nc->np", lin.bias, lin.score), data.sensor, S)
+            G = G.at[data.bias[:, :, None], data.bias[:, None, :]].add(own)
+            g = g.at[data.bias].add(pull)
+        return G[:M, :M], g[:M]
+
+    def of_both(self, lins: Sequence[Linearised]) -> list[jax.Array]:
+        """Cross information of states and biases, (E, n, M) of each recursion."""
+        M = self.biases
+        parts = [jnp.zeros((*part.drift.shape, M)) for part in self.recursions]
+        for (block, data, r), lin in zip(self._blocks(), lins, strict=True):
+            weighted = jnp.einsum("ncp,nc,ncu->npu", lin.bias, lin.weight, lin.state)
+            summed = jnp.zeros((parts[r].shape[0], M + 1, len(block.used)))
+            summed = summed.at[data.epoch[:, None], data.bias[data.sensor]].add(weighted)
+            parts[r] = parts[r].at[:, jnp.asarray(block.used, int)].add(summed[:, :M].mT)
+        return parts
+
+    def by_state(self, lins: Sequence[Linearised], states: Sequence[jax.Array]) -> Data:
+        """Change (N, C, K) of every predicted value along K directions of the states (E, n, K)."""
+        return tuple(
+            jnp.einsum("ncu,nuk->nck", lin.state, states[r][:, jnp.asarray(block.used, int)][data.epoch])
+            for (block, data, r), lin in zip(self._blocks(), lins, strict=True)
+        )
+
+    def by_bias(self, lins: Sequence[Linearised], biases: jax.Array) -> Data:
+        """Change (N, C, K) of every predicted value along K directions of the biases (M, K)."""
+        parts = zip(self.rows, lins, self.by_sensor(biases), strict=True)
+        return tuple(jnp.einsum("ncp,npk->nck", lin.bias, own[data.sensor]) for data, lin, own in parts)
+
+    def responses(self, lins: Sequence[Linearised], states: Sequence[jax.Array], biases: jax.Array) -> Data:
+        """Change (N, C, K) of every predicted value along K directions of states (E, n, K) and biases (M, K)."""
+        return jax.tree.map(jnp.add, self.by_state(lins, states), self.by_bias(lins, biases))
+
+    def spread(self, lins: Sequence[Linearised], states: Sequence[jax.Array], biases: jax.Array) -> Data:
+        """Sum of squares (N, C) over the K directions of `responses`, some rows at a time."""
+        found = []
+        for (block, data, r), lin, own in zip(self._blocks(), lins, self.by_sensor(biases), strict=True):
+            moved = states[r][:, jnp.asarray(block.used, int)]
+
+            def one(row: tuple[jax.Array, ...], moved: jax.Array = moved, own: jax.Array = own) -> jax.Array:
+                by_state, by_bias, epoch, sensor = row
+                return jnp.sum((by_state @ moved[epoch] + by_bias @ own[sensor]) ** 2, 1)
+
+            found.append(jax.lax.map(one, (lin.state, lin.bias, data.epoch, data.sensor), batch_size=BATCH))
+        return tuple(found)
+
+    def state_variance(self, lins: Sequence[Linearised], covariances: Sequence[jax.Array]) -> Data:
+        """Variance (N, C) of every predicted value by the covariances (E, n, n) of the states of each recursion."""
+        found = []
+        for (block, data, r), lin in zip(self._blocks(), lins, strict=True):
+            used = jnp.asarray(block.used, int)
+            P = covariances[r][:, used[:, None], used[None, :]][data.epoch]
+            found.append(jnp.einsum("ncu,nuv,ncv->nc", lin.state, P, lin.state))
+        return tuple(found)
+
+    def onto_states(self, lins: Sequence[Linearised], columns: Sequence[jax.Array]) -> list[jax.Array]:
+        """Columns (N, C, K) of data taken back to the states by their Jacobians, (E, n, K) of each recursion."""
+        parts = [jnp.zeros((*part.drift.shape, columns[0].shape[2])) for part in self.recursions]
+        for (block, data, r), lin, column in zip(self._blocks(), lins, columns, strict=True):
+            summed = jax.ops.segment_sum(jnp.einsum("ncu,nck->nuk", lin.state, column), data.epoch, parts[r].shape[0])
+            parts[r] = parts[r].at[:, jnp.asarray(block.used, int)].add(summed)
+        return parts
+
+    # sums and indices
+
+    def by_epoch(self, values: Sequence[jax.Array]) -> list[jax.Array]:
+        """Sums (E,) of values (N, C) over the data of each epoch, for each recursion."""
+        parts = [jnp.zeros(part.drift.shape[0]) for part in self.recursions]
+        for data, r, value in zip(self.rows, self.recursion, values, strict=True):
+            parts[r] = parts[r].at[data.epoch].add(jnp.sum(value, 1))
+        return parts
+
+    def by_level(self, values: Sequence[jax.Array]) -> jax.Array:
+        """Sums (H + 1,) of values (N, C) over the data of each unknown level, those of known ones last."""
+        total = jnp.zeros(self.level_spread.shape[0] + 1)
+        for data, value in zip(self.rows, values, strict=True):
+            total = total.at[data.level].add(value)
+        return total
+
+    def by_sensor(self, biases: jax.Array) -> Data:
+        """What (M, ...) says of the biases that each sensor of each block reads, (S, p, ...); 0 of fixed ones."""
+        padded = jnp.concatenate([biases, jnp.zeros((1, *biases.shape[1:]), biases.dtype)])
+        return tuple(padded[data.bias] for data in self.rows)
+
+    @property
+    def measured(self) -> Data:
+        """1 where there is a measured value, else 0."""
+        return tuple(data.mask for data in self.rows)
+
+    @property
+    def values(self) -> Data:
+        """Measured value of every datum, 0 where missing."""
+        return tuple(data.y for data in self.rows)
+
+    @property
+    def read(self) -> Data:
+        """Which biases each row reads, (N, p) of each block; M where it is fixed or none."""
+        return tuple(data.bias[data.sensor] for data in self.rows)
+
+    @property
+    def epochs(self) -> Data:
+        """Epoch (N,) of each row in its recursion, for each block."""
+        return tuple(data.epoch for data in self.rows)
+
+    @property
+    def noises(self) -> tuple[tuple[Any, ...], ...]:
+        """Noise family of each channel of each block."""
+        return tuple(tuple(channel.noise for channel in block.channels) for block in self.blocks)
+
+    @property
+    def size(self) -> int:
+        """Number of data, missing ones of a row included."""
+        return sum(data.mask.size for data in self.rows)
+
+    @property
+    def state_size(self) -> int:
+        """Number of all state entries of all epochs."""
+        return sum(part.drift.size for part in self.recursions)
+
+    def entries(self, r: int) -> tuple[int, ...]:
+        """State entries of recursion r that any row reads."""
+        return tuple(sorted({i for block, _, own in self._blocks() if own == r for i in block.used}))
+
+    # other models of the same form
+
+    def with_values(self, y: Sequence[Any]) -> "Model":
+        """The same rows with other measured values y (N, C), read where a value is measured."""
+        pairs = zip(self.rows, y, strict=True)
+        rows = [data._replace(y=jnp.where(data.mask > 0, jnp.asarray(new, data.y.dtype), 0.0)) for data, new in pairs]
+        return replace(self, rows=tuple(rows))
+
+    def weighted(self, weights: Sequence[Any]) -> "Model":
+        """Every datum counted by a weight (N, C) or (N, 1): 0 leaves it out, a share is soft association."""
+        pairs = zip(self.rows, weights, strict=True)
+        return replace(self, rows=tuple(data._replace(mask=data.mask * jnp.asarray(w)) for data, w in pairs))
+
+    def part(self, r: int) -> "Model":
+        """The model of recursion r and its rows alone."""
+        pairs = [(block, data) for block, data, own in self._blocks() if own == r]
+        return replace(
+            self,
+            blocks=tuple(block for block, _ in pairs),
+            recursion=(0,) * len(pairs),
+            recursions=(self.recursions[r],),
+            rows=tuple(data for _, data in pairs),
+        )
+
+    def of_epochs(self, r: int, kept: np.ndarray) -> "Model":
+        """The model with the rows of recursion r at the epochs that are kept (E,) only; its epochs stay."""
+
+        def some(data: Rows) -> Rows:
+            mine = np.flatnonzero(kept[np.asarray(data.epoch)])
+            return data._replace(**{name: getattr(data, name)[mine] for name in BY_ROW})
+
+        pairs = zip(self.rows, self.recursion, strict=True)
+        return replace(self, rows=tuple(some(data) if own == r else data for data, own in pairs))
+
+    def measured_twice(self, y: Sequence[Any]) -> "Model":
+        """Every row twice, the second time with measured values y (N, C)."""
+        again = self.with_values(y)
+        pairs = zip(self.rows, again.rows, strict=True)
+        both = [
+            old._replace(**{name: jnp.concatenate([getattr(old, name), getattr(new, name)]) for name in BY_ROW})
+            for old, new in pairs
+        ]
+        return replace(self, rows=tuple(both))
+
+    def split(self, piece: Sequence[np.ndarray], count: int) -> "Model":
+        """Biases of its own for each of `count` pieces; `piece` (N,) is that of every row."""
+        M, rows = self.biases, []
+        for data, own in zip(self.rows, piece, strict=True):
+            S, bias = data.bias.shape[0], np.asarray(data.bias)
+            copies = [np.where(bias < M, bias + p * M, count * M) for p in range(count)]
+            rows.append(
+                data._replace(
+                    sensor=jnp.asarray(np.asarray(data.sensor) + S * own),
+                    bias=jnp.asarray(np.concatenate(copies)),
+                    scale=jnp.asarray(np.tile(data.scale, (count, 1))),
+                    base=jnp.asarray(np.tile(data.base, (count, 1))),
+                )
+            )
+        return replace(self, biases=count * M, rows=tuple(rows))
+
+    def placed(self, block: int, mine: jax.Array, place: jax.Array) -> "Model":
+        """The first node of the rows `mine` (N,) of one block moved to a place (d,)."""
+        data = self.rows[block]
+        first = jnp.where(mine[:, None], place[None], data.pose[:, 0, : len(place)])
+        moved = data._replace(pose=data.pose.at[:, 0, : len(place)].set(first))
+        return replace(self, rows=tuple(moved if b == block else other for b, other in enumerate(self.rows)))
+
+    def without(self, held: np.ndarray) -> "Model":
+        """The model that does not feel the biases in `held` (M,), which stay columns."""
+        felt = np.append(~held, True)
+        rows = (data._replace(scale=data.scale * jnp.asarray(felt[np.asarray(data.bias)])) for data in self.rows)
+        return replace(self, rows=tuple(rows))
+
+    def _blocks(self) -> Iterator[tuple[Block, Rows, int]]:
+        return zip(self.blocks, self.rows, self.recursion, strict=True)
+
+    def _each(self, function: Any, predicted: Data, **given: Any) -> tuple[Any, ...]:
+        """A function of a block, its rows and its predicted values, for every block."""
+        parts = zip(self.blocks, self.rows, predicted, strict=True)
+        return tuple(function(block, data, values, **given) for block, data, values in parts)
+
+
+def scaled(lins: Sequence[Linearised], weights: Sequence[Any]) -> tuple[Linearised, ...]:
+    """Rows linearised with every datum counted by a weight (N, C)."""
+    pairs = zip(lins, weights, strict=True)
+    return tuple(lin._replace(score=lin.score * w, weight=lin.weight * w) for lin, w in pairs)
