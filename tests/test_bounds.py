@@ -4,7 +4,6 @@ Statistical tests say how often they would fail by chance; their seeds are fixed
 """
 
 import sys
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -34,7 +33,6 @@ from probcal import (
     Target,
     Truth,
     White,
-    rows,
     sensor,
     sensors,
 )
@@ -242,12 +240,7 @@ def likeliest(model, true, precision, keys):
     """Biases (runs, M) that maximise the joint density of runs simulated at one point."""
 
     def one(key):
-        drawn = []
-        for b, (block, data) in enumerate(zip(model.blocks, model.rows, strict=True)):
-            predicted = rows.predict(block, data, true.states[0], true.z)
-            y = rows.sample(block, data, predicted, true.levels, jax.random.fold_in(key, b))
-            drawn.append(data._replace(y=data.mask * y))
-        measured = replace(model, rows=tuple(drawn))
+        measured = model.with_values(model.sample(true, key))
         return find_mode(measured, true, Precision.single(precision), 30, 1e-7).point.z
 
     return jax.lax.map(one, keys)

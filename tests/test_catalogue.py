@@ -41,10 +41,10 @@ from probcal import (
     Unknown,
     White,
     fit,
-    rows,
     sensors,
     simulate,
 )
+from probcal.model import rows
 
 LINEARISE = jax.jit(rows.linearise, static_argnums=0, static_argnames="expected")
 CV = ConstantVelocity(0.5)

@@ -12,7 +12,7 @@ from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Prior
 from probcal.problem import Problem
 from probcal.smoothing.information import laplace, paper_b, update_levels
-from probcal.smoothing.mode import Point, between, cost, find_mode, track
+from probcal.smoothing.mode import Point, cost, find_mode, track
 
 MODE_STEPS = 30  # Gauss-Newton steps between two updates of the precisions
 RULES = ("mackay", "em")
@@ -28,7 +28,7 @@ def _learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -
     point = state.point
     if point.levels.shape[0]:
         moved = update_levels(model, point, state.found.covariance)
-        point = between(moved, point, jnp.where(fresh, 1.0, 0.0))
+        point = jax.tree.map(lambda after, before: jnp.where(fresh, before, after), moved, point)
     return state._replace(point=point, alpha=jnp.where(fresh, state.alpha, alpha))
 
 
