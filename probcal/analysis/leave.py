@@ -21,6 +21,7 @@ from probcal import linalg
 from probcal.analysis.fitted import Fitted, eliminate_rows, linearise
 from probcal.inference.pose import TAILED
 from probcal.inference.psis import smoothed
+from probcal.model import variants
 from probcal.model.model import Model, scaled
 from probcal.model.rows import Linearised, standardised
 from probcal.priors import Precision
@@ -81,7 +82,7 @@ class _Refits:
         model = fit.problem.model if out is None else masked(fit, out)
         point, lins = fit.point, fit.lins
         if not self.quick:
-            frozen = model.without(held)
+            frozen = variants.without(model, held)
             start = point._replace(z=jnp.asarray(np.where(held, 0.0, point.z)))
             point = find_mode(frozen, start, prior, STEPS, TOLERANCE).point
             lins = linearise(frozen, point)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.analysis.fitted import Fitted, eliminate_rows
+from probcal.model import variants
 from probcal.model.model import Model
 
 Limit = Callable[[int], float]  # chi-square by degrees of freedom
@@ -69,7 +70,7 @@ def divide(fit: Fitted, piece: np.ndarray, count: int) -> Pieces:
 
 def copied(fit: Fitted, piece: np.ndarray, count: int) -> Model:
     """The problem with a table of sensors for every piece, each pointing to its own biases."""
-    return fit.problem.model.split([piece[index] for index in fit.problem.row_index], count)
+    return variants.split(fit.problem.model, [piece[index] for index in fit.problem.row_index], count)
 
 
 def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.ndarray]] = ()) -> dict[int, Contrast]:

@@ -16,6 +16,7 @@ import xarray as xr
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
 from probcal.labels import AXES
+from probcal.model import variants
 from probcal.model.model import Model
 from probcal.network import Network, Node
 from probcal.problem import Epochs, Problem
@@ -166,7 +167,7 @@ def _of_states(model: Model, states: jax.Array, z: jax.Array, levels: jax.Array)
 @partial(jax.jit, static_argnames="block")
 def _of_places(model: Model, point: Point, places: jax.Array, block: int, mine: jax.Array) -> jax.Array:
     """Information (C, M, M) with the first node of the rows `mine` (N,) of a block at each of the places (C, d)."""
-    return jax.lax.map(lambda place: marginal_information(model.placed(block, mine, place), point), places)
+    return jax.lax.map(lambda place: marginal_information(variants.placed(model, block, mine, place), point), places)
 
 
 def _information(problem: Problem, point: Point) -> np.ndarray:

@@ -32,6 +32,7 @@ from probcal.inference.run import Maximiser, Method, maximise
 from probcal.inference.sampler import Sampler
 from probcal.inference.storage import Records, Storage
 from probcal.inference.uniformity import NOMINAL
+from probcal.model import variants
 from probcal.priors import Gaussian, Precision, Prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
@@ -235,7 +236,7 @@ class _Engine:
 def _twice(problem: Problem, y: tuple[jax.Array, ...]) -> Problem:
     """The problem whose every row is measured twice, the second time as y (N, C) of each block."""
     other = copy(problem)
-    other.model = problem.model.measured_twice(y)
+    other.model = variants.measured_twice(problem.model, y)
     other.row_index = [np.concatenate([index, index]) for index in problem.row_index]
     return other
 

@@ -11,12 +11,10 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from probcal.model import rows as waist
 from probcal.model.rows import Block, Linearised, Rows
 
-BY_ROW = ("epoch", "sensor", "pose", "y", "mask", "std", "level")  # arrays of `Rows` that have an entry a row
 BATCH = 512  # rows whose responses to all biases are formed at once
 
 Data = tuple[jax.Array, ...]  # of every datum: (N, C), or (N, C, ...), for each block
@@ -286,66 +284,6 @@ class Model:
         """Every datum counted by a weight (N, C) or (N, 1): 0 leaves it out, a share is soft association."""
         pairs = zip(self.rows, weights, strict=True)
         return replace(self, rows=tuple(data._replace(mask=data.mask * jnp.asarray(w)) for data, w in pairs))
-
-    def part(self, r: int) -> "Model":
-        """The model of recursion r and its rows alone."""
-        pairs = [(block, data) for block, data, own in self._blocks() if own == r]
-        return replace(
-            self,
-            blocks=tuple(block for block, _ in pairs),
-            recursion=(0,) * len(pairs),
-            recursions=(self.recursions[r],),
-            rows=tuple(data for _, data in pairs),
-        )
-
-    def of_epochs(self, r: int, kept: np.ndarray) -> "Model":
-        """The model with the rows of recursion r at the epochs that are kept (E,) only; its epochs stay."""
-
-        def some(data: Rows) -> Rows:
-            mine = np.flatnonzero(kept[np.asarray(data.epoch)])
-            return data._replace(**{name: getattr(data, name)[mine] for name in BY_ROW})
-
-        pairs = zip(self.rows, self.recursion, strict=True)
-        return replace(self, rows=tuple(some(data) if own == r else data for data, own in pairs))
-
-    def measured_twice(self, y: Sequence[Any]) -> "Model":
-        """Every row twice, the second time with measured values y (N, C)."""
-        again = self.with_values(y)
-        pairs = zip(self.rows, again.rows, strict=True)
-        both = [
-            old._replace(**{name: jnp.concatenate([getattr(old, name), getattr(new, name)]) for name in BY_ROW})
-            for old, new in pairs
-        ]
-        return replace(self, rows=tuple(both))
-
-    def split(self, piece: Sequence[np.ndarray], count: int) -> "Model":
-        """Biases of its own for each of `count` pieces; `piece` (N,) is that of every row."""
-        M, rows = self.biases, []
-        for data, own in zip(self.rows, piece, strict=True):
-            S, bias = data.bias.shape[0], np.asarray(data.bias)
-            copies = [np.where(bias < M, bias + p * M, count * M) for p in range(count)]
-            rows.append(
-                data._replace(
-                    sensor=jnp.asarray(np.asarray(data.sensor) + S * own),
-                    bias=jnp.asarray(np.concatenate(copies)),
-                    scale=jnp.asarray(np.tile(data.scale, (count, 1))),
-                    base=jnp.asarray(np.tile(data.base, (count, 1))),
-                )
-            )
-        return replace(self, biases=count * M, rows=tuple(rows))
-
-    def placed(self, block: int, mine: jax.Array, place: jax.Array) -> "Model":
-        """The first node of the rows `mine` (N,) of one block moved to a place (d,)."""
-        data = self.rows[block]
-        first = jnp.where(mine[:, None], place[None], data.pose[:, 0, : len(place)])
-        moved = data._replace(pose=data.pose.at[:, 0, : len(place)].set(first))
-        return replace(self, rows=tuple(moved if b == block else other for b, other in enumerate(self.rows)))
-
-    def without(self, held: np.ndarray) -> "Model":
-        """The model that does not feel the biases in `held` (M,), which stay columns."""
-        felt = np.append(~held, True)
-        rows = (data._replace(scale=data.scale * jnp.asarray(felt[np.asarray(data.bias)])) for data in self.rows)
-        return replace(self, rows=tuple(rows))
 
     def _blocks(self) -> Iterator[tuple[Block, Rows, int]]:
         return zip(self.blocks, self.rows, self.recursion, strict=True)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.model import variants
 from probcal.model.model import At, Model, Recursion
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
@@ -79,7 +80,7 @@ def _profile(
     levels = jnp.zeros(model.level_spread.shape)
     resting = jax.lax.scan(lambda x, k: ((y := k[0] @ x + k[1]), y), jnp.zeros(n), (part.F, part.drift))[1]
     states = resting.at[:, span[0] : span[1]].set(place)
-    mine = model.part(r)
+    mine = variants.part(model, r)
     held = np.zeros(n, bool)
     for name, start, stop, _ in mine.blocks[0].layout if mine.blocks else ():
         held[start:stop] = name in ("position", "velocity", "acceleration")
@@ -138,7 +139,7 @@ def _thinned(problem: Problem, r: int) -> Model:
         for window in _windows(np.flatnonzero(epochs.target == name)):
             stride = max(1, int(min(counts[window].sum() / WINDOW_ROWS, len(window) / 2)))
             kept[window[::stride]] = True
-    return problem.model.of_epochs(r, kept)
+    return variants.of_epochs(problem.model, r, kept)
 
 
 def _windows(epochs: np.ndarray) -> list[np.ndarray]:

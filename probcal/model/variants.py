@@ -1,0 +1,81 @@
+"""Other models made from one: a part of it, some of its rows, rows counted twice, biases split or held."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.model.model import Model
+from probcal.model.rows import Rows
+
+BY_ROW = ("epoch", "sensor", "pose", "y", "mask", "std", "level")  # arrays of `Rows` that have an entry a row
+
+
+def part(model: Model, r: int) -> Model:
+    """The model of recursion r and its rows alone."""
+    triples = zip(model.blocks, model.rows, model.recursion, strict=True)
+    pairs = [(block, data) for block, data, own in triples if own == r]
+    return replace(
+        model,
+        blocks=tuple(block for block, _ in pairs),
+        recursion=(0,) * len(pairs),
+        recursions=(model.recursions[r],),
+        rows=tuple(data for _, data in pairs),
+    )
+
+
+def of_epochs(model: Model, r: int, kept: np.ndarray) -> Model:
+    """The model with the rows of recursion r at the epochs that are kept (E,) only; its epochs stay."""
+
+    def some(data: Rows) -> Rows:
+        mine = np.flatnonzero(kept[np.asarray(data.epoch)])
+        return data._replace(**{name: getattr(data, name)[mine] for name in BY_ROW})
+
+    pairs = zip(model.rows, model.recursion, strict=True)
+    return replace(model, rows=tuple(some(data) if own == r else data for data, own in pairs))
+
+
+def measured_twice(model: Model, y: Sequence[Any]) -> Model:
+    """Every row twice, the second time with measured values y (N, C)."""
+    again = model.with_values(y)
+    pairs = zip(model.rows, again.rows, strict=True)
+    both = [
+        old._replace(**{name: jnp.concatenate([getattr(old, name), getattr(new, name)]) for name in BY_ROW})
+        for old, new in pairs
+    ]
+    return replace(model, rows=tuple(both))
+
+
+def split(model: Model, piece: Sequence[np.ndarray], count: int) -> Model:
+    """Biases of its own for each of `count` pieces; `piece` (N,) is that of every row."""
+    M, rows = model.biases, []
+    for data, own in zip(model.rows, piece, strict=True):
+        S, bias = data.bias.shape[0], np.asarray(data.bias)
+        copies = [np.where(bias < M, bias + p * M, count * M) for p in range(count)]
+        rows.append(
+            data._replace(
+                sensor=jnp.asarray(np.asarray(data.sensor) + S * own),
+                bias=jnp.asarray(np.concatenate(copies)),
+                scale=jnp.asarray(np.tile(data.scale, (count, 1))),
+                base=jnp.asarray(np.tile(data.base, (count, 1))),
+            )
+        )
+    return replace(model, biases=count * M, rows=tuple(rows))
+
+
+def placed(model: Model, block: int, mine: jax.Array, place: jax.Array) -> Model:
+    """The first node of the rows `mine` (N,) of one block moved to a place (d,)."""
+    data = model.rows[block]
+    first = jnp.where(mine[:, None], place[None], data.pose[:, 0, : len(place)])
+    moved = data._replace(pose=data.pose.at[:, 0, : len(place)].set(first))
+    return replace(model, rows=tuple(moved if b == block else other for b, other in enumerate(model.rows)))
+
+
+def without(model: Model, held: np.ndarray) -> Model:
+    """The model that does not feel the biases in `held` (M,), which stay columns."""
+    felt = np.append(~held, True)
+    rows = (data._replace(scale=data.scale * jnp.asarray(felt[np.asarray(data.bias)])) for data in model.rows)
+    return replace(model, rows=tuple(rows))
