@@ -90,9 +90,9 @@ class _Prior:
             matrix[np.ix_(members, members)] = np.where(np.eye(len(members)) > 0, 1.0, value)
             if 1 + (len(members) - 1) * value <= 0:
                 raise InputError(f'correlation "{pattern}" is {value:g}: too negative for {len(members)} biases')
-        alpha = jnp.asarray(np.where(surveyed, 1.0, self.first))
-        inverse, logdet = linalg.inverse_and_logdet(jnp.asarray(matrix))
-        return Precision(alpha, inverse - jnp.eye(M), -logdet)
+        alpha = jax.device_put(np.where(surveyed, 1.0, self.first))
+        inverse, logdet = (np.asarray(part) for part in linalg.inverse_and_logdet(matrix))
+        return Precision(alpha, jax.device_put(inverse - np.eye(M)), jax.device_put(-logdet))
 
     def groups(self, members: Members) -> np.ndarray:
         """Which precision governs each bias, (M,)."""

@@ -166,7 +166,7 @@ def _result(
 ) -> tree.Result:
     model, point = problem.model, outcome.point
     found = outcome.laplace
-    if not bool(jnp.isfinite(found.covariance).all()):  # a flat prior on a singular problem: no interval exists
+    if not np.isfinite(np.asarray(found.covariance)).all():  # a flat prior on a singular problem: no interval exists
         raise FitError(outcome.message)
     shape = (CHAINS, draws_a_chain(model.size, CHAINS))
     z = draw_biases(point, found.covariance, keys[0], shape[0] * shape[1])
@@ -202,9 +202,10 @@ def _uncalibrated(point: Point) -> Point:
 def _tracks(point: Point, before: Point, spread: list[Any], covariance: jax.Array) -> list[tree.Tracks]:
     found = []
     for states, old, moment in zip(point.states, before.states, spread, strict=True):
-        variance = jnp.diagonal(moment.states, axis1=1, axis2=2)
-        variance = variance + jnp.einsum("eni,ij,enj->en", moment.response, covariance, moment.response)
-        found.append(tree.Tracks(np.asarray(states), np.sqrt(np.maximum(np.asarray(variance), 0.0)), np.asarray(old)))
+        response = np.asarray(moment.response)
+        variance = np.diagonal(np.asarray(moment.states), axis1=1, axis2=2)
+        variance = variance + np.sum((response @ np.asarray(covariance)) * response, 2)
+        found.append(tree.Tracks(np.asarray(states), np.sqrt(np.maximum(variance, 0.0)), np.asarray(old)))
     return found
 
 

@@ -125,15 +125,15 @@ def given_of(method: Maximiser, problem: Problem, prior: Prior) -> Given:
     group = np.where(problem.surveyed, len(group) + np.arange(len(group)), group)  # surveyed biases share none
     group = np.unique(group, return_inverse=True)[1]
     first = prior.precision(problem.labels, problem.surveyed)
-    return Given(first, jnp.asarray(problem.surveyed), jnp.asarray(group), jnp.asarray(float(method.tolerance)))
+    return Given(first, *jax.device_put((problem.surveyed, group, np.array(float(method.tolerance)))))
 
 
 def first_state(given: Given, start: Point) -> State:
     """State before the first iteration."""
-    alpha, low = given.prior.alpha, jnp.full((), -jnp.inf, float)
+    alpha, low = given.prior.alpha, np.array(-np.inf)
     M = alpha.shape[0]
-    nothing = Laplace(jnp.zeros((M, M)), jnp.zeros((M, M)), jnp.zeros(M), low)
-    return State(start, alpha, nothing, low, low, jnp.ones((), bool), jnp.zeros((), bool))
+    nothing = Laplace(*jax.device_put((np.zeros((M, M)), np.zeros((M, M)), np.zeros(M), low)))
+    return State(start, alpha, nothing, *jax.device_put((low, low, np.array(True), np.array(False))))
 
 
 def learn(prior: Prior, given: Given, alpha: jax.Array, gamma: Any, variance: Any, z: jax.Array, rule: str) -> Any:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from probcal.model import rows as waist
 from probcal.model.rows import Block, Linearised, Rows
@@ -244,9 +245,9 @@ class Model:
         return tuple(data.y for data in self.rows)
 
     @property
-    def read(self) -> Data:
+    def read(self) -> tuple[np.ndarray, ...]:
         """Which biases each row reads, (N, p) of each block; M where it is fixed or none."""
-        return tuple(data.bias[data.sensor] for data in self.rows)
+        return tuple(np.asarray(data.bias)[np.asarray(data.sensor)] for data in self.rows)
 
     @property
     def epochs(self) -> Data:

@@ -1,6 +1,6 @@
 """Other models made from one: a part of it, some of its rows, rows counted twice, biases split or held."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,12 +27,21 @@ def part(model: Model, r: int) -> Model:
     )
 
 
+def counts(model: Model, of: Callable[[np.ndarray], np.ndarray]) -> list[np.ndarray]:
+    """Counts (E,) at each epoch of each recursion: sums of what `of` makes of the mask (N, C), a number (N,) a row."""
+    found = [np.zeros(recursion.drift.shape[0]) for recursion in model.recursions]
+    for data, r in zip(model.rows, model.recursion, strict=True):
+        np.add.at(found[r], np.asarray(data.epoch), of(np.asarray(data.mask)))
+    return found
+
+
 def of_epochs(model: Model, r: int, kept: np.ndarray) -> Model:
     """The model with the rows of recursion r at the epochs that are kept (E,) only; its epochs stay."""
 
     def some(data: Rows) -> Rows:
         mine = np.flatnonzero(kept[np.asarray(data.epoch)])
-        return data._replace(**{name: getattr(data, name)[mine] for name in BY_ROW})
+        chosen: dict[str, Any] = {name: np.asarray(getattr(data, name))[mine] for name in BY_ROW}
+        return data._replace(**chosen)
 
     pairs = zip(model.rows, model.recursion, strict=True)
     return replace(model, rows=tuple(some(data) if own == r else data for data, own in pairs))
@@ -54,15 +63,13 @@ def split(model: Model, piece: Sequence[np.ndarray], count: int) -> Model:
     M, rows = model.biases, []
     for data, own in zip(model.rows, piece, strict=True):
         S, bias = data.bias.shape[0], np.asarray(data.bias)
-        copies = [np.where(bias < M, bias + p * M, count * M) for p in range(count)]
-        rows.append(
-            data._replace(
-                sensor=jnp.asarray(np.asarray(data.sensor) + S * own),
-                bias=jnp.asarray(np.concatenate(copies)),
-                scale=jnp.asarray(np.tile(data.scale, (count, 1))),
-                base=jnp.asarray(np.tile(data.base, (count, 1))),
-            )
-        )
+        copied: dict[str, Any] = {
+            "sensor": np.asarray(data.sensor) + S * own,
+            "bias": np.concatenate([np.where(bias < M, bias + p * M, count * M) for p in range(count)]),
+            "scale": np.tile(data.scale, (count, 1)),
+            "base": np.tile(data.base, (count, 1)),
+        }
+        rows.append(data._replace(**copied))
     return replace(model, biases=count * M, rows=tuple(rows))
 
 
@@ -77,5 +84,5 @@ def placed(model: Model, block: int, mine: jax.Array, place: jax.Array) -> Model
 def without(model: Model, held: np.ndarray) -> Model:
     """The model that does not feel the biases in `held` (M,), which stay columns."""
     felt = np.append(~held, True)
-    rows = (data._replace(scale=data.scale * jnp.asarray(felt[np.asarray(data.bias)])) for data in model.rows)
+    rows = (data._replace(scale=np.asarray(data.scale) * felt[np.asarray(data.bias)]) for data in model.rows)
     return replace(model, rows=tuple(rows))

@@ -14,7 +14,8 @@ from probcal.smoothing.information import Moments, moments_of
 from probcal.smoothing.mode import Point, factors
 from probcal.tree import Residuals
 
-VALUES = 4_000_000  # of all states that are drawn at once
+PASS = 200  # draws that are made at once
+VALUES = 4_000_000  # of all states that are drawn at once, at most
 LEAST, MOST = 10, 250  # draws of a chain
 DATA = 10_000_000  # values by datum and draw up to which every chain has the most draws
 
@@ -32,12 +33,6 @@ def draws_a_chain(data: int, chains: int) -> int:
     return int(np.clip(DATA // max(chains * data, 1), LEAST, MOST))
 
 
-def _passes(model: Model, count: int) -> int:
-    """The least divisor of `count` that keeps the draws of one pass within `VALUES`."""
-    most = max(1, VALUES // model.state_size)
-    return next(k for k in range(1, count + 1) if count % k == 0 and count // k <= most)
-
-
 @partial(jax.jit, static_argnames="count")
 def draw_biases(point: Point, covariance: jax.Array, key: jax.Array, count: int) -> jax.Array:
     """Draws (D, M) of the biases from a Gaussian around a point."""
@@ -53,74 +48,81 @@ def draw(
     """A trajectory for each draw of the biases z (D, M), what is to be kept of them, and their exact moments.
 
     `levels` (H,) or (D, H) are those of the densities and replicas. `keep` names "states", "log_likelihood",
-    "replicas". Many draws of many epochs are made in passes, of which only what is kept stays.
+    "replicas". Draws are made in passes of one size, whatever their number, and of each only what is kept stays.
     """
-    levels = jnp.broadcast_to(levels, (z.shape[0], point.levels.shape[0]))
-    return _draw(model, point, covariance, z, levels, key, keep, _passes(model, z.shape[0]))
+    count = z.shape[0]
+    size = max(1, min(PASS, count, VALUES // model.state_size))
+    biases, log_levels = np.asarray(z), np.broadcast_to(np.asarray(levels), (count, point.levels.shape[0]))
+    known = _known(model, point, covariance)
+    passes = []
+    for k, start in enumerate(range(0, count, size)):
+        chosen = np.minimum(np.arange(start, start + size), count - 1)  # the last pass is filled with its last draw
+        seeds = jax.random.split(jax.random.fold_in(key, k))
+        mine = biases[chosen]
+        states = _trajectories(model, point, known, mine, seeds[0])
+        by_datum: tuple[Data, Data] = ((), ())
+        if {"log_likelihood", "replicas"} & set(keep):
+            by_datum = predictive(model, log_levels[chosen], mine, states, seeds[1], keep)
+        kept = Drawn(states if "states" in keep else (), *by_datum)
+        passes.append(jax.tree.map(lambda leaf, most=count - start: np.asarray(leaf)[:most], kept))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *passes), [part.moments for part in known]
 
 
-@partial(jax.jit, static_argnames=("keep", "passes"))
-def _draw(
-    model: Model, point: Point, covariance: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array,
-    keep: tuple[str, ...], passes: int,
-) -> tuple[Drawn, list[Moments]]:  # fmt: skip
-    """Trajectories given z by the simulation smoother (draw from the prior, subtract its smoothed self).
+class _Known(NamedTuple):
+    """What all draws of one recursion share."""
 
-    All draws are columns of one pass. The response of the trajectory to z is linear.
-    """
-    lins = model.linearise(point, expected=True)
-    compressed, crosses = model.of_states(lins), model.of_both(lins)
-    known, found = [], []
-    for part, (J, _), cross in zip(model.recursions, compressed, crosses, strict=True):
+    L: jax.Array
+    J: jax.Array
+    gain: rec.Gains
+    half: jax.Array  # (E, n, n) root of J
+    moments: Moments
+
+
+@jax.jit
+def _known(model: Model, point: Point, covariance: jax.Array) -> list[_Known]:
+    """The covariance pass of every recursion at a point, and its response to the biases, which is linear."""
+    lins, found = model.linearise(point, expected=True), []
+    for part, (J, _), cross in zip(model.recursions, model.of_states(lins), model.of_both(lins), strict=True):
         L = factors(part, point.levels)
         gain = rec.gains(part.F, L, J)
-        response = rec.smooth(part.F, L, J, gain, cross)
         values, vectors = linalg.spectrum(J)
         half = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
-        known.append((part, L, J, gain, half))
-        found.append(moments_of(part, L, J, gain, response, covariance))
-
-    def trajectories(dz: jax.Array, seed: jax.Array) -> tuple[jax.Array, ...]:
-        drawn = []
-        for r, (part, L, J, gain, half) in enumerate(known):
-            noise = jax.random.normal(jax.random.fold_in(seed, r), (2, *part.drift.shape, len(dz)))
-            prior = rec.trajectory(part.F, L, jnp.zeros((*part.drift.shape, 1)), noise[0])
-            smooth = rec.smooth(part.F, L, J, gain, J @ prior + half @ noise[1])
-            free = prior - smooth.states + found[r].response @ dz.T
-            drawn.append(jnp.moveaxis(point.states[r][:, :, None] + free, 2, 0))
-        return tuple(drawn)
-
-    def one_pass(given: tuple[jax.Array, jax.Array, jax.Array]) -> Drawn:
-        z, levels, seed = given
-        states = trajectories(z - point.z[None, :], seed)
-        log_likelihood, replicas = _by_datum(model, levels, z, states, jax.random.fold_in(seed, 2**31 - 1), keep)
-        return Drawn(states if "states" in keep else (), log_likelihood, replicas)
-
-    def split(a: jax.Array) -> jax.Array:
-        return a.reshape(passes, a.shape[0] // passes, *a.shape[1:])
-
-    drawn = jax.lax.map(one_pass, (split(z), split(levels), jax.random.split(key, passes)))
-    return jax.tree.map(lambda a: a.reshape(z.shape[0], *a.shape[2:]), drawn), found
+        moments = moments_of(part, L, J, gain, rec.smooth(part.F, L, J, gain, cross), covariance)
+        found.append(_Known(L, J, gain, half, moments))
+    return found
 
 
-def _by_datum(
-    model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...], key: jax.Array,
-    keep: tuple[str, ...],
-) -> tuple[Data, Data]:  # fmt: skip
-    """Log-likelihood and replicas (D, N, C) of each block at draws, one draw after the other; empty if not kept."""
-    wanted = "log_likelihood" in keep, "replicas" in keep
-    if not any(wanted):
-        return (), ()
+@jax.jit
+def _trajectories(
+    model: Model, point: Point, known: list[_Known], z: jax.Array, key: jax.Array
+) -> tuple[jax.Array, ...]:
+    """Trajectories (D, E, n) given biases z (D, M): draws from the prior, less their smoothed selves.
+
+    All draws are columns of one pass of the simulation smoother (Durbin and Koopman 2002).
+    """
+    drawn = []
+    for r, (part, own) in enumerate(zip(model.recursions, known, strict=True)):
+        noise = jax.random.normal(jax.random.fold_in(key, r), (2, *part.drift.shape, len(z)))
+        prior = rec.trajectory(part.F, own.L, jnp.zeros((*part.drift.shape, 1)), noise[0])
+        smooth = rec.smooth(part.F, own.L, own.J, own.gain, own.J @ prior + own.half @ noise[1])
+        free = prior - smooth.states + own.moments.response @ (z - point.z[None, :]).T
+        drawn.append(jnp.moveaxis(point.states[r][:, :, None] + free, 2, 0))
+    return tuple(drawn)
+
+
+@partial(jax.jit, static_argnames="keep")
+def predictive(
+    model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...], key: jax.Array, keep: tuple[str, ...]
+) -> tuple[Data, Data]:
+    """Log-likelihood and replicas (D, N, C) of every datum at draws, one draw after the other; empty if not kept."""
 
     def one(draw: Any) -> tuple[Data, Data]:
         levels, z, states, seed = draw
         at = At(states, z, levels)
-        return model.log_likelihood(at) if wanted[0] else (), model.sample(at, seed) if wanted[1] else ()
+        density = model.log_likelihood(at) if "log_likelihood" in keep else ()
+        return density, model.sample(at, seed) if "replicas" in keep else ()
 
     return jax.lax.map(one, (levels, z, states, jax.random.split(key, z.shape[0])))
-
-
-predictive = partial(jax.jit, static_argnames="keep")(_by_datum)
 
 
 class Remainder(NamedTuple):

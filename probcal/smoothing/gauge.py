@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.model import variants
 from probcal.model.model import Model
 from probcal.motion import Known, as_motion
 from probcal.problem import Problem
@@ -114,7 +115,7 @@ def gauge(problem: Problem, point: Point) -> Gauge:
 def _countable(problem: Problem, free: Free) -> bool:
     """Whether at least half of the data stand in epochs with more data than unknowns."""
     inside = total = 0.0
-    counts = [np.asarray(count) for count in problem.model.by_epoch(problem.model.measured)]
+    counts = variants.counts(problem.model, lambda mask: mask.sum(1))
     for count, rank in zip(counts, free.ranks, strict=True):
         inside += count[count > np.asarray(rank)].sum()
         total += count.sum()

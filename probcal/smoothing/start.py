@@ -8,6 +8,7 @@ into a consistent trajectory.
 
 import itertools
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -132,8 +133,7 @@ def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndar
 def _thinned(problem: Problem, r: int) -> Model:
     """The model with enough rows of every window of recursion r for a place, evenly spaced over its epochs."""
     epochs = problem.epochs[r]
-    seen = [jnp.any(there > 0, 1, keepdims=True).astype(float) for there in problem.model.measured]
-    counts = np.asarray(problem.model.by_epoch(seen)[r])
+    counts = variants.counts(problem.model, lambda mask: mask.any(1))[r]
     kept = np.zeros(len(counts), bool)
     for name in dict.fromkeys(epochs.target):
         for window in _windows(np.flatnonzero(epochs.target == name)):
@@ -182,12 +182,13 @@ def _consistent(
 
 def project(problem: Problem, tracks: list[np.ndarray], precision: list[np.ndarray]) -> Point:
     """Point at zero biases whose trajectories follow given states (E, n) with given precisions (E, n)."""
-    levels = jnp.zeros(len(problem.levels))
+    levels: Any = np.zeros(len(problem.levels))
     pairs = [
-        _consistent(part, jnp.asarray(states), jnp.asarray(weight), levels)
+        _consistent(part, states, weight, levels)
         for part, states, weight in zip(problem.model.recursions, tracks, precision, strict=True)
     ]
-    return Point(tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), jnp.zeros(problem.model.biases), levels)
+    z, levels = jax.device_put((np.zeros(problem.model.biases), levels))
+    return Point(tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), z, levels)
 
 
 def follow_states(problem: Problem, states: list[np.ndarray]) -> Point:
@@ -204,13 +205,13 @@ def _grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
         path, known = _known(problem, r, span)
         unknown = [name for name in dict.fromkeys(epochs.target) if not known[epochs.target == name].all()]
         if unknown:
-            loss = np.asarray(_losses(_thinned(problem, r), r, span, z, jnp.asarray(places)))
+            loss = np.asarray(_losses(_thinned(problem, r), r, span, z, places))
         for name in unknown:
             mine = epochs.target == name
             path[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)
-        _, states = _profile(problem.model, r, span, z, jnp.asarray(path))
+        _, states = _profile(problem.model, r, span, z, path)
         states = np.array(states)
-        spread = np.asarray(jnp.sum(problem.model.recursions[r].L ** 2, 2))
+        spread = np.sum(np.asarray(problem.model.recursions[r].L) ** 2, 2)
         precision = np.where(spread > 0, 1e4 / np.maximum(spread, 1e-300), 1e-9)
         for name, start, stop, _ in epochs.layout:
             if name == "position":
@@ -228,7 +229,7 @@ def automatic_start(problem: Problem, iterations: int = 30) -> Point:
 
     Grid, Viterbi path, motion model, iterated EKS at zero biases, then a few joint steps.
     """
-    tracked = _grid_start(problem, jnp.zeros(problem.model.biases), iterations)
+    tracked = _grid_start(problem, jax.device_put(np.zeros(problem.model.biases)), iterations)
     prior = Precision.single(jnp.ones(problem.model.biases))
     return find_mode(problem.model, tracked, prior, iterations, 1e-3).point
 
