@@ -7,14 +7,17 @@ from copy import copy
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from os import PathLike
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from probcal.errors import InputError, nearest
+from probcal.model.epochs import Epoch, merged
 from probcal.model.model import Model, Recursion
 from probcal.model.rows import Block, Layout, Rows, addresses, make_block, pose_entries, pose_vector
+from probcal.model.variants import aligned
 from probcal.motion import Motion, Static, Target, White, as_motion
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, Level, Unknown, guess_of
@@ -187,14 +190,48 @@ class Problem:
             declared = declared[name]
         return declared if isinstance(declared, Target) else Target(declared)
 
-    def _compile(self) -> None:
+    def later(self, data: Any, sizes: tuple[int, ...] | None = None) -> Epoch:
+        """The epochs of rows that came after those of this problem, stacked in time order (K leading).
+
+        Each target goes on from its last epoch here, so that a kernel compiled for `model.epochs()` takes these too.
+        `sizes` are the most rows of each block at an epoch, by default those of this problem. Raises `InputError` for
+        a row that is not later, for a new target, and where an epoch has more rows than its size.
+        """
+        other = copy(self)
+        other.measurements = measure(read_table(data), self.network)
+        other.silent = _check_rows(other.measurements, self.network)
+        last = {str(name): float(e.time[e.target == name][-1]) for e in self.epochs for name in dict.fromkeys(e.target)}
+        measured = other.measurements
+        for name in measured.target_names:
+            if name not in last:
+                raise InputError(
+                    f'later: target "{name}" is new{nearest(name, last)}; build a new Problem from all rows'
+                )
+        before = np.array([last[name] for name in measured.target_names])[measured.target]
+        early = np.flatnonzero(measured.time <= before)
+        if len(early):
+            n = early[0]
+            raise InputError(
+                f"{measured.table.where(n)}: time {measured.time[n]:g} is not after the last epoch of its target, at"
+                f" {before[n]:g}"
+            )
+        other._compile(last)
+        names = [list(dict.fromkeys(e.target)) for e in self.epochs]
+        own = {e.layout: (r, list(dict.fromkeys(e.target))) for r, e in enumerate(other.epochs)}
+        pairs = [own.get(e.layout) for e in self.epochs]
+        targets = [[mine.index(n) for n in pair[1]] if pair else [] for mine, pair in zip(names, pairs, strict=True)]
+        found = aligned(self.model, other.model, [pair[0] if pair else None for pair in pairs], targets)
+        return merged(found, self.model.rows, self.model.sizes if sizes is None else sizes)
+
+    def _compile(self, begun: Mapping[str, float] = MappingProxyType({})) -> None:
+        """Arrays of the rows; the targets in `begun` go on from an earlier epoch at that time."""
         data = self.measurements
         targets = {name: self.target(name) for name in data.target_names}
         motions = {name: as_motion(target.motion) for name, target in targets.items()}
         for name, motion in motions.items():
             if "position" not in {component for component, *_ in motion.layout(self.network.dimension)}:
                 raise InputError(f'target "{name}": the motion has no position; add ConstantVelocity(std) or Static()')
-        levels = _Levels()
+        levels = _Levels(self.levels if begun else ())
         layouts: dict[Layout, list[str]] = {}
         for name, motion in motions.items():
             layouts.setdefault(motion.layout(self.network.dimension), []).append(name)
@@ -205,18 +242,22 @@ class Problem:
         for r, (layout, names) in enumerate(layouts.items()):
             parts: list[Any] = []
             offset = 0
-            times, owners = [], []
+            times: list[np.ndarray] = []
+            owners = []
             for name in names:
                 rows = data.target == data.target_names.index(name)
                 time = np.unique(data.time[rows])
-                if motions[name].static:
+                if motions[name].static and name not in begun:
                     time = time[:1]
                 else:
                     epoch_of[rows] = np.searchsorted(time, data.time[rows])
                 epoch_of[rows] += offset
                 recursion_of[rows] = r
                 offset += len(time)
-                parts.append(self._chain(name, targets[name], motions[name], time, levels))
+                chain = self._chain(name, targets[name], motions[name], time, levels, begun.get(name))
+                first = np.arange(len(time)) == (0 if name not in begun else -1)
+                dt = np.diff(time, prepend=begun.get(name, time[0]))
+                parts.append((*chain, time, dt, first, np.full(len(time), len(times))))
                 times.append(time)
                 owners.append(np.full(len(time), name))
             columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
@@ -251,6 +292,8 @@ class Problem:
                 tuple(recursion_index),
                 len(self.biases),
                 driven,
+                tuple(len(dict.fromkeys(epochs.target)) for epochs in self.epochs),
+                all(bool((np.linalg.slogdet(part.L)[0] != 0).all()) for part in recursions),
                 tuple(recursions),
                 tuple(rows_of),
                 spread,
@@ -263,14 +306,14 @@ class Problem:
         return np.flatnonzero(inside & np.isin(self.measurements.sensor, ours))
 
     def _chain(
-        self, name: str, target: Target, motion: Motion, time: np.ndarray, levels: _Levels
+        self, name: str, target: Target, motion: Motion, time: np.ndarray, levels: _Levels, before: float | None
     ) -> tuple[np.ndarray, ...]:
-        """Arrays of one target's epochs: F, L, level, drift."""
+        """Arrays of one target's epochs: F, L, level, drift; it begins at the first, or goes on from a time before."""
         d = self.network.dimension
         n, epochs = motion.size(d), len(time)
         F, L = np.zeros((epochs, n, n)), np.zeros((epochs, n, n))
         level, drift = np.full((epochs, n), -1), np.zeros((epochs, n))
-        dt = np.diff(time, prepend=time[0])
+        dt = np.diff(time, prepend=time[0] if before is None else before)
         row = column = 0
         for component in motion.components:
             transition, factor = component.transition(dt, d), component.noise_factor(dt, d)
@@ -283,14 +326,15 @@ class Problem:
                 drift[:, here] = component.means(time, d)
             except InputError as error:
                 raise InputError(f'target "{name}": {error}') from None
-            if not component.memoryless:
+            if not component.memoryless and before is None:
                 F[0, here, here], drift[0, here] = 0.0, 0.0
                 L[0, here, :], level[0, noise] = 0.0, -1
                 mean, std = self._start(name, component, target, motion, time)
                 drift[0, here] = mean
                 L[0, here, here] = np.diag(std)
             row, column = row + size, column + size
-        F[0] = 0.0
+        if before is None:
+            F[0] = 0.0
         return F, L, level, drift
 
     def _start(
@@ -401,8 +445,8 @@ class Problem:
 class _Levels:
     """Collects unknown noise levels; equal declarations under one label are one level."""
 
-    def __init__(self) -> None:
-        self.records: list[LevelRecord] = []
+    def __init__(self, records: Iterable[LevelRecord] = ()) -> None:
+        self.records: list[LevelRecord] = list(records)
 
     def of(self, level: Level, label: str, unit: str) -> int:
         """Number of the level, -1 where it is known."""

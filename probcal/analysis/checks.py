@@ -113,7 +113,7 @@ def by_epoch(fit: Fitted, found: residuals.Innovations) -> xr.Dataset:
     values: dict[str, Any] = {}
     coords: dict[str, Any] = {}
     model = fit.problem.model
-    pairs = zip(model.measured, model.epochs, model.recursion, strict=True)
+    pairs = zip(model.measured, model.epoch, model.recursion, strict=True)
     places, owners = zip(
         *((np.broadcast_to(np.asarray(e)[:, None], there.shape), np.full(there.shape, r)) for there, e, r in pairs),
         strict=True,

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.model import rows as waist
+from probcal.model.epochs import Epoch, Stepwise, merged, most_rows
 from probcal.model.rows import Block, Linearised, Rows
 
 BATCH = 512  # rows whose responses to all biases are formed at once
@@ -52,21 +53,27 @@ class Recursion(NamedTuple):
     L: jax.Array  # (E, n, n) noise factors (start factors at a first epoch), unused columns 0
     level: jax.Array  # (E, n) which unknown level multiplies a column of L, H where known
     drift: jax.Array  # (E, n) known part: start means, means of white components
+    time: jax.Array  # (E,) of each epoch, in seconds
+    dt: jax.Array  # (E,) since the epoch before of the same target, 0 at its first
+    first: jax.Array  # (E,) whether a target begins here
+    target: jax.Array  # (E,) which of the targets of this recursion
 
 
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["recursions", "rows", "level_spread"],
-    meta_fields=["blocks", "recursion", "biases", "driven"],
+    meta_fields=["blocks", "recursion", "biases", "driven", "targets", "full_rank"],
 )
 @dataclass(frozen=True)
-class Model:
+class Model(Stepwise):
     """All numbers of a problem and what is computed from them: a kernel compiled for one serves all of its form."""
 
     blocks: tuple[Block, ...]
     recursion: tuple[int, ...]  # which recursion each block reads
     biases: int  # M, number of free biases
     driven: bool  # whether a process noise has an unknown level
+    targets: tuple[int, ...]  # T, number of targets of each recursion
+    full_rank: bool  # whether the noise reaches every direction of every state, so that steps have a density
     recursions: tuple[Recursion, ...]
     rows: tuple[Rows, ...]  # of each block
     level_spread: jax.Array  # (H,) standard deviation of each log level
@@ -250,7 +257,7 @@ class Model:
         return tuple(np.asarray(data.bias)[np.asarray(data.sensor)] for data in self.rows)
 
     @property
-    def epochs(self) -> Data:
+    def epoch(self) -> Data:
         """Epoch (N,) of each row in its recursion, for each block."""
         return tuple(data.epoch for data in self.rows)
 
@@ -272,6 +279,19 @@ class Model:
     def entries(self, r: int) -> tuple[int, ...]:
         """State entries of recursion r that any row reads."""
         return tuple(sorted({i for block, _, own in self._blocks() if own == r for i in block.used}))
+
+    def epochs(self, sizes: tuple[int, ...] | None = None) -> Epoch:
+        """The epochs of all targets in time order, stacked (K leading), for filters that scan over them.
+
+        The rows of each block are padded to `sizes`, by default to the most that an epoch has. Raises `InputError`
+        where an epoch has more.
+        """
+        return merged(self, self.rows, self.sizes if sizes is None else sizes)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The most rows that an epoch has, of each block."""
+        return most_rows(self)
 
     # other models of the same form
 

@@ -23,6 +23,7 @@ def part(model: Model, r: int) -> Model:
         blocks=tuple(block for block, _ in pairs),
         recursion=(0,) * len(pairs),
         recursions=(model.recursions[r],),
+        targets=(model.targets[r],),
         rows=tuple(data for _, data in pairs),
     )
 
@@ -33,6 +34,25 @@ def counts(model: Model, of: Callable[[np.ndarray], np.ndarray]) -> list[np.ndar
     for data, r in zip(model.rows, model.recursion, strict=True):
         np.add.at(found[r], np.asarray(data.epoch), of(np.asarray(data.mask)))
     return found
+
+
+def aligned(like: Model, later: Model, recursions: Sequence[int | None], targets: Sequence[Sequence[int]]) -> Model:
+    """The rows and epochs of a later model in the form of an earlier one, whose blocks and targets it may lack.
+
+    `recursions` names the later recursion behind each earlier one, `targets` which earlier target each later one is.
+    """
+    found, rows = [], []
+    for part, r, names in zip(like.recursions, recursions, targets, strict=True):
+        if r is None:
+            found.append(jax.tree.map(lambda leaf: leaf[:0], part))
+        else:
+            mine = later.recursions[r]
+            found.append(mine._replace(target=np.asarray(names, int)[np.asarray(mine.target)]))
+    own: dict[Any, Rows] = {(b, r): data for b, data, r in zip(later.blocks, later.rows, later.recursion, strict=True)}
+    for block, data, r in zip(like.blocks, like.rows, like.recursion, strict=True):
+        nothing = {name: getattr(data, name)[:0] for name in BY_ROW}
+        rows.append(own.get((block, recursions[r]), data._replace(**nothing)))
+    return replace(like, recursions=tuple(found), rows=tuple(rows))
 
 
 def of_epochs(model: Model, r: int, kept: np.ndarray) -> Model:

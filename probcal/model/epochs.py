@@ -1,0 +1,199 @@
+"""The model epoch by epoch, as filters read it: the epochs of all targets merged in time order, each a pytree.
+
+The state x of all targets is a tuple with an array (T, n) of the T targets of each recursion. An epoch belongs to one
+target: `step` moves that one, and only its rows are seen. Nothing here looks into the arrays of whole trajectories,
+so that epochs of rows that came later, of the same form, serve a kernel that was compiled before.
+"""
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.errors import InputError
+from probcal.model import rows as waist
+from probcal.model.rows import Block, Linearised, Rows
+
+State = tuple[jax.Array, ...]  # (T, n) of each recursion
+
+
+class Move(NamedTuple):
+    """How the state of one target reaches an epoch: x = F x + drift + L u, u ~ N(0, I) times the unknown levels."""
+
+    F: jax.Array  # (n, n), 0 at the first epoch of a target
+    L: jax.Array  # (n, n)
+    level: jax.Array  # (n,) which unknown level multiplies a column of L, H where known
+    drift: jax.Array  # (n,)
+
+
+class Seen(NamedTuple):
+    """The rows of one block at an epoch, padded to P of them."""
+
+    sensor: jax.Array  # (P,)
+    pose: jax.Array  # (P, nodes, entries)
+    y: jax.Array  # (P, C)
+    mask: jax.Array  # (P, C) 0 where nothing was measured, and in padded rows
+    std: jax.Array  # (P, C)
+    level: jax.Array  # (P, C)
+
+
+class Epoch(NamedTuple):
+    """One epoch of one target, or a stack of K of them along the leading axis of every array."""
+
+    time: jax.Array  # () in seconds
+    dt: jax.Array  # () since the epoch before of the same target, 0 at its first
+    first: jax.Array  # () whether the target begins here: `step` then ignores x
+    recursion: jax.Array  # () the recursion of the target
+    target: tuple[jax.Array, ...]  # () of each recursion which target moves; in the others a move that changes nothing
+    move: tuple[Move, ...]  # of each recursion
+    rows: tuple[Seen, ...]  # of each block
+
+
+class Stepwise:
+    """What a `Model` computes at one epoch."""
+
+    blocks: tuple[Block, ...]
+    recursion: tuple[int, ...]
+    targets: tuple[int, ...]
+    full_rank: bool
+    recursions: tuple[Any, ...]
+    rows: tuple[Rows, ...]
+    level_spread: jax.Array
+
+    def initial(self, key: jax.Array, epoch: Epoch, levels: jax.Array) -> State:
+        """State drawn at the first epoch of all; targets that begin later are 0 until they do."""
+        sizes = [part.drift.shape[1] for part in self.recursions]
+        return self.step(
+            key, tuple(jnp.zeros((count, n)) for count, n in zip(self.targets, sizes, strict=True)), epoch, levels
+        )
+
+    def step(self, key: jax.Array, x: State, epoch: Epoch, levels: jax.Array) -> State:
+        """State at an epoch drawn from that before it, at log levels (H,)."""
+        found = []
+        for r, (states, move, target) in enumerate(zip(x, epoch.move, epoch.target, strict=True)):
+            noise = jax.random.normal(jax.random.fold_in(key, r), move.drift.shape)
+            found.append(states.at[target].set(_mean(states, move, target) + _root(move, levels) @ noise))
+        return tuple(found)
+
+    def log_step(self, x: State, after: State, epoch: Epoch, levels: jax.Array) -> jax.Array:
+        """Log density of the state at an epoch given that before it.
+
+        Raises `InputError` for a motion whose noise leaves out a direction, which has no density.
+        """
+        if not self.full_rank:
+            raise InputError(
+                "the motion has no density: its noise does not reach every component of the state (singular=True, or"
+                " Static()); take a motion with noise in all of them"
+            )
+
+        def of(r: int) -> jax.Array:
+            move, target = epoch.move[r], epoch.target[r]
+            root = _root(move, levels)
+            lower, inverse = linalg.factor_and_inverse(root @ root.T)
+            white = inverse @ (after[r][target] - _mean(x[r], move, target))
+            size = jnp.sum(jnp.log(jnp.diagonal(lower))) + 0.5 * len(white) * np.log(2 * np.pi)
+            return -0.5 * jnp.sum(white**2) - size
+
+        return jax.lax.switch(epoch.recursion, [lambda r=r: of(r) for r in range(len(self.recursions))])
+
+    def predict_at(self, epoch: Epoch, x: State, z: jax.Array) -> tuple[jax.Array, ...]:
+        """Predicted value (P, C) of every row of an epoch, for each block."""
+        return tuple(waist.predict(block, data, states, z) for block, data, states in self._seen(epoch, x))
+
+    def log_likelihood_at(self, epoch: Epoch, x: State, z: jax.Array, levels: jax.Array) -> tuple[jax.Array, ...]:
+        """Log density (P, C) of every row of an epoch, zero where nothing was measured, for each block."""
+        return tuple(
+            waist.log_likelihood(block, data, waist.predict(block, data, states, z), levels)
+            for block, data, states in self._seen(epoch, x)
+        )
+
+    def linearise_at(
+        self, epoch: Epoch, x: State, z: jax.Array, levels: jax.Array, *, expected: bool = True
+    ) -> tuple[Linearised, ...]:
+        """The rows of an epoch linearised, Jacobians by the state of its target whole: (P, C, n) for each block."""
+        found = []
+        for block, data, states in self._seen(epoch, x):
+            lin = waist.linearise(block, data, states, z, levels, expected=expected)
+            whole = jnp.zeros((*lin.state.shape[:2], states.shape[1]))
+            found.append(lin._replace(state=whole.at[:, :, np.asarray(block.used, int)].set(lin.state)))
+        return tuple(found)
+
+    def _seen(self, epoch: Epoch, x: State) -> list[tuple[Block, Rows, jax.Array]]:
+        """Blocks, their rows at an epoch, and the state (1, n) of the target that they see."""
+        found = []
+        for block, data, r, seen in zip(self.blocks, self.rows, self.recursion, epoch.rows, strict=True):
+            here = data._replace(epoch=jnp.zeros_like(seen.sensor), **seen._asdict())
+            found.append((block, here, x[r][epoch.target[r]][None]))
+        return found
+
+
+def _mean(states: jax.Array, move: Move, target: jax.Array) -> jax.Array:
+    return move.F @ states[target] + move.drift
+
+
+def _root(move: Move, levels: jax.Array) -> jax.Array:
+    return move.L * jnp.concatenate([jnp.exp(levels), jnp.ones(1, levels.dtype)])[move.level][None, :]
+
+
+def most_rows(model: Any) -> tuple[int, ...]:
+    """The most rows that an epoch has, of each block."""
+    return tuple(int(np.bincount(np.asarray(data.epoch)).max(initial=0)) for data in model.rows)
+
+
+def merged(model: Any, fill: tuple[Rows, ...], sizes: tuple[int, ...]) -> Epoch:
+    """All epochs of a model in time order, stacked (K leading); rows of each block padded to `sizes`.
+
+    What is left over repeats the first row of `fill`, masked. At one time the targets follow in their order. Raises
+    `InputError` where an epoch has more rows than its size.
+    """
+    time = np.concatenate([np.asarray(part.time) for part in model.recursions])
+    place = np.empty(len(time), int)
+    place[np.argsort(time, kind="stable")] = np.arange(len(time))
+    starts = np.cumsum([0, *(part.drift.shape[0] for part in model.recursions)])
+    of = [place[a:b] for a, b in pairwise(starts)]  # of each recursion
+    K, H = len(time), model.level_spread.shape[0]
+    shared: Any = {
+        "time": np.zeros(K), "dt": np.zeros(K), "first": np.zeros(K, bool), "recursion": np.zeros(K, int),
+    }  # fmt: skip
+    targets: list[Any] = []
+    moves, rows = [], []
+    for r, (part, mine) in enumerate(zip(model.recursions, of, strict=True)):
+        n = part.drift.shape[1]
+        for name, value in (("time", part.time), ("dt", part.dt), ("first", part.first), ("recursion", r)):
+            shared[name][mine] = np.asarray(value)
+        target = np.zeros(K, int)
+        target[mine] = np.asarray(part.target)
+        targets.append(target)
+        nothing: Any = (np.tile(np.eye(n), (K, 1, 1)), np.zeros((K, n, n)), np.full((K, n), H), np.zeros((K, n)))
+        for whole, own in zip(nothing, (part.F, part.L, part.level, part.drift), strict=True):
+            whole[mine] = np.asarray(own)
+        moves.append(Move(*nothing))
+    for b, (data, r) in enumerate(zip(model.rows, model.recursion, strict=True)):
+        rows.append(_padded(data, of[r][np.asarray(data.epoch)], K, sizes[b], fill[b], model.blocks[b]))
+    found: Any = Epoch(**shared, target=tuple(targets), move=tuple(moves), rows=tuple(rows))
+    return jax.device_put(found)
+
+
+def _padded(data: Rows, epoch: np.ndarray, count: int, size: int, fill: Rows, block: Block) -> Seen:
+    """Rows of a block by epoch (N,), `size` to each of `count`."""
+    taken = np.bincount(epoch, minlength=count)
+    most = int(taken.max(initial=0))
+    if most > size:
+        raise InputError(f"an epoch has {most} rows of sensor {block.type.name}, but its size is {size}; give more")
+    order = np.argsort(epoch, kind="stable")
+    slot = np.empty(len(epoch), int)
+    slot[order] = np.arange(len(epoch)) - np.repeat(np.cumsum(taken) - taken, taken)
+
+    def put(name: str) -> np.ndarray:
+        values, first = np.asarray(getattr(data, name)), np.asarray(getattr(fill, name))[0]
+        filled = np.broadcast_to(first, (count, size, *first.shape)).copy()
+        filled[epoch, slot] = values
+        return filled
+
+    mask = np.zeros((count, size, data.mask.shape[1]))
+    mask[epoch, slot] = np.asarray(data.mask)
+    found: Any = [mask if name == "mask" else put(name) for name in Seen._fields]
+    return Seen(*found)
