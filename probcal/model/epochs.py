@@ -63,12 +63,10 @@ class Stepwise:
     rows: tuple[Rows, ...]
     level_spread: jax.Array
 
-    def initial(self, key: jax.Array, epoch: Epoch, levels: jax.Array) -> State:
-        """State drawn at the first epoch of all; targets that begin later are 0 until they do."""
+    def initial(self) -> State:
+        """State before any epoch, all 0: each target is drawn at its first epoch, where `step` ignores what was."""
         sizes = [part.drift.shape[1] for part in self.recursions]
-        return self.step(
-            key, tuple(jnp.zeros((count, n)) for count, n in zip(self.targets, sizes, strict=True)), epoch, levels
-        )
+        return tuple(jnp.zeros((count, n)) for count, n in zip(self.targets, sizes, strict=True))
 
     def step(self, key: jax.Array, x: State, epoch: Epoch, levels: jax.Array) -> State:
         """State at an epoch drawn from that before it, at log levels (H,)."""
