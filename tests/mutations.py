@@ -50,7 +50,7 @@ MUTATIONS = [
     # smoothing/draws.py
     Mutation("smoothing/draws.py", "free = prior - smooth.states", "free = prior + smooth.states", "test_exact.py"),
     Mutation("smoothing/draws.py", "jax.random.normal(key, (count, M)) @ root.T", "jax.random.normal(key, (count, M)) @ root", "test_exact.py"),
-    Mutation("smoothing/draws.py", "J @ prior + half @ noise[1]", "J @ prior", "test_exact.py"),
+    Mutation("smoothing/draws.py", "own.J @ prior + own.half @ noise[1]", "own.J @ prior", "test_exact.py"),
     # smoothing/gauge.py
     Mutation("smoothing/gauge.py", "information = information - linalg.gram(flat, flat)", "information = information", "test_observability.py"),
     Mutation("smoothing/gauge.py", "np.asarray(free.information) + np.diag(survey)", "np.asarray(free.information)", "test_observability.py"),
@@ -114,7 +114,7 @@ MUTATIONS = [
     Mutation("inference/posterior.py", "mixed[\"r_hat\"][:M] > 1.05", "mixed[\"r_hat\"][:M] > 10.5", "test_formulas.py"),
     Mutation("inference/collapsed.py", "momentum = (momentum[0] * given.active, momentum[1])", "momentum = (momentum[0], momentum[1])", "test_samplers.py"),
     Mutation("inference/collapsed.py", "level = chain.weight - jax.random.exponential(keys[2])", "level = chain.weight + jax.random.exponential(keys[2])", "test_samplers.py"),
-    Mutation("inference/nuts.py", "hyper + volume + log_prior", "hyper + log_prior", "test_model.py test_samplers.py"),
+    Mutation("inference/coordinates.py", "hyper + volume + log_prior", "hyper + log_prior", "test_model.py test_samplers.py"),
     Mutation("inference/hierarchy.py", "self.prior.shape + 0.5 * number", "self.prior.shape + number", "test_samplers.py"),
     Mutation("inference/hierarchy.py", "self.prior.b + out", "self.prior.b + number", "test_samplers.py"),
     Mutation("inference/hierarchy.py", "(1.0 / auxiliary + 0.5 * z**2 / tau2)", "(1.0 / auxiliary + z**2 / tau2)", "test_samplers.py"),

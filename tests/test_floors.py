@@ -5,8 +5,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from mutations import MUTATIONS
 
 import probcal
+from probcal.inference.methods import METHODS as BY_NAME
 
 ROOT = Path(probcal.__file__).parent
 FLOORS = {
@@ -20,7 +22,11 @@ FLOORS = {
     7: ("cli", "report", "plots", "diagnostics"),
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
-METHODS = ("inference.ea", "inference.em")  # algorithms: they share what lies below, never each other
+METHODS = tuple(f"inference.{name}" for name in ("ea", "em", "collapsed", "nuts", "svi"))  # algorithms
+SHARED = tuple(
+    f"inference.{name}"
+    for name in ("run", "sampler", "sampling", "hierarchy", "posed", "pose", "gibbs", "coordinates", "guides", "psis")
+)  # what they share: it knows none of them
 LOW = {"jax", "numpy", "filelock"}  # third parties of floor 0, besides the standard library
 FACTORISE = {
     "cho_factor", "cho_solve", "cholesky", "eigh", "eig", "eigvalsh", "inv", "lu", "lu_factor", "lu_solve",
@@ -98,10 +104,17 @@ def test_imports_keep_the_floors(module):
     assert not high, f"{module} is on floor {floor(module)}, {'; '.join(high)}"
 
 
-@pytest.mark.parametrize("module", METHODS)
-def test_algorithms_do_not_import_each_other(module):
+@pytest.mark.parametrize("module", METHODS + SHARED)
+def test_algorithms_do_not_import_each_other_nor_does_what_they_share(module):
     others = [name for name, _ in own(module, MODULES[module]) if name in METHODS and name != module]
-    assert not others, f"{module} imports {others}: move what they share to inference/run.py or below"
+    assert not others, f"{module} imports {others}: move what they share to a module of its own"
+
+
+def test_every_method_is_listed():
+    """A new algorithm joins the rule above."""
+    listed = {name.split(".")[1] for name in METHODS}
+    homes = {type(method).__module__.rsplit(".", 1)[1] for method, _ in BY_NAME.values()}
+    assert homes == listed
 
 
 @pytest.mark.parametrize("module", FLOORS[0])
@@ -193,3 +206,9 @@ def test_the_search_for_factorisations_spares(text):
 def test_only_linalg_factorises(module):
     found = [f"line {line}: {name}" for name, line in factorisations(MODULES[module].read_text())]
     assert not found, f"{module}: {'; '.join(found)}: factorisations belong into linalg.py"
+
+
+def test_every_mutation_still_has_its_line():
+    """The table of `mutations.py` follows the code: each old text stands in its file once."""
+    lost = [(m.file, m.old) for m in MUTATIONS if (ROOT / m.file).read_text().count(m.old) != 1]
+    assert not lost

@@ -36,7 +36,7 @@ from probcal import (
     numpyro_model,
     sensor,
 )
-from probcal.inference.nuts import Free, parts
+from probcal.inference.coordinates import Free, parts
 from probcal.priors import BernoulliGaussian
 from probcal.smoothing.frame import place
 

@@ -8,8 +8,8 @@ import reference
 from worlds import linear, posed_of, resting, small, two_motions
 
 from probcal import NUTS, SVI, Gaussian, Horseshoe, InputError
+from probcal.inference.coordinates import Free
 from probcal.inference.guides import Fitted, LowRank, MeanField, Structured
-from probcal.inference.nuts import Free
 from probcal.inference.pose import pareto_khat
 from probcal.inference.sampling import sample
 from probcal.inference.svi import plain

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.hierarchy import Phi, SpikeAndSlab
-from probcal.inference.posed import Conditional, Form, Posed, conditional, update_inclusions
+from probcal.inference.gibbs import sweep
+from probcal.inference.hierarchy import Phi
+from probcal.inference.posed import Conditional, Form, Posed, conditional
 from probcal.inference.sampler import Sample, Sampler
-from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
+from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace, Prior
 from probcal.smoothing.frame import log_weight
 
 SHRINKINGS = 40  # most times that an ellipse is cut
@@ -32,28 +33,6 @@ class Chain(NamedTuple):
     phi: Phi
     weight: jax.Array  # log weight of theta and eps
     key: jax.Array
-
-
-def sweep(
-    form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array, *, backwards: bool
-) -> tuple[jax.Array, Phi]:
-    """Gibbs on the frame: hyper-parameters given the biases, then theta given them; `backwards` in reverse order."""
-    kind = form.hierarchy
-    learnt = jnp.asarray(kind.learnt, int)
-
-    def hyper(k: int, theta: jax.Array, phi: Phi, key: jax.Array) -> tuple[jax.Array, Phi]:
-        return theta, kind.updates()[k](phi, theta[learnt], key)
-
-    def biases(theta: jax.Array, phi: Phi, key: jax.Array) -> tuple[jax.Array, Phi]:
-        keys = jax.random.split(key)
-        if isinstance(kind, SpikeAndSlab):
-            phi = update_inclusions(form, posed, phi, keys[0], backwards=backwards)
-        return conditional(form, posed, phi).draw(keys[1]), phi
-
-    steps: list[Any] = [lambda t, p, s, k=k: hyper(k, t, p, s) for k in range(len(kind.updates()))] + [biases]
-    for step, own in zip(steps[::-1] if backwards else steps, jax.random.split(key, len(steps)), strict=True):
-        theta, phi = step(theta, phi, own)
-    return theta, phi
 
 
 def surrogate(
@@ -185,6 +164,12 @@ class Collapsed(Sampler):
     def kernel(self) -> "Collapsed":
         """The method whatever the number of its chains and draws."""
         return replace(self, chains=1, warmup=0, draws=1)
+
+    def instead(self, prior: Prior, fallback: Any) -> tuple[Sampler, str]:
+        """The fallback where it has the prior, else the swing, which needs no frame that fits."""
+        if fallback.takes(prior):
+            return replace(fallback, chains=self.chains, draws=self.draws), fallback.name
+        return replace(self, move="swing"), "the swing"
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Chain:
         """A chain at a draw of the frame's posterior."""

@@ -3,53 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
+from probcal.inference.coordinates import Free, parts
 from probcal.inference.hierarchy import Phi
-from probcal.inference.posed import Form, Posed, conditional, log_prior, prior_precision, whiten
+from probcal.inference.posed import Form, Posed, conditional
 from probcal.inference.sampler import Sample, Sampler
 from probcal.lazy import Later
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
-from probcal.smoothing.frame import log_joint
 
 if TYPE_CHECKING:
     from numpyro.infer import hmc
 else:
     hmc = Later("numpyro.infer.hmc")
-
-
-class Free(NamedTuple):
-    """Unconstrained coordinates: phi on the real line, eta and eps unit normals where the frame is exact."""
-
-    phi: Phi
-    eta: jax.Array  # (Q,) of theta given phi
-    eps: tuple[jax.Array, ...]  # (E, n) of the trajectories given theta
-
-
-class Parts(NamedTuple):
-    """What coordinates stand for, and the log densities there."""
-
-    theta: jax.Array
-    phi: Phi
-    joint: jax.Array  # of data and eps given theta
-    density: jax.Array  # of the coordinates
-
-
-def parts(form: Form, posed: Posed, free: Free) -> Parts:
-    """Biases and hyper-parameters of coordinates, and the log density of the joint posterior in them.
-
-    theta = mean(phi) + factor(phi) eta follows the hyper-parameters, the trajectories follow theta: neither the funnel
-    of a scale nor the ridge between a bias and a track is left.
-    """
-    phi, hyper = form.hierarchy.constrain(free.phi)
-    alpha, coupling = prior_precision(form, posed, phi)
-    theta, volume = whiten(posed.frame.information + coupling, alpha, posed.frame.pull, free.eta)
-    joint = log_joint(posed.model, posed.frame, theta, free.eps)
-    return Parts(theta, phi, joint, hyper + volume + log_prior(form, posed, theta, phi) + joint)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.inference.collapsed import sweep
+from probcal.inference.gibbs import sweep
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.posed import Form, Posed, activity, conditional
 from probcal.inference.psis import smoothed

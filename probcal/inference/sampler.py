@@ -61,6 +61,10 @@ class Sampler(Method, ABC):
         """The method without what does not change its kernels, so that these are compiled once."""
         return self
 
+    def instead(self, prior: Prior, fallback: "Sampler") -> tuple["Sampler", str] | None:
+        """What takes over, and its name, where the frame does not stand for the posterior; None: this one goes on."""
+        return None
+
     @abstractmethod
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
         """State of a chain that starts at theta and phi."""

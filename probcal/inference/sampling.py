@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -12,8 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.inference.collapsed import Collapsed
-from probcal.inference.nuts import NUTS
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Posed
 from probcal.inference.run import Progress
@@ -68,7 +66,7 @@ def sample(
     progress: Progress | None = None,
     storage: Storage | None = None,
     threads: int | None = None,
-    fallback: NUTS | None = None,
+    fallback: Sampler | None = None,
 ) -> Sampled:
     """Draws of a method from the posterior of a problem.
 
@@ -80,14 +78,12 @@ def sample(
     keys = jax.random.split(key)
     form, posed, found, worth = pose(problem, prior, start, keys[0])
     note = ""
-    if worth.failed and isinstance(method, Collapsed) and fallback is not None:
-        joint = fallback.takes(prior)
-        taken = replace(fallback, chains=method.chains, draws=method.draws) if joint else replace(method, move="swing")
+    if worth.failed and fallback is not None and (taken := method.instead(prior, fallback)) is not None:
+        method, name = taken
         note = (
             f"The collapse does not fit (Pareto k-hat {worth.khat:.2g} after {worth.moves} moves of the frame):"
-            f" {fallback.name if joint else 'the swing'} took over."
+            f" {name} took over."
         )
-        method = taken
     runs = _Run(method, form, posed, found, keys[1])
     state = runs.restored(box.state) if box.state is not None else runs.first()
     total, interrupted = method.warmup + method.draws, False

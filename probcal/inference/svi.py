@@ -15,9 +15,9 @@ from jax.flatten_util import ravel_pytree
 
 from probcal import linalg
 from probcal.errors import InputError, nearest
+from probcal.inference.coordinates import Free, parts
 from probcal.inference.guides import Fitted, Guide, LowRank, MeanField, Structured
 from probcal.inference.hierarchy import Phi
-from probcal.inference.nuts import Free, parts
 from probcal.inference.posed import Form, Posed, log_prior, prior_precision, whiten
 from probcal.inference.sampler import Sample, Sampler
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace

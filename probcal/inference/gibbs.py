@@ -1,0 +1,31 @@
+"""Gibbs sweeps on the Gaussian likelihood of the frame, which the pilot and the collapsed sampler share."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from probcal.inference.hierarchy import Phi, SpikeAndSlab
+from probcal.inference.posed import Form, Posed, conditional, update_inclusions
+
+
+def sweep(
+    form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array, *, backwards: bool
+) -> tuple[jax.Array, Phi]:
+    """Gibbs on the frame: hyper-parameters given the biases, then theta given them; `backwards` in reverse order."""
+    kind = form.hierarchy
+    learnt = jnp.asarray(kind.learnt, int)
+
+    def hyper(k: int, theta: jax.Array, phi: Phi, key: jax.Array) -> tuple[jax.Array, Phi]:
+        return theta, kind.updates()[k](phi, theta[learnt], key)
+
+    def biases(theta: jax.Array, phi: Phi, key: jax.Array) -> tuple[jax.Array, Phi]:
+        keys = jax.random.split(key)
+        if isinstance(kind, SpikeAndSlab):
+            phi = update_inclusions(form, posed, phi, keys[0], backwards=backwards)
+        return conditional(form, posed, phi).draw(keys[1]), phi
+
+    steps: list[Any] = [lambda t, p, s, k=k: hyper(k, t, p, s) for k in range(len(kind.updates()))] + [biases]
+    for step, own in zip(steps[::-1] if backwards else steps, jax.random.split(key, len(steps)), strict=True):
+        theta, phi = step(theta, phi, own)
+    return theta, phi
