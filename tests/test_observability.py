@@ -195,7 +195,7 @@ def test_gauge_directions_are_counted_and_named(name):
     assert tree.attrs["status"] == "open"
 
 
-@tiers((), ("radars",))
+@tiers((), ())
 def test_a_gauge_is_no_answer_until_anchored_as_advised(name):
     kinds, dimension, scale, motion, expected = CASES[name]
     free = problem_of(kinds, dimension, scale, motion)

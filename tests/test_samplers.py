@@ -349,7 +349,7 @@ def test_the_tree_of_a_sampler_is_whole_and_arviz_reads_it():
     assert np.array_equal(again["posterior"]["bias"], tree["posterior"]["bias"]), "a seed gives its draws"
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_the_draws_of_a_sampler_are_assessed():
     problem, tree, _ = fitted("plane", SPIKE, BernoulliGaussian(), key=3)
     assert "verdict" in probcal.assess(problem, tree).children

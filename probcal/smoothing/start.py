@@ -211,7 +211,8 @@ def _grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
             path[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)
         _, states = _profile(problem.model, r, span, z, path)
         states = np.array(states)
-        spread = np.sum(np.asarray(problem.model.recursions[r].L) ** 2, 2)
+        with np.errstate(over="ignore"):  # gaps of 1e-300 s
+            spread = np.sum(np.asarray(problem.model.recursions[r].L) ** 2, 2)
         precision = np.where(spread > 0, 1e4 / np.maximum(spread, 1e-300), 1e-9)
         for name, start, stop, _ in epochs.layout:
             if name == "position":
