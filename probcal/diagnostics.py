@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from probcal.errors import INVALID
 from probcal.labels import AXES, step_of
+from probcal.status import Status
 
 if TYPE_CHECKING:
     from probcal.simulate import Truth
@@ -66,7 +66,7 @@ def study_table(study: xr.Dataset) -> pd.DataFrame:
     if bool(there.any()) and not bool(there.all()):
         table["of non-zero"] = inside.mean(["run", "bias_label"]).to_series().reindex(table.index)
     table["runs"] = groups.size()
-    for status in ("converged", "not converged", *INVALID):
+    for status in map(str, Status):
         frame[status] = frame["status"] == status
         table[status] = frame.reset_index().groupby([*grid_of(study), "estimator"], sort=False)[status].sum()
     return table.reset_index().rename(columns={"estimator": "method"}).dropna(axis=1, how="all")  # no sd of one run

@@ -3,8 +3,6 @@
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-INVALID = ("at bound", "diverged", "misfit")  # status of a fit or a bias whose numbers are no estimate
-
 
 class InputError(ValueError):
     """A declaration, table or argument that cannot be used; the text, one line, says what to do about it."""

@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 
 from probcal import plots
 from probcal.diagnostics import drift_table
-from probcal.errors import INVALID
 from probcal.files import write_whole
+from probcal.status import INVALID, Status
 from probcal.tree import outliers
 
 NONE = "–"  # where there is no finite number
@@ -45,7 +45,7 @@ CHECKS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
          "white": "Ljung-Box p", "p_misfit": "predictive p, misfit", "p_mean": "predictive p, mean"},
     ),
 }  # fmt: skip
-COLOURS = {"converged": "good", "not converged": "warn", "at bound": "bad", "diverged": "bad", "misfit": "bad"}
+COLOURS = {str(s): "good" if s.settled else "warn" if s.valid else "bad" for s in Status}
 
 PAGE = """<!DOCTYPE html>
 <html lang="en">

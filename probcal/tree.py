@@ -17,6 +17,7 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.files import write_whole
 from probcal.lazy import Later
+from probcal.status import Status
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,7 +79,7 @@ class Result:
     intervals: str
     settings: str
     correlated: bool  # whether the prior couples biases
-    status: str
+    status: Status
     message: str
     z: np.ndarray  # (M,)
     covariance: np.ndarray  # (M, M)
@@ -100,6 +101,7 @@ class Result:
     residuals: Residuals
     lower: np.ndarray | None = None  # (M,) of the interval, in z; Gaussian where not given
     upper: np.ndarray | None = None
+    requested: str = ""  # the method that was asked for, where another ran
     columns: Mapping[str, np.ndarray] = field(default_factory=dict)  # further columns (M,) of the calibration
     posterior: Mapping[str, Any] = field(default_factory=dict)  # name -> dims, values (chain, draw, ...)[, coords]
     sample_stats: Mapping[str, np.ndarray] = field(default_factory=dict)  # (chain, draw)
@@ -208,7 +210,8 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         "method": result.method, "prior": result.prior, "seed": result.seed, "approximate": result.approximate,
         "intervals": result.intervals, "settings": result.settings, "correlated": int(result.correlated),
         "interval_probability": INTERVAL, "results_version": RESULTS_VERSION,
-        "status": result.status, "message": result.message, "data": problem.measurements.table.source,
+        "requested": result.requested or result.method,
+        "status": str(result.status), "message": result.message, "data": problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
     } | dict(result.attrs)  # fmt: skip
     if result.evidence is not None:
@@ -341,7 +344,7 @@ def add_optima(tree: xr.DataTree, problem: Problem, outcomes: Sequence[Any], bes
     values: dict[str, Any] = {
         "bias": (("optimum", "bias_label"), np.stack([np.asarray(o.point.z) * problem.scales for o in chosen])),
         "objective": ("optimum", np.array([float(o.trace[-1]) for o in chosen])),
-        "status": ("optimum", np.array([o.status for o in chosen])),
+        "status": ("optimum", np.array([str(o.status) for o in chosen])),
         "start": ("optimum", np.array(order)),
     }
     evidence = np.array([float(o.laplace.evidence) for o in chosen])

@@ -122,7 +122,7 @@ MUTATIONS = [
     Mutation("inference/sampling.py", "kept = max(0, min((box.count + 1) * method.chunk", "kept = max(0, min(box.count * method.chunk", "test_samplers.py"),
     Mutation("inference/storage.py", "for part in map(self.storage.read, self.storage.numbers)", "for part in map(self.storage.read, self.storage.numbers[:-1] or self.storage.numbers)", "test_storage.py"),
     # analysis/
-    Mutation("analysis/verdict.py", "elif status != \"converged\":", "elif status == \"diverged\":", "test_guards.py"),
+    Mutation("analysis/verdict.py", "elif not status.settled:", "elif status is Status.DIVERGED:", "test_guards.py"),
     Mutation("analysis/verdict.py", "(gamma + inflation * (1.0 - gamma))", "gamma", "test_assess.py"),
     Mutation("analysis/leave.py", "-least - 0.5 * (solved.logdet + logdet)", "-least - 0.5 * solved.logdet", "test_assess.py"),
     Mutation("analysis/leave.py", "solved.score - prior.pull(point.z) - matrix @ away", "solved.score - prior.pull(point.z)", "test_assess.py"),

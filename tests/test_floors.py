@@ -12,7 +12,7 @@ from probcal.inference.methods import METHODS as BY_NAME
 
 ROOT = Path(probcal.__file__).parent
 FLOORS = {
-    0: ("linalg", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files"),
+    0: ("linalg", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files", "status"),
     1: ("sensor", "motion", "priors", "noise"),
     2: ("sensors",),
     3: ("network", "table", "nodes"),

@@ -29,9 +29,8 @@ from probcal import (
     simulate,
 )
 from probcal.analysis import verdict
-from probcal.analysis.differences import ENDED
 from probcal.diagnostics import study_table
-from probcal.errors import INVALID, FitError
+from probcal.errors import FitError
 from probcal.geometry import bearing, norm
 from probcal.inference.run import End, finish, first_state, given_of, maximise
 from probcal.inference.run import verdict as status_of
@@ -41,6 +40,7 @@ from probcal.report import COLOURS
 from probcal.smoothing.information import laplace, mean_square, squares_of
 from probcal.smoothing.mode import _proposal, find_mode
 from probcal.smoothing.start import automatic_start
+from probcal.status import INVALID, Status
 
 
 @sensor(range=Channel("m", std=0.5), azimuth=Channel("rad", std=0.02, wrap=True))
@@ -158,10 +158,10 @@ def test_a_search_that_never_moved_has_diverged_and_one_at_the_mode_has_not():
         assert bool(again.converged)
         assert not bool(again.refused)
         outcome = maximise(MAP(tolerance=1e-13), problem, Gaussian(), point, None)
-        assert outcome.status == "converged"
+        assert outcome.status.settled
     for method in (EM(), EMEA()):
         problem, _ = linear("plane")
-        assert probcal.fit(problem, method, start=resting(problem)).attrs["status"] == "converged"
+        assert Status(probcal.fit(problem, method, start=resting(problem)).attrs["status"]).settled
 
 
 def test_the_promise_of_a_step_is_what_it_keeps_on_a_linear_problem():
@@ -183,8 +183,9 @@ def test_an_evidence_below_its_best_is_no_answer():
         start = first_state(given, resting(problem))
         found = laplace(problem.model, start.point, given.prior)
         state = start._replace(found=found, best=found.evidence + 5.0, refused=jnp.zeros((), bool))
-        fallen = finish(problem, ARD(), state, True, np.zeros(3))
-        held = finish(problem, Gaussian(), state, True, np.zeros(3))  # nothing is learnt: the evidence is no objective
+        state = state._replace(done=jnp.ones((), bool))
+        fallen = finish(problem, ARD(), state, False, np.zeros(3))
+        held = finish(problem, Gaussian(), state, False, np.zeros(3))  # nothing is learnt: the evidence is no objective
     assert fallen.status == "not converged"
     assert "The evidence fell by 5 nats below its best on the way" in fallen.message
     assert held.status == "converged"
@@ -209,8 +210,16 @@ def test_a_scene_that_collapses_is_no_answer():
 
 
 def end(**changed):
-    sound = {"still": True, "low": False, "far": False, "sound": True, "refused": False, "fallen": 0.0, "square": 1.0}
-    return End(**(sound | changed))
+    sound = {"still": True, "asked": False, "low": False, "far": False, "sound": True, "refused": False}
+    return End(**(sound | {"fallen": 0.0, "square": 1.0} | changed))
+
+
+def test_spent_iterations_are_not_convergence():
+    assert status_of(end(still=False, asked=True)) is Status.SPENT
+    assert status_of(end(still=True, asked=True)) is Status.CONVERGED
+    assert status_of(end(still=False)) is Status.NOT_CONVERGED
+    assert status_of(end(still=False, asked=True, fallen=9.0)) is Status.NOT_CONVERGED
+    assert status_of(end(still=False, asked=True, low=True)) is Status.AT_BOUND
 
 
 def test_status_follows_the_gravest():
@@ -240,7 +249,7 @@ def test_verdicts_stand_no_higher_than_the_status(status, ended, word, reason):
     problem, _ = linear("plane")
     M = len(problem.labels)
     known = verdict.Evidence(np.full(M, 0.9), np.zeros(M), np.zeros(M), 3.0)
-    words, reasons = verdict.judge(problem, status, [ended] * M, known, {}, {}, "")
+    words, reasons = verdict.judge(problem, Status(status), [ended] * M, known, {}, {}, "")
     assert set(words) == {word}
     assert all(reason in text for text in reasons)
 
@@ -301,7 +310,9 @@ def test_the_mean_square_counts_residuals_and_process_noises():
     assert square == pytest.approx(expected, rel=1e-8)
 
 
-def test_every_list_of_statuses_knows_a_misfit():
+def test_every_status_has_its_words_and_its_colour():
     assert set(INVALID) == {"at bound", "diverged", "misfit"}
-    assert set(INVALID) <= set(ENDED)
-    assert set(INVALID) <= set(COLOURS)
+    assert {status for status in Status if status.settled} == {"converged", "iterations spent"}
+    for status in Status:
+        assert status.said
+        assert COLOURS[status] == ("bad" if status in INVALID else "good" if status.settled else "warn")

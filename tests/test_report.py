@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from probcal import InputError, plots, report
-from probcal.errors import INVALID
 from probcal.plots import base
+from probcal.status import INVALID
 
 AXES = ("x", "y", "z")
 EPOCHS = 5_000

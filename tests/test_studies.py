@@ -14,6 +14,7 @@ from probcal.cli.options import parse_values
 from probcal.diagnostics import study_table
 from probcal.errors import InputError
 from probcal.plots import plot_study
+from probcal.status import Status
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import radars
@@ -59,7 +60,7 @@ def test_c1_at_one_share_reproduces_the_trial_and_equals_single_fits():
     table = study_table(found)
     assert list(table["method"]) == ["ml", "em-ea", "ea", "oracle"]
     assert table["runs"].tolist() == [8] * 4
-    assert (table[["converged", "not converged", "at bound", "diverged", "misfit"]].sum(axis=1) == 8).all()
+    assert (table[[str(status) for status in Status]].sum(axis=1) == 8).all()
 
 
 def test_values_of_settings():

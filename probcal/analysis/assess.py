@@ -13,9 +13,9 @@ from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.pieces import Change, Pieces
 from probcal.analysis.verdict import RATE, limit_of
-from probcal.errors import INVALID
 from probcal.problem import Problem
 from probcal.simulate import Key, Truth, as_key
+from probcal.status import INVALID, Status
 from probcal.tree import suffix
 from probcal.types import float64
 
@@ -119,7 +119,7 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
         verdict.pull(z, alpha, calibration["gamma"].values, inflation), float(np.sqrt(limit_of(M))),
     )  # fmt: skip
     ended = calibration["status"].values.tolist()
-    words, reasons = verdict.judge(problem, str(tree.attrs["status"]), ended, known, drifts, disagreements, first)
+    words, reasons = verdict.judge(problem, Status(tree.attrs["status"]), ended, known, drifts, disagreements, first)
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}
     labels = {"bias_label": list(problem.labels)}

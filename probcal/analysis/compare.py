@@ -12,8 +12,9 @@ from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.analysis.differences import findings
 from probcal.analysis.findings import Finding
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
-from probcal.errors import INVALID, InputError, nearest
+from probcal.errors import InputError, nearest
 from probcal.labels import label_parts
+from probcal.status import INVALID
 
 Fits = Mapping[str, xr.DataTree] | Sequence[xr.DataTree]
 COLUMNS = ("mean", "sd", "lower", "upper", "gamma", "status")  # of every fit

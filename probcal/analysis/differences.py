@@ -12,19 +12,13 @@ import xarray as xr
 
 from probcal.analysis.findings import NAMES, Finding
 from probcal.analysis.overlap import ZERO
-from probcal.errors import INVALID
+from probcal.status import INVALID, Status
 
 NARROW = 0.7  # ratio of sds beyond which, either way, a method is not enough
 GAMMA = 0.05  # by which a gamma must lie above the interval of the reference's to be a finding
 CERTAIN = 4.0  # nats of elpd below which a difference is none, whatever its error
 MIXED = 1.01  # r_hat above which chains disagree
 BAD = 0.01  # share of bad Pareto k that is a finding
-ENDED = {
-    "not converged": "did not converge",
-    "at bound": "ended at bound: its numbers are no estimate",
-    "diverged": "diverged: its numbers are no estimate",
-    "misfit": "explains nothing: its numbers are no estimate",
-}
 
 
 def findings(comparison: xr.DataTree) -> list[Finding]:
@@ -42,9 +36,9 @@ def findings(comparison: xr.DataTree) -> list[Finding]:
 
 
 def _doubts(name: str, method: xr.Dataset) -> list[Finding]:
-    status, found = method.attrs["status"], list[Finding]()
-    if status != "converged":
-        found.append(Finding("status", name, f"{name} {ENDED.get(status, f'ended {status}')}"))
+    status, found = Status(method.attrs["status"]), list[Finding]()
+    if not status.settled:
+        found.append(Finding("status", name, f"{name} {status.said}"))
     if method.attrs.get("largest_r_hat", 1.0) > MIXED:
         label = method["bias_label"].values[int(np.argmax(method["r_hat"].values))]
         text = f"{name}: r_hat of {label} is {method.attrs['largest_r_hat']:.3f}, its chains disagree; draw more"

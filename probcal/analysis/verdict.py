@@ -23,6 +23,7 @@ import numpy as np
 from scipy import special
 
 from probcal.problem import Problem
+from probcal.status import Status
 
 RATE = 0.01  # false alarms of each kind of check, all its comparisons together
 PRIOR_ONLY, WEAK = 0.05, 0.5
@@ -64,7 +65,7 @@ def limit_of(count: int, freedom: int = 1) -> float:
 
 def judge(
     problem: Problem,
-    status: str,
+    status: Status,
     ended: Sequence[str],
     known: Evidence,
     drifts: Mapping[int, str],
@@ -93,9 +94,9 @@ def judge(
             verdict, reason = "prior only", f"the data hardly narrow its {declared} ({information})"
         elif s < WEAK:
             verdict, reason = "weak", f"the data narrow its {sizes} only ({information})"
-        elif status == "misfit":
+        elif status is Status.MISFIT:
             verdict, reason = "conflicting", "the fit ended misfit: model and data contradict each other"
-        elif status != "converged":
+        elif not status.settled:
             verdict, reason = "weak", f"the fit ended {status}, which is no answer"
         elif ended[m] == "not mixed":
             verdict, reason = "weak", "its chains have not mixed, which is no answer"

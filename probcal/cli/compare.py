@@ -12,8 +12,8 @@ from probcal.analysis import compare
 from probcal.analysis.compare import chosen_pair, named
 from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.diagnostics import comparison_rows
-from probcal.errors import INVALID
 from probcal.files import Outputs
+from probcal.status import INVALID
 from probcal.tree import load, save
 
 

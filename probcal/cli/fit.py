@@ -17,6 +17,7 @@ from probcal.cli.progress import line
 from probcal.files import Outputs
 from probcal.inference import METHODS, fit
 from probcal.inference.manifest import remove_run
+from probcal.status import Status
 from probcal.tree import add_scores, outliers, save, summary
 
 FINDINGS = 8  # sentences of an assessment that are printed
@@ -62,7 +63,7 @@ def run(
             _write(tree, outputs)
         if "Interrupted" not in tree.attrs["message"]:
             remove_run(store, tree.attrs["identity"])  # its draws are in fit.nc now
-    return 0 if tree.attrs["status"] == "converged" else 1
+    return 0 if Status(tree.attrs["status"]).settled else 1
 
 
 @contextmanager
@@ -123,7 +124,7 @@ def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
         print(f"position RMSE before {attrs['position_rmse_before']:.3f} m, after {attrs['position_rmse_after']:.3f} m")
     _print_findings(tree)
     if attrs["message"]:
-        print(attrs["message"], file=sys.stdout if attrs["status"] == "converged" else sys.stderr)
+        print(attrs["message"], file=sys.stdout if Status(attrs["status"]).settled else sys.stderr)
 
 
 def _print_findings(tree: xr.DataTree) -> None:

@@ -10,9 +10,10 @@ from probcal.cli.files import write_csv
 from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem, load_truth
 from probcal.diagnostics import scores
-from probcal.errors import INVALID, InputError
+from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.inference import track
+from probcal.status import INVALID
 from probcal.tree import load
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import tree
-from probcal.errors import INVALID, FitError, InputError
+from probcal.errors import FitError, InputError
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.manifest import stored_run
 from probcal.inference.methods import EA, MAP, NUTS, check_problem, choose_prior
@@ -157,8 +157,8 @@ def _suited(given: Problem, problem: Problem, start: Point) -> Point:
 def _rank(prior: Prior, outcome: Outcome) -> tuple[bool, bool, float]:
     """Order of optima: an answer before none, a converged one before others, then evidence (density if flat)."""
     value = float(outcome.laplace.evidence) if prior.proper else float(outcome.trace[-1])
-    sound = outcome.status not in INVALID and np.isfinite(value)
-    return sound, outcome.status == "converged", value if np.isfinite(value) else -np.inf
+    sound = outcome.status.valid and np.isfinite(value)
+    return sound, outcome.status.settled, value if np.isfinite(value) else -np.inf
 
 
 def _result(

@@ -22,6 +22,7 @@ from probcal.smoothing.draws import draws_a_chain, predictive, residuals_of
 from probcal.smoothing.information import at_levels, mean_square
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import track_mode
+from probcal.status import Status
 
 if TYPE_CHECKING:
     from arviz_stats.base import array_stats
@@ -95,7 +96,7 @@ def result(
         tracks=_tracks(states, before),
         residuals=residuals_of(problem.model, before, after), lower=lower, upper=upper,
         columns=_columns(run, mixed, M), posterior=_posterior(problem, run), sample_stats=_stats(run),
-        attrs=_attrs(run),
+        attrs=_attrs(run), requested=run.asked.name,
     )  # fmt: skip
 
 
@@ -205,7 +206,7 @@ def _bias_status(problem: Problem, mixed: Mapping[str, np.ndarray], M: int) -> t
 
 def judge(
     problem: Problem, prior: Prior, run: Sampled, mixed: Mapping[str, np.ndarray], mean: Point
-) -> tuple[str, str]:
+) -> tuple[Status, str]:
     """Status of a run whose posterior has this mean, and one or more sentences on what hurts and what to do."""
     said = [run.note] if run.note else []
     chains, draws = run.z.shape[:2]
@@ -226,15 +227,16 @@ def judge(
         good = False
     square = float(mean_square(problem.model, mean))
     if not square <= ABSURD:
-        return "misfit", " ".join([misfit_sentence(problem, mean, square), *said])
+        return Status.MISFIT, " ".join([misfit_sentence(problem, mean, square), *said])
     good = _say_steps(run, said) and good
     if not run.method.exact:
         khat = pareto_khat(run.draws["stats_log_weight"].ravel())
         worth = "it stands for the posterior" if khat < 0.7 else "it does not fit; take nuts or collapsed"
         said.append(f"Pareto k-hat of the guide {khat:.2f}: {worth}.")
     if isinstance(prior, Flat) and (np.abs(run.z.mean((0, 1))[~problem.surveyed]) > FAR).any():
-        return "diverged", " ".join([*said, "Some biases lie far from the stated values: use a prior, or fix some."])
-    return "converged" if good else "not converged", " ".join(said)
+        said.append("Some biases lie far from the stated values: use a prior, or fix some.")
+        return Status.DIVERGED, " ".join(said)
+    return Status.CONVERGED if good else Status.NOT_CONVERGED, " ".join(said)
 
 
 def _say_steps(run: Sampled, said: list[str]) -> bool:

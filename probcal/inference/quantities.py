@@ -76,7 +76,7 @@ def sampled_posterior(
 
     points = Points(flat(found.z), flat(found.levels), tuple(flat(x) for x in found.states))
     phi = {name: flat(a) for name, a in found.group("phi_").items()}
-    return Posterior(points, phi, found.z.shape[0], True, TAKEN if found.note else "sampled", found)
+    return Posterior(points, phi, found.z.shape[0], True, TAKEN if found.method != found.asked else "sampled", found)
 
 
 def gaussian_posterior(
@@ -222,7 +222,7 @@ def ranked(trial: Trial, found: Posterior, most: int, rng: np.random.Generator) 
         for field, value in zip(record, values, strict=True):
             record[field].append(value)
     arrays = {field: np.array(values) for field, values in record.items()}
-    arrays["status"] = np.array(found.status, "<U13")
+    arrays["status"] = np.array(found.status, "<U16")
     if found.points.states:
         arrays["position_rmse"] = np.array(_position_rmse(trial.problem, trial.point, found.points))
     if found.sampled is not None:

@@ -23,6 +23,7 @@ from probcal.problem import Problem
 from probcal.smoothing.directions import Direction, weak_directions
 from probcal.smoothing.information import Laplace, mean_square, squares_of
 from probcal.smoothing.mode import Point
+from probcal.status import Status
 
 CHUNK = 5  # outer iterations between two reports of progress
 FAR = 10.0  # scales from the stated value beyond which a bias without prior has diverged
@@ -95,7 +96,7 @@ class Outcome(NamedTuple):
     alpha: np.ndarray  # (M,)
     laplace: Laplace
     trace: np.ndarray  # objective of every outer iteration
-    status: str  # converged, not converged, at bound, misfit, diverged
+    status: Status  # converged, not converged, at bound, misfit, diverged
     message: str  # one sentence on the status and what to do; empty where nothing is to be said
     bias_status: tuple[str, ...]
     weak: tuple[Direction, ...]
@@ -170,9 +171,8 @@ def maximise(method: Maximiser, problem: Problem, prior: Prior, start: Point, pr
         trace = np.concatenate([trace, np.asarray(objective)[~np.asarray(idle)]])
         if progress is not None:
             progress(method.name, len(trace), float(trace[-1]))
-    converged = bool(state.done) or method.tolerance == 0.0
-    outcome = finish(problem, prior, state, converged, trace)
-    if method.tolerance > 0.0 or outcome.status != "converged" or len(trace) < 2:
+    outcome = finish(problem, prior, state, method.tolerance == 0.0, trace)
+    if outcome.status is not Status.SPENT or len(trace) < 2:
         return outcome
     note = (
         f"All {len(trace)} iterations were run, as asked; the last moved the objective by {trace[-1] - trace[-2]:.2g}."
@@ -180,15 +180,19 @@ def maximise(method: Maximiser, problem: Problem, prior: Prior, start: Point, pr
     return outcome._replace(message=f"{note} {outcome.message}".strip())
 
 
-def finish(problem: Problem, prior: Prior, state: State, converged: bool, trace: np.ndarray) -> Outcome:
-    """Say in words what the point and the Laplace approximation are worth where a method ended."""
+def finish(problem: Problem, prior: Prior, state: State, asked: bool, trace: np.ndarray) -> Outcome:
+    """Say in words what the point and the Laplace approximation are worth where a method ended.
+
+    `asked` is whether it was to run so many iterations, whatever they reach.
+    """
     point, found = state.point, state.found
     alpha, z = np.asarray(state.alpha), np.asarray(point.z)
     information = np.asarray(found.information)
     weak = weak_directions(problem, information, point) if np.isfinite(information).all() else ()
     low, far = low_and_far(prior, alpha, z, problem.surveyed)
     end = End(
-        converged,
+        bool(state.done),
+        asked,
         bool(low.any()),
         bool(far.any()),
         all(np.isfinite(np.asarray(part)).all() for part in (found.covariance, found.evidence, point.z)),
@@ -230,6 +234,7 @@ class End(NamedTuple):
     """What the status of a fit follows from."""
 
     still: bool  # the method says that it is done
+    asked: bool  # it was to run so many iterations, and did
     low: bool  # a precision stands at its lower bound
     far: bool  # a bias without prior ran away
     sound: bool  # everything is finite
@@ -238,15 +243,17 @@ class End(NamedTuple):
     square: float  # mean square a datum of what is left
 
 
-def verdict(end: End) -> str:
-    """Status of a fit in words."""
+def verdict(end: End) -> Status:
+    """Status of a fit."""
     if not end.square <= ABSURD:
-        return "misfit"
+        return Status.MISFIT
     if end.far or not end.sound or end.refused:
-        return "diverged"
+        return Status.DIVERGED
     if end.low:
-        return "at bound"
-    return "converged" if end.still and end.fallen <= FALL else "not converged"
+        return Status.AT_BOUND
+    if end.fallen > FALL:
+        return Status.NOT_CONVERGED
+    return Status.CONVERGED if end.still else Status.SPENT if end.asked else Status.NOT_CONVERGED
 
 
 def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
@@ -266,7 +273,7 @@ def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
 def _message(
     problem: Problem,
     point: Point,
-    status: str,
+    status: Status,
     end: End,
     low: np.ndarray,
     far: np.ndarray,
@@ -278,28 +285,28 @@ def _message(
         return ", ".join(labels[:12]) + (f" and {len(labels) - 12} more" if len(labels) > 12 else "")
 
     advice = f" The data do not fix: {'; '.join(d.sentence for d in weak[:4])}." if weak else ""
-    if status == "at bound":
+    if status is Status.AT_BOUND:
         return f"The precision of {listed(low)} stands at its lower bound: the estimate is invalid.{advice}"
-    if status == "misfit":
+    if status is Status.MISFIT:
         return misfit_sentence(problem, point, end.square)
-    if status == "diverged" and end.sound and end.refused and not end.far:
+    if status is Status.DIVERGED and end.sound and end.refused and not end.far:
         return (
             "The fit diverged: it never left its start, since no step fitted better; the estimate is invalid. Check"
             " units, the time column, sentinels such as -9999 and the noise std, or give a start."
         )
-    if status == "diverged":
+    if status is Status.DIVERGED:
         where = (
             f"{listed(far)} lie more than {FAR:g} scales from the stated value"
             if far.any()
             else "the information matrix is singular"
         )
         return f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases.{advice}"
-    if status == "not converged" and end.fallen > FALL:
+    if status is Status.NOT_CONVERGED and end.fallen > FALL:
         return (
             f"The evidence fell by {end.fallen:.3g} nats below its best on the way: the fit ran to a place that the"
             f" data as a whole do not favour. Survey or fix more, state narrower scales, or take a sampler.{advice}"
         )
-    if status == "not converged":
+    if status is Status.NOT_CONVERGED:
         return (
             f"The fit did not converge in {iterations} iterations: allow more, or fix what the data leave open.{advice}"
         )

@@ -27,6 +27,7 @@ class Sampled:
     """What a sampler leaves: draws by name (chain, draw, ...), and how the run went."""
 
     method: Sampler
+    asked: Sampler  # the method that was asked for, where another took over
     form: Form
     posed: Posed
     worth: Worth
@@ -77,7 +78,7 @@ def sample(
     box = Chunks(Storage(None, "draws", {}) if storage is None else storage)
     keys = jax.random.split(key)
     form, posed, found, worth = pose(problem, prior, start, keys[0])
-    note = ""
+    asked, note = method, ""
     if worth.failed and fallback is not None and (taken := method.instead(prior, fallback)) is not None:
         method, name = taken
         note = (
@@ -104,7 +105,7 @@ def sample(
         raise FitError(
             f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them"
         )
-    return Sampled(method, form, posed, worth, joined, time.perf_counter() - began, interrupted, note)
+    return Sampled(method, asked, form, posed, worth, joined, time.perf_counter() - began, interrupted, note)
 
 
 def named(draws: Draw) -> dict[str, np.ndarray]:

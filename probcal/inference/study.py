@@ -87,10 +87,9 @@ def _solve(method: Any, models: Model, prior: Prior, iterations: int, givens: Gi
         state, count = jax.lax.while_loop(on, step, (first_state(given, start), jnp.zeros((), int)))
         state = method.close(model, given, state)
         sd = jnp.sqrt(jnp.diagonal(state.found.covariance))
-        done = state.done | (given.tolerance == 0.0)
         found, point = state.found, state.point
         return _Solved(
-            point.z, sd, found.gamma, state.alpha, point.states, done, state.refused, state.best, found.evidence,
+            point.z, sd, found.gamma, state.alpha, point.states, state.done, state.refused, state.best, found.evidence,
             mean_square(model, point), count,
         )  # fmt: skip
 
@@ -168,7 +167,7 @@ def _batch(
                 solved = jax.tree.map(np.asarray, solved)
                 for j, k in enumerate(members):
                     one = jax.tree.map(lambda leaf, j=j: leaf[j], solved)
-                    found.append({"case": cases[k], "method": name} | _record(chosen[j], prior, one))
+                    found.append({"case": cases[k], "method": name} | _record(chosen[j], method, prior, one))
         if stored:
             first = next(record for record in found if record["case"] == cases[0])
             first["problem"] = problem_digest(whole[0].problem, whole[0].truth.biases)
@@ -199,21 +198,29 @@ def _prepared(method: Method, run: _Run) -> _Run:
     return run if problem is run.problem else run._replace(problem=problem, start=automatic_start(problem))
 
 
-def _record(run: _Run, prior: Prior, one: Any) -> dict[str, Any]:
-    problem = run.problem
+def _record(run: _Run, method: Maximiser, prior: Prior, one: Any) -> dict[str, Any]:
+    problem, asked = run.problem, method.tolerance == 0.0
     true = np.array([run.truth.biases[label] for label in problem.labels]) / problem.scales
     error = one.z - true
     low, far = low_and_far(prior, one.alpha, one.z, problem.surveyed)
+    finite = bool(np.isfinite(one.z).all() and np.isfinite(one.sd).all())
     end = End(
-        bool(one.done), bool(low.any()), bool(far.any()), bool(np.isfinite(one.z).all() and np.isfinite(one.sd).all()),
-        bool(one.refused), fallen(prior, len(problem.levels), one.best, one.evidence), float(one.square),
-    )  # fmt: skip
+        still=bool(one.done),
+        asked=asked,
+        low=bool(low.any()),
+        far=bool(far.any()),
+        sound=finite,
+        refused=bool(one.refused),
+        fallen=fallen(prior, len(problem.levels), one.best, one.evidence),
+        square=float(one.square),
+    )
     half = NormalDist().inv_cdf(0.5 + INTERVAL / 2)
     return {
         "bias_rmse": float(np.sqrt(np.mean(error**2))),
         "coverage": float((np.abs(error) <= half * one.sd).mean()),
         "position_rmse": _position_rmse(run, one.states),
-        "status": verdict(end),
+        "status": str(verdict(end)),
+        "ran": method.name,
         "iterations": int(one.iterations),
         "error": error, "true": true, "gamma": one.gamma, "sd": one.sd,
         "lower": error - half * one.sd, "upper": error + half * one.sd, "labels": problem.labels,
@@ -234,7 +241,8 @@ def _drawn(run: _Run, method: Sampler, prior: Prior) -> dict[str, Any]:
         "bias_rmse": float(np.sqrt(np.mean(error**2))),
         "coverage": float(((lower <= true) & (true <= upper)).mean()),
         "position_rmse": _position_rmse(run, [x.mean((0, 1)) for x in drawn.states]),
-        "status": status,
+        "status": str(status),
+        "ran": drawn.method.name,
         "iterations": drawn.z.shape[1],
         "error": error, "true": true, "gamma": drawn.draws["gamma"].mean((0, 1)), "sd": z.std(0),
         "lower": lower - true, "upper": upper - true, "labels": problem.labels,
@@ -292,8 +300,8 @@ def study(
     method and prior.
     Variables have the grid's dims, `estimator` (the method; xarray keeps that word for itself) and `run`:
     `bias_rmse` (root mean square of the errors over their scales), `position_rmse` in m, `coverage` of the
-    intervals, `status`, `iterations`; with `bias_label`: `error`, `lower` and `upper` end of the interval less the
-    truth, `true`, `sd` (all over their scales) and `gamma`.
+    intervals, `status`, `ran` (the method, or the one that took over), `iterations`; with `bias_label`: `error`,
+    `lower` and `upper` end of the interval less the truth, `true`, `sd` (all over their scales) and `gamma`.
     `store` is a folder that keeps finished fits, `resume` goes on with it, for more runs and settings too, `overwrite`
     replaces what it holds; an interruption changes no result.
     Raises `InputError` for an unknown method, settings whose biases differ and a folder that holds another study. Runs
@@ -387,7 +395,7 @@ class _Kept:
         found = []
         for record in self.box.records.values():
             point, run = json.loads(str(record["case"]))
-            texts = {name: str(record[name]) for name in ("method", "status")}
+            texts = {name: str(record[name]) for name in ("method", "status", "ran")}
             labels = tuple(record["labels"].tolist())
             found.append(record | texts | {"case": (point, run), "labels": labels})
         return found
@@ -408,7 +416,8 @@ def _dataset(
     dims = (*axes, "estimator", "run")
     shape = (*(len(values) for values in axes.values()), len(methods), len(runs))
     scalars: dict[str, Any] = {name: np.full(shape, np.nan) for name in ("bias_rmse", "coverage", "position_rmse")}
-    scalars |= {"status": np.full(shape, "", "<U13"), "iterations": np.zeros(shape, int)}
+    scalars |= {name: np.full(shape, "", "<U16") for name in ("status", "ran")}
+    scalars["iterations"] = np.zeros(shape, int)
     vectors = {name: np.full((*shape, len(labels)), np.nan) for name in VECTORS}
     for record in records:
         point, run = record["case"]

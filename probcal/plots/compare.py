@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from probcal.analysis.compare import Fits, chosen_pair, interchangeable, named, plugged_in
-from probcal.errors import INVALID
 from probcal.plots.base import LINEAR, ROWS, colour, ellipse, new_axes, plain, probability, write_figure
+from probcal.status import INVALID
 
 SCATTER = 2_000  # draws of one fit in the picture of a pair
 PAIRS = 2  # of interchangeable biases that are drawn where none is asked for

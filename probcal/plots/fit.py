@@ -16,7 +16,6 @@ from matplotlib.patches import FancyArrowPatch
 from matplotlib.ticker import MaxNLocator
 
 from probcal.diagnostics import drift_table
-from probcal.errors import INVALID
 from probcal.labels import label_parts
 from probcal.plots.base import (
     ALL_POINTS,
@@ -33,6 +32,7 @@ from probcal.plots.base import (
     plain,
     probability,
 )
+from probcal.status import INVALID
 
 
 @dataclass(frozen=True)
