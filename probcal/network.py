@@ -1,5 +1,6 @@
 """Nodes and placed sensors, and the table of biases that follows from them."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -189,11 +190,15 @@ class Network:
                 )
         self.biases = tuple(self._node_biases() + self._sensor_biases())
         self._check_labels()
+        self._steps: dict[tuple[str, str, int], tuple[BiasRecord, ...]] = {}
+        for bias in self.biases:
+            if bias.since is not None:
+                key = (bias.owner, bias.component, bias.axis)
+                self._steps[key] = (*self._steps.get(key, ()), bias)
 
     def _check_labels(self) -> None:
-        labels = [bias.label for bias in self.biases]
-        for label in labels:
-            if labels.count(label) > 1:
+        for label, count in Counter(bias.label for bias in self.biases).items():
+            if count > 1:
                 raise InputError(f'two biases are called "{label}"; give node, sensor and bias names that differ')
 
     @property
@@ -203,8 +208,7 @@ class Network:
 
     def steps(self, owner: str, component: str, axis: int = 0) -> tuple[BiasRecord, ...]:
         """Steps of a drifting bias in order of time, none where it is constant."""
-        where = (owner, f"{component}_step", axis)
-        return tuple(b for b in self.biases if b.since is not None and (b.owner, b.component, b.axis) == where)
+        return self._steps.get((owner, f"{component}_step", axis), ())
 
     @property
     def channel_names(self) -> tuple[str, ...]:
@@ -222,14 +226,13 @@ class Network:
         return tuple(nodes.values())
 
     def _check_names(self) -> None:
-        seen: dict[str, str] = {}
+        seen: dict[str, Sensor] = {}
         for placed in self.sensors:
             if placed.name in seen:
                 raise InputError(f'two sensors are called "{placed.name}"; place one with .on(node, name="...")')
-            seen[placed.name] = "sensor"
+            seen[placed.name] = placed
         for node in self.nodes:
-            users = [placed for placed in self.sensors if placed.name == node.name]
-            if users and node not in users[0].nodes:
+            if node.name in seen and node not in seen[node.name].nodes:
                 raise InputError(f'"{node.name}" is the name of a node and of a sensor elsewhere; rename one')
         for kind in self.types:
             if [other.name for other in self.types].count(kind.name) > 1:
@@ -238,9 +241,13 @@ class Network:
                 raise InputError(f'"{kind.name}" is the name of a sensor type; rename the node or sensor')
 
     def _node_biases(self) -> list[BiasRecord]:
-        records = []
+        records: list[BiasRecord] = []
+        users: dict[str, set[str]] = {}
+        for placed in self.sensors:
+            for node in placed.nodes:
+                users.setdefault(node.name, set()).update(placed.type.pose_components)
         for node in self.nodes:
-            read = {c for s in self.sensors if node in s.nodes for c in s.type.pose_components}
+            read = users[node.name]
             for component, (kind, bias) in node.spread.items():
                 if component not in read:
                     raise InputError(f'node "{node.name}": {component} has a {kind}, but none of its sensors reads it')

@@ -21,7 +21,7 @@ from probcal.model.variants import aligned
 from probcal.motion import Motion, Static, Target, White, as_motion
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, Level, Unknown, guess_of
-from probcal.sensor import VECTORS
+from probcal.sensor import VECTORS, Sensor
 from probcal.table import Measurements, Table, factor, header, measure, read_table
 from probcal.types import float64
 
@@ -94,8 +94,12 @@ class Problem:
     def members(self) -> list[dict[str, str]]:
         """What each free bias belongs to: its owner, node(s), sensor type(s) and component."""
         found = []
+        readers: dict[str, list[Sensor]] = {}
+        for s in self.network.sensors:
+            for owner in dict.fromkeys((s.name, s.type.name, *(n.name for n in s.nodes))):
+                readers.setdefault(owner, []).append(s)
         for bias in self.biases:
-            users = [s for s in self.network.sensors if bias.owner in (s.name, s.type.name, *(n.name for n in s.nodes))]
+            users = readers.get(bias.owner, [])
             nodes = {n.name for s in users for n in s.nodes}
             node = bias.owner if bias.owner in nodes else "-".join(sorted(nodes))
             types = "-".join(sorted({s.type.name for s in users}))
@@ -374,15 +378,16 @@ class Problem:
         nodes = [network.sensors[k].nodes for k in ours]
         entries = pose_entries(network.dimension, block.extras)
         pose = np.zeros((len(chosen), block.type.arity, len(entries)))
-        for s, pair in enumerate(nodes):
-            for a, node in enumerate(pair):
-                self._check_path(node, chosen[sensor == s])
-                pose[sensor == s, a] = pose_vector(node, block.extras, data.time[chosen][sensor == s])
         local, starts = self._local(block, ours)
-        pieces = [np.flatnonzero(sensor == s) for s in range(len(ours))]
+        ends = np.cumsum(np.bincount(sensor, minlength=len(ours)))
+        pieces = np.split(np.argsort(sensor, kind="stable"), ends[:-1])  # the rows of each sensor
+        for pair, own in zip(nodes, pieces, strict=True):
+            for a, node in enumerate(pair):
+                self._check_path(node, chosen[own])
+                pose[own, a] = pose_vector(node, block.extras, data.time[chosen[own]])
         first = np.cumsum([0, *map(len, starts)])
         for s, own in enumerate(pieces):
-            sensor[own] = first[s] + np.searchsorted(starts[s], data.time[chosen][own], side="right") - 1
+            sensor[own] = first[s] + np.searchsorted(starts[s], data.time[chosen[own]], side="right") - 1
         names = [name for name, _ in block.type.expand(network.dimension)]
         columns = [data.channels.index(name) for name in names]
         pick = np.ix_(chosen, columns)

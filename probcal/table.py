@@ -282,20 +282,21 @@ def _to_channel(
     value: np.ndarray, std: np.ndarray, measured: np.ndarray,
 ) -> None:  # fmt: skip
     """Convert a column to the unit of each sensor's channel, in place, and check that the sensors have it."""
-    for k, placed in enumerate(network.sensors):
-        rows = (sensor == k) & measured[:, j]
-        channel = dict(placed.type.expand(network.dimension)).get(name)
+    kinds = np.array([network.types.index(placed.type) for placed in network.sensors])[sensor]
+    for k, kind in enumerate(network.types):
+        rows = (kinds == k) & measured[:, j]
+        channel = dict(kind.expand(network.dimension)).get(name)
         if channel is None:
             if rows.any():
                 row = int(np.flatnonzero(rows)[0])
-                own = ", ".join(n for n, _ in placed.type.expand(network.dimension))
+                own = ", ".join(n for n, _ in kind.expand(network.dimension))
                 raise InputError(
-                    f'{table.where(row)} column "{name}": sensor "{placed.name}" ({placed.type.name}) has no such '
-                    f"channel, it measures {own}; leave the cell blank"
+                    f'{table.where(row)} column "{name}": sensor "{network.sensors[sensor[row]].name}" ({kind.name})'
+                    f" has no such channel, it measures {own}; leave the cell blank"
                 )
             continue
         for column, array in ((name, value), (f"{name}_std", std)):
-            array[sensor == k, j] *= factor(table, column, units.get(column), channel.unit)
+            array[kinds == k, j] *= factor(table, column, units.get(column), channel.unit)
         if isinstance(channel.noise, Bernoulli):
             wrong = np.flatnonzero(rows & ~channel.noise.check(value[:, j]))
             if len(wrong):
