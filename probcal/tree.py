@@ -102,6 +102,7 @@ class Result:
     lower: np.ndarray | None = None  # (M,) of the interval, in z; Gaussian where not given
     upper: np.ndarray | None = None
     requested: str = ""  # the method that was asked for, where another ran
+    precisions: str = "given"  # or "maximised", or "sampled"
     columns: Mapping[str, np.ndarray] = field(default_factory=dict)  # further columns (M,) of the calibration
     posterior: Mapping[str, Any] = field(default_factory=dict)  # name -> dims, values (chain, draw, ...)[, coords]
     sample_stats: Mapping[str, np.ndarray] = field(default_factory=dict)  # (chain, draw)
@@ -210,7 +211,8 @@ def build(problem: Problem, result: Result) -> xr.DataTree:
         "method": result.method, "prior": result.prior, "seed": result.seed, "approximate": result.approximate,
         "intervals": result.intervals, "settings": result.settings, "correlated": int(result.correlated),
         "interval_probability": INTERVAL, "results_version": RESULTS_VERSION,
-        "requested": result.requested or result.method,
+        "requested": result.requested or result.method, "precisions": result.precisions,
+        "motion": "used",
         "status": str(result.status), "message": result.message, "data": problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
     } | dict(result.attrs)  # fmt: skip

@@ -62,7 +62,8 @@ def synthetic(mean, sd, labels=LABELS, draws=None, truth=None, y=None, log_likel
         groups["log_likelihood"] = xr.Dataset({"y": (("chain", "draw", "datum"), log_likelihood)}, datum)
     tree = xr.DataTree.from_dict(groups)
     tree.attrs |= {"method": "EA", "prior": "ARD", "status": "converged", "message": "", "settings": "EA()",
-                   "intervals": "plug-in", "interval_probability": 0.89} | attrs  # fmt: skip
+                   "intervals": "plug-in", "interval_probability": 0.89, "approximate": "exact" if given else "Laplace",
+                   "precisions": "sampled" if given else "maximised"} | attrs  # fmt: skip
     return tree
 
 

@@ -149,7 +149,7 @@ def _evidence(methods: dict[str, xr.Dataset]) -> list[Finding]:
         return []
     best, *others = sorted(known, key=lambda name: -known[name])
     listed = ", ".join(f"{name} {known[name] - known[best]:.1f}" for name in others)
-    learnt = [name for name in known if methods[name].attrs.get("intervals", "").startswith("plug-in")]
+    learnt = [name for name in known if methods[name].attrs.get("precisions") == "maximised"]
     note = f"; that of {', '.join(learnt)} is maximised over precisions, too high beside the others" if learnt else ""
     note = note if len(learnt) < len(known) else ""
     return [Finding("evidence", best, f"log evidence is highest of {best}; in nats below it: {listed}{note}")]

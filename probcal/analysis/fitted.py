@@ -71,7 +71,7 @@ def take_up(problem: Problem, fit: xr.DataTree) -> Fitted:
     """
     if "calibration" not in fit.children or "track" not in fit.children:
         raise InputError("assess: the tree is no fit; give the problem and the DataTree that fit() returned for it")
-    if fit.attrs.get("method") == "least squares":
+    if fit.attrs.get("motion") == "left out":
         problem = problem.unlinked()
     group = fit["calibration"].to_dataset()
     if group["bias_label"].values.tolist() != list(problem.labels):

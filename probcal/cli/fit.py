@@ -61,7 +61,7 @@ def run(
     if outputs is not None and store is not None:
         with outputs.writing(tree.attrs["identity"]):
             _write(tree, outputs)
-        if "Interrupted" not in tree.attrs["message"]:
+        if not tree.attrs.get("interrupted", 0):
             remove_run(store, tree.attrs["identity"])  # its draws are in fit.nc now
     return 0 if Status(tree.attrs["status"]).settled else 1
 

@@ -117,6 +117,7 @@ def _fit(
     outcomes = [maximise(method, problem, prior, point, progress) for point in points]
     best = max(range(starts), key=lambda k: _rank(prior, outcomes[k]))
     tree_ = tree.build(problem, _result(problem, method, prior, outcomes[best], keys, seed, keep))
+    tree_.attrs["motion"] = "used" if problem is given else "left out"
     return tree.add_optima(tree_, problem, outcomes, best) if starts > 1 else tree_
 
 
@@ -191,7 +192,7 @@ def _result(
         states=[split(s) for s in drawn.states], kept=np.arange(shape[1]),
         log_likelihood=[split(a) for a in drawn.log_likelihood], replicas=[split(a) for a in drawn.replicas],
         tracks=_tracks(point, before, spread, found.covariance),
-        residuals=residuals_of(model, before, point),
+        residuals=residuals_of(model, before, point), precisions="maximised" if prior.learns else "given",
     )  # fmt: skip
 
 

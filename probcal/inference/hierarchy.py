@@ -41,11 +41,16 @@ class Hierarchy(ABC):
     group: tuple[int, ...]
 
     sweeps: ClassVar[int] = 10  # Gibbs sweeps between two draws that pay for themselves
+    by_bias: ClassVar[tuple[str, ...]] = ()  # hyper-parameters that have a value a governed bias
 
     @property
     def count(self) -> int:
         """Number of precisions."""
         return max(self.group, default=-1) + 1
+
+    def belongs(self, name: str) -> str:
+        """Whose a hyper-parameter is: of each "bias" that is governed, of each "group" of them, or of "all"."""
+        return "bias" if name in self.by_bias else "all"
 
     @abstractmethod
     def hyper(self) -> Mapping[str, dist.Distribution]:
@@ -120,6 +125,10 @@ class Known(Hierarchy):
 class Precisions(Hierarchy):
     """ARD: one precision a group with a Gamma hyper-prior; the biases are then Student-t."""
 
+    def belongs(self, name):
+        """Precisions are those of groups; where each bias is a group of its own, of the biases."""
+        return "bias" if self.group == tuple(range(len(self.learnt))) else "group"
+
     def hyper(self):
         """Precisions, (groups,)."""
         return {"alpha": dist.Gamma(self.prior.shape * jnp.ones(self.count), self.prior.rate)}
@@ -144,6 +153,8 @@ class Precisions(Hierarchy):
 class Exponentials(Hierarchy):
     """Laplace density as a Gaussian of exponential variance (Park, Casella 2008)."""
 
+    by_bias = ("variance",)
+
     def hyper(self):
         """Variances, (L,)."""
         return {"variance": dist.Exponential(0.5 * self.prior.rate**2 * jnp.ones(len(self.learnt)))}
@@ -164,6 +175,8 @@ class Exponentials(Hierarchy):
 
 class RegularisedHorseshoe(Hierarchy):
     """Half-Cauchy local and global scales, cut by a slab (Piironen, Vehtari 2017): alpha = 1/c^2 + 1/(tau lambda)^2."""
+
+    by_bias = ("local_scale",)
 
     def hyper(self):
         """Local scales (L,), global scale, slab variance; in declared scales."""
@@ -216,6 +229,8 @@ class RegularisedHorseshoe(Hierarchy):
 
 class SpikeAndSlab(Hierarchy):
     """Bernoulli-Gaussian: which biases are in, and the share of them; `posed.update_inclusions` moves the first."""
+
+    by_bias = ("included",)
 
     sweeps = 2
 

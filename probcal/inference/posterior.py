@@ -96,7 +96,7 @@ def result(
         tracks=_tracks(states, before),
         residuals=residuals_of(problem.model, before, after), lower=lower, upper=upper,
         columns=_columns(run, mixed, M), posterior=_posterior(problem, run), sample_stats=_stats(run),
-        attrs=_attrs(run), requested=run.asked.name,
+        attrs=_attrs(run), requested=run.asked.name, precisions="sampled",
     )  # fmt: skip
 
 
@@ -173,12 +173,11 @@ def _posterior(problem: Problem, run: Sampled) -> dict[str, Any]:
     }
     learnt = [labels[m] for m in run.form.hierarchy.learnt]
     for name, values in run.group("phi_").items():
-        if values.ndim == 2:
-            found[name] = ((), values)
-        elif values.shape[2] == len(learnt):
+        whose = run.form.hierarchy.belongs(name)
+        if whose == "bias":
             found[name] = (("governed_label",), values, {"governed_label": learnt})
         else:
-            found[name] = (("precision_group",), values)
+            found[name] = ((), values) if whose == "all" else (("precision_group",), values)
     if problem.levels:
         guess = np.array([level.guess for level in problem.levels])
         names = [level.label for level in problem.levels]
@@ -193,6 +192,7 @@ def _stats(run: Sampled) -> dict[str, np.ndarray]:
 def _attrs(run: Sampled) -> dict[str, Any]:
     """Numbers of the whole run."""
     found = {"seconds": run.seconds, "rope": ROPE, "frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
+    found |= {"interrupted": run.interrupted}
     if not run.method.exact:
         found["khat"] = pareto_khat(run.draws["stats_log_weight"].ravel())
     return {name: float(value) for name, value in found.items()}

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError
-from probcal.inference.hierarchy import Phi
+from probcal.inference.hierarchy import Hierarchy, Phi
 from probcal.inference.nuts import NUTS
 from probcal.inference.posed import Form, Posed, log_prior
 from probcal.inference.run import Maximiser, maximise
@@ -128,7 +128,7 @@ class _Quantity(NamedTuple):
     draws: np.ndarray  # (D,)
 
 
-def _hyper(phi: Mapping[str, Any], truth: Mapping[str, Any], learnt: int) -> dict[str, _Quantity]:
+def _hyper(phi: Mapping[str, Any], truth: Mapping[str, Any], kind: Hierarchy) -> dict[str, _Quantity]:
     """Hyper-parameters that biases share, and how many biases a spike and slab lets in."""
     found = {}
     for name, draws in phi.items():
@@ -136,9 +136,9 @@ def _hyper(phi: Mapping[str, Any], truth: Mapping[str, Any], learnt: int) -> dic
             continue
         if name == "included":
             found["biases not zero"] = _Quantity("hyper", float(np.sum(truth[name])), draws.sum(1).astype(float))
-        elif draws.ndim == 1:
+        elif kind.belongs(name) == "all":
             found[name] = _Quantity("hyper", float(truth[name]), draws)
-        elif draws.shape[1] < learnt:
+        elif kind.belongs(name) == "group":
             values = np.asarray(truth[name])
             found |= {f"{name} {g}": _Quantity("hyper", float(values[g]), draws[:, g]) for g in range(len(values))}
     return found
@@ -156,7 +156,7 @@ def _quantities(trial: Trial, found: Posterior) -> dict[str, _Quantity]:
             all_[level.label] = _Quantity("level", level.guess * float(np.exp(point.levels[h])), draws)
     sampled = found.sampled
     if sampled is not None:
-        all_ |= _hyper(found.phi, trial.phi, len(sampled.form.hierarchy.learnt))
+        all_ |= _hyper(found.phi, trial.phi, sampled.form.hierarchy)
     if points.states:
         all_ |= _middle(problem, point, points)
         args = jax.tree.map(jnp.asarray, tuple(points))
