@@ -556,6 +556,7 @@ def test_sensitivity_of_ranges_to_small_biases_is_the_predicted_one():
 # pictures and errors
 
 
+@pytest.mark.ci
 def test_pictures():
     found = bound_map(declared(finders()[1], azimuth=0.0), AREA, (9, 7))
     ax = plot_bound_map(found)

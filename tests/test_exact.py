@@ -16,7 +16,7 @@ import probcal
 from probcal.priors import Precision
 from probcal.smoothing.mode import find_mode
 
-WORLDS = [pytest.param(name, marks=pytest.mark.ci if name == "extras" else ()) for name in LINEAR]
+WORLDS = [pytest.param(name, marks=pytest.mark.ci if name in ("space", "extras") else ()) for name in LINEAR]
 FALSE_ALARM = 1e-6  # of each statistical test below, all its comparisons together
 
 
@@ -79,7 +79,7 @@ def test_evidence(name):
     assert tree.attrs["log_evidence"] == pytest.approx(exact.evidence, rel=TOLERANCE)
 
 
-@pytest.mark.parametrize("name", ["plane", "mixed"])
+@pytest.mark.parametrize("name", ["plane", pytest.param("mixed", marks=pytest.mark.ci)])
 def test_iterating_changes_nothing(name):
     """On a linear model one step reaches the mode and thirty leave it there: a datum counts once."""
     _, exact, problem, _ = solved(name)

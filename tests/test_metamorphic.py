@@ -218,6 +218,7 @@ def test_splitting_a_row_into_its_channels_changes_nothing():
     same_estimate(estimate(world.problem(split)), expected)
 
 
+@pytest.mark.ci
 def test_a_blank_row_equals_no_row():
     """Rows without values at times of their own: the epochs appear, nothing else changes."""
     world, table, expected = base("pair")
@@ -242,6 +243,7 @@ def radar_km(target, pose, *, range_offset=Bias("km", 0.01)):
     return {"range": norm(line) / 1e3 + range_offset, "azimuth": jnp.rad2deg(angle)}
 
 
+@pytest.mark.ci
 def test_units_of_a_declaration():
     """Ranges and offsets in km, angles in degrees: the same z, tracks in metres."""
     world, table, expected = base("pair")

@@ -217,6 +217,7 @@ def test_a_gauge_is_no_answer_until_anchored_as_advised(name):
 
 
 @float64
+@pytest.mark.ci
 def test_a_fit_of_free_radars_says_what_the_data_leave_open():
     problem, point, _ = free_radars()
     outcome = maximise(EA(), problem, ARD(), point, None)

@@ -252,7 +252,7 @@ SPIKE = Collapsed(draws=100, warmup=50)
 @pytest.mark.parametrize(
     ("name", "method"),
     [
-        ("plane", "collapsed"), ("plane", "swing"), ("plane", "nuts"),
+        ("plane", "collapsed"), pytest.param("plane", "swing", marks=pytest.mark.ci), ("plane", "nuts"),
         *(pytest.param(*pair, marks=pytest.mark.slow) for pair in (("mixed", "swing"), ("extras", "nuts"))),
     ],
 )  # fmt: skip
@@ -313,7 +313,8 @@ def test_what_a_spike_keeps_out_has_no_part_in_a_swing(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("chains", "draws"), [(1, 1), *(pytest.param(*n, marks=pytest.mark.slow) for n in ((1, 3), (2, 10)))]
+    ("chains", "draws"),
+    [pytest.param(1, 1, marks=pytest.mark.ci), *(pytest.param(*n, marks=pytest.mark.slow) for n in ((1, 3), (2, 10)))],
 )
 def test_a_run_of_few_draws_has_numbers_and_can_be_assessed(chains, draws):
     problem, tree, _ = fitted("plane", Collapsed(chains=chains, draws=draws, warmup=0), Gaussian())
