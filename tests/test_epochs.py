@@ -226,3 +226,28 @@ def test_the_particle_filter_of_cuthbert_takes_a_model(name):
         error = np.asarray(mine).mean(0) - np.asarray(x)
         spread = np.asarray(mine).std(0, ddof=1) / np.sqrt(len(ratio))
         assert (np.abs(error) < 5 * spread + 0.02 * np.sqrt(np.diagonal(np.asarray(P), axis1=1, axis2=2))).all()
+
+
+@pytest.mark.parametrize("name", ["mixed", "space"])
+def test_an_epoch_predicts_what_whole_trajectories_predict(name):
+    """Row by row, two-node sensors and missing rows too: the sorted predictions of both ways are one list."""
+    problem = worlds.linear(name)[0]
+    with jax.enable_x64(True):
+        model, point = problem.model, worlds.resting(problem)
+        epochs, z = model.epochs(), jnp.linspace(-1.0, 1.0, model.biases)
+        x, found = model.initial(), [[] for _ in model.blocks]
+        place = [0] * len(model.recursions)
+        order = [np.argsort(np.asarray(p.time), kind="stable") for p in model.recursions]
+        for k in range(len(epochs.time)):
+            epoch = jax.tree.map(lambda leaf, k=k: leaf[k], epochs)
+            r = int(epoch.recursion)
+            now = point.states[r][order[r][place[r]]]
+            place[r] += 1
+            x = tuple(part.at[epoch.target[r]].set(now) if s == r else part for s, part in enumerate(x))
+            for own, seen, predicted in zip(found, epoch.rows, model.predict_at(epoch, x, z), strict=True):
+                own.append(np.asarray(predicted)[np.asarray(seen.mask) > 0])
+        whole = model.predict(point._replace(z=z))
+    for mine, all_, mask in zip(found, whole, model.measured, strict=True):
+        np.testing.assert_allclose(
+            np.sort(np.concatenate(mine)), np.sort(np.asarray(all_)[np.asarray(mask) > 0]), atol=1e-12
+        )
