@@ -234,6 +234,7 @@ def test_an_epoch_predicts_what_whole_trajectories_predict(name):
     problem = worlds.linear(name)[0]
     with jax.enable_x64(True):
         model, point = problem.model, worlds.resting(problem)
+        point = point._replace(states=tuple(x + np.arange(x.size).reshape(x.shape) for x in point.states))
         epochs, z = model.epochs(), jnp.linspace(-1.0, 1.0, model.biases)
         x, found = model.initial(), [[] for _ in model.blocks]
         place = [0] * len(model.recursions)

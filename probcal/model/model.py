@@ -283,6 +283,7 @@ class Model(Stepwise):
     def epochs(self, sizes: tuple[int, ...] | None = None) -> Epoch:
         """The epochs of all targets in time order, stacked (K leading), for filters that scan over them.
 
+        All rows of a target that never moves stand at its first epoch.
         The rows of each block are padded to `sizes`, by default to the most that an epoch has. Raises `InputError`
         where an epoch has more.
         """
