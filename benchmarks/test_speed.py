@@ -18,10 +18,10 @@ import pytest
 
 from probcal import ARD, EMEA, Bias, ConstantVelocity, Drift, Network, Node, Problem, fit, study
 from probcal.analysis import next_passes, observability
-from probcal.inference.run import maximise
+from probcal.inference.run import Context, maximise
 from probcal.priors import Precision
 from probcal.sensors import radar
-from probcal.smoothing.information import laplace
+from probcal.smoothing.linearised import laplace
 from probcal.smoothing.mode import Point, find_mode
 from probcal.smoothing.start import automatic_start, project, track_mode
 
@@ -114,8 +114,8 @@ def test_fifty_em_ea_iterations_of_c1(benchmark):
     problem, _ = radars.setting(0, 0.3, "C1")
     with jax.enable_x64(True):
         start = automatic_start(problem)
-        method = EMEA(iterations=50)
-        benchmark(lambda: jax.block_until_ready(maximise(method, problem, ARD(), start, None).point.z))
+        method, context = EMEA(iterations=50), Context(jax.random.key(0))
+        benchmark(lambda: jax.block_until_ready(maximise(method, problem, ARD(), start, context)[0].point.z))
 
 
 def test_one_smoothing_pass_of_c1(benchmark):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from probcal.lazy import lazy
 
 if TYPE_CHECKING:
-    from probcal import noise, priors, sensors
+    from probcal import motion, noise, priors, sensors
     from probcal.analysis import (
         assess,
         bound_map,
@@ -28,7 +28,10 @@ if TYPE_CHECKING:
         NUTS,
         SVI,
         Collapsed,
+        Cubature,
+        Extended,
         LeastSquares,
+        Unscented,
         coverage_table,
         fit,
         log_evidence,
@@ -53,10 +56,12 @@ if TYPE_CHECKING:
     from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
     from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
     from probcal.problem import Problem
+    from probcal.results.build import add_scores
+    from probcal.results.io import load, save
+    from probcal.results.read import outliers, summary
     from probcal.sensor import Bias, Channel, Drift, Sensor, SensorType, sensor
     from probcal.simulate import Simulation, Truth, simulate
     from probcal.table import read_table
-    from probcal.tree import load, outliers, save, summary
 
 __all__ = lazy(
     __name__,
@@ -68,8 +73,8 @@ __all__ = lazy(
         "probcal.diagnostics": "drift_table scores",
         "probcal.errors": "FitError InputError",
         "probcal.inference": (
-            "EA EM EMEA MAP NUTS SVI Collapsed LeastSquares coverage_table fit log_evidence numpyro_model "
-            "sbc study track"
+            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares Unscented coverage_table fit "
+            "log_evidence numpyro_model sbc study track"
         ),
         "probcal.motion": (
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"
@@ -82,7 +87,9 @@ __all__ = lazy(
         "probcal.sensor": "Bias Channel Drift Sensor SensorType sensor",
         "probcal.simulate": "Simulation Truth simulate",
         "probcal.table": "read_table",
-        "probcal.tree": "load outliers save summary",
+        "probcal.results.build": "add_scores",
+        "probcal.results.io": "load save",
+        "probcal.results.read": "outliers summary",
     },
-    submodules="noise priors sensors",
+    submodules="motion noise priors sensors",
 )

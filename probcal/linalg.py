@@ -1,5 +1,7 @@
 """The only place that factorises: small triangular factors for the recursion, dense ones for the biases."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
@@ -144,9 +146,11 @@ def inverse_and_logdet(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     return inverse.T @ inverse, 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower)))
 
 
-def inverse_diagonal(matrix: jax.Array) -> jax.Array:
-    """Diagonal of the inverse of a symmetric positive definite matrix."""
-    return jnp.sum(factor_and_inverse(matrix)[1] ** 2, 0)
+def log_normal(residual: jax.Array, root: jax.Array) -> jax.Array:
+    """Log density of a residual (n,) whose covariance is root @ root.T, by its root (n, m)."""
+    lower, inverse = factor_and_inverse(root @ root.T)
+    white = inverse @ residual
+    return -0.5 * jnp.sum(white**2) - (jnp.sum(jnp.log(jnp.diagonal(lower))) + 0.5 * len(white) * math.log(2 * math.pi))
 
 
 def factor(matrix: jax.Array) -> jax.Array:

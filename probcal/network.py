@@ -10,10 +10,11 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.geometry import slopes
 from probcal.labels import AXES
-from probcal.sensor import VECTORS, Bias, Drift, Sensor, SensorType
+from probcal.sensor import Bias, Drift, Sensor, SensorType
 
 POSE_UNITS = {"position": "m", "heading": "rad", "pitch": "rad", "roll": "rad", "clock": "m", "time_offset": "s"}
 ANGLES = ("heading", "pitch", "roll")
+MOVING = ("velocity", "acceleration")  # what the path of a node says
 Spread = float | Bias
 
 
@@ -58,7 +59,8 @@ class Path:
 class Node:
     """A mast, a box in the grass, a robot: a stated pose and further components (`clock`, ...), some biased.
 
-    position (d,) in m, heading (pitch, roll) in rad, or a known `path`; extras such as `gain=0.0` are numbers. `clock`
+    position (d,) in m, heading (pitch, roll) in rad, or a known `path`; extras such as `gain=0.0` are numbers, or
+    vectors (d,) where a sensor type declares them so (`vectors=("boresight",)`), with a bias an axis. `clock`
     is in m (time times speed), `time_offset` in s: the node's rows were measured so much after their stated time.
     `survey` and `scale` give standard deviations by component (a bare number means the position; a `Bias` may
     carry the unit of a clock or an extra): `survey` is how well the stated value is known, `scale` is governed by
@@ -74,7 +76,7 @@ class Node:
         survey: Spread | Mapping[str, Spread] | None = None,
         scale: Spread | Mapping[str, Spread] | None = None,
         path: Path | None = None,
-        **components: float,
+        **components: Any,
     ):
         self.name = str(name)
         self.path = path
@@ -84,16 +86,21 @@ class Node:
         if stated.shape not in ((2,), (3,)) or not np.isfinite(stated).all():
             raise InputError(f'node "{name}": position must be 2 or 3 finite numbers, got {position!r}')
         self.position = stated
-        self.components = dict.fromkeys(("heading", "pitch", "roll", "clock", "time_offset"), 0.0) | components
+        own = dict.fromkeys(("heading", "pitch", "roll", "clock", "time_offset"), 0.0)
+        self.components: dict[str, Any] = own | components
         self.components["heading"] = heading
-        for vector in set(VECTORS) & set(components):
+        for vector in set(MOVING) & set(components):
             raise InputError(
-                f'node "{name}": {vector} cannot be stated, extras are numbers;'
-                " a moving node takes its velocity from path=Path(...)"
+                f'node "{name}": {vector} cannot be stated; a moving node takes its velocity from path=Path(...)'
             )
-        for component, stated_value in self.components.items():
-            if not np.isfinite(stated_value):
-                raise InputError(f'node "{name}": {component} must be a finite number, got {stated_value!r}')
+        for component, value in self.components.items():
+            if np.shape(value) == stated.shape and component not in own:
+                self.components[component] = np.asarray(value, float)
+            if np.shape(value) not in ((), () if component in own else stated.shape) or not np.isfinite(value).all():
+                raise InputError(
+                    f'node "{name}": {component} must be a finite number, got {value!r}'
+                    + ("" if component in own else f", or {len(stated)} of them, one an axis")
+                )
         self.spread: dict[str, tuple[str, Bias]] = {}
         for kind, given in (("survey", survey), ("scale", scale)):
             entries: Mapping[str, Spread] = (
@@ -129,6 +136,15 @@ class Node:
     def dimension(self) -> int:
         """Number of coordinates."""
         return len(self.position)
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The components as numbers, a vector once for each axis (`boresight_x`)."""
+        found: dict[str, float] = {}
+        for name, value in self.components.items():
+            axes = [name] if np.ndim(value) == 0 else [f"{name}_{axis}" for axis in AXES[: len(value)]]
+            found |= dict(zip(axes, np.atleast_1d(value).tolist(), strict=True))
+        return found
 
 
 @dataclass(frozen=True)
@@ -251,8 +267,9 @@ class Network:
             for component, (kind, bias) in node.spread.items():
                 if component not in read:
                     raise InputError(f'node "{node.name}": {component} has a {kind}, but none of its sensors reads it')
-                for axis in range(self.dimension if component == "position" else 1):
-                    suffix = f"_{AXES[axis]}" if component == "position" else ""
+                vector = component == "position" or np.ndim(node.components[component]) > 0
+                for axis in range(self.dimension if vector else 1):
+                    suffix = f"_{AXES[axis]}" if vector else ""
                     label = f"{node.name}.{component}{suffix}"
                     record = BiasRecord(label, bias.unit, bias.scale, 0.0, kind, node.name, component, axis)
                     records += [record, *record.steps(bias.drift)]

@@ -371,6 +371,12 @@ def write_nodes(
 def _stated(nodes: Iterable[Node]) -> list[_Record]:
     records = []
     for node in nodes:
+        for component, value in node.components.items():
+            if np.ndim(value):
+                raise InputError(
+                    f'node "{node.name}" states {component} as a vector, which a file of nodes does not hold; keep such'
+                    " nodes in Python"
+                )
         further = {f"{kind}_{component}": bias.scale for component, (kind, bias) in node.spread.items()}
         units = {component: bias.unit for component, (_, bias) in node.spread.items()}
         if node.path is None and not any(bias.drift for _, bias in node.spread.values()):

@@ -102,6 +102,10 @@ class _Prior:
         """Negative log density of each z whose precision this prior governs, up to a constant, (M,)."""
         return 0.5 * alpha * z**2
 
+    def log_hyper(self, alpha: jax.Array, group: jax.Array) -> jax.Array:
+        """Log density of the log precisions that are learnt, up to a constant: with the evidence what is maximised."""
+        return jnp.zeros(())
+
 
 @dataclass(frozen=True)
 class Flat(_Prior):
@@ -171,6 +175,12 @@ class ARD(_Prior):
         names = [member[self.by] for member in members]
         order = {name: k for k, name in enumerate(dict.fromkeys(names))}
         return np.array([order[name] for name in names], int)
+
+    def log_hyper(self, alpha: jax.Array, group: jax.Array) -> jax.Array:
+        """(shape - 1) log alpha - rate alpha of each precision, whose maximum with the evidence `learn` seeks."""
+        M = alpha.shape[0]
+        members = jax.ops.segment_sum(jnp.ones(M), group, M)[group]
+        return jnp.sum(((self.shape - 1) * jnp.log(alpha) - self.rate * alpha) / members)
 
     def learn(self, gamma: jax.Array, variance: jax.Array, z: jax.Array, group: jax.Array, rule: str) -> jax.Array:
         """New precisions (M,): `mackay` solves gamma = alpha z^2 (Paper B 25), `em` the expectation (Paper C 40)."""

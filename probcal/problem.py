@@ -16,19 +16,29 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.model.epochs import Epoch, merged
 from probcal.model.model import Model, Recursion
-from probcal.model.rows import Block, Layout, Rows, addresses, make_block, pose_entries, pose_vector
+from probcal.model.motions import (
+    DIFFUSE,
+    Area,
+    LevelRecord,
+    Levels,
+    chain,
+    channel_levels,
+    form_of,
+    linear_of,
+    start_of,
+)
+from probcal.model.rows import Block, Rows, addresses, make_block, pose_entries, pose_vector
+from probcal.model.sampled import Sampled
 from probcal.model.variants import aligned
-from probcal.motion import Motion, Static, Target, White, as_motion
+from probcal.motion import Layout, LinearMotion, Static, Target, White, as_motion, labels_of
 from probcal.network import BiasRecord, Network, Node
-from probcal.noise import Bernoulli, Level, Unknown, guess_of
-from probcal.sensor import VECTORS, Sensor
+from probcal.noise import Bernoulli, guess_of
+from probcal.sensor import Sensor
 from probcal.table import Measurements, Table, factor, header, measure, read_table
 from probcal.types import float64
 
 if TYPE_CHECKING:
     import pandas as pd
-
-DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,16 +54,6 @@ class Epochs:
     def position(self) -> tuple[int, int]:
         """First and last (excluded) state entry of the position."""
         return next((start, stop) for name, start, stop, _ in self.layout if name == "position")
-
-
-@dataclass(frozen=True)
-class LevelRecord:
-    """One unknown noise level: label, unit, guess and the factor within which it is known."""
-
-    label: str
-    unit: str
-    guess: float
-    factor: float
 
 
 class Problem:
@@ -108,6 +108,7 @@ class Problem:
 
     def unlinked(self) -> Problem:
         """The same problem without motion: the state of every epoch is free, but for known and static targets."""
+        check_linear(self)
         names = self.measurements.target_names
         motion = {name: self._unlinked(name, self.target(name)) for name in names}
         return Problem(self.network, motion, self.measurements.table, fix=self.fixed)
@@ -116,21 +117,25 @@ class Problem:
         """Each component that links epochs replaced by one drawn anew, as wide as an undeclared start."""
         time = self.measurements.time[self.measurements.target == self.measurements.target_names.index(name)]
         free: list[Any] = []
-        motion = as_motion(target.motion)
-        for component in motion.components:
+        for component in linear_of(as_motion(target.motion)):
             if component.memoryless or isinstance(component, Static):
                 free.append(component)
                 continue
-            mean, std = self._start(name, component, Target(motion), motion, time)
+            mean, std = start_of(name, component, Target(target.motion), time, self.area)
             row = 0
             for part, per_axis in component.names():
                 width = self.network.dimension if per_axis else 1
                 wide = max(std[row], guess_of(component.std) * np.sqrt(np.ptp(time)))
-                wide = wide if part in VECTORS else DIFFUSE * wide
+                wide = wide if per_axis else DIFFUSE * wide
                 free.append(White(part, "", wide, mean[row : row + width] if per_axis else mean[row], per_axis))
                 row += width
         kept = {part for c in free if isinstance(c, Static) for part, _ in c.names()}
-        return Target(Motion(tuple(free)), {part: pair for part, pair in target.start.items() if part in kept})
+        return Target(LinearMotion(tuple(free)), {part: pair for part, pair in target.start.items() if part in kept})
+
+    @property
+    def area(self) -> Area:
+        """Where a target starts of which nothing is stated."""
+        return Area(self.network.dimension, self.node_positions.mean(0), self.extent)
 
     @property
     def extent(self) -> float:
@@ -221,8 +226,9 @@ class Problem:
             )
         other._compile(last)
         names = [list(dict.fromkeys(e.target)) for e in self.epochs]
-        own = {e.layout: (r, list(dict.fromkeys(e.target))) for r, e in enumerate(other.epochs)}
-        pairs = [own.get(e.layout) for e in self.epochs]
+        forms = [list(zip((e.layout for e in p.epochs), p.model.sampled, strict=True)) for p in (self, other)]
+        own = {form: (r, list(dict.fromkeys(other.epochs[r].target))) for r, form in enumerate(forms[1])}
+        pairs = [own.get(form) for form in forms[0]]
         targets = [[mine.index(n) for n in pair[1]] if pair else [] for mine, pair in zip(names, pairs, strict=True)]
         found = aligned(self.model, other.model, [pair[0] if pair else None for pair in pairs], targets)
         return merged(found, self.model.rows, self.model.sizes if sizes is None else sizes)
@@ -232,18 +238,18 @@ class Problem:
         data = self.measurements
         targets = {name: self.target(name) for name in data.target_names}
         motions = {name: as_motion(target.motion) for name, target in targets.items()}
+        levels, area = Levels(self.levels if begun else ()), self.area
+        forms: dict[tuple[Layout, Sampled | None], list[str]] = {}
         for name, motion in motions.items():
-            if "position" not in {component for component, *_ in motion.layout(self.network.dimension)}:
+            layout, sampled = form_of(name, motion, levels, self.network.dimension)
+            if "position" not in {component for component, *_ in layout}:
                 raise InputError(f'target "{name}": the motion has no position; add ConstantVelocity(std) or Static()')
-        levels = _Levels(self.levels if begun else ())
-        layouts: dict[Layout, list[str]] = {}
-        for name, motion in motions.items():
-            layouts.setdefault(motion.layout(self.network.dimension), []).append(name)
+            forms.setdefault((layout, sampled), []).append(name)
         recursions: list[Any] = []
         self.epochs: list[Epochs] = []
         epoch_of = np.zeros(len(data.time), int)
         recursion_of = np.zeros(len(data.time), int)
-        for r, (layout, names) in enumerate(layouts.items()):
+        for r, ((layout, _), names) in enumerate(forms.items()):
             parts: list[Any] = []
             offset = 0
             times: list[np.ndarray] = []
@@ -251,22 +257,22 @@ class Problem:
             for name in names:
                 rows = data.target == data.target_names.index(name)
                 time = np.unique(data.time[rows])
-                if motions[name].static and name not in begun:
+                if getattr(motions[name], "static", False) and name not in begun:
                     time = time[:1]
                 else:
                     epoch_of[rows] = np.searchsorted(time, data.time[rows])
                 epoch_of[rows] += offset
                 recursion_of[rows] = r
                 offset += len(time)
-                chain = self._chain(name, targets[name], motions[name], time, levels, begun.get(name))
+                arrays = chain(name, targets[name], time, levels, begun.get(name), area)
                 first = np.arange(len(time)) == (0 if name not in begun else -1)
                 dt = np.diff(time, prepend=begun.get(name, time[0]))
-                parts.append((*chain, time, dt, first, np.full(len(time), len(times))))
+                parts.append((*arrays, time, dt, first, np.full(len(time), len(times))))
                 times.append(time)
                 owners.append(np.full(len(time), name))
             columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
             recursions.append(Recursion(*columns))
-            components = motions[names[0]].labels(self.network.dimension)
+            components = labels_of(layout, self.network.dimension)
             self.epochs.append(Epochs(np.concatenate(times), np.concatenate(owners), layout, components))
         blocks: list[Block] = []
         rows_of: list[Any] = []
@@ -274,18 +280,21 @@ class Problem:
         self.row_index: list[np.ndarray] = []  # rows of the table behind each block
         self.columns: list[tuple[str, ...]] = []  # their channels
         for kind in self.network.types:
-            channel_levels = _channel_levels(kind, self.network.dimension, levels)
+            level_of = channel_levels(kind, self.network.dimension, levels)
             for r, epochs in enumerate(self.epochs):
                 chosen = self._rows_of(kind, recursion_of == r)
                 if len(chosen):
                     block = make_block(self.network, kind, epochs.layout)
                     blocks.append(block)
-                    rows_of.append(Rows(**self._rows(block, chosen, epoch_of[chosen], channel_levels)))
+                    rows_of.append(Rows(**self._rows(block, chosen, epoch_of[chosen], level_of)))
                     recursion_index.append(r)
                     self.row_index.append(chosen)
                     self.columns.append(tuple(name for name, _ in kind.expand(self.network.dimension)))
         self.levels = tuple(levels.records)
-        driven = any((r.level >= 0).any() for r in recursions)
+        sampled_of_each = tuple(sampled for _, sampled in forms)
+        driven = any((r.level >= 0).any() for r in recursions) or any(
+            number >= 0 for sampled in sampled_of_each if sampled is not None for *_, number in sampled.levels
+        )
         spread: Any = np.array([np.log(level.factor) for level in self.levels])
         recursions = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in recursions]
         rows_of = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in rows_of]
@@ -298,6 +307,7 @@ class Problem:
                 driven,
                 tuple(len(dict.fromkeys(epochs.target)) for epochs in self.epochs),
                 all(bool((np.linalg.slogdet(part.L)[0] != 0).all()) for part in recursions),
+                sampled_of_each,
                 tuple(recursions),
                 tuple(rows_of),
                 spread,
@@ -309,74 +319,13 @@ class Problem:
         ours = [k for k, placed in enumerate(self.network.sensors) if placed.type == kind]
         return np.flatnonzero(inside & np.isin(self.measurements.sensor, ours))
 
-    def _chain(
-        self, name: str, target: Target, motion: Motion, time: np.ndarray, levels: _Levels, before: float | None
-    ) -> tuple[np.ndarray, ...]:
-        """Arrays of one target's epochs: F, L, level, drift; it begins at the first, or goes on from a time before."""
-        d = self.network.dimension
-        n, epochs = motion.size(d), len(time)
-        F, L = np.zeros((epochs, n, n)), np.zeros((epochs, n, n))
-        level, drift = np.full((epochs, n), -1), np.zeros((epochs, n))
-        dt = np.diff(time, prepend=time[0] if before is None else before)
-        row = column = 0
-        for component in motion.components:
-            transition, factor = component.transition(dt, d), component.noise_factor(dt, d)
-            size, width = factor.shape[1:]
-            here, noise = slice(row, row + size), slice(column, column + width)
-            F[:, here, here] = transition
-            L[:, here, noise] = factor * guess_of(component.std)
-            level[:, noise] = levels.of(component.std, f"motion.{component.driven}_std", "")
-            try:
-                drift[:, here] = component.means(time, d)
-            except InputError as error:
-                raise InputError(f'target "{name}": {error}') from None
-            if not component.memoryless and before is None:
-                F[0, here, here], drift[0, here] = 0.0, 0.0
-                L[0, here, :], level[0, noise] = 0.0, -1
-                mean, std = self._start(name, component, target, motion, time)
-                drift[0, here] = mean
-                L[0, here, here] = np.diag(std)
-            row, column = row + size, column + size
-        if before is None:
-            F[0] = 0.0
-        return F, L, level, drift
-
-    def _start(
-        self, name: str, component: Any, target: Target, motion: Motion, time: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Start mean and standard deviation of a component: declared, its own, or wide."""
-        d, extent = self.network.dimension, self.extent
-        duration = float(np.ptp(time)) or 1.0
-        pace, wander = DIFFUSE * extent / duration, guess_of(component.std) * np.sqrt(duration)
-        bent = component.driven == "acceleration"
-        wide = {
-            "position": (self.node_positions.mean(0), DIFFUSE * extent),
-            "velocity": (0.0, pace + wander * (duration if bent else 1.0)),
-            "acceleration": (0.0, pace / duration + wander),
-        }
-        given = wide | component.start() | dict(target.start)
-        means, stds = [], []
-        for part, per_axis in component.names():
-            if part not in given:
-                raise InputError(
-                    f'target "{name}": state the start of "{part}", Target(motion, start={{"{part}": (mean, std)}})'
-                )
-            width = d if per_axis else 1
-            mean, std = given[part]
-            try:
-                means.append(np.broadcast_to(np.asarray(mean, float), (width,)))
-            except ValueError:
-                raise InputError(f'target "{name}": the start mean of "{part}" must have {width} value(s)') from None
-            stds.append(np.full(width, float(std)))
-        return np.concatenate(means), np.concatenate(stds)
-
-    def _rows(self, block: Block, chosen: np.ndarray, epoch: np.ndarray, channel_levels: list[int]) -> dict[str, Any]:
+    def _rows(self, block: Block, chosen: np.ndarray, epoch: np.ndarray, level_of: list[int]) -> dict[str, Any]:
         """Numbers of a block of rows, by the names of `Rows`."""
         data, network = self.measurements, self.network
         ours = [k for k, placed in enumerate(network.sensors) if placed.type == block.type]
         sensor = np.searchsorted(ours, data.sensor[chosen])
         nodes = [network.sensors[k].nodes for k in ours]
-        entries = pose_entries(network.dimension, block.extras)
+        entries = pose_entries(block.type, network.dimension)
         pose = np.zeros((len(chosen), block.type.arity, len(entries)))
         local, starts = self._local(block, ours)
         ends = np.cumsum(np.bincount(sensor, minlength=len(ours)))
@@ -407,7 +356,7 @@ class Problem:
             y=np.where(data.measured[pick], data.value[pick], 0.0),
             mask=data.measured[pick].astype(float),
             std=std,
-            level=np.where(own, -1, np.asarray(channel_levels)),
+            level=np.where(own, -1, np.asarray(level_of)),
         )  # fmt: skip
 
     def _check_path(self, node: Node, rows: np.ndarray) -> None:
@@ -427,7 +376,7 @@ class Problem:
         """
         constant = {(b.owner, b.component, b.axis): b for b in self.network.biases if b.since is None}
         number = {label: m for m, label in enumerate(self.labels)}
-        entries = pose_entries(self.network.dimension, block.extras)
+        entries = pose_entries(block.type, self.network.dimension)
         records: list[list[BiasRecord | None]] = []
         starts = []
         for k in ours:
@@ -447,36 +396,14 @@ class Problem:
         return {"bias": bias, "scale": scale, "base": base}, starts
 
 
-class _Levels:
-    """Collects unknown noise levels; equal declarations under one label are one level."""
-
-    def __init__(self, records: Iterable[LevelRecord] = ()) -> None:
-        self.records: list[LevelRecord] = list(records)
-
-    def of(self, level: Level, label: str, unit: str) -> int:
-        """Number of the level, -1 where it is known."""
-        if not isinstance(level, Unknown):
-            return -1
-        twins = [other for other in self.records if other.label.split("#")[0] == label]
-        for k, other in enumerate(twins):
-            if (other.guess, other.factor) == (level.guess, level.factor):
-                return self.records.index(twins[k])
-        name = f"{label}#{len(twins) + 1}" if twins else label
-        self.records.append(LevelRecord(name, unit, level.guess, level.factor))
-        return len(self.records) - 1
-
-
-def _channel_levels(kind: Any, dimension: int, levels: _Levels) -> list[int]:
-    """Level number of each scalar channel of a type; a channel declared per axis has one level."""
-    numbers = []
-    for name, channel in kind.channels.items():
-        level = (
-            -1
-            if isinstance(channel.noise, Bernoulli)
-            else levels.of(channel.std, f"{kind.name}.{name}_std", channel.unit)
-        )
-        numbers += [level] * (dimension if channel.per_axis else 1)
-    return numbers
+def check_linear(problem: Problem) -> None:
+    """Raise `InputError` naming target and motion where one has no linear form, which Gaussian methods need."""
+    for epochs, sampled in zip(problem.epochs, problem.model.sampled, strict=True):
+        if sampled is not None:
+            raise InputError(
+                f'target "{epochs.target[0]}" moves by {type(sampled.others[0]).__name__}, which has no linear form, as'
+                " Gaussian methods need it; take motions such as ConstantVelocity(std), or particles on problem.model"
+            )
 
 
 def _fixed(network: Network, fix: Mapping[str, float] | Iterable[str]) -> dict[str, float]:

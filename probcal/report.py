@@ -17,8 +17,8 @@ from matplotlib.axes import Axes
 from probcal import plots
 from probcal.diagnostics import drift_table
 from probcal.files import write_whole
+from probcal.results.read import outliers
 from probcal.status import INVALID, Status
-from probcal.tree import outliers
 
 NONE = "–"  # where there is no finite number
 EXTRA = {"r_hat": "r_hat", "ess_bulk": "ess bulk", "ess_tail": "ess tail", "ess": "ess"}  # of samplers

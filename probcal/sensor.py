@@ -2,7 +2,7 @@
 
 import hashlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
@@ -17,7 +17,7 @@ from probcal.labels import AXES
 from probcal.noise import Bernoulli, Family, Gaussian, Level, check_level
 from probcal.types import PoseView, TargetView
 
-VECTORS = ("position", "velocity", "acceleration", "moment")  # components with one value an axis
+VECTORS = ("position", "velocity", "acceleration", "moment")  # have one value an axis without being declared so
 PERIODS = {"rad": 2 * np.pi, "deg": 360.0}
 
 
@@ -127,7 +127,7 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class SensorType:
-    """A declared sensor type; `on(node)` places one, `on(a, b)` places a two-node sensor."""
+    """A declared sensor type; `on(node)` places one, `on(a, b, ...)` one that uses several nodes."""
 
     name: str
     function: Callable[..., Mapping[str, Any]]
@@ -137,6 +137,7 @@ class SensorType:
     target_components: frozenset[str]  # what the function reads; "at" where it extrapolates
     pose_components: frozenset[str]
     dimensions: tuple[int, ...]  # those in which the function works
+    vectors: frozenset[str] = frozenset(VECTORS)  # components of targets and poses with one value an axis
 
     @cached_property
     def fingerprint(self) -> str:
@@ -159,7 +160,7 @@ class SensorType:
         """Digest of what the function computes in 2-D or 3-D."""
 
         def stated(names: set[str]) -> dict[str, jax.ShapeDtypeStruct]:
-            return {n: jax.ShapeDtypeStruct((dimension,) if n in VECTORS else (), float) for n in sorted(names)}
+            return {n: jax.ShapeDtypeStruct((dimension,) if n in self.vectors else (), float) for n in sorted(names)}
 
         moving = {"velocity", "acceleration"} if "at" in self.target_components else set()
         target = stated({"position"} | set(self.target_components) - {"at"} | moving)
@@ -220,8 +221,9 @@ class _Probe:
     `strict` answers NumPy vectors, which complain where a jax array clamps the index of an axis it lacks.
     """
 
-    def __init__(self, dimension: int, asked: set[str], strict: bool = False):
+    def __init__(self, dimension: int, asked: set[str], vectors: frozenset[str], strict: bool = False):
         self._dimension = dimension
+        self._vectors = vectors
         self._asked = asked
         self._ones = np.ones if strict else jnp.ones
 
@@ -229,7 +231,7 @@ class _Probe:
         if name.startswith("__"):
             raise AttributeError(name)
         self._asked.add(name)
-        return self._ones(self._dimension if name in VECTORS else ())
+        return self._ones(self._dimension if name in self._vectors else ())
 
     def at(self, dt: Any) -> "_Probe":
         self._asked |= {"position", "at"}
@@ -244,7 +246,9 @@ class _Probe:
         return self.turn(point)
 
 
-def _probe(function: Callable, arity: int, biases: Mapping[str, Bias]) -> tuple[Any, set[str], set[str], list[int]]:
+def _probe(
+    function: Callable, arity: int, biases: Mapping[str, Bias], vectors: frozenset[str]
+) -> tuple[Any, set[str], set[str], list[int]]:
     """Call the function on probes in 2-D, then 3-D: its channels, what it asks for, and where it works."""
     failure: Exception | None = None
     returned: Any = None
@@ -258,8 +262,10 @@ def _probe(function: Callable, arity: int, biases: Mapping[str, Bias]) -> tuple[
         def call(
             strict: bool, dimension: int = dimension, target: set[str] = target, pose: set[str] = pose
         ) -> Mapping[str, Any]:
-            poses = [_Probe(dimension, pose, strict) for _ in range(arity)]
-            return function(_Probe(dimension, target, strict), *poses, **{name: jnp.ones(()) for name in biases})
+            poses = [_Probe(dimension, pose, vectors, strict) for _ in range(arity)]
+            return function(
+                _Probe(dimension, target, vectors, strict), *poses, **{name: jnp.ones(()) for name in biases}
+            )
 
         try:
             found = jax.eval_shape(partial(call, False))
@@ -282,12 +288,19 @@ def _probe(function: Callable, arity: int, biases: Mapping[str, Bias]) -> tuple[
     return returned, target_asked, pose_asked, dimensions
 
 
-def sensor(**channels: Channel) -> Callable[[Callable[..., Mapping[str, Any]]], SensorType]:
+def sensor(
+    *, vectors: Iterable[str] = (), **channels: Channel
+) -> Callable[[Callable[..., Mapping[str, Any]]], SensorType]:
     """Declare a sensor type from a function `f(target, pose, *, bias=Bias(...))` that returns its channels.
 
-    The function sees one target and one pose (two for a two-node sensor) and returns a dict of scalars by
-    channel name; keyword-only arguments are its biases. Raises `InputError` naming function and argument.
+    The function sees one target and a pose for each of its nodes, and returns a dict of scalars by channel name;
+    keyword-only arguments are its biases. `vectors` names the components of targets and poses that have one value an
+    axis (`vectors=("wind",)`), besides position, velocity, acceleration and moment, which always do; all others are
+    numbers. Raises `InputError` naming function and argument.
     """
+    if isinstance(vectors, (str, Channel)) or not all(isinstance(name, str) for name in vectors):
+        raise InputError(f'sensor vectors={vectors!r}: give the names of components, as in vectors=("wind",)')
+    known = frozenset((*VECTORS, *vectors))
     for name, channel in channels.items():
         if not isinstance(channel, Channel):
             raise InputError(f"sensor channel {name}={channel!r}: give Channel(unit, std=...)")
@@ -307,12 +320,12 @@ def sensor(**channels: Channel) -> Callable[[Callable[..., Mapping[str, Any]]], 
             else:
                 raise InputError(f'sensor {label}: argument "*{parameter.name}" is not allowed')
         arity = len(positional) - 1
-        if arity not in (1, 2):
+        if arity < 1:
             raise InputError(
-                f"sensor {label}: the arguments are (target, pose, *, biases) or (target, pose_a, pose_b, *, biases),"
+                f"sensor {label}: the arguments are (target, pose, *, biases), with one pose for each node,"
                 f" found ({', '.join(positional)})"
             )
-        returned, target_asked, pose_asked, dimensions = _probe(function, arity, biases)
+        returned, target_asked, pose_asked, dimensions = _probe(function, arity, biases, known)
         if not isinstance(returned, Mapping) or set(returned) != set(channels):
             found = sorted(returned) if isinstance(returned, Mapping) else type(returned).__name__
             wrong = next((n for n in found if n not in channels), None) if isinstance(returned, Mapping) else None
@@ -327,6 +340,7 @@ def sensor(**channels: Channel) -> Callable[[Callable[..., Mapping[str, Any]]], 
             target_components=frozenset(target_asked),
             pose_components=frozenset(pose_asked),
             dimensions=tuple(dimensions),
+            vectors=known,
         )
 
     return declare

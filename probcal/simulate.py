@@ -17,6 +17,7 @@ from probcal.files import write_whole
 from probcal.labels import AXES
 from probcal.lazy import Later
 from probcal.model import rows
+from probcal.model.sampled import path
 from probcal.network import Network
 from probcal.noise import Bernoulli
 from probcal.problem import Epochs, Problem
@@ -259,7 +260,7 @@ def _biases(problem: Problem, share: float, given: Mapping[str, float] | None, k
 
 
 def _states(problem: Problem, r: int, tracks: Mapping[str, Any], key: jax.Array) -> np.ndarray:
-    """States (E, n) of one recursion: drawn from the motion, given components put over."""
+    """What rows read of the states (E, n) of one recursion: drawn from the motion, given components put over."""
     part, epochs = problem.model.recursions[r], problem.epochs[r]
     noise = np.asarray(jax.random.normal(jax.random.fold_in(key, r), part.drift.shape))
     F, L, drift = (np.asarray(a) for a in (part.F, part.L, part.drift))
@@ -268,6 +269,11 @@ def _states(problem: Problem, r: int, tracks: Mapping[str, Any], key: jax.Array)
     for e in range(len(noise)):
         previous = F[e] @ previous + drift[e] + L[e] @ noise[e]
         states[e] = previous
+    sampled = problem.model.sampled[r]
+    if sampled is not None:
+        seed = jax.random.fold_in(jax.random.fold_in(key, r), 1)
+        others = path(sampled, part.first, part.dt, seed, np.zeros(len(problem.levels)))
+        states = np.asarray(problem.model.vectors(r, sampled.whole(states, others)))
     count = {name: int((epochs.target == name).sum()) for name in tracks}
     frames = {
         name: _frame(track, problem.network.dimension, count[name], name)

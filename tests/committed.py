@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import probcal
+from probcal import add_scores
 
 DATA = Path(__file__).parent / "data"
 MODEL, ROWS = DATA / "small.py", DATA / "small.csv"
@@ -62,7 +63,7 @@ def make():
             found = probcal.fit(problem, method, store=folder)
         found = probcal.assess(problem, found, truth=simulation.truth)
         found.attrs["model"] = "small"
-        probcal.tree.add_scores(found, probcal.scores(found, simulation.truth), simulation.truth.biases)
+        add_scores(found, probcal.scores(found, simulation.truth), simulation.truth.biases)
         probcal.save(shortened(found, draws), DATA / f"{name}.nc")
 
 

@@ -18,6 +18,8 @@ import pytest
 from hypothesis import settings
 from xdist.scheduler import LoadFileScheduling
 
+from probcal import kernels
+
 BUDGET = 3100  # kernels of a whole default run, all workers together; a new capability pays for its own by less
 MOST_MAPS = 20_000  # memory maps of a process, which may have 65530: past them XLA fails without a word
 KERNELS = Path(__file__).parents[1] / ".pytest_cache" / "kernels"
@@ -130,3 +132,9 @@ def few_maps():
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
         jax.clear_caches()
+
+
+@pytest.fixture
+def kept_kernels(monkeypatch):
+    """No kernel is dropped inside a test that counts them, however many this process has compiled before."""
+    monkeypatch.setattr(kernels, "maps", lambda: 0)

@@ -105,6 +105,7 @@ def test_the_bound_of_a_linear_problem_is_the_inverse_hessian(name):
             close(tree["track"][f"position_rmse{s}"].values, np.sqrt((place**2).sum(1)))
 
 
+@pytest.mark.ci
 def test_the_posterior_bound_is_the_hybrid_one_and_the_prior():
     """On a linear problem, where no kind depends on where the sensors are linearised."""
     network, motion, table, _ = LINEAR["plane"]()
@@ -186,6 +187,7 @@ def test_a_bias_without_a_bound_is_named_and_left_out():
     assert (sd < [3.0, 10.0]).all()
 
 
+@pytest.mark.ci
 def test_tracks_are_taken_as_they_are_given():
     """A target without a track takes the motion; one with gaps is refused; velocities come from differences."""
     network = Network([sensors.doppler.on(Node(f"d{k}", (50.0 * k, 10.0 * k**2))) for k in range(3)])
@@ -608,6 +610,7 @@ def test_an_error_says_what_to_do(call, text):
     assert text in str(caught.value)
 
 
+@pytest.mark.ci
 def test_a_known_target_needs_no_track():
     """The bound of a bias against a reported path is that of its rows alone."""
     path = pd.DataFrame({"time": [0.0, 9.0], "position_x": [0.0, 90.0], "position_y": [50.0, 50.0]})

@@ -308,7 +308,7 @@ def tracked(motion):
 @pytest.mark.parametrize(
     ("declare", "text"),
     [
-        (lambda: Node("a", (0, 0), velocity=1.0), 'node "a": velocity cannot be stated, extras are numbers; a moving'),
+        (lambda: Node("a", (0, 0), velocity=1.0), 'node "a": velocity cannot be stated; a moving node'),
         (
             lambda: Path([0, 1], [(0, 0), (1, 1)], pitch=[0.0]),
             r"Path: time has shape \(T,\), position .* pitch and roll",

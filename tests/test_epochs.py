@@ -94,7 +94,7 @@ def test_epochs_come_in_time_order_and_hold_every_row_once():
         problem.model.epochs(sizes=(0,) * len(problem.model.blocks))
 
 
-def test_rows_that_came_later_take_the_same_kernel():
+def test_rows_that_came_later_take_the_same_kernel(kept_kernels):
     """A filter compiled for the first rows goes on, epoch by epoch, with those of a table that came after."""
     network, motion, table, fixed = worlds.mixed()
     early = table["time"] < 2.0

@@ -16,17 +16,22 @@ FLOORS = {
     1: ("sensor", "motion", "priors", "noise"),
     2: ("sensors",),
     3: ("network", "table", "nodes"),
-    4: ("model", "problem", "simulate", "tree"),
+    4: ("model", "problem", "simulate"),
     5: ("smoothing",),
-    6: ("inference", "analysis"),
-    7: ("cli", "report", "plots", "diagnostics"),
+    6: ("identifiability", "results"),
+    7: ("inference",),
+    8: ("analysis",),
+    9: ("cli", "report", "plots", "diagnostics"),
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
 METHODS = tuple(f"inference.{name}" for name in ("ea", "em", "collapsed", "nuts", "svi"))  # algorithms
 SHARED = tuple(
     f"inference.{name}"
-    for name in ("run", "sampler", "sampling", "hierarchy", "posed", "pose", "gibbs", "coordinates", "guides", "psis")
-)  # what they share: it knows none of them
+    for name in (
+        "run", "ending", "sampler", "sampling", "chains", "posterior", "hierarchy", "posed", "pose", "gibbs",
+        "coordinates", "guides", "psis",
+    )
+)  # fmt: skip  # what they share: it knows none of them
 LOW = {"jax", "numpy", "filelock"}  # third parties of floor 0, besides the standard library
 FACTORISE = {
     "cho_factor", "cho_solve", "cholesky", "eigh", "eig", "eigvalsh", "inv", "lu", "lu_factor", "lu_solve",

@@ -9,13 +9,15 @@ import pandas as pd
 import pytest
 from worlds import exact, linear, resting, ruler
 
-from probcal import ARD, Channel, ConstantVelocity, Network, Node, Problem, Unknown
+from probcal import ARD, Channel, ConstantVelocity, Network, Node, Problem, Unknown, simulate
 from probcal.inference.posterior import _bias_status
 from probcal.model.rows import noise_std
 from probcal.priors import Precision
+from probcal.sensors import doa
 from probcal.smoothing.frame import _moves, _with_levels
-from probcal.smoothing.information import at_levels, moments, predicted_variances
-from probcal.smoothing.mode import Point, cost, factors
+from probcal.smoothing.information import at_levels, update_levels
+from probcal.smoothing.linearised import linearise
+from probcal.smoothing.mode import Point, cost, factors, find_mode
 from probcal.smoothing.recursion import trajectory
 
 
@@ -88,8 +90,7 @@ def test_a_predicted_value_is_as_uncertain_as_biases_and_trajectory_make_it():
     with jax.enable_x64(True):
         model, point = problem.model, resting(problem)
         covariance = jnp.asarray(exact("plane").z[1][np.ix_(order, order)])
-        found = moments(model, point, covariance)
-        (variance,) = predicted_variances(model, point, covariance, found)
+        (variance,) = linearise(model, point).predicted_variances(covariance)
     np.testing.assert_allclose(np.asarray(variance)[np.asarray(model.rows[0].mask) > 0], expected, rtol=1e-8)
 
 
@@ -117,3 +118,47 @@ def test_levels_border_a_frame_by_differences_of_its_likelihood():
         information, score = _with_levels(*given, 2)
     np.testing.assert_allclose(information, matrix, rtol=1e-6)
     np.testing.assert_allclose(score, slope, rtol=1e-6)
+
+
+def test_what_data_determine_is_what_priors_leave():
+    """tr(H^-1 J) = tr(I - H^-1 P): leverages of the data, and what noises and biases have lost of their priors."""
+    problem, _ = linear("plane")
+    with jax.enable_x64(True):
+        prior = Precision.single(jnp.ones(problem.model.biases))
+        at = linearise(problem.model, resting(problem))
+        covariance = at.laplace(prior).covariance
+        data = sum(
+            float(np.sum(np.asarray(lin.weight) * np.asarray(own)))
+            for lin, own in zip(at.rows, at.predicted_variances(covariance), strict=True)
+        )
+        noises = sum(float(np.sum(1 - np.asarray(own))) for own in at.noise_variances(covariance))
+    biases = np.sum(1 - np.diag(np.asarray(covariance)))
+    assert data == pytest.approx(noises + biases, rel=1e-9)
+    assert noises > 1.0
+
+
+@pytest.mark.parametrize(("factor", "least", "most"), [(5.0, -1.0, -0.4), (1.1, -0.35, -0.1)])
+def test_an_unknown_level_moves_as_far_as_its_prior_lets_it(factor, least, most):
+    """One step: the data want a std half of the guess; a factor of 5 lets them, one of 1.1 holds it back."""
+    kind = replace(ruler, channels={"height": Channel("m", std=Unknown(2.0, factor))})
+    network = Network([kind.on(Node("a", (0.0, 0.0)))])
+    rng = np.random.default_rng(0)
+    heights = np.arange(40.0) + rng.standard_normal(40)
+    table = pd.DataFrame({"time": np.arange(40.0), "sensor": "a", "height": heights})
+    problem = Problem(network, ConstantVelocity(0.01), table)
+    with jax.enable_x64(True):
+        point = find_mode(problem.model, resting(problem), Precision.single(jnp.ones(1)), 30, 1e-9).point
+        stds = [np.asarray(problem.model.noise_std(jnp.full(1, level))[0]) for level in (0.0, 0.5)]
+        moved = float(jax.jit(update_levels)(problem.model, point, jnp.eye(1)).levels[0])
+    np.testing.assert_allclose(stds[1], np.exp(0.5) * stds[0])
+    assert least < moved < most
+
+
+def test_a_drawn_angle_lies_where_it_is_predicted():
+    """Bearings around a node, drawn with next to no noise: within 1e-3 rad of the predicted ones, in (-pi, pi]."""
+    finder = replace(doa, channels={"azimuth": Channel("rad", std=1e-5, wrap=True)})
+    network = Network([finder.on(Node("a", (0.0, 0.0)))])
+    angle = np.linspace(-3.0, 3.0, 9)
+    path = 10.0 * np.stack([np.cos(angle), np.sin(angle)], 1)
+    found = simulate(network, ConstantVelocity(1.0), np.arange(9.0), 0, tracks={"one": path}).table["azimuth"]
+    np.testing.assert_allclose(found, angle, atol=1e-3)

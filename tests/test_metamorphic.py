@@ -21,7 +21,7 @@ import probcal
 from probcal import Bias, Channel, sensor
 from probcal.geometry import norm
 from probcal.priors import Precision
-from probcal.smoothing.information import laplace, moments
+from probcal.smoothing.linearised import linearise
 from probcal.smoothing.mode import find_mode
 
 TOLERANCE = 1e-6  # in z, and in metres for tracks of sd near one metre
@@ -52,13 +52,9 @@ def solved(model, start):
     """Whether the mode was reached, its point, covariance and evidence, and the variance of every state."""
     alone = Precision.single(jnp.ones(model.biases))
     mode = find_mode(model, start, alone, 500, 1e-11)
-    found = laplace(model, mode.point, alone)
-    variance = [
-        jnp.einsum("eni,ij,enj->en", moment.response, found.covariance, moment.response)
-        + jnp.diagonal(moment.states, axis1=1, axis2=2)
-        for moment in moments(model, mode.point, found.covariance)
-    ]
-    return mode.converged, mode.point, found.covariance, found.evidence, variance
+    at = linearise(model, mode.point)
+    found = at.laplace(alone)
+    return mode.converged, mode.point, found.covariance, found.evidence, at.variances(found.covariance)
 
 
 def estimate(problem):

@@ -165,6 +165,7 @@ def test_numpyros_own_sampler_finds_the_exact_posterior():
     assert (np.abs(z.std(0) / sd - 1) < 5.5 / np.sqrt(effective)).all()
 
 
+@pytest.mark.ci
 def test_other_data_take_the_place_of_the_tables():
     problem = small()
     with jax.enable_x64(True):

@@ -121,6 +121,7 @@ def test_an_import_changes_no_configuration_and_allocates_no_array():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.ci
 def test_a_fit_changes_no_configuration_and_answers_in_double_precision():
     before = dict(jax.config.values)
     problem, tree = fitted(table())
@@ -162,7 +163,7 @@ def test_results_carry_more_digits_than_float32(processes):
         assert (values != values.astype(np.float32)).mean() > 0.9
 
 
-def test_other_data_of_the_same_shape_compile_nothing():
+def test_other_data_of_the_same_shape_compile_nothing(kept_kernels):
     """A kernel takes data as arguments: new numbers, and a network of the same form, reuse every trace."""
     _, first = fitted(table())
     traces = run.chunk._cache_size()

@@ -25,7 +25,8 @@ from probcal.inference.posed import Form, Posed, conditional, update_inclusions,
 from probcal.inference.posterior import mixing
 from probcal.priors import Precision
 from probcal.smoothing.frame import driving, frame_at, log_weight, place, volume
-from probcal.smoothing.information import at_levels, laplace
+from probcal.smoothing.information import at_levels
+from probcal.smoothing.linearised import laplace
 from probcal.smoothing.mode import factors, find_mode, track
 from probcal.smoothing.start import automatic_start
 

@@ -406,6 +406,7 @@ def test_a_wide_start_is_said():
 # long runs
 
 
+@pytest.mark.ci
 def test_runs_are_resumed(tmp_path):
     """An interrupted run, taken up again by other threads and for more runs, gives the same numbers."""
     problem, method = linear(), MAP()
@@ -445,13 +446,13 @@ def test_a_run_without_posterior_is_counted_apart(monkeypatch):
         return given(*arguments)
 
     module = importlib.import_module("probcal.inference.sbc")  # the name in the package is the function
-    given = module.gaussian_posterior
-    monkeypatch.setattr(module, "gaussian_posterior", fails)
+    given = module.pool_of
+    monkeypatch.setattr(module, "pool_of", fails)
     tree = sbc(linear(), MAP(), Gaussian(), 6, threads=1)
     assert tree.attrs["failed"] == 1
     assert "1 runs left no posterior and are not counted" in tree.attrs["message"]
     assert tree["run"]["run"].values.tolist() == [0, 2, 3, 4, 5]
-    monkeypatch.setattr(module, "gaussian_posterior", lambda *_: (_ for _ in ()).throw(FitError("none")))
+    monkeypatch.setattr(module, "pool_of", lambda *_: (_ for _ in ()).throw(FitError("none")))
     with pytest.raises(FitError, match="of 3 runs left no posterior: none"):
         sbc(linear(), MAP(), Gaussian(), 3)
 

@@ -41,7 +41,7 @@ from probcal.inference import identity
 from probcal.inference.fit import _check_store
 from probcal.inference.manifest import MANIFEST, remove_run, stored_run
 from probcal.inference.storage import Chunks, Records, Storage
-from probcal.tree import SEAL, SMALL, check_content
+from probcal.results.io import SEAL, SMALL, check_content
 
 RUN = {"method": "NUTS()", "seed": "1", "model": "abc"}
 
@@ -433,6 +433,7 @@ def whole():
     return fitted()
 
 
+@pytest.mark.ci
 def test_an_interrupted_fit_is_resumed_with_the_same_draws(tmp_path, whole):
     def stop(name, count, value):
         if count >= 150:
@@ -608,14 +609,14 @@ def test_what_is_no_fit_is_one_sentence(content, tmp_path):
 FULL = """
 import resource, sys
 import probcal
-from probcal import tree
+from probcal import save
 import numpy as np, xarray as xr
 big = xr.DataTree.from_dict({"a": xr.Dataset({"x": ("n", np.random.default_rng(0).standard_normal(20000))})})
 resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 import signal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 try:
-    tree.save(big, sys.argv[1])
+    save(big, sys.argv[1])
 except probcal.InputError as error:
     print(error)
 """

@@ -83,8 +83,8 @@ def test_linear_problems_are_exact():
         assert (np.abs(flat.mean(0) - mean) < ALARM * sd / np.sqrt(count)).all()
         assert (np.abs(flat.std(0) / sd - 1) < ALARM / np.sqrt(2 * count)).all()
     # no gradient where the guide is exact: it stays, and p / q is the evidence at every draw
-    np.testing.assert_allclose(run.draws["stats_log_weight"], exact.evidence, atol=1e-5)
-    np.testing.assert_allclose(run.draws["stats_elbo"][:, -1], exact.evidence, atol=1e-5)
+    np.testing.assert_allclose(run.draws.stats["log_weight"], exact.evidence, atol=1e-5)
+    np.testing.assert_allclose(run.draws.stats["elbo"][:, -1], exact.evidence, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_mean_field_is_too_narrow_where_biases_are_correlated():
     sd = np.sqrt(np.diag(exact.z[1]))
     assert (run.z.std((0, 1)) / sd).min() < 0.7
     assert (wide.z.std((0, 1)) / sd).min() > 0.75
-    bounds = [float(guide.draws["stats_log_weight"].mean()) for guide in (run, wide)]
+    bounds = [float(guide.draws.stats["log_weight"].mean()) for guide in (run, wide)]
     assert bounds[0] < bounds[1] < exact.evidence + 0.2, "a narrower family bounds the evidence less tightly"
 
 
@@ -105,15 +105,15 @@ def test_determined_biases_have_the_sds_of_nuts():
     start = automatic_start(problem)
     exact = sample(problem, NUTS(chains=2, warmup=200, draws=400), Horseshoe(), start, jax.random.key(0))
     found = sample(problem, SVI(chains=2), Horseshoe(), start, jax.random.key(1))
-    determined = exact.draws["gamma"].mean((0, 1)) > 0.5
+    determined = exact.draws.gamma.mean((0, 1)) > 0.5
     assert determined.sum() >= 2
     sd = exact.z.std((0, 1))
     assert (np.abs(found.z.std((0, 1)) / sd - 1)[determined] < 0.15).all()
     assert (np.abs(found.z.mean((0, 1)) - exact.z.mean((0, 1))) < 0.25 * sd).all()
-    assert pareto_khat(found.draws["stats_log_weight"].ravel()) < 0.7
-    bound = found.draws["stats_elbo"]
+    assert pareto_khat(found.draws.stats["log_weight"].ravel()) < 0.7
+    bound = found.draws.stats["elbo"]
     assert (bound[:, -1] > bound[:, 0] + 1.0).all()
-    np.testing.assert_allclose(bound[:, -1], found.draws["stats_log_weight"].mean(1), atol=0.5)
+    np.testing.assert_allclose(bound[:, -1], found.draws.stats["log_weight"].mean(1), atol=0.5)
 
 
 def test_what_it_refuses():

@@ -14,9 +14,10 @@ from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.pieces import Change, Pieces
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.problem import Problem
+from probcal.results.answer import Answer
+from probcal.results.groups import suffix
 from probcal.simulate import Key, Truth, as_key
 from probcal.status import INVALID, Status
-from probcal.tree import suffix
 from probcal.types import float64
 
 QUARTERS = 4
@@ -24,10 +25,13 @@ COPIES = 2000  # most biases of all pieces together
 
 
 @float64
-def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, key: Key = 0) -> xr.DataTree:
+def assess(
+    problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, key: Key = 0, answer: Answer | None = None
+) -> xr.DataTree:
     """Say what a fit is worth: a copy of its tree with further groups.
 
-    `problem` is the one that `fit` solved, `truth` is used for scoring only, `key` seeds replicas.
+    `problem` is the one that `fit` solved, `truth` is used for scoring only, `key` seeds replicas; the `answer` that
+    `calibrate` returns with the tree saves finding the point of the fit again.
 
     - `datum_check`, `epoch_check`, `channel_check`, `sensor_check`, `target_check`: innovations, and their NIS (mean
       square a datum) with limits; whiteness; posterior predictive p-values; PSIS-LOO by row; by sensor and target
@@ -40,7 +44,7 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     Refits of large networks are one step from the fit (attribute `refits` of the group). Of a misfit nothing is left
     out and no halves are compared. Raises `InputError` where the tree is no fit of the problem.
     """
-    fit = take_up(problem, tree)
+    fit = take_up(problem, tree, answer)
     with np.errstate(all="ignore" if _absurd(tree) else None):  # squares of absurd residuals overflow
         return _assessed(fit, tree, truth, as_key(key))
 
@@ -74,7 +78,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
         text = (
             f"the fit ended {tree.attrs['status']}, which is no answer: what is left of the data says nothing of them"
         )
-        kept = [f for f in findings if f.kind == "nis"] if _absurd(tree) else []
+        kept = [f for f in findings if f.kind == "wrapping" or (f.kind == "nis" and _absurd(tree))]  # likely causes
         findings = [Finding("status", "fit", text), *kept]
     scaled = scaling.power_scaling(tree) if leave.tailed(tree) else None
     if scaled is not None:

@@ -15,10 +15,10 @@ from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, 
 from probcal.errors import InputError, nearest
 from probcal.model.model import At, Model
 from probcal.problem import Problem
+from probcal.results.groups import by_epoch
 from probcal.simulate import Key, Truth, as_key
-from probcal.smoothing.information import moments_compressed
+from probcal.smoothing.linearised import Trajectory, state_variances, trajectories_of
 from probcal.smoothing.mode import Compressed, compress, eliminate_compressed
-from probcal.tree import by_epoch
 from probcal.types import float64
 
 KINDS = ("parametric", "posterior", "hybrid")
@@ -66,10 +66,11 @@ def bounds(
     if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(compressed)):
         raise InputError("bounds: a sensor is not finite at the trajectories drawn; give truth=Truth(tracks)")
     prior = np.ones(model.biases) if kind == "posterior" else problem.surveyed.astype(float)
-    information, alone = _information(model, levels, compressed, jnp.asarray(prior))
-    covariance, bounded = invert(np.asarray(information), np.asarray(alone))
-    spread = _variances(model, levels, compressed, jnp.asarray(covariance))
-    return _tree(problem, kind, len(z), covariance, bounded, [np.asarray(v) for v in spread])
+    information, trajectories = _eliminated(model, levels, compressed)
+    alone = np.diagonal(compressed.information) + prior
+    covariance, bounded = invert(np.asarray(information) + np.diag(prior), alone)
+    spread = [np.maximum(np.asarray(v), 0.0) for v in state_variances(trajectories, jnp.asarray(covariance))]
+    return _tree(problem, kind, len(z), covariance, bounded, spread)
 
 
 @jax.jit
@@ -90,13 +91,11 @@ def average(model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Arr
 
 
 @jax.jit
-def _information(
-    model: Model, levels: jax.Array, compressed: Compressed, prior: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Information (M, M) of z with a prior (M,), trajectories marginalised; and that of each with all else known."""
+def _eliminated(model: Model, levels: jax.Array, compressed: Compressed) -> tuple[jax.Array, tuple[Trajectory, ...]]:
+    """Information (M, M) of z, trajectories marginalised, and these given z."""
     noises = tuple(jnp.zeros_like(part.drift) for part in model.recursions)
     solved = eliminate_compressed(model, noises, levels, compressed)
-    return solved.information + jnp.diag(prior), jnp.diagonal(compressed.information) + prior
+    return solved.information, trajectories_of(model, levels, solved)
 
 
 def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -114,16 +113,6 @@ def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.n
     bounded = np.abs(vectors[:, lost]).max(1, initial=0.0) <= INVOLVED
     inverse = (vectors[:, ~lost] / values[~lost]) @ vectors[:, ~lost].T
     return inverse / np.outer(size, size), bounded
-
-
-@jax.jit
-def _variances(model: Model, levels: jax.Array, compressed: Compressed, covariance: jax.Array) -> list[jax.Array]:
-    """Variance (E, n) of the states of each recursion, for a covariance (M, M) of z."""
-    found = []
-    for moment in moments_compressed(model, levels, compressed, covariance):
-        own = jnp.diagonal(moment.states, axis1=1, axis2=2)
-        found.append(own + jnp.einsum("eni,ij,enj->en", moment.response, covariance, moment.response))
-    return [jnp.maximum(variance, 0.0) for variance in found]
 
 
 def _tree(

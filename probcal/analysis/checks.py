@@ -11,7 +11,7 @@ from probcal.analysis import leave, predictive, residuals
 from probcal.analysis.findings import NAMES, Finding
 from probcal.analysis.fitted import Fitted
 from probcal.analysis.verdict import RATE
-from probcal.tree import suffix
+from probcal.results.groups import suffix
 
 PRACTICAL = 1.25  # factor from 1 within which a NIS beyond its limits is no finding
 NOTABLE = 0.1  # lag-1 correlation, and mean, of innovations within which neither is

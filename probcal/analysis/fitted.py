@@ -9,32 +9,45 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from probcal import linalg, tree
+from probcal import linalg
 from probcal.errors import InputError
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
 from probcal.problem import Problem
+from probcal.results.answer import Answer
+from probcal.results.groups import datum_of, gather, suffix
 from probcal.smoothing import mode
 from probcal.smoothing.information import at_levels
+from probcal.smoothing.linearised import Linearisation
+from probcal.smoothing.linearised import linearise as linearised_at
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import follow_states, track_mode
 
 
 class Fitted(NamedTuple):
-    """A problem at a fit: the point, the prior with the precisions that the fit ended with, the rows linearised."""
+    """A problem linearised where its fit ended, and the prior with the precisions that the fit ended with."""
 
     problem: Problem
-    point: Point
+    at: Linearisation
     prior: Precision
     covariance: np.ndarray  # (M, M) of z
-    lins: Sequence[Linearised]  # with the expected information
     picks: list[Any]  # where each block keeps its data
     data: pd.DataFrame  # sensor, channel, target, time, row of every datum
 
+    @property
+    def point(self) -> Point:
+        """Where the fit ended."""
+        return self.at.point
+
+    @property
+    def lins(self) -> Sequence[Linearised]:
+        """Rows linearised there, with the expected information."""
+        return self.at.rows
+
     def flat(self, parts: Any) -> np.ndarray:
         """Arrays (..., N, C) of the blocks as one (..., data)."""
-        return tree.gather([np.asarray(part) for part in parts], self.picks)
+        return gather([np.asarray(part) for part in parts], self.picks)
 
     @property
     def readers(self) -> np.ndarray:
@@ -64,32 +77,32 @@ def linearise(model: Model, point: Point) -> tuple[Linearised, ...]:
 eliminate_rows = jax.jit(mode.eliminate_rows)
 
 
-def take_up(problem: Problem, fit: xr.DataTree) -> Fitted:
-    """The fit of a problem from its tree: biases, precisions and levels as saved, trajectories at their mode.
+def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) -> Fitted:
+    """The fit of a problem from its tree, and from the answer behind it where that is at hand.
 
-    Raises `InputError` where the tree is no fit of this problem.
+    Biases, precisions and levels are those of the tree; without an answer the trajectories are brought to their mode
+    again and the problem is linearised anew. Raises `InputError` where the tree is no fit of this problem.
     """
     if "calibration" not in fit.children or "track" not in fit.children:
         raise InputError("assess: the tree is no fit; give the problem and the DataTree that fit() returned for it")
     if fit.attrs.get("motion") == "left out":
-        problem = problem.unlinked()
+        problem = problem.unlinked() if answer is None else answer.problem
     group = fit["calibration"].to_dataset()
     if group["bias_label"].values.tolist() != list(problem.labels):
         raise InputError("assess: the tree was fitted with other free biases; give the problem as it was fitted")
-    datum, picks = tree.datum_of(problem)
+    datum, picks = datum_of(problem)
     if not np.array_equal(datum["y"], fit["observed_data"].to_dataset()["y"].values):
         raise InputError("assess: the tree was fitted to other data; give the problem as it was fitted")
     covariance = group["covariance"].values / np.outer(problem.scales, problem.scales)
-    point = _point(problem, fit)
-    lins = linearise(problem.model, point)
+    at = linearised_at(problem.model, _point(problem, fit)) if answer is None else answer.posterior.linearised
     data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
-    return Fitted(problem, point, _prior(fit, group, covariance), covariance, lins, picks, data)
+    return Fitted(problem, at, _prior(group), covariance, picks, data)
 
 
 def _point(problem: Problem, fit: xr.DataTree) -> Point:
     """Biases and levels of the tree, trajectories at their mode, searched from the saved ones."""
     track = fit["track"].to_dataset()
-    saved = [track[f"mean{tree.suffix(problem, r)}"].values for r in range(len(problem.epochs))]
+    saved = [track[f"mean{suffix(problem, r)}"].values for r in range(len(problem.epochs))]
     point = follow_states(problem, saved)
     if problem.levels:
         level = fit["level"].to_dataset()
@@ -98,16 +111,11 @@ def _point(problem: Problem, fit: xr.DataTree) -> Point:
     return track_mode(problem, point._replace(z=z))
 
 
-def _prior(fit: xr.DataTree, group: xr.Dataset, covariance: np.ndarray) -> Precision:
-    """Precisions of the tree; couplings of correlated biases are what its covariance leaves for them."""
+def _prior(group: xr.Dataset) -> Precision:
+    """The prior as saved: precisions, and couplings of correlated biases."""
     alpha = group["precision"].values
-    if not fit.attrs["correlated"]:
+    if "coupling" not in group:
         return Precision.single(jnp.asarray(alpha))
-    held, _ = linalg.inverse_and_logdet(jnp.asarray(covariance))
-    coupling = np.asarray(held) - group["information"].values - np.diag(alpha)
-    coupled = np.outer(alpha == 1, alpha == 1)  # only biases of a Gaussian known beforehand are correlated
-    coupling = np.where(coupled & (np.abs(coupling) > 1e-6), 0.5 * (coupling + coupling.T), 0.0)
-    _, whole = linalg.inverse_and_logdet(jnp.asarray(np.diag(np.where(alpha > 0, alpha, 1.0)) + coupling))
-    return Precision(
-        jnp.asarray(alpha), jnp.asarray(coupling), whole - jnp.sum(jnp.log(jnp.where(alpha > 0, alpha, 1.0)))
-    )
+    coupling, own = group["coupling"].values, np.where(alpha > 0, alpha, 1.0)
+    _, whole = linalg.inverse_and_logdet(jnp.asarray(np.diag(own) + coupling))
+    return Precision(jnp.asarray(alpha), jnp.asarray(coupling), whole - jnp.sum(jnp.log(own)))

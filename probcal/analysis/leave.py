@@ -73,7 +73,6 @@ class _Refits:
         model = fit.problem.model
         sizes = model.state_size
         self.fit, self.quick = fit, 2.0 * jobs * sizes * model.biases**2 > WORK
-        self._solved: Eliminated | None = None
 
     def run(self, out: np.ndarray | None, alpha: np.ndarray, held: np.ndarray) -> tuple[float, float]:
         """Evidence and least squares without the rows (of the table) in `out`, at precisions alpha (M,)."""
@@ -88,9 +87,7 @@ class _Refits:
             lins = linearise(frozen, point)
             solved, model = eliminate_rows(frozen, point, lins), frozen
         elif out is None:
-            if self._solved is None:
-                self._solved = eliminate_rows(model, point, lins)
-            solved = self._solved
+            solved = fit.at.solved
         else:
             lins = scaled(lins, model.measured)
             solved = eliminate_rows(model, point, lins)

@@ -10,11 +10,12 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from probcal import linalg, tree
+from probcal import linalg
 from probcal.errors import InputError, nearest
 from probcal.labels import AXES
 from probcal.model.model import At, Model
-from probcal.problem import Problem
+from probcal.problem import Problem, check_linear
+from probcal.results.read import apply
 from probcal.simulate import blank
 from probcal.smoothing.mode import compress, factors
 from probcal.types import float64
@@ -57,7 +58,7 @@ def bound_map(
     if isinstance(biases, xr.DataTree):
         if not {"calibration", "constant_data"} <= set(biases.children):
             raise InputError("bound_map: the tree of biases has no group calibration; give the result of fit()")
-        found = tree.apply(at, biases)
+        found = apply(at, biases)
         at, mean, levels = found.problem, found.z, found.levels
         variances, vectors = np.linalg.eigh(found.covariance)
         root = vectors * np.sqrt(np.maximum(variances, 0.0))
@@ -120,7 +121,8 @@ def snapshot(problem: Problem, target: str | None = None, time: float | None = N
     instant = float(problem.measurements.time.min() if time is None else time)
     rows = {"time": instant, "sensor": [s.name for s in problem.network.sensors]}
     table = blank(problem.network, pd.DataFrame(rows).assign(target=name))
-    return Problem(problem.network, motion, table, fix=problem.fixed)
+    check_linear(found := Problem(problem.network, motion, table, fix=problem.fixed))
+    return found
 
 
 @partial(jax.jit, static_argnames="span")

@@ -4,15 +4,18 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal import tree
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.analysis.verdict import narrowed
 from probcal.errors import InputError
+from probcal.identifiability.directions import marginal, weak_directions
+from probcal.identifiability.gauge import NULL, gauge
+from probcal.identifiability.remedies import WEAK
 from probcal.problem import Problem
+from probcal.results.answer import tracks_of
+from probcal.results.build import bands
+from probcal.results.groups import constant_group, datum_of, direction_group, gather, track_group
 from probcal.simulate import Truth
-from probcal.smoothing.directions import WEAK, marginal, weak_directions
-from probcal.smoothing.gauge import NULL, gauge
-from probcal.smoothing.information import Moments, leverages, marginal_information, moments
+from probcal.smoothing.linearised import Linearisation, linearise
 from probcal.smoothing.mode import Point
 from probcal.types import float64
 
@@ -36,19 +39,19 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     """
     check_free(problem)
     point = standpoint(problem, point, truth)
-    found = _information(problem, point)
+    at = linearise(problem.model, point)
+    found = _information(at)
     null = gauge(problem, point)
     directions = weak_directions(problem, found.information, point, null)
-    spread = moments(problem.model, point, jnp.asarray(found.covariance))
     groups = {
         "bias": _biases(problem, found),
         "spectrum": _spectrum(found.information),
-        **_leverage_groups(problem, point, found, spread),
-        "track": _tracks(problem, point, found.covariance, spread),
-        "constant_data": tree.constant_group(problem),
+        **_leverage_groups(problem, at, found),
+        "track": track_group(problem, bands(tracks_of(at, jnp.asarray(found.covariance)), point)),
+        "constant_data": constant_group(problem),
     }
     if directions:
-        groups["direction"] = tree.direction_group(problem.labels, directions)
+        groups["direction"] = direction_group(problem.labels, directions)
     free = ~problem.surveyed
     values = np.linalg.eigvalsh(marginal(found.information, free)) if free.any() else np.full(1, np.inf)
     result = xr.DataTree.from_dict(groups)
@@ -74,8 +77,8 @@ class Information:
         return np.clip(1.0 - np.diag(self.covariance), 0.0, 1.0)
 
 
-def _information(problem: Problem, point: Point) -> Information:
-    information = np.asarray(marginal_information(problem.model, point))
+def _information(at: Linearisation) -> Information:
+    information = np.asarray(at.information)
     if not np.isfinite(information).all():
         raise InputError(
             "observability: the rows have no finite derivatives at the start; is a target at the place of a sensor?"
@@ -110,13 +113,11 @@ def _spectrum(information: np.ndarray) -> xr.Dataset:
     return xr.Dataset({"information": ("eigenvalue", values), "share": ("eigenvalue", values / (1.0 + values))})
 
 
-def _leverage_groups(
-    problem: Problem, point: Point, found: Information, spread: list[Moments]
-) -> dict[str, xr.Dataset]:
+def _leverage_groups(problem: Problem, at: Linearisation, found: Information) -> dict[str, xr.Dataset]:
     """How many biases each datum, sensor and target determines; the motion tells the rest."""
-    parts = leverages(problem.model, point, jnp.asarray(found.covariance), spread)
-    datum, picks = tree.datum_of(problem)
-    values = tree.gather([np.asarray(part) for part in parts], picks)
+    parts = at.leverages(jnp.asarray(found.covariance))
+    datum, picks = datum_of(problem)
+    values = gather([np.asarray(part) for part in parts], picks)
     each = xr.Dataset({"leverage": ("datum", values)}, coords=datum["coords"])
     groups = {"datum": each}
     for name in ("sensor", "target"):
@@ -127,14 +128,3 @@ def _leverage_groups(
         )
     groups["target"].attrs["motion"] = max(float(found.share.sum() - values.sum()), 0.0)
     return groups
-
-
-def _tracks(problem: Problem, point: Point, covariance: np.ndarray, spread: list[Moments]) -> xr.Dataset:
-    """The trajectories at the point and the bound on their sd, biases marginalised."""
-    parts = []
-    for states, moment in zip(point.states, spread, strict=True):
-        variance = jnp.diagonal(moment.states, axis1=1, axis2=2)
-        variance = variance + jnp.einsum("eni,ij,enj->en", moment.response, covariance, moment.response)
-        mean = np.asarray(states)
-        parts.append(tree.Tracks(mean, np.sqrt(np.maximum(np.asarray(variance), 0.0)), mean))
-    return tree.track_group(problem, parts)

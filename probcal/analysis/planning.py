@@ -15,6 +15,7 @@ import xarray as xr
 
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
+from probcal.identifiability.remedies import WEAK
 from probcal.labels import AXES
 from probcal.model import variants
 from probcal.model.model import Model
@@ -22,8 +23,7 @@ from probcal.network import Network, Node
 from probcal.problem import Epochs, Problem
 from probcal.sensor import SensorType
 from probcal.simulate import Truth
-from probcal.smoothing.directions import WEAK
-from probcal.smoothing.information import marginal_information
+from probcal.smoothing.linearised import marginal_information
 from probcal.smoothing.mode import Point
 from probcal.table import Table, header
 from probcal.types import float64

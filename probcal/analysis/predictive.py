@@ -17,8 +17,8 @@ from probcal.analysis.fitted import Fitted
 from probcal.model.model import At, Model
 from probcal.model.rows import standardised
 from probcal.noise import Bernoulli, Gaussian
+from probcal.results.groups import suffix
 from probcal.smoothing.draws import draw
-from probcal.tree import suffix
 
 DRAWS = 400
 VALUES = 20_000_000  # of all states drawn
@@ -123,8 +123,7 @@ def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Drawn:
         guess = np.array([level.guess for level in problem.levels])
         levels = jnp.asarray(np.log(thin(posterior["level"].values) / guess))
     if not set(names) <= set(posterior.data_vars):
-        covariance = jnp.asarray(fit.covariance)
-        drawn, _ = draw(problem.model, fit.point, covariance, z, levels, key)
+        drawn = draw(fit.at, z, levels, key)
         return Drawn(z, levels, drawn.states, None)
     states = tuple(jnp.asarray(thin(posterior[name].values)) for name in names)
     replicas = tree["posterior_predictive"].to_dataset()["y"] if "posterior_predictive" in tree.children else None

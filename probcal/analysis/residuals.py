@@ -19,7 +19,7 @@ from probcal.analysis.fitted import Fitted
 from probcal.model.model import Data, Model
 from probcal.model.rows import Linearised, standardised
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Point, factors
+from probcal.smoothing.mode import Eliminated, Point, factors
 
 COLUMNS = 16  # bias directions that are filtered together
 LAGS = 10  # of the Ljung-Box statistic
@@ -44,11 +44,11 @@ class Innovations(NamedTuple):
 
 
 @jax.jit
-def prepare(model: Model, point: Point, lins: Sequence[Linearised]) -> list[Filter]:
+def prepare(solved: Eliminated) -> list[Filter]:
     """Covariance pass of every recursion: with U the data's responses to the whitened prediction, S = I + U U'."""
     found = []
-    for part, (J, _) in zip(model.recursions, model.of_states(lins), strict=True):
-        gain = rec.gains(part.F, factors(part, point.levels), J)
+    for kept in solved.parts:
+        J, gain = kept.J, kept.gain
         root = gain.predicted
         values, vectors = linalg.spectrum(root.mT @ J @ root)
         size = jnp.sqrt(1.0 + jnp.maximum(values, 0.0))
@@ -128,7 +128,7 @@ def innovations(fit: Fitted, kurtosis: np.ndarray) -> Filtered:
     over a share of them the trace of B (G + A)^-1 B', B their responses to the biases.
     """
     model = fit.problem.model
-    filters = prepare(model, fit.point, fit.lins)
+    filters = prepare(fit.at.solved)
     values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(fit.covariance)))
     root = vectors * np.sqrt(np.maximum(values, 0.0))  # that of few draws is singular
     chunk = min(COLUMNS, model.biases)

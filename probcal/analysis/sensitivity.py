@@ -14,7 +14,7 @@ from probcal.errors import InputError, nearest
 from probcal.model.model import At, Model
 from probcal.problem import Problem
 from probcal.simulate import Key, Truth, as_key
-from probcal.smoothing.information import moments
+from probcal.smoothing.linearised import linearise
 from probcal.smoothing.mode import Point, track
 from probcal.smoothing.start import follow_states
 from probcal.types import float64
@@ -131,9 +131,9 @@ def _first_order(model: Model, spans: Spans, true: tuple[jax.Array, ...]) -> tup
     def one(states: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
         point = Point(states, tuple(jnp.zeros_like(x) for x in states), jnp.zeros(M), levels)
         alone, gain = jnp.zeros(()), jnp.zeros(M)
-        for moment, (a, b) in zip(moments(model, point, jnp.zeros((M, M))), spans, strict=True):
-            alone = alone + jnp.sum(jnp.diagonal(moment.states, axis1=1, axis2=2)[:, a:b])
-            gain = gain + jnp.sum(moment.response[:, a:b] ** 2, (0, 1))
+        for own, (a, b) in zip(linearise(model, point).trajectories, spans, strict=True):
+            alone = alone + jnp.sum(jnp.diagonal(own.covariance, axis1=1, axis2=2)[:, a:b])
+            gain = gain + jnp.sum(own.response[:, a:b] ** 2, (0, 1))
         epochs = sum(x.shape[0] for x in states)
         return alone / epochs, gain / epochs
 

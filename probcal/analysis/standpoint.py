@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError, nearest
-from probcal.problem import Problem
+from probcal.problem import Problem, check_linear
 from probcal.simulate import Truth, on_tracks
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Point, factors
@@ -15,7 +15,8 @@ from probcal.smoothing.start import automatic_start, track_mode
 
 
 def check_free(problem: Problem) -> None:
-    """Raise `InputError` for a problem without free biases."""
+    """Raise `InputError` for a problem without free biases, or of a motion without linear form."""
+    check_linear(problem)
     if not problem.labels:
         raise InputError("every bias of the problem is fixed or none is declared; free one of them")
 
@@ -57,6 +58,7 @@ def true_point(problem: Problem, truth: Truth | None) -> tuple[jax.Array, tuple[
 
 def draw_states(problem: Problem, count: int, key: jax.Array | None) -> tuple[jax.Array, ...]:
     """Trajectories (D, E, n) of each recursion drawn from the motion, or its means where there is no key."""
+    check_linear(problem)
     found = []
     for r, part in enumerate(problem.model.recursions):
         shape = (*part.drift.shape, count)

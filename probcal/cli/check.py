@@ -14,8 +14,8 @@ from probcal.cli.models import load_problem
 from probcal.cli.progress import line
 from probcal.files import Outputs
 from probcal.problem import Problem
+from probcal.results.io import save
 from probcal.smoothing.start import automatic_start
-from probcal.tree import save
 
 MAP_CELLS = 60  # of a bound map an axis
 STATUS = {

@@ -13,8 +13,8 @@ from probcal.analysis.compare import chosen_pair, named
 from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.diagnostics import comparison_rows
 from probcal.files import Outputs
+from probcal.results.io import load, save
 from probcal.status import INVALID
-from probcal.tree import load, save
 
 
 def run(

@@ -15,10 +15,12 @@ from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import choose_prior, load_problem, load_truth
 from probcal.cli.progress import line
 from probcal.files import Outputs
-from probcal.inference import METHODS, fit
+from probcal.inference import METHODS, calibrate
 from probcal.inference.manifest import remove_run
+from probcal.results.build import add_scores
+from probcal.results.io import save
+from probcal.results.read import outliers, summary
 from probcal.status import Status
-from probcal.tree import add_scores, outliers, save, summary
 
 FINDINGS = 8  # sentences of an assessment that are printed
 LONG = 10.0  # s of a fit that is written before it is assessed
@@ -42,7 +44,7 @@ def run(
     if outputs is not None and overwrite:
         outputs.begin()
     with line() as progress:
-        tree = fit(
+        tree, answer = calibrate(
             problem, value, prior=chosen, key=seed, starts=starts, progress=progress, save=kept, store=store,
             resume=resume, overwrite=overwrite,
         )  # fmt: skip
@@ -50,7 +52,7 @@ def run(
             from probcal.analysis import assess
 
             with _safe(tree, outputs, time.perf_counter() - began > LONG):
-                tree = assess(problem, tree, truth=truth, key=seed)
+                tree = assess(problem, tree, truth=truth, key=seed, answer=answer)
     tree.attrs["model"] = model.stem
     if truth is not None:
         from probcal.diagnostics import scores

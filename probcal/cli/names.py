@@ -27,6 +27,7 @@ _SAMPLED = (*_FIXED, "ard-gamma", "horseshoe")
 METHODS = {
     "ea": Known("EA", False, _LEARNT),
     "ea-em": Known("EA", False, _LEARNT),
+    "ea-marginal": Known("EA", False, _LEARNT),
     "paper-b": Known("EA", False, _LEARNT),
     "em-ea": Known("EM-EA", False, _LEARNT),
     "em": Known("EM", False, _FIXED),

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from probcal.cli.files import report_of, say_written
 from probcal.files import Outputs
-from probcal.tree import load
+from probcal.results.io import load
 
 
 def run(path: Path, outputs: Outputs) -> int:

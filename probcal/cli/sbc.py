@@ -16,7 +16,7 @@ from probcal.inference import METHODS, sbc
 from probcal.inference.coverage import coverage_table
 from probcal.inference.sbc import short
 from probcal.priors import PRIORS
-from probcal.tree import save
+from probcal.results.io import save
 
 
 def run(

@@ -16,7 +16,7 @@ from probcal.diagnostics import grid_of, study_table
 from probcal.files import Outputs
 from probcal.inference import study
 from probcal.inference.study import choose_methods
-from probcal.tree import save
+from probcal.results.io import save
 
 
 def run(

@@ -13,8 +13,8 @@ from probcal.diagnostics import scores
 from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.inference import track
+from probcal.results.io import load
 from probcal.status import INVALID
-from probcal.tree import load
 
 
 def run(model: Path, data: Path | None, calibration: Path, outputs: Outputs) -> int:

@@ -7,25 +7,27 @@ from probcal.lazy import lazy
 if TYPE_CHECKING:
     from probcal.inference.coverage import coverage_table
     from probcal.inference.evidence import Evidence, log_evidence
-    from probcal.inference.fit import fit, track
+    from probcal.inference.fit import calibrate, fit, track
     from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, NUTS, Collapsed, LeastSquares, table
     from probcal.inference.model import numpyro_model
     from probcal.inference.run import Method
     from probcal.inference.sbc import sbc
     from probcal.inference.study import ORACLE, study
     from probcal.inference.svi import SVI
+    from probcal.smoothing.esteps import Cubature, EStep, Extended, Unscented
 
 __all__ = lazy(
     __name__,
     {
         "probcal.inference.coverage": "coverage_table",
         "probcal.inference.evidence": "Evidence log_evidence",
-        "probcal.inference.fit": "fit track",
+        "probcal.inference.fit": "calibrate fit track",
         "probcal.inference.methods": "EA EM EMEA MAP METHODS NUTS Collapsed LeastSquares table",
         "probcal.inference.model": "numpyro_model",
         "probcal.inference.run": "Method",
         "probcal.inference.sbc": "sbc",
         "probcal.inference.study": "ORACLE study",
         "probcal.inference.svi": "SVI",
+        "probcal.smoothing.esteps": "Cubature EStep Extended Unscented",
     },
 )

@@ -12,7 +12,7 @@ import numpy as np
 from probcal.fingerprint import ADDRESS, computes
 from probcal.model.rows import Block, Rows, information, log_likelihood, noise_std, weigh
 from probcal.problem import Problem
-from probcal.tree import RESULTS_VERSION
+from probcal.results.schema import RESULTS_VERSION
 
 
 def identity_of(problem: Problem, **settings: Any) -> dict[str, str]:

@@ -16,7 +16,7 @@ from probcal.inference.run import Method
 from probcal.inference.svi import SVI
 from probcal.lazy import Later
 from probcal.priors import PRIORS, BernoulliGaussian, Flat, Laplace, Prior
-from probcal.problem import Problem
+from probcal.problem import Problem, check_linear
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,6 +27,7 @@ else:
 METHODS: dict[str, tuple[Method, Prior | None]] = {
     "ea": (EA(), None),
     "ea-em": (EA(update="em", iterations=2000), None),
+    "ea-marginal": (EA(trajectory="marginal"), None),
     "paper-b": (EA(trajectory="smoothed", iterations=25), None),
     "em-ea": (EMEA(), None),
     "em": (EM(), None),
@@ -55,7 +56,8 @@ def choose_prior(method: Method, prior: Prior | None) -> Prior:
 
 
 def check_problem(problem: Problem) -> None:
-    """Raise `InputError` for a problem of a single row, without free biases or with sensors that have no rows."""
+    """Raise `InputError` for a single row, a motion that is not linear, no free biases or sensors without rows."""
+    check_linear(problem)
     source = problem.measurements.table.source
     if problem.measurements.measured.any(1).sum() < 2:
         raise InputError(f"{source} has one measured row only; a fit needs at least two")

@@ -17,7 +17,7 @@ from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
 from probcal.model import rows
 from probcal.model.rows import Block, Rows
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
-from probcal.problem import Problem
+from probcal.problem import Problem, check_linear
 from probcal.smoothing.mode import factors
 from probcal.smoothing.recursion import trajectory
 from probcal.types import float64
@@ -84,6 +84,7 @@ def numpyro_model(problem: Problem, prior: Prior | None = None) -> Callable[...,
             f"numpyro_model: {type(prior).__name__} has no density that numpyro could take; give one of"
             f" {', '.join(kind.__name__ for kind in DENSE)}, or fit BernoulliGaussian by Collapsed()"
         )
+    check_linear(problem)
     hierarchy = hierarchy_of(prior, problem)
     first = prior.precision(problem.labels, problem.surveyed)
     of, scales = problem.model, jnp.asarray(problem.scales)

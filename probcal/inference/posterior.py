@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import tree
+from probcal.inference.ending import ABSURD, FAR, misfit_sentence
 from probcal.inference.hierarchy import LEAST, MOST, SpikeAndSlab
 from probcal.inference.pose import pareto_khat
-from probcal.inference.run import ABSURD, FAR, misfit_sentence
 from probcal.inference.sampling import Sampled
 from probcal.lazy import Later
 from probcal.priors import PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
-from probcal.smoothing.directions import weak_directions
-from probcal.smoothing.draws import draws_a_chain, predictive, residuals_of
+from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_normal
+from probcal.results.schema import INTERVAL
+from probcal.smoothing.draws import draws_a_chain, predictive
 from probcal.smoothing.information import at_levels, mean_square
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import track_mode
@@ -61,42 +62,88 @@ def _both_tails(draws: np.ndarray) -> bool:
     return all(0 < (draws <= q).mean() < 1 for q in np.quantile(draws, (0.05, 0.95)))
 
 
-def result(
-    problem: Problem, prior: Prior, run: Sampled, key: jax.Array, seed: int, keep: tuple[str, ...]
-) -> tree.Result:
-    """The result of a sampler for the tree; `keep` names the draws that it holds beside those of the biases."""
-    z, levels = run.z, run.levels
-    mixed = mixing(run.draws["theta"])
-    M = run.form.biases
-    mean, mean_levels = z.mean((0, 1)), levels.mean((0, 1))
-    flat = z.reshape(-1, M)  # one draw has no spread: then its variances given the hyper-parameters
-    covariance = np.atleast_2d(np.cov(flat, rowvar=False)) if len(flat) > 1 else np.diag(run.draws["variance"][0, 0])
-    after = mean_point(problem, run)
-    before = track_mode(problem, after._replace(z=jnp.zeros_like(after.z)))
-    states = run.states
-    half = 50 * (1 - tree.INTERVAL)
-    lower, upper = np.percentile(z, [half, 100 - half], axis=(0, 1))
-    gamma = run.draws["gamma"]
-    variance = np.diag(covariance)
-    precision = np.clip((1 - gamma.mean((0, 1))) / np.maximum(variance, 1e-300), *PRECISION_BOUNDS)
-    precision = np.where(problem.surveyed | isinstance(prior, Flat), np.asarray(run.posed.first.alpha), precision)
-    information = np.asarray(run.posed.frame.information)[:M, :M]
-    status, message = judge(problem, prior, run, mixed, after)
-    kept, likelihood, replicas = _by_datum(problem, run, states, key, keep)
-    return tree.Result(
-        method=run.method.name, prior=type(prior).__name__, seed=seed,
-        approximate="exact" if run.method.exact else "variational",
-        intervals=run.method.note(), settings=f"{run.method!r}, {prior!r}",
-        correlated=bool(prior.correlation), status=status, message=message, z=mean, covariance=covariance,
-        precision=precision, gamma=gamma.mean((0, 1)), bias_status=_bias_status(problem, mixed, M),
-        information=information, evidence=None, objective=None, levels=mean_levels,
-        directions=weak_directions(problem, information, after), draws=z,
-        log_prior=_log_prior(problem, prior, run),
-        states=states if "states" in keep else [], kept=kept, log_likelihood=likelihood, replicas=replicas,
-        tracks=_tracks(states, before),
-        residuals=residuals_of(problem.model, before, after), lower=lower, upper=upper,
-        columns=_columns(run, mixed, M), posterior=_posterior(problem, run), sample_stats=_stats(run),
-        attrs=_attrs(run), requested=run.asked.name, precisions="sampled",
+@dataclass(frozen=True, eq=False)
+class Chains(Posterior):
+    """The draws of a sampler."""
+
+    run: Sampled
+
+    chained: ClassVar[bool] = True
+
+    @classmethod
+    def of(cls, problem: Problem, prior: Prior, run: Sampled, mixed: Mapping[str, np.ndarray]) -> Chains:
+        """The posterior of a run, whose quantities mixed as they did."""
+        z, M, gamma = run.z, run.form.biases, np.asarray(run.draws.gamma).mean((0, 1))
+        flat = z.reshape(-1, M)  # one draw has no spread: then its variances given the hyper-parameters
+        spread = np.asarray(run.draws.variance)[0, 0]
+        covariance = np.atleast_2d(np.cov(flat, rowvar=False)) if len(flat) > 1 else np.diag(spread)
+        half = 50 * (1 - INTERVAL)
+        lower, upper = np.percentile(z, [half, 100 - half], axis=(0, 1))
+        precision = np.clip((1 - gamma) / np.maximum(np.diag(covariance), 1e-300), *PRECISION_BOUNDS)
+        precision = np.where(problem.surveyed | isinstance(prior, Flat), np.asarray(run.posed.first.alpha), precision)
+        summary = Summary(
+            "exact" if run.method.exact else "variational", "sampled", z.mean((0, 1)), covariance, lower, upper, gamma,
+            precision, np.asarray(run.posed.frame.information)[:M, :M], run.levels.mean((0, 1)), None,
+            _columns(run, mixed, M),
+        )  # fmt: skip
+        return cls(problem, prior, mean_point(problem, run), summary, run)
+
+    @property
+    def states(self) -> Sequence[np.ndarray]:
+        """Mean states (E, n) of each recursion."""
+        return [x.mean((0, 1)) for x in self.run.states]
+
+    def tracks(self) -> Sequence[Tracks]:
+        """Mean and sd of all states."""
+        return [Tracks(x.mean((0, 1)), x.std((0, 1))) for x in self.run.states]
+
+    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
+        """The draws that were made; of data that are many, values by datum at some of them."""
+        kept, likelihood, replicas = _by_datum(self.problem, self.run, key, keep)
+        states = self.run.states if "states" in keep else []
+        return Draws(self.run.z, self.run.levels, states, kept, likelihood, replicas)
+
+    def log_prior(self, draws: Draws) -> np.ndarray | None:
+        """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
+        run = self.run
+        if isinstance(self.prior, Flat) or self.prior.correlation or isinstance(run.form.hierarchy, SpikeAndSlab):
+            return None
+        return log_normal(run.z, np.clip(_alpha(run), LEAST, MOST))
+
+    @property
+    def variables(self) -> Mapping[str, Any]:
+        """Gamma, contraction, hyper-parameters and levels of every draw."""
+        return _variables(self.problem, self.run)
+
+    @property
+    def hyper(self) -> Mapping[str, np.ndarray]:
+        """Draws of the hyper-parameters, (chain, draw, ...)."""
+        return {name: np.asarray(a) for name, a in self.run.draws.phi.items()}
+
+    @property
+    def stats(self) -> Mapping[str, np.ndarray]:
+        """Log density of every draw, and what its steps say."""
+        return {"lp": np.asarray(self.run.draws.density)} | _stats(self.run)
+
+    @property
+    def attrs(self) -> Mapping[str, float]:
+        """Seconds, the frame's worth, and the limits used."""
+        run = self.run
+        found = {"seconds": run.seconds, "rope": ROPE, "frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
+        if not run.method.exact:
+            found["khat"] = pareto_khat(_stats(run)["log_weight"].ravel())
+        return {name: float(value) for name, value in found.items()}
+
+
+def conclude_draws(problem: Problem, prior: Prior, run: Sampled) -> Answer:
+    """The answer of a sampler's run."""
+    mixed = mixing(np.asarray(run.draws.theta))
+    posterior = Chains.of(problem, prior, run, mixed)
+    status, message = judge(problem, prior, run, mixed, posterior.point)
+    ended = _bias_status(problem, mixed, run.form.biases)
+    return Answer(
+        problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
+        interrupted=run.interrupted,
     )  # fmt: skip
 
 
@@ -106,24 +153,21 @@ def mean_point(problem: Problem, run: Sampled) -> Point:
     return track_mode(problem, start._replace(z=jnp.asarray(run.z.mean((0, 1)))))
 
 
-def _tracks(states: list[np.ndarray], before: Point) -> list[tree.Tracks]:
-    parts = zip(states, before.states, strict=True)
-    return [tree.Tracks(x.mean((0, 1)), x.std((0, 1)), np.asarray(old)) for x, old in parts]
-
-
 def _by_datum(
-    problem: Problem, run: Sampled, states: list[np.ndarray], key: jax.Array, keep: tuple[str, ...]
+    problem: Problem, run: Sampled, key: jax.Array, keep: tuple[str, ...]
 ) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
     """Which draws (kept,) of each chain have values by datum; log-likelihood and replicas (chain, kept, N, C) there."""
     chains, draws = run.z.shape[:2]
     most = draws_a_chain(problem.model.size, chains)
     kept = np.unique(np.linspace(0, draws - 1, min(draws, most)).round().astype(int))
+    if not {"log_likelihood", "replicas"} & set(keep):
+        return kept, [], []
 
     def flat(a: np.ndarray) -> jax.Array:
         return jnp.asarray(a[:, kept].reshape(chains * len(kept), *a.shape[2:]))
 
     found = predictive(
-        problem.model, flat(run.levels), flat(run.z), tuple(flat(s) for s in states), key, keep
+        problem.model, flat(run.levels), flat(run.z), tuple(flat(s) for s in run.states), key, keep
     )  # fmt: skip
     likelihood, replicas = (
         [np.asarray(a).reshape(chains, len(kept), *a.shape[1:]) for a in part] for part in found
@@ -131,22 +175,9 @@ def _by_datum(
     return kept, likelihood, replicas
 
 
-def log_normal(z: np.ndarray, precision: np.ndarray) -> np.ndarray:
-    """Log density of each entry of z, Gaussian around zero with its precision."""
-    return 0.5 * (np.log(precision / (2 * np.pi)) - precision * z**2)
-
-
-def _log_prior(problem: Problem, prior: Prior, run: Sampled) -> np.ndarray | None:
-    """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
-    if isinstance(prior, Flat) or prior.correlation or isinstance(run.form.hierarchy, SpikeAndSlab):
-        return None
-    alpha = _alpha(run)
-    return log_normal(run.z, np.clip(alpha, LEAST, MOST))
-
-
 def _alpha(run: Sampled) -> np.ndarray:
     """Prior precision (chain, draw, M) of each bias, draw by draw."""
-    phi = {name: jnp.asarray(a) for name, a in run.group("phi_").items()}
+    phi = {name: jnp.asarray(a) for name, a in run.draws.phi.items()}
     first = run.posed.first.alpha
     if not phi:
         return np.broadcast_to(np.asarray(first), run.z.shape)
@@ -158,21 +189,21 @@ def _columns(run: Sampled, mixed: Mapping[str, np.ndarray], M: int) -> dict[str,
     found = {name: values[:M] for name, values in mixed.items()}
     found["contraction"] = 1.0 - run.z.var((0, 1))
     found["inclusion"] = (np.abs(run.z) > ROPE).mean((0, 1))
-    if "phi_included" in run.draws:
+    if "included" in run.draws.phi:
         found["included"] = np.ones(M)
-        found["included"][list(run.form.hierarchy.learnt)] = run.draws["phi_included"].mean((0, 1))
+        found["included"][list(run.form.hierarchy.learnt)] = np.asarray(run.draws.phi["included"]).mean((0, 1))
     return found
 
 
-def _posterior(problem: Problem, run: Sampled) -> dict[str, Any]:
+def _variables(problem: Problem, run: Sampled) -> dict[str, Any]:
     """Further posterior variables, name -> (dims beyond chain and draw, values, coords)."""
     labels = list(problem.labels)
     found: dict[str, Any] = {
-        "gamma": (("bias_label",), run.draws["gamma"]),
-        "contraction": (("bias_label",), 1.0 - run.draws["variance"]),
+        "gamma": (("bias_label",), np.asarray(run.draws.gamma)),
+        "contraction": (("bias_label",), 1.0 - np.asarray(run.draws.variance)),
     }
     learnt = [labels[m] for m in run.form.hierarchy.learnt]
-    for name, values in run.group("phi_").items():
+    for name, values in run.draws.phi.items():
         whose = run.form.hierarchy.belongs(name)
         if whose == "bias":
             found[name] = (("governed_label",), values, {"governed_label": learnt})
@@ -186,22 +217,13 @@ def _posterior(problem: Problem, run: Sampled) -> dict[str, Any]:
 
 
 def _stats(run: Sampled) -> dict[str, np.ndarray]:
-    return {"lp": run.draws["density"]} | run.group("stats_")
-
-
-def _attrs(run: Sampled) -> dict[str, Any]:
-    """Numbers of the whole run."""
-    found = {"seconds": run.seconds, "rope": ROPE, "frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
-    found |= {"interrupted": run.interrupted}
-    if not run.method.exact:
-        found["khat"] = pareto_khat(run.draws["stats_log_weight"].ravel())
-    return {name: float(value) for name, value in found.items()}
+    return {name: np.asarray(value) for name, value in run.draws.stats.items()}
 
 
 def _bias_status(problem: Problem, mixed: Mapping[str, np.ndarray], M: int) -> tuple[str, ...]:
     lost = mixed["r_hat"][:M] > 1.05 if "r_hat" in mixed else np.zeros(M, bool)
-    pairs = zip(problem.surveyed, lost, strict=True)
-    return tuple("not mixed" if bad else "survey" if own else "estimated" for own, bad in pairs)
+    words = {"survey": "survey", "drift": "drift", "scale": "estimated"}
+    return tuple("not mixed" if bad else words[b.kind] for b, bad in zip(problem.biases, lost, strict=True))
 
 
 def judge(
@@ -230,7 +252,7 @@ def judge(
         return Status.MISFIT, " ".join([misfit_sentence(problem, mean, square), *said])
     good = _say_steps(run, said) and good
     if not run.method.exact:
-        khat = pareto_khat(run.draws["stats_log_weight"].ravel())
+        khat = pareto_khat(_stats(run)["log_weight"].ravel())
         worth = "it stands for the posterior" if khat < 0.7 else "it does not fit; take nuts or collapsed"
         said.append(f"Pareto k-hat of the guide {khat:.2f}: {worth}.")
     if isinstance(prior, Flat) and (np.abs(run.z.mean((0, 1))[~problem.surveyed]) > FAR).any():
@@ -241,7 +263,7 @@ def judge(
 
 def _say_steps(run: Sampled, said: list[str]) -> bool:
     """What the steps of NUTS or of the Metropolis correction say; whether all is well."""
-    found, good = run.group("stats_"), True
+    found, good = _stats(run), True
     if "diverging" in found and found["diverging"].any():
         said.append(f"{int(found['diverging'].sum())} divergences: raise target (0.95), or take collapsed.")
         good = False

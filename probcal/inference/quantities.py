@@ -17,17 +17,14 @@ import numpy as np
 
 from probcal.errors import FitError
 from probcal.inference.hierarchy import Hierarchy, Phi
-from probcal.inference.nuts import NUTS
 from probcal.inference.posed import Form, Posed, log_prior
-from probcal.inference.run import Maximiser, maximise
-from probcal.inference.sampler import Sampler
-from probcal.inference.sampling import Sampled, sample
+from probcal.inference.posterior import Chains
+from probcal.inference.sampling import Sampled
 from probcal.inference.uniformity import NOMINAL, randomised_rank
 from probcal.lazy import Later
 from probcal.model.model import At, Model
-from probcal.priors import Prior
 from probcal.problem import Problem
-from probcal.smoothing.draws import draw, draw_biases
+from probcal.results.answer import Answer
 from probcal.smoothing.frame import volume
 from probcal.smoothing.mode import Point, log_density, log_likelihood
 
@@ -36,7 +33,6 @@ if TYPE_CHECKING:
 else:
     array_stats = Later("arviz_stats.base.array_stats")
 
-CHAINS, DRAWS = 4, 250  # of a Gaussian
 TAKEN = "taken over"  # status of a run whose method gave way to another
 
 
@@ -49,15 +45,15 @@ class Points(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior:
-    """What a method says of one data set: draws, chain after chain, and how it went."""
+class Pool:
+    """Draws of what a method says of one data set, chain after chain, and how it went."""
 
     points: Points
-    phi: Mapping[str, np.ndarray]  # hyper-parameters (D, ...), of samplers
+    hyper: Mapping[str, np.ndarray]  # hyper-parameters (D, ...), of samplers
     chains: int
-    drawn: bool  # by a Markov chain: draws depend on each other, and levels vary
+    chained: bool  # draws depend on each other, and levels vary
     status: str
-    sampled: Sampled | None = None
+    run: Sampled | None = None  # of a sampler
 
     @property
     def count(self) -> int:
@@ -65,38 +61,27 @@ class Posterior:
         return len(self.points.z)
 
 
-def sampled_posterior(
-    problem: Problem, method: Sampler, prior: Prior, start: Point, key: jax.Array, fallback: NUTS | None
-) -> Posterior:
-    """Draws of a sampler, its chains one after the other."""
-    found = sample(problem, method, prior, start, key, threads=1, fallback=fallback)
+def pool_of(answer: Answer, key: jax.Array) -> Pool:
+    """Draws of an answer, its chains one after the other.
+
+    There are no trajectories where the method solved another problem in the place of the given one. Raises `FitError`
+    where there is no covariance.
+    """
+    posterior = answer.posterior
+    if not posterior.sound:
+        raise FitError(answer.message)
+    drawn = posterior.draws(key, ("states",))
 
     def flat(a: np.ndarray) -> np.ndarray:
         return a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
 
-    points = Points(flat(found.z), flat(found.levels), tuple(flat(x) for x in found.states))
-    phi = {name: flat(a) for name, a in found.group("phi_").items()}
-    return Posterior(points, phi, found.z.shape[0], True, TAKEN if found.method != found.asked else "sampled", found)
-
-
-def gaussian_posterior(
-    problem: Problem, prepared: Problem, method: Maximiser, prior: Prior, start: Point, key: jax.Array
-) -> Posterior:
-    """Draws of the Gaussian that a plug-in method reports, its noise levels held.
-
-    The trajectories are those of the problem that the method solves in the place of the given one. Raises `FitError`
-    where there is no covariance.
-    """
-    outcome = maximise(method, prepared, prior, start, None)
-    covariance = outcome.laplace.covariance
-    if not bool(jnp.isfinite(covariance).all() & jnp.isfinite(outcome.point.z).all()):
-        raise FitError(outcome.message)
-    keys, point = jax.random.split(key), outcome.point
-    z = draw_biases(point, covariance, keys[0], CHAINS * DRAWS)
-    drawn, _ = draw(prepared.model, point, covariance, z, point.levels, keys[1])
-    held = np.broadcast_to(np.asarray(outcome.point.levels), (CHAINS * DRAWS, len(problem.levels)))
-    kept = tuple(np.asarray(x) for x in drawn.states) if prepared is problem else ()
-    return Posterior(Points(np.asarray(z), held, kept), {}, CHAINS, False, outcome.status)
+    states = tuple(flat(x) for x in drawn.states) if answer.motion == "used" else ()
+    points = Points(flat(drawn.z), flat(drawn.levels), states)
+    hyper = {name: flat(a) for name, a in posterior.hyper.items()}
+    taken = answer.method != answer.requested
+    status = TAKEN if taken else "sampled" if posterior.chained else str(answer.status)
+    run = posterior.run if isinstance(posterior, Chains) else None
+    return Pool(points, hyper, drawn.z.shape[0], posterior.chained, status, run)
 
 
 @jax.jit
@@ -144,19 +129,19 @@ def _hyper(phi: Mapping[str, Any], truth: Mapping[str, Any], kind: Hierarchy) ->
     return found
 
 
-def _quantities(trial: Trial, found: Posterior) -> dict[str, _Quantity]:
+def _quantities(trial: Trial, found: Pool) -> dict[str, _Quantity]:
     problem, point, points = trial.problem, trial.point, found.points
     all_: dict[str, _Quantity] = {}
     for m, label in enumerate(problem.labels):
         scale = problem.scales[m]
         all_[label] = _Quantity("bias", float(point.z[m]) * scale, points.z[:, m] * scale)
-    if found.drawn:
+    if found.chained:
         for h, level in enumerate(problem.levels):
             draws = level.guess * np.exp(points.levels[:, h])
             all_[level.label] = _Quantity("level", level.guess * float(np.exp(point.levels[h])), draws)
-    sampled = found.sampled
+    sampled = found.run
     if sampled is not None:
-        all_ |= _hyper(found.phi, trial.phi, sampled.form.hierarchy)
+        all_ |= _hyper(found.hyper, trial.phi, sampled.form.hierarchy)
     if points.states:
         all_ |= _middle(problem, point, points)
         args = jax.tree.map(jnp.asarray, tuple(points))
@@ -167,7 +152,7 @@ def _quantities(trial: Trial, found: Posterior) -> dict[str, _Quantity]:
     if sampled is not None and trial.joint:
         phi = {name: jnp.asarray(value) for name, value in trial.phi.items()}
         truth = float(_joint(sampled.form, sampled.posed, point, phi))
-        all_["log joint"] = _Quantity("density", truth, sampled.draws["density"].reshape(-1))
+        all_["log joint"] = _Quantity("density", truth, np.asarray(sampled.draws.density).reshape(-1))
     return all_
 
 
@@ -203,7 +188,7 @@ def _effective(draws: np.ndarray, chains: int) -> tuple[float, float]:
     return (ess if np.isfinite(ess) else float(len(draws))), (r_hat if np.isfinite(r_hat) else 1.0)
 
 
-def ranked(trial: Trial, found: Posterior, most: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def ranked(trial: Trial, found: Pool, most: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Rank of the truth among at most `most` nearly independent draws of every quantity, and what else is recorded."""
     record: dict[str, list[Any]] = {
         name: [] for name in ("quantity", "kind", "truth", "mean", "sd", "rank", "draws", "place", "inside", "ess")
@@ -211,7 +196,7 @@ def ranked(trial: Trial, found: Posterior, most: int, rng: np.random.Generator) 
     worst = 1.0
     tails = np.array(NOMINAL)[:, None] / 2 * np.array([-1.0, 1.0]) + 0.5
     for name, (kind, truth, draws) in _quantities(trial, found).items():
-        ess, r_hat = _effective(draws, found.chains) if found.drawn else (float(len(draws)), 1.0)
+        ess, r_hat = _effective(draws, found.chains) if found.chained else (float(len(draws)), 1.0)
         worst = max(worst, r_hat)
         count = int(np.clip(ess, 1, most))
         thin = draws[((np.arange(count) + 0.5) * len(draws) / count).astype(int)]
@@ -225,6 +210,6 @@ def ranked(trial: Trial, found: Posterior, most: int, rng: np.random.Generator) 
     arrays["status"] = np.array(found.status, "<U16")
     if found.points.states:
         arrays["position_rmse"] = np.array(_position_rmse(trial.problem, trial.point, found.points))
-    if found.sampled is not None:
-        arrays |= {"r_hat": np.array(worst), "khat": np.array(found.sampled.worth.khat)}
+    if found.run is not None:
+        arrays |= {"r_hat": np.array(worst), "khat": np.array(found.run.worth.khat)}
     return arrays

@@ -1,37 +1,42 @@
 """Runs a sampler: chains in jitted chunks, each chain on its own thread, with progress, checkpoints and resume."""
 
+from __future__ import annotations
+
 import os
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
+from probcal.inference.chains import Draw, run_chunk, run_chunks
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Posed
-from probcal.inference.run import Progress
-from probcal.inference.sampler import Draw, Sampler, run_chunk, run_chunks
 from probcal.inference.storage import Chunks, Storage
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.smoothing.mode import Point
 
+if TYPE_CHECKING:
+    from probcal.inference.run import Progress
+    from probcal.inference.sampler import Sampler
+
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """What a sampler leaves: draws by name (chain, draw, ...), and how the run went."""
+    """What a sampler leaves: its draws, and how the run went."""
 
     method: Sampler
     asked: Sampler  # the method that was asked for, where another took over
     form: Form
     posed: Posed
     worth: Worth
-    draws: Mapping[str, np.ndarray]
+    draws: Draw  # leading dims (chain, draw) of every array
     seconds: float
     interrupted: bool
     note: str  # what happened on the way, a sentence or nothing
@@ -39,22 +44,17 @@ class Sampled:
     @property
     def z(self) -> np.ndarray:
         """Biases (chain, draw, M) over their scales."""
-        return self.draws["theta"][..., : self.form.biases]
+        return np.asarray(self.draws.theta)[..., : self.form.biases]
 
     @property
     def levels(self) -> np.ndarray:
         """Log levels (chain, draw, H)."""
-        return self.draws["theta"][..., self.form.biases :]
-
-    def group(self, prefix: str) -> dict[str, np.ndarray]:
-        """Draws whose name begins so, by the rest of the name."""
-        return {name.removeprefix(prefix): a for name, a in self.draws.items() if name.startswith(prefix)}
+        return np.asarray(self.draws.theta)[..., self.form.biases :]
 
     @property
     def states(self) -> list[np.ndarray]:
-        """States (chain, draw, E, n) of each recursion; empty where they were not kept."""
-        found = self.group("states_")
-        return [found[str(r)] for r in range(len(found))]
+        """States (chain, draw, E, n) of each recursion."""
+        return [np.asarray(x) for x in self.draws.states]
 
 
 def sample(
@@ -100,21 +100,33 @@ def sample(
             interrupted = True
             if box.count * method.chunk <= method.warmup:
                 raise
-    joined = {name: array[:, : method.draws] for name, array in box.joined().items()}
-    if not np.isfinite(joined["theta"]).all():
+    drawn = gathered({name: array[:, : method.draws] for name, array in box.joined().items()})
+    if not np.isfinite(np.asarray(drawn.theta)).all():
         raise FitError(
             f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them"
         )
-    return Sampled(method, asked, form, posed, worth, joined, time.perf_counter() - began, interrupted, note)
+    return Sampled(method, asked, form, posed, worth, drawn, time.perf_counter() - began, interrupted, note)
 
 
 def named(draws: Draw) -> dict[str, np.ndarray]:
-    """Draws as arrays (chains, draws, ...) by flat names."""
+    """Draws as arrays (chains, draws, ...) by flat names, as a storage keeps them."""
     found: dict[str, Any] = {name: getattr(draws, name) for name in ("theta", "gamma", "variance", "density")}
     found |= {f"phi_{name}": value for name, value in draws.phi.items()}
     found |= {f"stats_{name}": value for name, value in draws.stats.items()}
     found |= {f"states_{r}": value for r, value in enumerate(draws.states)}
     return {name: np.asarray(value) for name, value in found.items()}
+
+
+def gathered(arrays: Mapping[str, np.ndarray]) -> Draw:
+    """The draws of arrays by flat names: what `named` made."""
+
+    def group(prefix: str) -> dict[str, Any]:
+        return {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
+
+    states = group("states_")
+    fields: dict[str, Any] = {name: arrays[name] for name in ("theta", "gamma", "variance", "density")}
+    in_order = tuple(states[str(r)] for r in range(len(states)))
+    return Draw(phi=group("phi_"), stats=group("stats_"), states=in_order, **fields)
 
 
 class _Run:

@@ -24,22 +24,23 @@ from probcal.errors import FitError, InputError
 from probcal.inference.coverage import judge
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.identity import identity_of, points_digest, seed_text
-from probcal.inference.methods import MAP, NUTS, check_problem, choose_prior
+from probcal.inference.methods import NUTS, check_problem, choose_prior
 from probcal.inference.posed import Form
 from probcal.inference.prior_draws import check_drawable, draw_data, draw_prior, far_start
-from probcal.inference.quantities import TAKEN, Points, Posterior, Trial, gaussian_posterior, ranked, sampled_posterior
-from probcal.inference.run import Maximiser, Method, maximise
+from probcal.inference.quantities import TAKEN, Points, Pool, Trial, pool_of, ranked
+from probcal.inference.run import Context, Method
 from probcal.inference.sampler import Sampler
+from probcal.inference.solve import solve
 from probcal.inference.storage import Records, Storage
 from probcal.inference.uniformity import NOMINAL
 from probcal.model import variants
-from probcal.priors import Gaussian, Precision, Prior
+from probcal.priors import Precision, Prior
 from probcal.problem import Problem
+from probcal.results.groups import suffix
 from probcal.simulate import Key, as_key
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import Point, find_mode
-from probcal.smoothing.start import automatic_start, follow_states
-from probcal.tree import suffix
+from probcal.smoothing.start import follow_states
 from probcal.types import float64
 
 BATCH = 5  # runs of one file
@@ -162,7 +163,7 @@ class _Engine:
         self.other = replace(NUTS(), warmup=SHORT["warmup"]) if fallback else None
         self.first = source.precision(problem.labels, problem.surveyed)
         self.around = "data" if isinstance(around, str) else "fit" if around is not None else ""
-        self.pool: Posterior | None = None
+        self.pool: Pool | None = None
         if around is None:
             check_drawable(source, problem)
             self.form = Form(problem.model.biases, hierarchy_of(source, problem))
@@ -197,7 +198,7 @@ class _Engine:
         point = at_levels(self.problem.model, flat, jnp.asarray(levels))
         point = point._replace(states=tuple(jnp.asarray(x) for x in states))
         y = draw_data(self.problem.model, point, seed)
-        phi = {name: leaf[k] for name, leaf in self.pool.phi.items()}
+        phi = {name: leaf[k] for name, leaf in self.pool.hyper.items()}
         return Trial(_twice(self.problem, y), point, phi, joint=False)
 
     def _starting(self, trial: Trial) -> Point | None:
@@ -207,18 +208,12 @@ class _Engine:
         wide = Precision.single(jnp.ones(trial.problem.model.biases))
         return find_mode(trial.problem.model, trial.point, wide, 30, 1e-3).point
 
-    def _fit(self, problem: Problem, start: Point | None, key: jax.Array) -> Posterior:
+    def _fit(self, problem: Problem, start: Point | None, key: jax.Array) -> Pool:
         """The method's answer, started as `fit` starts it where no start is given."""
-        method = self.method
-        prepared = method.prepare(problem)
-        if start is None or prepared is not problem:
-            start = automatic_start(prepared)
-            if isinstance(method, Sampler) and problem.levels:
-                start = maximise(MAP(), problem, Gaussian(), start, None).point
-        if isinstance(method, Sampler):
-            return sampled_posterior(problem, method, self.prior, start, key, self.other)
-        assert isinstance(method, Maximiser)
-        return gaussian_posterior(problem, prepared, method, self.prior, start, key)
+        keys = jax.random.split(key)
+        context = Context(keys[0], threads=1, fallback=self.other)
+        answer = solve(problem, self.method, self.prior, context, start=start)
+        return pool_of(answer, keys[1])
 
     def run(self, number: int) -> dict[str, np.ndarray]:
         """The record of one run."""
@@ -241,7 +236,7 @@ def _twice(problem: Problem, y: tuple[jax.Array, ...]) -> Problem:
     return other
 
 
-def _of_tree(problem: Problem, tree: xr.DataTree) -> Posterior:
+def _of_tree(problem: Problem, tree: xr.DataTree) -> Pool:
     """The draws of a saved fit of a problem."""
     names = [f"state{suffix(problem, r)}" for r in range(len(problem.epochs))]
     group = tree["posterior"].to_dataset() if "posterior" in tree.children else xr.Dataset()
@@ -261,7 +256,7 @@ def _of_tree(problem: Problem, tree: xr.DataTree) -> Posterior:
         std = held.sel(level=level.label) if drawn is None else drawn.sel(level_label=level.label)
         levels[:, h] = np.log(np.ravel(std.values) / level.guess)
     points = Points(z, levels, tuple(flat(group[name].values) for name in names))
-    return Posterior(points, {}, group.sizes["chain"], True, "read")
+    return Pool(points, {}, group.sizes["chain"], True, "read")
 
 
 def _tree(engine: _Engine, records: dict[int, dict[str, np.ndarray]], interrupted: bool) -> xr.DataTree:

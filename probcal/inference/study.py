@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from os import PathLike
-from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import jax
@@ -16,56 +15,48 @@ import numpy as np
 import xarray as xr
 
 from probcal.errors import InputError, nearest
+from probcal.inference.ending import conclude
 from probcal.inference.identity import identity, problem_digest
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
-from probcal.inference.posterior import judge, mean_point, mixing
 from probcal.inference.run import (
-    End,
+    Context,
     Given,
     Maximiser,
     Method,
     State,
     check_method,
-    fallen,
     first_state,
     given_of,
     kernel,
-    low_and_far,
-    verdict,
 )
 from probcal.inference.sampler import Sampler
-from probcal.inference.sampling import sample
 from probcal.inference.settings import check_setting
+from probcal.inference.solve import solve
 from probcal.inference.storage import Records, Storage
 from probcal.model.model import Model
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem
+from probcal.results.answer import Answer
+from probcal.results.schema import INTERVAL
 from probcal.simulate import Truth
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start
-from probcal.tree import INTERVAL
 
 BATCH = 10  # runs that one compiled call solves
 CHECKED = 20  # stored problems that a resumed study makes anew, to see whether the model is still the same
 ORACLE = "oracle"  # MAP whose prior knows which biases are zero
 VECTORS = ("error", "lower", "upper", "true", "sd", "gamma")  # by bias, over its scale; the interval less the truth
+SEED = 0  # of what an E-step draws
+NOTHING = np.zeros(0)  # the trace of a batch, which keeps none
 Setting = Callable[..., tuple[Problem, Truth]]
 Advance = Callable[[int, int], None]  # fits done, fits in all
 
 
 class _Solved(NamedTuple):
-    """Where each run of a batch ended."""
+    """Where each run of a batch ended; leading dim (runs,)."""
 
-    z: jax.Array  # (runs, M)
-    sd: jax.Array  # (runs, M)
-    gamma: jax.Array  # (runs, M)
-    alpha: jax.Array  # (runs, M)
-    states: tuple[jax.Array, ...]  # (runs, E, n) of each recursion
-    done: jax.Array  # (runs,)
-    refused: jax.Array  # (runs,)
-    best: jax.Array  # (runs,) evidence on the way
-    evidence: jax.Array  # (runs,)
+    state: State
     square: jax.Array  # (runs,) of what is left, a datum
     iterations: jax.Array  # (runs,)
 
@@ -84,14 +75,10 @@ def _solve(method: Any, models: Model, prior: Prior, iterations: int, givens: Gi
         def on(carry: tuple[State, jax.Array]) -> jax.Array:
             return ~carry[0].done & (carry[1] < iterations)
 
-        state, count = jax.lax.while_loop(on, step, (first_state(given, start), jnp.zeros((), int)))
-        state = method.close(model, given, state)
-        sd = jnp.sqrt(jnp.diagonal(state.found.covariance))
-        found, point = state.found, state.point
-        return _Solved(
-            point.z, sd, found.gamma, state.alpha, point.states, state.done, state.refused, state.best, found.evidence,
-            mean_square(model, point), count,
-        )  # fmt: skip
+        first = first_state(given, start, method.begin(model, start), jax.random.key(SEED))
+        state, count = jax.lax.while_loop(on, step, (first, jnp.zeros((), int)))
+        state = method.close(model, prior, given, state)._replace(seed=jnp.zeros(()), carry=())
+        return _Solved(state, mean_square(model, state.point), count)
 
     pieces = (models, givens, starts)
     return jax.lax.map(one, pieces) if jax.default_backend() == "cpu" else jax.vmap(one)(pieces)
@@ -144,7 +131,7 @@ def _batch(
         for name, (method, prior) in methods.items():
             if isinstance(method, Sampler):
                 found += [
-                    {"case": case, "method": name} | _drawn(run, method, prior)
+                    {"case": case, "method": name} | _record(run, _drawn(run, method, prior))
                     for case, run in zip(cases, whole, strict=True)
                 ]
                 continue
@@ -166,8 +153,10 @@ def _batch(
                 solved = _solve(kernel(method), stacked[0], prior, method.iterations, *stacked[1:])
                 solved = jax.tree.map(np.asarray, solved)
                 for j, k in enumerate(members):
-                    one = jax.tree.map(lambda leaf, j=j: leaf[j], solved)
-                    found.append({"case": cases[k], "method": name} | _record(chosen[j], method, prior, one))
+                    state, square, count = jax.tree.map(lambda leaf, j=j: leaf[j], solved)
+                    problem = chosen[j].problem
+                    answer = conclude(problem, method, prior, state, NOTHING, float(square), int(count))
+                    found.append({"case": cases[k], "method": name} | _record(chosen[j], answer))
         if stored:
             first = next(record for record in found if record["case"] == cases[0])
             first["problem"] = problem_digest(whole[0].problem, whole[0].truth.biases)
@@ -198,55 +187,25 @@ def _prepared(method: Method, run: _Run) -> _Run:
     return run if problem is run.problem else run._replace(problem=problem, start=automatic_start(problem))
 
 
-def _record(run: _Run, method: Maximiser, prior: Prior, one: Any) -> dict[str, Any]:
-    problem, asked = run.problem, method.tolerance == 0.0
+def _record(run: _Run, answer: Answer) -> dict[str, Any]:
+    """What a study keeps of an answer, judged by the truth."""
+    problem, found = answer.problem, answer.posterior.summary
     true = np.array([run.truth.biases[label] for label in problem.labels]) / problem.scales
-    error = one.z - true
-    low, far = low_and_far(prior, one.alpha, one.z, problem.surveyed)
-    finite = bool(np.isfinite(one.z).all() and np.isfinite(one.sd).all())
-    end = End(
-        still=bool(one.done),
-        asked=asked,
-        low=bool(low.any()),
-        far=bool(far.any()),
-        sound=finite,
-        refused=bool(one.refused),
-        fallen=fallen(prior, len(problem.levels), one.best, one.evidence),
-        square=float(one.square),
-    )
-    half = NormalDist().inv_cdf(0.5 + INTERVAL / 2)
+    error, lower, upper = found.mean - true, found.lower - true, found.upper - true
     return {
         "bias_rmse": float(np.sqrt(np.mean(error**2))),
-        "coverage": float((np.abs(error) <= half * one.sd).mean()),
-        "position_rmse": _position_rmse(run, one.states),
-        "status": str(verdict(end)),
-        "ran": method.name,
-        "iterations": int(one.iterations),
-        "error": error, "true": true, "gamma": one.gamma, "sd": one.sd,
-        "lower": error - half * one.sd, "upper": error + half * one.sd, "labels": problem.labels,
+        "coverage": float(((lower <= 0) & (upper >= 0)).mean()),
+        "position_rmse": _position_rmse(run, answer.posterior.states),
+        "status": str(answer.status), "ran": answer.method.name, "iterations": answer.iterations,
+        "error": error, "true": true, "gamma": found.gamma, "sd": found.sd, "lower": lower, "upper": upper,
+        "labels": problem.labels,
     }  # fmt: skip
 
 
-def _drawn(run: _Run, method: Sampler, prior: Prior) -> dict[str, Any]:
-    """The record of a sampler: posterior means, and intervals by quantiles."""
-    problem = run.problem
-    drawn = sample(problem, method, prior, run.start, jax.random.key(run.number), threads=1, fallback=NUTS())
-    true = np.array([run.truth.biases[label] for label in problem.labels]) / problem.scales
-    z = drawn.z.reshape(-1, len(true))
-    half = 50 * (1 - INTERVAL)
-    lower, upper = np.percentile(z, [half, 100 - half], axis=0)
-    status, _ = judge(problem, prior, drawn, mixing(drawn.draws["theta"]), mean_point(problem, drawn))
-    error = z.mean(0) - true
-    return {
-        "bias_rmse": float(np.sqrt(np.mean(error**2))),
-        "coverage": float(((lower <= true) & (true <= upper)).mean()),
-        "position_rmse": _position_rmse(run, [x.mean((0, 1)) for x in drawn.states]),
-        "status": str(status),
-        "ran": drawn.method.name,
-        "iterations": drawn.z.shape[1],
-        "error": error, "true": true, "gamma": drawn.draws["gamma"].mean((0, 1)), "sd": z.std(0),
-        "lower": lower - true, "upper": upper - true, "labels": problem.labels,
-    }  # fmt: skip
+def _drawn(run: _Run, method: Method, prior: Prior) -> Answer:
+    """The answer of a sampler, which takes its runs one by one."""
+    context = Context(jax.random.key(run.number), threads=1, fallback=NUTS())
+    return solve(run.problem, method, prior, context, start=run.start)
 
 
 def choose_methods(names: Sequence[str]) -> dict[str, tuple[Method, Prior]]:

@@ -1,8 +1,9 @@
 """The model epoch by epoch, as filters read it: the epochs of all targets merged in time order, each a pytree.
 
-The state x of all targets is a tuple with an array (T, n) of the T targets of each recursion. An epoch belongs to one
-target: `step` moves that one, and only its rows are seen. Nothing here looks into the arrays of whole trajectories,
-so that epochs of rows that came later, of the same form, serve a kernel that was compiled before.
+The state x of all targets is a tuple with an array (T, n) of the T targets of each recursion, or, of a motion without
+linear form, with its pytree, T leading. An epoch belongs to one target: `step` moves that one, and only its rows are
+seen. Nothing here looks into the arrays of whole trajectories, so that epochs of rows that came later, of the same
+form, serve a kernel that was compiled before.
 """
 
 from itertools import pairwise
@@ -16,8 +17,9 @@ from probcal import linalg
 from probcal.errors import InputError
 from probcal.model import rows as waist
 from probcal.model.rows import Block, Linearised, Rows
+from probcal.model.sampled import Sampled, check_densities
 
-State = tuple[jax.Array, ...]  # (T, n) of each recursion
+State = tuple[Any, ...]  # (T, n) of each recursion, or a pytree with T leading
 
 
 class Move(NamedTuple):
@@ -59,27 +61,51 @@ class Stepwise:
     recursion: tuple[int, ...]
     targets: tuple[int, ...]
     full_rank: bool
+    sampled: tuple[Sampled | None, ...]
     recursions: tuple[Any, ...]
     rows: tuple[Rows, ...]
     level_spread: jax.Array
 
     def initial(self) -> State:
         """State before any epoch, all 0: each target is drawn at its first epoch, where `step` ignores what was."""
-        sizes = [part.drift.shape[1] for part in self.recursions]
-        return tuple(jnp.zeros((count, n)) for count, n in zip(self.targets, sizes, strict=True))
+        found: list[Any] = []
+        for part, count, form in zip(self.recursions, self.targets, self.sampled, strict=True):
+            vector = jnp.zeros((count, part.drift.shape[1]))
+            found.append(vector if form is None else form.whole(vector, form.resting(count)))
+        return tuple(found)
 
     def step(self, key: jax.Array, x: State, epoch: Epoch, levels: jax.Array) -> State:
         """State at an epoch drawn from that before it, at log levels (H,)."""
-        found = []
-        for r, (states, move, target) in enumerate(zip(x, epoch.move, epoch.target, strict=True)):
-            noise = jax.random.normal(jax.random.fold_in(key, r), move.drift.shape)
-            found.append(states.at[target].set(_mean(states, move, target) + _root(move, levels) @ noise))
+        found: list[Any] = []
+        for r, (states, move, target, form) in enumerate(zip(x, epoch.move, epoch.target, self.sampled, strict=True)):
+            own = jax.random.fold_in(key, r)
+            vector, others = (states, None) if form is None else form.part(states)
+            if vector is not None:
+                noise = jax.random.normal(own, move.drift.shape)
+                vector = vector.at[target].set(_mean(vector, move, target) + _root(move, levels) @ noise)
+            if form is not None:
+                moved = self._moved(form, jax.random.fold_in(own, 1), others, r, epoch, levels)
+                vector = form.whole(vector, moved)
+            found.append(vector)
         return tuple(found)
+
+    def _moved(
+        self, form: Sampled, key: jax.Array, states: Any, r: int, epoch: Epoch, levels: jax.Array
+    ) -> tuple[Any, ...]:
+        """States (T leading) of what has no linear form in recursion r, after an epoch."""
+        target = epoch.target[r]
+        old = jax.tree.map(lambda leaf: leaf[target], states)
+        new = jax.lax.switch(
+            jnp.where(epoch.recursion == r, jnp.where(epoch.first, 1, 2), 0),
+            [lambda: old, lambda: form.begin(key), lambda: form.go(key, old, epoch.dt, levels)],
+        )
+        return jax.tree.map(lambda leaf, one: leaf.at[target].set(one), states, new)
 
     def log_step(self, x: State, after: State, epoch: Epoch, levels: jax.Array) -> jax.Array:
         """Log density of the state at an epoch given that before it.
 
-        Raises `InputError` for a motion whose noise leaves out a direction, which has no density.
+        Raises `InputError` for a motion whose noise leaves out a direction, which has no density, and for one that
+        states none.
         """
         if not self.full_rank:
             raise InputError(
@@ -87,13 +113,20 @@ class Stepwise:
                 " Static()); take a motion with noise in all of them"
             )
 
+        check_densities(self.sampled)
+
         def of(r: int) -> jax.Array:
-            move, target = epoch.move[r], epoch.target[r]
-            root = _root(move, levels)
-            lower, inverse = linalg.factor_and_inverse(root @ root.T)
-            white = inverse @ (after[r][target] - _mean(x[r], move, target))
-            size = jnp.sum(jnp.log(jnp.diagonal(lower))) + 0.5 * len(white) * np.log(2 * np.pi)
-            return -0.5 * jnp.sum(white**2) - size
+            move, target, form = epoch.move[r], epoch.target[r], self.sampled[r]
+            (old, before), (new, later) = ((s, ()) if form is None else form.part(s) for s in (x[r], after[r]))
+            total = jnp.zeros(())
+            if old is not None and new is not None:
+                total = linalg.log_normal(new[target] - _mean(old, move, target), _root(move, levels))
+            if form is not None:
+                before, later = jax.tree.map(lambda leaf: leaf[target], (before, later))
+                total = total + jax.lax.cond(
+                    epoch.first, lambda: form.log_begin(later), lambda: form.log_go(before, later, epoch.dt, levels)
+                )
+            return total
 
         return jax.lax.switch(epoch.recursion, [lambda r=r: of(r) for r in range(len(self.recursions))])
 
@@ -111,7 +144,11 @@ class Stepwise:
     def linearise_at(
         self, epoch: Epoch, x: State, z: jax.Array, levels: jax.Array, *, expected: bool = True
     ) -> tuple[Linearised, ...]:
-        """The rows of an epoch linearised, Jacobians by the state of its target whole: (P, C, n) for each block."""
+        """The rows of an epoch linearised, Jacobians by the state of its target whole: (P, C, n) for each block.
+
+        Raises `InputError` where a motion has no linear form.
+        """
+        self.check_linear()
         found = []
         for block, data, states in self._seen(epoch, x):
             lin = waist.linearise(block, data, states, z, levels, expected=expected)
@@ -124,8 +161,23 @@ class Stepwise:
         found = []
         for block, data, r, seen in zip(self.blocks, self.rows, self.recursion, epoch.rows, strict=True):
             here = data._replace(epoch=jnp.zeros_like(seen.sensor), **seen._asdict())
-            found.append((block, here, x[r][epoch.target[r]][None]))
+            mine = jax.tree.map(lambda leaf, k=epoch.target[r]: leaf[k][None], x[r])
+            found.append((block, here, self.vectors(r, mine)))
         return found
+
+    def vectors(self, r: int, states: Any) -> jax.Array:
+        """What rows read of states of recursion r, (E, n): the states themselves where the motion is linear."""
+        form = self.sampled[r]
+        return states if form is None else jax.vmap(form.vector)(states)
+
+    def check_linear(self) -> None:
+        """Raise `InputError` where a motion has no linear form, so that there are no Jacobians by its state."""
+        for form in self.sampled:
+            if form is not None:
+                raise InputError(
+                    f"{type(form.others[0]).__name__} has no linear form, so that nothing is linearised by its state;"
+                    " use predict and log_likelihood, which jax differentiates by biases and levels"
+                )
 
 
 def _mean(states: jax.Array, move: Move, target: jax.Array) -> jax.Array:

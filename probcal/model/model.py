@@ -16,6 +16,7 @@ import numpy as np
 from probcal.model import rows as waist
 from probcal.model.epochs import Epoch, Stepwise, merged, most_rows
 from probcal.model.rows import Block, Linearised, Rows
+from probcal.model.sampled import Sampled
 
 BATCH = 512  # rows whose responses to all biases are formed at once
 
@@ -26,8 +27,8 @@ class Where(Protocol):
     """What a model is evaluated at: a `Point`, or `At`."""
 
     @property
-    def states(self) -> tuple[jax.Array, ...]:
-        """States (E, n) of each recursion."""
+    def states(self) -> tuple[Any, ...]:
+        """States (E, n) of each recursion, or a pytree (E leading) where a motion has no linear form."""
 
     @property
     def z(self) -> jax.Array:
@@ -41,13 +42,13 @@ class Where(Protocol):
 class At(NamedTuple):
     """States, biases and noise levels where a model is evaluated."""
 
-    states: tuple[jax.Array, ...]  # (E, n) of each recursion
+    states: tuple[Any, ...]  # (E, n) of each recursion, or a pytree (E leading) where a motion has no linear form
     z: jax.Array  # (M,)
     levels: jax.Array  # (H,)
 
 
 class Recursion(NamedTuple):
-    """Arrays of one recursion: E epochs of targets that share a state layout of n entries."""
+    """Arrays of one recursion: E epochs of targets that share a state layout, n entries of it with a linear form."""
 
     F: jax.Array  # (E, n, n) transitions, 0 at the first epoch of a target
     L: jax.Array  # (E, n, n) noise factors (start factors at a first epoch), unused columns 0
@@ -62,7 +63,7 @@ class Recursion(NamedTuple):
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["recursions", "rows", "level_spread"],
-    meta_fields=["blocks", "recursion", "biases", "driven", "targets", "full_rank"],
+    meta_fields=["blocks", "recursion", "biases", "driven", "targets", "full_rank", "sampled"],
 )
 @dataclass(frozen=True)
 class Model(Stepwise):
@@ -74,6 +75,7 @@ class Model(Stepwise):
     driven: bool  # whether a process noise has an unknown level
     targets: tuple[int, ...]  # T, number of targets of each recursion
     full_rank: bool  # whether the noise reaches every direction of every state, so that steps have a density
+    sampled: tuple[Sampled | None, ...]  # of each recursion, what its motion does that has no linear form
     recursions: tuple[Recursion, ...]
     rows: tuple[Rows, ...]  # of each block
     level_spread: jax.Array  # (H,) standard deviation of each log level
@@ -82,7 +84,9 @@ class Model(Stepwise):
 
     def predict(self, at: Where) -> Data:
         """Predicted value of every datum."""
-        return tuple(waist.predict(block, data, at.states[r], at.z) for block, data, r in self._blocks())
+        return tuple(
+            waist.predict(block, data, self.vectors(r, at.states[r]), at.z) for block, data, r in self._blocks()
+        )
 
     def innovation(self, at: Where) -> Data:
         """Measured minus predicted, wrapped, zero where missing."""
@@ -131,7 +135,11 @@ class Model(Stepwise):
         )
 
     def linearise(self, at: Where, *, expected: bool) -> tuple[Linearised, ...]:
-        """Every block linearised at a point, with step weights or the expected information."""
+        """Every block linearised at a point, with step weights or the expected information.
+
+        Raises `InputError` where a motion has no linear form.
+        """
+        self.check_linear()
         return tuple(
             waist.linearise(block, data, at.states[r], at.z, at.levels, expected=expected)
             for block, data, r in self._blocks()
@@ -265,6 +273,12 @@ class Model(Stepwise):
     def noises(self) -> tuple[tuple[Any, ...], ...]:
         """Noise family of each channel of each block."""
         return tuple(tuple(channel.noise for channel in block.channels) for block in self.blocks)
+
+    @property
+    def linear(self) -> tuple[Recursion | None, ...]:
+        """Linear form of the motion of each recursion, None where it has none."""
+        pairs = zip(self.recursions, self.sampled, strict=True)
+        return tuple(part if form is None else None for part, form in pairs)
 
     @property
     def size(self) -> int:

@@ -14,13 +14,11 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.geometry import wrap
-from probcal.motion import view
+from probcal.motion import Layout, view
 from probcal.network import ANGLES, Network, Node
 from probcal.noise import Bernoulli
-from probcal.sensor import VECTORS, Channel, Sensor, SensorType
+from probcal.sensor import Channel, Sensor, SensorType
 from probcal.types import PoseView
-
-Layout = tuple[tuple[str, int, int, bool], ...]
 
 
 @dataclass(frozen=True)
@@ -76,15 +74,20 @@ def make_block(network: Network, kind: SensorType, layout: Layout) -> Block:
         asked |= {"velocity", "acceleration"} & set(known)
     missing = sorted(kind.target_components - set(known) - {"at"})
     if missing:
-        name, vector = missing[0], ", per_axis=True" if missing[0] in VECTORS else ""
+        name, vector = missing[0], ", per_axis=True" if missing[0] in kind.vectors else ""
         remedy = {"velocity": "use ConstantVelocity(std)", "acceleration": "use ConstantAcceleration(std)"}
         raise InputError(
             f"sensor {kind.name} reads target.{name}, which the motion does not have{nearest(name, known)};"
             f" {remedy.get(name, f'add it, as in motion + White("{name}", unit, std{vector})')}"
         )
     for name, _, _, per_axis in layout:
-        if name in asked and name in VECTORS and not per_axis:
+        if name in asked and name in kind.vectors and not per_axis:
             raise InputError(f"sensor {kind.name} reads target.{name} as a vector; declare it with per_axis=True")
+        if name in asked and name not in kind.vectors and per_axis:
+            raise InputError(
+                f"sensor {kind.name} reads target.{name} as a number, but the motion has one value an axis;"
+                f' declare it, as in @sensor(..., vectors=("{name}",))'
+            )
     used = tuple(sorted(i for name in asked for i in range(*known[name])))
     placed = [s for s in network.sensors if s.type == kind]
     extras = tuple(sorted(kind.pose_components - {"position"}))
@@ -92,11 +95,23 @@ def make_block(network: Network, kind: SensorType, layout: Layout) -> Block:
         for node in sensor.nodes:
             for name in extras:
                 if name != "velocity" and name not in node.components:
+                    value = (0.0,) * network.dimension if name in kind.vectors else 0.0
                     raise InputError(
                         f'sensor {kind.name} reads pose.{name}, which node "{node.name}" does not have'
-                        f"{nearest(name, node.components)}; state it, as in Node(..., {name}=0.0)"
+                        f"{nearest(name, node.components)}; state it, as in Node(..., {name}={value})"
                     )
-    entries = pose_entries(network.dimension, extras)
+                if name == "velocity" or (np.ndim(node.components[name]) > 0) == (name in kind.vectors):
+                    continue
+                if name in kind.vectors:
+                    raise InputError(
+                        f'sensor {kind.name} reads pose.{name} as a vector, but node "{node.name}" states one number;'
+                        f" state one an axis, {network.dimension} of them"
+                    )
+                raise InputError(
+                    f'sensor {kind.name} reads pose.{name}, of which node "{node.name}" states one an axis, as a single'
+                    f' number; declare it, as in @sensor(..., vectors=("{name}",))'
+                )
+    entries = pose_entries(kind, network.dimension)
     free = tuple(
         (a, e)
         for a in range(kind.arity)
@@ -116,10 +131,10 @@ def addresses(
     return [(placed.nodes[a].name, *entries[e]) for a, e in free] + own
 
 
-def pose_entries(dimension: int, extras: tuple[str, ...]) -> list[tuple[str, int]]:
-    """Entries of a pose vector as (component, axis)."""
-    parts = ("position", *extras)
-    return [(name, axis) for name in parts for axis in range(dimension if name in VECTORS else 1)]
+def pose_entries(kind: SensorType, dimension: int) -> list[tuple[str, int]]:
+    """Entries of a pose vector as (component, axis): the position, then what else the type reads."""
+    parts = ("position", *sorted(kind.pose_components - {"position"}))
+    return [(name, axis) for name in parts for axis in range(dimension if name in kind.vectors else 1)]
 
 
 def pose_vector(node: Node, extras: tuple[str, ...], time: np.ndarray) -> np.ndarray:
@@ -142,10 +157,10 @@ def _local(block: Block, rows: Rows, z: jax.Array) -> jax.Array:
 def _view(block: Block, pose: jax.Array) -> PoseView:
     """Read a pose vector (P,) by component name."""
     parts: dict[str, Any] = dict.fromkeys(ANGLES, 0.0)
-    entries = [name for name, _ in pose_entries(block.dimension, block.extras)]
+    entries = [name for name, _ in pose_entries(block.type, block.dimension)]
     for name in dict.fromkeys(entries):
         start = entries.index(name)
-        parts[name] = pose[start : start + block.dimension] if name in VECTORS else pose[start]
+        parts[name] = pose[start : start + block.dimension] if name in block.type.vectors else pose[start]
     return PoseView("the node", parts)
 
 

@@ -1,11 +1,11 @@
-"""Statistical linearisation by sigma points: the unscented and the cubature choice of the E-step.
+"""Statistical linearisation by sigma points, as the unscented and the cubature E-step need it.
 
 Each row is regressed on the state over the smoothed density of its epoch (posterior linearisation, Garcia-Fernandez
 et al. 2015; the unscented transform of Julier and Uhlmann, the cubature rule of Arasaratnam and Haykin 2009).
 Where a sensor is linear the result is that of the extended smoother.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -19,6 +19,17 @@ from probcal.model.model import Model, Where
 from probcal.model.rows import Block, Linearised, Rows
 
 FLOOR = 1e-10  # least variance along an axis of the sigma points
+Rule = Callable[[int], float]  # weight kappa of the centre, by the number of state entries
+
+
+def unscented(entries: int) -> float:
+    """Weight of the centre by the unscented transform."""
+    return max(3.0 - entries, 1.0)
+
+
+def cubature(entries: int) -> float:
+    """None: the cubature rule has no point there."""
+    return 0.0
 
 
 class _Points(NamedTuple):
@@ -28,10 +39,10 @@ class _Points(NamedTuple):
     whiten: jax.Array  # (E, u, u) from state entries to unit covariance
 
 
-def _points(block: Block, states: jax.Array, covariance: jax.Array, rule: str) -> _Points:
+def _points(block: Block, states: jax.Array, covariance: jax.Array, rule: Rule) -> _Points:
     used = np.asarray(block.used, int)
     u = len(used)
-    kappa = 0.0 if rule == "cubature" else max(3.0 - u, 1.0)
+    kappa = rule(u)
     axes = np.concatenate([np.eye(u), -np.eye(u)]) * np.sqrt(u + kappa)
     unit = np.concatenate([np.zeros((1, u)), axes]) if kappa else axes
     centre = [kappa / (u + kappa)] if kappa else []
@@ -43,7 +54,7 @@ def _points(block: Block, states: jax.Array, covariance: jax.Array, rule: str) -
     return _Points(moved, jnp.asarray(unit), jnp.asarray(weight), vectors.mT / root[:, :, None])
 
 
-def _block(block: Block, data: Rows, point: Where, states: jax.Array, covariance: jax.Array, rule: str) -> Linearised:
+def _block(block: Block, data: Rows, point: Where, states: jax.Array, covariance: jax.Array, rule: Rule) -> Linearised:
     if not block.used:
         return rows.linearise(block, data, states, point.z, point.levels, expected=False)
     points = _points(block, states, covariance, rule)
@@ -62,7 +73,7 @@ def _block(block: Block, data: Rows, point: Where, states: jax.Array, covariance
     return Linearised(score, weight, by_state, jnp.einsum("s,sncp->ncp", points.weight, by_bias))
 
 
-def regress(model: Model, point: Where, covariances: Sequence[jax.Array], rule: str) -> list[Linearised]:
+def regress(model: Model, point: Where, covariances: Sequence[jax.Array], rule: Rule) -> list[Linearised]:
     """Every block regressed on the states over their smoothed densities; what is left over widens the noise."""
     return [
         _block(block, data, point, point.states[r], covariances[r], rule)
@@ -71,7 +82,7 @@ def regress(model: Model, point: Where, covariances: Sequence[jax.Array], rule: 
 
 
 def expect_biases(
-    model: Model, point: Where, covariances: Sequence[jax.Array], rule: str
+    model: Model, point: Where, covariances: Sequence[jax.Array], rule: Rule
 ) -> tuple[jax.Array, jax.Array]:
     """Information (M, M) and score (M,) of the biases, expected over the smoothed states (Paper A 15-21)."""
     M = model.biases

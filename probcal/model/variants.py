@@ -24,6 +24,7 @@ def part(model: Model, r: int) -> Model:
         recursion=(0,) * len(pairs),
         recursions=(model.recursions[r],),
         targets=(model.targets[r],),
+        sampled=(model.sampled[r],),
         rows=tuple(data for _, data in pairs),
     )
 

@@ -9,10 +9,8 @@ import numpy as np
 
 from probcal import linalg
 from probcal.model.model import At, Data, Model
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.information import Moments, moments_of
-from probcal.smoothing.mode import Point, factors
-from probcal.tree import Residuals
+from probcal.smoothing.linearised import Linearisation
+from probcal.smoothing.mode import Point
 
 PASS = 200  # draws that are made at once
 VALUES = 4_000_000  # of all states that are drawn at once, at most
@@ -42,72 +40,28 @@ def draw_biases(point: Point, covariance: jax.Array, key: jax.Array, count: int)
 
 
 def draw(
-    model: Model, point: Point, covariance: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array,
-    keep: tuple[str, ...] = ("states",),
-) -> tuple[Drawn, list[Moments]]:  # fmt: skip
-    """A trajectory for each draw of the biases z (D, M), what is to be kept of them, and their exact moments.
+    at: Linearisation, z: jax.Array, levels: jax.Array, key: jax.Array, keep: tuple[str, ...] = ("states",)
+) -> Drawn:
+    """A trajectory for each draw of the biases z (D, M), and what is to be kept of them.
 
     `levels` (H,) or (D, H) are those of the densities and replicas. `keep` names "states", "log_likelihood",
     "replicas". Draws are made in passes of one size, whatever their number, and of each only what is kept stays.
     """
     count = z.shape[0]
-    size = max(1, min(PASS, count, VALUES // model.state_size))
-    biases, log_levels = np.asarray(z), np.broadcast_to(np.asarray(levels), (count, point.levels.shape[0]))
-    known = _known(model, point, covariance)
+    size = max(1, min(PASS, count, VALUES // at.model.state_size))
+    biases, log_levels = np.asarray(z), np.broadcast_to(np.asarray(levels), (count, at.point.levels.shape[0]))
     passes = []
     for k, start in enumerate(range(0, count, size)):
         chosen = np.minimum(np.arange(start, start + size), count - 1)  # the last pass is filled with its last draw
         seeds = jax.random.split(jax.random.fold_in(key, k))
         mine = biases[chosen]
-        states = _trajectories(model, point, known, mine, seeds[0])
+        states = at.draw(mine, seeds[0])
         by_datum: tuple[Data, Data] = ((), ())
         if {"log_likelihood", "replicas"} & set(keep):
-            by_datum = predictive(model, log_levels[chosen], mine, states, seeds[1], keep)
+            by_datum = predictive(at.model, log_levels[chosen], mine, states, seeds[1], keep)
         kept = Drawn(states if "states" in keep else (), *by_datum)
         passes.append(jax.tree.map(lambda leaf, most=count - start: np.asarray(leaf)[:most], kept))
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *passes), [part.moments for part in known]
-
-
-class _Known(NamedTuple):
-    """What all draws of one recursion share."""
-
-    L: jax.Array
-    J: jax.Array
-    gain: rec.Gains
-    half: jax.Array  # (E, n, n) root of J
-    moments: Moments
-
-
-@jax.jit
-def _known(model: Model, point: Point, covariance: jax.Array) -> list[_Known]:
-    """The covariance pass of every recursion at a point, and its response to the biases, which is linear."""
-    lins, found = model.linearise(point, expected=True), []
-    for part, (J, _), cross in zip(model.recursions, model.of_states(lins), model.of_both(lins), strict=True):
-        L = factors(part, point.levels)
-        gain = rec.gains(part.F, L, J)
-        values, vectors = linalg.spectrum(J)
-        half = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
-        moments = moments_of(part, L, J, gain, rec.smooth(part.F, L, J, gain, cross), covariance)
-        found.append(_Known(L, J, gain, half, moments))
-    return found
-
-
-@jax.jit
-def _trajectories(
-    model: Model, point: Point, known: list[_Known], z: jax.Array, key: jax.Array
-) -> tuple[jax.Array, ...]:
-    """Trajectories (D, E, n) given biases z (D, M): draws from the prior, less their smoothed selves.
-
-    All draws are columns of one pass of the simulation smoother (Durbin and Koopman 2002).
-    """
-    drawn = []
-    for r, (part, own) in enumerate(zip(model.recursions, known, strict=True)):
-        noise = jax.random.normal(jax.random.fold_in(key, r), (2, *part.drift.shape, len(z)))
-        prior = rec.trajectory(part.F, own.L, jnp.zeros((*part.drift.shape, 1)), noise[0])
-        smooth = rec.smooth(part.F, own.L, own.J, own.gain, own.J @ prior + own.half @ noise[1])
-        free = prior - smooth.states + own.moments.response @ (z - point.z[None, :]).T
-        drawn.append(jnp.moveaxis(point.states[r][:, :, None] + free, 2, 0))
-    return tuple(drawn)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *passes)
 
 
 @partial(jax.jit, static_argnames="keep")
@@ -137,14 +91,3 @@ class Remainder(NamedTuple):
 def residuals(model: Model, point: Point) -> Remainder:
     """Innovation, noise level and reliance of every datum at a point."""
     return Remainder(model.innovation(point), model.noise_std(point.levels), model.reliance(point))
-
-
-def residuals_of(model: Model, before: Point, after: Point) -> Residuals:
-    """Residuals without and with calibration, at two points."""
-    old, new = residuals(model, before), residuals(model, after)
-    return Residuals(
-        before=[np.asarray(part) for part in old.innovation],
-        after=[np.asarray(part) for part in new.innovation],
-        std=[np.asarray(part) for part in new.std],
-        weight=[np.asarray(part) for part in new.reliance],
-    )

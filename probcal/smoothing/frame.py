@@ -170,10 +170,9 @@ def _frame(model: Model, point: Point, lins: Sequence[Linearised]) -> Frame:
         information, score = _with_levels(information, score, values, slopes, H)
     by_level = [_share(model, point, lins, h) for h in range(H if model.driven else 0)]
     loops = []
-    parts = zip(model.recursions, compressed.states, compressed.crosses, strict=True)
-    for r, (part, (J, pull), cross) in enumerate(parts):
-        L = factors(part, point.levels)
-        smooth = rec.smooth(part.F, L, J, rec.gains(part.F, L, J), cross)
+    for r, (part, kept) in enumerate(zip(model.recursions, solved.parts, strict=True)):
+        L, J, pull = factors(part, point.levels), kept.J, kept.pull
+        smooth = rec.smooth(part.F, L, J, kept.gain, kept.cross)
         closed = closed_loop(part, L, J, pull, point.noises[r])
         closed = closed._replace(shift=jnp.zeros_like(pull))  # the point is the mean, by definition
         own = [share[r] for share in by_level]

@@ -1,53 +1,14 @@
-"""The Laplace approximation at a point: information of the biases, gamma, evidence, noise levels."""
-
-from typing import NamedTuple
+"""What follows from a point: Paper B's evidence as printed, noise levels, and the mean square of what is left."""
 
 import jax
 import jax.numpy as jnp
 
 from probcal import linalg
-from probcal.model.model import Data, Model, Recursion
+from probcal.model.model import Data, Model
 from probcal.priors import Precision
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import (
-    Compressed,
-    Point,
-    compress,
-    eliminate,
-    factors,
-    log_likelihood,
-)
-
-
-class Laplace(NamedTuple):
-    """Gaussian approximation of the posterior of z at one consistent point, trajectories marginalised."""
-
-    information: jax.Array  # (M, M) of the data about z
-    covariance: jax.Array  # (M, M) of z
-    gamma: jax.Array  # (M,) 1 - alpha Sigma: 0 prior only, 1 data only
-    evidence: jax.Array  # log p(data | alpha, levels), Laplace (exact on a linear-Gaussian problem)
-
-
-@jax.jit
-def marginal_information(model: Model, point: Point) -> jax.Array:
-    """Expected information (M, M) of the data about the biases at a point, trajectories marginalised."""
-    return eliminate(model, point, expected=True).information
-
-
-@jax.jit
-def laplace(model: Model, point: Point, prior: Precision) -> Laplace:
-    """Evidence and covariance with every trajectory marginalised exactly, at the mode for a prior.
-
-    A precision of 0 is a flat prior: its density counts as one. The expected information is used throughout.
-    """
-    solved = eliminate(model, point, expected=True)
-    covariance, logdet = linalg.inverse_and_logdet(solved.information + prior.matrix())
-    fit = log_likelihood(model, point) - 0.5 * sum(jnp.sum(u**2) for u in point.noises)
-    own = 0.5 * prior.log_determinant() - 0.5 * prior.square(point.z)
-    spread = -0.5 * jnp.sum((point.levels / model.level_spread) ** 2)
-    evidence = fit + own + spread - 0.5 * (solved.logdet + logdet)
-    gamma = jnp.clip(1.0 - prior.alpha * jnp.diagonal(covariance), 0.0, 1.0)
-    return Laplace(solved.information, covariance, gamma, evidence)
+from probcal.smoothing.linearised import Laplace, linearise
+from probcal.smoothing.mode import Point, compress, factors, log_likelihood
 
 
 def paper_b(model: Model, point: Point, prior: Precision) -> tuple[Laplace, jax.Array]:
@@ -97,41 +58,6 @@ def mean_square(model: Model, point: Point) -> jax.Array:
     return (squares + sum(jnp.sum(u**2) for u in point.noises)) / jnp.maximum(count, 1)
 
 
-class Moments(NamedTuple):
-    """Posterior moments of one recursion with the biases integrated out."""
-
-    response: jax.Array  # (E, n, M) derivative of the states' mode by z
-    states: jax.Array  # (E, n, n) covariance given z
-    noises: jax.Array  # (E, n) variance of each whitened noise, biases included
-
-
-@jax.jit
-def moments(model: Model, point: Point, covariance: jax.Array) -> list[Moments]:
-    """Trajectory moments of each recursion at a point, for a covariance (M, M) of z."""
-    lins = model.linearise(point, expected=True)
-    return moments_compressed(model, point.levels, compress(model, lins), covariance)
-
-
-def moments_compressed(model: Model, levels: jax.Array, compressed: Compressed, covariance: jax.Array) -> list[Moments]:
-    """Trajectory moments of each recursion from compressed rows, for a covariance (M, M) of z."""
-    found = []
-    for part, (J, _), cross in zip(model.recursions, compressed.states, compressed.crosses, strict=True):
-        L = factors(part, levels)
-        gain = rec.gains(part.F, L, J)
-        response = rec.smooth(part.F, L, J, gain, cross)
-        found.append(moments_of(part, L, J, gain, response, covariance))
-    return found
-
-
-def moments_of(
-    part: Recursion, L: jax.Array, J: jax.Array, gain: rec.Gains, response: rec.Smoothed, covariance: jax.Array
-) -> Moments:
-    """Moments of one recursion from its smoothed response to the biases."""
-    states, noises = rec.covariances(part.F, L, J, gain)
-    spread = jnp.einsum("eni,ij,enj->en", response.noises, covariance, response.noises)
-    return Moments(-response.states, states, jnp.diagonal(noises, axis1=1, axis2=2) + spread)
-
-
 def state_covariances(model: Model, point: Point) -> list[jax.Array]:
     """Covariances (E, n, n) of every smoothed state at held biases, linearised at a point."""
     compressed = model.of_states(model.linearise(point, expected=True))
@@ -142,26 +68,6 @@ def state_covariances(model: Model, point: Point) -> list[jax.Array]:
     return found
 
 
-@jax.jit
-def predicted_variances(model: Model, point: Point, covariance: jax.Array, found: list[Moments]) -> Data:
-    """Posterior variance (N, C) of each predicted value, biases and trajectories both uncertain."""
-    lins, root = model.linearise(point, expected=True), linalg.factor(covariance)
-    alone = model.state_variance(lins, [moment.states for moment in found])
-    return jax.tree.map(jnp.add, alone, model.spread(lins, [moment.response @ root for moment in found], root))
-
-
-@jax.jit
-def leverages(model: Model, point: Point, covariance: jax.Array, found: list[Moments]) -> Data:
-    """What every datum (N, C) of each block tells about the biases at a point, trajectories marginalised.
-
-    The leverage is w c' Sigma c, c the derivative of the predicted value by z with the trajectory following. Those of
-    all data and a rest, what the motion tells, add up to tr(Sigma G), the number of biases that are determined.
-    """
-    lins, root = model.linearise(point, expected=True), linalg.factor(covariance)
-    spread = model.spread(lins, [moment.response @ root for moment in found], root)
-    return tuple(lin.weight * own for lin, own in zip(lins, spread, strict=True))
-
-
 def update_levels(model: Model, point: Point, covariance: jax.Array) -> Point:
     """One MacKay step of every unknown noise level, kept within its declared factor by its log-normal prior.
 
@@ -169,15 +75,15 @@ def update_levels(model: Model, point: Point, covariance: jax.Array) -> Point:
     trajectory stays; its whitened noises are rescaled.
     """
     H = point.levels.shape[0]
-    found = moments(model, point, covariance)
-    spread = predicted_variances(model, point, covariance, found)
+    at = linearise(model, point)
+    spread = at.predicted_variances(covariance)
     count, square = model.by_level(model.measured), model.by_level(model.level_score(point))
     variance = model.by_level(jax.tree.map(jnp.multiply, model.information(point), spread))
-    for part, u, moment in zip(model.recursions, point.noises, found, strict=True):
+    for part, u, own in zip(model.recursions, point.noises, at.noise_variances(covariance), strict=True):
         active = jnp.any(part.L != 0, 1)
         count = count.at[part.level].add(active)
         square = square.at[part.level].add(active * u**2)
-        variance = variance.at[part.level].add(active * moment.noises)
+        variance = variance.at[part.level].add(active * own)
     free = jnp.maximum(count - variance, 1e-3 * count + 1e-9)[:H]
     step = jnp.zeros(H)
     for _ in range(8):  # Newton: -free t - square/2 exp(-2 t) - (level + t)^2 / (2 spread^2) is concave

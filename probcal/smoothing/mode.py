@@ -16,6 +16,7 @@ from probcal.model.model import Model, Recursion, Where
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
 from probcal.smoothing import recursion as rec
+from probcal.smoothing.solves import Dense
 
 HALVINGS = 12  # step lengths tried before the damping grows
 DAMPING = 1e10  # damping at which the iteration gives up
@@ -147,7 +148,7 @@ def _proposal(model: Model, point: Point, prior: Precision, damping: jax.Array, 
     dz = jnp.zeros_like(point.z)
     if joint and model.biases:  # an arrowhead: the tip first, then the trajectories follow
         matrix = solved.information + prior.matrix() + damping * jnp.eye(model.biases)
-        dz = linalg.solve_positive(matrix, solved.score - prior.pull(point.z))
+        dz = Dense.of(matrix).solve(solved.score - prior.pull(point.z))
     proposal = follow(model, point, solved, dz)
     slope = -prior.pull(point.z) @ dz
     slope = slope + (solved.pull @ dz if joint and model.biases else 0.0)
@@ -194,6 +195,8 @@ class Mode(NamedTuple):
     iterations: jax.Array
     converged: jax.Array
     refused: jax.Array  # every step was refused though it promised a lower cost: the start is no mode
+    gained: jax.Array  # by how much the cost fell
+    volume: jax.Array  # 1/2 log det W of a marginal mode, which its cost counts; 0 of a joint one
 
 
 @partial(jax.jit, static_argnames="joint")
@@ -243,7 +246,8 @@ def find_mode(
     )
     last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations), body, first)
     converged = last.done & ((last.change < tolerance) | last.still)
-    return Mode(last.point, last.cost, last.iteration, converged, ~last.moved & ~converged)
+    gained = first.cost - last.cost
+    return Mode(last.point, last.cost, last.iteration, converged, ~last.moved & ~converged, gained, jnp.zeros(()))
 
 
 def track(model: Model, point: Point, iterations: int = 20) -> Point:

@@ -19,7 +19,7 @@ from probcal.model import variants
 from probcal.model.model import At, Model, Recursion
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
-from probcal.problem import Problem
+from probcal.problem import Problem, check_linear
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Point, cost, factors, find_mode, track
 from probcal.types import float64
@@ -230,6 +230,7 @@ def automatic_start(problem: Problem, iterations: int = 30) -> Point:
 
     Grid, Viterbi path, motion model, iterated EKS at zero biases, then a few joint steps.
     """
+    check_linear(problem)
     tracked = _grid_start(problem, jax.device_put(np.zeros(problem.model.biases)), iterations)
     prior = Precision.single(jnp.ones(problem.model.biases))
     return find_mode(problem.model, tracked, prior, iterations, 1e-3).point

@@ -35,8 +35,6 @@ class Gauge(NamedTuple):
     """The gauge directions of a problem at a point."""
 
     basis: np.ndarray  # (M, k) in z, orthonormal
-    information: np.ndarray  # (M, M) of the biases with free states, surveys included
-    known: np.ndarray  # (M,) information of each bias alone with known states
     countable: bool  # whether enough epochs have more data than unknowns
 
 
@@ -81,7 +79,8 @@ def held_states(problem: Problem) -> tuple[jax.Array, ...]:
         for name in dict.fromkeys(epochs.target):
             mine = epochs.target == name
             row = 0
-            for component in as_motion(problem.target(str(name)).motion).components:
+            linear, _ = as_motion(problem.target(str(name)).motion).split
+            for component in () if linear is None else linear.components:
                 d = problem.network.dimension
                 size = sum(d if per_axis else 1 for _, per_axis in component.names())
                 if isinstance(component, Known):
@@ -109,7 +108,7 @@ def gauge(problem: Problem, point: Point) -> Gauge:
     exact = np.asarray(within(model, point, hold, jnp.asarray(near))) + near.T @ (survey[:, None] * near)
     values, turned = np.linalg.eigh(0.5 * (exact + exact.T))
     basis, _ = np.linalg.qr(near @ turned[:, values < NULL])
-    return Gauge(basis, information, alone, _countable(problem, free))
+    return Gauge(basis, _countable(problem, free))
 
 
 def _countable(problem: Problem, free: Free) -> bool:

@@ -1,0 +1,168 @@
+"""Gauge and weak directions of the biases by name: what data and surveys leave open, and what fixes it.
+
+A direction is weak when its marginal information lambda is below 1 in units of the prior scale: lambda / (1 + lambda)
+is the share of its answer that the data give. It is a gauge when no row fixes it (`identifiability.gauge`).
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from probcal.identifiability.gauge import Gauge
+from probcal.identifiability.patterns import DILATION, Pattern, cause, common_shifts, rigid_motions
+from probcal.identifiability.remedies import WEAK, Direction, with_remedies
+from probcal.identifiability.spaces import complete, inside, orthonormal, readable
+from probcal.identifiability.wording import amount, in_words, involved, name_of, owner_of
+from probcal.problem import Problem
+from probcal.smoothing.mode import Point
+
+ALONG = 0.1  # share of the largest entry above which a component moves along with a rigid motion
+APART = 0.5  # part of a unit direction outside those already named that makes it a new one
+MATCH = 1e-3  # how closely a gauge must follow a pattern
+INSIDE = {"gauge": 1e-6, "weak": 0.3}  # size outside one sensor below which a unit direction is its own
+MOSTLY = 0.7  # size inside the weak space from which a completed pattern belongs to it
+
+
+def weak_directions(
+    problem: Problem, information: np.ndarray, point: Point, gauge: Gauge | None = None
+) -> tuple[Direction, ...]:
+    """Name the directions of marginal information (M, M) below 1 at a point, in an order in which remedies add up.
+
+    Surveyed biases are marginalised with their survey. Combinations within one sensor, translations, rotations,
+    dilation and common shifts are tried, each completed by the other biases that move along; what remains is
+    described by its largest entries. With a `gauge` its directions are named first, also those that only the start
+    of a target holds. The remedy of each is checked by recomputing, on top of those before it.
+    """
+    free = ~problem.surveyed
+    if not free.any():
+        return ()
+    naming = _Naming(problem, free, marginal(information, free), point)
+    if gauge is not None and gauge.countable:
+        naming.name_gauge(gauge.basis[free])
+    naming.name_weak()
+    return tuple(with_remedies(problem, naming.known, naming.found, naming.anchors))
+
+
+def marginal(information: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Information of the free biases with the surveyed ones (whose survey is 1 in z) marginalised."""
+    held = ~free
+    inner = information[np.ix_(held, held)] + np.eye(held.sum())
+    cross = information[np.ix_(held, free)]
+    return information[np.ix_(free, free)] - cross.T @ np.linalg.solve(inner, cross)
+
+
+class _Naming:
+    """The directions named so far, and the space (F, k) of the free biases that they span."""
+
+    def __init__(self, problem: Problem, free: np.ndarray, known: np.ndarray, point: Point):
+        self.problem, self.free, self.known = problem, free, known
+        self.cause = cause(problem, point)
+        self.labels = [label for label, own in zip(problem.labels, free, strict=True) if own]
+        self.found: list[Direction] = []
+        self.anchors: list[tuple[tuple[str, ...], ...]] = []  # of each, groups of labels one of which is to be fixed
+        self.basis = np.zeros((len(self.labels), 0))
+        rigid = [p._replace(vector=p.vector[free]) for p in rigid_motions(problem, np.asarray(point.z))]
+        common = [p._replace(vector=p.vector[free]) for p in common_shifts(problem)]
+        self.rigid, self.common = ([p for p in group if p.vector.any()] for group in (rigid, common))
+
+    def name_gauge(self, space: np.ndarray) -> None:
+        """Name the null space (F, k) of the rows."""
+        space = orthonormal(space, 1e-6)
+
+        def follow(pattern: np.ndarray) -> np.ndarray | None:
+            own = pattern != 0
+            mixed, *_ = np.linalg.lstsq(space[own], pattern[own], rcond=1e-9)
+            near = np.linalg.norm(space[own] @ mixed - pattern[own]) <= MATCH * np.linalg.norm(pattern)
+            return space @ mixed if near else None
+
+        self._name("gauge", space, follow)
+
+    def name_weak(self) -> None:
+        """Name what else the data leave weak."""
+        values, vectors = np.linalg.eigh(self.known)
+        space = vectors[:, values < WEAK]
+
+        def follow(pattern: np.ndarray) -> np.ndarray | None:
+            vector = complete(self.known, pattern)
+            weak = vector @ self.known @ vector < WEAK and np.linalg.norm(space.T @ vector) > MOSTLY
+            return vector if weak else None
+
+        self._name("weak", space, follow)
+
+    def _name(self, kind: str, space: np.ndarray, follow: Callable[[np.ndarray], np.ndarray | None]) -> None:
+        """Name the part of a space (F, k) that has no name yet; `follow` completes a pattern, or refuses."""
+        left = self._outside(space)
+        weak = sum(direction.information < WEAK for direction in self.found)
+        missing = min(left.shape[1], space.shape[1] - (weak if kind == "weak" else 0))
+        groups = [inside(space, own, INSIDE[kind]) for own in self._owners()] if missing > 0 else []
+        groups = [group for group in groups if group.shape[1]]
+        owned = [self._combination(vector) for group in groups for vector in readable(group)]
+        candidates = [*owned, *self.rigid] if len(groups) > 1 else [*self.rigid, *owned]
+        for pattern in (*candidates, *self.common):
+            if missing <= 0 or not left.shape[1]:
+                return
+            vector = pattern.vector if any(pattern is own for own in owned) else follow(pattern.vector)
+            if vector is None:
+                continue
+            vector = vector / np.linalg.norm(vector)
+            if np.linalg.norm(left.T @ vector) > APART:
+                self._add(kind, pattern, vector)
+                left = self._outside(space)
+                missing -= 1
+        for vector in readable(left[:, : max(missing, 0)]):
+            self._add(kind, self._combination(vector), vector)
+
+    def _owners(self) -> list[np.ndarray]:
+        """Masks (F,) of the biases of each node with its sensors."""
+        nodes = [m["node"] for m, own in zip(self.problem.members, self.free, strict=True) if own]
+        names = np.array(nodes)
+        return [names == name for name in dict.fromkeys(nodes)] if len(set(nodes)) > 1 else []
+
+    def _outside(self, space: np.ndarray) -> np.ndarray:
+        """Orthonormal basis of what of a space lies outside the directions named so far."""
+        return orthonormal(space - self.basis @ (self.basis.T @ space), APART)
+
+    def _add(self, kind: str, pattern: Pattern, vector: np.ndarray) -> None:
+        strength = max(float(vector @ self.known @ vector), 0.0)
+        rest = vector - self.basis @ (self.basis.T @ vector)
+        self.basis = np.concatenate([self.basis, rest[:, None] / np.linalg.norm(rest)], 1)
+        whole = np.zeros(len(self.free))
+        whole[self.free] = vector
+        along = np.where(pattern.vector != 0, 0.0, vector)
+        others = involved(self.labels, along, np.abs(vector).max())
+        words, remedy, anchors = pattern.words, pattern.remedy, pattern.anchors
+        if any(pattern is rigid for rigid in self.rigid):  # range scales in a dilation, pitch and roll in a rotation
+            moved = self._moved_along(along, np.abs(vector).max())
+            if moved:
+                words += f" and the {' and '.join(name.replace('_', ' ') for name in moved)}s with them"
+                anchors = (*anchors, *((label,) for label in self.labels if name_of(label) in moved))
+            if moved and pattern.name.startswith(DILATION):
+                remedy += f", or fix one {moved[0].replace('_', ' ')}"
+        if kind == "gauge" and strength >= WEAK:
+            words += "; only the start of the motion holds it"
+        self.found.append(Direction(pattern.name, words, kind, strength, whole, others, remedy))
+        own = (tuple(label for label in group if label in self.labels) for group in anchors)  # a survey is not fixed
+        self.anchors.append(tuple(group for group in own if group))
+
+    def _moved_along(self, along: np.ndarray, largest: float) -> list[str]:
+        """Components other than those of a pattern that a direction moves most, by name."""
+        most: dict[str, float] = {}
+        for label, size in zip(self.labels, np.abs(along), strict=True):
+            most[name_of(label)] = max(most.get(name_of(label), 0.0), float(size))
+        return [name for name, size in most.items() if size > max(ALONG * largest, 0.5 * max(most.values()))]
+
+    def _combination(self, vector: np.ndarray) -> Pattern:
+        """A direction without a pattern, in words: its largest bias against the next ones."""
+        problem, labels = self.problem, involved(self.labels, vector, np.abs(vector).max())
+        first = labels[0]
+        alone = tuple((label,) for label in labels)
+        placed = any(name_of(label).startswith("position_") or name_of(label) == "heading" for label in labels[:3])
+        cause = self.cause if placed else ""
+        if len(labels) == 1:
+            return Pattern(f"{in_words(first)} alone", f"the data hardly depend on it{cause}", vector, "", alone)
+        one = len({owner_of(label) for label in labels[:3]}) == 1
+        others = " and ".join(name_of(label) if one else in_words(label) for label in labels[1:3])
+        more = f" and {len(labels) - 3} more" if len(labels) > 3 else ""
+        amounts = ", ".join(amount(problem, label, vector[self.labels.index(label)]) for label in labels[:3])
+        name = f"{in_words(first)} against {'its ' if one else ''}{others}{more}"
+        return Pattern(name, f"{amounts} together hardly change the data{cause}", vector, "", alone)

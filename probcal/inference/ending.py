@@ -1,0 +1,154 @@
+"""How a climb to a point ended: the answer, its status, and one sentence on what to do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
+from probcal.problem import Problem
+from probcal.results.answer import Answer, Normal
+from probcal.smoothing.information import squares_of
+from probcal.smoothing.mode import Point
+from probcal.status import Status
+
+if TYPE_CHECKING:
+    from probcal.inference.run import Maximiser, State
+
+FAR = 10.0  # scales from the stated value beyond which a bias without prior has diverged
+FALL = 1.0  # nats below its best at which an evidence may end
+ABSURD = 100.0  # mean square a datum, 1 expected, beyond which a fit explains nothing
+
+
+def conclude(
+    problem: Problem, method: Maximiser, prior: Prior, state: State, trace: np.ndarray, square: float, iterations: int
+) -> Answer:
+    """The answer of a method whose outer loop ended in a state, whose data leave a mean square a datum."""
+    point, found = state.point, state.found
+    alpha, z = np.asarray(state.alpha), np.asarray(point.z)
+    low, far = low_and_far(prior, alpha, z, problem.surveyed)
+    asked = method.tolerance == 0.0  # to run so many iterations, whatever they reach
+    end = End(
+        bool(state.done),
+        asked,
+        bool(low.any()),
+        bool(far.any()),
+        all(np.isfinite(np.asarray(part)).all() for part in (found.covariance, found.evidence, point.z)),
+        bool(state.refused),
+        fallen(prior, len(problem.levels), state.best, state.worth),
+        square,
+    )
+    status = verdict(end)
+    message = _message(problem, point, status, end, low, far, iterations)
+    if status is Status.SPENT and len(trace) > 1:
+        message = (
+            f"All {iterations} iterations were run, as asked; the last moved the objective by"
+            f" {trace[-1] - trace[-2]:.2g}. {message}"
+        ).strip()
+    posterior = Normal.of(problem, prior, point, found, alpha)
+    ended = _bias_status(problem, prior, low, far, posterior.summary.gamma)
+    return Answer(problem, method, method, prior, posterior, status, message, ended, iterations, trace)
+
+
+def _bias_status(
+    problem: Problem, prior: Prior, low: np.ndarray, far: np.ndarray, gamma: np.ndarray
+) -> tuple[str, ...]:
+    """How each bias ended."""
+    pruned = (gamma < 1e-2) & prior.learns
+    kind = np.array([bias.kind for bias in problem.biases], str)
+    conditions = [kind == "survey", kind == "drift", low, far, pruned]
+    words = ["survey", "drift", "at bound", "diverged", "pruned"]
+    return tuple(np.select(conditions, words, "estimated").tolist())
+
+
+def low_and_far(prior: Prior, alpha: np.ndarray, z: np.ndarray, surveyed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which biases (..., M) stand at the lower bound of their precision, and which ran away without a prior."""
+    none = np.zeros(z.shape, bool)
+    low = (alpha <= PRECISION_BOUNDS[0] * (1 + 1e-9)) & ~surveyed if isinstance(prior, ARD) else none
+    far = (np.abs(z) > FAR) & ~surveyed if isinstance(prior, Flat) else none
+    return low, far
+
+
+def fallen(prior: Prior, levels: int, best: Any, worth: Any) -> float:
+    """Nats by which the last evidence lies below the best, where a method maximises it: precisions or levels learnt."""
+    return max(float(best) - float(worth), 0.0) if prior.proper and (prior.learns or levels) else 0.0
+
+
+class End(NamedTuple):
+    """What the status of a fit follows from."""
+
+    still: bool  # the method says that it is done
+    asked: bool  # it was to run so many iterations, and did
+    low: bool  # a precision stands at its lower bound
+    far: bool  # a bias without prior ran away
+    sound: bool  # everything is finite
+    refused: bool  # the search never left its start, though a step promised to
+    fallen: float  # nats that the evidence lost
+    square: float  # mean square a datum of what is left
+
+
+def verdict(end: End) -> Status:
+    """Status of a fit."""
+    if not end.square <= ABSURD:
+        return Status.MISFIT
+    if end.far or not end.sound or end.refused:
+        return Status.DIVERGED
+    if end.low:
+        return Status.AT_BOUND
+    if end.fallen > FALL:
+        return Status.NOT_CONVERGED
+    return Status.CONVERGED if end.still else Status.SPENT if end.asked else Status.NOT_CONVERGED
+
+
+def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
+    """What to check where a fit explains nothing, and the datum that is worst explained."""
+    squares = [np.asarray(part) for part in squares_of(problem.model, point)]
+    block = int(np.argmax([np.nan_to_num(part, nan=np.inf).max() for part in squares]))
+    n, c = np.unravel_index(np.argmax(np.nan_to_num(squares[block], nan=np.inf)), squares[block].shape)
+    row, data = problem.row_index[block][n], problem.measurements
+    sensor = problem.network.sensors[data.sensor[row]].name
+    channel = problem.columns[block][c]
+    return (
+        f"The fit explains nothing: mean square a datum {square:.2g} where 1 is expected, worst {sensor}.{channel} at"
+        f" {data.time[row]:.6g} s. Check units, the time column, sentinels such as -9999 and the noise std."
+    )
+
+
+def _message(
+    problem: Problem,
+    point: Point,
+    status: Status,
+    end: End,
+    low: np.ndarray,
+    far: np.ndarray,
+    iterations: int,
+) -> str:
+    def listed(mask: np.ndarray) -> str:
+        labels = [label for label, hit in zip(problem.labels, mask, strict=True) if hit]
+        return ", ".join(labels[:12]) + (f" and {len(labels) - 12} more" if len(labels) > 12 else "")
+
+    if status is Status.AT_BOUND:
+        return f"The precision of {listed(low)} stands at its lower bound: the estimate is invalid."
+    if status is Status.MISFIT:
+        return misfit_sentence(problem, point, end.square)
+    if status is Status.DIVERGED and end.sound and end.refused and not end.far:
+        return (
+            "The fit diverged: it never left its start, since no step fitted better; the estimate is invalid. Check"
+            " units, the time column, sentinels such as -9999 and the noise std, or give a start."
+        )
+    if status is Status.DIVERGED:
+        where = (
+            f"{listed(far)} lie more than {FAR:g} scales from the stated value"
+            if far.any()
+            else "the information matrix is singular"
+        )
+        return f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases."
+    if status is Status.NOT_CONVERGED and end.fallen > FALL:
+        return (
+            f"The evidence fell by {end.fallen:.3g} nats below its best on the way: the fit ran to a place that the"
+            f" data as a whole do not favour. Survey or fix more, state narrower scales, or take a sampler."
+        )
+    if status is Status.NOT_CONVERGED:
+        return f"The fit did not converge in {iterations} iterations: allow more, or fix what the data leave open."
+    return ""

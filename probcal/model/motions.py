@@ -1,0 +1,143 @@
+"""The motion of each target as arrays: transitions and noise factors of its epochs, and the levels that are unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from probcal.errors import InputError
+from probcal.model.sampled import Sampled, sampled_of
+from probcal.motion import Layout, Motion, Target, as_motion
+from probcal.motion.base import level_name
+from probcal.motion.layout import layout_of, stacked
+from probcal.noise import Bernoulli, Level, Unknown, guess_of
+
+DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
+
+
+class Area(NamedTuple):
+    """Where a target starts of which nothing is stated."""
+
+    dimension: int
+    centre: np.ndarray  # (d,)
+    extent: float  # in m
+
+
+@dataclass(frozen=True)
+class LevelRecord:
+    """One unknown noise level: label, unit, guess and the factor within which it is known."""
+
+    label: str
+    unit: str
+    guess: float
+    factor: float
+
+
+class Levels:
+    """Collects unknown noise levels; equal declarations under one label are one level."""
+
+    def __init__(self, records: Iterable[LevelRecord] = ()) -> None:
+        self.records: list[LevelRecord] = list(records)
+
+    def of(self, level: Level, label: str, unit: str) -> int:
+        """Number of the level, -1 where it is known."""
+        if not isinstance(level, Unknown):
+            return -1
+        twins = [other for other in self.records if other.label.split("#")[0] == label]
+        for k, other in enumerate(twins):
+            if (other.guess, other.factor) == (level.guess, level.factor):
+                return self.records.index(twins[k])
+        name = f"{label}#{len(twins) + 1}" if twins else label
+        self.records.append(LevelRecord(name, unit, level.guess, level.factor))
+        return len(self.records) - 1
+
+
+def channel_levels(kind: Any, dimension: int, levels: Levels) -> list[int]:
+    """Level number of each scalar channel of a type; a channel declared per axis has one level."""
+    numbers = []
+    for name, channel in kind.channels.items():
+        level = (
+            -1
+            if isinstance(channel.noise, Bernoulli)
+            else levels.of(channel.std, f"{kind.name}.{name}_std", channel.unit)
+        )
+        numbers += [level] * (dimension if channel.per_axis else 1)
+    return numbers
+
+
+def linear_of(motion: Motion) -> tuple[Any, ...]:
+    """Components of what is linear in a motion."""
+    vector = motion.split[0]
+    return () if vector is None else vector.components
+
+
+def form_of(name: str, motion: Motion, levels: Levels, d: int) -> tuple[Layout, Sampled | None]:
+    """What rows read of a target's state in d axes, and the static form of a motion that is not linear."""
+    others = motion.split[1]
+    if not others:
+        return layout_of(linear_of(motion), d), None
+    own = {level: value for other in others for level, value in other.levels.items()}
+    numbers = {level: levels.of(value, f"motion.{level}", "") for level, value in own.items()}
+    try:
+        found = sampled_of(motion, d, numbers, {level: guess_of(value) for level, value in own.items()})
+    except InputError as error:
+        raise InputError(f'target "{name}": {error}') from None
+    return found.layout, found
+
+
+def chain(
+    name: str, target: Target, time: np.ndarray, levels: Levels, before: float | None, area: Area
+) -> tuple[np.ndarray, ...]:
+    """Arrays of one target's epochs: F, L, level, drift; it begins at the first, or goes on from a time before."""
+    d, components = area.dimension, linear_of(as_motion(target.motion))
+    n, epochs = sum(stop - start for _, start, stop, _ in layout_of(components, d)), len(time)
+    F, L = np.zeros((epochs, n, n)), np.zeros((epochs, n, n))
+    level, drift = np.full((epochs, n), -1), np.zeros((epochs, n))
+    dt = np.diff(time, prepend=time[0] if before is None else before)
+    row = column = 0
+    for component in components:
+        transition, factor = component.transition(dt, d), component.noise_factor(dt, d)
+        size, width = factor.shape[1:]
+        here, noise = slice(row, row + size), slice(column, column + width)
+        F[:, here, here] = transition
+        L[:, here, noise] = factor * guess_of(component.std)
+        level[:, noise] = levels.of(component.std, f"motion.{level_name(component)}", "")
+        try:
+            drift[:, here] = component.means(time, d)
+        except InputError as error:
+            raise InputError(f'target "{name}": {error}') from None
+        if not component.memoryless and before is None:
+            F[0, here, here], drift[0, here] = 0.0, 0.0
+            L[0, here, :], level[0, noise] = 0.0, -1
+            mean, std = start_of(name, component, target, time, area)
+            drift[0, here] = mean
+            L[0, here, here] = np.diag(std)
+        row, column = row + size, column + size
+    if before is None:
+        F[0] = 0.0
+    return F, L, level, drift
+
+
+def start_of(name: str, component: Any, target: Target, time: np.ndarray, area: Area) -> tuple[np.ndarray, np.ndarray]:
+    """Start mean and standard deviation of a component: declared, its own, or wide."""
+    extent, duration = area.extent, float(np.ptp(time)) or 1.0
+    pace, wander = DIFFUSE * extent / duration, guess_of(component.std) * np.sqrt(duration)
+    bent = component.driven == "acceleration"
+    wide = {
+        "position": (area.centre, DIFFUSE * extent),
+        "velocity": (0.0, pace + wander * (duration if bent else 1.0)),
+        "acceleration": (0.0, pace / duration + wander),
+    }
+    given = wide | component.start() | dict(target.start)
+    for part, _ in component.names():
+        if part not in given:
+            raise InputError(
+                f'target "{name}": state the start of "{part}", Target(motion, start={{"{part}": (mean, std)}})'
+            )
+    try:
+        return stacked(component, given, area.dimension)
+    except ValueError as error:
+        raise InputError(f'target "{name}": {error}') from None

@@ -1,0 +1,210 @@
+"""The only writer of results: one labelled DataTree from the answer of any method."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from probcal.lazy import Later
+from probcal.results.answer import Answer, Draws, Summary, Tracks, uncalibrated
+from probcal.results.groups import (
+    Band,
+    constant_group,
+    datum_of,
+    direction_group,
+    gather,
+    suffix,
+    track_group,
+)
+from probcal.results.schema import INTERVAL, RESULTS_VERSION
+from probcal.smoothing.draws import residuals
+from probcal.smoothing.mode import Point
+from probcal.smoothing.start import track_mode
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from probcal.problem import Problem
+else:
+    xr = Later("xarray")
+
+SHARP = 256  # steps to which the spread of a log-likelihood over the draws is rounded, so that its file is small
+AT_ONCE = 10_000  # data that are rounded at once
+SAMPLE = ("chain", "draw")
+
+
+def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple[str, ...]) -> xr.DataTree:
+    """Assemble the DataTree of a fit (groups posterior, calibration, track, observed_data, ...).
+
+    `directions` are those that the data leave open; `keep` names the draws that the tree holds beside those of the
+    biases, made with `key`.
+    """
+    problem, posterior = answer.problem, answer.posterior
+    draws = posterior.draws(key, keep)
+    before = track_mode(problem, uncalibrated(posterior.point))
+    tracks = bands(posterior.tracks(), before)
+    groups = {
+        "posterior": _posterior_group(answer, draws, track_group(problem, tracks)),
+        "calibration": _calibration_group(answer),
+        "track": track_group(problem, tracks),
+        "constant_data": constant_group(problem),
+        **_data_groups(answer, draws, before),
+    }
+    if answer.trace is not None:
+        groups["optimisation"] = xr.Dataset({"objective": ("iteration", answer.trace)})
+    if posterior.stats:
+        groups["sample_stats"] = xr.Dataset({k: (SAMPLE, v) for k, v in posterior.stats.items()}, coords=_sample(draws))
+    if (log_prior := posterior.log_prior(draws)) is not None:
+        coords = {**_sample(draws), "bias_label": list(problem.labels)}
+        groups["log_prior"] = xr.Dataset({"bias": ((*SAMPLE, "bias_label"), log_prior)}, coords=coords)
+    if problem.levels:
+        guess = np.array([level.guess for level in problem.levels])
+        groups["level"] = xr.Dataset(
+            {"std": ("level", guess * np.exp(posterior.summary.levels)), "guess": ("level", guess)},
+            coords={"level": [level.label for level in problem.levels]},
+        )
+    if directions:
+        groups["direction"] = direction_group(problem.labels, directions)
+    for group in groups.values():
+        group.attrs.update(inference_library="probcal", inference_library_version=version("probcal"))
+    tree = xr.DataTree.from_dict(groups)
+    tree.attrs.update(_attrs(answer))
+    return tree
+
+
+def _sample(draws: Draws) -> dict[str, Any]:
+    chains, count = draws.z.shape[:2]
+    return {"chain": np.arange(chains), "draw": np.arange(count)}
+
+
+def bands(tracks: Sequence[Tracks], before: Point) -> list[Band]:
+    """Tracks with their means without calibration."""
+    return [Band(own.mean, own.sd, np.asarray(old)) for own, old in zip(tracks, before.states, strict=True)]
+
+
+def _posterior_group(answer: Answer, draws: Draws, track: xr.Dataset) -> xr.Dataset:
+    """Draws of the biases, and of what else varies with them."""
+    problem = answer.problem
+    values: dict[str, Any] = {"bias": ((*SAMPLE, "bias_label"), draws.z * problem.scales)}
+    for r, states in enumerate(draws.states):
+        s = suffix(problem, r)
+        values[f"state{s}"] = ((*SAMPLE, f"epoch{s}", f"component{s}"), states)
+    further: dict[str, Any] = {str(k): v for k, v in track.coords.items()} if len(draws.states) else {}
+    for name, (dims, drawn, *own) in answer.posterior.variables.items():
+        values[name] = ((*SAMPLE, *dims), drawn)
+        further |= own[0] if own else {}
+    return xr.Dataset(values, coords={**_sample(draws), **further, "bias_label": list(problem.labels)})
+
+
+def _calibration_group(answer: Answer) -> xr.Dataset:
+    """One entry a bias, in its unit; covariance, information of the data, and couplings of the prior."""
+    problem, found = answer.problem, answer.posterior.summary
+    scales, labels = problem.scales, list(problem.labels)
+    columns = {
+        "mean": found.mean * scales, "sd": found.sd * scales, "lower": found.lower * scales,
+        "upper": found.upper * scales, "gamma": found.gamma, "precision": found.precision, "scale": scales,
+        "status": np.array(answer.bias_status, str), "unit": np.array([b.unit for b in problem.biases], str),
+        "kind": np.array([b.kind for b in problem.biases], str), **found.columns,
+    }  # fmt: skip
+    matrices = {"covariance": found.covariance * np.outer(scales, scales), "information": found.information}
+    if answer.prior.correlation:
+        matrices["coupling"] = np.asarray(answer.prior.precision(problem.labels, problem.surveyed).coupling)
+    values: dict[str, Any] = {name: ("bias_label", column) for name, column in columns.items()}
+    values |= {name: (("bias_label", "bias_label_other"), matrix) for name, matrix in matrices.items()}
+    return xr.Dataset(values, coords={"bias_label": labels, "bias_label_other": labels})
+
+
+def _data_groups(answer: Answer, draws: Draws, before: Point) -> dict[str, xr.Dataset]:
+    """The data, what is left of them without and with calibration, and what the draws say of each."""
+    problem = answer.problem
+    datum, picks = datum_of(problem)
+    coords = datum["coords"]
+    old, new = residuals(problem.model, before), residuals(problem.model, answer.posterior.point)
+    parts = {"before": old.innovation, "after": new.innovation, "std": new.std, "weight": new.reliance}
+    residual = {name: ("datum", gather([np.asarray(part) for part in own], picks)) for name, own in parts.items()}
+    groups = {
+        "observed_data": xr.Dataset({"y": ("datum", datum["y"])}, coords=coords),
+        "residual": xr.Dataset(residual, coords=coords),
+    }
+    kept = {"chain": np.arange(draws.z.shape[0]), "draw": draws.kept, **coords}
+    for name, own in (("log_likelihood", draws.log_likelihood), ("posterior_predictive", draws.replicas)):
+        if len(own):
+            values = gather(own, picks)
+            rounded = _rounded(values) if name == "log_likelihood" else values
+            groups[name] = xr.Dataset({"y": ((*SAMPLE, "datum"), rounded)}, coords=kept)
+    return groups
+
+
+def _attrs(answer: Answer) -> dict[str, Any]:
+    """What was asked for, what ran, and how it ended."""
+    found: Summary = answer.posterior.summary
+    attrs = {
+        "method": answer.method.name, "requested": answer.requested.name, "prior": type(answer.prior).__name__,
+        "approximate": found.kind, "precisions": found.precisions, "correlated": int(bool(answer.prior.correlation)),
+        "intervals": (answer.prior.note if found.kind == "Laplace" else "") or answer.method.note(),
+        "settings": f"{answer.method!r}, {answer.prior!r}", "interval_probability": INTERVAL,
+        "results_version": RESULTS_VERSION, "motion": answer.motion, "interrupted": int(answer.interrupted),
+        "status": str(answer.status), "message": answer.message, "data": answer.problem.measurements.table.source,
+        "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
+        **answer.posterior.attrs,
+    }  # fmt: skip
+    if found.evidence is not None:
+        attrs["log_evidence"] = found.evidence
+    return attrs
+
+
+def _rounded(log_likelihood: np.ndarray) -> np.ndarray:
+    """Values (chain, draw, datum), rounded in place to 1/256 of their spread over the draws of a datum.
+
+    What is rounded away is noise, and the rest compresses to a byte and a half a value.
+    """
+    for start in range(0, log_likelihood.shape[2], AT_ONCE):
+        part = log_likelihood[:, :, start : start + AT_ONCE]
+        with np.errstate(invalid="ignore"):  # a row of probability zero
+            spread = part.std((0, 1))
+        sure = np.isfinite(spread) & (spread > 1e-9)
+        step = np.exp2(np.floor(np.log2(spread[sure] / SHARP)))
+        part[:, :, sure] = np.rint(part[:, :, sure] / step) * step
+    return log_likelihood
+
+
+def build_tracks(problem: Problem, tracks: Sequence[Band]) -> xr.DataTree:
+    """A tree of tracks alone, for data to which a calibration was applied."""
+    tree = xr.DataTree.from_dict({"track": track_group(problem, tracks)})
+    tree.attrs["data"] = problem.measurements.table.source
+    return tree
+
+
+def add_optima(tree: xr.DataTree, answers: Sequence[Answer], best: int) -> xr.DataTree:
+    """Add the optima found from several starts, the reported one first: biases, evidence, objective, status."""
+    order = [best, *(k for k in range(len(answers)) if k != best)]
+    chosen, problem = [answers[k] for k in order], answers[best].problem
+    summaries = [answer.posterior.summary for answer in chosen]
+    last = [np.nan if answer.trace is None else answer.trace[-1] for answer in chosen]
+    values: dict[str, Any] = {
+        "bias": (("optimum", "bias_label"), np.stack([own.mean * problem.scales for own in summaries])),
+        "objective": ("optimum", np.array(last, float)),
+        "status": ("optimum", np.array([str(answer.status) for answer in chosen])),
+        "start": ("optimum", np.array(order)),
+    }
+    evidence = np.array([np.nan if own.evidence is None else own.evidence for own in summaries])
+    if "log_evidence" in tree.attrs and np.isfinite(evidence).all():
+        values["log_evidence"] = ("optimum", evidence)
+    tree["optimum"] = xr.DataTree(xr.Dataset(values, coords={"bias_label": list(problem.labels)}))
+    return tree
+
+
+def add_scores(tree: xr.DataTree, scores: Mapping[str, float], biases: Mapping[str, float]) -> xr.DataTree:
+    """Add what the truth says of a fit: scores as attributes, true biases to the calibration group."""
+    tree.attrs.update({name: float(value) for name, value in scores.items()})
+    known = {label: value for label, value in biases.items() if label in tree["calibration"]["bias_label"]}
+    if known:
+        tree["truth"] = xr.DataTree(
+            xr.Dataset({"bias": ("bias_label", list(known.values()))}, coords={"bias_label": list(known)})
+        )
+    return tree

@@ -1,0 +1,76 @@
+"""What readers take from a tree: one row a bias, outliers, and a calibration for other data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from probcal.errors import InputError
+from probcal.results.schema import MORE, SUMMARY
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+    from probcal.problem import Problem
+
+
+def summary(tree: xr.DataTree) -> Any:
+    """One row a bias as a DataFrame: bias, unit, scale, mean, sd, lower, upper, gamma, precision, status.
+
+    After `assess` also verdict and reason.
+    """
+    group = tree["calibration"].to_dataset()
+    columns = [*SUMMARY, "precision", "status", *(name for name in MORE if name in tree["calibration"])]
+    if "verdict" in tree.children:
+        judged = tree["verdict"].to_dataset()[["verdict", "reason"]]
+        group, columns = group.merge(judged), [*columns, *judged.data_vars]
+    frame = group[columns[1:]].to_dataframe().reset_index()
+    return frame.rename(columns={"bias_label": "bias"})[columns]
+
+
+def outliers(tree: xr.DataTree, below: float = 0.5) -> pd.DataFrame:
+    """Data that count less than `below` (heavy-tailed noise), the least first: row, time, sensor, residual, weight.
+
+    The weight is that of a Student-t over its largest, or the probability that a datum is no echo of a mixture.
+    """
+    frame = tree["residual"].to_dataset().to_dataframe().reset_index(drop=True)
+    frame["residual/std"] = frame["after"] / frame["std"]
+    columns = ["row", "time", "sensor", "target", "channel", "after", "residual/std", "weight"]
+    return frame[frame["weight"] < below].sort_values("weight", kind="stable")[columns].reset_index(drop=True)
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibration in the numbers of a problem: the problem with the same biases held, z, its covariance, levels."""
+
+    problem: Problem
+    z: np.ndarray  # (M,)
+    covariance: np.ndarray  # (M, M)
+    levels: np.ndarray  # (H,) log factors
+
+
+def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
+    """What a fit found, for another problem of its network; biases and levels are matched by label.
+
+    Biases that the fit held are held; a level that it did not estimate stays at its guess. Raises `InputError` if the
+    calibration lacks a bias.
+    """
+    constant = calibration["constant_data"].to_dataset()
+    held = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
+    held = {label: value for label, value in held.items() if label in problem.labels}
+    problem = problem.rebuild(fix=problem.fixed | held) if held else problem
+    group, labels = calibration["calibration"].to_dataset(), list(problem.labels)
+    known = [str(label) for label in group["bias_label"].values]
+    for label in labels:
+        if label not in known:
+            raise InputError(f'the calibration has no bias "{label}"; fit the same network, or fix that bias')
+    mean = group["mean"].sel(bias_label=labels).values
+    spread = group["covariance"].sel(bias_label=labels, bias_label_other=labels).values
+    levels = np.zeros(len(problem.levels))
+    if problem.levels and "level" in calibration.children:
+        found = calibration["level"].to_dataset()["std"].to_series()
+        levels = np.array([np.log(found.get(r.label, r.guess) / r.guess) for r in problem.levels])
+    return Calibrated(problem, mean / problem.scales, spread / np.outer(problem.scales, problem.scales), levels)

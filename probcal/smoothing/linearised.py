@@ -1,0 +1,177 @@
+"""The problem linearised at a point: made once, asked for everything that follows from it.
+
+Rows carry the expected information. Given the biases each trajectory is Gaussian; with the trajectories marginalised
+so are the biases, `Eliminated`, and what a prior makes of these is solved by `Dense` (Schur complement).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from probcal import linalg
+from probcal.model.model import Data, Model
+from probcal.model.rows import Linearised
+from probcal.priors import Precision
+from probcal.smoothing import recursion as rec
+from probcal.smoothing.mode import (
+    Compressed,
+    Eliminated,
+    Point,
+    compress,
+    eliminate,
+    eliminate_compressed,
+    factors,
+    log_density,
+)
+from probcal.smoothing.solves import Dense
+
+
+class Laplace(NamedTuple):
+    """Gaussian approximation of the posterior of z at one consistent point, trajectories marginalised."""
+
+    information: jax.Array  # (M, M) of the data about z
+    covariance: jax.Array  # (M, M) of z
+    gamma: jax.Array  # (M,) 1 - alpha Sigma: 0 prior only, 1 data only
+    evidence: jax.Array  # log p(data | alpha, levels), Laplace (exact on a linear-Gaussian problem)
+
+
+class Trajectory(NamedTuple):
+    """Trajectories of one recursion given the biases: Gaussian around a mean that follows z."""
+
+    L: jax.Array  # (E, n, n) noise factors at the levels of the point
+    half: jax.Array  # (E, n, n) root of the information of the rows
+    response: jax.Array  # (E, n, M) derivative of the states by z
+    driven: jax.Array  # (E, n, M) derivative of the whitened noises by z
+    covariance: jax.Array  # (E, n, n) of the states given z
+    spread: jax.Array  # (E, n) variance of each whitened noise given z
+
+
+class Linearisation(NamedTuple):
+    """A problem linearised at a point with the expected information; a pytree."""
+
+    model: Model
+    point: Point
+    rows: tuple[Linearised, ...]  # of each block
+    system: Compressed
+    solved: Eliminated
+    trajectories: tuple[Trajectory, ...]  # of each recursion
+
+    @property
+    def information(self) -> jax.Array:
+        """Information (M, M) of the data about the biases, trajectories marginalised."""
+        return self.solved.information
+
+    def given(self, prior: Precision) -> Dense:
+        """The precision of the biases under a prior, ready to be solved."""
+        return Dense.of(self.information + prior.matrix())
+
+    def laplace(self, prior: Precision) -> Laplace:
+        """Covariance of the biases, gamma and evidence under a prior (see `laplace`)."""
+        return _laplace(self.model, self.point, self.solved, prior)
+
+    def variances(self, covariance: jax.Array) -> tuple[jax.Array, ...]:
+        """Variance (E, n) of every state of each recursion, for a covariance (M, M) of z."""
+        return state_variances(self.trajectories, covariance)
+
+    @jax.jit
+    def noise_variances(self, covariance: jax.Array) -> tuple[jax.Array, ...]:
+        """Variance (E, n) of every whitened noise of each recursion, for a covariance (M, M) of z."""
+        return tuple(
+            own.spread + jnp.einsum("eni,ij,enj->en", own.driven, covariance, own.driven) for own in self.trajectories
+        )
+
+    @jax.jit
+    def predicted_variances(self, covariance: jax.Array) -> Data:
+        """Variance (N, C) of each predicted value, biases and trajectories both uncertain."""
+        alone = self.model.state_variance(self.rows, [own.covariance for own in self.trajectories])
+        return jax.tree.map(jnp.add, alone, self._by_bias(covariance))
+
+    @jax.jit
+    def leverages(self, covariance: jax.Array) -> Data:
+        """What every datum (N, C) of each block tells about the biases, trajectories marginalised.
+
+        The leverage is w c' Sigma c, c the derivative of the predicted value by z with the trajectory following. Those
+        of all data and a rest, what the motion tells, add up to tr(Sigma G), the number of biases that are determined.
+        """
+        return tuple(lin.weight * own for lin, own in zip(self.rows, self._by_bias(covariance), strict=True))
+
+    def _by_bias(self, covariance: jax.Array) -> Data:
+        """Variance (N, C) of each predicted value by the biases, trajectories following."""
+        root = linalg.factor(covariance)
+        return self.model.spread(self.rows, [own.response @ root for own in self.trajectories], root)
+
+    @jax.jit
+    def draw(self, z: jax.Array, key: jax.Array) -> tuple[jax.Array, ...]:
+        """Trajectories (D, E, n) of each recursion given biases z (D, M): draws from the prior, less their smoothed
+        selves.
+
+        All draws are columns of one pass of the simulation smoother (Durbin and Koopman 2002).
+        """
+        drawn = []
+        parts = zip(self.model.recursions, self.trajectories, self.solved.parts, self.point.states, strict=True)
+        for r, (part, own, kept, mean) in enumerate(parts):
+            noise = jax.random.normal(jax.random.fold_in(key, r), (2, *part.drift.shape, len(z)))
+            prior = rec.trajectory(part.F, own.L, jnp.zeros((*part.drift.shape, 1)), noise[0])
+            smooth = rec.smooth(part.F, own.L, kept.J, kept.gain, kept.J @ prior + own.half @ noise[1])
+            free = prior - smooth.states + own.response @ (z - self.point.z[None, :]).T
+            drawn.append(jnp.moveaxis(mean[:, :, None] + free, 2, 0))
+        return tuple(drawn)
+
+
+@jax.jit
+def linearise(model: Model, point: Point) -> Linearisation:
+    """Linearise a problem at a consistent point and eliminate its trajectories."""
+    rows = model.linearise(point, expected=True)
+    system = compress(model, rows)
+    solved = eliminate_compressed(model, point.noises, point.levels, system)
+    return Linearisation(model, point, rows, system, solved, trajectories_of(model, point.levels, solved))
+
+
+def trajectories_of(model: Model, levels: jax.Array, solved: Eliminated) -> tuple[Trajectory, ...]:
+    """Trajectories of each recursion given the biases, where they were eliminated at log levels (H,)."""
+    found = []
+    for part, kept in zip(model.recursions, solved.parts, strict=True):
+        L = factors(part, levels)
+        values, vectors = linalg.spectrum(kept.J)
+        half = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
+        response = rec.smooth(part.F, L, kept.J, kept.gain, kept.cross)
+        states, noises = rec.covariances(part.F, L, kept.J, kept.gain)
+        spread = jnp.diagonal(noises, axis1=1, axis2=2)
+        found.append(Trajectory(L, half, -response.states, -response.noises, states, spread))
+    return tuple(found)
+
+
+@jax.jit
+def state_variances(trajectories: tuple[Trajectory, ...], covariance: jax.Array) -> tuple[jax.Array, ...]:
+    """Variance (E, n) of every state of each recursion, for a covariance (M, M) of z."""
+    return tuple(
+        jnp.diagonal(own.covariance, axis1=1, axis2=2)
+        + jnp.einsum("eni,ij,enj->en", own.response, covariance, own.response)
+        for own in trajectories
+    )
+
+
+@jax.jit
+def marginal_information(model: Model, point: Point) -> jax.Array:
+    """Expected information (M, M) of the data about the biases at a point, trajectories marginalised."""
+    return eliminate(model, point, expected=True).information
+
+
+@jax.jit
+def laplace(model: Model, point: Point, prior: Precision) -> Laplace:
+    """Evidence and covariance with every trajectory marginalised exactly, at the mode for a prior.
+
+    A precision of 0 is a flat prior: its density counts as one. The expected information is used throughout.
+    """
+    return _laplace(model, point, eliminate(model, point, expected=True), prior)
+
+
+def _laplace(model: Model, point: Point, solved: Eliminated, prior: Precision) -> Laplace:
+    biases = Dense.of(solved.information + prior.matrix())
+    own = 0.5 * prior.log_determinant() - 0.5 * prior.square(point.z)
+    spread = -0.5 * jnp.sum((point.levels / model.level_spread) ** 2)
+    evidence = log_density(model, point) + own + spread - 0.5 * (solved.logdet + biases.log_determinant())
+    covariance = biases.covariance()
+    gamma = jnp.clip(1.0 - prior.alpha * jnp.diagonal(covariance), 0.0, 1.0)
+    return Laplace(solved.information, covariance, gamma, evidence)

@@ -1,0 +1,101 @@
+"""The problem linearised at a point, and the solves behind it, against dense algebra in NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import exact, linear, resting
+
+from probcal import EA, MAP, Gaussian, assess, fit
+from probcal.analysis.fitted import take_up
+from probcal.inference import calibrate
+from probcal.priors import Precision
+from probcal.smoothing.linearised import laplace, linearise
+from probcal.smoothing.mode import find_mode
+from probcal.smoothing.solves import Dense
+from probcal.types import float64
+
+ALARM = 5.0  # sds of a mean beyond which a draw is wrong: one false alarm in 10^6
+
+
+@pytest.fixture(scope="module")
+def precision():
+    """A precision (6, 6) that is far from diagonal."""
+    root = np.random.default_rng(0).standard_normal((6, 6))
+    return root @ root.T + np.diag(np.arange(1.0, 7.0))
+
+
+def test_solves_are_those_of_numpy(precision):
+    covariance = np.linalg.inv(precision)
+    right = np.random.default_rng(1).standard_normal((6, 3))
+
+    @jax.jit
+    def answers(matrix, right):
+        solves = Dense.of(matrix)
+        return (
+            solves.solve(right), solves.solve(right[:, 0]), solves.apply(right), solves.log_determinant(),
+            solves.marginals(), solves.covariance(), solves.block(jnp.asarray([4, 1])), *solves.smallest(2),
+        )  # fmt: skip
+
+    with jax.enable_x64(True):
+        *found, values, vectors = answers(jnp.asarray(precision), jnp.asarray(right))
+    expected = (
+        covariance @ right, covariance @ right[:, 0], precision @ right, np.linalg.slogdet(precision)[1],
+        np.diag(covariance), covariance, covariance[np.ix_([4, 1], [4, 1])],
+    )  # fmt: skip
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9)
+    np.testing.assert_allclose(values, np.linalg.eigvalsh(precision)[:2], rtol=1e-9)
+    np.testing.assert_allclose(precision @ np.asarray(vectors), np.asarray(vectors) * np.asarray(values), atol=1e-9)
+
+
+def test_draws_of_solves_have_their_covariance(precision):
+    """36 products of 40,000 draws, each within 5 sd: less than one false alarm in 10^4."""
+    covariance, count = np.linalg.inv(precision), 40_000
+    with jax.enable_x64(True):
+        draw = jax.jit(lambda matrix, key: Dense.of(matrix).draw(key, count))
+        drawn = np.asarray(draw(jnp.asarray(precision), jax.random.key(0)))
+    own = np.diag(covariance)
+    sd = np.sqrt((np.outer(own, own) + covariance**2) / count)
+    assert (np.abs(drawn.T @ drawn / count - covariance) < ALARM * sd).all()
+
+
+def test_one_linearisation_has_all_moments():
+    """Covariance of biases, evidence and leverages of a linear problem, from one object."""
+    (problem, naive), known = linear("plane"), exact("plane")
+    with jax.enable_x64(True):
+        prior = Precision.single(jnp.ones(problem.model.biases))
+        mode = find_mode(problem.model, resting(problem), prior, 50, 1e-12).point
+        at = linearise(problem.model, mode)
+        found, again = jax.jit(at.laplace)(prior), laplace(problem.model, mode, prior)
+        leverages = sum(float(np.sum(part)) for part in at.leverages(found.covariance))
+        marginals = jax.jit(lambda: at.given(prior).marginals())()
+    order = [naive.labels.index(label) for label in problem.labels]
+    np.testing.assert_allclose(found.covariance, known.z[1][np.ix_(order, order)], rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(found.evidence, known.evidence, rtol=1e-10)
+    np.testing.assert_allclose(marginals, np.diag(found.covariance), rtol=1e-10)
+    for one, other in zip(found, again, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-14)
+    assert 0 < leverages <= np.trace(np.asarray(found.covariance) @ np.asarray(found.information)) + 1e-9
+
+
+@float64
+@pytest.mark.ci
+def test_an_answer_handed_on_is_the_fit_taken_up_again():
+    """`assess` of a tree alone, and with the answer behind it: the same point, rows and prior."""
+    problem, _ = linear("plane")
+    prior = Gaussian(correlation={"*.position_x": 0.5})
+    for options in ({}, {"prior": prior}):
+        method = None if not options else MAP()
+        tree, answer = calibrate(problem, method, start=resting(problem), **options)
+        handed, found = take_up(problem, tree, answer), take_up(problem, tree)
+        pairs = (jax.tree.leaves((own.point, own.lins)) for own in (handed, found))
+        for one, other in zip(*pairs, strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-6)
+        matrix = answer.prior.precision(problem.labels, problem.surveyed).matrix() if options else found.prior.matrix()
+        np.testing.assert_allclose(handed.prior.matrix(), matrix, rtol=1e-12)
+        assert float(handed.prior.log_determinant()) == pytest.approx(np.linalg.slogdet(np.asarray(matrix))[1])
+    tree, answer = calibrate(problem, EA(), start=resting(problem))
+    alone, handed = assess(problem, tree), assess(problem, tree, answer=answer)
+    assert alone["verdict"]["verdict"].values.tolist() == handed["verdict"]["verdict"].values.tolist()
+    assert fit(problem, EA(), start=resting(problem)).attrs["log_evidence"] == tree.attrs["log_evidence"]

@@ -1,0 +1,143 @@
+"""The mode of the marginal density of the biases: its gradient, linear problems, and scenes of bearings."""
+
+from functools import partial
+
+import bent
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import linear, resting
+
+import probcal
+from probcal import EA, MAP, Channel, ConstantVelocity, Gaussian, Network, Node, Problem, sensor, simulate
+from probcal.errors import InputError
+from probcal.geometry import bearing
+from probcal.priors import Precision
+from probcal.smoothing.linearised import laplace
+from probcal.smoothing.marginal import find_marginal_mode, volume_slope
+from probcal.smoothing.mode import cost, eliminate, find_mode
+from probcal.smoothing.start import automatic_start
+
+STEP = 3e-4  # of z in the differences
+
+
+@partial(jax.jit, static_argnames="slope")
+def at(model, point, prior, z, *, slope):
+    """Negative log marginal density at z with the trajectories at their mode, or its gradient."""
+    flat = Precision.single(jnp.zeros_like(z))
+    point = find_mode(model, point._replace(z=z), flat, 200, 0.0, joint=False).point
+    solved = eliminate(model, point, expected=True)
+    if slope:
+        return prior.pull(z) - solved.pull + 0.5 * volume_slope(model, point, solved)
+    return cost(model, point, prior) + 0.5 * solved.logdet
+
+
+@pytest.mark.parametrize("name", ["pair", *(pytest.param(n, marks=pytest.mark.ci) for n in bent.WORLDS if n != "pair")])
+def test_the_gradient_is_that_of_differences(name):
+    """Radars, directions, ranges, times and events, in 2-D and 3-D, two targets: central differences of l itself."""
+    world = bent.WORLDS[name]()
+    network = world.network()
+    biases = dict.fromkeys(network.labels, 0.0)
+    table = simulate(network, world.motion(), np.array(world.time), 1, biases=biases).table
+    problem = world.problem(table)
+    with jax.enable_x64(True):
+        model, prior = problem.model, Precision.single(jnp.ones(problem.model.biases))
+        point = find_mode(model, automatic_start(problem), prior, 50, 1e-10).point
+        found = np.asarray(at(model, point, prior, point.z, slope=True))
+        shifts = STEP * np.eye(len(found))
+        up, down = (
+            np.array([float(at(model, point, prior, point.z + sign * one, slope=False)) for one in shifts])
+            for sign in (1, -1)
+        )
+        mode = find_marginal_mode(model, point, prior, 50, 1e-9)
+        slope = np.asarray(at(model, mode.point, prior, mode.point.z, slope=True))
+    assert bool(mode.converged)
+    assert np.abs(slope).max() < 1e-3, "the gradient vanishes at the mode"
+    expected = (up - down) / (2 * STEP)
+    np.testing.assert_allclose(found, expected, atol=2e-5 * max(1.0, np.abs(expected).max()))
+
+
+def test_on_a_linear_problem_it_is_the_joint_mode():
+    problem, _ = linear("plane")
+    with jax.enable_x64(True):
+        prior = Precision.single(jnp.ones(problem.model.biases))
+        joint = find_mode(problem.model, resting(problem), prior, 50, 1e-12)
+        marginal = find_marginal_mode(problem.model, resting(problem), prior, 50, 1e-10)
+        evidence = laplace(problem.model, joint.point, prior).evidence
+        again = laplace(problem.model, marginal.point, prior).evidence
+    assert bool(marginal.converged)
+    np.testing.assert_allclose(marginal.point.z, joint.point.z, atol=1e-7)
+    assert float(evidence) == pytest.approx(float(again), abs=1e-8)
+
+
+def test_what_it_refuses():
+    with pytest.raises(InputError, match=r'MAP\(trajectory="smoothed"\): give one of joint, marginal'):
+        MAP(trajectory="smoothed")
+
+
+# A scene of bearings: motion noise and surveys fix its size
+
+
+@sensor(azimuth=Channel("rad", std=0.02, wrap=True))
+def camera(target, pose):
+    return dict(azimuth=bearing(target.position - pose.position) - pose.heading)
+
+
+PLACES = np.array([(0, 0), (60, 0), (60, 40), (0, 40), (30, -10), (30, 50)], float)
+LABELS = [f"cam_{k}.position_{axis}" for k in range(len(PLACES)) for axis in "xy"]
+
+
+def scene(seed):
+    """Six cameras surveyed to 2 m, headings to be found, a target whose motion noise is known; and the true biases."""
+    rng = np.random.default_rng(seed)
+    spread = {"survey": {"position": 2.0}, "scale": {"heading": 0.05}}
+    network = Network([camera.on(Node(f"cam_{k}", p, **spread)) for k, p in enumerate(PLACES)])
+    biases = dict.fromkeys(network.labels, 0.0) | dict(zip(LABELS, 2.0 * rng.standard_normal(12), strict=True))
+    motion = probcal.Target(ConstantVelocity(0.03), {"position": ((30.0, 20.0), 0.01), "velocity": ((0.2, -0.1), 0.01)})
+    drawn = simulate(network, motion, 0.5 * np.arange(400.0), seed, biases=biases)
+    return Problem(network, ConstantVelocity(0.03), drawn.table), np.array([biases[label] for label in LABELS])
+
+
+def dilation(biases, other):
+    """Log of the size of a scene with biases (12,) over that with others, by least squares."""
+    one, two = (PLACES + b.reshape(-1, 2) for b in (biases, other))
+    one, two = one - one.mean(0), two - two.mean(0)
+    turned = [a[:, 0] + 1j * a[:, 1] for a in (one, two)]
+    return float(np.log(abs(np.vdot(turned[1], turned[0]) / np.vdot(turned[1], turned[1]))))
+
+
+@pytest.mark.slow
+def test_a_scene_of_bearings_keeps_its_size():
+    """40 scenes from the model: the marginal mode within 2.5 standard errors of no dilation, the joint one beyond 4."""
+    logs, held = {"joint": [], "marginal": []}, {"joint": [], "marginal": []}
+    errors = {"joint": [], "marginal": []}
+    for seed in range(40):
+        problem, true = scene(seed)
+        for trajectory in logs:
+            tree = probcal.fit(problem, EA(trajectory=trajectory))
+            assert tree.attrs["status"] == "converged"
+            group = tree["calibration"].to_dataset().sel(bias_label=LABELS)
+            logs[trajectory].append(dilation(group["mean"].values, true))
+            held[trajectory].append(np.mean((group["lower"] <= true) & (true <= group["upper"])))
+            errors[trajectory].append(np.sqrt(np.mean((group["mean"] - true) ** 2)))
+    found = {}
+    for name, values in logs.items():
+        mean, error = np.mean(values), np.std(values, ddof=1) / np.sqrt(len(values))
+        found[name] = mean / error
+        print(
+            f"\n{name}: log dilation {mean:.4f} ({error:.4f}), 89 % intervals hold {np.mean(held[name]):.3f},"
+            f" rms error {np.mean(errors[name]):.2f} m"
+        )
+    assert abs(found["marginal"]) < 2.5
+    assert found["joint"] < -4
+
+
+@pytest.mark.ci
+def test_a_fit_of_the_marginal_says_what_it_is():
+    problem, true = scene(0)
+    trees = {name: probcal.fit(problem, MAP(trajectory=name), prior=Gaussian()) for name in ("joint", "marginal")}
+    size = {name: dilation(t["calibration"]["mean"].sel(bias_label=LABELS).values, true) for name, t in trees.items()}
+    assert size["marginal"] > size["joint"] + 0.01, "the joint mode prefers a smaller scene"
+    assert trees["marginal"].attrs["log_evidence"] > trees["joint"].attrs["log_evidence"]
+    assert "trajectory='marginal'" in trees["marginal"].attrs["settings"]
