@@ -29,7 +29,7 @@ def at(model, point, prior, z, *, slope):
     point = find_mode(model, point._replace(z=z), flat, 200, 0.0, joint=False).point
     solved = eliminate(model, point, expected=True)
     if slope:
-        return prior.pull(z) - solved.pull + 0.5 * volume_slope(model, point, solved)
+        return prior.pull(z) - solved.pull + 0.5 * volume_slope(model, point, solved)[0]
     return cost(model, point, prior) + 0.5 * solved.logdet
 
 

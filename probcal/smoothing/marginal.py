@@ -30,16 +30,19 @@ from probcal.smoothing.mode import (
 from probcal.smoothing.solves import Dense
 
 States = tuple[jax.Array, ...]  # (E, n) of each recursion
-ROUNDS, EXACT = 30, 1e-18  # of an adjoint solve at most, and the square of a change that ends it
+ROUNDS, EXACT = 30, 1e-14  # of an adjoint solve at most, and the share of its first square that ends it
 ENOUGH = 0.1  # share of the promised rise that a step must bring: along what motion noise alone fixes, half a step does
-TRACK_STEPS = 1  # of Gauss-Newton after every step of the biases; the trajectories reach their mode along with these
+LEAST_CURVED = 0.05  # share of its curvature so far that a secant must show
+TRACK_STEPS, SETTLED = 5, 1e-10  # of Gauss-Newton after every step of the biases, and nats at which they end: log det W
+# moves with the trajectories to first order
 
 
-def volume_slope(model: Model, point: Point, solved: Eliminated) -> jax.Array:
+def volume_slope(model: Model, point: Point, solved: Eliminated) -> tuple[jax.Array, jax.Array]:
     """Derivative (M,) of log det W by z at a point whose trajectories are at their mode, these following.
 
     d log det W = sum over k of tr(P_k dJ_k), P_k the smoothed covariance of the states given z. The way through the
-    trajectories is one adjoint smooth with the second derivatives of the density (see `_adjoint`).
+    trajectories is one adjoint smooth with the second derivatives of the density (see `_adjoint`). Where a target
+    stands on a cusp, at the place of a sensor, there is none: the derivative is zero and the second value False.
     """
     spread = [
         rec.covariances(part.F, factors(part, point.levels), kept.J, kept.gain)[0]
@@ -52,20 +55,23 @@ def volume_slope(model: Model, point: Point, solved: Eliminated) -> jax.Array:
         return sum((jnp.sum(P * J) for P, (J, _) in pairs), jnp.zeros(()))
 
     own, by_state = jax.grad(volume, argnums=(0, 1))(point.z, point.states)
-    moved = _adjoint(model, point, solved, by_state)
+    moved, sound = _adjoint(model, point, solved, by_state)
 
     def along(z: jax.Array) -> jax.Array:
         """Slope of the log-likelihood along the adjoint states."""
         return jax.jvp(lambda x: log_likelihood(model, At(x, z, point.levels)), (point.states,), (moved,))[1]
 
-    return own + jax.grad(along)(point.z)
+    slope = own + jax.grad(along)(point.z)
+    sound = sound & jnp.all(jnp.isfinite(slope))
+    return jnp.where(sound, slope, 0.0), sound
 
 
-def _adjoint(model: Model, point: Point, solved: Eliminated, slope: States) -> States:
+def _adjoint(model: Model, point: Point, solved: Eliminated, slope: States) -> tuple[States, jax.Array]:
     """Solve H x = slope (E, n), H the second derivatives of the negative log density by the trajectories.
 
-    Smoothing solves with the expected information in the place of the observed; what these differ by is moved to the
-    right-hand side until nothing changes. Where that does not settle the first solution stands.
+    Smoothing, S, solves with the expected information in the place of the observed. With R what the two differ by,
+    x = S y where (I + R S) y = slope: conjugate gradients in the inner product of S, one smooth each (Saad 2003, 6.7).
+    Also whether it is positive all the way: elsewhere the trajectories are at no mode.
     """
 
     def smooth(right: States) -> States:
@@ -83,27 +89,45 @@ def _adjoint(model: Model, point: Point, solved: Eliminated, slope: States) -> S
         parts = zip(solved.parts, observed, x, strict=True)
         return tuple(-own - jnp.einsum("eij,ej->ei", kept.J, v) for kept, own, v in parts)
 
-    def size(x: States) -> jax.Array:
-        return sum((jnp.sum(v**2) for v in x), jnp.zeros(()))
+    def on(state: Any) -> jax.Array:
+        *_, left, count, positive = state
+        return (count < ROUNDS) & (left > EXACT * dot(slope, first)) & positive
 
-    def on(state: tuple[States, jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        _, change, before, count = state
-        return (count < ROUNDS) & (change > EXACT * size(first)) & (change < before)
-
-    def again(state: tuple[States, jax.Array, jax.Array, jax.Array]) -> Any:
-        x, change, _, count = state
-        new = smooth(jax.tree.map(jnp.subtract, slope, rest(x)))
-        return new, size(jax.tree.map(jnp.subtract, new, x)), change, count + 1
+    def again(state: Any) -> Any:
+        x, r, p, along, left, count, _ = state
+        image = add(p, 1.0, rest(along))
+        curved = dot(along, image)
+        length = jnp.where(curved > 0, left / curved, 0.0)
+        x, r = add(x, length, along), add(r, -length, image)
+        s = smooth(r)
+        after = dot(r, s)
+        turn = after / left
+        return x, r, add(r, turn, p), add(s, turn, along), after, count + 1, curved > 0
 
     first = smooth(slope)
-    start = (first, jnp.full((), jnp.finfo(float).max), jnp.full((), jnp.inf), jnp.zeros((), int))
-    last, change, before, _ = jax.lax.while_loop(on, again, start)
-    return jax.tree.map(lambda new, old: jnp.where(change < before, new, old), last, first)
+    r = jax.tree.map(jnp.negative, rest(first))
+    s = smooth(r)
+    start = (first, r, r, s, dot(r, s), jnp.zeros((), int), jnp.ones((), bool))
+    x, *_, positive = jax.lax.while_loop(on, again, start)
+    return x, positive
+
+
+def dot(a: States, b: States) -> jax.Array:
+    """Sum of the products of all entries."""
+    return sum((jnp.sum(x * y) for x, y in zip(a, b, strict=True)), jnp.zeros(()))
+
+
+def add(a: States, factor: Any, b: States) -> States:
+    """a + factor b."""
+    return tuple(x + factor * y for x, y in zip(a, b, strict=True))
 
 
 class _Search(NamedTuple):
     point: Point
     solved: Eliminated
+    slope: jax.Array  # (M,) of the log density before the last step
+    step: jax.Array  # (M,) the last step
+    bent: jax.Array  # (M, M) what the secants of the steps add to the information
     value: jax.Array  # negative log marginal density
     damping: jax.Array
     moved: jax.Array  # some step raised the density
@@ -117,23 +141,37 @@ def _valued(model: Model, point: Point, prior: Precision) -> tuple[Eliminated, j
     return solved, cost(model, point, prior) + 0.5 * solved.logdet
 
 
+def _secant(matrix: jax.Array, step: jax.Array, change: jax.Array) -> jax.Array:
+    """What makes a curvature (M, M) agree with the change of the slope along a step: BFGS, where it stays positive."""
+    image, curved = matrix @ step, step @ change
+    before = step @ image
+    sound = curved > LEAST_CURVED * before
+    update = jnp.outer(change, change) / jnp.where(sound, curved, 1.0) - jnp.outer(image, image) / jnp.where(
+        sound, before, 1.0
+    )
+    return jnp.where(sound, update, 0.0)
+
+
 @jax.jit
 def find_marginal_mode(model: Model, start: Point, prior: Precision, iterations: int, tolerance: float) -> Mode:
     """Climb to the mode of the marginal density until a step promises less than `tolerance`; levels are held.
 
-    Gauss-Newton with the information of the biases, trajectories eliminated, and the whole gradient; a step that does
-    not bring its share of what it promises is halved, then damped. The cost of the mode is that of the marginal
-    density.
+    Quasi-Newton steps with the whole gradient: the information of the biases, trajectories eliminated, and what the
+    secants say of log det W (BFGS), which along what motion noise alone fixes doubles it. A step that does not bring
+    its share of what it promises is halved, then damped. The cost of the mode is that of the marginal density.
     """
     flat = Precision.single(jnp.zeros_like(start.z))
 
     def settled(point: Point) -> Point:
-        return find_mode(model, point, flat, TRACK_STEPS, 1e-2 * tolerance, joint=False).point
+        return find_mode(model, point, flat, TRACK_STEPS, SETTLED, joint=False).point
 
     def body(s: _Search) -> _Search:
         point, solved = s.point, s.solved
-        score = solved.score - prior.pull(point.z) - 0.5 * volume_slope(model, point, solved)
-        matrix = solved.information + prior.matrix() + s.damping * jnp.eye(model.biases)
+        volume, _ = volume_slope(model, point, solved)
+        score = solved.score - prior.pull(point.z) - 0.5 * volume
+        matrix = solved.information + prior.matrix() + s.bent
+        bent = s.bent + _secant(matrix, s.step, s.slope - score)
+        matrix = solved.information + prior.matrix() + bent + s.damping * jnp.eye(model.biases)
         dz = Dense.of(matrix).solve(score)
         promised = 0.5 * score @ dz
 
@@ -159,13 +197,15 @@ def find_marginal_mode(model: Model, start: Point, prior: Precision, iterations:
         damping = jnp.where(damping < 1e-6, 0.0, damping)
         converged = small & (s.damping <= 1.0) & jnp.isfinite(s.value)
         return _Search(
-            point, solved, jnp.where(take, value, s.value), damping, s.moved | take, s.iteration + 1, converged,
-            converged | (damping > DAMPING),
+            point, solved, score, jnp.where(take, t * dz, 0.0), bent, jnp.where(take, value, s.value), damping,
+            s.moved | take, s.iteration + 1, converged, converged | (damping > DAMPING),
         )  # fmt: skip
 
     begin = settled(start)
+    zeros = jnp.zeros(model.biases)
+    solved, value = _valued(model, begin, prior)
     first = _Search(
-        begin, *_valued(model, begin, prior), jnp.zeros(()), jnp.zeros((), bool), jnp.zeros((), int),
+        begin, solved, zeros, zeros, jnp.zeros((model.biases, model.biases)), value, jnp.zeros(()), jnp.zeros((), bool), jnp.zeros((), int),
         jnp.zeros((), bool), jnp.zeros((), bool),
     )  # fmt: skip
     last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations), body, first)
