@@ -139,6 +139,12 @@ def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:
     return inverse.T @ (inverse @ right)
 
 
+def displace(matrix: jax.Array, right: jax.Array, noise: jax.Array) -> jax.Array:
+    """matrix^-1 right + L^-T noise, L the Cholesky factor: with unit normals a draw of the precision `matrix` (n, n)."""
+    lower = jnp.linalg.cholesky(matrix)
+    return solve_triangular(lower, solve_triangular(lower, right, lower=True) + noise, lower=True, trans=1)
+
+
 @jax.jit
 def inverse_and_logdet(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Inverse and log determinant of a symmetric positive definite matrix."""

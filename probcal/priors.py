@@ -18,7 +18,7 @@ from probcal import linalg
 from probcal.errors import InputError, nearest
 
 PRECISION_BOUNDS = (1e-2, 1e8)  # of z; a fit with a bias at the lower bound is not an answer
-GROUPS = ("owner", "node", "type", "component")
+GROUPS = ("owner", "node", "type", "component", "vector")
 Members = Sequence[Mapping[str, str]]  # of each bias: what it belongs to, by the names in GROUPS
 
 
@@ -144,12 +144,28 @@ class Laplace(_Prior):
         return self.rate * abs(z)
 
 
+def check_by(name: str, by: str | None) -> None:
+    """Raise `InputError` where a prior shares its precisions by something that it does not know."""
+    if by is not None and by not in GROUPS:
+        raise InputError(f'{name}(by="{by}"): give one of {", ".join(GROUPS)}{nearest(by, GROUPS)}')
+
+
+def grouped(members: Members, by: str | None) -> np.ndarray:
+    """A number (M,) that biases share which belong together; each has its own where `by` is None."""
+    if by is None:
+        return np.arange(len(members))
+    names = [member[by] for member in members]
+    order = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    return np.array([order[name] for name in names], int)
+
+
 @dataclass(frozen=True)
 class ARD(_Prior):
     """Automatic relevance determination: one precision a bias, with a Gamma(shape, rate) hyper-prior.
 
     The default, shape 1 and rate 0, is the flat hyper-prior of the papers (Paper B 11, Paper C 18). `by` shares a
-    precision among the biases of one "node", "owner" (sensor or node), sensor "type", or "component" (all headings).
+    precision among the biases of one "node", "owner" (sensor or node), sensor "type", "component" (all headings), or
+    "vector" (the axes of one position: the answer then turns with the world).
     """
 
     shape: float = 1.0
@@ -165,16 +181,11 @@ class ARD(_Prior):
                 f"ARD(shape={self.shape}, rate={self.rate}): shape must be 1 or more (1 is flat, more is sparser), "
                 f"rate not negative"
             )
-        if self.by is not None and self.by not in GROUPS:
-            raise InputError(f'ARD(by="{self.by}"): give one of {", ".join(GROUPS)}{nearest(self.by, GROUPS)}')
+        check_by("ARD", self.by)
 
     def groups(self, members: Members) -> np.ndarray:
         """Which precision governs each bias, (M,)."""
-        if self.by is None:
-            return np.arange(len(members))
-        names = [member[self.by] for member in members]
-        order = {name: k for k, name in enumerate(dict.fromkeys(names))}
-        return np.array([order[name] for name in names], int)
+        return grouped(members, self.by)
 
     def log_hyper(self, alpha: jax.Array, group: jax.Array) -> jax.Array:
         """(shape - 1) log alpha - rate alpha of each precision, whose maximum with the evidence `learn` seeks."""
@@ -196,15 +207,17 @@ class ARD(_Prior):
 
 @dataclass(frozen=True)
 class Horseshoe(_Prior):
-    """Regularised horseshoe, for samplers: half-Cauchy global and local scales, a slab of inverse-Gamma variance.
+    """Regularised horseshoe: half-Cauchy global and local scales, a slab of inverse-Gamma variance.
 
     `expected` is the share of biases expected to be non-zero, `slab_scale` (in declared scales) and `slab_df` bound
-    the large ones (Piironen, Vehtari 2017).
+    the large ones (Piironen, Vehtari 2017). `by` shares a local scale, as in `ARD`: by "vector" the axes of one
+    position.
     """
 
     expected: float = 0.2
     slab_scale: float = 2.0
     slab_df: float = 4.0
+    by: str | None = None
 
     def __post_init__(self):
         super().__post_init__()
@@ -213,6 +226,11 @@ class Horseshoe(_Prior):
         for name in ("slab_scale", "slab_df"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InputError(f"Horseshoe({name}={getattr(self, name)}): it must be positive")
+        check_by("Horseshoe", self.by)
+
+    def groups(self, members: Members) -> np.ndarray:
+        """Which local scale governs each bias, (M,)."""
+        return grouped(members, self.by)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,7 +265,9 @@ PRIORS: dict[str, Prior] = {
     "ard-owner": ARD(by="owner"),
     "ard-type": ARD(by="type"),
     "ard-component": ARD(by="component"),
+    "ard-vector": ARD(by="vector"),
     "ard-gamma": ARD(shape=1.0, rate=0.5),
     "horseshoe": Horseshoe(),
+    "horseshoe-vector": Horseshoe(by="vector"),
     "bernoulli-gaussian": BernoulliGaussian(),
 }

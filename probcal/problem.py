@@ -92,7 +92,7 @@ class Problem:
 
     @property
     def members(self) -> list[dict[str, str]]:
-        """What each free bias belongs to: its owner, node(s), sensor type(s) and component."""
+        """What each free bias belongs to: its owner, node(s), sensor type(s), component, and vector of axes."""
         found = []
         readers: dict[str, list[Sensor]] = {}
         for s in self.network.sensors:
@@ -103,7 +103,10 @@ class Problem:
             nodes = {n.name for s in users for n in s.nodes}
             node = bias.owner if bias.owner in nodes else "-".join(sorted(nodes))
             types = "-".join(sorted({s.type.name for s in users}))
-            found.append({"owner": bias.owner, "node": node, "type": types, "component": bias.component})
+            vector = f"{bias.owner}.{bias.component}" + ("" if bias.since is None else f"@{bias.since!r}")
+            found.append(
+                {"owner": bias.owner, "node": node, "type": types, "component": bias.component, "vector": vector}
+            )
         return found
 
     def unlinked(self) -> Problem:

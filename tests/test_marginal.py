@@ -50,7 +50,7 @@ def test_the_gradient_is_that_of_differences(name):
             np.array([float(at(model, point, prior, point.z + sign * one, slope=False)) for one in shifts])
             for sign in (1, -1)
         )
-        mode = find_marginal_mode(model, point, prior, 50, 1e-9)
+        mode, _ = find_marginal_mode(model, point, prior, 50, 1e-9)
         slope = np.asarray(at(model, mode.point, prior, mode.point.z, slope=True))
     assert bool(mode.converged)
     assert np.abs(slope).max() < 1e-3, "the gradient vanishes at the mode"

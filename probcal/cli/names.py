@@ -18,16 +18,19 @@ ORACLE = "oracle"  # of studies: the method that knows which biases are zero
 SAVE = ("states", "predictive")  # draws that a fit writes where asked for
 PRIORS = {  # the class of each
     "flat": "Flat", "gaussian": "Gaussian", "laplace": "Laplace", "ard": "ARD", "ard-node": "ARD", "ard-owner": "ARD",
-    "ard-type": "ARD", "ard-component": "ARD", "ard-gamma": "ARD", "horseshoe": "Horseshoe",
-    "bernoulli-gaussian": "BernoulliGaussian",
+    "ard-type": "ARD", "ard-component": "ARD", "ard-vector": "ARD", "ard-gamma": "ARD", "horseshoe": "Horseshoe",
+    "horseshoe-vector": "Horseshoe", "bernoulli-gaussian": "BernoulliGaussian",
 }  # fmt: skip
-_LEARNT = ("ard", "ard-node", "ard-owner", "ard-type", "ard-component", "ard-gamma")
+_LEARNT = ("ard", "ard-node", "ard-owner", "ard-type", "ard-component", "ard-vector", "ard-gamma")
 _FIXED = ("flat", "gaussian", "laplace")
-_SAMPLED = (*_FIXED, "ard-gamma", "horseshoe")
+_HORSESHOE = ("horseshoe", "horseshoe-vector")
+_SAMPLED = (*_FIXED, "ard-gamma", *_HORSESHOE)
+_INTEGRATED = ("laplace", *_LEARNT, *_HORSESHOE, "bernoulli-gaussian")
 METHODS = {
-    "ea": Known("EA", False, _LEARNT),
+    "ea": Known("EA", False, _INTEGRATED),
+    "ea-maximised": Known("EA", False, _LEARNT),
+    "ea-printed": Known("EA", False, _LEARNT),
     "ea-em": Known("EA", False, _LEARNT),
-    "ea-marginal": Known("EA", False, _LEARNT),
     "paper-b": Known("EA", False, _LEARNT),
     "em-ea": Known("EM-EA", False, _LEARNT),
     "em": Known("EM", False, _FIXED),

@@ -1,24 +1,29 @@
-"""Joint mode and evidence: EA, MAP and weighted least squares, with every trajectory marginalised."""
+"""Modes and evidence: EA, MAP and weighted least squares, with every trajectory marginalised."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
+from probcal.inference.hierarchy import hierarchy_of
+from probcal.inference.integrate import Integration
+from probcal.inference.posed import Form
 from probcal.inference.run import Given, Maximiser, State, learn, valued
 from probcal.model.model import Model
-from probcal.priors import ARD, Flat, Gaussian, Laplace, Prior
+from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
 from probcal.smoothing.information import paper_b, update_levels
-from probcal.smoothing.linearised import laplace
+from probcal.smoothing.linearised import laplace_of
 from probcal.smoothing.marginal import find_marginal_mode
-from probcal.smoothing.mode import Point, cost, find_mode, track
+from probcal.smoothing.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, track
 
 RULES = ("mackay", "em")
-MODES = {"joint": find_mode, "marginal": find_marginal_mode}
-STEPS = {"joint": 30, "marginal": 2}  # between two updates of the precisions; a marginal step costs several joint ones
+MODES = ("joint", "marginal")
+STEPS = 30  # between two updates of precisions or levels
+FEW = 2  # of the marginal mode, each of which costs several joint ones, where precisions are learnt
+PRECISIONS = ("integrated", "maximised")
 TRAJECTORIES = (*MODES, "smoothed")
 
 
@@ -35,12 +40,23 @@ def _learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -
     return state._replace(point=point, alpha=jnp.where(fresh, state.alpha, alpha))
 
 
+def _climb(
+    model: Model, start: Point, prior: Precision, steps: int, tolerance: jax.Array, trajectory: str
+) -> tuple[Mode, Eliminated]:
+    """The mode of the joint or of the marginal density, and the system eliminated there."""
+    if trajectory == "marginal":
+        return find_marginal_mode(model, start, prior, steps, tolerance)
+    mode = find_mode(model, start, prior, steps, tolerance)
+    return mode, eliminate(model, mode.point, expected=True)
+
+
 def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, trajectory: str) -> State:
     """New precisions and levels, then the mode and the evidence at that mode: all of one state belongs together."""
     state = _learnt(model, prior, given, state, rule)
     now = given.prior._replace(alpha=state.alpha)
-    mode = MODES[trajectory](model, state.point, now, STEPS[trajectory], 1e-2 * given.tolerance)
-    found = laplace(model, mode.point, now)
+    steps = FEW if prior.learns and trajectory == "marginal" else STEPS
+    mode, solved = _climb(model, state.point, now, steps, 1e-2 * given.tolerance, trajectory)
+    found = laplace_of(model, mode.point, solved, now)
     objective = (
         found.evidence if prior.proper or not prior.learns else _density(model, prior, given, mode.point) - mode.volume
     )
@@ -75,36 +91,90 @@ def _iterate_paper_b(model: Model, prior: Prior, given: Given, state: State, rul
 
 @dataclass(frozen=True)
 class EA(Maximiser):
-    """Evidence approximation with trajectories marginalised exactly: the default.
+    """Evidence approximation with trajectories marginalised: the default.
 
-    `update` of the precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed points, slower).
-    `trajectory` says what the reported point is: "joint" the mode of biases and trajectory together, "marginal" that of
-    the biases with the trajectory integrated (Laplace; see `smoothing.marginal`), which does not shrink a scene whose
-    size only the motion tells. "smoothed" is Paper B as printed: the smoothed density of each epoch alone stands for
-    the trajectory (R-bar, 10-17), so that the data count twice. `tolerance` is the change of log evidence, in nats,
-    at which it stops; `iterations` caps the outer loop. Raises `InputError` for another update or trajectory.
+    `precisions` "integrated" (the default) climbs to the mode of the marginal density under the declared scales, takes
+    the Gaussian likelihood of the biases there, and integrates the precisions of a proper hierarchical prior
+    (`Horseshoe` by default) by Gibbs sweeps; the answer is a mixture. "maximised" climbs to the precisions of largest
+    evidence (type-II maximum likelihood, Paper B 24-25) and takes them as known. An ARD prior with a flat hyper-prior
+    has no posterior and is always maximised. Noise levels that are unknown maximise the evidence and are held.
+
+    `trajectory` says what the reported point is: "marginal" the mode of the biases with the trajectory integrated
+    (Laplace; see `smoothing.marginal`), "joint" that of biases and trajectory together, which shrinks a scene whose
+    size only the motion tells, "smoothed" Paper B as printed: the smoothed density of each epoch alone stands for
+    the trajectory (R-bar, 10-17), so that the data count twice. `EA.as_printed()` is the joint mode with precisions
+    maximised. `update` of maximised precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed points,
+    slower). `tolerance` is the change of log evidence, in nats, at which it stops; `iterations` caps the outer loop.
+    Raises `InputError` for another update, trajectory or kind of precisions.
     """
 
     iterations: int = 200
     tolerance: float = 1e-3
     update: str = "mackay"
-    trajectory: str = "joint"
+    trajectory: str = "marginal"
+    precisions: str = "integrated"
 
     name: ClassVar[str] = "EA"
-    priors: ClassVar[tuple[type, ...]] = (ARD,)
+    priors: ClassVar[tuple[type, ...]] = (Horseshoe, ARD, Laplace, BernoulliGaussian)
     intervals: ClassVar[str] = (
+        "a mixture over the precisions around the Gaussian likelihood at one point; unknown noise levels are held"
+    )
+    plugged: ClassVar[str] = (
         "plug-in: the precisions (and unknown levels) are taken as known, so the intervals are too narrow"
     )
 
     def __post_init__(self):
-        for field, known in (("update", RULES), ("trajectory", TRAJECTORIES)):
-            if getattr(self, field) not in known:
-                raise InputError(f'EA({field}="{getattr(self, field)}"): give one of {", ".join(known)}')
+        known = {"update": RULES, "trajectory": TRAJECTORIES, "precisions": PRECISIONS}
+        for field, words in known.items():
+            if getattr(self, field) not in words:
+                raise InputError(f'EA({field}="{getattr(self, field)}"): give one of {", ".join(words)}')
+        if self.trajectory == "smoothed" and self.precisions == "integrated":
+            raise InputError(
+                'EA(trajectory="smoothed") counts the data twice, of which no posterior can be made: add'
+                ' precisions="maximised"'
+            )
 
-    def note(self) -> str:
-        """What the intervals are worth with these settings."""
+    @classmethod
+    def as_printed(cls, **settings: Any) -> "EA":
+        """The joint mode with precisions maximised, the baseline of comparisons."""
+        return cls(**{"trajectory": "joint", "precisions": "maximised"} | settings)
+
+    def first_prior(self) -> Prior:
+        """`Horseshoe()` where precisions are integrated, else `ARD()`."""
+        return Horseshoe() if self.precisions == "integrated" else ARD()
+
+    def takes(self, prior: Prior) -> bool:
+        """Any hierarchical prior where precisions are integrated, else ARD."""
+        return isinstance(prior, self.priors if self.precisions == "integrated" else ARD)
+
+    def integrates(self, prior: Prior) -> bool:
+        """Whether the precisions of a prior are integrated: a flat hyper-prior leaves no posterior."""
+        return self.precisions == "integrated" and not (isinstance(prior, ARD) and prior.rate == 0.0)
+
+    def climbs_under(self, prior: Prior) -> Prior:
+        """The declared scales where precisions are integrated after the climb."""
+        return Gaussian(correlation=prior.correlation) if self.integrates(prior) else prior
+
+    def integration(self, problem: Problem, prior: Prior) -> Integration | None:
+        """The hierarchy of the prior, at the mode that the climb reached."""
+        if not self.integrates(prior):
+            return None
+        form = Form(problem.model.biases, hierarchy_of(prior, problem))
+        return Integration(form, self.trajectory == "marginal")
+
+    def note(self, prior: Prior) -> str:
+        """What the intervals are worth with these settings and a prior."""
         twice = "; the data count twice (Paper B as printed)" if self.trajectory == "smoothed" else ""
-        return self.intervals + twice
+        return self.intervals if self.integrates(prior) else self.plugged + twice
+
+    def remark(self, prior: Prior) -> str:
+        """That precisions were maximised though it was not asked for."""
+        if self.precisions == "maximised" or self.integrates(prior):
+            return ""
+        return (
+            "The precisions were maximised, since ARD with a flat hyper-prior has no posterior: the intervals are too"
+            " narrow; Horseshoe() or ARD(rate=0.5) is integrated."
+        )
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Mode (or smoothed trajectory), evidence, new precisions."""
@@ -115,15 +185,15 @@ class EA(Maximiser):
 
 @dataclass(frozen=True)
 class MAP(Maximiser):
-    """Mode under a given prior with its Laplace covariance: of trajectories and biases jointly, or of the marginal.
+    """Mode under a given prior with its Laplace covariance: of the marginal, or of trajectories and biases jointly.
 
-    `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood; `trajectory` "joint" or "marginal", as
+    `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood; `trajectory` "marginal" or "joint", as
     in `EA`. Raises `InputError` for another trajectory.
     """
 
     iterations: int = 500
     tolerance: float = 1e-6
-    trajectory: str = "joint"
+    trajectory: str = "marginal"
 
     name: ClassVar[str] = "MAP"
     priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat, Laplace)
@@ -146,8 +216,14 @@ class LeastSquares(MAP):
     of the declared noise. Take it where targets are known; `MAP` with `Flat` adds the motion.
     """
 
+    trajectory: str = "joint"
+
     name: ClassVar[str] = "least squares"
     priors: ClassVar[tuple[type, ...]] = (Flat,)
+
+    def __post_init__(self):
+        if self.trajectory != "joint":
+            raise InputError(f'{self.name}(trajectory="{self.trajectory}"): without motion there is the joint mode only')
 
     def prepare(self, problem: Problem) -> Problem:
         """The problem without motion."""

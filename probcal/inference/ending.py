@@ -6,67 +6,90 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from probcal.inference.mixture import Mixture
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, Normal
+from probcal.results.answer import Answer, Normal, Posterior, Summary
 from probcal.smoothing.information import squares_of
 from probcal.smoothing.mode import Point
 from probcal.status import Status
 
 if TYPE_CHECKING:
+    from probcal.inference.integrate import Integrated, Integration
     from probcal.inference.run import Maximiser, State
 
-FAR = 10.0  # scales from the stated value beyond which a bias without prior has diverged
+FAR = 10.0  # scales from the stated value beyond which an estimate is none
 FALL = 1.0  # nats below its best at which an evidence may end
 ABSURD = 100.0  # mean square a datum, 1 expected, beyond which a fit explains nothing
 
 
 def conclude(
-    problem: Problem, method: Maximiser, prior: Prior, state: State, trace: np.ndarray, square: float, iterations: int
+    problem: Problem,
+    method: Maximiser,
+    prior: Prior,
+    state: State,
+    trace: np.ndarray,
+    square: float,
+    iterations: int,
+    how: Integration | None = None,
+    mixed: Integrated | None = None,
 ) -> Answer:
-    """The answer of a method whose outer loop ended in a state, whose data leave a mean square a datum."""
-    point, found = state.point, state.found
-    alpha, z = np.asarray(state.alpha), np.asarray(point.z)
-    low, far = low_and_far(prior, alpha, z, problem.surveyed)
+    """The answer of a method whose outer loop ended in a state, whose data leave a mean square a datum.
+
+    Where precisions were integrated after it, `mixed` is what came of it.
+    """
+    posterior = _posterior(problem, prior, state, how, mixed)
+    point, found, summary = posterior.point, state.found, posterior.summary
+    low, far = low_and_far(prior, summary, problem.surveyed)
     asked = method.tolerance == 0.0  # to run so many iterations, whatever they reach
     end = End(
         bool(state.done),
         asked,
         bool(low.any()),
         bool(far.any()),
-        all(np.isfinite(np.asarray(part)).all() for part in (found.covariance, found.evidence, point.z)),
+        posterior.sound and bool(np.isfinite(found.evidence)),
         bool(state.refused),
         fallen(prior, len(problem.levels), state.best, state.worth),
         square,
     )
     status = verdict(end)
-    message = _message(problem, point, status, end, low, far, iterations)
+    message = _message(problem, point, status, end, low, far, iterations, summary.precisions)
     if status is Status.SPENT and len(trace) > 1:
         message = (
             f"All {iterations} iterations were run, as asked; the last moved the objective by"
             f" {trace[-1] - trace[-2]:.2g}. {message}"
         ).strip()
-    posterior = Normal.of(problem, prior, point, found, alpha)
-    ended = _bias_status(problem, prior, low, far, posterior.summary.gamma)
+    ended = _bias_status(problem, summary, low, far)
+    message = " ".join(part for part in (message, method.remark(prior)) if part)
     return Answer(problem, method, method, prior, posterior, status, message, ended, iterations, trace)
 
 
-def _bias_status(
-    problem: Problem, prior: Prior, low: np.ndarray, far: np.ndarray, gamma: np.ndarray
-) -> tuple[str, ...]:
+def _posterior(
+    problem: Problem, prior: Prior, state: State, how: Integration | None, mixed: Integrated | None
+) -> Posterior:
+    """The Gaussian at the end of a climb, or the mixture that the integration made of it."""
+    if how is None or mixed is None:
+        return Normal.of(problem, prior, state.point, state.found, np.asarray(state.alpha))
+    first = np.asarray(prior.precision(problem.labels, problem.surveyed).alpha)
+    return Mixture.of(problem, prior, how.form, first, mixed)
+
+
+def _bias_status(problem: Problem, summary: Summary, low: np.ndarray, far: np.ndarray) -> tuple[str, ...]:
     """How each bias ended."""
-    pruned = (gamma < 1e-2) & prior.learns
+    pruned = (summary.gamma < 1e-2) & (summary.precisions == "maximised")
     kind = np.array([bias.kind for bias in problem.biases], str)
     conditions = [kind == "survey", kind == "drift", low, far, pruned]
     words = ["survey", "drift", "at bound", "diverged", "pruned"]
     return tuple(np.select(conditions, words, "estimated").tolist())
 
 
-def low_and_far(prior: Prior, alpha: np.ndarray, z: np.ndarray, surveyed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which biases (..., M) stand at the lower bound of their precision, and which ran away without a prior."""
-    none = np.zeros(z.shape, bool)
-    low = (alpha <= PRECISION_BOUNDS[0] * (1 + 1e-9)) & ~surveyed if isinstance(prior, ARD) else none
-    far = (np.abs(z) > FAR) & ~surveyed if isinstance(prior, Flat) else none
+def low_and_far(prior: Prior, summary: Summary, surveyed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which biases (M,) stand at the bound that their precision sets, and which ran away without a prior."""
+    none, mean = np.zeros(len(surveyed), bool), np.nan_to_num(summary.mean, nan=np.inf)
+    far = (np.abs(mean) > FAR) & ~surveyed if isinstance(prior, Flat) else none
+    if summary.precisions == "integrated":
+        return (np.abs(mean) > FAR) & ~surveyed, far
+    low = (summary.precision <= PRECISION_BOUNDS[0] * (1 + 1e-9)) & ~surveyed if isinstance(prior, ARD) else none
     return low, far
 
 
@@ -123,11 +146,17 @@ def _message(
     low: np.ndarray,
     far: np.ndarray,
     iterations: int,
+    precisions: str,
 ) -> str:
     def listed(mask: np.ndarray) -> str:
         labels = [label for label, hit in zip(problem.labels, mask, strict=True) if hit]
         return ", ".join(labels[:12]) + (f" and {len(labels) - 12} more" if len(labels) > 12 else "")
 
+    if status is Status.AT_BOUND and precisions == "integrated":
+        return (
+            f"{listed(low)} lie more than {FAR:g} scales from the stated value: the estimate is invalid. Check labels,"
+            " units and the declared scales."
+        )
     if status is Status.AT_BOUND:
         return f"The precision of {listed(low)} stands at its lower bound: the estimate is invalid."
     if status is Status.MISFIT:

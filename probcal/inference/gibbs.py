@@ -1,4 +1,4 @@
-"""Gibbs sweeps on the Gaussian likelihood of the frame, which the pilot and the collapsed sampler share."""
+"""Gibbs sweeps on a Gaussian likelihood: what the pilot, the collapsed sampler and integrated precisions share."""
 
 from typing import Any
 
@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 
 from probcal.inference.hierarchy import Phi, SpikeAndSlab
-from probcal.inference.posed import Form, Posed, conditional, update_inclusions
+from probcal.inference.posed import Form, Quadratic, draw_given, update_inclusions
 
 
 def sweep(
-    form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array, *, backwards: bool
+    form: Form, posed: Quadratic, theta: jax.Array, phi: Phi, key: jax.Array, *, backwards: bool
 ) -> tuple[jax.Array, Phi]:
     """Gibbs on the frame: hyper-parameters given the biases, then theta given them; `backwards` in reverse order."""
     kind = form.hierarchy
@@ -23,7 +23,7 @@ def sweep(
         keys = jax.random.split(key)
         if isinstance(kind, SpikeAndSlab):
             phi = update_inclusions(form, posed, phi, keys[0], backwards=backwards)
-        return conditional(form, posed, phi).draw(keys[1]), phi
+        return draw_given(form, posed, phi, keys[1]), phi
 
     steps: list[Any] = [lambda t, p, s, k=k: hyper(k, t, p, s) for k in range(len(kind.updates()))] + [biases]
     for step, own in zip(steps[::-1] if backwards else steps, jax.random.split(key, len(steps)), strict=True):

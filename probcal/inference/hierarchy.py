@@ -8,7 +8,7 @@ add one: a class here with its `hyper` distributions and its `updates`, and a li
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -52,9 +52,24 @@ class Hierarchy(ABC):
         """Whose a hyper-parameter is: of each "bias" that is governed, of each "group" of them, or of "all"."""
         return "bias" if name in self.by_bias else "all"
 
+    def variables(self, labels: Sequence[str], phi: Mapping[str, Any]) -> dict[str, Any]:
+        """Hyper-parameters by draw for biases of these labels: name -> (dims beyond chain and draw, values, coords)."""
+        governed, found = {"governed_label": [labels[m] for m in self.learnt]}, dict[str, Any]()
+        for name, values in phi.items():
+            whose = self.belongs(name)
+            if whose == "bias":
+                found[name] = (("governed_label",), values, governed)
+            else:
+                found[name] = ((), values) if whose == "all" else (("precision_group",), values)
+        return found
+
     @abstractmethod
     def hyper(self) -> Mapping[str, dist.Distribution]:
         """Independent prior distributions of the continuous hyper-parameters."""
+
+    @abstractmethod
+    def drawn(self) -> dict[str, Callable[[jax.Array], jax.Array]]:
+        """How each of them is drawn by a key; apart from `hyper`, so that what only draws need not load numpyro."""
 
     @abstractmethod
     def governed(self, phi: Phi) -> jax.Array:
@@ -76,9 +91,13 @@ class Hierarchy(ABC):
 
     def draw(self, key: jax.Array) -> Phi:
         """One draw of the hyper-parameters from their prior."""
-        hyper = self.hyper()
-        keys = jax.random.split(key, len(hyper) + 1)
-        return {name: d.sample(k) for (name, d), k in zip(hyper.items(), keys, strict=False)}
+        drawn = self.drawn()
+        keys = jax.random.split(key, len(drawn) + 1)
+        return {name: one(k) for (name, one), k in zip(drawn.items(), keys, strict=False)}
+
+    def begin(self, key: jax.Array) -> Phi:
+        """Where a chain on a Gaussian likelihood starts: a draw from the prior, unless said otherwise."""
+        return self.draw(key)
 
     def log_prior(self, phi: Phi) -> jax.Array:
         """Log density of the hyper-parameters."""
@@ -113,6 +132,10 @@ class Known(Hierarchy):
         """None."""
         return {}
 
+    def drawn(self):
+        """None."""
+        return {}
+
     def governed(self, phi):
         """None."""
         raise AssertionError("a known prior governs no bias")
@@ -132,6 +155,10 @@ class Precisions(Hierarchy):
     def hyper(self):
         """Precisions, (groups,)."""
         return {"alpha": dist.Gamma(self.prior.shape * jnp.ones(self.count), self.prior.rate)}
+
+    def drawn(self):
+        """Gamma."""
+        return {"alpha": lambda key: jax.random.gamma(key, self.prior.shape, (self.count,)) / self.prior.rate}
 
     def governed(self, phi):
         """The precision of the group."""
@@ -159,6 +186,11 @@ class Exponentials(Hierarchy):
         """Variances, (L,)."""
         return {"variance": dist.Exponential(0.5 * self.prior.rate**2 * jnp.ones(len(self.learnt)))}
 
+    def drawn(self):
+        """Exponential."""
+        L = len(self.learnt)
+        return {"variance": lambda key: jax.random.exponential(key, (L,)) / (0.5 * self.prior.rate**2)}
+
     def governed(self, phi):
         """One over the variance."""
         return 1.0 / phi["variance"]
@@ -176,40 +208,73 @@ class Exponentials(Hierarchy):
 class RegularisedHorseshoe(Hierarchy):
     """Half-Cauchy local and global scales, cut by a slab (Piironen, Vehtari 2017): alpha = 1/c^2 + 1/(tau lambda)^2."""
 
-    by_bias = ("local_scale",)
+    def belongs(self, name):
+        """Local scales are those of groups; where each bias is a group of its own, of the biases."""
+        if name != "local_scale":
+            return "all"
+        return "bias" if self.group == tuple(range(len(self.learnt))) else "group"
 
     def hyper(self):
-        """Local scales (L,), global scale, slab variance; in declared scales."""
+        """Local scales (groups,), global scale, slab variance; in declared scales."""
         half = 0.5 * self.prior.slab_df
         return {
-            "local_scale": dist.HalfCauchy(jnp.ones(len(self.learnt))),
+            "local_scale": dist.HalfCauchy(jnp.ones(self.count)),
             "global_scale": dist.HalfCauchy(self.prior.expected / (1.0 - self.prior.expected)),
             "slab_variance": dist.InverseGamma(half, half * self.prior.slab_scale**2),
         }
 
+    def drawn(self):
+        """Half-Cauchy by the modulus, inverse Gamma by the reciprocal."""
+        width = self.prior.expected / (1.0 - self.prior.expected)
+        half = 0.5 * self.prior.slab_df
+        return {
+            "local_scale": lambda key: jnp.abs(jax.random.cauchy(key, (self.count,))),
+            "global_scale": lambda key: jnp.abs(width * jax.random.cauchy(key)),
+            "slab_variance": lambda key: half * self.prior.slab_scale**2 / jax.random.gamma(key, half),
+        }
+
+    def begin(self, key):
+        """Scales from their prior, the slab as declared: its Gamma variable would take a second to compile."""
+        drawn, keys = self.drawn(), jax.random.split(key)
+        names = ("local_scale", "global_scale")
+        scales = {name: drawn[name](k) for name, k in zip(names, keys, strict=True)}
+        return scales | {"slab_variance": jnp.full((), self.prior.slab_scale**2, float)}
+
     def governed(self, phi):
         """Slab and shrinkage added."""
-        return 1.0 / phi["slab_variance"] + 1.0 / (phi["global_scale"] * phi["local_scale"]) ** 2
+        local = phi["local_scale"][jnp.asarray(self.group)]
+        return 1.0 / phi["slab_variance"] + 1.0 / (phi["global_scale"] * local) ** 2
 
     def updates(self):
         """Local scales by the auxiliary form (Makalic, Schmidt 2016) made exact for the slab; the others by slices."""
         width = self.prior.expected / (1.0 - self.prior.expected)
         half = 0.5 * self.prior.slab_df
+        group = jnp.asarray(self.group)
+        members = np.bincount(self.group, minlength=self.count)
+
+        def total(z: jax.Array) -> jax.Array:
+            return jnp.zeros(self.count).at[group].add(z**2)
+
+        def standard_gamma(key: jax.Array) -> jax.Array:
+            """Gamma draws of shape (members + 1) / 2, of one member an exponential."""
+            if (members == 1).all():
+                return jax.random.exponential(key, (self.count,))
+            return jax.random.gamma(key, 0.5 * (jnp.asarray(members) + 1.0))
 
         def local(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
             keys = jax.random.split(key, 3)
             square, tau2 = phi["local_scale"] ** 2, phi["global_scale"] ** 2
-            auxiliary = (1.0 + 1.0 / square) / jax.random.exponential(keys[0], z.shape)
-            proposal = (1.0 / auxiliary + 0.5 * z**2 / tau2) / jax.random.exponential(keys[1], z.shape)
+            auxiliary = (1.0 + 1.0 / square) / jax.random.exponential(keys[0], square.shape)
+            proposal = (1.0 / auxiliary + 0.5 * total(z) / tau2) / standard_gamma(keys[1])
             ratio = 0.5 * (
                 jnp.log1p(tau2 * proposal / phi["slab_variance"]) - jnp.log1p(tau2 * square / phi["slab_variance"])
             )
-            taken = jnp.log(jax.random.uniform(keys[2], z.shape)) < ratio
+            taken = jnp.log(jax.random.uniform(keys[2], square.shape)) < jnp.asarray(members) * ratio
             return phi | {"local_scale": jnp.sqrt(jnp.where(taken, proposal, square))}
 
         def density(z: jax.Array, local: jax.Array, logs: jax.Array) -> jax.Array:
             tau, slab = jnp.exp(logs)
-            alpha = jnp.clip(1.0 / slab + 1.0 / (tau * local) ** 2, LEAST, MOST)
+            alpha = jnp.clip(1.0 / slab + 1.0 / (tau * local[group]) ** 2, LEAST, MOST)
             own = logs[0] - jnp.log1p((tau / width) ** 2) - half * logs[1] - half * self.prior.slab_scale**2 / slab
             return own + 0.5 * jnp.sum(jnp.log(alpha) - alpha * z**2)
 
@@ -237,6 +302,13 @@ class SpikeAndSlab(Hierarchy):
     def hyper(self):
         """The share of the biases that are not zero, where it is not given."""
         return {} if self.prior.share is not None else {"share": dist.Beta(self.prior.a, self.prior.b)}
+
+    def drawn(self):
+        """Beta, where it is not given."""
+        if self.prior.share is not None:
+            return {}
+        both = jnp.array([self.prior.a, self.prior.b])
+        return {"share": lambda key: jax.random.dirichlet(key, both)[0]}
 
     def governed(self, phi):
         """The slab."""

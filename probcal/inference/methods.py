@@ -26,9 +26,10 @@ else:
 # names on the command line: method, and the prior it means where that is not the method's first
 METHODS: dict[str, tuple[Method, Prior | None]] = {
     "ea": (EA(), None),
-    "ea-em": (EA(update="em", iterations=2000), None),
-    "ea-marginal": (EA(trajectory="marginal"), None),
-    "paper-b": (EA(trajectory="smoothed", iterations=25), None),
+    "ea-maximised": (EA(precisions="maximised"), None),
+    "ea-printed": (EA.as_printed(), None),
+    "ea-em": (EA.as_printed(update="em", iterations=2000), None),
+    "paper-b": (EA.as_printed(trajectory="smoothed", iterations=25), None),
     "em-ea": (EMEA(), None),
     "em": (EM(), None),
     "em-ml": (EM(), Flat()),
@@ -48,7 +49,7 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
 def choose_prior(method: Method, prior: Prior | None) -> Prior:
     """The prior of a fit: the given one if the method takes it, else the method's first."""
     if prior is None:
-        return method.priors[0]()
+        return method.first_prior()
     if not method.takes(prior):
         allowed = ", ".join(name for name, known in PRIORS.items() if method.takes(known))
         raise InputError(f"{method.name} does not take the prior {type(prior).__name__}; it takes: {allowed}")
@@ -69,6 +70,7 @@ def check_problem(problem: Problem) -> None:
 
 def table() -> pd.DataFrame:
     """Which method (rows, by class) takes which prior (columns, by name on the command line)."""
-    classes = {type(method).__name__: type(method) for method, _ in METHODS.values()}
-    rows = {name: ["yes" if kind.takes(prior) else "" for prior in PRIORS.values()] for name, kind in classes.items()}
+    first = {type(method).__name__: method for method, _ in reversed(METHODS.values())}
+    known = {name: first[name] for name in dict.fromkeys(type(method).__name__ for method, _ in METHODS.values())}
+    rows = {name: ["yes" if one.takes(prior) else "" for prior in PRIORS.values()] for name, one in known.items()}
     return pd.DataFrame.from_dict(rows, orient="index", columns=list(PRIORS))

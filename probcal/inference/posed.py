@@ -4,7 +4,7 @@ theta holds the biases z (M,) and the log levels (H,). Given the hyper-parameter
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -24,12 +24,56 @@ class Form:
     hierarchy: Hierarchy
 
 
+class Quadratic(Protocol):
+    """A Gaussian likelihood of theta in natural form, and the prior of the biases that no hierarchy governs."""
+
+    @property
+    def information(self) -> jax.Array:
+        """Precision (Q, Q)."""
+
+    @property
+    def pull(self) -> jax.Array:
+        """Linear term about zero, (Q,)."""
+
+    @property
+    def level_spread(self) -> jax.Array:
+        """Prior sd (H,) of the log levels that theta holds."""
+
+    @property
+    def first(self) -> Precision:
+        """Prior of the biases before a hierarchy governs some."""
+
+
+class Natural(NamedTuple):
+    """A Gaussian likelihood of the biases alone."""
+
+    information: jax.Array  # (M, M)
+    pull: jax.Array  # (M,)
+    level_spread: jax.Array  # (0,)
+    first: Precision
+
+
 class Posed(NamedTuple):
     """The numbers: data, frame, and the prior of the biases that no hierarchy governs."""
 
     model: Model
     frame: Frame
     first: Precision
+
+    @property
+    def information(self) -> jax.Array:
+        """Precision (Q, Q) of the frame's likelihood."""
+        return self.frame.information
+
+    @property
+    def pull(self) -> jax.Array:
+        """Its linear term about zero, (Q,)."""
+        return self.frame.pull
+
+    @property
+    def level_spread(self) -> jax.Array:
+        """Prior sd (H,) of the log levels."""
+        return self.model.level_spread
 
 
 class Conditional(NamedTuple):
@@ -55,32 +99,42 @@ class Conditional(NamedTuple):
         return jnp.where(self.active, self.inverse.T @ jax.random.normal(key, self.mean.shape), 0.0)
 
 
-def prior_precision(form: Form, posed: Posed, phi: Phi) -> tuple[jax.Array, jax.Array]:
+def prior_precision(form: Form, posed: Quadratic, phi: Phi) -> tuple[jax.Array, jax.Array]:
     """Precisions (Q,) of theta given phi, and what correlations add to them (Q, Q)."""
-    H = posed.model.level_spread.shape[0]
+    H = posed.level_spread.shape[0]
     alpha = form.hierarchy.alpha(phi, posed.first.alpha)
-    alpha = jnp.concatenate([alpha, 1.0 / posed.model.level_spread**2])
+    alpha = jnp.concatenate([alpha, 1.0 / posed.level_spread**2])
     return alpha, jnp.pad(posed.first.coupling, (0, H))
 
 
-def activity(form: Form, posed: Posed, phi: Phi) -> jax.Array:
+def activity(form: Form, posed: Quadratic, phi: Phi) -> jax.Array:
     """Which entries of theta are not exactly zero, (Q,)."""
-    H = posed.model.level_spread.shape[0]
+    H = posed.level_spread.shape[0]
     return jnp.concatenate([form.hierarchy.active(phi, form.biases), jnp.ones(H, bool)])
 
 
-def conditional(form: Form, posed: Posed, phi: Phi) -> Conditional:
+def conditional(form: Form, posed: Quadratic, phi: Phi) -> Conditional:
     """theta given phi, trajectories marginalised."""
     alpha, coupling = prior_precision(form, posed, phi)
     active = activity(form, posed, phi)
-    matrix = posed.frame.information + coupling + jnp.diag(alpha)
+    matrix = posed.information + coupling + jnp.diag(alpha)
     matrix = jnp.where(active[:, None] & active[None, :], matrix, jnp.eye(alpha.shape[0]))
-    pull = jnp.where(active, posed.frame.pull, 0.0)
+    pull = jnp.where(active, posed.pull, 0.0)
     factor, inverse = linalg.factor_and_inverse(matrix)
     return Conditional(inverse.T @ (inverse @ pull), factor, inverse, active, alpha)
 
 
-def log_prior(form: Form, posed: Posed, theta: jax.Array, phi: Phi) -> jax.Array:
+def draw_given(form: Form, posed: Quadratic, phi: Phi, key: jax.Array) -> jax.Array:
+    """One draw (Q,) of theta given phi: that of `conditional`, without the inverse."""
+    alpha, coupling = prior_precision(form, posed, phi)
+    active = activity(form, posed, phi)
+    matrix = posed.information + coupling + jnp.diag(alpha)
+    matrix = jnp.where(active[:, None] & active[None, :], matrix, jnp.eye(alpha.shape[0]))
+    pull = jnp.where(active, posed.pull, 0.0)
+    return jnp.where(active, linalg.displace(matrix, pull, jax.random.normal(key, pull.shape)), 0.0)
+
+
+def log_prior(form: Form, posed: Quadratic, theta: jax.Array, phi: Phi) -> jax.Array:
     """Log density of theta given phi, up to a constant; only for priors without a spike."""
     alpha, coupling = prior_precision(form, posed, phi)
     proper = alpha > 0
@@ -88,7 +142,7 @@ def log_prior(form: Form, posed: Posed, theta: jax.Array, phi: Phi) -> jax.Array
     return 0.5 * jnp.sum(jnp.log(jnp.where(proper, alpha, 1.0))) - 0.5 * square
 
 
-def update_inclusions(form: Form, posed: Posed, phi: Phi, key: jax.Array, *, backwards: bool) -> Phi:
+def update_inclusions(form: Form, posed: Quadratic, phi: Phi, key: jax.Array, *, backwards: bool) -> Phi:
     """One sweep over the inclusions of a spike and slab, theta integrated out, then as many exchanges of two.
 
     The covariance of what is in follows each flip by a rank-one update (George, McCulloch 1997, collapsed).
@@ -98,7 +152,7 @@ def update_inclusions(form: Form, posed: Posed, phi: Phi, key: jax.Array, *, bac
     L = len(kind.learnt)
     learnt = jnp.asarray(kind.learnt)
     alpha, coupling = prior_precision(form, posed, phi)
-    matrix, pull = posed.frame.information + coupling + jnp.diag(alpha), posed.frame.pull
+    matrix, pull = posed.information + coupling + jnp.diag(alpha), posed.pull
     start = conditional(form, posed, phi)
     both = start.active[:, None] & start.active[None, :]
     covariance = jnp.where(both, start.inverse.T @ start.inverse, 0.0)

@@ -18,7 +18,7 @@ from probcal.lazy import Later
 from probcal.priors import PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_normal
-from probcal.results.schema import INTERVAL
+from probcal.results.schema import INTERVAL, ROPE
 from probcal.smoothing.draws import draws_a_chain, predictive
 from probcal.smoothing.information import at_levels, mean_square
 from probcal.smoothing.mode import Point
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 else:
     array_stats = Later("arviz_stats.base.array_stats")
 
-ROPE = 0.1  # scales within which a bias is practically zero
 R_HAT = 1.01  # above which chains have not mixed
 ESS = 100  # effective draws a chain below which its quantiles are not to be trusted
 BFMI = 0.3  # below which the energy is not explored (Betancourt 2016)
@@ -69,6 +68,7 @@ class Chains(Posterior):
     run: Sampled
 
     chained: ClassVar[bool] = True
+    held: ClassVar[bool] = False
 
     @classmethod
     def of(cls, problem: Problem, prior: Prior, run: Sampled, mixed: Mapping[str, np.ndarray]) -> Chains:
@@ -197,18 +197,11 @@ def _columns(run: Sampled, mixed: Mapping[str, np.ndarray], M: int) -> dict[str,
 
 def _variables(problem: Problem, run: Sampled) -> dict[str, Any]:
     """Further posterior variables, name -> (dims beyond chain and draw, values, coords)."""
-    labels = list(problem.labels)
     found: dict[str, Any] = {
         "gamma": (("bias_label",), np.asarray(run.draws.gamma)),
         "contraction": (("bias_label",), 1.0 - np.asarray(run.draws.variance)),
     }
-    learnt = [labels[m] for m in run.form.hierarchy.learnt]
-    for name, values in run.draws.phi.items():
-        whose = run.form.hierarchy.belongs(name)
-        if whose == "bias":
-            found[name] = (("governed_label",), values, {"governed_label": learnt})
-        else:
-            found[name] = ((), values) if whose == "all" else (("precision_group",), values)
+    found |= run.form.hierarchy.variables(problem.labels, run.draws.phi)
     if problem.levels:
         guess = np.array([level.guess for level in problem.levels])
         names = [level.label for level in problem.levels]

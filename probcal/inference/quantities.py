@@ -17,6 +17,7 @@ import numpy as np
 
 from probcal.errors import FitError
 from probcal.inference.hierarchy import Hierarchy, Phi
+from probcal.inference.mixture import Mixture
 from probcal.inference.posed import Form, Posed, log_prior
 from probcal.inference.posterior import Chains
 from probcal.inference.sampling import Sampled
@@ -51,9 +52,11 @@ class Pool:
     points: Points
     hyper: Mapping[str, np.ndarray]  # hyper-parameters (D, ...), of samplers
     chains: int
-    chained: bool  # draws depend on each other, and levels vary
+    chained: bool  # draws depend on each other
+    held: bool  # levels are the same in every draw
     status: str
     run: Sampled | None = None  # of a sampler
+    hierarchy: Hierarchy | None = None  # that the hyper-parameters belong to
 
     @property
     def count(self) -> int:
@@ -79,9 +82,10 @@ def pool_of(answer: Answer, key: jax.Array) -> Pool:
     points = Points(flat(drawn.z), flat(drawn.levels), states)
     hyper = {name: flat(a) for name, a in posterior.hyper.items()}
     taken = answer.method != answer.requested
-    status = TAKEN if taken else "sampled" if posterior.chained else str(answer.status)
     run = posterior.run if isinstance(posterior, Chains) else None
-    return Pool(points, hyper, drawn.z.shape[0], posterior.chained, status, run)
+    hierarchy = posterior.hierarchy if isinstance(posterior, Mixture) else None if run is None else run.form.hierarchy
+    status = TAKEN if taken else str(answer.status) if run is None else "sampled"
+    return Pool(points, hyper, drawn.z.shape[0], posterior.chained, posterior.held, status, run, hierarchy)
 
 
 @jax.jit
@@ -135,13 +139,13 @@ def _quantities(trial: Trial, found: Pool) -> dict[str, _Quantity]:
     for m, label in enumerate(problem.labels):
         scale = problem.scales[m]
         all_[label] = _Quantity("bias", float(point.z[m]) * scale, points.z[:, m] * scale)
-    if found.chained:
+    if not found.held:
         for h, level in enumerate(problem.levels):
             draws = level.guess * np.exp(points.levels[:, h])
             all_[level.label] = _Quantity("level", level.guess * float(np.exp(point.levels[h])), draws)
     sampled = found.run
-    if sampled is not None:
-        all_ |= _hyper(found.hyper, trial.phi, sampled.form.hierarchy)
+    if found.hierarchy is not None:
+        all_ |= _hyper(found.hyper, trial.phi, found.hierarchy)
     if points.states:
         all_ |= _middle(problem, point, points)
         args = jax.tree.map(jnp.asarray, tuple(points))

@@ -17,6 +17,7 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.inference.ending import conclude
+from probcal.inference.integrate import Integration, integrate
 from probcal.inference.storage import Storage
 from probcal.model.model import Model
 from probcal.priors import ARD, PRECISION_BOUNDS, Precision, Prior
@@ -77,14 +78,22 @@ class Method(ABC):
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Solve a problem from a start."""
 
-    @classmethod
-    def takes(cls, prior: Prior) -> bool:
-        """Whether the method can be used with a prior."""
-        return isinstance(prior, cls.priors)
+    def first_prior(self) -> Prior:
+        """The prior where none is given."""
+        found: Prior = self.priors[0]()
+        return found
 
-    def note(self) -> str:
-        """What the intervals are worth with these settings."""
+    def takes(self, prior: Prior) -> bool:
+        """Whether the method can be used with a prior."""
+        return isinstance(prior, self.priors)
+
+    def note(self, prior: Prior) -> str:
+        """What the intervals are worth with these settings and a prior."""
         return self.intervals
+
+    def remark(self, prior: Prior) -> str:
+        """What the message of a fit says of the method under a prior; empty where nothing is to be said."""
+        return ""
 
     def prepare(self, problem: Problem) -> Problem:
         """The problem that is solved in the place of the given one."""
@@ -100,8 +109,19 @@ class Maximiser(Method, ABC):
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Climb from a start until it is done or its iterations are spent."""
         state, trace = maximise(self, problem, prior, start, context)
-        square = float(mean_square(problem.model, state.point))
-        return conclude(problem, self, prior, state, trace, square, len(trace))
+        how, mixed = self.integration(problem, prior), None
+        if how is not None:
+            mixed = integrate(how, problem.model, first_precision(problem, prior), state.point, context.key)
+        square = float(mean_square(problem.model, state.point if mixed is None else mixed.point))
+        return conclude(problem, self, prior, state, trace, square, len(trace), how, mixed)
+
+    def climbs_under(self, prior: Prior) -> Prior:
+        """The prior of the climb: where precisions are integrated after it, not that of the fit."""
+        return prior
+
+    def integration(self, problem: Problem, prior: Prior) -> Integration | None:
+        """How the precisions of a prior are integrated after the climb, None where they are not."""
+        return None
 
     @abstractmethod
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
@@ -134,13 +154,18 @@ def check_method(method: Maximiser) -> None:
         raise InputError(f"{method.name}(tolerance={method.tolerance}): give a finite number that is not negative")
 
 
+def first_precision(problem: Problem, prior: Prior) -> Precision:
+    """Precisions of the biases before any is learnt, and the couplings of correlated ones."""
+    return prior.precision(problem.labels, problem.surveyed)
+
+
 def given_of(method: Maximiser, problem: Problem, prior: Prior) -> Given:
     """Arrays of a prior and of the stopping rule for a problem."""
+    prior = method.climbs_under(prior)
     group = prior.groups(problem.members)
     group = np.where(problem.surveyed, len(group) + np.arange(len(group)), group)  # surveyed biases share none
     group = np.unique(group, return_inverse=True)[1]
-    first = prior.precision(problem.labels, problem.surveyed)
-    return Given(first, *jax.device_put((problem.surveyed, group, np.array(float(method.tolerance)))))
+    return Given(first_precision(problem, prior), *jax.device_put((problem.surveyed, group, np.array(float(method.tolerance)))))
 
 
 def first_state(given: Given, start: Point, carry: Any, seed: jax.Array) -> State:
@@ -186,12 +211,12 @@ def maximise(
 ) -> tuple[State, np.ndarray]:
     """Run a method from a start until it is done or its iterations are spent; the last state and the objectives."""
     check_method(method)
-    given = given_of(method, problem, prior)
+    given, prior = given_of(method, problem, prior), bare(method.climbs_under(prior))
     state = first_state(given, start, method.begin(problem.model, start), context.key)
     trace = np.zeros(0)
     while len(trace) < method.iterations and not bool(state.done):
         left = method.iterations - len(trace)
-        state, (objective, idle) = chunk(kernel(method), problem.model, bare(prior), given, state, left)
+        state, (objective, idle) = chunk(kernel(method), problem.model, prior, given, state, left)
         trace = np.concatenate([trace, np.asarray(objective)[~np.asarray(idle)]])
         if context.progress is not None:
             context.progress(method.name, len(trace), float(trace[-1]))

@@ -36,8 +36,7 @@ class Sampler(Method, ABC):
             if getattr(self, field) < least:
                 raise InputError(f"{self.name}({field}={getattr(self, field)}): it must be at least {least}")
 
-    @classmethod
-    def takes(cls, prior: Prior) -> bool:
+    def takes(self, prior: Prior) -> bool:
         """Whether there is a posterior to draw from: a flat hyper-prior of ARD leaves none."""
         return super().takes(prior) and not (isinstance(prior, ARD) and prior.rate == 0.0)
 

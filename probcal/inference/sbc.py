@@ -256,7 +256,7 @@ def _of_tree(problem: Problem, tree: xr.DataTree) -> Pool:
         std = held.sel(level=level.label) if drawn is None else drawn.sel(level_label=level.label)
         levels[:, h] = np.log(np.ravel(std.values) / level.guess)
     points = Points(z, levels, tuple(flat(group[name].values) for name in names))
-    return Pool(points, {}, group.sizes["chain"], True, "read")
+    return Pool(points, {}, group.sizes["chain"], True, False, "read")
 
 
 def _tree(engine: _Engine, records: dict[int, dict[str, np.ndarray]], interrupted: bool) -> xr.DataTree:

@@ -17,6 +17,7 @@ import xarray as xr
 from probcal.errors import InputError, nearest
 from probcal.inference.ending import conclude
 from probcal.inference.identity import identity, problem_digest
+from probcal.inference.integrate import Integrated, Integration, integrate
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
 from probcal.inference.run import (
     Context,
@@ -57,12 +58,15 @@ class _Solved(NamedTuple):
     """Where each run of a batch ended; leading dim (runs,)."""
 
     state: State
+    mixed: Integrated | None  # where precisions are integrated after the climb
     square: jax.Array  # (runs,) of what is left, a datum
     iterations: jax.Array  # (runs,)
 
 
-@partial(jax.jit, static_argnames=("method", "prior"))
-def _solve(method: Any, models: Model, prior: Prior, iterations: int, givens: Given, starts: Point) -> _Solved:
+@partial(jax.jit, static_argnames=("method", "prior", "how"))
+def _solve(
+    method: Any, models: Model, prior: Prior, iterations: int, givens: Given, starts: Point, how: Integration | None
+) -> _Solved:
     """Run a method on many problems of one form: one after the other on a CPU, together on an accelerator."""
 
     def one(pieces: tuple[Model, Given, Point]) -> _Solved:
@@ -78,7 +82,8 @@ def _solve(method: Any, models: Model, prior: Prior, iterations: int, givens: Gi
         first = first_state(given, start, method.begin(model, start), jax.random.key(SEED))
         state, count = jax.lax.while_loop(on, step, (first, jnp.zeros((), int)))
         state = method.close(model, prior, given, state)._replace(seed=jnp.zeros(()), carry=())
-        return _Solved(state, mean_square(model, state.point), count)
+        mixed = None if how is None else integrate(how, model, given.prior, state.point, jax.random.key(SEED))
+        return _Solved(state, mixed, mean_square(model, state.point if mixed is None else mixed.point), count)
 
     pieces = (models, givens, starts)
     return jax.lax.map(one, pieces) if jax.default_backend() == "cpu" else jax.vmap(one)(pieces)
@@ -150,12 +155,13 @@ def _batch(
                         [run.start for run in chosen],
                     )
                 ]
-                solved = _solve(kernel(method), stacked[0], prior, method.iterations, *stacked[1:])
+                how, climb = method.integration(chosen[0].problem, prior), method.climbs_under(prior)
+                solved = _solve(kernel(method), stacked[0], climb, method.iterations, *stacked[1:], how)
                 solved = jax.tree.map(np.asarray, solved)
                 for j, k in enumerate(members):
-                    state, square, count = jax.tree.map(lambda leaf, j=j: leaf[j], solved)
+                    state, mixed, square, count = jax.tree.map(lambda leaf, j=j: leaf[j], solved)
                     problem = chosen[j].problem
-                    answer = conclude(problem, method, prior, state, NOTHING, float(square), int(count))
+                    answer = conclude(problem, method, prior, state, NOTHING, float(square), int(count), how, mixed)
                     found.append({"case": cases[k], "method": name} | _record(chosen[j], answer))
         if stored:
             first = next(record for record in found if record["case"] == cases[0])

@@ -35,8 +35,8 @@ class Named(Protocol):
 
     name: ClassVar[str]
 
-    def note(self) -> str:
-        """What the intervals are worth."""
+    def note(self, prior: Prior) -> str:
+        """What the intervals are worth under a prior."""
 
 
 class Draws(NamedTuple):
@@ -61,8 +61,8 @@ class Tracks(NamedTuple):
 class Summary:
     """What an answer says of each bias, z over its scale, in the order of `problem.labels`."""
 
-    kind: str  # "Laplace", "exact" or "variational"
-    precisions: str  # of the prior: "given", "maximised" or "sampled"
+    kind: str  # "Laplace", "mixture", "exact" or "variational"
+    precisions: str  # of the prior: "given", "maximised", "integrated" or "sampled"
     mean: np.ndarray  # (M,)
     covariance: np.ndarray  # (M, M)
     lower: np.ndarray  # (M,) of the interval
@@ -89,7 +89,8 @@ class Posterior(ABC):
     point: Point  # the mode, or the mean with the trajectories at their mode
     summary: Summary
 
-    chained: ClassVar[bool]  # whether draws depend on each other, and levels vary
+    chained: ClassVar[bool]  # whether draws depend on each other
+    held: ClassVar[bool]  # whether noise levels are the same in every draw
 
     @property
     @abstractmethod
@@ -146,6 +147,7 @@ class Normal(Posterior):
     found: Laplace
 
     chained: ClassVar[bool] = False
+    held: ClassVar[bool] = True
 
     @classmethod
     def of(cls, problem: Problem, prior: Prior, point: Point, found: Laplace, alpha: np.ndarray) -> Normal:

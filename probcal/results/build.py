@@ -21,7 +21,7 @@ from probcal.results.groups import (
     suffix,
     track_group,
 )
-from probcal.results.schema import INTERVAL, RESULTS_VERSION
+from probcal.results.schema import EVIDENCE, INTERVAL, RESULTS_VERSION
 from probcal.smoothing.draws import residuals
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import track_mode
@@ -146,7 +146,7 @@ def _attrs(answer: Answer) -> dict[str, Any]:
     attrs = {
         "method": answer.method.name, "requested": answer.requested.name, "prior": type(answer.prior).__name__,
         "approximate": found.kind, "precisions": found.precisions, "correlated": int(bool(answer.prior.correlation)),
-        "intervals": (answer.prior.note if found.kind == "Laplace" else "") or answer.method.note(),
+        "intervals": (answer.prior.note if found.kind == "Laplace" else "") or answer.method.note(answer.prior),
         "settings": f"{answer.method!r}, {answer.prior!r}", "interval_probability": INTERVAL,
         "results_version": RESULTS_VERSION, "motion": answer.motion, "interrupted": int(answer.interrupted),
         "status": str(answer.status), "message": answer.message, "data": answer.problem.measurements.table.source,
@@ -154,7 +154,7 @@ def _attrs(answer: Answer) -> dict[str, Any]:
         **answer.posterior.attrs,
     }  # fmt: skip
     if found.evidence is not None:
-        attrs["log_evidence"] = found.evidence
+        attrs[EVIDENCE[found.precisions]] = found.evidence
     return attrs
 
 
@@ -193,8 +193,9 @@ def add_optima(tree: xr.DataTree, answers: Sequence[Answer], best: int) -> xr.Da
         "start": ("optimum", np.array(order)),
     }
     evidence = np.array([np.nan if own.evidence is None else own.evidence for own in summaries])
-    if "log_evidence" in tree.attrs and np.isfinite(evidence).all():
-        values["log_evidence"] = ("optimum", evidence)
+    name = EVIDENCE[summaries[0].precisions]
+    if name in tree.attrs and np.isfinite(evidence).all():
+        values[name] = ("optimum", evidence)
     tree["optimum"] = xr.DataTree(xr.Dataset(values, coords={"bias_label": list(problem.labels)}))
     return tree
 

@@ -15,3 +15,6 @@ NEEDED = {  # what readers of a fit take for granted
 TRACKED = ("mean", "sd", "before", "epoch_time", "epoch_target", "component")  # of each recursion
 JUDGED = {"verdict": ("verdict", "reason"), "finding": ("sentence",), "level": ("std", "guess")}  # where they are
 ATTRIBUTES = ("method", "prior", "seed", "status", "message", "intervals", "settings", "interval_probability", "data")
+ROPE = 0.1  # scales within which a bias is practically zero
+TYPE_II = "log_evidence_type_ii"  # the largest over the precisions, which are then taken as known
+EVIDENCE = {"given": "log_evidence", "integrated": "log_evidence", "sampled": "log_evidence", "maximised": TYPE_II}

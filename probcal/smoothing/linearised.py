@@ -68,7 +68,7 @@ class Linearisation(NamedTuple):
 
     def laplace(self, prior: Precision) -> Laplace:
         """Covariance of the biases, gamma and evidence under a prior (see `laplace`)."""
-        return _laplace(self.model, self.point, self.solved, prior)
+        return laplace_of(self.model, self.point, self.solved, prior)
 
     def variances(self, covariance: jax.Array) -> tuple[jax.Array, ...]:
         """Variance (E, n) of every state of each recursion, for a covariance (M, M) of z."""
@@ -164,10 +164,11 @@ def laplace(model: Model, point: Point, prior: Precision) -> Laplace:
 
     A precision of 0 is a flat prior: its density counts as one. The expected information is used throughout.
     """
-    return _laplace(model, point, eliminate(model, point, expected=True), prior)
+    return laplace_of(model, point, eliminate(model, point, expected=True), prior)
 
 
-def _laplace(model: Model, point: Point, solved: Eliminated, prior: Precision) -> Laplace:
+def laplace_of(model: Model, point: Point, solved: Eliminated, prior: Precision) -> Laplace:
+    """Evidence and covariance at a mode, of the system eliminated there with the expected information."""
     biases = Dense.of(solved.information + prior.matrix())
     own = 0.5 * prior.log_determinant() - 0.5 * prior.square(point.z)
     spread = -0.5 * jnp.sum((point.levels / model.level_spread) ** 2)

@@ -33,6 +33,7 @@ States = tuple[jax.Array, ...]  # (E, n) of each recursion
 ROUNDS, EXACT = 30, 1e-14  # of an adjoint solve at most, and the share of its first square that ends it
 ENOUGH = 0.1  # share of the promised rise that a step must bring: along what motion noise alone fixes, half a step does
 LEAST_CURVED = 0.05  # share of its curvature so far that a secant must show
+SHORT = 0.25  # part of a step above which the damping falls again
 TRACK_STEPS, SETTLED = 5, 1e-10  # of Gauss-Newton after every step of the biases, and nats at which they end: log det W
 # moves with the trajectories to first order
 
@@ -123,12 +124,15 @@ def add(a: States, factor: Any, b: States) -> States:
 
 
 class _Search(NamedTuple):
-    point: Point
+    point: Point  # the best so far
     solved: Eliminated
-    slope: jax.Array  # (M,) of the log density before the last step
-    step: jax.Array  # (M,) the last step
+    value: jax.Array  # negative log marginal density there; NaN before the first look
+    begun: jax.Array  # that at the start
+    score: jax.Array  # (M,) slope of the log density there
     bent: jax.Array  # (M, M) what the secants of the steps add to the information
-    value: jax.Array  # negative log marginal density
+    step: jax.Array  # (M,) the step that is being tried
+    promised: jax.Array  # the rise that the whole of it promises
+    share: jax.Array  # the part of it that is tried, 1, 1/2, ...
     damping: jax.Array
     moved: jax.Array  # some step raised the density
     iteration: jax.Array
@@ -153,62 +157,67 @@ def _secant(matrix: jax.Array, step: jax.Array, change: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def find_marginal_mode(model: Model, start: Point, prior: Precision, iterations: int, tolerance: float) -> Mode:
+def find_marginal_mode(
+    model: Model, start: Point, prior: Precision, iterations: int, tolerance: float
+) -> tuple[Mode, Eliminated]:
     """Climb to the mode of the marginal density until a step promises less than `tolerance`; levels are held.
 
     Quasi-Newton steps with the whole gradient: the information of the biases, trajectories eliminated, and what the
     secants say of log det W (BFGS), which along what motion noise alone fixes doubles it. A step that does not bring
-    its share of what it promises is halved, then damped. The cost of the mode is that of the marginal density.
+    its share of what it promises is halved, then damped. The cost of the mode is that of the marginal density; the
+    system eliminated there comes with it.
     """
     flat = Precision.single(jnp.zeros_like(start.z))
 
-    def settled(point: Point) -> Point:
-        return find_mode(model, point, flat, TRACK_STEPS, SETTLED, joint=False).point
-
-    def body(s: _Search) -> _Search:
-        point, solved = s.point, s.solved
+    def turned(s: _Search, point: Point, solved: Eliminated, value: jax.Array) -> _Search:
+        """The search at a better point, with the next step."""
         volume, _ = volume_slope(model, point, solved)
         score = solved.score - prior.pull(point.z) - 0.5 * volume
-        matrix = solved.information + prior.matrix() + s.bent
-        bent = s.bent + _secant(matrix, s.step, s.slope - score)
-        matrix = solved.information + prior.matrix() + bent + s.damping * jnp.eye(model.biases)
-        dz = Dense.of(matrix).solve(score)
-        promised = 0.5 * score @ dz
-
-        def shorter(state):
-            t, tries, *_ = state
-            t = jnp.where(tries == 0, 1.0, 0.5 * t)
-            moved = settled(follow(model, point, solved, t * dz))
-            return t, tries + 1, moved, *_valued(model, moved, prior)
-
-        def worse(state):
-            t, tries, _, _, value = state
-            enough = s.value - value >= ENOUGH * t * promised
-            return (tries == 0) | (~enough & (tries < HALVINGS))
-
-        t, tries, moved, after, value = jax.lax.while_loop(
-            worse, shorter, (jnp.ones(()), jnp.zeros((), int), point, solved, s.value)
-        )
-        better = s.value - value >= ENOUGH * t * promised
-        small = promised <= jnp.maximum(tolerance, ROUNDING * jnp.abs(s.value))
-        take = better & (value <= s.value)
-        point, solved = jax.tree.map(lambda new, old: jnp.where(take, new, old), (moved, after), (point, solved))
-        damping = jnp.where(take & (tries <= 3), s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
+        matrix = solved.information + prior.matrix()
+        bent = s.bent + _secant(matrix + s.bent, point.z - s.point.z, s.score - score)
+        damping = jnp.where(s.share >= SHORT, s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
         damping = jnp.where(damping < 1e-6, 0.0, damping)
-        converged = small & (s.damping <= 1.0) & jnp.isfinite(s.value)
+        step = Dense.of(matrix + bent + damping * jnp.eye(model.biases)).solve(score)
+        promised = 0.5 * score @ step
+        small = promised <= jnp.maximum(tolerance, ROUNDING * jnp.abs(value))
+        found = small & (damping <= 1.0) & jnp.isfinite(value)
+        begun = jnp.where(s.iteration == 0, value, s.begun)
         return _Search(
-            point, solved, score, jnp.where(take, t * dz, 0.0), bent, jnp.where(take, value, s.value), damping,
-            s.moved | take, s.iteration + 1, converged, converged | (damping > DAMPING),
+            point, solved, value, begun, score, bent, step, promised, jnp.ones(()), damping, s.moved | (s.iteration > 0),
+            s.iteration + 1, found, found | ~jnp.isfinite(value),
         )  # fmt: skip
 
-    begin = settled(start)
-    zeros = jnp.zeros(model.biases)
-    solved, value = _valued(model, begin, prior)
+    def shorter(s: _Search, *_: Any) -> _Search:
+        """The search with half the step, or with more damping where that was tried often enough."""
+        spent = s.share <= 0.5**HALVINGS
+        damping = jnp.where(spent, jnp.maximum(s.damping * 10.0, 1e-3), s.damping)
+        matrix = s.solved.information + prior.matrix() + s.bent + damping * jnp.eye(model.biases)
+        step = jnp.where(spent, Dense.of(matrix).solve(s.score), s.step)
+        return s._replace(
+            step=step, promised=0.5 * s.score @ step, share=jnp.where(spent, 1.0, 0.5 * s.share), damping=damping,
+            iteration=s.iteration + spent, done=damping > DAMPING,
+        )  # fmt: skip
+
+    def body(s: _Search) -> _Search:
+        first = s.iteration == 0
+        tried = follow(model, s.point, s.solved, s.share * s.step)
+        tried = jax.tree.map(lambda new, old: jnp.where(first, old, new), tried, s.point)
+        tried = find_mode(model, tried, flat, TRACK_STEPS, SETTLED, joint=False).point
+        solved, value = _valued(model, tried, prior)
+        better = (s.value - value >= ENOUGH * s.share * s.promised) & (value <= s.value)
+        return jax.lax.cond(better | first, turned, shorter, s, tried, solved, value)
+
+    M, zero, no = model.biases, jnp.zeros(()), jnp.zeros((), bool)
+    blank = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: eliminate(model, start, expected=True))
+    )
+    none = jnp.zeros(M)
     first = _Search(
-        begin, solved, zeros, zeros, jnp.zeros((model.biases, model.biases)), value, jnp.zeros(()), jnp.zeros((), bool), jnp.zeros((), int),
-        jnp.zeros((), bool), jnp.zeros((), bool),
+        start, blank, zero * jnp.nan, zero, none, jnp.zeros((M, M)), none, zero, jnp.ones(()), zero, no,
+        jnp.zeros((), int), no, no,
     )  # fmt: skip
-    last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations), body, first)
-    gained, volume = first.value - last.value, 0.5 * last.solved.logdet
-    refused = ~last.moved & ~last.converged
-    return Mode(last.point, last.value, last.iteration, last.converged, refused, gained, volume)
+    last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration <= iterations), body, first)
+    refused, volume = ~last.moved & ~last.converged, 0.5 * last.solved.logdet
+    gained = last.begun - last.value
+    mode = Mode(last.point, last.value, last.iteration - 1, last.converged, refused, gained, volume)
+    return mode, last.solved

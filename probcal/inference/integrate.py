@@ -1,0 +1,177 @@
+"""Precisions integrated: a mixture of Gaussians of the biases around their Gaussian likelihood.
+
+At a point the data leave a Gaussian likelihood of the biases in natural form, G and G z + g, g the score of the
+marginal density. Gibbs sweeps over hyper-parameters and biases sample what a hierarchical prior makes of it; the point
+then moves to the mean of the mixture, once, and the sweeps go on. Noise levels are held.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import ndtr
+
+from probcal import linalg
+from probcal.inference.gibbs import sweep
+from probcal.inference.hierarchy import Phi
+from probcal.inference.posed import Form, Natural, activity, draw_given, prior_precision
+from probcal.model.model import Model
+from probcal.priors import Precision
+from probcal.results.schema import INTERVAL
+from probcal.smoothing.marginal import volume_slope
+from probcal.smoothing.mode import Point, eliminate, track
+
+CHAINS, BURN, KEPT = 4, 60, 250  # of the sweeps around one point
+EVERY = 5  # kept draws between two whose conditional Gaussian enters the moments
+HALVINGS = 40  # of the bracket of a quantile
+
+
+@dataclass(frozen=True)
+class Integration:
+    """The static part: what the integration is compiled for."""
+
+    form: Form
+    marginal: bool  # whether the determinant of the trajectories belongs to the likelihood; not at a joint mode
+
+
+class Moments(NamedTuple):
+    """What a mixture says of the biases z."""
+
+    mean: jax.Array  # (M,)
+    covariance: jax.Array  # (M, M)
+    lower: jax.Array  # (M,) of the interval
+    upper: jax.Array  # (M,)
+    gamma: jax.Array  # (M,)
+
+
+class Integrated(NamedTuple):
+    """Where the integration ended: the mixture, its draws, and the likelihood behind it."""
+
+    point: Point  # biases at the mean, trajectories at their mode
+    information: jax.Array  # (M, M) of the data about z
+    moments: Moments
+    z: jax.Array  # (CHAINS, KEPT, M)
+    phi: Phi  # leading dims (CHAINS, KEPT)
+
+
+def integrate(how: Integration, model: Model, first: Precision, start: Point, key: jax.Array) -> Integrated:
+    """Integrate the hyper-parameters of a hierarchy, from a mode of the biases under their declared scales.
+
+    `first` is the prior of what no hierarchy governs. Once the mean of the mixture is known the likelihood is taken
+    there, and the sweeps go on.
+    """
+    known, _ = likelihood(how, model, first, start)
+    chains = begin(how.form, known, jax.random.fold_in(key, 0))
+    chains, first_found = run(how.form, known, chains, jax.random.fold_in(key, 1))
+    point, known = recentred(how, model, start, known, first_found.mean)
+    _, found = run(how.form, known, chains, jax.random.fold_in(key, 2))
+    total = moments(how.form, known, found.phi)
+    return Integrated(placed(model, point, total.mean), known.information, total, found.z, found.phi)
+
+
+@partial(jax.jit, static_argnames="how")
+def likelihood(how: Integration, model: Model, first: Precision, point: Point) -> tuple[Natural, jax.Array]:
+    """The Gaussian likelihood of the biases at a point, and whether it is one."""
+    solved = eliminate(model, point, expected=True)
+    score, sound = solved.score, jnp.all(jnp.isfinite(solved.information))
+    if how.marginal:
+        volume, smooth = volume_slope(model, point, solved)
+        score, sound = score - 0.5 * volume, sound & smooth
+    pull = solved.information @ point.z + score
+    return Natural(solved.information, pull, jnp.zeros(0), first), sound & jnp.all(jnp.isfinite(pull))
+
+
+def placed(model: Model, point: Point, z: jax.Array) -> Point:
+    """The point at biases z (M,), trajectories at their mode."""
+    return track(model, point._replace(z=z))
+
+
+def recentred(how: Integration, model: Model, point: Point, known: Natural, mean: jax.Array) -> tuple[Point, Natural]:
+    """Point and likelihood at a mean (M,); as they were where there is no likelihood at the mean."""
+    moved = placed(model, point, mean)
+    after, sound = likelihood(how, model, known.first, moved)
+    return chosen(sound, (moved, after), (point, known))
+
+
+@jax.jit
+def chosen(first: jax.Array, one: Any, other: Any) -> Any:
+    """One pytree or the other."""
+    return jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)
+
+
+@partial(jax.jit, static_argnames="form")
+def begin(form: Form, known: Natural, key: jax.Array) -> tuple[jax.Array, Phi]:
+    """Biases and hyper-parameters that each chain starts from: drawn from the prior, so further out than the data."""
+
+    def one(own: jax.Array) -> tuple[jax.Array, Phi]:
+        phi = form.hierarchy.begin(own)
+        return draw_given(form, known, phi, jax.random.fold_in(own, 1)), phi
+
+    return jax.lax.map(one, jax.random.split(key, CHAINS))
+
+
+class Swept(NamedTuple):
+    """Draws of all chains."""
+
+    z: jax.Array  # (CHAINS, KEPT, M)
+    phi: Phi  # leading dims (CHAINS, KEPT)
+    mean: jax.Array  # (M,)
+
+
+@partial(jax.jit, static_argnames="form")
+def run(form: Form, known: Natural, chains: Any, key: jax.Array) -> tuple[Any, Swept]:
+    """Sweeps of every chain from where it stands, those of the burn-in dropped; also where the chains end."""
+
+    def one(carry: tuple[jax.Array, Phi], own: jax.Array) -> tuple[Any, Any]:
+        found = sweep(form, known, *carry, own, backwards=False)
+        return found, found
+
+    def chain(pair: tuple[Any, jax.Array]) -> tuple[Any, Any]:
+        end, found = jax.lax.scan(one, pair[0], jax.random.split(pair[1], BURN + KEPT))
+        return end, jax.tree.map(lambda leaf: leaf[BURN:], found)
+
+    ends, (z, phi) = jax.lax.map(chain, (chains, jax.random.split(key, CHAINS)))
+    return ends, Swept(z, phi, jnp.mean(z, (0, 1)))
+
+
+@partial(jax.jit, static_argnames="form")
+def moments(form: Form, known: Natural, phi: Phi) -> Moments:
+    """Mean, covariance, interval and gamma of the mixture of the Gaussians that hyper-parameters leave (thinned)."""
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[::EVERY], phi)
+
+    def one(phi: Phi) -> tuple[jax.Array, jax.Array, jax.Array]:
+        alpha, coupling = prior_precision(form, known, phi)
+        active = activity(form, known, phi)
+        both = active[:, None] & active[None, :]
+        matrix = jnp.where(both, known.information + coupling + jnp.diag(alpha), jnp.eye(form.biases))
+        covariance = jnp.where(both, linalg.inverse_and_logdet(matrix)[0], 0.0)
+        gamma = jnp.where(active, jnp.clip(1.0 - alpha * jnp.diagonal(covariance), 0.0, 1.0), 0.0)
+        return covariance @ known.pull, covariance, gamma
+
+    def add(total: jax.Array, own: Phi) -> tuple[jax.Array, Any]:
+        mean, covariance, gamma = one(own)
+        return total + covariance, (mean, jnp.diagonal(covariance), gamma)
+
+    total, (means, variances, gammas) = jax.lax.scan(add, jnp.zeros((form.biases, form.biases)), flat)
+    count, mean = means.shape[0], jnp.mean(means, 0)
+    covariance = total / count + jnp.cov(means, rowvar=False, bias=True).reshape(total.shape)
+    sds = jnp.sqrt(jnp.maximum(variances, 0.0))
+    tail = 0.5 * (1.0 - INTERVAL)
+    lower, upper = (_quantile(means, sds, share) for share in (tail, 1.0 - tail))
+    return Moments(mean, covariance, lower, upper, jnp.mean(gammas, 0))
+
+
+def _quantile(means: jax.Array, sds: jax.Array, share: float) -> jax.Array:
+    """Quantile (M,) of each mixture of Gaussians of means and sds (S, M), by halving a bracket."""
+    width = 10.0 * jnp.max(sds, 0) + 1e-12
+
+    def half(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        low, high = ends
+        at = 0.5 * (low + high)
+        below = jnp.mean(ndtr((at - means) / jnp.maximum(sds, 1e-12)), 0) < share
+        return jnp.where(below, at, low), jnp.where(below, high, at)
+
+    low, high = jax.lax.fori_loop(0, HALVINGS, half, (jnp.min(means, 0) - width, jnp.max(means, 0) + width))
+    return 0.5 * (low + high)

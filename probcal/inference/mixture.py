@@ -1,0 +1,98 @@
+"""The posterior of a fit whose precisions are integrated: a mixture of Gaussians, by its moments and its draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.inference.hierarchy import LEAST, MOST, Hierarchy, SpikeAndSlab
+from probcal.inference.integrate import Integrated
+from probcal.inference.posed import Form
+from probcal.priors import PRECISION_BOUNDS, Prior
+from probcal.problem import Problem
+from probcal.results.answer import Draws, Posterior, Summary, Tracks, log_normal, tracks_of
+from probcal.results.schema import ROPE
+from probcal.smoothing.draws import draw, draws_a_chain
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture(Posterior):
+    """A mixture of Gaussians of the biases around a point, noise levels held."""
+
+    found: Integrated
+    hierarchy: Hierarchy
+    first: np.ndarray  # (M,) precisions before the hierarchy governs some
+
+    chained: ClassVar[bool] = True
+    held: ClassVar[bool] = True
+
+    @classmethod
+    def of(cls, problem: Problem, prior: Prior, form: Form, first: np.ndarray, found: Integrated) -> Mixture:
+        """The mixture of an integration; `first` (M,) are the precisions of what no hierarchy governs."""
+        mean, covariance, lower, upper, gamma = (np.asarray(part) for part in found.moments)
+        z = np.asarray(found.z)
+        columns = {"inclusion": (np.abs(z) > ROPE).mean((0, 1))}
+        if "included" in found.phi:
+            columns["included"] = np.ones(len(mean))
+            columns["included"][list(form.hierarchy.learnt)] = np.asarray(found.phi["included"]).mean((0, 1))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            own = np.clip((1 - gamma) / np.maximum(np.diag(covariance), 1e-300), *PRECISION_BOUNDS)
+        precision = np.where(problem.surveyed, first, own)
+        summary = Summary(
+            "mixture", "integrated", mean, covariance, lower, upper, gamma, precision, np.asarray(found.information),
+            np.asarray(found.point.levels), None, columns,
+        )  # fmt: skip
+        return cls(problem, prior, found.point, summary, found, form.hierarchy, first)
+
+    @property
+    def states(self) -> Sequence[np.ndarray]:
+        """States (E, n) of each recursion at the mean of the biases."""
+        return [np.asarray(x) for x in self.point.states]
+
+    def tracks(self) -> Sequence[Tracks]:
+        """States at the mean of the biases, and their sd with the biases uncertain."""
+        return tracks_of(self.linearised, jnp.asarray(self.summary.covariance))
+
+    def _kept(self) -> np.ndarray:
+        """Which draws of each chain are kept: fewer where the data are many."""
+        chains, count = self.found.z.shape[:2]
+        return np.linspace(0, count - 1, draws_a_chain(self.problem.model.size, chains)).round().astype(int)
+
+    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
+        """Draws of the mixture with a trajectory each, as many as the size of the data lets be kept."""
+        z = np.asarray(self.found.z)[:, self._kept()]
+        shape, M = z.shape[:2], z.shape[2]
+        drawn = draw(self.linearised, jnp.asarray(z.reshape(-1, M)), self.point.levels, key, keep)
+        states, likelihood, replicas = ([np.asarray(a).reshape(*shape, *a.shape[1:]) for a in part] for part in drawn)
+        levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
+        return Draws(z, levels, states, np.arange(shape[1]), likelihood, replicas)
+
+    def log_prior(self, draws: Draws) -> np.ndarray | None:
+        """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
+        if self.prior.correlation or isinstance(self.hierarchy, SpikeAndSlab):
+            return None
+        phi = {name: jnp.asarray(values) for name, values in self.hyper.items()}
+        first = jnp.asarray(self.first)
+        alpha = np.asarray(jax.vmap(jax.vmap(lambda one: self.hierarchy.alpha(one, first)))(phi))
+        return log_normal(draws.z, np.clip(alpha, LEAST, MOST))
+
+    @property
+    def variables(self) -> Mapping[str, Any]:
+        """Hyper-parameters of every draw."""
+        return self.hierarchy.variables(self.problem.labels, self.hyper)
+
+    @property
+    def hyper(self) -> Mapping[str, np.ndarray]:
+        """Draws of the hyper-parameters, (chain, draw, ...)."""
+        kept = self._kept()
+        return {name: np.asarray(values)[:, kept] for name, values in self.found.phi.items()}
+
+    @property
+    def attrs(self) -> Mapping[str, float]:
+        """The limit of inclusion."""
+        return {"rope": ROPE}
