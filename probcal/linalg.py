@@ -140,7 +140,7 @@ def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def displace(matrix: jax.Array, right: jax.Array, noise: jax.Array) -> jax.Array:
-    """matrix^-1 right + L^-T noise, L the Cholesky factor: with unit normals a draw of the precision `matrix` (n, n)."""
+    """matrix^-1 right + L^-T noise, L the Cholesky factor of `matrix`: a draw of that precision by unit noise."""
     lower = jnp.linalg.cholesky(matrix)
     return solve_triangular(lower, solve_triangular(lower, right, lower=True) + noise, lower=True, trans=1)
 

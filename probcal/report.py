@@ -18,6 +18,7 @@ from probcal import plots
 from probcal.diagnostics import drift_table
 from probcal.files import write_whole
 from probcal.results.read import outliers
+from probcal.results.schema import EVIDENCES, evidence_in
 from probcal.status import INVALID, Status
 
 NONE = "–"  # where there is no finite number
@@ -84,7 +85,7 @@ footer { margin-top: 2rem; padding-top: .5rem; border-top: 1px solid #d5d5d5; co
 <body>
 <h1>{{ title }}</h1>
 <p class="sub">Method {{ attrs.method }}, prior {{ attrs.prior }}{% if source %}, data {{ source }}{% endif %}
-{%- if evidence %}, log evidence {{ evidence }}{% endif %}</p>
+{%- if evidence %}, {{ evidence }}{% endif %}</p>
 <div class="banner {{ colour }}" role="status">
 <strong>{{ attrs.status | capitalize }}{% if invalid %}: estimate invalid{% endif %}</strong>
 {% if attrs.message %}<p>{{ attrs.message }}</p>{% endif %}
@@ -158,7 +159,7 @@ def _render(tree: xr.DataTree) -> str:
         attrs=attrs,
         title=model or data or "probcal fit",
         source=data if model else "",
-        evidence=_number(attrs["log_evidence"], 7) if "log_evidence" in attrs else "",
+        evidence=f"{EVIDENCES[name]} {_number(attrs[name], 7)}" if (name := evidence_in(attrs)) else "",
         colour=COLOURS.get(str(attrs["status"]), "plain"),
         invalid=attrs["status"] in INVALID,
         rmse=_rmse(attrs),
@@ -281,14 +282,14 @@ def _optima(tree: xr.DataTree) -> dict[str, Any] | None:
     group = tree["optimum"].to_dataset()
     scale = tree["calibration"].to_dataset()["scale"].values
     apart = np.abs((group["bias"].values - group["bias"].values[0]) / scale).max(1)
-    score = "log_evidence" if "log_evidence" in group else "objective"
+    score = evidence_in(group) or "objective"
     rows = [
         [str(start), str(status), _number(value, 7), _number(far)]
         for start, status, value, far in zip(
             group["start"].values, group["status"].values, group[score].values, apart, strict=True
         )
     ]
-    columns = ["start", "status", score.replace("_", " "), "largest difference, in scales"]
+    columns = ["start", "status", EVIDENCES.get(score, score), "largest difference, in scales"]
     return {"title": "Optima of several starts", "columns": columns, "rows": rows}
 
 

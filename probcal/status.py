@@ -11,6 +11,7 @@ class Status(StrEnum):
     NOT_CONVERGED = "not converged"
     AT_BOUND = "at bound"
     DIVERGED = "diverged"
+    GAUGE = "along a gauge"
     MISFIT = "misfit"
 
     @property
@@ -21,7 +22,7 @@ class Status(StrEnum):
     @property
     def valid(self) -> bool:
         """Whether the numbers are estimates at all."""
-        return self not in (Status.AT_BOUND, Status.DIVERGED, Status.MISFIT)
+        return self not in (Status.AT_BOUND, Status.DIVERGED, Status.GAUGE, Status.MISFIT)
 
     @property
     def settled(self) -> bool:
@@ -35,6 +36,7 @@ WORDS = {
     Status.NOT_CONVERGED: "did not converge",
     Status.AT_BOUND: "ended at bound: its numbers are no estimate",
     Status.DIVERGED: "diverged: its numbers are no estimate",
+    Status.GAUGE: "ran along a gauge: its numbers are no estimate",
     Status.MISFIT: "explains nothing: its numbers are no estimate",
 }
 INVALID = tuple(str(status) for status in Status if not status.valid)  # of a fit or of a bias

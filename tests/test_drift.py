@@ -259,7 +259,7 @@ def test_the_radios_of_plaza_stand_still():
         network = Network([kind.on(node) for node in constant.network.nodes])
         problem = Problem(network, constant.motion, constant.measurements.table)
         fits[name] = probcal.fit(problem, EA())
-        evidence[name] = fits[name].attrs["log_evidence"]
+        evidence[name] = fits[name].attrs["log_evidence_declared"]
     compared = probcal.compare(fits)
     for name in fits:
         found = compared[f"method/{name}"].attrs

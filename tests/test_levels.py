@@ -60,7 +60,9 @@ def test_unknown_noise_and_process_noise_are_estimated_along():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "method", [EM(iterations=100), EMEA(), MAP(), LeastSquares(), EA(trajectory="smoothed")], ids=lambda m: m.name
+    "method",
+    [EM(iterations=100), EMEA(), MAP(), LeastSquares(), EA.as_printed(trajectory="smoothed")],
+    ids=lambda m: m.name,
 )
 def test_every_method_estimates_an_unknown_level(method):
     path = np.stack([np.linspace(5, 55, 60), 30 + 20 * np.sin(np.linspace(0, 6, 60))], 1)

@@ -10,6 +10,7 @@ from probcal import EA, MAP, Gaussian, assess, fit
 from probcal.analysis.fitted import take_up
 from probcal.inference import calibrate
 from probcal.priors import Precision
+from probcal.results.schema import DECLARED
 from probcal.smoothing.linearised import laplace, linearise
 from probcal.smoothing.mode import find_mode
 from probcal.smoothing.solves import Dense
@@ -98,4 +99,4 @@ def test_an_answer_handed_on_is_the_fit_taken_up_again():
     tree, answer = calibrate(problem, EA(), start=resting(problem))
     alone, handed = assess(problem, tree), assess(problem, tree, answer=answer)
     assert alone["verdict"]["verdict"].values.tolist() == handed["verdict"]["verdict"].values.tolist()
-    assert fit(problem, EA(), start=resting(problem)).attrs["log_evidence"] == tree.attrs["log_evidence"]
+    assert fit(problem, EA(), start=resting(problem)).attrs[DECLARED] == tree.attrs[DECLARED]

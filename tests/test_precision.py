@@ -52,7 +52,7 @@ print(json.dumps({
     "track": track["mean"].values.tolist(),
     "track_sd": track["sd"].values.tolist(),
     "draws": tree["posterior"]["bias"].values[:, :3].tolist(),
-    "evidence": tree.attrs["log_evidence"],
+    "evidence": tree.attrs["log_evidence_declared"],
 }))
 """
 

@@ -13,6 +13,8 @@ from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.pieces import Change, Pieces
 from probcal.analysis.verdict import RATE, limit_of
+from probcal.analysis.widen import rejection, widened
+from probcal.identifiability.remedies import WEAK
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.groups import suffix
@@ -21,6 +23,7 @@ from probcal.status import INVALID, Status
 from probcal.types import float64
 
 QUARTERS = 4
+PART = 0.3  # of its largest entry from which a bias has a substantial part in a combination
 COPIES = 2000  # most biases of all pieces together
 
 
@@ -39,6 +42,9 @@ def assess(
     - `halves`: what each bias alone would change from the first half of the recording to the second.
     - `sensitivity`: power scaling of prior and likelihood, where the tree holds both.
     - `verdict`: `verdict` and `reason` of every bias (rules in `probcal.analysis.verdict`); `finding`: sentences.
+
+    Where the innovations reject the model (p below 0.001: their mean square, or their correlation in time) the sd,
+    intervals, covariance and draws of the biases are widened by what they call for, and a finding says so.
 
     Limits have a false-alarm rate of 1 %: of one epoch in `epoch_check`, else of all comparisons of a kind together.
     Refits of large networks are one step from the fit (attribute `refits` of the group). Of a misfit nothing is left
@@ -85,9 +91,11 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
         groups["sensitivity"] = scaled
     if truth is not None:
         _score(fit, tree, drawn, truth, groups)
+    inflation = groups["verdict"]["inflation"].values
+    result, widening = widened(tree, inflation, rejection(found.innovations, groups["channel_check"]))
+    findings += widening
     texts = {name: ("finding", np.array([getattr(f, name) for f in findings], str)) for name in Finding._fields}
     groups["finding"] = xr.Dataset(texts)
-    result = tree.copy()
     for name, group in groups.items():
         result[name] = xr.DataTree(group)
     return result
@@ -123,13 +131,29 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
         verdict.pull(z, alpha, calibration["gamma"].values, inflation), float(np.sqrt(limit_of(M))),
     )  # fmt: skip
     ended = calibration["status"].values.tolist()
-    words, reasons = verdict.judge(problem, Status(tree.attrs["status"]), ended, known, drifts, disagreements, first)
+    status = Status(tree.attrs["status"])
+    words, reasons = verdict.judge(problem, status, ended, known, drifts, disagreements, first, _shared(tree))
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}
     labels = {"bias_label": list(problem.labels)}
     group = xr.Dataset({name: ("bias_label", value) for name, value in values.items()}, labels)
     group.attrs |= {"rate": RATE, "limit": known.limit}
     return group
+
+
+def _shared(tree: xr.DataTree) -> dict[int, str]:
+    """The combination, by name, that each bias has a substantial part in, of those that the data leave open."""
+    found = dict[int, str]()
+    if "direction" not in tree.children:
+        return found
+    group = tree["direction"].to_dataset()
+    for name, information, vector in zip(
+        group["direction"].values, group["information"].values, np.abs(group["vector"].values), strict=True
+    ):
+        if information < WEAK:
+            for m in np.flatnonzero(vector > PART * vector.max()):
+                found.setdefault(int(m), f"{name} (information {information:.2g})")
+    return found
 
 
 class _Grid(NamedTuple):

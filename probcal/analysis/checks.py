@@ -76,6 +76,7 @@ def by_channel(
         name, mean, limit = f"{sensor}.{channel}", extra[k, 1], -special.ndtri(RATE / (2 * count)) / np.sqrt(mine.sum())
         if judged and abs(mean) > max(limit, NOTABLE):
             text = f"{name}: innovations have mean {mean:.2f} noise std (limit {limit:.2f}): a bias is left"
+            text += ", or targets keep turning"
             findings.append(Finding("mean", name, text))
     values |= dict(zip(("autocorrelation", "mean", "white"), extra.T, strict=True))
     names, r = [".".join(pair) for pair in labels.to_numpy(str)], extra[:, 0]

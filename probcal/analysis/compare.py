@@ -14,6 +14,7 @@ from probcal.analysis.findings import Finding
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
 from probcal.errors import InputError, nearest
 from probcal.labels import label_parts
+from probcal.results.schema import EVIDENCES
 from probcal.status import INVALID
 
 Fits = Mapping[str, xr.DataTree] | Sequence[xr.DataTree]
@@ -21,7 +22,7 @@ COLUMNS = ("mean", "sd", "lower", "upper", "gamma", "status")  # of every fit
 FURTHER = ("inclusion", "r_hat", "ess", "ess_tail")  # of some
 DRAWN = ("gamma", "contraction")  # of which samplers have draws
 NOTHING = 1e-3  # scales
-TOTALS = ("log_evidence", "log_evidence_se", "seconds")
+TOTALS = (*EVIDENCES, "log_evidence_se", "seconds")
 TEXTS = ("method", "requested", "prior", "status", "message", "settings", "intervals", "approximate", "precisions")
 
 

@@ -12,6 +12,7 @@ import xarray as xr
 
 from probcal.analysis.findings import NAMES, Finding
 from probcal.analysis.overlap import ZERO
+from probcal.results.schema import EVIDENCES
 from probcal.status import INVALID, Status
 
 NARROW = 0.7  # ratio of sds beyond which, either way, a method is not enough
@@ -143,13 +144,14 @@ def _prediction(methods: dict[str, xr.Dataset]) -> list[Finding]:
 
 
 def _evidence(methods: dict[str, xr.Dataset]) -> list[Finding]:
-    known = {name: method.attrs["log_evidence"] for name, method in methods.items()
-             if "log_evidence" in method.attrs and method.attrs["status"] not in INVALID}  # fmt: skip
-    if len(known) < 2:
-        return []
-    best, *others = sorted(known, key=lambda name: -known[name])
-    listed = ", ".join(f"{name} {known[name] - known[best]:.1f}" for name in others)
-    learnt = [name for name in known if methods[name].attrs.get("precisions") == "maximised"]
-    note = f"; that of {', '.join(learnt)} is maximised over precisions, too high beside the others" if learnt else ""
-    note = note if len(learnt) < len(known) else ""
-    return [Finding("evidence", best, f"log evidence is highest of {best}; in nats below it: {listed}{note}")]
+    """Evidences of one kind put in order: one that is maximised says nothing beside one that is integrated."""
+    found = []
+    for kind, words in EVIDENCES.items():
+        known = {name: method.attrs[kind] for name, method in methods.items()
+                 if kind in method.attrs and method.attrs["status"] not in INVALID}  # fmt: skip
+        if len(known) < 2:
+            continue
+        best, *others = sorted(known, key=lambda name: -known[name])
+        listed = ", ".join(f"{name} {known[name] - known[best]:.1f}" for name in others)
+        found.append(Finding("evidence", best, f"{words} is highest of {best}; in nats below it: {listed}"))
+    return found

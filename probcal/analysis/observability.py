@@ -56,7 +56,7 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     values = np.linalg.eigvalsh(marginal(found.information, free)) if free.any() else np.full(1, np.inf)
     result = xr.DataTree.from_dict(groups)
     result.attrs.update(
-        status=_status(max(float(values[0]), 0.0)), rule=RULE,
+        status=_status(max(float(values[0]), 0.0), null.countable and null.basis.shape[1] > 0), rule=RULE,
         countable=int(null.countable), data=problem.measurements.table.source,
         gauge=null.basis.shape[1] if null.countable else 0,
         weak=int((values < WEAK).sum()),
@@ -86,10 +86,12 @@ def _information(at: Linearisation) -> Information:
     return Information(information)
 
 
-def _status(least: float) -> str:
-    """What the least information of any direction means for a fit."""
+def _status(least: float, gauge: bool) -> str:
+    """What the least information of any direction means for a fit; a gauge is never determined by its motion alone."""
     word = narrowed(1.0 - 1.0 / (1.0 + least))
-    return "open" if word == "prior only" else word
+    if word == "prior only":
+        return "open"
+    return "weak" if gauge else word
 
 
 def _biases(problem: Problem, found: Information) -> xr.Dataset:

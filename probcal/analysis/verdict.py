@@ -7,8 +7,10 @@ drifting     the halves of the recording differ on it beyond the limit, after wh
 conflicting  it lies beyond the limit of its survey (or of its scale under a prior that does not learn), or the
              targets disagree on it beyond the limit, after what stronger changes explain
 prior only   s < 0.05
-weak         s < 0.5 (information below 1), or the fit is no answer (not converged, at bound, diverged), or the chains
-             of the bias have not mixed; "conflicting" where the fit explains nothing (misfit)
+weak         s < 0.5 (information below 1), or it has a substantial part in a combination of biases that the data
+             leave open, or the fit is no answer (not converged, at bound, diverged), or the chains of the bias have
+             not mixed, or it was pruned: held at zero by a precision that was maximised; "conflicting" where the fit
+             explains nothing (misfit)
 determined   none of these
 
 Limits have a false-alarm rate of 1 % over all biases together, and the standard deviations behind them carry the
@@ -71,10 +73,11 @@ def judge(
     drifts: Mapping[int, str],
     disagreements: Mapping[int, str],
     first: str,
+    shared: Mapping[int, str],
 ) -> tuple[list[str], list[str]]:
     """Verdict and reason of every bias, from the evidence and the reasons of those that change, `first` most.
 
-    `status` is that of the fit, `ended` that of each bias.
+    `status` is that of the fit, `ended` that of each bias, `shared` the open combination that some belong to.
     """
     verdicts, sentences = [], []
     for m, bias in enumerate(problem.biases):
@@ -94,15 +97,18 @@ def judge(
             verdict, reason = "prior only", f"the data hardly narrow its {declared} ({information})"
         elif s < WEAK:
             verdict, reason = "weak", f"the data narrow its {sizes} only ({information})"
+        elif m in shared:
+            verdict, reason = "weak", f"it belongs to {shared[m]}, which the data leave open"
         elif status is Status.MISFIT:
             verdict, reason = "conflicting", "the fit ended misfit: model and data contradict each other"
         elif not status.settled:
             verdict, reason = "weak", f"the fit ended {status}, which is no answer"
         elif ended[m] == "not mixed":
             verdict, reason = "weak", "its chains have not mixed, which is no answer"
+        elif ended[m] == "pruned":
+            verdict, reason = "weak", "pruned: its precision was maximised, and its interval is none"
         else:
             verdict, reason = "determined", f"the data narrow its {sizes}"
-            reason += "; learnt to be zero" if ended[m] == "pruned" else ""
         if verdict != "drifting" and known.square[m] > known.limit**2 and first not in ("", bias.label):
             reason += f"; its halves differ by {np.sqrt(known.square[m]):.1f} sd, which {first} explains"
         verdicts.append(verdict)

@@ -14,6 +14,7 @@ from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.diagnostics import comparison_rows
 from probcal.files import Outputs
 from probcal.results.io import load, save
+from probcal.results.schema import EVIDENCES
 from probcal.status import INVALID
 
 
@@ -75,7 +76,8 @@ def methods_text(comparison: xr.DataTree) -> str:
         "status": lambda at: at["status"], "bias_rmse": number("bias_rmse", ".3f"), "coverage": covered(""),
         "non-zero": covered("_nonzero"), "elpd": number("elpd", ".1f", "elpd_se"),
         "difference": number("elpd_difference", ".2f", "elpd_difference_se"), "bad k": number("bad_k", ".1%"),
-        "log evidence": number("log_evidence", ".1f", "log_evidence_se"), "r_hat": number("largest_r_hat", ".3f"),
+        **{title: number(name, ".1f", f"{name}_se") for name, title in EVIDENCES.items()},
+        "r_hat": number("largest_r_hat", ".3f"),
         "ess": number("smallest_ess", ".0f"), "ess/s": number("ess_per_second", ".3g"),
         "seconds": number("seconds", ".3g"),
     }  # fmt: skip

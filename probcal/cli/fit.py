@@ -20,6 +20,7 @@ from probcal.inference.manifest import remove_run
 from probcal.results.build import add_scores
 from probcal.results.io import save
 from probcal.results.read import outliers, summary
+from probcal.results.schema import evidence_in
 from probcal.status import Status
 
 FINDINGS = 8  # sentences of an assessment that are printed
@@ -119,7 +120,7 @@ def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
         print(f"{len(listed)} of {total} data count less than half; the least: row {first['row']}, {first['sensor']}")
     if "optimum" in tree.children:
         optima = tree["optimum"].to_dataset()
-        score = optima["log_evidence" if "log_evidence" in optima else "objective"]
+        score = optima[evidence_in(optima) or "objective"]
         pairs = zip(optima["start"].values, optima["status"].values, score.values, strict=True)
         print(f"{score.name} by start: " + ", ".join(f"{k}: {value:.2f} ({status})" for k, status, value in pairs))
     if "position_rmse_after" in attrs:

@@ -223,7 +223,9 @@ class LeastSquares(MAP):
 
     def __post_init__(self):
         if self.trajectory != "joint":
-            raise InputError(f'{self.name}(trajectory="{self.trajectory}"): without motion there is the joint mode only')
+            raise InputError(
+                f'{self.name}(trajectory="{self.trajectory}"): without motion there is the joint mode only'
+            )
 
     def prepare(self, problem: Problem) -> Problem:
         """The problem without motion."""

@@ -71,7 +71,7 @@ def _posterior(
     if how is None or mixed is None:
         return Normal.of(problem, prior, state.point, state.found, np.asarray(state.alpha))
     first = np.asarray(prior.precision(problem.labels, problem.surveyed).alpha)
-    return Mixture.of(problem, prior, how.form, first, mixed)
+    return Mixture.of(problem, prior, how.form, first, mixed, float(state.found.evidence))
 
 
 def _bias_status(problem: Problem, summary: Summary, low: np.ndarray, far: np.ndarray) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ import numpy as np
 from probcal.errors import FitError, InputError
 from probcal.identifiability.directions import weak_directions
 from probcal.identifiability.remedies import Direction
+from probcal.identifiability.watch import runs, strained_starts
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.manifest import stored_run
 from probcal.inference.methods import EA, NUTS, check_problem, choose_prior
@@ -104,7 +105,7 @@ def calibrate(
         context = Context(keys[0], progress, storage, fallback=NUTS())
         answer = solve(problem, method, prior, context, start=start, starts=starts)
         directions = _directions(answer)
-        answer = replace(answer, message=_advised(answer, directions))
+        answer = _watched(replace(answer, message=_advised(answer, directions)))
         if not answer.posterior.sound:  # a flat prior on a singular problem: no interval exists
             raise FitError(answer.message)
         found = build(answer, directions, keys[1], keep)
@@ -131,6 +132,30 @@ def _advised(answer: Answer, directions: Sequence[Direction]) -> str:
     listed = "; ".join(direction.sentence for direction in directions[:NAMED])
     about = "Weakly determined by the data" if answer.status.settled else "The data do not fix"
     return f"{answer.message} {about}: {listed}.".strip()
+
+
+def _watched(answer: Answer) -> Answer:
+    """The answer with what it ran along: no estimate where no row fixes that, else a sentence."""
+    problem, point = answer.problem, answer.posterior.point
+    if not answer.status.valid or not np.isfinite(np.asarray(point.z)).all():
+        return answer
+    found, status = [answer.message] if answer.message else [], answer.status
+    for run in runs(problem, point):
+        if run.gauge:
+            status = Status.GAUGE
+            found.append(
+                f"The estimate ran {run.far:.1f} prior sd along {run.name}, which no row fixes: it is invalid. Survey"
+                " or fix what holds it."
+            )
+        else:
+            found.append(f"The estimate lies {run.far:.1f} prior sd along {run.name}: check the stated network.")
+    if answer.motion == "used":
+        found += [
+            f'The start of target "{name}" was never declared and strains the fit by {far:.1f} sd: declare it, '
+            "Target(motion, start={...})."
+            for name, far in strained_starts(problem, point)
+        ]
+    return replace(answer, status=status, message=" ".join(found))
 
 
 def _check_store(method: Method, store: str | PathLike[str] | None, resume: bool, overwrite: bool) -> None:

@@ -23,7 +23,12 @@ from probcal.results.schema import INTERVAL
 from probcal.smoothing.marginal import volume_slope
 from probcal.smoothing.mode import Point, eliminate, track
 
-CHAINS, BURN, KEPT = 4, 60, 250  # of the sweeps around one point
+CHAINS, BURN, FIRST, KEPT = (
+    4,
+    60,
+    120,
+    500,
+)  # sweeps: before, around the mode, and around the mean, whose draws are kept
 EVERY = 5  # kept draws between two whose conditional Gaussian enters the moments
 HALVINGS = 40  # of the bracket of a quantile
 
@@ -64,9 +69,9 @@ def integrate(how: Integration, model: Model, first: Precision, start: Point, ke
     """
     known, _ = likelihood(how, model, first, start)
     chains = begin(how.form, known, jax.random.fold_in(key, 0))
-    chains, first_found = run(how.form, known, chains, jax.random.fold_in(key, 1))
+    chains, first_found = run(how.form, known, chains, jax.random.fold_in(key, 1), FIRST)
     point, known = recentred(how, model, start, known, first_found.mean)
-    _, found = run(how.form, known, chains, jax.random.fold_in(key, 2))
+    _, found = run(how.form, known, chains, jax.random.fold_in(key, 2), KEPT)
     total = moments(how.form, known, found.phi)
     return Integrated(placed(model, point, total.mean), known.information, total, found.z, found.phi)
 
@@ -113,7 +118,7 @@ def begin(form: Form, known: Natural, key: jax.Array) -> tuple[jax.Array, Phi]:
 
 
 class Swept(NamedTuple):
-    """Draws of all chains."""
+    """Draws of all chains; zeros beyond those that were asked for."""
 
     z: jax.Array  # (CHAINS, KEPT, M)
     phi: Phi  # leading dims (CHAINS, KEPT)
@@ -121,19 +126,20 @@ class Swept(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="form")
-def run(form: Form, known: Natural, chains: Any, key: jax.Array) -> tuple[Any, Swept]:
-    """Sweeps of every chain from where it stands, those of the burn-in dropped; also where the chains end."""
-
-    def one(carry: tuple[jax.Array, Phi], own: jax.Array) -> tuple[Any, Any]:
-        found = sweep(form, known, *carry, own, backwards=False)
-        return found, found
+def run(form: Form, known: Natural, chains: Any, key: jax.Array, count: int) -> tuple[Any, Swept]:
+    """`count` sweeps of every chain from where it stands, after those of the burn-in; also where the chains end."""
 
     def chain(pair: tuple[Any, jax.Array]) -> tuple[Any, Any]:
-        end, found = jax.lax.scan(one, pair[0], jax.random.split(pair[1], BURN + KEPT))
-        return end, jax.tree.map(lambda leaf: leaf[BURN:], found)
+        def one(k: jax.Array, state: Any) -> Any:
+            (theta, phi), drawn = state
+            at = sweep(form, known, theta, phi, jax.random.fold_in(pair[1], k), backwards=False)
+            return at, jax.tree.map(lambda kept, leaf: kept.at[jnp.maximum(k - BURN, 0)].set(leaf), drawn, at)
+
+        blank = jax.tree.map(lambda leaf: jnp.zeros((KEPT, *leaf.shape), leaf.dtype), pair[0])
+        return jax.lax.fori_loop(0, BURN + count, one, (pair[0], blank))
 
     ends, (z, phi) = jax.lax.map(chain, (chains, jax.random.split(key, CHAINS)))
-    return ends, Swept(z, phi, jnp.mean(z, (0, 1)))
+    return ends, Swept(z, phi, jnp.sum(z, (0, 1)) / (CHAINS * count))
 
 
 @partial(jax.jit, static_argnames="form")
@@ -170,7 +176,7 @@ def _quantile(means: jax.Array, sds: jax.Array, share: float) -> jax.Array:
     def half(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         low, high = ends
         at = 0.5 * (low + high)
-        below = jnp.mean(ndtr((at - means) / jnp.maximum(sds, 1e-12)), 0) < share
+        below = jnp.mean(ndtr((at[None] - means) / jnp.maximum(sds, 1e-12)), 0) < share
         return jnp.where(below, at, low), jnp.where(below, high, at)
 
     low, high = jax.lax.fori_loop(0, HALVINGS, half, (jnp.min(means, 0) - width, jnp.max(means, 0) + width))

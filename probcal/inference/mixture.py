@@ -32,8 +32,13 @@ class Mixture(Posterior):
     held: ClassVar[bool] = True
 
     @classmethod
-    def of(cls, problem: Problem, prior: Prior, form: Form, first: np.ndarray, found: Integrated) -> Mixture:
-        """The mixture of an integration; `first` (M,) are the precisions of what no hierarchy governs."""
+    def of(
+        cls, problem: Problem, prior: Prior, form: Form, first: np.ndarray, found: Integrated, evidence: float
+    ) -> Mixture:
+        """The mixture of an integration; `first` (M,) are the precisions of what no hierarchy governs.
+
+        `evidence` is that under the declared scales.
+        """
         mean, covariance, lower, upper, gamma = (np.asarray(part) for part in found.moments)
         z = np.asarray(found.z)
         columns = {"inclusion": (np.abs(z) > ROPE).mean((0, 1))}
@@ -45,7 +50,7 @@ class Mixture(Posterior):
         precision = np.where(problem.surveyed, first, own)
         summary = Summary(
             "mixture", "integrated", mean, covariance, lower, upper, gamma, precision, np.asarray(found.information),
-            np.asarray(found.point.levels), None, columns,
+            np.asarray(found.point.levels), evidence, columns,
         )  # fmt: skip
         return cls(problem, prior, found.point, summary, found, form.hierarchy, first)
 

@@ -165,7 +165,9 @@ def given_of(method: Maximiser, problem: Problem, prior: Prior) -> Given:
     group = prior.groups(problem.members)
     group = np.where(problem.surveyed, len(group) + np.arange(len(group)), group)  # surveyed biases share none
     group = np.unique(group, return_inverse=True)[1]
-    return Given(first_precision(problem, prior), *jax.device_put((problem.surveyed, group, np.array(float(method.tolerance)))))
+    return Given(
+        first_precision(problem, prior), *jax.device_put((problem.surveyed, group, np.array(float(method.tolerance))))
+    )
 
 
 def first_state(given: Given, start: Point, carry: Any, seed: jax.Array) -> State:

@@ -32,6 +32,7 @@ from probcal.plots.base import (
     plain,
     probability,
 )
+from probcal.results.schema import EVIDENCES, evidence_in
 from probcal.status import INVALID
 
 
@@ -137,9 +138,10 @@ def plot_objective(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     steps = np.arange(1, len(trace) + 1)
     known = np.isfinite(trace)
     ax.plot(steps[known], trace[known], "o-", color=COLOURS[0], markersize=3.5 if len(trace) < 60 else 0)
-    evidence = tree.attrs.get("log_evidence")
+    name = evidence_in(tree.attrs)
+    evidence = tree.attrs.get(name)
     is_evidence = evidence is not None and known.any() and np.isclose(trace[known][-1], evidence, rtol=1e-6)
-    ax.set(xlabel="iteration", ylabel="log evidence" if is_evidence else "objective")
+    ax.set(xlabel="iteration", ylabel=EVIDENCES[name] if is_evidence else "objective")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.ticklabel_format(axis="y", useOffset=False, style="plain")
     ax.grid(color="0.9")

@@ -1,5 +1,7 @@
 """What a tree of results holds: version, columns, and what readers of a file take for granted."""
 
+from collections.abc import Container, Hashable
+
 INTERVAL = 0.89  # probability of lower to upper
 RESULTS_VERSION = 2  # of the groups and variables that a fit writes; a reader refuses any other
 MORE = ("r_hat", "ess", "ess_tail", "inclusion", "included", "contraction")  # columns of samplers
@@ -17,4 +19,13 @@ JUDGED = {"verdict": ("verdict", "reason"), "finding": ("sentence",), "level": (
 ATTRIBUTES = ("method", "prior", "seed", "status", "message", "intervals", "settings", "interval_probability", "data")
 ROPE = 0.1  # scales within which a bias is practically zero
 TYPE_II = "log_evidence_type_ii"  # the largest over the precisions, which are then taken as known
-EVIDENCE = {"given": "log_evidence", "integrated": "log_evidence", "sampled": "log_evidence", "maximised": TYPE_II}
+DECLARED = "log_evidence_declared"  # with every bias Gaussian of its declared scale, whatever the prior of the fit
+EVIDENCE = {"given": "log_evidence", "maximised": TYPE_II, "integrated": DECLARED}  # by what is done with precisions
+EVIDENCES = {
+    "log_evidence": "log evidence", TYPE_II: "log evidence (type II)", DECLARED: "log evidence under declared scales",
+}  # fmt: skip
+
+
+def evidence_in(names: Container[Hashable]) -> str:
+    """Which of the evidences is among some names, empty where there is none."""
+    return next((name for name in EVIDENCES if name in names), "")

@@ -179,23 +179,26 @@ def find_marginal_mode(
         damping = jnp.where(damping < 1e-6, 0.0, damping)
         step = Dense.of(matrix + bent + damping * jnp.eye(model.biases)).solve(score)
         promised = 0.5 * score @ step
-        small = promised <= jnp.maximum(tolerance, ROUNDING * jnp.abs(value))
-        found = small & (damping <= 1.0) & jnp.isfinite(value)
-        begun = jnp.where(s.iteration == 0, value, s.begun)
+        found = (promised <= tolerance) & (damping <= 1.0) & jnp.isfinite(value)
+        first = s.iteration == 0
         return _Search(
-            point, solved, value, begun, score, bent, step, promised, jnp.ones(()), damping, s.moved | (s.iteration > 0),
-            s.iteration + 1, found, found | ~jnp.isfinite(value),
+            point, solved, value, jnp.where(first, value, s.begun), score, bent, step, promised, jnp.ones(()), damping,
+            s.moved | ~first, s.iteration + 1, found, found | ~jnp.isfinite(value),
         )  # fmt: skip
 
     def shorter(s: _Search, *_: Any) -> _Search:
-        """The search with half the step, or with more damping where that was tried often enough."""
+        """The search with half the step, or with more damping where that was tried often enough.
+
+        A step that promised less than the rounding of the density, and shows nothing, is the end.
+        """
+        found = (s.promised <= ROUNDING * jnp.abs(s.value)) & (s.damping <= 1.0)
         spent = s.share <= 0.5**HALVINGS
         damping = jnp.where(spent, jnp.maximum(s.damping * 10.0, 1e-3), s.damping)
         matrix = s.solved.information + prior.matrix() + s.bent + damping * jnp.eye(model.biases)
         step = jnp.where(spent, Dense.of(matrix).solve(s.score), s.step)
         return s._replace(
             step=step, promised=0.5 * s.score @ step, share=jnp.where(spent, 1.0, 0.5 * s.share), damping=damping,
-            iteration=s.iteration + spent, done=damping > DAMPING,
+            iteration=s.iteration + spent, converged=found, done=found | (damping > DAMPING),
         )  # fmt: skip
 
     def body(s: _Search) -> _Search:

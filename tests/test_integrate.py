@@ -1,0 +1,158 @@
+"""Precisions integrated: against importance sampling on hand-made likelihoods, and what a fit says of them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+from contracts import check_tree, close
+
+import probcal
+from probcal import ARD, EA, MAP, BernoulliGaussian, Gaussian, Horseshoe, Laplace, fit
+from probcal.errors import InputError
+from probcal.inference.hierarchy import Exponentials, Precisions, RegularisedHorseshoe, SpikeAndSlab
+from probcal.inference.integrate import BURN, CHAINS, KEPT, begin, moments, run
+from probcal.inference.posed import Form, Natural
+from probcal.priors import Precision
+
+PRIORS = [ARD(shape=1.5, rate=0.5), Laplace(), Horseshoe(), BernoulliGaussian(share=0.4)]
+KINDS = {ARD: Precisions, Laplace: Exponentials, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab}
+G = np.array([[4.0, 2.5, 0.0], [2.5, 3.0, 0.5], [0.0, 0.5, 9.0]])  # two that trade against each other, one seen well
+PULL = np.array([5.0, 2.0, -1.0])
+DRAWS = 200_000
+
+
+def mixture(prior, matrix=G, pull=PULL, group=(0, 1, 2), key=0):
+    """The mixture by Gibbs sweeps: moments and draws."""
+    form = Form(3, KINDS[type(prior)](prior, (0, 1, 2), group))
+    with jax.enable_x64(True):
+        known = Natural(jnp.asarray(matrix), jnp.asarray(pull), jnp.zeros(0), Precision.single(jnp.ones(3)))
+        keys = jax.random.split(jax.random.key(key))
+        _, swept = run(form, known, begin(form, known, keys[0]), keys[1], KEPT)
+        found = jax.tree.map(np.asarray, moments(form, known, swept.phi))
+        return found, np.asarray(swept.z), np.asarray(swept.mean)
+
+
+def weighed(prior):
+    """The same by importance sampling: hyper-parameters from their prior, each weighed by its evidence."""
+    kind = KINDS[type(prior)](prior, (0, 1, 2), (0, 1, 2))
+    with jax.enable_x64(True):
+        phi = jax.vmap(kind.draw)(jax.random.split(jax.random.key(1), DRAWS))
+        alpha = np.asarray(jax.vmap(lambda one: kind.alpha(one, jnp.ones(3)))(phi))
+        active = np.asarray(jax.vmap(lambda one: kind.active(one, 3))(phi))
+    alpha = np.where(active, alpha, 1e9)  # a spike
+    covariance = np.linalg.inv(G + np.apply_along_axis(np.diag, 1, alpha))
+    mean = covariance @ PULL
+    log = 0.5 * (np.log(alpha).sum(1) + np.linalg.slogdet(covariance)[1] + mean @ PULL)
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    middle = weight @ mean
+    spread = np.einsum("s,sij->ij", weight, covariance) + (mean - middle).T @ (weight[:, None] * (mean - middle))
+    gamma = weight @ np.where(active, 1 - alpha * np.diagonal(covariance, axis1=1, axis2=2), 0.0)
+    return middle, spread, gamma
+
+
+@pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: type(prior).__name__)
+def test_a_mixture_has_the_moments_of_the_posterior(prior):
+    """Three biases, two of them traded: within five Monte Carlo errors of some 400 effective draws, a quarter sd."""
+    found, z, mean = mixture(prior)
+    middle, spread, gamma = weighed(prior)
+    sd = np.sqrt(np.diag(spread))
+    np.testing.assert_allclose((found.mean - middle) / sd, 0, atol=0.25)
+    np.testing.assert_allclose(found.covariance / np.outer(sd, sd), spread / np.outer(sd, sd), atol=0.2)
+    np.testing.assert_allclose(found.gamma, gamma, atol=0.08)
+    assert z.shape == (CHAINS, KEPT, 3)
+    np.testing.assert_allclose(mean, z.mean((0, 1)), rtol=1e-12)
+    inside = ((np.asarray(found.lower) <= z) & (z <= np.asarray(found.upper))).mean((0, 1))
+    np.testing.assert_allclose(inside, 0.89, atol=0.05)
+    assert BURN > 0
+
+
+def test_one_gaussian_is_a_mixture_of_itself():
+    """A spike and slab whose biases are all in: the plain Gaussian, its interval to rounding."""
+    kind = SpikeAndSlab(BernoulliGaussian(share=0.5), (0, 1, 2), (0, 1, 2))
+    with jax.enable_x64(True):
+        known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision.single(jnp.ones(3)))
+        phi = {"included": jnp.ones((CHAINS, KEPT, 3), bool)}
+        found = jax.tree.map(np.asarray, moments(Form(3, kind), known, phi))
+    covariance = np.linalg.inv(G + np.eye(3))
+    close(found.mean, covariance @ PULL, 1e-12)
+    close(found.covariance, covariance, 1e-12)
+    sd = np.sqrt(np.diag(covariance))
+    close(found.upper, covariance @ PULL + 1.5981931399228169 * sd, 1e-9)
+    close(found.lower, covariance @ PULL - 1.5981931399228169 * sd, 1e-9)
+    close(found.gamma, 1 - np.diag(covariance), 1e-12)
+
+
+def test_a_scale_of_a_vector_turns_with_the_world():
+    """Two axes that share a local scale: turning the likelihood turns the mean, which one scale an axis would not."""
+    turn = np.eye(3)
+    turn[:2, :2] = [[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]
+    group = (0, 0, 1)
+    plain, z, _ = mixture(Horseshoe(), group=group)
+    turned, _, _ = mixture(Horseshoe(), turn @ G @ turn.T, turn @ PULL, group, key=1)
+    np.testing.assert_allclose(turn.T @ np.asarray(turned.mean), plain.mean, atol=0.25 * z.std((0, 1)).max())
+
+
+@pytest.fixture(scope="module")
+def plane():
+    problem, _ = worlds.linear("plane")
+    return problem, fit(problem, EA(), start=worlds.resting(problem))
+
+
+def test_a_fit_integrates_by_default(plane):
+    problem, tree = plane
+    check_tree(tree, problem)
+    assert tree.attrs["status"] == "converged"
+    assert (tree.attrs["prior"], tree.attrs["precisions"], tree.attrs["approximate"]) == (
+        "Horseshoe", "integrated", "mixture",
+    )  # fmt: skip
+    group = tree["calibration"].to_dataset()
+    assert ((group["inclusion"] >= 0) & (group["inclusion"] <= 1)).all()
+    assert "pruned" not in group["status"].values
+    assert {"local_scale", "global_scale", "slab_variance"} <= set(tree["posterior"].data_vars)
+    draws = tree["posterior"]["bias"]
+    assert np.abs((draws.mean(("chain", "draw")) - group["mean"]) / group["sd"]).max() < 0.4
+    assert "log_evidence" not in tree.attrs
+    gaussian = fit(problem, MAP(), prior=Gaussian(), start=worlds.resting(problem))
+    assert tree.attrs["log_evidence_declared"] == pytest.approx(gaussian.attrs["log_evidence"], rel=1e-9)
+    same = fit(problem, EA(), start=worlds.resting(problem))
+    np.testing.assert_array_equal(same["calibration"]["mean"], tree["calibration"]["mean"])
+
+
+def test_a_flat_hyper_prior_is_maximised_and_says_so():
+    problem, _ = worlds.linear("plane")
+    tree = fit(problem, EA(), prior=ARD(), start=worlds.resting(problem))
+    assert tree.attrs["precisions"] == "maximised"
+    assert "ARD with a flat hyper-prior has no posterior" in tree.attrs["message"]
+    assert "log_evidence_type_ii" in tree.attrs
+    asked = fit(problem, EA(precisions="maximised"), start=worlds.resting(problem))
+    assert asked.attrs["prior"] == "ARD"
+    assert "no posterior" not in asked.attrs["message"]
+    np.testing.assert_array_equal(asked["calibration"]["mean"], tree["calibration"]["mean"])
+
+
+def test_an_estimate_far_beyond_its_scale_is_none():
+    problem, _ = worlds.linear("plane")
+    table = problem.measurements.table.frame.copy()
+    column = next(name for name in table if name not in ("time", "sensor", "target"))
+    table.loc[table["sensor"] == table["sensor"].iloc[0], column] += 1e4
+    tree = fit(probcal.Problem(problem.network, problem.motion, table), EA())
+    assert tree.attrs["status"] in ("at bound", "misfit")
+
+
+@pytest.mark.parametrize(
+    ("ask", "text"),
+    [
+        (lambda: EA(precisions="both"), 'EA\\(precisions="both"\\): give one of integrated, maximised'),
+        (lambda: EA(trajectory="smoothed"), "counts the data twice"),
+        (lambda: Horseshoe(by="nod"), 'Horseshoe\\(by="nod"\\).*did you mean "node"'),
+        (
+            lambda: fit(worlds.linear("plane")[0], EA(precisions="maximised"), prior=Horseshoe()),
+            "EA does not take the prior Horseshoe; it takes: ard",
+        ),
+    ],
+)
+def test_what_it_refuses(ask, text):
+    with pytest.raises(InputError, match=text):
+        ask()
