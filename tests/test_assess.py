@@ -416,7 +416,7 @@ def test_nothing_is_nan_and_the_tree_is_a_copy(judged, tmp_path):
     probcal.save(out, tmp_path / "fit.nc")
     again = probcal.load(tmp_path / "fit.nc")
     assert probcal.summary(again).columns[-2:].tolist() == ["verdict", "reason"]
-    assert probcal.summary(tree).columns[-1] == "status"
+    assert probcal.summary(tree).columns[-1] == "inclusion"
     for label in ("prior", "likelihood"):
         assert (out["sensitivity"][label] >= 0).all()
 

@@ -72,7 +72,7 @@ def test_the_main_job_writes_a_table_a_report_and_a_tree(fitted):
         assert label in (folder / "report.html").read_text()
     tree = probcal.load(folder)
     assert tree.attrs["model"] == "small"
-    assert tree.attrs["prior"] == "ARD"
+    assert tree.attrs["prior"] == "Horseshoe"
     assert set(tree["truth"]["bias_label"].values) >= set(summary["bias"])
 
 

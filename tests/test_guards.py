@@ -241,7 +241,7 @@ def test_status_follows_the_gravest():
     ("status", "ended", "word", "reason"),
     [
         ("converged", "estimated", "determined", "the data narrow its"),
-        ("converged", "pruned", "determined", "learnt to be zero"),
+        ("converged", "pruned", "weak", "its precision was maximised"),
         ("converged", "not mixed", "weak", "its chains have not mixed"),
         ("not converged", "estimated", "weak", "the fit ended not converged, which is no answer"),
         ("at bound", "estimated", "weak", "the fit ended at bound"),
@@ -253,9 +253,20 @@ def test_verdicts_stand_no_higher_than_the_status(status, ended, word, reason):
     problem, _ = linear("plane")
     M = len(problem.labels)
     known = verdict.Evidence(np.full(M, 0.9), np.zeros(M), np.zeros(M), 3.0)
-    words, reasons = verdict.judge(problem, Status(status), [ended] * M, known, {}, {}, "")
+    words, reasons = verdict.judge(problem, Status(status), [ended] * M, known, {}, {}, "", {})
     assert set(words) == {word}
     assert all(reason in text for text in reasons)
+
+
+def test_a_bias_that_shares_an_open_combination_is_weak_and_names_it():
+    problem, _ = linear("plane")
+    M = len(problem.labels)
+    known = verdict.Evidence(np.full(M, 0.9), np.zeros(M), np.zeros(M), 3.0)
+    shared = {1: "a common gain of all (information 0.01)"}
+    words, reasons = verdict.judge(problem, Status.CONVERGED, ["estimated"] * M, known, {}, {}, "", shared)
+    assert words[1] == "weak"
+    assert "it belongs to a common gain of all" in reasons[1]
+    assert {word for m, word in enumerate(words) if m != 1} == {"determined"}
 
 
 @pytest.mark.ci
@@ -315,7 +326,7 @@ def test_the_mean_square_counts_residuals_and_process_noises():
 
 
 def test_every_status_has_its_words_and_its_colour():
-    assert set(INVALID) == {"at bound", "diverged", "misfit"}
+    assert set(INVALID) == {"at bound", "diverged", "along a gauge", "misfit"}
     assert {status for status in Status if status.settled} == {"converged", "iterations spent"}
     for status in Status:
         assert status.said

@@ -33,7 +33,7 @@ ERRORS = [  # of options and arguments, with the end of what is said
     ("fit {plaza} --prior gausian", '--prior "gausian" is not known; did you mean "gaussian"?'),
     (
         "fit {plaza} --prior gaussian",
-        "EA does not take the prior Gaussian; it takes: ard, ard-node, ard-owner, ard-typ",
+        "EA does not take the prior Gaussian; it takes: laplace, ard, ard-node, ard-owner",
     ),
     ("fit {plaza} --chains 2", '--chains: "ea" draws no chains; take collapsed, nuts or svi'),
     ("fit {plaza} --method nuts --resume", "--resume needs --out, the folder of the run to go on with"),

@@ -13,6 +13,7 @@ from probcal.errors import InputError
 from probcal.inference.hierarchy import Exponentials, Precisions, RegularisedHorseshoe, SpikeAndSlab
 from probcal.inference.integrate import BURN, CHAINS, KEPT, begin, moments, run
 from probcal.inference.posed import Form, Natural
+from probcal.inference.propagate import nodes_of, propagate
 from probcal.priors import Precision
 
 PRIORS = [ARD(shape=1.5, rate=0.5), Laplace(), Horseshoe(), BernoulliGaussian(share=0.4)]
@@ -66,6 +67,23 @@ def test_a_mixture_has_the_moments_of_the_posterior(prior):
     inside = ((np.asarray(found.lower) <= z) & (z <= np.asarray(found.upper))).mean((0, 1))
     np.testing.assert_allclose(inside, 0.89, atol=0.05)
     assert BURN > 0
+
+
+@pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: type(prior).__name__)
+def test_expectation_propagation_agrees_too(prior):
+    """Without sweeps: means within a fifth of an sd, sds within 15 %."""
+    form = Form(3, KINDS[type(prior)](prior, (0, 1, 2), (0, 1, 2)))
+    with jax.enable_x64(True):
+        known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision.single(jnp.ones(3)))
+        found = jax.tree.map(np.asarray, propagate(form, known, nodes_of(form), jax.random.key(0), 4000))
+    middle, spread, gamma = weighed(prior)
+    sd = np.sqrt(np.diag(spread))
+    np.testing.assert_allclose((found.mean - middle) / sd, 0, atol=0.2)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)) / sd, 1, atol=0.15)
+    np.testing.assert_allclose(found.gamma, gamma, atol=0.08)
+    np.testing.assert_allclose((found.z.mean(0) - found.mean) / sd, 0, atol=0.08)
+    wanted = found.covariance / np.outer(*[np.sqrt(np.diag(found.covariance))] * 2)
+    np.testing.assert_allclose(np.corrcoef(found.z.T), wanted, atol=0.12)
 
 
 def test_one_gaussian_is_a_mixture_of_itself():

@@ -98,7 +98,7 @@ def test_group_ard_shares_a_precision_at_the_fixed_point(by):
     linear, _, tree = solve(EA(iterations=5000, tolerance=1e-12, precisions="maximised"), ARD(by=by))
     z, group = z_of(tree, linear)
     alpha, gamma, free = group["precision"].values, group["gamma"].values, group["status"].values != "survey"
-    wanted = 2 if by in ("node", "owner") else 1
+    wanted = 2 if by in ("node", "owner", "vector") else 1
     assert len(np.unique(alpha[free].round(9))) == wanted
     for value in np.unique(alpha[free]):
         mine = free & (alpha == value)

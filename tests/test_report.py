@@ -74,7 +74,7 @@ def make(dimension=2, nodes=("north", "south"), status="converged", recursions=1
     """A fit of radars with free positions, headings and range offsets."""
     names = [*(f"position_{axis}" for axis in AXES[:dimension]), "heading", "range_offset"]
     labels = [f"{node}.{name}" for node in nodes for name in names]
-    states = np.full(len(labels), "estimated", dtype="U12")
+    states = np.full(len(labels), "estimated", dtype="U16")
     states[1] = "pruned"
     if status in INVALID:
         states[0] = status

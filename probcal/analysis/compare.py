@@ -41,8 +41,9 @@ def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
       `bias_rmse` (in scales) and how many intervals hold it;
     - `truth` where one of the fits knows it, and `finding`: kind, subject and a sentence each.
 
-    The attribute `reference` names the fit whose posterior the others are judged by: the first that was sampled, else
-    the first. Raises `InputError` for fits of different data, scales or units, and where no bias is common.
+    The attribute `reference` names the fit whose posterior the others are judged by: the first whose draws are exact,
+    else the first that has draws of its own, else the first. Raises `InputError` for fits of different data, scales or
+    units, and where no bias is common.
     """
     known = named(fits, names)
     labels = _common(known)
@@ -57,7 +58,9 @@ def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
     for name, found in loo.elpd(known, order).items():
         methods[name].attrs |= found
     groups |= {f"method/{name}": dataset for name, dataset in methods.items()}
-    reference = next((n for n, t in known.items() if not plugged_in(t) and _sound(t)), next(iter(known)))
+    sampled = [n for n, t in known.items() if not plugged_in(t) and _sound(t)]
+    exact = [n for n in sampled if known[n].attrs["approximate"] == "exact"]
+    reference = next(iter([*exact, *sampled, *known]))
     tree = xr.DataTree.from_dict(groups)
     tree.attrs |= {
         "reference": reference,

@@ -23,6 +23,7 @@ RULES = ("mackay", "em")
 MODES = ("joint", "marginal")
 STEPS = 30  # between two updates of precisions or levels
 FEW = 2  # of the marginal mode, each of which costs several joint ones, where precisions are learnt
+MANY = 500  # biases beyond which precisions are integrated by expectation propagation in the place of sweeps
 PRECISIONS = ("integrated", "maximised")
 TRAJECTORIES = (*MODES, "smoothed")
 
@@ -95,9 +96,10 @@ class EA(Maximiser):
 
     `precisions` "integrated" (the default) climbs to the mode of the marginal density under the declared scales, takes
     the Gaussian likelihood of the biases there, and integrates the precisions of a proper hierarchical prior
-    (`Horseshoe` by default) by Gibbs sweeps; the answer is a mixture. "maximised" climbs to the precisions of largest
-    evidence (type-II maximum likelihood, Paper B 24-25) and takes them as known. An ARD prior with a flat hyper-prior
-    has no posterior and is always maximised. Noise levels that are unknown maximise the evidence and are held.
+    (`Horseshoe` by default): by Gibbs sweeps, above 500 biases by expectation propagation. The answer is a mixture.
+    "maximised" climbs to the precisions of largest evidence (type-II maximum likelihood, Paper B 24-25) and takes them
+    as known. An ARD prior with a flat hyper-prior has no posterior and is always maximised. Noise levels that are
+    unknown maximise the evidence and are held.
 
     `trajectory` says what the reported point is: "marginal" the mode of the biases with the trajectory integrated
     (Laplace; see `smoothing.marginal`), "joint" that of biases and trajectory together, which shrinks a scene whose
@@ -160,7 +162,7 @@ class EA(Maximiser):
         if not self.integrates(prior):
             return None
         form = Form(problem.model.biases, hierarchy_of(prior, problem))
-        return Integration(form, self.trajectory == "marginal")
+        return Integration(form, self.trajectory == "marginal", len(form.hierarchy.learnt) <= MANY)
 
     def note(self, prior: Prior) -> str:
         """What the intervals are worth with these settings and a prior."""

@@ -17,6 +17,7 @@ from probcal import linalg
 from probcal.inference.gibbs import sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Natural, activity, draw_given, prior_precision
+from probcal.inference.propagate import nodes_of, propagate
 from probcal.model.model import Model
 from probcal.priors import Precision
 from probcal.results.schema import INTERVAL
@@ -39,6 +40,7 @@ class Integration:
 
     form: Form
     marginal: bool  # whether the determinant of the trajectories belongs to the likelihood; not at a joint mode
+    sweeps: bool = True  # Gibbs; else expectation propagation, for biases that are many
 
 
 class Moments(NamedTuple):
@@ -68,12 +70,27 @@ def integrate(how: Integration, model: Model, first: Precision, start: Point, ke
     there, and the sweeps go on.
     """
     known, _ = likelihood(how, model, first, start)
+    if not how.sweeps:
+        return _propagated(how, model, known, start, key)
     chains = begin(how.form, known, jax.random.fold_in(key, 0))
     chains, first_found = run(how.form, known, chains, jax.random.fold_in(key, 1), FIRST)
     point, known = recentred(how, model, start, known, first_found.mean)
     _, found = run(how.form, known, chains, jax.random.fold_in(key, 2), KEPT)
     total = moments(how.form, known, found.phi)
     return Integrated(placed(model, point, total.mean), known.information, total, found.z, found.phi)
+
+
+def _propagated(how: Integration, model: Model, known: Natural, start: Point, key: jax.Array) -> Integrated:
+    """The same by expectation propagation, which draws nothing of the hyper-parameters."""
+    nodes, count = nodes_of(how.form), CHAINS * KEPT
+    before = propagate(how.form, known, nodes, key, count)
+    point, known = recentred(how, model, start, known, before.mean)
+    found = propagate(how.form, known, nodes, key, count)
+    tail = 50.0 * (1.0 - INTERVAL)
+    lower, upper = jnp.percentile(found.z, jnp.array([tail, 100.0 - tail]), axis=0)
+    total = Moments(found.mean, found.covariance, lower, upper, found.gamma)
+    z = found.z.reshape(CHAINS, KEPT, -1)
+    return Integrated(placed(model, point, found.mean), known.information, total, z, {})
 
 
 @partial(jax.jit, static_argnames="how")

@@ -79,7 +79,7 @@ class Mixture(Posterior):
 
     def log_prior(self, draws: Draws) -> np.ndarray | None:
         """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
-        if self.prior.correlation or isinstance(self.hierarchy, SpikeAndSlab):
+        if self.prior.correlation or isinstance(self.hierarchy, SpikeAndSlab) or not self.found.phi:
             return None
         phi = {name: jnp.asarray(values) for name, values in self.hyper.items()}
         first = jnp.asarray(self.first)
