@@ -25,7 +25,7 @@ def solve(
     given, problem = problem, method.prepare(problem)
     first = automatic_start(problem) if start is None else _suited(given, problem, start)
     points = [first, *further_starts(problem, starts - 1, jax.random.fold_in(context.key, 1))]
-    climber, own = (method, prior) if method.climbs else (MAP(), Gaussian())
+    climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint"), Gaussian())
     optima: list[Answer] = []
     if method.climbs or starts > 1 or problem.levels:
         optima = [climber.answer(problem, own, point, context) for point in points]
