@@ -18,6 +18,7 @@ from probcal.model.epochs import Epoch, merged
 from probcal.model.model import Model, Recursion
 from probcal.model.motions import (
     DIFFUSE,
+    FAR,
     Area,
     LevelRecord,
     Levels,
@@ -138,7 +139,15 @@ class Problem:
     @property
     def area(self) -> Area:
         """Where a target starts of which nothing is stated."""
-        return Area(self.network.dimension, self.node_positions.mean(0), self.extent)
+        ranged = any(
+            channel.unit == "m"
+            for s in self.network.sensors
+            if len(s.nodes) == 1
+            for channel in s.type.channels.values()
+        )
+        return Area(
+            self.network.dimension, self.node_positions.mean(0), self.extent, DIFFUSE * (1.0 if ranged else FAR)
+        )
 
     @property
     def extent(self) -> float:

@@ -16,6 +16,7 @@ from probcal.motion.layout import layout_of, stacked
 from probcal.noise import Bernoulli, Level, Unknown, guess_of
 
 DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
+FAR = 10.0  # times as wide where no sensor measures a range: bearings of a small array reach far beyond it
 
 
 class Area(NamedTuple):
@@ -24,6 +25,7 @@ class Area(NamedTuple):
     dimension: int
     centre: np.ndarray  # (d,)
     extent: float  # in m
+    wide: float  # spread of a start, in extents
 
 
 @dataclass(frozen=True)
@@ -124,10 +126,10 @@ def chain(
 def start_of(name: str, component: Any, target: Target, time: np.ndarray, area: Area) -> tuple[np.ndarray, np.ndarray]:
     """Start mean and standard deviation of a component: declared, its own, or wide."""
     extent, duration = area.extent, float(np.ptp(time)) or 1.0
-    pace, wander = DIFFUSE * extent / duration, guess_of(component.std) * np.sqrt(duration)
+    pace, wander = area.wide * extent / duration, guess_of(component.std) * np.sqrt(duration)
     bent = component.driven == "acceleration"
     wide = {
-        "position": (area.centre, DIFFUSE * extent),
+        "position": (area.centre, area.wide * extent),
         "velocity": (0.0, pace + wander * (duration if bent else 1.0)),
         "acceleration": (0.0, pace / duration + wander),
     }
