@@ -43,6 +43,16 @@ MUTATIONS = [
     Mutation("smoothing/marginal.py", "slope = own + jax.grad(along)(point.z)", "slope = own", "test_marginal.py"),
     Mutation("smoothing/marginal.py", "tuple(-own - jnp.einsum(", "tuple(0 * own - 0 * jnp.einsum(", "test_marginal.py"),
     Mutation("smoothing/marginal.py", "score = solved.score - prior.pull(point.z) - 0.5 * volume", "score = solved.score - prior.pull(point.z) + 0.5 * volume", "test_marginal.py"),
+    Mutation("smoothing/marginal.py", "update = jnp.outer(change, change)", "update = 2 * jnp.outer(change, change)", "test_marginal.py"),
+    # inference/integrate.py, propagate.py
+    Mutation("inference/integrate.py", "solved.information @ point.z + score", "solved.information @ point.z - score", "test_integrate.py"),
+    Mutation("inference/integrate.py", "clip(1.0 - alpha * jnp.diagonal(covariance)", "clip(1.0 - jnp.diagonal(covariance)", "test_integrate.py"),
+    Mutation("inference/integrate.py", "total / count + jnp.cov(", "total / count + 0 * jnp.cov(", "test_integrate.py"),
+    Mutation("inference/propagate.py", "1.0 / own - sites.tau, LEAST", "1.0 / own, LEAST", "test_integrate.py"),
+    Mutation("inference/propagate.py", "nu = centre * (precision + tau) - middle * precision", "nu = centre * (precision + tau)", "test_integrate.py"),
+    Mutation("inference/propagate.py", "total - jnp.sum(matched)", "total", "test_integrate.py"),
+    # analysis/widen.py
+    Mutation("analysis/widen.py", "1.0 + group[\"gamma\"].values * (inflation - 1.0)", "inflation", "test_watch.py"),
     # smoothing/information.py
     Mutation("smoothing/linearised.py", "0.5 * (solved.logdet + biases.log_determinant())", "0.5 * solved.logdet", "test_exact.py"),
     Mutation("smoothing/linearised.py", "half, -response.states,", "half, response.states,", "test_exact.py test_observability.py"),
@@ -93,8 +103,8 @@ MUTATIONS = [
     Mutation("problem.py", "epoch_of[rows] += offset", "epoch_of[rows] += 0", "test_exact.py"),
     Mutation("problem.py", "side=\"right\") - 1", "side=\"left\") - 1", "test_exact.py test_drift.py"),
     Mutation("problem.py", "level=np.where(own, -1,", "level=np.where(own, 0,", "test_formulas.py"),
-    Mutation("model/motions.py", "pace, wander = DIFFUSE * extent / duration", "pace, wander = DIFFUSE * extent", "test_formulas.py test_model.py"),
-    Mutation("model/motions.py", "\"position\": (area.centre, DIFFUSE * extent)", "\"position\": (area.centre, extent)", "test_formulas.py test_model.py"),
+    Mutation("model/motions.py", "pace, wander = area.wide * extent / duration", "pace, wander = area.wide * extent", "test_formulas.py test_model.py"),
+    Mutation("model/motions.py", "\"position\": (area.centre, area.wide * extent)", "\"position\": (area.centre, extent)", "test_formulas.py test_model.py"),
     # table.py
     Mutation("table.py", "np.arange(2, len(frame) + 2)", "np.arange(1, len(frame) + 1)", "test_table.py test_cli.py"),
     Mutation("table.py", "in ((name, value), (f\"{name}_std\", std)):", "in ((name, value),):", "test_table.py"),

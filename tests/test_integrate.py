@@ -10,11 +10,12 @@ from contracts import check_tree, close
 import probcal
 from probcal import ARD, EA, MAP, BernoulliGaussian, Gaussian, Horseshoe, Laplace, fit
 from probcal.errors import InputError
-from probcal.inference.hierarchy import Exponentials, Precisions, RegularisedHorseshoe, SpikeAndSlab
-from probcal.inference.integrate import BURN, CHAINS, KEPT, begin, moments, run
+from probcal.inference.hierarchy import Exponentials, Precisions, RegularisedHorseshoe, SpikeAndSlab, hierarchy_of
+from probcal.inference.integrate import BURN, CHAINS, KEPT, Integration, begin, likelihood, moments, run
 from probcal.inference.posed import Form, Natural
 from probcal.inference.propagate import nodes_of, propagate
 from probcal.priors import Precision
+from probcal.smoothing.start import track_mode
 
 PRIORS = [ARD(shape=1.5, rate=0.5), Laplace(), Horseshoe(), BernoulliGaussian(share=0.4)]
 KINDS = {ARD: Precisions, Laplace: Exponentials, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab}
@@ -136,6 +137,22 @@ def test_a_fit_integrates_by_default(plane):
     assert tree.attrs["log_evidence_declared"] == pytest.approx(gaussian.attrs["log_evidence"], rel=1e-9)
     same = fit(problem, EA(), start=worlds.resting(problem))
     np.testing.assert_array_equal(same["calibration"]["mean"], tree["calibration"]["mean"])
+
+
+def test_the_likelihood_at_a_mode_is_that_of_the_data():
+    """On a linear problem, with any prior: what the data say is the same at every point."""
+    problem, _ = worlds.linear("plane")
+    with jax.enable_x64(True):
+        first = Gaussian().precision(problem.labels, problem.surveyed)
+        how = Integration(Form(problem.model.biases, hierarchy_of(Horseshoe(), problem)), True)
+        start = worlds.resting(problem)
+        for z in (start.z, start.z + 1.5):
+            point = track_mode(problem, start._replace(z=z))
+            known, sound = likelihood(how, problem.model, first, point)
+            assert bool(sound)
+            mean = np.linalg.solve(np.asarray(known.information + first.matrix()), np.asarray(known.pull))
+            expected = fit(problem, MAP(), prior=Gaussian(), start=start)["calibration"]["mean"].values / problem.scales
+            np.testing.assert_allclose(mean, expected, atol=1e-8)
 
 
 def test_a_flat_hyper_prior_is_maximised_and_says_so():
