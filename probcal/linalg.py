@@ -140,7 +140,13 @@ def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def displace(matrix: jax.Array, right: jax.Array, noise: jax.Array) -> jax.Array:
-    """matrix^-1 right + L^-T noise, L the Cholesky factor of `matrix`: a draw of that precision by unit noise."""
+    """matrix^-1 right + L^-T noise, L the Cholesky factor of `matrix`: a draw of that precision by unit noise.
+
+    A large one by halves, as in `factor_and_inverse`: beside other work LAPACK's threads wait for each other.
+    """
+    if matrix.shape[0] > NARROW:
+        _, inverse = factor_and_inverse(matrix)
+        return inverse.T @ (inverse @ right + noise)
     lower = jnp.linalg.cholesky(matrix)
     return solve_triangular(lower, solve_triangular(lower, right, lower=True) + noise, lower=True, trans=1)
 

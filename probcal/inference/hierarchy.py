@@ -28,6 +28,7 @@ else:
     dist = Later("numpyro.distributions")
 
 SHARED, INNER = 15, 40  # nodes of what all biases share, and of what each has of its own
+HALF, SLABS = 8, (0.3, 0.6, 1.2, 3.0)  # nodes of a global scale where the slab is shared too, and those of the slab
 LEAST, MOST = 1e-12, 1e16  # precisions outside carry no mass that a draw could show
 Phi = dict[str, jax.Array]
 Update = Callable[[Phi, jax.Array, jax.Array], Phi]  # phi, learnt z, key
@@ -274,11 +275,14 @@ class RegularisedHorseshoe(Hierarchy):
         return scales | {"slab_variance": jnp.full((), self.prior.slab_scale**2, float)}
 
     def nodes(self):
-        """Quantiles of local and global scale, the slab as declared."""
-        width = self.prior.expected / (1.0 - self.prior.expected)
-        scale = width * np.tan(0.5 * np.pi * _shares(SHARED))[:, None] * np.tan(0.5 * np.pi * _shares(INNER))[None]
-        variance = 1.0 / (1.0 / self.prior.slab_scale**2 + 1.0 / scale**2)
-        return Nodes(variance, np.full(variance.shape, -np.log(INNER)), np.zeros(SHARED))
+        """Quantiles of local and global scale, and slabs around the declared one."""
+        width, declared = self.prior.expected / (1.0 - self.prior.expected), self.prior.slab_scale**2
+        scale = width * np.tan(0.5 * np.pi * _shares(HALF))[:, None] * np.tan(0.5 * np.pi * _shares(INNER))[None]
+        slab = declared * np.array(SLABS)
+        variance = 1.0 / (1.0 / slab[:, None, None] + 1.0 / scale[None] ** 2)
+        prior = -0.5 * self.prior.slab_df * (np.log(slab) + declared / slab)
+        shape = len(slab) * HALF, INNER
+        return Nodes(variance.reshape(shape), np.full(shape, -np.log(INNER)), np.repeat(prior, HALF))
 
     def governed(self, phi):
         """Slab and shrinkage added."""
