@@ -17,7 +17,7 @@ from probcal import linalg
 from probcal.inference.gibbs import sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Natural, activity, draw_given, prior_precision
-from probcal.inference.propagate import nodes_of, propagate
+from probcal.inference.propagate import Propagated, nodes_of, propagate
 from probcal.model.model import Model
 from probcal.priors import Precision
 from probcal.results.schema import INTERVAL
@@ -31,6 +31,7 @@ CHAINS, BURN, FIRST, KEPT = (
     500,
 )  # sweeps: before, around the mode, and around the mean, whose draws are kept
 EVERY = 5  # kept draws between two whose conditional Gaussian enters the moments
+MOVES, NEAR = 6, 1.0  # most times that the point moves to the mean, and sd by which it may have moved at the last
 HALVINGS = 40  # of the bracket of a quantile
 
 
@@ -63,33 +64,43 @@ class Integrated(NamedTuple):
     phi: Phi  # leading dims (CHAINS, KEPT)
 
 
-def integrate(how: Integration, model: Model, first: Precision, start: Point, key: jax.Array) -> Integrated:
+def integrate(
+    how: Integration, model: Model, first: Precision, start: Point, key: jax.Array, *, search: bool = False
+) -> Integrated:
     """Integrate the hyper-parameters of a hierarchy, from a mode of the biases under their declared scales.
 
     `first` is the prior of what no hierarchy governs. Once the mean of the mixture is known the likelihood is taken
-    there, and the sweeps go on.
+    there; with `search`, which no kernel can hold, until the mean moves by less than an sd.
     """
     known, _ = likelihood(how, model, first, start)
-    if not how.sweeps:
-        return _propagated(how, model, known, start, key)
-    chains = begin(how.form, known, jax.random.fold_in(key, 0))
-    chains, first_found = run(how.form, known, chains, jax.random.fold_in(key, 1), FIRST)
-    point, known = recentred(how, model, start, known, first_found.mean)
-    _, found = run(how.form, known, chains, jax.random.fold_in(key, 2), KEPT)
-    total = moments(how.form, known, found.phi)
-    return Integrated(placed(model, point, total.mean), known.information, total, found.z, found.phi)
+    nodes = None if how.sweeps else nodes_of(how.form)
+    chains = begin(how.form, known, jax.random.fold_in(key, 0)) if how.sweeps else None
+    point = start
+    for turn in range(MOVES if search else 1):
+        own = jax.random.fold_in(key, turn + 2)
+        if nodes is None:
+            chains, swept = run(how.form, known, chains, own, FIRST)
+            mean, spread = swept.mean, swept.spread
+        else:
+            found = propagate(how.form, known, nodes, own, CHAINS * KEPT)
+            mean, spread = found.mean, jnp.sqrt(jnp.diagonal(found.covariance))
+        before = point.z
+        point, known = recentred(how, model, point, known, mean)
+        if search and float(jnp.max(jnp.abs(point.z - before) / jnp.maximum(spread, 1e-9))) < NEAR:
+            break
+    if nodes is not None:
+        return _propagated(how, model, known, point, propagate(how.form, known, nodes, key, CHAINS * KEPT))
+    _, swept = run(how.form, known, chains, jax.random.fold_in(key, 1), KEPT)
+    total = moments(how.form, known, swept.phi)
+    return Integrated(placed(model, point, total.mean), known.information, total, swept.z, swept.phi)
 
 
-def _propagated(how: Integration, model: Model, known: Natural, start: Point, key: jax.Array) -> Integrated:
-    """The same by expectation propagation, which draws nothing of the hyper-parameters."""
-    nodes, count = nodes_of(how.form), CHAINS * KEPT
-    before = propagate(how.form, known, nodes, key, count)
-    point, known = recentred(how, model, start, known, before.mean)
-    found = propagate(how.form, known, nodes, key, count)
+def _propagated(how: Integration, model: Model, known: Natural, point: Point, found: Propagated) -> Integrated:
+    """What expectation propagation leaves, which draws nothing of the hyper-parameters."""
     tail = 50.0 * (1.0 - INTERVAL)
     lower, upper = jnp.percentile(found.z, jnp.array([tail, 100.0 - tail]), axis=0)
     total = Moments(found.mean, found.covariance, lower, upper, found.gamma)
-    z = found.z.reshape(CHAINS, KEPT, -1)
+    z = found.z.reshape(CHAINS, KEPT, how.form.biases)
     return Integrated(placed(model, point, found.mean), known.information, total, z, {})
 
 
@@ -140,6 +151,7 @@ class Swept(NamedTuple):
     z: jax.Array  # (CHAINS, KEPT, M)
     phi: Phi  # leading dims (CHAINS, KEPT)
     mean: jax.Array  # (M,)
+    spread: jax.Array  # (M,) their sd
 
 
 @partial(jax.jit, static_argnames="form")
@@ -156,7 +168,8 @@ def run(form: Form, known: Natural, chains: Any, key: jax.Array, count: int) -> 
         return jax.lax.fori_loop(0, BURN + count, one, (pair[0], blank))
 
     ends, (z, phi) = jax.lax.map(chain, (chains, jax.random.split(key, CHAINS)))
-    return ends, Swept(z, phi, jnp.sum(z, (0, 1)) / (CHAINS * count))
+    mean, square = jnp.sum(z, (0, 1)) / (CHAINS * count), jnp.sum(z**2, (0, 1)) / (CHAINS * count)
+    return ends, Swept(z, phi, mean, jnp.sqrt(jnp.maximum(square - mean**2, 0.0)))
 
 
 @partial(jax.jit, static_argnames="form")

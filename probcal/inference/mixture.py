@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import jax
@@ -18,6 +19,7 @@ from probcal.problem import Problem
 from probcal.results.answer import Draws, Posterior, Summary, Tracks, log_normal, tracks_of
 from probcal.results.schema import ROPE
 from probcal.smoothing.draws import draw, draws_a_chain
+from probcal.smoothing.linearised import laplace
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,14 @@ class Mixture(Posterior):
             np.asarray(found.point.levels), evidence, columns,
         )  # fmt: skip
         return cls(problem, prior, found.point, summary, found, form.hierarchy, first)
+
+    @cached_property
+    def worth(self) -> float | None:
+        """Evidence at the mean with the precisions that the mixture ended with: declared scales would shun a swap."""
+        prior = self.prior.precision(self.problem.labels, self.problem.surveyed)
+        alpha = jnp.asarray(self.summary.precision)
+        with jax.enable_x64(True):
+            return float(laplace(self.problem.model, self.point, prior._replace(alpha=alpha)).evidence)
 
     @property
     def states(self) -> Sequence[np.ndarray]:

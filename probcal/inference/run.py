@@ -111,7 +111,8 @@ class Maximiser(Method, ABC):
         state, trace = maximise(self, problem, prior, start, context)
         how, mixed = self.integration(problem, prior), None
         if how is not None:
-            mixed = integrate(how, problem.model, first_precision(problem, prior), state.point, context.key)
+            first = first_precision(problem, prior)
+            mixed = integrate(how, problem.model, first, state.point, context.key, search=True)
         square = float(mean_square(problem.model, state.point if mixed is None else mixed.point))
         return conclude(problem, self, prior, state, trace, square, len(trace), how, mixed)
 

@@ -115,6 +115,11 @@ class Posterior(ABC):
         return bool(np.isfinite(self.summary.covariance).all() and np.isfinite(self.summary.mean).all())
 
     @property
+    def worth(self) -> float | None:
+        """What optima of several starts are ranked by: the evidence."""
+        return self.summary.evidence
+
+    @property
     def variables(self) -> Mapping[str, Any]:
         """Further variables by draw: dims beyond chain and draw, values, and their coordinates."""
         return {}
@@ -224,7 +229,7 @@ class Answer:
     @property
     def objective(self) -> float:
         """Evidence where the prior is proper, else the last value of the trace; -inf where there is none."""
-        value = self.posterior.summary.evidence
+        value = self.posterior.worth
         value = float(self.trace[-1]) if value is None and self.trace is not None and len(self.trace) else value
         return -np.inf if value is None or not np.isfinite(value) else value
 

@@ -185,16 +185,15 @@ def add_optima(tree: xr.DataTree, answers: Sequence[Answer], best: int) -> xr.Da
     order = [best, *(k for k in range(len(answers)) if k != best)]
     chosen, problem = [answers[k] for k in order], answers[best].problem
     summaries = [answer.posterior.summary for answer in chosen]
-    last = [np.nan if answer.trace is None else answer.trace[-1] for answer in chosen]
     values: dict[str, Any] = {
         "bias": (("optimum", "bias_label"), np.stack([own.mean * problem.scales for own in summaries])),
-        "objective": ("optimum", np.array(last, float)),
+        "objective": ("optimum", np.array([answer.objective for answer in chosen])),
         "status": ("optimum", np.array([str(answer.status) for answer in chosen])),
         "start": ("optimum", np.array(order)),
     }
     evidence = np.array([np.nan if own.evidence is None else own.evidence for own in summaries])
     name = EVIDENCE[summaries[0].precisions]
-    if name in tree.attrs and np.isfinite(evidence).all():
+    if name in tree.attrs and np.isfinite(evidence).all() and summaries[0].precisions != "integrated":
         values[name] = ("optimum", evidence)
     tree["optimum"] = xr.DataTree(xr.Dataset(values, coords={"bias_label": list(problem.labels)}))
     return tree
