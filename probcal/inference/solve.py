@@ -30,7 +30,7 @@ def solve(
     if method.climbs or starts > 1 or problem.levels:
         optima = [climber.answer(problem, own, point, context) for point in points]
         points = [optimum.posterior.point for optimum in optima]
-    best = max(range(starts), key=lambda k: _rank(optima[k])) if optima else 0
+    best = max(range(starts), key=lambda k: _rank(optima[k])) if len(optima) > 1 else 0
     found = optima[best] if method.climbs else method.answer(problem, prior, points[best], context)
     motion = "used" if problem is given else "left out"
     return replace(found, motion=motion, optima=tuple(optima) if starts > 1 else (), best=best)
