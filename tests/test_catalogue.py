@@ -192,7 +192,7 @@ def test_a_small_mixed_network_is_fitted_from_the_table_alone():
     run = simulate(network, CV, np.arange(15.0), 5, tracks={"target": path(2, 15)}, missing=0.2)
     late = (run.table["sensor"].str.contains("-")) & (run.table["time"] % 2 == 1)
     problem = Problem(network, CV, run.table[~late])
-    tree = fit(problem, EA())
+    tree = fit(problem, EA(precisions="maximised"))
     check_tree(tree, problem)
     check_fixed_point(tree, problem)
     # radars of std 1 m and 1 degree at 60 m, five of them: about 1 m

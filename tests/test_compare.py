@@ -328,7 +328,7 @@ def test_the_command_line_compares_saved_fits(saved, tmp_path):
     pair = ["--pair", "c.heading,c.range_offset"]
     code, out, err = call("compare", *folders[:2], "--out", tmp_path / "out", *pair)
     assert code == 0, err
-    assert "EA (ARD) gamma MAP (Gaussian) gamma distance" in " ".join(out.splitlines()[0].split())
+    assert "EA (Horseshoe) gamma MAP (Gaussian) gamma distance" in " ".join(out.splitlines()[0].split())
     labels = saved[0]["calibration"]["bias_label"].values
     table = [line for line in out.splitlines() if "±" in line and not line.startswith("-")]
     assert [line.split()[0] for line in table if "." in line.split()[0]][: len(labels)] == labels.tolist()
@@ -336,7 +336,7 @@ def test_the_command_line_compares_saved_fits(saved, tmp_path):
     rows = pd.read_csv(tmp_path / "out" / "compare.csv", keep_default_na=False)
     assert set(rows["quantity"]) >= {"mean", "overlap", "wasserstein", "elpd", "log_evidence", "coverage"}
     with xr.open_datatree(tmp_path / "out" / "compare.nc", engine="h5netcdf") as written:
-        assert written["estimate"]["estimator"].values.tolist() == ["EA (ARD)", "MAP (Gaussian)"]
+        assert written["estimate"]["estimator"].values.tolist() == ["EA (Horseshoe)", "MAP (Gaussian)"]
     assert (tmp_path / "out" / "compare.png").stat().st_size > 10_000
     code, out, _ = call("compare", *folders, "--name", "one", "--name", "two", "--name", "three")
     assert code == 0

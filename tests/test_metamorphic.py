@@ -260,7 +260,7 @@ def test_units_of_a_declaration():
 def test_the_fit_as_a_whole():
     """`fit` with its automatic start: a moved and turned world in shuffled rows has the same calibration."""
     world, table, expected = base("pair")
-    method = probcal.MAP(tolerance=1e-9)
+    method = probcal.MAP(tolerance=1e-9, trajectory="joint")
     for angle, shift in ((0.0, 0.0), (1.1, 300.0), (-2.5, -80.0)):
         problem = world.moved(angle, np.array([shift, -shift])).problem(table.sample(frac=1, random_state=1))
         group = probcal.fit(problem, method)["calibration"].to_dataset()

@@ -23,7 +23,7 @@ from probcal.status import INVALID, Status
 from probcal.types import float64
 
 QUARTERS = 4
-PART = 0.3  # of its largest entry from which a bias has a substantial part in a combination
+PART = 0.1  # of its largest entry from which a bias has a substantial part in a combination
 COPIES = 2000  # most biases of all pieces together
 
 

@@ -32,6 +32,7 @@ from probcal.smoothing.solves import Dense
 States = tuple[jax.Array, ...]  # (E, n) of each recursion
 ROUNDS, EXACT = 30, 1e-14  # of an adjoint solve at most, and the share of its first square that ends it
 ENOUGH = 0.1  # share of the promised rise that a step must bring: along what motion noise alone fixes, half a step does
+SMALL = 1e-6  # share of its first square from which on an adjoint solve is good enough
 LEAST_CURVED = 0.05  # share of its curvature so far that a secant must show
 SHORT = 0.25  # part of a step above which the damping falls again
 TRACK_STEPS, SETTLED = 5, 1e-10  # of Gauss-Newton after every step of the biases, and nats at which they end: log det W
@@ -109,8 +110,8 @@ def _adjoint(model: Model, point: Point, solved: Eliminated, slope: States) -> t
     r = jax.tree.map(jnp.negative, rest(first))
     s = smooth(r)
     start = (first, r, r, s, dot(r, s), jnp.zeros((), int), jnp.ones((), bool))
-    x, *_, positive = jax.lax.while_loop(on, again, start)
-    return x, positive
+    x, _, _, _, left, _, positive = jax.lax.while_loop(on, again, start)
+    return x, positive | (left <= SMALL * dot(slope, first))  # at the end rounding may turn a curvature
 
 
 def dot(a: States, b: States) -> jax.Array:
