@@ -48,7 +48,7 @@ def test_plaza_is_calibrated_from_the_command_line(tmp_path):
 def test_freed_beacons_are_weak_and_the_dilation_is_named():
     code, out, err = call("fit", FREE)
     assert code == 0, err
-    rows = [line for line in out.splitlines() if ".position_" in line.split(" m ")[0]]
+    rows = [line for line in out.splitlines() if line.strip().startswith("beacon_") and ".position_" in line.split()[0]]
     assert len(rows) == 8
     assert all(row.endswith("weak") for row in rows)
     for word in ("dilation", "translation", "anchor the positions of two nodes"):
