@@ -8,17 +8,46 @@
 - clocks: six arrival-time receivers with clocks of about 3 m, three displaced, emission times unknown;
 - pass: four radars that see one straight pass;
 - signal: eight signal-strength receivers whose gains share a loss of about 4 dB that nobody knows (every bias counts);
+- line: four range beacons on one line, two of them free; the target on the other side of it fits as well;
+- ceiling: six range anchors at one height above a drone (3-D), two of them free: the drone above them fits as well;
+- corners: the beacons, and a target that goes straight and turns five times; with `tails="student"` its process noise
+  has heavy tails, as the motion has;
 - bearings: six cameras surveyed to 2 m with free headings, where motion noise alone tells the size of the scene.
 """
 
+from fnmatch import fnmatch
+
 import numpy as np
 
-from probcal import Channel, ConstantVelocity, Network, Node, Problem, RandomWalk, Truth, White, sensor, simulate
-from probcal.geometry import bearing
+from probcal import (
+    Bias,
+    Channel,
+    ConstantVelocity,
+    Network,
+    Node,
+    Problem,
+    RandomWalk,
+    StudentT,
+    Target,
+    Truth,
+    Unknown,
+    White,
+    sensor,
+    simulate,
+)
+from probcal.geometry import bearing, norm
+from probcal.noise import Gaussian
 from probcal.sensors import radar, ranger, rss, toa
 
-NAMES = ("beacons", "clocks", "pass", "signal", "bearings")
+NAMES = ("beacons", "clocks", "pass", "signal", "bearings", "line", "ceiling", "corners")
+FIXED = {"line": ("*.range_scale", "*.range_offset")}
 CAMERAS = np.array([(0, 0), (60, 0), (60, 40), (0, 40), (30, -10), (30, 50)], float)
+
+
+@sensor(range=Channel("m", std=0.1))
+def anchor(target, pose, *, range_offset=Bias("m", 0.3)):
+    """Range of an ultra-wideband anchor."""
+    return dict(range=norm(target.position - pose.position) + range_offset)
 
 
 @sensor(azimuth=Channel("rad", std=0.02, wrap=True))
@@ -55,13 +84,30 @@ def _bearings(places=CAMERAS):
     )
 
 
+def _line():
+    scales = {1: {"position": 3.0}, 2: {"position": 3.0}}
+    return Network([ranger.on(Node(f"b{k}", (30.0 * k, 0.0), scale=scales.get(k))) for k in range(4)])
+
+
+def _ceiling():
+    places = [(0, 0, 3), (10, 0, 3), (10, 8, 3), (0, 8, 3), (5, 0, 3), (5, 8, 3)]
+    scales = {4: {"position": 0.5}, 5: {"position": 0.5}}
+    return Network([anchor.on(Node(f"a{k}", p, scale=scales.get(k))) for k, p in enumerate(places)])
+
+
 NETWORKS = {"beacons": _beacons, "clocks": _clocks, "pass": _pass, "signal": _signal, "bearings": _bearings}
+NETWORKS |= {"line": _line, "ceiling": _ceiling, "corners": _beacons}
 
 
-def motion(network):
-    """The motion of the target of a network, and of what it sends out."""
-    steps = {"beacons": 0.5, "clocks": 0.5, "pass": 0.3, "signal": 0.3, "bearings": 0.03}
-    own = ConstantVelocity(steps[network])
+STEPS = {"beacons": 0.5, "clocks": 0.5, "pass": 0.3, "signal": 0.3, "bearings": 0.03, "line": 0.5, "ceiling": 0.5}
+TAILS = {"gaussian": Gaussian(), "student": StudentT(4.0), "heavy": StudentT(2.0)}
+
+
+def motion(network, noise=None, tails="gaussian"):
+    """The motion of the target of a network, and of what it sends out; another process noise if given."""
+    if network == "corners":
+        return ConstantVelocity(Unknown(0.3), noise=TAILS[tails])
+    own = ConstantVelocity(STEPS[network] if noise is None else noise)
     if network == "clocks":
         return own + White("emission", "m", 100.0)
     return own + RandomWalk("power", "dB", 0.1, (40.0, 10.0)) if network == "signal" else own
@@ -72,14 +118,36 @@ def _path(network, time, rng):
     t = time
     if network == "bearings":
         return _wander(t, rng)
+    if network == "corners":
+        return _corners(t, rng)
     place = {
         "beacons": (40 + 30 * np.cos(t / 7), 22 + 16 * np.sin(t / 4.5)),
         "clocks": (35 + 22 * np.cos(t / 9), 28 + 20 * np.sin(t / 6)),
         "pass": (-20 + 2.8 * t, 35 + 0.4 * t),
         "signal": (5 + 1.2 * t, 50 + 35 * np.sin(t / 9)),
+        "line": (-10 + 1.9 * t, 15 + 8 * np.sin(t / 8)),
+        "ceiling": (5 + 3 * np.cos(t / 3), 4 + 2.5 * np.sin(t / 2.2), 1.2 + 0.5 * np.sin(t / 4)),
     }[network]
-    found = {"position_x": place[0], "position_y": place[1]}
+    found = {f"position_{axis}": column for axis, column in zip("xyz", place, strict=False)}
     return found | ({"power": 40.0 + 0 * t} if network == "signal" else {})
+
+
+def _corners(time, rng):
+    """Straight at 2.5 m/s, and five turns of a right angle within 2 s, always back towards the beacons."""
+    place, angle, rate, found = np.array([15.0, 10.0]), 0.4, 0.0, []
+    turns = np.linspace(time[0], time[-1], 7)[1:-1] + rng.uniform(-3.0, 3.0, 5)
+    for before, now in zip([time[0], *time[:-1]], time, strict=True):
+        new = [t for t in turns if before < t <= now]
+        if new:
+            away = np.array([40.0, 22.0]) - place
+            side = np.cos(angle) * away[1] - np.sin(angle) * away[0]
+            rate, left = np.copysign(np.pi / 4, side), 2.0
+        if rate:
+            angle, left = angle + rate * (now - before), left - (now - before)
+            rate = rate if left > 1e-9 else 0.0
+        place = place + 2.5 * (now - before) * np.array([np.cos(angle), np.sin(angle)])
+        found.append(place)
+    return dict(zip(("position_x", "position_y"), np.array(found).T, strict=True))
 
 
 def _wander(time, rng):
@@ -94,20 +162,38 @@ def _wander(time, rng):
     return dict(zip(("position_x", "position_y", "velocity_x", "velocity_y"), np.array(found).T, strict=True))
 
 
+def times(network):
+    """Times of the measurements of a network."""
+    steps = {"beacons": (100, 0.5), "bearings": (400, 0.5), "line": (120, 0.5), "ceiling": (150, 0.2)}
+    steps["corners"] = (120, 0.5)
+    count, step = steps.get(network, (80, 1.0))
+    return step * np.arange(count)
+
+
 def recording(network="beacons", run=0, share=0.3):
     """The network, and table and truth of one run: a share of the biases drawn at their scales, surveys always."""
     rng = np.random.default_rng(1000 + run)
-    placed = NETWORKS[network]()
-    time = {"beacons": 0.5 * np.arange(100), "bearings": 0.5 * np.arange(400)}.get(network, np.arange(80.0))
+    placed, time = NETWORKS[network](), times(network)
     biases = {
         bias.label: float(bias.scale * rng.normal()) if bias.kind == "survey" or rng.uniform() < share else 0.0
         for bias in placed.biases
+        if not any(fnmatch(bias.label, pattern) for pattern in FIXED.get(network, ()))
     }
     if network == "signal":
         loss = 4.0 * rng.normal()
         biases |= {label: loss + 0.3 * rng.normal() for label in biases if label.endswith("gain")}
     path = pd_frame(_path(network, time, rng))
     return placed, simulate(placed, motion(network), time, run, biases=biases, tracks={"target": path})
+
+
+def own_path(network="beacons", run=0, share=0.3, noise=0.05):
+    """Problem and truth of one run whose path is drawn from its motion too, from a start that is declared."""
+    placed, rng = NETWORKS[network](), np.random.default_rng(run)
+    middle = np.mean([node.position for node in placed.nodes], 0)
+    begin = {"position": (tuple(middle + rng.uniform(-15, 15, 2)), 1.0), "velocity": ((0.0, 0.0), 0.5)}
+    target = Target(motion(network, noise), begin)
+    drawn = simulate(placed, target, times(network), run, share=share)
+    return Problem(placed, target, drawn.table), drawn.truth
 
 
 def pd_frame(columns):
@@ -117,10 +203,10 @@ def pd_frame(columns):
     return pd.DataFrame(columns)
 
 
-def setting(run=0, network="beacons", share=0.3):
+def setting(run=0, network="beacons", share=0.3, tails="gaussian"):
     """Problem and truth of one run of a study."""
     placed, drawn = recording(network, run, share)
-    return Problem(placed, motion(network), drawn.table), drawn.truth
+    return Problem(placed, motion(network, tails=tails), drawn.table, fix=FIXED.get(network, ())), drawn.truth
 
 
 def problem(data=None):

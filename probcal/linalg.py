@@ -4,11 +4,13 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.linalg import solve_triangular
 
 UNROLL = 12  # largest matrix whose factors are written out instead of calling LAPACK
 BASE = 16  # largest block that a dense factorisation hands to LAPACK
 RANK = 1e-14  # share of its diagonal below which a pivot counts as zero
+LOST = 1e-12  # share of its length below which a row counts as dependent on those before it
 SYMMETRIC = 96  # widest symmetric product that is formed whole
 NARROW = 64  # most columns for which a product is written as a sum: inside a scan a small dot costs more
 
@@ -54,24 +56,79 @@ def inverse_cholesky(matrix: jax.Array) -> jax.Array:
     return jnp.stack(rows)
 
 
-def semi_cholesky(matrices: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Lower roots (E, n, n) of positive semi-definite matrices of any rank, and the y with root y = right (E, n, m).
+def observe(root: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Root of a covariance (n, n) root root' after unit-noise data columns' x, for columns (n, u), one after another.
 
-    The right-hand sides must lie in the range of the matrices; a pivot that is lost in rounding counts as zero.
+    Also the gains (n, u) of each by its whitened innovation, and the std (u,) of that innovation. Potter's square-root
+    update (Bierman 1977, II.7): no product of the root with itself is formed.
     """
+    gains, stds = [], []
+    for j in range(columns.shape[1]):
+        seen = jnp.sum(root * columns[:, j, None], 0)
+        variance = 1.0 + jnp.sum(seen**2)
+        std = jnp.sqrt(variance)
+        gain = jnp.sum(root * (seen / std)[None, :], 1)
+        root = root - gain[:, None] * (seen / (1.0 + std))[None, :]
+        gains.append(gain)
+        stds.append(std)
+    return root, jnp.stack(gains, 1), jnp.stack(stds)
+
+
+def regress(rows: jax.Array, known: jax.Array) -> jax.Array:
+    """The C (p, n) for which rows (p, m) less C known are orthogonal to the rows `known` (n, m), of any rank.
+
+    Modified Gram-Schmidt of both together. Of a known row that is lost in rounding beside the others C has zero.
+    """
+    n = known.shape[0]
+    least = LOST * jnp.sqrt(jnp.sum(known**2, 1))
+
+    def project(j, carry):
+        left, whole = carry
+        length = jnp.sqrt(jnp.sum(left[j] ** 2))
+        there = length > least[j]
+        unit = jnp.where(there, left[j] / jnp.where(there, length, 1.0), 0.0)
+        column = jnp.sum(left * unit[None, :], 1)
+        return left - column[:, None] * unit[None, :], whole.at[:, j].set(column)
+
+    def solve(i, carry):  # C times the triangle above is what stands below it
+        j = n - 1 - i
+        rest, found = carry
+        pivot = whole[j, j]
+        share = jnp.where(pivot > 0, rest[:, j] / jnp.where(pivot > 0, pivot, 1.0), 0.0)
+        return rest - share[:, None] * whole[j][None, :], found.at[:, j].set(share)
+
+    left = jnp.concatenate([known, rows])
+    _, whole = jax.lax.fori_loop(0, n, project, (left, jnp.zeros((len(left), n), left.dtype)))
+    _, found = jax.lax.fori_loop(0, n, solve, (whole[n:], jnp.zeros((len(rows), n), left.dtype)))
+    return found
+
+
+def semi_cholesky(matrices: jax.Array) -> jax.Array:
+    """Lower roots (E, n, n) of positive semi-definite matrices of any rank; a pivot lost in rounding counts as zero."""
     n = matrices.shape[-1]
     least = RANK * jnp.diagonal(matrices, axis1=1, axis2=2)
-    left, rest, columns, solved = matrices, right, [], []
+    left, columns = matrices, []
     for j in range(n):
         there = left[:, j, j] > least[:, j]
-        root = jnp.sqrt(jnp.where(there, left[:, j, j], 1.0))
-        column = jnp.where((jnp.arange(n) >= j)[None] & there[:, None], left[:, :, j] / root[:, None], 0.0)
-        y = jnp.where(there[:, None], rest[:, j] / root[:, None], 0.0)
+        pivot = jnp.sqrt(jnp.where(there, left[:, j, j], 1.0))
+        column = jnp.where((jnp.arange(n) >= j)[None] & there[:, None], left[:, :, j] / pivot[:, None], 0.0)
         left = left - column[:, :, None] * column[:, None, :]
-        rest = rest - column[:, :, None] * y[:, None, :]
         columns.append(column)
+    return jnp.stack(columns, 2)
+
+
+def forward(root: jax.Array, right: jax.Array) -> jax.Array:
+    """The y (E, n, m) with root y = right, for lower roots (E, n, n) and right-hand sides in their range.
+
+    Where a pivot is zero the entry of y is zero.
+    """
+    rest, solved = right, []
+    for j in range(root.shape[-1]):
+        pivot = root[:, j, j, None]
+        y = jnp.where(pivot > 0, rest[:, j] / jnp.where(pivot > 0, pivot, 1.0), 0.0)
+        rest = rest - root[:, :, j, None] * y[:, None, :]
         solved.append(y)
-    return jnp.stack(columns, 2), jnp.stack(solved, 1)
+    return jnp.stack(solved, 1)
 
 
 def semi_solve(matrices: jax.Array, right: jax.Array) -> jax.Array:
@@ -79,7 +136,8 @@ def semi_solve(matrices: jax.Array, right: jax.Array) -> jax.Array:
 
     Where a pivot is lost in rounding the entry of x is zero.
     """
-    root, y = semi_cholesky(matrices, right)
+    root = semi_cholesky(matrices)
+    y = forward(root, right)
     n = matrices.shape[-1]
     pivots = jnp.diagonal(root, axis1=1, axis2=2)
     there = pivots > 0
@@ -165,6 +223,12 @@ def log_normal(residual: jax.Array, root: jax.Array) -> jax.Array:
     return -0.5 * jnp.sum(white**2) - (jnp.sum(jnp.log(jnp.diagonal(lower))) + 0.5 * len(white) * math.log(2 * math.pi))
 
 
+def driving(residual: jax.Array, root: jax.Array) -> jax.Array:
+    """The shortest u (m,) with root @ u the residual (n,), for a root (n, m) of full rank."""
+    _, inverse = factor_and_inverse(root @ root.T)
+    return root.T @ (inverse.T @ (inverse @ residual))
+
+
 def factor(matrix: jax.Array) -> jax.Array:
     """Lower Cholesky factor of a symmetric positive definite matrix."""
     return factor_and_inverse(matrix)[0]
@@ -179,3 +243,14 @@ def solve_batched(matrices: jax.Array, right: jax.Array) -> jax.Array:
 def spectrum(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Eigenvalues (ascending) and eigenvectors (columns) of a symmetric matrix."""
     return jnp.linalg.eigh(matrix)
+
+
+def pseudo_inverse(matrices: np.ndarray) -> np.ndarray:
+    """Pseudo-inverses (E, m, n) of matrices (E, n, m), on the host."""
+    return np.linalg.pinv(matrices)
+
+
+def singular(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Singular values (descending) of a matrix and its left singular vectors (columns)."""
+    vectors, values, _ = jnp.linalg.svd(matrix, full_matrices=False)
+    return values, vectors

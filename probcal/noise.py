@@ -2,17 +2,18 @@
 
 Steps of an algorithm use the positive step weight; covariance, gamma and evidence use the expected
 information (for a Student-t the two differ).
-To add a family, write a frozen dataclass with the methods of `Gaussian`.
+To add a family, write a frozen dataclass with the methods of `Gaussian`. To let it drive a motion too, write those of
+`ScaleMixture`: a vector of noise is then normal given a precision that is drawn anew at every epoch.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import gammaln
+from jax.scipy.special import digamma, gammaln
 
 from probcal.errors import InputError
 from probcal.geometry import wrap
@@ -40,6 +41,13 @@ def guess_of(level: Level) -> float:
     return float(level.guess if isinstance(level, Unknown) else level)
 
 
+def check_driving(noise: Any, what: str) -> None:
+    """Raise `InputError` unless a family can drive a motion: Gaussian, or a scale mixture around zero."""
+    if isinstance(noise, Gaussian) or (isinstance(noise, ScaleMixture) and not getattr(noise, "delay", 0.0)):
+        return
+    raise InputError(f"{what} is {noise!r}, which cannot drive a motion: give Gaussian(), StudentT(df) or a Mixture")
+
+
 def check_level(level: Level, what: str, *, zero: bool = False) -> None:
     """Raise `InputError` unless the level is a positive (or, where allowed, zero) finite number."""
     if isinstance(level, Unknown):
@@ -64,6 +72,29 @@ class Family(Protocol):
     def reliance(self, y, predicted, std, period: float | None): ...
     def sample(self, key, predicted, std): ...
     def check(self, y: np.ndarray) -> np.ndarray: ...
+
+
+@runtime_checkable
+class ScaleMixture(Protocol):
+    """What a family answers that drives a motion: a vector u (size,) is N(0, I / w), its precision w drawn anew.
+
+    `square` is |u|^2 (or what is expected of it), `size` the number of entries; arrays of one shape.
+    """
+
+    def mixing_mean(self, square, size):
+        """Mean of w given u (with an expected square, the best that does not depend on u: variational Bayes)."""
+
+    def mixing_gain(self, weight, size):
+        """E log p(w) - E log q(w) + size / 2 (E log w - log weight), for the q that `weight` = E w belongs to."""
+
+    def mixing_density(self, square, size):
+        """Log density of u over that of unit normals, w integrated."""
+
+    def mixing_information(self, size):
+        """Fisher information of each entry of u about its place, over that of unit normals."""
+
+    def mixing_draw(self, key, shape):
+        """Draws of w."""
 
 
 class _Location:
@@ -153,6 +184,33 @@ class StudentT(_Location):
         size = jnp.sqrt(self.df * jnp.expm1(-2.0 / self.df * jnp.log1p(-u)))
         return predicted + std * size * jnp.cos(2.0 * jnp.pi * v)
 
+    def mixing_mean(self, square, size):
+        """(df + size) / (df + square)."""
+        return (self.df + size) / (self.df + square)
+
+    def mixing_gain(self, weight, size):
+        """Of a Gamma q of shape (df + size) / 2."""
+        shape, own = 0.5 * (self.df + size), 0.5 * self.df
+        rate = shape / weight
+        log_mean = digamma(shape) - jnp.log(rate)
+        prior = own * np.log(own) - gammaln(own) + (own - 1) * log_mean - own * weight
+        entropy = shape - jnp.log(rate) + gammaln(shape) + (1 - shape) * digamma(shape)
+        return prior + entropy + 0.5 * size * (log_mean - jnp.log(weight))
+
+    def mixing_density(self, square, size):
+        """Multivariate Student-t over normal."""
+        top, own = 0.5 * (self.df + size), 0.5 * self.df
+        constant = gammaln(top) - gammaln(own) - 0.5 * size * np.log(own)
+        return constant - top * jnp.log1p(square / self.df) + 0.5 * square
+
+    def mixing_information(self, size):
+        """(df + size) / (df + size + 2)."""
+        return (self.df + size) / (self.df + size + 2.0)
+
+    def mixing_draw(self, key, shape):
+        """Chi-square of df degrees of freedom over df."""
+        return jax.random.gamma(key, 0.5 * self.df, shape) / (0.5 * self.df)
+
 
 @dataclass(frozen=True)
 class Mixture(_Location):
@@ -232,6 +290,52 @@ class Mixture(_Location):
         late = jax.random.uniform(pick, predicted.shape) < self.share
         normal = jax.random.normal(size, predicted.shape, predicted.dtype)
         return predicted + std * jnp.where(late, self.delay + self.scale * normal, normal)
+
+    def _often(self, square, size):
+        """Log densities of u, times its share, of the two components, less the constant."""
+        inlier = np.log1p(-self.share) - 0.5 * square
+        return inlier, np.log(self.share) - size * np.log(self.scale) - 0.5 * square / self.scale**2
+
+    def mixing_mean(self, square, size):
+        """One or 1 / scale^2, each by its probability."""
+        inlier, wide = self._often(square, size)
+        kept = jax.nn.sigmoid(inlier - wide)
+        return kept + (1 - kept) / self.scale**2
+
+    def mixing_gain(self, weight, size):
+        """Of a q with two values."""
+        low = self.scale**-2.0
+        kept = jnp.clip((weight - low) / (1.0 - low), 1e-12, 1 - 1e-12)
+        prior = kept * np.log1p(-self.share) + (1 - kept) * np.log(self.share)
+        entropy = -kept * jnp.log(kept) - (1 - kept) * jnp.log1p(-kept)
+        return prior + entropy + 0.5 * size * ((1 - kept) * np.log(low) - jnp.log(weight))
+
+    def mixing_density(self, square, size):
+        """Two normals over one."""
+        return jnp.logaddexp(*self._often(square, size)) + 0.5 * square
+
+    def mixing_information(self, size):
+        """By the trapezoidal rule over |u|^2, for one size."""
+        most = int(np.max(size, initial=1))
+        of = np.array([1.0, *(self._radial(n) for n in range(1, most + 1))])
+        return of[np.asarray(size, int)]
+
+    def _radial(self, size: int) -> float:
+        """E w(|u|^2)^2 |u|^2 / size."""
+        from scipy import special
+
+        radius = np.concatenate([np.linspace(0.0, 12.0, 4001), self.scale * np.linspace(0.0, 12.0, 4001)])
+        radius = np.unique(radius + 1e-9)
+        square = radius**2
+        constant = (size - 1) * np.log(radius) + (1 - 0.5 * size) * np.log(2.0) - special.gammaln(0.5 * size)
+        inlier, wide = self._often(square, size)
+        kept = special.expit(inlier - wide)
+        weight = kept + (1 - kept) / self.scale**2
+        return float(np.trapezoid(np.exp(np.logaddexp(inlier, wide) + constant) * weight**2 * square, radius) / size)
+
+    def mixing_draw(self, key, shape):
+        """One, or 1 / scale^2 with the probability of the share."""
+        return jnp.where(jax.random.uniform(key, shape) < self.share, self.scale**-2.0, 1.0)
 
 
 @dataclass(frozen=True)

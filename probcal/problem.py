@@ -15,7 +15,7 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.model.epochs import Epoch, merged
-from probcal.model.model import Model, Recursion
+from probcal.model.model import Mixing, Model, Recursion, Tail
 from probcal.model.motions import (
     DIFFUSE,
     FAR,
@@ -27,6 +27,7 @@ from probcal.model.motions import (
     form_of,
     linear_of,
     start_of,
+    tails_of,
 )
 from probcal.model.rows import Block, Rows, addresses, make_block, pose_entries, pose_vector
 from probcal.model.sampled import Sampled
@@ -211,6 +212,14 @@ class Problem:
             declared = declared[name]
         return declared if isinstance(declared, Target) else Target(declared)
 
+    def with_mixing(self, weights: Mixing) -> Problem:
+        """The same problem with other precisions (E,) of the process noises that are not Gaussian."""
+        if not self.model.tailed:
+            return self
+        other = copy(self)
+        other.model = self.model.with_mixing(weights)
+        return other
+
     def later(self, data: Any, sizes: tuple[int, ...] | None = None) -> Epoch:
         """The epochs of rows that came after those of this problem, stacked in time order (K leading).
 
@@ -266,6 +275,7 @@ class Problem:
             offset = 0
             times: list[np.ndarray] = []
             owners = []
+            drives: list[tuple[Any, int]] = []
             for name in names:
                 rows = data.target == data.target_names.index(name)
                 time = np.unique(data.time[rows])
@@ -279,11 +289,13 @@ class Problem:
                 arrays = chain(name, targets[name], time, levels, begun.get(name), area)
                 first = np.arange(len(time)) == (0 if name not in begun else -1)
                 dt = np.diff(time, prepend=begun.get(name, time[0]))
+                own = tails_of(targets[name], len(time), name not in begun, self.network.dimension)
+                drives += [(tail, offset - len(time)) for tail in own]
                 parts.append((*arrays, time, dt, first, np.full(len(time), len(times))))
                 times.append(time)
                 owners.append(np.full(len(time), name))
             columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
-            recursions.append(Recursion(*columns))
+            recursions.append(Recursion(*columns)._replace(tails=_tails(drives, offset)))
             components = labels_of(layout, self.network.dimension)
             self.epochs.append(Epochs(np.concatenate(times), np.concatenate(owners), layout, components))
         blocks: list[Block] = []
@@ -406,6 +418,16 @@ class Problem:
                     if b.label in number:
                         bias[s, j], scale[s, j] = number[b.label], b.scale
         return {"bias": bias, "scale": scale, "base": base}, starts
+
+
+def _tails(drives: list[tuple[Any, int]], epochs: int) -> tuple[Tail, ...]:
+    """The noises of a recursion that are not Gaussian, targets of one family joined; each with its first epoch."""
+    joined: dict[Any, np.ndarray] = {}
+    for (*key, on), first in drives:
+        whole = joined.setdefault(tuple(key), np.zeros(epochs, bool))
+        whole[first : first + len(on)] = on
+    found: list[Any] = [(*key, on, np.ones(epochs)) for key, on in joined.items()]
+    return tuple(Tail(*own) for own in found)
 
 
 def check_linear(problem: Problem) -> None:

@@ -262,7 +262,7 @@ def _biases(problem: Problem, share: float, given: Mapping[str, float] | None, k
 def _states(problem: Problem, r: int, tracks: Mapping[str, Any], key: jax.Array) -> np.ndarray:
     """What rows read of the states (E, n) of one recursion: drawn from the motion, given components put over."""
     part, epochs = problem.model.recursions[r], problem.epochs[r]
-    noise = np.asarray(jax.random.normal(jax.random.fold_in(key, r), part.drift.shape))
+    noise = np.asarray(problem.model.draw_noises(key, r, 1))[:, :, 0]
     F, L, drift = (np.asarray(a) for a in (part.F, part.L, part.drift))
     states = np.zeros_like(noise)
     previous = np.zeros(noise.shape[1])

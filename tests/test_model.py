@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import arviz as az
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,11 +11,12 @@ import numpyro
 import pandas as pd
 import pytest
 import reference
+import xarray as xr
 from jax.flatten_util import ravel_pytree
-from numpyro.infer import MCMC, NUTS, SVI, Predictive, Trace_ELBO
-from numpyro.infer.autoguide import AutoNormal
+from numpyro.infer import MCMC, NUTS, SVI, Predictive, Trace_ELBO, init_to_value
+from numpyro.infer.autoguide import AutoMultivariateNormal, AutoNormal
 from numpyro.infer.util import log_density
-from worlds import posed_of, small, two_motions
+from worlds import posed_of, resting, small, two_motions
 
 import probcal
 from probcal import (
@@ -39,6 +41,7 @@ from probcal import (
 from probcal.inference.coordinates import Free, parts
 from probcal.priors import BernoulliGaussian
 from probcal.smoothing.frame import place
+from probcal.smoothing.mode import factors
 
 FALSE_ALARM = 1e-6  # of each statistical test
 radar, fix = probcal.sensors.radar, probcal.sensors.position
@@ -206,8 +209,130 @@ def test_autoguides_and_log_likelihoods_of_numpyro_take_it():
     assert np.isfinite(np.asarray(again)).all()
 
 
+def sites(model, values):
+    """Values of the latent sites and of the states of a model at values of its latent sites."""
+
+    @jax.jit
+    def traced(values):
+        seeded = numpyro.handlers.substitute(numpyro.handlers.seed(model, jax.random.key(0)), values)
+        trace = numpyro.handlers.trace(seeded).get_trace()
+        latent = {k: v["value"] for k, v in trace.items() if v["type"] == "sample" and not v["is_observed"]}
+        return latent, {k: v["value"] for k, v in trace.items() if k.startswith("state")}
+
+    return traced(values)
+
+
+STARTED = ("gaussian", "two recursions", "horseshoe", "ard", "levels and Student-t", "flat")
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, marks=[] if c == STARTED[0] else pytest.mark.ci) for c in STARTED])
+def test_a_start_has_every_latent_site_and_the_trajectories_of_its_point(case):
+    prior, settings = CASES[case]
+    problem = small(**settings)
+    model = numpyro_model(problem, prior)
+    random, noises, states = np.random.default_rng(0), [], []
+    for part in problem.model.recursions:
+        F, drift, u = np.asarray(part.F), np.asarray(part.drift), random.standard_normal(part.drift.shape)
+        x = np.zeros_like(u)
+        with jax.enable_x64(True):
+            L = np.asarray(factors(part, jnp.zeros(len(problem.levels))))
+        for k in range(len(x)):
+            x[k] = F[k] @ x[k - 1] + drift[k] + L[k] @ u[k]
+        noises.append(u)
+        states.append(x)
+    with jax.enable_x64(True):
+        point = resting(problem)._replace(
+            noises=tuple(map(jnp.asarray, noises)), states=tuple(map(jnp.asarray, states))
+        )
+        found = model.start(point)
+        latent, reached = sites(model, found)
+    assert {name: value.shape for name, value in found.items()} == {k: v.shape for k, v in latent.items()}
+    for own, expected in zip(reached.values(), states, strict=True):
+        np.testing.assert_allclose(own, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+    assert all(np.isfinite(value).all() for value in found.values())
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, marks=[] if c in OFTEN else pytest.mark.ci) for c in STARTED])
+def test_every_site_has_dims_and_every_bias_its_label(case):
+    prior, settings = CASES[case]
+    problem = small(**settings)
+    model = numpyro_model(problem, prior)
+    dims, coords = model.dims, model.coords
+    assert dims["bias"] == dims["z"] == ["bias_label"]
+    assert coords["bias_label"] == list(problem.labels)
+    assert set(model.hierarchy.hyper()) <= set(dims)
+    assert coords["level_label"] == [level.label for level in problem.levels]
+    for site, data in zip(model.sites, problem.model.rows, strict=True):
+        assert tuple(len(coords[name]) for name in dims[site]) == data.y.shape
+    if isinstance(prior, Horseshoe):
+        assert dims["local_scale"] == ["governed_label"]
+        assert coords["governed_label"] == np.array(problem.labels)[~problem.surveyed].tolist()
+
+
+def tree_of(problem, z, held=None):
+    """As much of a fit's tree as a start is made of."""
+    labels, scales = list(problem.labels), problem.scales
+    values = {"mean": ("bias_label", z * scales), "covariance": (("bias_label", "bias_label_other"), np.eye(len(z)))}
+    group = xr.Dataset(values, {"bias_label": labels, "bias_label_other": labels})
+    fixed = xr.Dataset({"fixed": ("fixed_label", [0.0])}, {"fixed_label": [held]}) if held else xr.Dataset()
+    return xr.DataTree.from_dict({"calibration": group, "constant_data": fixed})
+
+
+@pytest.mark.ci
+def test_a_start_takes_the_biases_of_a_fit():
+    problem = small()
+    z = np.linspace(-1.0, 1.0, len(problem.labels))
+    found = numpyro_model(problem, Gaussian()).start(tree_of(problem, z))
+    np.testing.assert_allclose(found["z"], z, rtol=1e-12)
+    assert np.abs(found["noise"]).max() < 10.0
+
+
+@pytest.mark.ci
+def test_numpyros_kernels_and_guides_agree_with_the_samplers_from_a_start():
+    """Rangers whose target has no declared start; ArviZ labels the draws, which agree within Monte Carlo error."""
+    places = {"a": (0.0, 0.0), "b": (100.0, 10.0), "c": (90.0, 80.0), "d": (-10.0, 70.0)}
+    nodes = [Node(name, place, scale={"position": 3.0} if name > "b" else {}) for name, place in places.items()]
+    network = Network([probcal.sensors.ranger.on(node) for node in nodes])
+    start = {"position": ((30.0, 40.0), 1.0), "velocity": ((3.0, -1.0), 0.5)}
+    drawn = probcal.simulate(network, Target(ConstantVelocity(1.0), start), np.arange(8.0), key=1)
+    problem = Problem(network, ConstantVelocity(1.0), drawn.table)
+    own = az.extract(probcal.fit(problem, probcal.NUTS(draws=500), prior=Gaussian(), key=1), var_names="bias").values
+    mean, sd = own.mean(1), own.std(1)
+    model = numpyro_model(problem, Gaussian())
+    with jax.enable_x64(True), jax.numpy_rank_promotion("allow"):
+        init = init_to_value(values=model.start())
+        run = MCMC(NUTS(model, init_strategy=init), num_warmup=500, num_samples=1000, progress_bar=False)
+        run.run(jax.random.key(0))
+        tree = az.from_numpyro(run, dims=model.dims, coords=model.coords)
+    bias = tree["posterior"]["bias"].sel(bias_label=list(problem.labels))
+    effective = az.ess(tree, var_names=["bias"])["bias"].values
+    assert effective.min() > 300
+    width = 5.5 * np.sqrt(1 / effective + 1 / 300)
+    assert (np.abs(bias.values.mean((0, 1)) - mean) < width * sd).all()
+    assert (np.abs(bias.values.std((0, 1)) / sd - 1) < width).all()
+    assert tree["posterior"]["state"].dims == ("chain", "draw", "epoch", "component")
+    assert set(az.summary(tree, var_names=["bias"]).index) == {f"bias[{label}]" for label in problem.labels}
+
+
+@pytest.mark.ci
+def test_a_guide_of_full_rank_from_a_start_has_the_moments_of_the_posterior():
+    problem = small()
+    own = az.extract(probcal.fit(problem, probcal.NUTS(draws=500), prior=Gaussian(), key=1), var_names="bias").values
+    model = numpyro_model(problem, Gaussian())
+    with jax.enable_x64(True), jax.numpy_rank_promotion("allow"):
+        guide = AutoMultivariateNormal(model, init_loc_fn=init_to_value(values=model.start()), init_scale=0.01)
+        svi = SVI(model, guide, numpyro.optim.ClippedAdam(0.005), Trace_ELBO(num_particles=4))
+        found = svi.run(jax.random.key(0), 6000, progress_bar=False)
+        tree = az.from_numpyro_svi(svi, svi_result=found, dims=model.dims, coords=model.coords)
+    bias = tree["posterior"]["bias"].sel(bias_label=list(problem.labels)).values
+    assert (np.abs(bias.mean(0) - own.mean(1)) < 0.25 * own.std(1)).all()
+    np.testing.assert_allclose(bias.std(0) / own.std(1), 1.0, atol=0.15)
+
+
 def test_what_it_refuses():
     problem = small()
+    with pytest.raises(InputError, match=r"start: the fit holds b\.position_x fixed; give the Problem of this"):
+        numpyro_model(problem, Gaussian()).start(tree_of(problem, np.zeros(len(problem.labels)), "b.position_x"))
     with pytest.raises(InputError, match="BernoulliGaussian has no density that numpyro could take"):
         numpyro_model(problem, BernoulliGaussian())
     with pytest.raises(InputError, match=r"runs in double precision only: call numpyro\.enable_x64"):

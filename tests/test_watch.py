@@ -3,22 +3,21 @@
 from dataclasses import replace
 
 import committed
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from worlds import linear, resting
 
 import probcal
-from probcal import Channel, ConstantVelocity, Network, Node, Problem, Target, simulate
+from probcal import Channel, ConstantVelocity, Network, Node, Problem, simulate
 from probcal.analysis.residuals import Innovations
 from probcal.analysis.widen import rejection, widened
 from probcal.identifiability.watch import runs, strained_starts
 from probcal.sensors import doa
 
 
-def anchored(scale=30.0):
+def anchored():
     """Five bearings-only nodes, the first one known: only the motion tells the size of the scene."""
-    places, free = [(0, 0), (200, 0), (200, 150), (0, 150), (100, -40)], {"position": scale, "heading": np.deg2rad(3)}
+    places, free = [(0, 0), (200, 0), (200, 150), (0, 150), (100, -40)], {"position": 30.0, "heading": np.deg2rad(3)}
     network = Network([doa.on(Node(f"d{k}", place, scale=free if k else None)) for k, place in enumerate(places)])
     biases = dict.fromkeys(network.labels, 0.0) | {"d1.heading": 0.07, "d2.position_x": 15.0, "d4.position_y": -9.0}
     time = np.arange(80.0)
@@ -47,7 +46,7 @@ def test_a_stated_network_ran_nowhere():
     assert strained_starts(problem, start) == []
 
 
-def far_away(std, distance, start=None):
+def far_away(std, distance):
     """Four direction finders 20 m apart, three of unknown heading, and a target far beyond them."""
     places, kind = (
         [(0, 0), (20, 0), (20, 20), (0, 20)],
@@ -59,14 +58,13 @@ def far_away(std, distance, start=None):
     time = np.arange(60.0)
     path = np.stack([distance + 20 * time, 0.3 * distance + 5 * time], 1)
     drawn = simulate(network, ConstantVelocity(0.1), time, 0, share=1.0, tracks={"target": path})
-    motion = Target(ConstantVelocity(0.1), start) if start else ConstantVelocity(0.1)
-    return Problem(network, motion, drawn.table), path, drawn.truth.biases
+    return Problem(network, ConstantVelocity(0.1), drawn.table), path
 
 
 @pytest.mark.ci
 def test_an_undeclared_start_of_a_small_array_reaches_far():
     """A target at 1 km, 50 arrays away: the track holds it within 3 sd, as with a start that is declared."""
-    problem, path, _ = far_away(0.0175, 1000.0)
+    problem, path = far_away(0.0175, 1000.0)
     track = probcal.fit(problem)["track"].to_dataset()
     off = np.abs(track["mean"].values[:, :2] - path) / track["sd"].values[:, :2]
     assert off.max() < 3.0
@@ -74,7 +72,7 @@ def test_an_undeclared_start_of_a_small_array_reaches_far():
 
 @pytest.mark.ci
 def test_a_start_that_was_never_declared_and_strains_the_fit_is_named():
-    problem, _, _ = far_away(1e-5, 60_000.0)
+    problem, _ = far_away(1e-5, 60_000.0)
     assert "was never declared and strains the fit" in probcal.fit(problem).attrs["message"]
 
 
@@ -82,7 +80,7 @@ def channels(white=1.0, autocorrelation=0.0):
     """Whiteness of two channels as `assess` writes it."""
     import xarray as xr
 
-    values = {"white": [white, 1.0], "autocorrelation": [autocorrelation, 0.0]}
+    values = {"white": [white, 1.0], "autocorrelation": [autocorrelation, 0.0], "data": [100, 100]}
     names = {"sensor": ("part", ["a", "b"]), "channel": ("part", ["range", "range"])}
     return xr.Dataset({name: ("part", value) for name, value in values.items()}, names)
 
@@ -111,8 +109,6 @@ def test_widening_takes_the_share_that_the_data_gave():
     spread = [t["posterior"]["bias"].std(("chain", "draw")).values for t in (result, tree)]
     np.testing.assert_allclose(spread[0], spread[1] * wide, rtol=1e-9)
     assert "widened by up to" in findings[0].sentence
-    assert "Their mean square" not in result.attrs["message"]
     again, nothing = widened(result, np.full(M, 4.0), "their mean square is 4")
     assert not nothing
     np.testing.assert_array_equal(again["calibration"]["sd"], after["sd"])
-    assert jnp.isfinite(after["sd"].values).all()

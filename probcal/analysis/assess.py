@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal.analysis import checks, leave, nees, pieces, predictive, residuals, scaling, verdict
+from probcal.analysis import checks, leave, nees, pieces, predictive, process, residuals, scaling, verdict
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.pieces import Change, Pieces
@@ -19,11 +19,13 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.groups import suffix
 from probcal.simulate import Key, Truth, as_key
+from probcal.smoothing.mirrors import touched
 from probcal.status import INVALID, Status
 from probcal.types import float64
 
 QUARTERS = 4
-PART = 0.1  # of its largest entry from which a bias has a substantial part in a combination
+SHARED = 1.8  # sd that an open combination of one scale may put a bias off; of four with a free common part, about 1.9
+BEYOND = 2.0  # sd that an answer as good may be away
 COPIES = 2000  # most biases of all pieces together
 
 
@@ -60,7 +62,7 @@ def _absurd(tree: xr.DataTree) -> bool:
 
 
 def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Array) -> xr.DataTree:
-    keys = jax.random.split(key)
+    keys = jax.random.split(key, 3)
     drawn = predictive.draws_of(fit, tree, keys[0])
     replicas = predictive.check(fit, drawn, keys[1])
     found = residuals.innovations(fit, replicas.kurtosis)
@@ -75,8 +77,14 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     findings += [
         Finding("wrapping", *pair) for pair in residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     ]
-    findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups)
+    findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups) + process.check(fit, keys[2])
     groups["verdict"] = _verdicts(fit, tree, found, groups)
+    if "mirror" in tree.children:
+        group = tree["mirror"].to_dataset()
+        findings += [
+            Finding("mirror", "fit", f"{name}: an answer {abs(gain):.1f} nats apart")
+            for name, gain in zip(group["mirror"].values, group["gain"].values, strict=True)
+        ]
     columns = [groups["verdict"][name].values.tolist() for name in ("verdict", "bias_label", "reason")]
     alarms = [row for row in zip(*columns, strict=True) if row[0] in ("drifting", "conflicting")]
     findings += [Finding(word, label, f"{label}: {reason}") for word, label, reason in alarms]
@@ -132,7 +140,9 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
     )  # fmt: skip
     ended = calibration["status"].values.tolist()
     status = Status(tree.attrs["status"])
-    words, reasons = verdict.judge(problem, status, ended, known, drifts, disagreements, first, _shared(tree))
+    words, reasons = verdict.judge(
+        problem, status, ended, known, drifts, disagreements, first, _shared(tree), _mirrored(fit, tree)
+    )
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}
     labels = {"bias_label": list(problem.labels)}
@@ -142,17 +152,47 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
 
 
 def _shared(tree: xr.DataTree) -> dict[int, str]:
-    """The combination, by name, that each bias has a substantial part in, of those that the data leave open."""
+    """The combination that the data leave open, by name, that would put the answer of a bias far off.
+
+    Where the truth lies c v along a combination v, an estimate under the declared scales, C = (G + I)^-1, is off by
+    c C v. Named is what is off by more than `SHARED` sd once the largest part of c v is one scale: of M biases with a
+    common part that no row tells, each is sqrt(M) sd off.
+    """
     found = dict[int, str]()
     if "direction" not in tree.children:
         return found
     group = tree["direction"].to_dataset()
-    for name, information, vector in zip(
-        group["direction"].values, group["information"].values, np.abs(group["vector"].values), strict=True
-    ):
-        if information < WEAK:
-            for m in np.flatnonzero(vector > PART * vector.max()):
-                found.setdefault(int(m), f"{name} (information {information:.2g})")
+    information, vectors = group["information"].values, group["vector"].values
+    known = tree["calibration"].to_dataset()["information"].values
+    left = np.linalg.inv(known + np.eye(vectors.shape[1]))
+    off = np.abs(vectors @ left) / np.sqrt(np.diag(left)) / np.abs(vectors).max(1, keepdims=True)
+    off[information >= WEAK] = 0.0
+    for m in np.flatnonzero(off.max(0, initial=0.0) > SHARED):
+        k = int(off[:, m].argmax())
+        found[int(m)] = f"{group['direction'].values[k]} (information {information[k]:.2g})"
+    return found
+
+
+def _mirrored(fit: Fitted, tree: xr.DataTree) -> dict[int, str]:
+    """How far each bias is another one in an answer on the other side of a mirror that fits as well.
+
+    All of them where a target touches the mirror, since it may then go on at either side.
+    """
+    found = dict[int, str]()
+    if "mirror" not in tree.children:
+        return found
+    group = tree["mirror"].to_dataset()
+    if (group["gain"].values > -group.attrs["same"]).any():
+        variances = [np.asarray(v) for v in fit.at.variances(jnp.asarray(fit.covariance))]
+        near, where = touched(fit.problem, fit.point, variances)
+        if near < BEYOND:
+            return dict.fromkeys(range(fit.problem.model.biases), f"{where}, which hides on which side it goes on")
+    for k in np.flatnonzero(group["gain"].values > -group.attrs["same"]):
+        away = group["apart"].values[k]
+        for m in np.flatnonzero(away > BEYOND):
+            found.setdefault(
+                int(m), f"it is {away[m]:.1f} sd away in an answer that fits as well: {group['mirror'].values[k]}"
+            )
     return found
 
 

@@ -8,13 +8,11 @@ import xarray as xr
 from scipy import special
 
 from probcal.analysis import leave, predictive, residuals
-from probcal.analysis.findings import NAMES, Finding
+from probcal.analysis.findings import LAGGED, NAMES, NOTABLE, PRACTICAL, Finding
 from probcal.analysis.fitted import Fitted
 from probcal.analysis.verdict import RATE
 from probcal.results.groups import suffix
 
-PRACTICAL = 1.25  # factor from 1 within which a NIS beyond its limits is no finding
-NOTABLE = 0.1  # lag-1 correlation, and mean, of innovations within which neither is
 GAIN = 5.0  # nats that a calibration must win before it is a finding
 
 
@@ -80,7 +78,8 @@ def by_channel(
             findings.append(Finding("mean", name, text))
     values |= dict(zip(("autocorrelation", "mean", "white"), extra.T, strict=True))
     names, r = [".".join(pair) for pair in labels.to_numpy(str)], extra[:, 0]
-    red = np.flatnonzero((extra[:, 2] < RATE / count) & (np.abs(r) > NOTABLE))
+    notable = np.maximum(NOTABLE, LAGGED / np.sqrt(np.bincount(group)))
+    red = np.flatnonzero((extra[:, 2] < RATE / count) & (np.abs(r) > notable))
     if len(red):
         order = red[np.argsort(-np.abs(r[red]))]
         text = f"innovations are correlated from one to the next: {_listed(names, r, order)}"
@@ -96,12 +95,13 @@ def by_channel(
 def _unlike_replicas(kind: str, names: list[str], p: np.ndarray, draws: int) -> list[Finding]:
     """Findings of the predictive p-values (parts,) that are small or near one, one sentence for those alike.
 
-    They are shares of so many draws: one more draw must not change the verdict, and few draws show nothing.
+    They are shares of so many draws: one more draw must not change the verdict, and few draws show nothing. Of many
+    parts some are extreme by chance: there must be more of them than a binomial has at the false-alarm rate.
     """
     words, found = {"misfit": ("fit worse", "fit better"), "mean": ("lie higher", "lie lower")}[kind], []
     for word, extreme in zip(words, (p + 1 / draws, 1 - p + 1 / draws), strict=True):
         out = np.flatnonzero(extreme < RATE / 2)
-        if len(out):
+        if len(out) and special.bdtrc(len(out) - 1, len(p), RATE / 2) < RATE:
             listed = ", ".join(names[k] for k in out[:NAMES])
             listed += f" and {len(out) - NAMES} more" if len(out) > NAMES else ""
             text = f"{listed}: the data {word} than replicas (posterior predictive p at most {extreme[out].max():.3f})"
@@ -193,7 +193,7 @@ def _unlike_the_rest(check: xr.Dataset) -> list[Finding]:
         text = f"{names[worst]} fits the rest {gain[worst]:.1f} nats better calibrated than as stated"
         if len(order) > 1:
             text += f"; next {names[order[1]]}, {gain[order[1]]:.1f}"
-        findings.append(Finding("rest", names[worst], text))
+        findings.append(Finding("gain", names[worst], text))
     nis, upper = check["rest_nis"].values, check["upper"].values
     for k in np.flatnonzero(nis > np.maximum(upper, PRACTICAL)):
         text = f"{names[k]} does not fit the rest even when calibrated: NIS {nis[k]:.3g} a datum, limit {upper[k]:.3g}"

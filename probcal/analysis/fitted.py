@@ -16,7 +16,7 @@ from probcal.model.rows import Linearised
 from probcal.priors import Precision
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.results.groups import datum_of, gather, suffix
+from probcal.results.groups import datum_of, gather, suffix, weight_name
 from probcal.smoothing import mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import Linearisation
@@ -87,6 +87,7 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
         raise InputError("assess: the tree is no fit; give the problem and the DataTree that fit() returned for it")
     if fit.attrs.get("motion") == "left out":
         problem = problem.unlinked() if answer is None else answer.problem
+    problem = _weighted(problem, fit["track"].to_dataset()) if answer is None else answer.problem
     group = fit["calibration"].to_dataset()
     if group["bias_label"].values.tolist() != list(problem.labels):
         raise InputError("assess: the tree was fitted with other free biases; give the problem as it was fitted")
@@ -97,6 +98,17 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
     at = linearised_at(problem.model, _point(problem, fit)) if answer is None else answer.posterior.linearised
     data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
     return Fitted(problem, at, _prior(group), covariance, picks, data)
+
+
+def _weighted(problem: Problem, track: xr.Dataset) -> Problem:
+    """The problem with the precisions of its process noise that a tree holds."""
+    weights = []
+    for r, part in enumerate(problem.model.recursions):
+        names = [weight_name(problem, r, k) for k in range(len(part.tails))]
+        if any(name not in track or len(track[name]) != len(part.time) for name in names):
+            raise InputError("assess: the tree was fitted with other process noise; give the problem as it was fitted")
+        weights.append(tuple(jnp.asarray(track[name].values) for name in names))
+    return problem.with_mixing(tuple(weights))
 
 
 def _point(problem: Problem, fit: xr.DataTree) -> Point:

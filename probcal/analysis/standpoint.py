@@ -62,7 +62,7 @@ def draw_states(problem: Problem, count: int, key: jax.Array | None) -> tuple[ja
     found = []
     for r, part in enumerate(problem.model.recursions):
         shape = (*part.drift.shape, count)
-        noise = jnp.zeros(shape) if key is None else jax.random.normal(jax.random.fold_in(key, r), shape)
+        noise = jnp.zeros(shape) if key is None else problem.model.draw_noises(key, r, count)
         L = factors(part, jnp.zeros(len(problem.levels)))
         found.append(jnp.moveaxis(rec.trajectory(part.F, L, part.drift[:, :, None], noise), 2, 0))
     return tuple(found)

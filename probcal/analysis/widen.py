@@ -6,20 +6,19 @@ import numpy as np
 import xarray as xr
 
 from probcal.analysis import residuals
-from probcal.analysis.findings import Finding
+from probcal.analysis.findings import LAGGED, NOTABLE, PRACTICAL, Finding
 from probcal.status import Status
 
-REJECTED = (
-    1e-3  # probability of the NIS of all data, or of the whiteness of any channel, below which the model is wrong
-)
+REJECTED = 1e-3  # probability of the NIS of all data, or of the whiteness of any channel, of a model that is wrong
 
 
 def rejection(found: residuals.Innovations, channels: xr.Dataset) -> str:
     """Which test of the innovations rejects the model, in words; empty where none does."""
     total = residuals.squares(found, np.zeros(len(found.value), int), 1, 2 * REJECTED)
-    if total.nis[0] > total.upper[0]:
+    if total.nis[0] > max(total.upper[0], PRACTICAL):
         return f"their mean square is {total.nis[0]:.2g} (limit {total.upper[0]:.2g})"
-    red = (channels["white"].values < REJECTED / len(channels["white"])) & (channels["autocorrelation"].values > 0)
+    lagged, notable = channels["autocorrelation"].values, np.maximum(NOTABLE, LAGGED / np.sqrt(channels["data"].values))
+    red = (channels["white"].values < REJECTED / len(lagged)) & (lagged > notable)
     if red.any():
         worst = int(np.argmax(np.where(red, channels["autocorrelation"].values, -1.0)))
         name = ".".join(str(channels[part].values[worst]) for part in ("sensor", "channel"))

@@ -46,8 +46,8 @@ def free_states(model: Model, point: Point, hold: tuple[jax.Array, ...]) -> Free
     known = information = compressed.information
     ranks = []
     for (J, _), cross, precision in zip(compressed.states, compressed.crosses, hold, strict=True):
-        root, y = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision), cross)
-        flat = y.reshape(-1, y.shape[2])
+        root = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision))
+        flat = linalg.forward(root, cross).reshape(-1, cross.shape[2])
         information = information - linalg.gram(flat, flat)
         ranks.append(jnp.sum((jnp.diagonal(root, axis1=1, axis2=2) > 0) & (precision < HELD), 1))
     return Free(information, known, tuple(ranks))

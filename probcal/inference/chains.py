@@ -55,4 +55,42 @@ def run_chunk(method: Any, form: Form, posed: Posed, chain: Any) -> tuple[Any, D
     return jax.lax.scan(one, chain, None, length=method.chunk)
 
 
+class Sided(NamedTuple):
+    """Where a chain stands that visits several sides of a mirror."""
+
+    chain: Any
+    side: jax.Array  # () which frame it moves in
+    key: jax.Array
+
+
+def side_of(sides: Posed, side: Any) -> Posed:
+    """The posterior posed on one side, of frames with a leading dim."""
+    return sides._replace(frame=jax.tree.map(lambda leaf: leaf[side], sides.frame))
+
+
+@partial(jax.jit, static_argnames=("method", "form"))
+def run_sided(method: Any, form: Form, sides: Posed, state: Sided) -> tuple[Sided, Draw]:
+    """`method.chunk` steps of one chain as in `run_chunk`, each followed by an attempt to cross to another side.
+
+    Crossing keeps hyper-parameters and the coordinates that the frame of a side whitens, an involution between any two
+    sides, and is accepted by the joint density there (`method.across`).
+    """
+    count = jax.tree.leaves(sides.frame)[0].shape[0]
+
+    def one(state: Sided, _: None) -> tuple[Sided, Draw]:
+        here = side_of(sides, state.side)
+        chain, sample = method.step(form, here, state.chain)
+        key, pick, lot = jax.random.split(state.key, 3)
+        other = (state.side + 1 + jax.random.randint(pick, (), 0, count - 1)) % count
+        moved, gain = method.across(form, here, side_of(sides, other), chain)
+        taken = jnp.log(jax.random.uniform(lot)) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
+        draw = keep(form, here, sample)
+        draw = draw._replace(stats=draw.stats | {"side": state.side, "crossed": taken})
+        after = jax.tree.map(lambda new, old: jnp.where(taken, new, old), (moved, other), (chain, state.side))
+        return Sided(after[0], after[1], key), draw
+
+    return jax.lax.scan(one, state, None, length=method.chunk)
+
+
+run_sideds = jax.jit(jax.vmap(run_sided, in_axes=(None, None, None, 0)), static_argnums=(0, 1))
 run_chunks = jax.jit(jax.vmap(run_chunk, in_axes=(None, None, None, 0)), static_argnums=(0, 1))

@@ -16,7 +16,8 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.inference.gibbs import sweep
 from probcal.inference.hierarchy import Phi
-from probcal.inference.posed import Conditional, Form, Posed, conditional
+from probcal.inference.orbits import Place, roam
+from probcal.inference.posed import Conditional, Form, Posed, conditional, prior_precision
 from probcal.inference.sampler import Sample, Sampler
 from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace, Prior
 from probcal.smoothing.frame import log_weight
@@ -154,6 +155,8 @@ class Collapsed(Sampler):
 
     name: ClassVar[str] = "Collapsed"
     priors: ClassVar[tuple[type, ...]] = (Horseshoe, BernoulliGaussian, Gaussian, Laplace, ARD, Flat)
+    crosses: ClassVar[bool] = True
+    roams: ClassVar[bool] = True
     chunk: ClassVar[int] = 50
 
     def __post_init__(self):
@@ -193,6 +196,25 @@ class Collapsed(Sampler):
             phi = update(phi, chain.theta[learnt], jax.random.fold_in(keys[2], k))
         given = conditional(form, posed, phi)
         theta, eps, weight, tries = MOVES[self.move](form, posed, chain, given, keys[3])
+        (theta, eps, weight), roamed = roam(form, posed, phi, Place(theta, eps, weight), jax.random.fold_in(keys[4], 0))
         chain = Chain(theta, eps, phi, weight, key)
         joint = weight + posed.frame.log_likelihood(theta) - 0.5 * sum(jnp.sum(e**2) for e in eps)
-        return chain, Sample(theta, eps, phi, joint, {"acceptance_rate": rate, "tries": tries, "log_weight": weight})
+        stats = {"acceptance_rate": rate, "tries": tries, "log_weight": weight}
+        stats |= {"roamed": roamed} if posed.orbits else {}
+        return chain, Sample(theta, eps, phi, joint, stats)
+
+    def across(self, form: Form, here: Posed, there: Posed, chain: Chain) -> tuple[Chain, jax.Array]:
+        """theta by the same unit normals on the other side, hyper-parameters and those of the trajectories kept."""
+        own, other = conditional(form, here, chain.phi), conditional(form, there, chain.phi)
+        eta = own.factor.T @ (chain.theta - own.mean)
+        theta = jnp.where(other.active, other.mean + other.inverse.T @ eta, 0.0)
+        weight = log_weight(there.model, there.frame, theta, chain.eps)
+        alpha, coupling = prior_precision(form, here, chain.phi)
+
+        def value(posed: Posed, given: Conditional, theta: jax.Array, weight: jax.Array) -> jax.Array:
+            square = jnp.sum(jnp.where(given.active, alpha, 0.0) * theta**2) + theta @ (coupling @ theta)
+            volume = jnp.sum(jnp.log(jnp.diagonal(given.inverse)))
+            return weight + posed.frame.log_likelihood(theta) - 0.5 * square + volume
+
+        gain = value(there, other, theta, weight) - value(here, own, chain.theta, chain.weight)
+        return chain._replace(theta=theta, weight=weight), gain

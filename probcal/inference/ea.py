@@ -5,31 +5,44 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from probcal.errors import InputError
 from probcal.inference.hierarchy import hierarchy_of
-from probcal.inference.integrate import Integration
+from probcal.inference.integrate import Integration, likelihood
 from probcal.inference.posed import Form
-from probcal.inference.run import Given, Maximiser, State, learn, valued
+from probcal.inference.relevance import best_precisions
+from probcal.inference.run import (
+    Context,
+    Given,
+    Maximiser,
+    State,
+    first_precision,
+    learn,
+    maximise,
+    reweighted,
+    valued,
+)
 from probcal.model.model import Model
 from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
 from probcal.smoothing.information import paper_b, update_levels
 from probcal.smoothing.linearised import laplace_of
 from probcal.smoothing.marginal import find_marginal_mode
-from probcal.smoothing.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, track
+from probcal.smoothing.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, mixing_gain, track
 
 RULES = ("mackay", "em")
 MODES = ("joint", "marginal")
 STEPS = 30  # between two updates of precisions or levels
 FEW = 2  # of the marginal mode, each of which costs several joint ones, where precisions are learnt
 MANY = 500  # biases beyond which precisions are integrated by expectation propagation in the place of sweeps
+BETTER, GAIN = 5, 0.1  # most times that a climb begins again from better precisions, and nats that make them so
 PRECISIONS = ("integrated", "maximised")
 TRAJECTORIES = (*MODES, "smoothed")
 
 
-def _learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -> State:
-    """The state with precisions and levels that follow from what the last iteration found, if there was one."""
+def _learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -> tuple[Model, State]:
+    """Model and state with precisions and levels that follow from what the last iteration found, if there was one."""
     fresh = jnp.isneginf(state.objective)
     alpha = learn(
         prior, given, state.alpha, state.found.gamma, jnp.diagonal(state.found.covariance), state.point.z, rule
@@ -38,7 +51,8 @@ def _learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -
     if point.levels.shape[0]:
         moved = update_levels(model, point, state.found.covariance)
         point = jax.tree.map(lambda after, before: jnp.where(fresh, before, after), moved, point)
-    return state._replace(point=point, alpha=jnp.where(fresh, state.alpha, alpha))
+    state = state._replace(point=point, alpha=jnp.where(fresh, state.alpha, alpha))
+    return reweighted(model, state, state.found.covariance)
 
 
 def _climb(
@@ -53,9 +67,9 @@ def _climb(
 
 def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, trajectory: str) -> State:
     """New precisions and levels, then the mode and the evidence at that mode: all of one state belongs together."""
-    state = _learnt(model, prior, given, state, rule)
+    model, state = _learnt(model, prior, given, state, rule)
     now = given.prior._replace(alpha=state.alpha)
-    steps = FEW if prior.learns and trajectory == "marginal" else STEPS
+    steps = FEW if (prior.learns or model.tailed) and trajectory == "marginal" else STEPS
     mode, solved = _climb(model, state.point, now, steps, 1e-2 * given.tolerance, trajectory)
     found = laplace_of(model, mode.point, solved, now)
     objective = (
@@ -64,7 +78,8 @@ def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, 
     still = jnp.abs(objective - state.objective) < given.tolerance
     # where a target grazes a sensor the density has a cusp: no step lowers the cost, and none is needed
     settled = mode.converged | (mode.gained < given.tolerance)
-    done = still & settled if prior.learns or mode.point.levels.shape[0] else mode.converged
+    learns = prior.learns or mode.point.levels.shape[0] or model.tailed
+    done = still & settled if learns else mode.converged
     refused = state.refused & mode.refused
     state = state._replace(point=mode.point, found=found, objective=objective, refused=refused, done=done)
     return valued(prior, given, state)
@@ -74,12 +89,12 @@ def _density(model: Model, prior: Prior, given: Given, point: Point) -> jax.Arra
     """Log joint density with the prior's own penalty."""
     held = given.prior._replace(alpha=jnp.where(given.surveyed, given.prior.alpha, 0.0))
     penalty = jnp.where(given.surveyed, 0.0, prior.penalty(point.z, 0.0))
-    return -cost(model, point, held) - jnp.sum(penalty)
+    return mixing_gain(model) - cost(model, point, held) - jnp.sum(penalty)
 
 
 def _iterate_paper_b(model: Model, prior: Prior, given: Given, state: State, rule: str) -> State:
     """Smooth at the current biases, then their posterior (16)-(17) for the precisions (25) of Paper B."""
-    state = _learnt(model, prior, given, state, rule)
+    model, state = _learnt(model, prior, given, state, rule)
     point = track(model, state.point)
     found, step = paper_b(model, point, given.prior._replace(alpha=state.alpha))
     refused = state.refused & ~jnp.all(jnp.isfinite(step))
@@ -98,8 +113,9 @@ class EA(Maximiser):
     the Gaussian likelihood of the biases there, and integrates the precisions of a proper hierarchical prior
     (`Horseshoe` by default): by Gibbs sweeps, above 500 biases by expectation propagation. The answer is a mixture.
     "maximised" climbs to the precisions of largest evidence (type-II maximum likelihood, Paper B 24-25) and takes them
-    as known. An ARD prior with a flat hyper-prior has no posterior and is always maximised. Noise levels that are
-    unknown maximise the evidence and are held.
+    as known; where nothing gains any more, single precisions are set to their exact maximum and groups of biases (one
+    component, one node) taken out or in together (Tipping, Faul 2003). An ARD prior with a flat hyper-prior has no
+    posterior and is always maximised. Noise levels that are unknown maximise the evidence and are held.
 
     `trajectory` says what the reported point is: "marginal" the mode of the biases with the trajectory integrated
     (Laplace; see `smoothing.marginal`), "joint" that of biases and trajectory together, which shrinks a scene whose
@@ -148,6 +164,35 @@ class EA(Maximiser):
     def takes(self, prior: Prior) -> bool:
         """Any hierarchical prior where precisions are integrated, else ARD."""
         return isinstance(prior, self.priors if self.precisions == "integrated" else ARD)
+
+    def climb(self, problem: Problem, prior: Prior, start: Point, context: Context) -> tuple[State, np.ndarray]:
+        """The outer loop; where each precision is maximised alone, again from better ones while there are any."""
+        state, trace = maximise(self, problem, prior, start, context)
+        alone = isinstance(prior, ARD) and (prior.shape, prior.rate, prior.by) == (1.0, 0.0, None)
+        if self.trajectory != "marginal" or not alone:
+            return state, trace
+        for _ in range(BETTER):
+            alpha, gain = self._better(problem, prior, state)
+            if gain <= GAIN or not np.isfinite(float(state.objective)):
+                break
+            tried, more = maximise(self, problem.with_mixing(state.mixing), prior, state.point, context, alpha)
+            if not float(tried.objective) > float(state.objective) + self.tolerance:
+                break
+            state, trace = tried, np.concatenate([trace, more])
+        return state, trace
+
+    def _better(self, problem: Problem, prior: Prior, state: State) -> tuple[np.ndarray, float]:
+        """Precisions of largest evidence on the Gaussian likelihood at a state, and the nats that they gain."""
+        how = Integration(Form(problem.model.biases, hierarchy_of(Gaussian(), problem)), True)
+        model = problem.model.with_mixing(state.mixing)
+        known, sound = likelihood(how, model, first_precision(problem, prior), state.point)
+        if not bool(sound):
+            return np.asarray(state.alpha), 0.0
+        learnt, members = np.flatnonzero(~problem.surveyed).tolist(), problem.members
+        names = dict.fromkeys((kind, members[m][kind]) for kind in ("component", "owner") for m in learnt)
+        sets = [[m for m in learnt if members[m][kind] == name] for kind, name in names]
+        information = np.asarray(known.information + known.first.coupling)
+        return best_precisions(information, np.asarray(known.pull), np.asarray(state.alpha), learnt, sets)
 
     def integrates(self, prior: Prior) -> bool:
         """Whether the precisions of a prior are integrated: a flat hyper-prior leaves no posterior."""

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
-from probcal.inference.run import Given, Maximiser, State, learn, valued
+from probcal.inference.run import Given, Maximiser, State, learn, reweighted, valued
 from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
 from probcal.smoothing.esteps import EStep, Extended, shorten
 from probcal.smoothing.information import update_levels
 from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import Point, cost
+from probcal.smoothing.mode import Point, cost, mixing_gain
 from probcal.smoothing.solves import Dense
 
 EXTENDED = Extended()
@@ -48,9 +48,12 @@ def _iterate(model: Model, prior: Prior, given: Given, state: State, inner: int,
     alpha = learn(prior, given, state.alpha, jnp.zeros_like(variance), variance, point.z, "em")
     if point.levels.shape[0]:
         point = update_levels(model, point, jnp.diag(variance))
+    state = state._replace(point=point)
+    model, state = reweighted(model, state, jnp.diag(variance))
+    point = state.point
     after = given.prior._replace(alpha=alpha)
     free = jnp.where(given.surveyed, 0.0, prior.penalty(point.z, alpha) - 0.5 * alpha * point.z**2)
-    value = -cost(model, point, after) - jnp.sum(free)
+    value = mixing_gain(model) - cost(model, point, after) - jnp.sum(free)
     if prior.proper:
         value = value + 0.5 * after.log_determinant()
     done = jnp.abs(value - state.objective) < given.tolerance

@@ -24,13 +24,15 @@ from probcal.inference.storage import Storage
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, tracks_of, uncalibrated
-from probcal.results.build import add_optima, bands, build, build_tracks
+from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
 from probcal.results.read import apply
 from probcal.simulate import Key, as_key
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import linearise
+from probcal.smoothing.mirrors import SAME, Mirrored
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start, track_mode
+from probcal.smoothing.tails import settle
 from probcal.status import Status
 from probcal.types import float64
 
@@ -38,7 +40,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SAVE = ("states", "predictive")
-NAMED = 4  # directions that a message names
+NAMED = 4  # directions, or biases, that a message names
+DIFFERENT = 2.0  # sd from which a bias is another one in another answer
 
 
 @float64
@@ -111,6 +114,8 @@ def calibrate(
         found = build(answer, directions, keys[1], keep)
     if answer.optima:
         found = add_optima(found, answer.optima, answer.best)
+    if answer.mirrors:
+        found = add_mirrors(found, answer)
     found.attrs["seed"] = int(key) if isinstance(key, (int, np.integer)) else -1
     if store is not None:
         found.attrs["identity"] = storage.digest
@@ -155,7 +160,26 @@ def _watched(answer: Answer) -> Answer:
             "Target(motion, start={...})."
             for name, far in strained_starts(problem, point)
         ]
+    found += [_mirrored(answer, other) for other in answer.mirrors]
     return replace(answer, status=status, message=" ".join(found))
+
+
+def _mirrored(answer: Answer, other: Mirrored) -> str:
+    """What to say of an answer on the other side of a mirror."""
+    problem = answer.problem
+    away = np.abs(other.shift) / np.maximum(answer.posterior.here[1], 1e-12)
+    labels = [problem.labels[m] for m in np.argsort(-away) if away[m] > DIFFERENT]
+    more = f" and {len(labels) - NAMED} more" if len(labels) > NAMED else ""
+    where = (
+        f"{other.name}, with other {', '.join(labels[:NAMED])}{more}" if labels else f"{other.name}, the biases alike"
+    )
+    if other.gain <= -SAME:
+        return f"Another answer fits {-other.gain:.1f} nats worse only: {where}."
+    word = "line" if problem.network.dimension == 2 else "plane"
+    return (
+        f"Another answer fits as well ({abs(other.gain):.1f} nats apart): {where}. Survey a position off that {word},"
+        " or declare on which side a target starts, Target(motion, start={...})."
+    )
 
 
 def _check_store(method: Method, store: str | PathLike[str] | None, resume: bool, overwrite: bool) -> None:
@@ -195,4 +219,7 @@ def track(problem: Problem, calibration: xr.DataTree) -> xr.DataTree:
     start = at_levels(problem.model, automatic_start(problem), jnp.asarray(found.levels))
     before = track_mode(problem, uncalibrated(start))
     after = track_mode(problem, start._replace(z=jnp.asarray(found.z)))
+    if problem.model.tailed:
+        _, before = settle(problem, before, jnp.zeros_like(covariance))
+        problem, after = settle(problem, after, covariance)
     return build_tracks(problem, bands(tracks_of(linearise(problem.model, after), covariance), before))

@@ -1,26 +1,43 @@
 """The joint posterior as a numpyro model, open to every kernel, guide and handler of numpyro.
 
-Nothing of the frame enters: sites are the declared quantities, trajectories written by their whitened noises.
+Nothing of the frame enters the density: sites are the declared quantities, trajectories written by their whitened
+noises.
 """
 
+from __future__ import annotations
+
 import math
-from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 from numpyro import distributions as dist
 
 from probcal.errors import InputError, nearest
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
+from probcal.inference.pose import pilot
+from probcal.inference.posed import Form, Posed
 from probcal.model import rows
+from probcal.model.model import Model
 from probcal.model.rows import Block, Rows
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem, check_linear
-from probcal.smoothing.mode import factors
+from probcal.results.groups import suffix
+from probcal.results.read import apply
+from probcal.smoothing.frame import frame_at
+from probcal.smoothing.information import at_levels
+from probcal.smoothing.mode import Point, factors
 from probcal.smoothing.recursion import trajectory
+from probcal.smoothing.start import automatic_start, track_mode
 from probcal.types import float64
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 DENSE = (Horseshoe, Gaussian, Laplace, ARD, Flat)  # priors with a density
 
@@ -61,8 +78,31 @@ class Measured(dist.Distribution):
         return jax.vmap(one)(value.reshape(-1, *self.batch_shape)).reshape(value.shape)
 
 
+class Mixed(dist.Distribution):
+    """Process noises (E, n) of one recursion, some of them scale mixtures whose precisions are integrated."""
+
+    support = dist.constraints.independent(dist.constraints.real, 2)
+
+    def __init__(self, model: Model, r: int):
+        self.model, self.r = model, r
+        super().__init__((), model.recursions[r].drift.shape)
+
+    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+        """Draws (*sample_shape, E, n)."""
+        drawn = self.model.draw_noises(key, self.r, math.prod(sample_shape))
+        return jnp.moveaxis(drawn, 2, 0).reshape(*sample_shape, *self.event_shape)
+
+    def log_prob(self, value: jax.Array) -> jax.Array:
+        """Log density (...) of noises (..., E, n)."""
+        found = jnp.sum(-0.5 * value**2 - 0.5 * math.log(2 * math.pi), (-1, -2))
+        for tail in self.model.recursions[self.r].tails:
+            square = jnp.sum(value[..., slice(*tail.columns)] ** 2, -1)
+            found = found + jnp.sum(jnp.where(tail.on, tail.family.mixing_density(square, tail.size), 0.0), -1)
+        return found
+
+
 @float64
-def numpyro_model(problem: Problem, prior: Prior | None = None) -> Callable[..., None]:
+def numpyro_model(problem: Problem, prior: Prior | None = None) -> NumpyroModel:
     """The joint posterior of a problem as a numpyro model `model(data=None, *, observed=True)`.
 
     `model()` conditions on the problem's own rows. `data` maps sites `y_TYPE` to other values (N, C), NaN where
@@ -73,6 +113,25 @@ def numpyro_model(problem: Problem, prior: Prior | None = None) -> Callable[...,
     of ARD, `variance` of Laplace), `z` (M,) biases over scales, `level` (H,) log levels over their guesses, `noise`
     (E, n) whitened noises of the trajectories, `y_TYPE`; deterministic `bias` (M,) in units and `state` (E, n). With
     several recursions `noise`, `state` and the `y_TYPE` of a type that sees several end in `_0`, `_1`, ...
+
+    numpyro's own start is a track far from the data, from which kernels and guides may never find the posterior.
+    `model.start()` gives values of all latent sites at the automatic start, `model.start(tree)` at a fit's result;
+    `model.dims` and `model.coords` label what is drawn:
+
+    ```python
+    import arviz as az, jax
+    from numpyro.infer import MCMC, NUTS, init_to_value
+
+    with jax.enable_x64(True):
+        model = numpyro_model(problem, prior)
+        mcmc = MCMC(NUTS(model, init_strategy=init_to_value(values=model.start())), num_warmup=500, num_samples=500)
+        mcmc.run(jax.random.key(0))
+        tree = az.from_numpyro(mcmc, dims=model.dims, coords=model.coords)
+    ```
+
+    and a guide is `AutoMultivariateNormal(model, init_loc_fn=init_to_value(values=model.start()), init_scale=0.01)`.
+    The sites are not whitened by the data: with precise bearings and starts that are not declared numpyro's kernels
+    mix slowly; look at r_hat, or take `fit(problem, probcal.NUTS())`.
 
     numpyro must run in double precision: `numpyro.enable_x64()`, or all of it inside `with jax.enable_x64(True):`.
     Raises `InputError` for a prior without density (`BernoulliGaussian`), and the model for single precision, for
@@ -85,39 +144,108 @@ def numpyro_model(problem: Problem, prior: Prior | None = None) -> Callable[...,
             f" {', '.join(kind.__name__ for kind in DENSE)}, or fit BernoulliGaussian by Collapsed()"
         )
     check_linear(problem)
-    hierarchy = hierarchy_of(prior, problem)
-    first = prior.precision(problem.labels, problem.surveyed)
-    of, scales = problem.model, jnp.asarray(problem.scales)
-    suffixes = [f"_{r}" for r in range(len(of.recursions))] if len(of.recursions) > 1 else [""]
-    kinds = [block.type.name for block in of.blocks]
-    sites = [
-        f"y_{name}{suffixes[r] if kinds.count(name) > 1 else ''}" for name, r in zip(kinds, of.recursion, strict=True)
-    ]
+    return NumpyroModel(problem, hierarchy_of(prior, problem), prior.precision(problem.labels, problem.surveyed))
 
-    def model(data: Mapping[str, Any] | None = None, *, observed: bool = True) -> None:
+
+@dataclass(frozen=True, eq=False)
+class NumpyroModel:
+    """The joint posterior of a problem for numpyro (see `numpyro_model`)."""
+
+    problem: Problem
+    hierarchy: Hierarchy
+    first: Precision  # prior of the biases that no hierarchy governs
+
+    @cached_property
+    def sites(self) -> list[str]:
+        """Names of the observed sites, one for each block of rows."""
+        model = self.problem.model
+        kinds = [block.type.name for block in model.blocks]
+        return [
+            f"y_{name}{suffix(self.problem, r) if kinds.count(name) > 1 else ''}"
+            for name, r in zip(kinds, model.recursion, strict=True)
+        ]
+
+    def __call__(self, data: Mapping[str, Any] | None = None, *, observed: bool = True) -> None:
+        """Sample every site, in double precision only."""
         if jnp.zeros(()).dtype != jnp.float64:
             raise InputError(
                 "a numpyro_model runs in double precision only: call numpyro.enable_x64() before,"
                 " or run numpyro inside `with jax.enable_x64(True):`"
             )
-        given = _given(data, sites, of.rows)
-        phi = {name: numpyro.sample(name, d.to_event()) for name, d in hierarchy.hyper().items()}
-        z = _biases(hierarchy, first, phi)
-        numpyro.deterministic("bias", scales * z)
+        of = self.problem.model
+        given = _given(data, self.sites, of.rows)
+        phi = {name: numpyro.sample(name, d.to_event()) for name, d in self.hierarchy.hyper().items()}
+        z = _biases(self.hierarchy, self.first, phi)
+        numpyro.deterministic("bias", jnp.asarray(self.problem.scales) * z)
         levels = jnp.zeros(0)
-        if problem.levels:
+        if self.problem.levels:
             levels = numpyro.sample("level", dist.Normal(0.0, of.level_spread).to_event())
         states = []
-        for part, suffix in zip(of.recursions, suffixes, strict=True):
-            unit = dist.Normal(jnp.zeros_like(part.drift), 1.0).to_event()
-            u = numpyro.sample(f"noise{suffix}", unit)
+        for r, part in enumerate(of.recursions):
+            s = suffix(self.problem, r)
+            unit = Mixed(of, r) if part.tails else dist.Normal(jnp.zeros_like(part.drift), 1.0).to_event()
+            u = numpyro.sample(f"noise{s}", unit)
             x = trajectory(part.F, factors(part, levels), part.drift[:, :, None], u[:, :, None])[:, :, 0]
-            states.append(numpyro.deterministic(f"state{suffix}", x))
-        for site, block, own, r in zip(sites, of.blocks, of.rows, of.recursion, strict=True):
+            states.append(numpyro.deterministic(f"state{s}", x))
+        for site, block, own, r in zip(self.sites, of.blocks, of.rows, of.recursion, strict=True):
             predicted = rows.predict(block, own, states[r], z)
             numpyro.sample(site, Measured(block, own, predicted, levels), obs=given[site] if observed else None)
 
-    return model
+    @float64
+    def start(self, at: xr.DataTree | Point | None = None) -> dict[str, np.ndarray]:
+        """Values of the latent sites to start from, by site: those of the automatic start, a fit's tree or a point.
+
+        Biases and levels are those of the start, trajectories at their mode given them, hyper-parameters at their
+        median under the Gaussian likelihood there. Raises `InputError` for a fit that lacks a bias, or holds one fixed
+        that this problem does not.
+        """
+        point = at if isinstance(at, Point) else _started(self.problem, at)
+        found = {"z": point.z} | ({"level": point.levels} if self.problem.levels else {})
+        found |= {f"noise{suffix(self.problem, r)}": u for r, u in enumerate(point.noises)}
+        if self.hierarchy.learnt:
+            posed = Posed(self.problem.model, frame_at(self.problem.model, point), self.first)
+            drawn = pilot(Form(self.problem.model.biases, self.hierarchy), posed, jax.random.key(0))
+            found |= {name: np.median(values, 0) for name, values in drawn.phi.items()}
+        return {name: np.asarray(value) for name, value in found.items()}
+
+    @property
+    def dims(self) -> dict[str, list[str]]:
+        """Dimensions of every site beyond those of the draws, for `az.from_numpyro`."""
+        found = {"z": ["bias_label"], "bias": ["bias_label"], "level": ["level_label"]}
+        found |= {name: list(dims) for name, (dims, *_) in self._hyper.items()}
+        for r in range(len(self.problem.epochs)):
+            s = suffix(self.problem, r)
+            found |= {f"noise{s}": [f"epoch{s}", f"noise_component{s}"], f"state{s}": [f"epoch{s}", f"component{s}"]}
+        return found | {site: [f"row_{site[2:]}", f"channel_{site[2:]}"] for site in self.sites}
+
+    @property
+    def coords(self) -> dict[str, Sequence[Any]]:
+        """Labels along these dimensions; `row_TYPE` are lines of the table."""
+        problem = self.problem
+        found: dict[str, Sequence[Any]] = {"bias_label": list(problem.labels)}
+        found["level_label"] = [level.label for level in problem.levels]
+        for _, _, *own in self._hyper.values():
+            found |= own[0] if own else {}
+        found |= {f"component{suffix(problem, r)}": list(e.components) for r, e in enumerate(problem.epochs)}
+        for site, columns, index in zip(self.sites, problem.columns, problem.row_index, strict=True):
+            found[f"channel_{site[2:]}"] = list(columns)
+            found[f"row_{site[2:]}"] = problem.measurements.table.lines[index]
+        return found
+
+    @property
+    def _hyper(self) -> dict[str, Any]:
+        return self.hierarchy.variables(self.problem.labels, dict.fromkeys(self.hierarchy.hyper()))
+
+
+def _started(problem: Problem, tree: xr.DataTree | None) -> Point:
+    """The automatic start, or biases and levels of a fit with the trajectories at their mode."""
+    if tree is None:
+        return automatic_start(problem)
+    found = apply(problem, tree)
+    if held := [label for label in problem.labels if label not in found.problem.labels]:
+        raise InputError(f"start: the fit holds {', '.join(held)} fixed; give the Problem of this model the same fix=")
+    point = at_levels(problem.model, automatic_start(problem), jnp.asarray(found.levels))
+    return track_mode(problem, point._replace(z=jnp.asarray(found.z)))
 
 
 def _biases(hierarchy: Hierarchy, first: Precision, phi: Phi) -> jax.Array:

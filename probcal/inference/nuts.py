@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
-from probcal.inference.coordinates import Free, parts
+from probcal.inference.coordinates import Free, Parts, parts
 from probcal.inference.hierarchy import Phi
+from probcal.inference.orbits import Place, roam
 from probcal.inference.posed import Form, Posed, conditional
 from probcal.inference.sampler import Sample, Sampler
 from probcal.lazy import Later
@@ -39,6 +40,8 @@ class NUTS(Sampler):
 
     name: ClassVar[str] = "NUTS"
     priors: ClassVar[tuple[type, ...]] = (Horseshoe, Gaussian, Laplace, ARD, Flat)
+    crosses: ClassVar[bool] = True
+    roams: ClassVar[bool] = True
     chunk: ClassVar[int] = 20
 
     def __post_init__(self):
@@ -76,6 +79,7 @@ class NUTS(Sampler):
         self._started(kernels, chain.z, chain.rng_key)  # hands its settings to the kernel; its state is not used
         chain = kernels[1](chain)
         found = parts(form, posed, chain.z)
+        chain, found, roamed = self._roamed(form, posed, chain, found)
         stats = {
             "acceptance_rate": chain.accept_prob,
             "diverging": chain.diverging,
@@ -84,4 +88,23 @@ class NUTS(Sampler):
             "energy": chain.energy,
             "step_size": chain.adapt_state.step_size,
         }
+        stats |= {"roamed": roamed} if posed.orbits else {}
         return chain, Sample(found.theta, chain.z.eps, found.phi, found.joint, stats)
+
+    def _roamed(self, form: Form, posed: Posed, chain: Any, found: Parts) -> tuple[Any, Parts, jax.Array]:
+        """The chain after a proposal along each orbit."""
+        if not posed.orbits:
+            return chain, found, jnp.zeros(())
+        square = sum(jnp.sum(e**2) for e in chain.z.eps)
+        weight = found.joint + 0.5 * square - posed.frame.log_likelihood(found.theta)
+        begun = Place(found.theta, chain.z.eps, weight)
+        at, roamed = roam(form, posed, found.phi, begun, jax.random.fold_in(chain.rng_key, 1))
+        given = conditional(form, posed, found.phi)
+        free = chain.z._replace(eta=given.factor.T @ (at.theta - given.mean), eps=at.eps)
+        energy, slope = jax.value_and_grad(lambda own: -parts(form, posed, own).density)(free)
+        return chain._replace(z=free, potential_energy=energy, z_grad=slope), parts(form, posed, free), roamed
+
+    def across(self, form: Form, here: Posed, there: Posed, chain: Any) -> tuple[Any, jax.Array]:
+        """The same coordinates on the other side."""
+        energy, slope = jax.value_and_grad(lambda free: -parts(form, there, free).density)(chain.z)
+        return chain._replace(potential_energy=energy, z_grad=slope), chain.potential_energy - energy

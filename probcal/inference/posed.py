@@ -59,6 +59,7 @@ class Posed(NamedTuple):
     model: Model
     frame: Frame
     first: Precision
+    orbits: tuple[Any, ...] = ()  # `orbits.Orbit`s that chains move along
 
     @property
     def information(self) -> jax.Array:

@@ -21,6 +21,7 @@ from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, lo
 from probcal.results.schema import INTERVAL, ROPE
 from probcal.smoothing.draws import draws_a_chain, predictive
 from probcal.smoothing.information import at_levels, mean_square
+from probcal.smoothing.mirrors import Mirrored
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import track_mode
 from probcal.status import Status
@@ -32,6 +33,7 @@ else:
 
 R_HAT = 1.01  # above which chains have not mixed
 ESS = 100  # effective draws a chain below which its quantiles are not to be trusted
+UNSURE = 0.1  # standard error of the weight of a side above which it is not known
 BFMI = 0.3  # below which the energy is not explored (Betancourt 2016)
 
 
@@ -89,6 +91,12 @@ class Chains(Posterior):
         return cls(problem, prior, mean_point(problem, run), summary, run)
 
     @property
+    def here(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and sd (M,) of the biases on the heaviest side of a mirror."""
+        mine = self.run.z[self.run.side == heaviest(self.run)]
+        return mine.mean(0), mine.std(0) if len(mine) > 1 else self.summary.sd
+
+    @property
     def states(self) -> Sequence[np.ndarray]:
         """Mean states (E, n) of each recursion."""
         return [x.mean((0, 1)) for x in self.run.states]
@@ -137,20 +145,50 @@ class Chains(Posterior):
 
 def conclude_draws(problem: Problem, prior: Prior, run: Sampled) -> Answer:
     """The answer of a sampler's run."""
-    mixed = mixing(np.asarray(run.draws.theta))
+    mixed = mixing(within_sides(np.asarray(run.draws.theta), run.side))
     posterior = Chains.of(problem, prior, run, mixed)
     status, message = judge(problem, prior, run, mixed, posterior.point)
     ended = _bias_status(problem, mixed, run.form.biases)
     return Answer(
         problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
-        interrupted=run.interrupted,
+        interrupted=run.interrupted, mirrors=_mirrors(run),
     )  # fmt: skip
 
 
+def within_sides(draws: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """Draws (chain, draw, P) less the mean of their side of a mirror (chain, draw): what must mix on each."""
+    found = np.array(draws)
+    for k in np.unique(side):
+        found[side == k] -= draws[side == k].mean(0)
+    return found
+
+
+def heaviest(run: Sampled) -> int:
+    """The side of a mirror that most draws are on."""
+    return int(np.bincount(run.side.ravel()).argmax())
+
+
+def _mirrors(run: Sampled) -> tuple[Mirrored, ...]:
+    """The other sides that draws are on, seen from the heaviest: log ratio of weights, and shift of the means."""
+    first, share = heaviest(run), np.bincount(run.side.ravel(), minlength=len(run.sides) + 1) / run.side.size
+    middle = run.z[run.side == first].mean(0)
+    found = []
+    for k in np.flatnonzero(share):
+        if k != first:
+            other = run.sides[int(k or first) - 1]  # of the first side, what was reflected to leave it
+            shift = run.z[run.side == k].mean(0) - middle
+            point = other.point if k else run.posed.frame.point
+            found.append(Mirrored(other.name, float(np.log(share[k] / share[first])), point, shift))
+    return tuple(found)
+
+
 def mean_point(problem: Problem, run: Sampled) -> Point:
-    """Posterior means of biases and levels, trajectories at their mode there."""
-    start = at_levels(problem.model, run.posed.frame.point, jnp.asarray(run.levels.mean((0, 1))))
-    return track_mode(problem, start._replace(z=jnp.asarray(run.z.mean((0, 1)))))
+    """Posterior means of biases and levels on the heaviest side, trajectories at their mode there."""
+    side = heaviest(run)
+    start = run.posed.frame.point if side == 0 else run.sides[side - 1].point
+    mine = run.side == side
+    start = at_levels(problem.model, start, jnp.asarray(run.levels[mine].mean(0)))
+    return track_mode(problem, start._replace(z=jnp.asarray(run.z[mine].mean(0))))
 
 
 def _by_datum(
@@ -240,6 +278,7 @@ def judge(
     if mixed["ess"][worst] < ESS * chains:
         said.append(f"Only {mixed['ess'][worst]:.0f} effective draws of {names[worst]}; take more draws.")
         good = False
+    good = _say_sides(run, said) and good
     square = float(mean_square(problem.model, mean))
     if not square <= ABSURD:
         return Status.MISFIT, " ".join([misfit_sentence(problem, mean, square), *said])
@@ -252,6 +291,21 @@ def judge(
         said.append("Some biases lie far from the stated values: use a prior, or fix some.")
         return Status.DIVERGED, " ".join(said)
     return Status.CONVERGED if good else Status.NOT_CONVERGED, " ".join(said)
+
+
+def _say_sides(run: Sampled, said: list[str]) -> bool:
+    """What each side of a mirror weighs, and whether the chains agree on it."""
+    counts = [np.bincount(own, minlength=len(run.sides) + 1) / len(own) for own in run.side]
+    share = np.mean(counts, 0)
+    if np.count_nonzero(share) < 2:
+        return True
+    error = np.std(counts, 0) / np.sqrt(max(len(counts) - 1, 1))
+    listed = ", ".join(f"{share[k]:.2f} ± {error[k]:.2f}" for k in np.flatnonzero(share))
+    said.append(f"The posterior has {np.count_nonzero(share)} sides, of weights {listed}; r_hat is within sides.")
+    if error.max() > UNSURE:
+        said.append("The chains hardly cross between the sides, so that their weights are not known; take more draws.")
+        return False
+    return True
 
 
 def _say_steps(run: Sampled, said: list[str]) -> bool:

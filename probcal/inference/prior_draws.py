@@ -49,7 +49,7 @@ def draw_prior(form: Form, model: Model, first: Precision, key: jax.Array) -> Dr
     levels = model.level_spread * jax.random.normal(keys[2], model.level_spread.shape)
     states, noises = [], []
     for r, part in enumerate(model.recursions):
-        noise = jax.random.normal(jax.random.fold_in(keys[3], r), part.drift.shape)
+        noise = model.draw_noises(keys[3], r, 1)[:, :, 0]
         path = trajectory(part.F, factors(part, levels), part.drift[:, :, None], noise[:, :, None])
         states.append(path[:, :, 0])
         noises.append(noise)

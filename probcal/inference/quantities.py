@@ -27,7 +27,7 @@ from probcal.model.model import At, Model
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.frame import volume
-from probcal.smoothing.mode import Point, log_density, log_likelihood
+from probcal.smoothing.mode import Point, log_likelihood, mixed_density
 
 if TYPE_CHECKING:
     from arviz_stats.base import array_stats
@@ -99,7 +99,7 @@ def _joint(form: Form, posed: Posed, point: Point, phi: Phi) -> jax.Array:
     """Log joint density of data, noises and biases at the truth, as samplers keep it of each draw."""
     theta = jnp.concatenate([point.z, point.levels])
     spread = volume(posed.model, posed.frame, theta)
-    return log_density(posed.model, point) + spread + log_prior(form, posed, theta, phi)
+    return mixed_density(posed.model, point) + spread + log_prior(form, posed, theta, phi)
 
 
 class Trial(NamedTuple):

@@ -19,7 +19,7 @@ from probcal.errors import InputError
 from probcal.inference.ending import conclude
 from probcal.inference.integrate import Integration, integrate
 from probcal.inference.storage import Storage
-from probcal.model.model import Model
+from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, PRECISION_BOUNDS, Precision, Prior
 from probcal.priors import Laplace as LaplacePrior
 from probcal.problem import Problem
@@ -27,6 +27,7 @@ from probcal.results.answer import Answer
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.linearised import Laplace
 from probcal.smoothing.mode import Point
+from probcal.smoothing.tails import expected_mixing, rewhitened
 
 CHUNK = 5  # outer iterations between two reports of progress
 Progress = Callable[[str, int, float], None]  # method, iterations done, current objective
@@ -54,6 +55,7 @@ class State(NamedTuple):
     done: jax.Array  # ()
     seed: jax.Array  # key of what the method draws next
     carry: Any  # what the method keeps between two iterations, a pytree of fixed form
+    mixing: Mixing  # weights of process noise that is not Gaussian
 
 
 class Context(NamedTuple):
@@ -108,13 +110,18 @@ class Maximiser(Method, ABC):
 
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Climb from a start until it is done or its iterations are spent."""
-        state, trace = maximise(self, problem, prior, start, context)
+        state, trace = self.climb(problem, prior, start, context)
         how, mixed = self.integration(problem, prior), None
+        problem = problem.with_mixing(state.mixing)
         if how is not None:
             first = first_precision(problem, prior)
             mixed = integrate(how, problem.model, first, state.point, context.key, search=True)
         square = float(mean_square(problem.model, state.point if mixed is None else mixed.point))
         return conclude(problem, self, prior, state, trace, square, len(trace), how, mixed)
+
+    def climb(self, problem: Problem, prior: Prior, start: Point, context: Context) -> tuple[State, np.ndarray]:
+        """The last state of the outer loop and the objectives on the way."""
+        return maximise(self, problem, prior, start, context)
 
     def climbs_under(self, prior: Prior) -> Prior:
         """The prior of the climb: where precisions are integrated after it, not that of the fit."""
@@ -171,19 +178,33 @@ def given_of(method: Maximiser, problem: Problem, prior: Prior) -> Given:
     )
 
 
-def first_state(given: Given, start: Point, carry: Any, seed: jax.Array) -> State:
+def first_state(given: Given, model: Model, start: Point, carry: Any, seed: jax.Array) -> State:
     """State before the first iteration."""
     alpha, low = given.prior.alpha, np.array(-np.inf)
     M = alpha.shape[0]
     nothing = Laplace(*jax.device_put((np.zeros((M, M)), np.zeros((M, M)), np.zeros(M), low)))
     worst, refused, done = jax.device_put((low, np.array(True), np.array(False)))
-    return State(start, alpha, nothing, worst, worst, worst, refused, done, seed, carry)
+    return State(start, alpha, nothing, worst, worst, worst, refused, done, seed, carry, model.mixing)
 
 
 def valued(prior: Prior, given: Given, state: State) -> State:
     """The state with what the climb maximises, and the best of it so far."""
     worth = state.found.evidence + prior.log_hyper(state.alpha, given.group)
     return state._replace(worth=worth, best=jnp.fmax(state.best, worth))
+
+
+def reweighted(model: Model, state: State, covariance: jax.Array) -> tuple[Model, State]:
+    """Model and state with the precisions of process noise that follow from the point, for a covariance of z.
+
+    Before the first iteration, and where all noise is Gaussian, they stay.
+    """
+    if not model.tailed:
+        return model, state
+    fresh = jnp.isneginf(state.objective)
+    weights = expected_mixing(model, state.point, covariance)
+    weights = jax.tree.map(lambda new, old: jnp.where(fresh, old, new), weights, model.mixing)
+    point = rewhitened(model, state.point, weights)
+    return model.with_mixing(weights), state._replace(point=point, mixing=weights)
 
 
 def learn(prior: Prior, given: Given, alpha: jax.Array, gamma: Any, variance: Any, z: jax.Array, rule: str) -> Any:
@@ -202,20 +223,30 @@ def chunk(
 
     def body(state: State, k: jax.Array) -> tuple[State, tuple[jax.Array, jax.Array]]:
         idle = state.done | (k >= left)
-        after = jax.lax.cond(idle, lambda s: s, lambda s: method.iterate(model, prior, given, s), state)
+        after = jax.lax.cond(idle, lambda s: s, lambda s: stepped(method, model, prior, given, s), state)
         return after, (after.objective, idle)
 
     state, trace = jax.lax.scan(body, state, jnp.arange(CHUNK))
-    return method.close(model, prior, given, state), trace
+    return method.close(model.with_mixing(state.mixing), prior, given, state), trace
+
+
+def stepped(method: Any, model: Model, prior: Prior, given: Given, state: State) -> State:
+    """One outer iteration at the precisions of the process noise that a state has."""
+    after: State = method.iterate(model.with_mixing(state.mixing), prior, given, state)
+    return after
 
 
 def maximise(
-    method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context
+    method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context, alpha: np.ndarray | None = None
 ) -> tuple[State, np.ndarray]:
-    """Run a method from a start until it is done or its iterations are spent; the last state and the objectives."""
+    """Run a method from a start until it is done or its iterations are spent; the last state and the objectives.
+
+    It begins with precisions `alpha` (M,), those of the prior if None.
+    """
     check_method(method)
     given, prior = given_of(method, problem, prior), bare(method.climbs_under(prior))
-    state = first_state(given, start, method.begin(problem.model, start), context.key)
+    state = first_state(given, problem.model, start, method.begin(problem.model, start), context.key)
+    state = state if alpha is None else state._replace(alpha=jnp.asarray(alpha))
     trace = np.zeros(0)
     while len(trace) < method.iterations and not bool(state.done):
         left = method.iterations - len(trace)

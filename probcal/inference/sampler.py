@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 
 from probcal.errors import InputError
 from probcal.inference.chains import Sample
@@ -28,6 +29,8 @@ class Sampler(Method, ABC):
     draws: int
     chunk: ClassVar[int]  # steps between two checkpoints
     exact: ClassVar[bool] = True  # whether its draws are those of the posterior
+    crosses: ClassVar[bool] = False  # whether its chains visit other sides of a mirror, by `across`
+    roams: ClassVar[bool] = False  # whether its chains move along orbits where the frame fits badly, by `roam`
     intervals: ClassVar[str] = "quantiles of the exact posterior"
     climbs: ClassVar[bool] = False
 
@@ -63,3 +66,10 @@ class Sampler(Method, ABC):
     @abstractmethod
     def step(self, form: Form, posed: Posed, chain: Any) -> tuple[Any, Sample]:
         """The next state, and the draw it stands for."""
+
+    def across(self, form: Form, here: Posed, there: Posed, chain: Any) -> tuple[Any, jax.Array]:
+        """The chain on another side, and by how much the log density of its coordinates is larger there.
+
+        It must be an involution between any two sides. A sampler that does not cross stays where it is.
+        """
+        return chain, jnp.asarray(-jnp.inf)

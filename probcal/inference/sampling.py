@@ -14,17 +14,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.inference.chains import Draw, run_chunk, run_chunks
+from probcal.inference.chains import Draw, Sided, run_chunk, run_chunks, run_sided, run_sideds
+from probcal.inference.hierarchy import SpikeAndSlab
+from probcal.inference.orbits import orbits_of
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Posed
 from probcal.inference.storage import Chunks, Storage
 from probcal.priors import Prior
 from probcal.problem import Problem
+from probcal.smoothing.mirrors import Mirrored, distance, new, other_sides
 from probcal.smoothing.mode import Point
 
 if TYPE_CHECKING:
     from probcal.inference.run import Progress
     from probcal.inference.sampler import Sampler
+
+ROAMING = 0.6  # acceptance of independent draws of the frame below which chains also move along orbits
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +45,17 @@ class Sampled:
     seconds: float
     interrupted: bool
     note: str  # what happened on the way, a sentence or nothing
+    sides: tuple[Mirrored, ...] = ()  # other sides of a mirror that the chains visit, numbered from 1
 
     @property
     def z(self) -> np.ndarray:
         """Biases (chain, draw, M) over their scales."""
         return np.asarray(self.draws.theta)[..., : self.form.biases]
+
+    @property
+    def side(self) -> np.ndarray:
+        """Which side of a mirror each draw (chain, draw) is on, 0 where there is none."""
+        return np.asarray(self.draws.stats["side"]) if "side" in self.draws.stats else np.zeros(self.z.shape[:2], int)
 
     @property
     def levels(self) -> np.ndarray:
@@ -77,6 +88,8 @@ def sample(
     began = time.perf_counter()
     box = Chunks(Storage(None, "draws", {}) if storage is None else storage)
     keys = jax.random.split(key)
+    around = other_sides(problem, start) if np.isfinite(np.asarray(start.z)).all() else None
+    start = start if around is None else around.point
     form, posed, found, worth = pose(problem, prior, start, keys[0])
     asked, note = method, ""
     if worth.failed and fallback is not None and (taken := method.instead(prior, fallback)) is not None:
@@ -85,7 +98,18 @@ def sample(
             f"The collapse does not fit (Pareto k-hat {worth.khat:.2g} after {worth.moves} moves of the frame):"
             f" {name} took over."
         )
-    runs = _Run(method, form, posed, found, keys[1])
+    sides, poses = list[Mirrored](), [(posed, found)]
+    for k, other in enumerate(around.others if around is not None and method.crosses else ()):
+        _, there, drawn_there, _ = pose(problem, prior, other.point, jax.random.fold_in(keys[0], 1 + k))
+        size = distance(problem, other.point, start)
+        if new(problem, there.frame.point, [one.frame.point for one, _ in poses], size):  # none is visited twice
+            sides.append(other)
+            poses.append((there, drawn_there))
+    if worth.acceptance < ROAMING and method.roams and not isinstance(form.hierarchy, SpikeAndSlab):
+        covariance = np.cov(np.asarray(found.theta)[:, : form.biases].T).reshape(form.biases, form.biases)
+        orbits = orbits_of(problem, posed, covariance)
+        poses = [(one._replace(orbits=orbits), drawn) for one, drawn in poses]
+    runs = _Run(method, form, [one for one, _ in poses], [draws for _, draws in poses], keys[1])
     state = runs.restored(box.state) if box.state is not None else runs.first()
     total, interrupted = method.warmup + method.draws, False
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
@@ -105,7 +129,8 @@ def sample(
         raise FitError(
             f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them"
         )
-    return Sampled(method, asked, form, posed, worth, drawn, time.perf_counter() - began, interrupted, note)
+    seconds = time.perf_counter() - began
+    return Sampled(method, asked, form, posed, worth, drawn, seconds, interrupted, note, tuple(sides))
 
 
 def named(draws: Draw) -> dict[str, np.ndarray]:
@@ -130,22 +155,30 @@ def gathered(arrays: Mapping[str, np.ndarray]) -> Draw:
 
 
 class _Run:
-    """Chains of one method, advanced by a chunk: a thread each on a CPU, together on an accelerator."""
+    """Chains of one method, advanced by a chunk: a thread each on a CPU, together on an accelerator.
 
-    def __init__(self, method: Sampler, form: Form, posed: Posed, found: Pilot, key: jax.Array):
-        self.method, self.form, self.posed, self.found = method, form, posed, found
+    Where there are several sides of a mirror the chains start on them in turn, and cross.
+    """
+
+    def __init__(self, method: Sampler, form: Form, posed: list[Posed], found: list[Pilot], key: jax.Array):
+        self.method, self.form, self.sides, self.found = method, form, posed, found
         self.keys = jax.random.split(key, method.chains)
         self.apart = jax.default_backend() == "cpu"
+        self.mirrored = len(posed) > 1
+        frames = [one.frame for one in posed]
+        frame = jax.tree.map(lambda *leaves: jnp.stack(leaves), *frames) if self.mirrored else frames[0]
+        self.posed = posed[0]._replace(frame=frame)
 
     def first(self) -> Any:
         """State of all chains, leading dim (chains,)."""
-        starts = [
-            self.method.first(
-                self.form, self.posed, *chain_start(self.form, self.posed, self.found, k, self.method.chains),
-                jax.random.key_data(self.keys[k]),
-            )
-            for k in range(self.method.chains)
-        ]  # fmt: skip
+        starts = []
+        for k in range(self.method.chains):
+            side, key = k % len(self.sides), self.keys[k]
+            posed = self.sides[side]
+            begun = chain_start(self.form, posed, self.found[side], k, self.method.chains)
+            chain = self.method.first(self.form, posed, *begun, jax.random.key_data(key))
+            own = jax.random.key_data(jax.random.fold_in(key, 1))
+            starts.append(Sided(chain, jnp.asarray(side), own) if self.mirrored else chain)
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
 
     def restored(self, leaves: list[np.ndarray]) -> Any:
@@ -160,13 +193,14 @@ class _Run:
 
     def advance(self, state: Any, pool: ThreadPoolExecutor) -> tuple[Any, Draw]:
         """All chains one chunk further."""
+        alone, together = (run_sided, run_sideds) if self.mirrored else (run_chunk, run_chunks)
         if not self.apart:
-            return run_chunks(self.method.kernel(), self.form, self.posed, state)
+            return together(self.method.kernel(), self.form, self.posed, state)
 
         def one(k: int) -> tuple[Any, Draw]:
             with jax.enable_x64(True):
                 own = jax.tree.map(lambda leaf: leaf[k], state)
-                return jax.block_until_ready(run_chunk(self.method.kernel(), self.form, self.posed, own))
+                return jax.block_until_ready(alone(self.method.kernel(), self.form, self.posed, own))
 
         found = list(pool.map(one, range(self.method.chains)))
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)

@@ -10,6 +10,7 @@ from probcal.inference.run import Context, Method
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
+from probcal.smoothing.mirrors import NEAR, SAME, Mirrored, other_sides
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start, follow_states, further_starts
 
@@ -23,17 +24,46 @@ def solve(
     that are unknown. The context's key seeds draws and further starts.
     """
     given, problem = problem, method.prepare(problem)
+    used = problem is given
     first = automatic_start(problem) if start is None else _suited(given, problem, start)
     points = [first, *further_starts(problem, starts - 1, jax.random.fold_in(context.key, 1))]
     climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint"), Gaussian())
     optima: list[Answer] = []
-    if method.climbs or starts > 1 or problem.levels:
+    if method.climbs or starts > 1 or problem.levels or problem.model.tailed:
         optima = [climber.answer(problem, own, point, context) for point in points]
         points = [optimum.posterior.point for optimum in optima]
     best = max(range(starts), key=lambda k: _rank(optima[k])) if len(optima) > 1 else 0
+    if optima and not method.climbs:  # with the precisions that its process noise has there
+        problem = optima[best].problem
     found = optima[best] if method.climbs else method.answer(problem, prior, points[best], context)
-    motion = "used" if problem is given else "left out"
-    return replace(found, motion=motion, optima=tuple(optima) if starts > 1 else (), best=best)
+    motion = "used" if used else "left out"
+    found = replace(found, motion=motion, optima=tuple(optima) if starts > 1 else (), best=best)
+    return _beside_mirrors(found, method, context) if method.climbs and used else found
+
+
+def _beside_mirrors(answer: Answer, method: Method, context: Context) -> Answer:
+    """The answer on the side of a mirror that fits best, and those of other sides that fit about as well."""
+    if not (answer.status.valid and answer.posterior.sound):
+        return answer
+    sides = other_sides(answer.problem, answer.posterior.point)
+    found = answer
+    if sides.moved:
+        again = method.answer(answer.problem, answer.prior, sides.point, context)
+        gain = again.objective - answer.objective
+        if not (again.status.valid and gain > -SAME):  # better under the declared scales, not under the prior
+            name = sides.others[0].name if sides.others else "pieces of tracks on their other side"
+            shift = np.asarray(sides.point.z) - answer.posterior.summary.mean
+            near = again.status.valid and gain > -NEAR
+            return replace(answer, mirrors=(Mirrored(name, gain, sides.point, shift),) if near else ())
+        found = replace(again, motion=answer.motion, optima=answer.optima, best=answer.best)
+    others = []
+    for other in sides.others:
+        if other.gain > -SAME:  # as good as the first: an answer of its own
+            own = method.answer(answer.problem, answer.prior, other.point, context).posterior
+            if own.sound:
+                other = other._replace(point=own.point, shift=own.summary.mean - found.posterior.summary.mean)
+        others.append(other)
+    return replace(found, mirrors=tuple(others))
 
 
 def _suited(given: Problem, problem: Problem, start: Point) -> Point:

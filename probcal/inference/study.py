@@ -29,6 +29,7 @@ from probcal.inference.run import (
     first_state,
     given_of,
     kernel,
+    stepped,
 )
 from probcal.inference.sampler import Sampler
 from probcal.inference.settings import check_setting
@@ -74,13 +75,14 @@ def _solve(
 
         def step(carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
             state, count = carry
-            return method.iterate(model, prior, given, state), count + 1
+            return stepped(method, model, prior, given, state), count + 1
 
         def on(carry: tuple[State, jax.Array]) -> jax.Array:
             return ~carry[0].done & (carry[1] < iterations)
 
-        first = first_state(given, start, method.begin(model, start), jax.random.key(SEED))
+        first = first_state(given, model, start, method.begin(model, start), jax.random.key(SEED))
         state, count = jax.lax.while_loop(on, step, (first, jnp.zeros((), int)))
+        model = model.with_mixing(state.mixing)
         state = method.close(model, prior, given, state)._replace(seed=jnp.zeros(()), carry=())
         mixed = None if how is None else integrate(how, model, given.prior, state.point, jax.random.key(SEED))
         return _Solved(state, mixed, mean_square(model, state.point if mixed is None else mixed.point), count)
@@ -160,7 +162,7 @@ def _batch(
                 solved = jax.tree.map(np.asarray, solved)
                 for j, k in enumerate(members):
                     state, mixed, square, count = jax.tree.map(lambda leaf, j=j: leaf[j], solved)
-                    problem = chosen[j].problem
+                    problem = chosen[j].problem.with_mixing(state.mixing)
                     answer = conclude(problem, method, prior, state, NOTHING, float(square), int(count), how, mixed)
                     found.append({"case": cases[k], "method": name} | _record(chosen[j], answer))
         if stored:

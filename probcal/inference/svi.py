@@ -22,7 +22,7 @@ from probcal.inference.posed import Form, Posed, log_prior, prior_precision, whi
 from probcal.inference.sampler import Sample, Sampler
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
 from probcal.smoothing.frame import driving, log_joint, place
-from probcal.smoothing.mode import Point, factors, log_density
+from probcal.smoothing.mode import Point, factors, mixed_density
 from probcal.smoothing.recursion import trajectory
 
 GUIDES = ("structured", "mean-field", "low-rank")
@@ -66,7 +66,7 @@ def plain(form: Form, posed: Posed, free: Free) -> Plain:
     tracks = zip(model.recursions, free.eps, strict=True)
     states = tuple(trajectory(p.F, factors(p, levels), p.drift[:, :, None], u[:, :, None])[:, :, 0] for p, u in tracks)
     point = Point(states, free.eps, theta[: form.biases], levels)
-    density = hyper + volume + log_prior(form, posed, theta, phi) + log_density(model, point)
+    density = hyper + volume + log_prior(form, posed, theta, phi) + mixed_density(model, point)
     return Plain(theta, phi, point, jnp.where(jnp.isfinite(density), density, -jnp.inf))
 
 

@@ -29,6 +29,7 @@ class Move(NamedTuple):
     L: jax.Array  # (n, n)
     level: jax.Array  # (n,) which unknown level multiplies a column of L, H where known
     drift: jax.Array  # (n,)
+    mixed: tuple[jax.Array, ...] = ()  # () of each tail of the recursion whether it drives this epoch
 
 
 class Seen(NamedTuple):
@@ -82,6 +83,9 @@ class Stepwise:
             vector, others = (states, None) if form is None else form.part(states)
             if vector is not None:
                 noise = jax.random.normal(own, move.drift.shape)
+                for k, (tail, on) in enumerate(zip(self.recursions[r].tails, move.mixed, strict=True)):
+                    drawn = tail.family.mixing_draw(jax.random.fold_in(own, 1 + k), ())
+                    noise = noise.at[slice(*tail.columns)].divide(jnp.sqrt(jnp.where(on, drawn, 1.0)))
                 vector = vector.at[target].set(_mean(vector, move, target) + _root(move, levels) @ noise)
             if form is not None:
                 moved = self._moved(form, jax.random.fold_in(own, 1), others, r, epoch, levels)
@@ -120,7 +124,12 @@ class Stepwise:
             (old, before), (new, later) = ((s, ()) if form is None else form.part(s) for s in (x[r], after[r]))
             total = jnp.zeros(())
             if old is not None and new is not None:
-                total = linalg.log_normal(new[target] - _mean(old, move, target), _root(move, levels))
+                away, root = new[target] - _mean(old, move, target), _root(move, levels)
+                total = linalg.log_normal(away, root)
+                noise = linalg.driving(away, root) if move.mixed else away
+                for tail, on in zip(self.recursions[r].tails, move.mixed, strict=True):
+                    square = jnp.sum(noise[slice(*tail.columns)] ** 2)
+                    total = total + jnp.where(on, tail.family.mixing_density(square, tail.size), 0.0)
             if form is not None:
                 before, later = jax.tree.map(lambda leaf: leaf[target], (before, later))
                 total = total + jax.lax.cond(
@@ -220,7 +229,11 @@ def merged(model: Any, fill: tuple[Rows, ...], sizes: tuple[int, ...]) -> Epoch:
         nothing: Any = (np.tile(np.eye(n), (K, 1, 1)), np.zeros((K, n, n)), np.full((K, n), H), np.zeros((K, n)))
         for whole, own in zip(nothing, (part.F, part.L, part.level, part.drift), strict=True):
             whole[mine] = np.asarray(own)
-        moves.append(Move(*nothing))
+        mixed = [np.zeros(K, bool) for _ in part.tails]
+        for whole, tail in zip(mixed, part.tails, strict=True):
+            whole[mine] = np.asarray(tail.on)
+        driving: Any = tuple(mixed)
+        moves.append(Move(*nothing)._replace(mixed=driving))
     for b, (data, r) in enumerate(zip(model.rows, model.recursion, strict=True)):
         rows.append(_padded(data, of[r][np.asarray(data.epoch)], K, sizes[b], fill[b], model.blocks[b]))
     found: Any = Epoch(**shared, target=tuple(targets), move=tuple(moves), rows=tuple(rows))

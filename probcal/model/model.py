@@ -21,6 +21,7 @@ from probcal.model.sampled import Sampled
 BATCH = 512  # rows whose responses to all biases are formed at once
 
 Data = tuple[jax.Array, ...]  # of every datum: (N, C), or (N, C, ...), for each block
+Mixing = tuple[tuple[jax.Array, ...], ...]  # weight (E,) of each tail of each recursion
 
 
 class Where(Protocol):
@@ -47,6 +48,30 @@ class At(NamedTuple):
     levels: jax.Array  # (H,)
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=["on", "weight"], meta_fields=["family", "name", "columns"])
+@dataclass(frozen=True)
+class Tail:
+    """Noise columns of one recursion that are driven by a scale mixture: N(0, I / w) with a precision w an epoch.
+
+    Everything Gaussian takes `weight` for w, one until a method sets it; samplers integrate w.
+    """
+
+    family: Any  # a `noise.ScaleMixture`
+    name: str  # the state component that it drives
+    columns: tuple[int, int]  # first and last (excluded) of the noise factor
+    on: jax.Array  # (E,) whether it drives an epoch: not where a target begins, nor targets of another family
+    weight: jax.Array  # (E,)
+
+    @property
+    def size(self) -> int:
+        """Number of columns."""
+        return self.columns[1] - self.columns[0]
+
+    def squares(self, u: jax.Array) -> jax.Array:
+        """Sums of squares (E,) over the columns of whitened noises (E, n), as they would be at weight 1."""
+        return jnp.sum(u[:, slice(*self.columns)] ** 2, 1) / self.weight
+
+
 class Recursion(NamedTuple):
     """Arrays of one recursion: E epochs of targets that share a state layout, n entries of it with a linear form."""
 
@@ -58,6 +83,15 @@ class Recursion(NamedTuple):
     dt: jax.Array  # (E,) since the epoch before of the same target, 0 at its first
     first: jax.Array  # (E,) whether a target begins here
     target: jax.Array  # (E,) which of the targets of this recursion
+    tails: tuple[Tail, ...] = ()  # of the noise that is not Gaussian
+
+    @property
+    def weight(self) -> jax.Array:
+        """Precision (E, n) that every whitened noise is taken to have beside its level."""
+        found = jnp.ones_like(self.drift)
+        for tail in self.tails:
+            found = found.at[:, slice(*tail.columns)].set(tail.weight[:, None])
+        return found
 
 
 @partial(
@@ -279,6 +313,37 @@ class Model(Stepwise):
         """Linear form of the motion of each recursion, None where it has none."""
         pairs = zip(self.recursions, self.sampled, strict=True)
         return tuple(part if form is None else None for part, form in pairs)
+
+    @property
+    def tailed(self) -> bool:
+        """Whether some process noise is not Gaussian."""
+        return any(part.tails for part in self.recursions)
+
+    @property
+    def mixing(self) -> Mixing:
+        """Precisions (E,) that the noises of each tail of each recursion are taken to have."""
+        return tuple(tuple(tail.weight for tail in part.tails) for part in self.recursions)
+
+    def with_mixing(self, weights: Mixing) -> "Model":
+        """The model with other precisions of its process noise, where this is not Gaussian."""
+        if not self.tailed:
+            return self
+        parts = [
+            part._replace(tails=tuple(replace(t, weight=w) for t, w in zip(part.tails, own, strict=True)))
+            for part, own in zip(self.recursions, weights, strict=True)
+        ]
+        return replace(self, recursions=tuple(parts))
+
+    def draw_noises(self, key: jax.Array, r: int, count: int) -> jax.Array:
+        """Process noises (E, n, count) of recursion r from the prior, of unit level."""
+        part = self.recursions[r]
+        own = jax.random.fold_in(key, r)
+        noise = jax.random.normal(own, (*part.drift.shape, count))
+        for k, tail in enumerate(part.tails):
+            drawn = tail.family.mixing_draw(jax.random.fold_in(own, 1 + k), (len(tail.on), count))
+            precision = jnp.where(tail.on[:, None], drawn, 1.0)
+            noise = noise.at[:, slice(*tail.columns)].divide(jnp.sqrt(precision)[:, None, :])
+        return noise
 
     @property
     def size(self) -> int:

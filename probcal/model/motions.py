@@ -123,6 +123,27 @@ def chain(
     return F, L, level, drift
 
 
+def tails_of(
+    target: Target, epochs: int, begins: bool, dimension: int
+) -> list[tuple[Any, str, tuple[int, int], np.ndarray]]:
+    """Families of the noise of one target that are not Gaussian: what they drive, columns, and epochs (E,)."""
+    vector = as_motion(target.motion).split[0]
+    found = []
+    for family, start, stop in () if vector is None else vector.mixed(dimension):
+        component = _driving(vector, start, dimension)
+        on = np.ones(epochs, bool)
+        on[0] = component.memoryless or not begins
+        if stop > start:
+            found.append((family, component.driven, (start, stop), on))
+    return found
+
+
+def _driving(vector: Any, column: int, dimension: int) -> Any:
+    """The component that a column of the noise factor belongs to."""
+    ends = np.cumsum([component.noise_factor(np.ones(1), dimension).shape[2] for component in vector.components])
+    return vector.components[int(np.searchsorted(ends, column, side="right"))]
+
+
 def start_of(name: str, component: Any, target: Target, time: np.ndarray, area: Area) -> tuple[np.ndarray, np.ndarray]:
     """Start mean and standard deviation of a component: declared, its own, or wide."""
     extent, duration = area.extent, float(np.ptp(time)) or 1.0

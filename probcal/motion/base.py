@@ -20,9 +20,10 @@ import numpy as np
 from probcal import linalg
 from probcal.errors import InputError
 from probcal.motion.layout import Layout, Start, check_once, labels_of, layout_of, pieces, stacked
-from probcal.noise import Level, guess_of
+from probcal.noise import Gaussian, Level, guess_of
 
 NO_START: Start = MappingProxyType({})
+GAUSSIAN = Gaussian()
 
 
 class Linear(NamedTuple):
@@ -86,10 +87,13 @@ class Component(ABC):
     """Part of a target's state that evolves linearly on its own; `a + b` stacks two into one `LinearMotion`.
 
     `dt` has shape (E,) and is a NumPy or a jax array: `dt.__array_namespace__()` are the functions for it. s is the
-    size of the part in `dimension` axes. `std`, the level of its noise, multiplies the noise factor.
+    size of the part in `dimension` axes. `std`, the level of its noise, multiplies the noise factor. `noise` is the
+    family of the noise of each epoch: Gaussian, or a scale mixture such as `StudentT(4)` for what goes straight most of
+    the time and turns now and then; the axes share its precision, so that it turns with the world.
     """
 
     std: Level
+    noise: Any = GAUSSIAN
     memoryless: ClassVar[bool] = False  # drawn anew at every epoch around `means`; the others start from `start()`
     timed: ClassVar[bool] = False  # whether the means are those of a time, known at the rows of a table only
     static: ClassVar[bool] = False  # whether it never moves, so that all rows of a target form one epoch
@@ -175,14 +179,24 @@ class LinearMotion(Motion):
     def sample(self, key: jax.Array, state: Any, dt: Any, levels: Mapping[str, Any]) -> jax.Array:
         """State (n,) drawn after `dt` seconds; a level that is not given has its declared value."""
         mean, root = self._step(state, dt, levels)
-        return mean + root @ jax.random.normal(key, root.shape[1:])
+        own, drawn = jax.random.split(key)
+        noise = jax.random.normal(own, root.shape[1:])
+        for k, (family, start, stop) in enumerate(self.mixed(self._dimension(state))):
+            precision = family.mixing_draw(jax.random.fold_in(drawn, k), ())
+            noise = noise.at[start:stop].divide(jnp.sqrt(precision))
+        return mean + root @ noise
 
     def log_density(self, before: Any, state: Any, dt: Any, levels: Mapping[str, Any]) -> jax.Array:
         """Log density () of a state (n,); raises `InputError` where the noise leaves out a direction."""
         step = self.linear(np.ones(1), self._dimension(state)).L[0]
         _check_density(step, any(guess_of(component.std) == 0 for component in self.components))
         mean, root = self._step(before, dt, levels)
-        return linalg.log_normal(state - mean, root)
+        density = linalg.log_normal(state - mean, root)
+        mixed = self.mixed(self._dimension(state))
+        noise = linalg.driving(state - mean, root) if mixed else state
+        for family, start, stop in mixed:
+            density = density + family.mixing_density(jnp.sum(noise[start:stop] ** 2), stop - start)
+        return density
 
     def log_initial(self, state: Any, start: Start = NO_START) -> jax.Array:
         """Log density () of a state (n,) at the start."""
@@ -196,6 +210,16 @@ class LinearMotion(Motion):
         L = [component.noise_factor(dt, dimension) for component in self.components]
         names = [level_name(c) for c, own in zip(self.components, L, strict=True) for _ in range(own.shape[2])]
         return Linear(_diagonal(F), _diagonal(L), tuple(names))
+
+    def mixed(self, dimension: int) -> list[tuple[Any, int, int]]:
+        """Families that are not Gaussian, and the first and last (excluded) column of the noise factor they drive."""
+        found, column = [], 0
+        for component in self.components:
+            width = component.noise_factor(np.ones(1), dimension).shape[2]
+            if not isinstance(getattr(component, "noise", GAUSSIAN), Gaussian):
+                found.append((component.noise, column, column + width))
+            column += width
+        return found
 
     @property
     def static(self) -> bool:

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.motion.base import Component
+from probcal.motion.base import GAUSSIAN, Component
 from probcal.motion.target import check_pair
-from probcal.noise import Level, check_level
+from probcal.noise import Level, check_driving, check_level
 
 PLANE, QUARTER, UP = np.diag([1.0, 1.0, 0.0]), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]), np.diag([0.0, 0, 1])
 
@@ -37,9 +37,11 @@ class ConstantVelocity(Component):
 
     std: Level
     singular: bool = False
+    noise: Any = GAUSSIAN
 
     def __post_init__(self):
         check_level(self.std, "ConstantVelocity: std", zero=True)
+        check_driving(self.noise, "ConstantVelocity: noise")
 
     def names(self) -> tuple[tuple[str, bool], ...]:
         """State components and whether each has one value an axis."""
@@ -68,9 +70,11 @@ class ConstantAcceleration(Component):
 
     std: Level
     singular: bool = False
+    noise: Any = GAUSSIAN
 
     def __post_init__(self):
         check_level(self.std, "ConstantAcceleration: std", zero=True)
+        check_driving(self.noise, "ConstantAcceleration: noise")
 
     def names(self) -> tuple[tuple[str, bool], ...]:
         """State components and whether each has one value an axis."""
@@ -103,9 +107,11 @@ class CoordinatedTurn(Component):
 
     std: Level
     rate: float
+    noise: Any = GAUSSIAN
 
     def __post_init__(self):
         check_level(self.std, "CoordinatedTurn: std", zero=True)
+        check_driving(self.noise, "CoordinatedTurn: noise")
         if not np.isfinite(self.rate):
             raise InputError(f"CoordinatedTurn: rate is {self.rate!r}: give a finite number in rad/s")
 
@@ -184,10 +190,12 @@ class RandomWalk(Component):
     std: Level
     initial: tuple[float, float]
     per_axis: bool = False
+    noise: Any = GAUSSIAN
 
     def __post_init__(self):
         check_level(self.std, f'RandomWalk("{self.name}"): std', zero=True)
         check_pair(self.initial, f'RandomWalk("{self.name}"): initial')
+        check_driving(self.noise, f'RandomWalk("{self.name}"): noise')
 
     def names(self) -> tuple[tuple[str, bool], ...]:
         """State component and whether it has one value an axis."""
@@ -217,9 +225,11 @@ class White(Component):
     std: Level
     mean: Any = 0.0
     per_axis: bool = False
+    noise: Any = GAUSSIAN
 
     def __post_init__(self):
         check_level(self.std, f'White("{self.name}"): std')
+        check_driving(self.noise, f'White("{self.name}"): noise')
 
     def names(self) -> tuple[tuple[str, bool], ...]:
         """State component and whether it has one value an axis."""

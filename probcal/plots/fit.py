@@ -46,12 +46,15 @@ class _Track:
 
 
 def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
-    """Draw stated and calibrated nodes with their ellipses, and the tracks before and after calibration."""
+    """Draw stated and calibrated nodes with their ellipses, the tracks before and after calibration.
+
+    Dashed: the tracks of an answer on the other side of a mirror that fits as well.
+    """
     ax = new_axes(ax, 9.0, 6.5)
     ax.set_aspect("equal", adjustable="box")
-    tracks = list(_tracks(tree))
-    _limit(ax, tree, tracks)
-    keys = _draw_tracks(ax, tracks)
+    tracks, mirrored = list(_tracks(tree)), list(_mirrored(tree))
+    _limit(ax, tree, [*tracks, *mirrored])
+    keys = _draw_tracks(ax, tracks) + _draw_mirrored(ax, mirrored)
     keys += _draw_nodes(ax, tree)
     nodes = tree["constant_data"].to_dataset()
     space = nodes.sizes["axis"] > 2
@@ -224,6 +227,34 @@ def _tracks(tree: xr.DataTree) -> Iterator[_Track]:
             mine = np.nonzero(owners == target)[0]
             mine = mine[np.argsort(times[mine], kind="stable")]
             yield _Track(str(target), before[mine], after[mine])
+
+
+def _mirrored(tree: xr.DataTree) -> Iterator[_Track]:
+    """Tracks of the best answer on the other side of a mirror, where one fits as well."""
+    if "mirror" not in tree.children:
+        return
+    group = tree["mirror"].to_dataset()
+    same = group.attrs["same"]
+    group = group.isel(mirror=int(group["gain"].values.argmax()))
+    if group["gain"].item() <= -same:
+        return
+    for name in group.data_vars:
+        if str(name).startswith("position"):
+            s = str(name).removeprefix("position")
+            places, owners = group[name].values[:, :2], group[f"epoch_target{s}"].values
+            times = group[f"epoch_time{s}"].values
+            for target in dict.fromkeys(owners.tolist()):
+                mine = np.nonzero(owners == target)[0]
+                mine = mine[np.argsort(times[mine], kind="stable")]
+                yield _Track(str(target), places[mine], places[mine])
+
+
+def _draw_mirrored(ax: Axes, tracks: list[_Track]) -> list[Line2D]:
+    """Draw the tracks of the other side and return the legend entry."""
+    most = min(POINTS, max(2, ALL_POINTS // max(len(tracks), 1)))
+    for k, track in enumerate(tracks):
+        ax.plot(*_thin(track.after, most).T, "--", color=colour(k), linewidth=1.0, alpha=0.7, zorder=2.5)
+    return [Line2D([], [], color="0.3", linestyle="--", label="fits as well")] if tracks else []
 
 
 def _thin(path: np.ndarray, most: int) -> np.ndarray:

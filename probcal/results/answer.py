@@ -20,6 +20,7 @@ from probcal.priors import Prior
 from probcal.results.schema import INTERVAL
 from probcal.smoothing.draws import draw, draw_biases, draws_a_chain
 from probcal.smoothing.linearised import Laplace, Linearisation, linearise
+from probcal.smoothing.mirrors import Mirrored
 from probcal.smoothing.mode import Point
 from probcal.status import Status
 
@@ -113,6 +114,11 @@ class Posterior(ABC):
     def sound(self) -> bool:
         """Whether every number is finite: a flat prior on a singular problem leaves no interval."""
         return bool(np.isfinite(self.summary.covariance).all() and np.isfinite(self.summary.mean).all())
+
+    @property
+    def here(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and sd (M,) of the biases on this side of a mirror, where there is one."""
+        return self.summary.mean, self.summary.sd
 
     @property
     def worth(self) -> float | None:
@@ -225,6 +231,7 @@ class Answer:
     motion: str = "used"  # or "left out", for least squares
     optima: tuple[Answer, ...] = ()  # those found from several starts
     best: int = 0  # which of them is reported, or where a sampler began
+    mirrors: tuple[Mirrored, ...] = ()  # answers on the other side of a line or plane that fit about as well
 
     @property
     def objective(self) -> float:

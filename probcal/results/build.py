@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from probcal.labels import AXES
 from probcal.lazy import Later
 from probcal.results.answer import Answer, Draws, Summary, Tracks, uncalibrated
 from probcal.results.groups import (
@@ -21,8 +22,9 @@ from probcal.results.groups import (
     suffix,
     track_group,
 )
-from probcal.results.schema import EVIDENCE, INTERVAL, RESULTS_VERSION
+from probcal.results.schema import BOUND, EVIDENCE, INTERVAL, RESULTS_VERSION
 from probcal.smoothing.draws import residuals
+from probcal.smoothing.mirrors import SAME
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import track_mode
 
@@ -154,7 +156,8 @@ def _attrs(answer: Answer) -> dict[str, Any]:
         **answer.posterior.attrs,
     }  # fmt: skip
     if found.evidence is not None:
-        attrs[EVIDENCE[found.precisions]] = found.evidence
+        tailed = answer.problem.model.tailed
+        attrs[BOUND if tailed else EVIDENCE[found.precisions]] = found.evidence
     return attrs
 
 
@@ -192,10 +195,34 @@ def add_optima(tree: xr.DataTree, answers: Sequence[Answer], best: int) -> xr.Da
         "start": ("optimum", np.array(order)),
     }
     evidence = np.array([np.nan if own.evidence is None else own.evidence for own in summaries])
-    name = EVIDENCE[summaries[0].precisions]
+    name = BOUND if answers[0].problem.model.tailed else EVIDENCE[summaries[0].precisions]
     if name in tree.attrs and np.isfinite(evidence).all() and summaries[0].precisions != "integrated":
         values[name] = ("optimum", evidence)
     tree["optimum"] = xr.DataTree(xr.Dataset(values, coords={"bias_label": list(problem.labels)}))
+    return tree
+
+
+def add_mirrors(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
+    """Add the answers on other sides of a mirror: names, biases, places, and evidence less that of the answer.
+
+    `apart` says by how many sd each bias is another one there; within `same` nats an answer is as good.
+    """
+    problem, others = answer.problem, answer.mirrors
+    shifts, (mean, sd) = np.stack([other.shift for other in others]), answer.posterior.here
+    values: dict[str, Any] = {
+        "gain": ("mirror", np.array([other.gain for other in others])),
+        "bias": (("mirror", "bias_label"), (mean + shifts) * problem.scales),
+        "apart": (("mirror", "bias_label"), np.abs(shifts) / np.maximum(sd, 1e-12)),
+    }
+    coords: dict[str, Any] = {"mirror": [other.name for other in others], "bias_label": list(problem.labels)}
+    for r, epochs in enumerate(problem.epochs):
+        s, span = suffix(problem, r), slice(*epochs.position)
+        places = np.stack([np.asarray(other.point.states[r])[:, span] for other in others])
+        values[f"position{s}"] = (("mirror", f"epoch{s}", "axis"), places)
+        coords |= {f"epoch_time{s}": (f"epoch{s}", epochs.time)}
+        coords |= {f"epoch_target{s}": (f"epoch{s}", np.asarray(epochs.target, str))}
+    coords["axis"] = list(AXES[: problem.network.dimension])
+    tree["mirror"] = xr.DataTree(xr.Dataset(values, coords=coords, attrs={"same": SAME}))
     return tree
 
 

@@ -73,7 +73,21 @@ def direction_group(labels: Sequence[str], directions: Sequence[Any]) -> xr.Data
 
 def track_group(problem: Problem, tracks: Sequence[Band]) -> xr.Dataset:
     """Mean, sd and uncalibrated mean of every state, with times and targets of the epochs."""
-    return by_epoch(problem, {name: [getattr(t, name) for t in tracks] for name in ("mean", "sd", "before")})
+    found = by_epoch(problem, {name: [getattr(t, name) for t in tracks] for name in ("mean", "sd", "before")})
+    for r, part in enumerate(problem.model.recursions):
+        for k, tail in enumerate(part.tails):
+            found[weight_name(problem, r, k)] = ((f"epoch{suffix(problem, r)}",), np.asarray(tail.weight))
+    return found
+
+
+def weight_name(problem: Problem, r: int, k: int) -> str:
+    """What the precisions of tail k of recursion r are called: what it drives, and a number where several families do.
+
+    1 is what is declared; an epoch of 0.1 has noise of three times the std.
+    """
+    tails = problem.model.recursions[r].tails
+    twin = [tail.name for tail in tails[:k]].count(tails[k].name)
+    return f"weight_{tails[k].name}{f'_{1 + twin}' if twin else ''}{suffix(problem, r)}"
 
 
 def by_epoch(problem: Problem, variables: Mapping[str, Sequence[np.ndarray]]) -> xr.Dataset:

@@ -20,9 +20,11 @@ ATTRIBUTES = ("method", "prior", "seed", "status", "message", "intervals", "sett
 ROPE = 0.1  # scales within which a bias is practically zero
 TYPE_II = "log_evidence_type_ii"  # the largest over the precisions, which are then taken as known
 DECLARED = "log_evidence_declared"  # with every bias Gaussian of its declared scale, whatever the prior of the fit
+BOUND = "log_evidence_bound"  # the same where process noise is not Gaussian: a variational lower bound, loose by nats
 EVIDENCE = {"given": "log_evidence", "maximised": TYPE_II, "integrated": DECLARED}  # by what is done with precisions
 EVIDENCES = {
     "log_evidence": "log evidence", TYPE_II: "log evidence (type II)", DECLARED: "log evidence under declared scales",
+    BOUND: "log evidence (lower bound)",
 }  # fmt: skip
 
 

@@ -29,6 +29,7 @@ from probcal.smoothing.mode import (
     factors,
     follow,
     log_density,
+    mixed_density,
     track,
     widening,
 )
@@ -155,7 +156,7 @@ def refined(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, 
     lins = averaged(model, frame, theta, eps)
     compressed = compress(model, lins)
     solved = eliminate_compressed(model, frame.point.noises, frame.point.levels, compressed)
-    point = follow(model, frame.point, solved, jnp.zeros_like(frame.point.z))
+    point = follow(model, frame.point, solved, jnp.zeros_like(frame.point.z), free=True)
     return _frame(model, point, averaged(model, frame._replace(point=point), theta, eps))
 
 
@@ -172,7 +173,7 @@ def _frame(model: Model, point: Point, lins: Sequence[Linearised]) -> Frame:
     loops = []
     for r, (part, kept) in enumerate(zip(model.recursions, solved.parts, strict=True)):
         L, J, pull = factors(part, point.levels), kept.J, kept.pull
-        smooth = rec.smooth(part.F, L, J, kept.gain, kept.cross)
+        smooth = rec.smooth(part.F, kept.gain, kept.cross)
         closed = closed_loop(part, L, J, pull, point.noises[r])
         closed = closed._replace(shift=jnp.zeros_like(pull))  # the point is the mean, by definition
         own = [share[r] for share in by_level]
@@ -298,7 +299,7 @@ def log_joint(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array
     """Log density of data and eps given theta, less that of independent unit normals' constant; -inf if not finite."""
     loops = _closed(model, frame, theta)
     point = _placed(model, frame, theta, eps, loops)
-    value = log_density(model, point) + _volume(model, frame, theta, loops)
+    value = mixed_density(model, point) + _volume(model, frame, theta, loops)
     return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
 

@@ -21,9 +21,10 @@ def paper_b(model: Model, point: Point, prior: Precision) -> tuple[Laplace, jax.
     compressed = compress(model, lins)
     information, score = compressed.information, compressed.score
     likelihood, logdet = log_likelihood(model, point), jnp.zeros(())
-    for part, (J, pull), cross in zip(model.recursions, compressed.states, compressed.crosses, strict=True):
+    parts = zip(model.recursions, compressed.states, compressed.crosses, strict=True)
+    for r, (part, (J, pull), cross) in enumerate(parts):
         L = factors(part, point.levels)
-        P, _ = rec.covariances(part.F, L, J, rec.gains(part.F, L, J))
+        P, _ = rec.covariances(part.F, L, rec.gains(part.F, L, J, model.entries(r)))
         values, vectors = linalg.spectrum(P)
         half = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
         inner = jnp.eye(P.shape[-1])[None] + half.mT @ J @ half
@@ -62,9 +63,9 @@ def state_covariances(model: Model, point: Point) -> list[jax.Array]:
     """Covariances (E, n, n) of every smoothed state at held biases, linearised at a point."""
     compressed = model.of_states(model.linearise(point, expected=True))
     found = []
-    for part, (J, _) in zip(model.recursions, compressed, strict=True):
+    for r, (part, (J, _)) in enumerate(zip(model.recursions, compressed, strict=True)):
         L = factors(part, point.levels)
-        found.append(rec.covariances(part.F, L, J, rec.gains(part.F, L, J))[0])
+        found.append(rec.covariances(part.F, L, rec.gains(part.F, L, J, model.entries(r)))[0])
     return found
 
 

@@ -4,6 +4,7 @@ Rows carry the expected information. Given the biases each trajectory is Gaussia
 so are the biases, `Eliminated`, and what a prior makes of these is solved by `Dense` (Schur complement).
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -23,6 +24,7 @@ from probcal.smoothing.mode import (
     eliminate_compressed,
     factors,
     log_density,
+    mixing_gain,
 )
 from probcal.smoothing.solves import Dense
 
@@ -109,14 +111,26 @@ class Linearisation(NamedTuple):
         All draws are columns of one pass of the simulation smoother (Durbin and Koopman 2002).
         """
         drawn = []
-        parts = zip(self.model.recursions, self.trajectories, self.solved.parts, self.point.states, strict=True)
-        for r, (part, own, kept, mean) in enumerate(parts):
-            noise = jax.random.normal(jax.random.fold_in(key, r), (2, *part.drift.shape, len(z)))
-            prior = rec.trajectory(part.F, own.L, jnp.zeros((*part.drift.shape, 1)), noise[0])
-            smooth = rec.smooth(part.F, own.L, kept.J, kept.gain, kept.J @ prior + own.half @ noise[1])
+        pairs = zip(self.trajectories, self.point.states, self._simulated(key, len(z)), strict=True)
+        for own, mean, (prior, smooth) in pairs:
             free = prior - smooth.states + own.response @ (z - self.point.z[None, :]).T
             drawn.append(jnp.moveaxis(mean[:, :, None] + free, 2, 0))
         return tuple(drawn)
+
+    @partial(jax.jit, static_argnames="count")
+    def smoothed_noises(self, key: jax.Array, count: int) -> tuple[jax.Array, ...]:
+        """Smoothed noises (E, n, count) of each recursion for data drawn from the linearised model, biases held."""
+        return tuple(smooth.noises for _, smooth in self._simulated(key, count))
+
+    def _simulated(self, key: jax.Array, count: int) -> list[tuple[jax.Array, rec.Smoothed]]:
+        """Trajectories (E, n, count) drawn from the motion, less its drift, and what smoothing makes of their data."""
+        found = []
+        parts = zip(self.model.recursions, self.trajectories, self.solved.parts, strict=True)
+        for r, (part, own, kept) in enumerate(parts):
+            noise = jax.random.normal(jax.random.fold_in(key, r), (2, *part.drift.shape, count))
+            prior = rec.trajectory(part.F, own.L, jnp.zeros((*part.drift.shape, 1)), noise[0])
+            found.append((prior, rec.smooth(part.F, kept.gain, kept.J @ prior + own.half @ noise[1])))
+        return found
 
 
 @jax.jit
@@ -135,8 +149,8 @@ def trajectories_of(model: Model, levels: jax.Array, solved: Eliminated) -> tupl
         L = factors(part, levels)
         values, vectors = linalg.spectrum(kept.J)
         half = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
-        response = rec.smooth(part.F, L, kept.J, kept.gain, kept.cross)
-        states, noises = rec.covariances(part.F, L, kept.J, kept.gain)
+        response = rec.smooth(part.F, kept.gain, kept.cross)
+        states, noises = rec.covariances(part.F, L, kept.gain)
         spread = jnp.diagonal(noises, axis1=1, axis2=2)
         found.append(Trajectory(L, half, -response.states, -response.noises, states, spread))
     return tuple(found)
@@ -162,7 +176,8 @@ def marginal_information(model: Model, point: Point) -> jax.Array:
 def laplace(model: Model, point: Point, prior: Precision) -> Laplace:
     """Evidence and covariance with every trajectory marginalised exactly, at the mode for a prior.
 
-    A precision of 0 is a flat prior: its density counts as one. The expected information is used throughout.
+    A precision of 0 is a flat prior: its density counts as one. The expected information is used throughout. Where
+    process noise is not Gaussian it is the variational lower bound of the evidence (see `mixing_gain`).
     """
     return laplace_of(model, point, eliminate(model, point, expected=True), prior)
 
@@ -172,7 +187,8 @@ def laplace_of(model: Model, point: Point, solved: Eliminated, prior: Precision)
     biases = Dense.of(solved.information + prior.matrix())
     own = 0.5 * prior.log_determinant() - 0.5 * prior.square(point.z)
     spread = -0.5 * jnp.sum((point.levels / model.level_spread) ** 2)
-    evidence = log_density(model, point) + own + spread - 0.5 * (solved.logdet + biases.log_determinant())
+    density = log_density(model, point) + mixing_gain(model)
+    evidence = density + own + spread - 0.5 * (solved.logdet + biases.log_determinant())
     covariance = biases.covariance()
     gamma = jnp.clip(1.0 - prior.alpha * jnp.diagonal(covariance), 0.0, 1.0)
     return Laplace(solved.information, covariance, gamma, evidence)

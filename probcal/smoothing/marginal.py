@@ -47,7 +47,7 @@ def volume_slope(model: Model, point: Point, solved: Eliminated) -> tuple[jax.Ar
     stands on a cusp, at the place of a sensor, there is none: the derivative is zero and the second value False.
     """
     spread = [
-        rec.covariances(part.F, factors(part, point.levels), kept.J, kept.gain)[0]
+        rec.covariances(part.F, factors(part, point.levels), kept.gain)[0]
         for part, kept in zip(model.recursions, solved.parts, strict=True)
     ]
 
@@ -57,7 +57,7 @@ def volume_slope(model: Model, point: Point, solved: Eliminated) -> tuple[jax.Ar
         return sum((jnp.sum(P * J) for P, (J, _) in pairs), jnp.zeros(()))
 
     own, by_state = jax.grad(volume, argnums=(0, 1))(point.z, point.states)
-    moved, sound = _adjoint(model, point, solved, by_state)
+    moved, sound = _adjoint(model, point, solved, spread, by_state)
 
     def along(z: jax.Array) -> jax.Array:
         """Slope of the log-likelihood along the adjoint states."""
@@ -68,20 +68,20 @@ def volume_slope(model: Model, point: Point, solved: Eliminated) -> tuple[jax.Ar
     return jnp.where(sound, slope, 0.0), sound
 
 
-def _adjoint(model: Model, point: Point, solved: Eliminated, slope: States) -> tuple[States, jax.Array]:
+def _adjoint(
+    model: Model, point: Point, solved: Eliminated, spread: list[jax.Array], slope: States
+) -> tuple[States, jax.Array]:
     """Solve H x = slope (E, n), H the second derivatives of the negative log density by the trajectories.
 
-    Smoothing, S, solves with the expected information in the place of the observed. With R what the two differ by,
-    x = S y where (I + R S) y = slope: conjugate gradients in the inner product of S, one smooth each (Saad 2003, 6.7).
+    Smoothing, S, solves with the expected information in the place of the observed; `spread` are its covariances
+    (E, n, n). With R what the two differ by, x = S y where (I + R S) y = slope: conjugate gradients in the inner
+    product of S, one smooth each (Saad 2003, 6.7).
     Also whether it is positive all the way: elsewhere the trajectories are at no mode.
     """
 
     def smooth(right: States) -> States:
-        parts = zip(model.recursions, solved.parts, right, strict=True)
-        return tuple(
-            rec.smooth(part.F, factors(part, point.levels), kept.J, kept.gain, b[:, :, None]).states[:, :, 0]
-            for part, kept, b in parts
-        )
+        parts = zip(solved.parts, spread, right, strict=True)
+        return tuple(rec.respond(kept.gain, P, b[:, :, None])[:, :, 0] for kept, P, b in parts)
 
     score = jax.grad(lambda x: log_likelihood(model, At(x, point.z, point.levels)))
 

@@ -61,8 +61,9 @@ class Kept(NamedTuple):
 
 
 def factors(part: Recursion, levels: jax.Array) -> jax.Array:
-    """Noise factors with the estimated levels, (E, n, n)."""
+    """Noise factors with the estimated levels, and the precisions of noise that is not Gaussian, (E, n, n)."""
     scale = jnp.concatenate([jnp.exp(levels), jnp.ones(1, levels.dtype)])[part.level]
+    scale = scale / jnp.sqrt(part.weight) if part.tails else scale
     return part.L * scale[:, None, :]
 
 
@@ -72,15 +73,44 @@ def log_likelihood(model: Model, point: Where) -> jax.Array:
 
 
 def log_density(model: Model, point: Point) -> jax.Array:
-    """Log density of data and whitened noises given biases and levels, up to the constant of the noises."""
+    """Log density of data and whitened noises given biases and levels, up to the constant of the noises.
+
+    Noise that is not Gaussian has the precisions of the model here; `mixed_density` integrates them.
+    """
     return log_likelihood(model, point) - 0.5 * sum(jnp.sum(u**2) for u in point.noises)
+
+
+def mixed_density(model: Model, point: Point) -> jax.Array:
+    """`log_density` with the precisions of noise that is not Gaussian integrated, of noises whitened by those."""
+    value = log_density(model, point)
+    for part, u in zip(model.recursions, point.noises, strict=True):
+        for tail in part.tails:
+            square = tail.squares(u)
+            own = tail.family.mixing_density(square, tail.size) - 0.5 * square - 0.5 * tail.size * jnp.log(tail.weight)
+            given = 0.5 * jnp.sum(u[:, slice(*tail.columns)] ** 2, 1)
+            value = value + jnp.sum(jnp.where(tail.on, own + given, 0.0))
+    return value
+
+
+def mixing_gain(model: Model) -> jax.Array:
+    """What the evidence at the mean precisions lacks of its variational bound, the precisions uncertain.
+
+    With q(trajectory) q(w), log p(data) is at least the evidence at E w and this sum (Ting, Theodorou, Schaal 2007).
+    """
+    parts = [
+        jnp.sum(jnp.where(tail.on, tail.family.mixing_gain(tail.weight, tail.size), 0.0))
+        for part in model.recursions
+        for tail in part.tails
+    ]
+    return sum(parts, jnp.zeros(()))
 
 
 def widening(model: Model, levels: jax.Array) -> jax.Array:
     """Log determinant by which the levels widen the noises that they multiply."""
     levels = jnp.concatenate([levels, jnp.zeros(1, levels.dtype)])
     parts = [jnp.sum(jnp.any(part.L != 0, 1) * levels[part.level]) for part in model.recursions]
-    return sum(parts, jnp.zeros(()))
+    precisions = [0.5 * tail.size * jnp.sum(jnp.log(tail.weight)) for part in model.recursions for tail in part.tails]
+    return sum(parts, jnp.zeros(())) - sum(precisions, jnp.zeros(()))
 
 
 def cost(model: Model, point: Point, prior: Precision) -> jax.Array:
@@ -126,12 +156,12 @@ def eliminate_compressed(
     parts = zip(model.recursions, compressed.states, compressed.crosses, noises, strict=True)
     for r, (part, (J, pull), cross, u) in enumerate(parts):
         L = factors(part, levels)
-        gain = rec.gains(part.F, L, J)
         used = model.entries(r)
+        gain = rec.gains(part.F, L, J, used)
         if joint and used:
             columns = jnp.concatenate([pull[:, :, None], cross], 2)
             drift = jnp.zeros_like(columns).at[:, :, 0].set(-(L @ u[:, :, None])[:, :, 0])
-            alone, new = (c.reshape(-1, c.shape[2]) for c in rec.innovate(part.F, J, gain, columns, drift, used))
+            alone, new = (c.reshape(-1, c.shape[2]) for c in rec.innovate(part.F, gain, columns, drift))
             rows_ = jnp.concatenate([alone, new])
             signed = jnp.concatenate([-alone, new])
             information = information + linalg.gram(rows_[:, 1:], signed[:, 1:])
@@ -159,13 +189,16 @@ def _proposal(model: Model, point: Point, prior: Precision, damping: jax.Array, 
     return proposal, 0.5 * slope
 
 
-def follow(model: Model, point: Point, solved: Eliminated, dz: jax.Array) -> Point:
-    """Move the biases by dz (M,) and every trajectory to its smoothed response."""
+def follow(model: Model, point: Point, solved: Eliminated, dz: jax.Array, *, free: bool = False) -> Point:
+    """Move the biases by dz (M,) and every trajectory to its smoothed response.
+
+    Where scores are `free`, some data may have one without an information.
+    """
     states, noises = [], []
     for part, kept, x, u in zip(model.recursions, solved.parts, point.states, point.noises, strict=True):
         L = factors(part, point.levels)
         column = kept.pull - kept.cross @ dz[: kept.cross.shape[2]]
-        smooth = rec.smooth(part.F, L, kept.J, kept.gain, column[:, :, None], -(L @ u[:, :, None]))
+        smooth = rec.smooth(part.F, kept.gain, column[:, :, None], -(L @ u[:, :, None]), free=free)
         states.append(x + smooth.states[:, :, 0])
         noises.append(smooth.noises[:, :, 0])
     return point._replace(states=tuple(states), noises=tuple(noises), z=point.z + dz)

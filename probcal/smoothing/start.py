@@ -72,9 +72,7 @@ def _misfit(lin: Linearised) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames=("r", "span"))
-def _profile(
-    model: Model, r: int, span: tuple[int, int], z: jax.Array, place: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def profile(model: Model, r: int, span: tuple[int, int], z: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Loss (E,) and states (E, n) of recursion r with the position at `place` (E, d), other components profiled."""
     part = model.recursions[r]
     n = part.drift.shape[1]
@@ -106,7 +104,7 @@ def _losses(model: Model, r: int, span: tuple[int, int], z: jax.Array, places: j
     """Loss of every candidate at every epoch, (candidates, E)."""
     E = model.recursions[r].drift.shape[0]
     width = span[1] - span[0]
-    return jax.lax.map(lambda c: _profile(model, r, span, z, jnp.broadcast_to(c, (E, width)))[0], places)
+    return jax.lax.map(lambda c: profile(model, r, span, z, jnp.broadcast_to(c, (E, width)))[0], places)
 
 
 def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -160,7 +158,7 @@ def _path(problem: Problem, time: np.ndarray, loss: np.ndarray, places: np.ndarr
     return np.stack([np.interp(time, centre, column) for column in path.T], -1)
 
 
-def _known(problem: Problem, r: int, span: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def known_places(problem: Problem, r: int, span: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Mean positions (E, d) by the motion alone, and the epochs (E,) where they are better than the grid's."""
     part, place = problem.model.recursions[r], slice(*span)
     memory = np.asarray(part.F)[:, place].any((1, 2))
@@ -175,8 +173,8 @@ def _consistent(
     """Smooth pseudo-measured states (E, n) of precision `weight` (E, n) into a trajectory of the motion model."""
     L = factors(part, levels)
     J = jax.vmap(jnp.diag)(weight)
-    gain = rec.gains(part.F, L, J)
-    smooth = rec.smooth(part.F, L, J, gain, (weight * states)[:, :, None], part.drift[:, :, None])
+    gain = rec.gains(part.F, L, J, tuple(range(J.shape[-1])))
+    smooth = rec.smooth(part.F, gain, (weight * states)[:, :, None], part.drift[:, :, None])
     return smooth.states[:, :, 0], smooth.noises[:, :, 0]
 
 
@@ -196,20 +194,20 @@ def follow_states(problem: Problem, states: list[np.ndarray]) -> Point:
     return project(problem, states, [np.full_like(x, CLOSE) for x in states])
 
 
-def _grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
+def grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
     """Trajectories from the data alone at biases z (M,): grid, Viterbi path, motion model, iterated EKS."""
     places = candidates(problem)
     tracks, precisions = [], []
     for r, epochs in enumerate(problem.epochs):
         span = epochs.position
-        path, known = _known(problem, r, span)
+        path, known = known_places(problem, r, span)
         unknown = [name for name in dict.fromkeys(epochs.target) if not known[epochs.target == name].all()]
         if unknown:
             loss = np.asarray(_losses(_thinned(problem, r), r, span, z, places))
         for name in unknown:
             mine = epochs.target == name
             path[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)
-        _, states = _profile(problem.model, r, span, z, path)
+        _, states = profile(problem.model, r, span, z, path)
         states = np.array(states)
         with np.errstate(over="ignore"):  # gaps of 1e-300 s
             spread = np.sum(np.asarray(problem.model.recursions[r].L) ** 2, 2)
@@ -231,7 +229,7 @@ def automatic_start(problem: Problem, iterations: int = 30) -> Point:
     Grid, Viterbi path, motion model, iterated EKS at zero biases, then a few joint steps.
     """
     check_linear(problem)
-    tracked = _grid_start(problem, jax.device_put(np.zeros(problem.model.biases)), iterations)
+    tracked = grid_start(problem, jax.device_put(np.zeros(problem.model.biases)), iterations)
     prior = Precision.single(jnp.ones(problem.model.biases))
     return find_mode(problem.model, tracked, prior, iterations, 1e-3).point
 
@@ -271,13 +269,13 @@ def further_starts(problem: Problem, count: int, key: jax.Array) -> list[Point]:
     shape = (DRAWN * count, len(problem.labels))
     moved = np.asarray(jax.random.uniform(seeds[1], shape)) < SPARSE
     drawn = np.where(moved, 2.0 * np.asarray(jax.random.normal(seeds[2], shape)), 0.0)
-    points = [_grid_start(problem, jnp.asarray(z), 30) for z in np.concatenate([swaps, drawn])]
+    points = [grid_start(problem, jnp.asarray(z), 30) for z in np.concatenate([swaps, drawn])]
     flat = Precision.single(jnp.zeros(len(problem.labels)))
-    costs = [float(_cost(problem.model, point, flat)) for point in points]
+    costs = [float(joint_cost(problem.model, point, flat)) for point in points]
     value = np.nan_to_num(costs, nan=np.inf)
     pairs, others = np.argsort(value[: len(swaps)]), len(swaps) + np.argsort(value[len(swaps) :])
     half = min(len(pairs), (count + 1) // 2)
     return [points[k] for k in (*pairs[:half], *others[: count - half])]
 
 
-_cost = jax.jit(cost)
+joint_cost = jax.jit(cost)

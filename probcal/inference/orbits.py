@@ -1,0 +1,226 @@
+"""Moves along a gauge: the scene turned, shifted, or made larger, with tracks and process noise, in one jump.
+
+Where only priors and the motion hold the frame, biases and all trajectories go together, and steps that move one of
+them at a time creep. A similarity of places and tracks leaves what the sensors see nearly as it is: it is proposed by
+a random angle, shift or factor, -r as likely as r, and accepted by the joint density and the volume that it spreads
+(Green 1995; Liu, Sabatti 2000).
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.inference.hierarchy import Phi
+from probcal.inference.posed import Form, Posed, log_prior
+from probcal.problem import Problem
+from probcal.smoothing.frame import driving, log_weight, place, volume
+from probcal.smoothing.mode import Point, factors
+from probcal.smoothing.recursion import trajectory
+
+SIZES = (2.0, 0.5, 0.1)  # of a proposal, in sd along the direction by the frame: one of them by lot
+CLOSE = 1e-6  # share by which a moved track may miss the motion
+TURNING = 1.0  # largest angle in rad and log factor that a proposal is drawn from
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["base", "scale", "centre", "pinned", "size"],
+    meta_fields=["kind", "axes", "places", "headings", "spans", "levels", "volume"],
+)
+@dataclass(frozen=True)
+class Orbit:
+    """One family of similarities of a problem, r = 0 the identity."""
+
+    kind: str  # "turn", "shift", "size"
+    axes: tuple[int, int]  # the plane of a turn, the axis of a shift (twice)
+    places: tuple[tuple[int, ...], ...]  # biases of the places of nodes, one an axis
+    headings: tuple[int, ...]  # biases of headings
+    spans: tuple[tuple[tuple[int, int, bool], ...], ...]  # of each recursion: vectors in the state, whether a place
+    levels: tuple[int, ...]  # noise levels that grow with the scene
+    volume: float  # log volume that a factor exp(1) spreads
+    base: jax.Array  # (nodes, d) stated places
+    scale: jax.Array  # (M,)
+    centre: jax.Array  # (d,)
+    pinned: tuple[jax.Array, ...]  # pseudo-inverses (E, n, n) of the noise factors of each recursion
+    size: jax.Array  # () sd of r by the frame
+
+    def vector(self, r: jax.Array, value: jax.Array, *, place: bool) -> jax.Array:
+        """Vectors (..., d), places or not, moved by r."""
+        if self.kind == "shift":
+            return value.at[..., self.axes[0]].add(r) if place else value
+        centre = jnp.broadcast_to(self.centre if place else jnp.zeros_like(self.centre), value.shape)
+        away = value - centre
+        if self.kind == "size":
+            return centre + jnp.exp(r) * away
+        a, b = self.axes
+        c, s = jnp.cos(r), jnp.sin(r)
+        turned = away.at[..., a].set(c * away[..., a] - s * away[..., b])
+        return centre + turned.at[..., b].set(s * away[..., a] + c * away[..., b])
+
+    def biases(self, r: jax.Array, z: jax.Array) -> jax.Array:
+        """Biases (M,) moved by r."""
+        if self.places:
+            index = jnp.asarray(self.places)
+            place = self.base + z[index] * self.scale[index]
+            z = z.at[index].set((self.vector(r, place, place=True) - self.base) / self.scale[index])
+        if self.kind == "turn" and self.headings:
+            index = jnp.asarray(self.headings)
+            z = z.at[index].add(r / self.scale[index])
+        return z
+
+    def states(self, r: jax.Array, states: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        """Trajectories (E, n) moved by r."""
+        found = []
+        for x, spans in zip(states, self.spans, strict=True):
+            for start, stop, located in spans:
+                x = x.at[:, start:stop].set(self.vector(r, x[:, start:stop], place=located))
+            found.append(x)
+        return tuple(found)
+
+    def moved(self, posed: Posed, r: jax.Array, point: Point) -> Point:
+        """The point moved by r, its noises those of the moved trajectories at the moved levels."""
+        levels = point.levels.at[jnp.asarray(self.levels, int)].add(r) if self.levels else point.levels
+        states, noises = self.states(r, point.states), []
+        parts = zip(posed.model.recursions, states, point.noises, self.pinned, strict=True)
+        for part, x, u, inverse in parts:
+            old, new = (
+                jnp.concatenate([jnp.exp(own), jnp.ones(1)])[part.level] / jnp.sqrt(part.weight)
+                for own in (point.levels, levels)
+            )
+            before = jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
+            source = x - part.drift - jnp.einsum("eij,ej->ei", part.F, before)
+            idle = jnp.einsum("eij,ej->ei", part.L, old * u)  # columns that reach no state stay as they are
+            noises.append((old * u + jnp.einsum("eij,ej->ei", inverse, source - idle)) / new)
+        return Point(states, tuple(noises), self.biases(r, point.z), levels)
+
+
+class Place(NamedTuple):
+    """Where a chain stands, in the frame's coordinates."""
+
+    theta: jax.Array  # (Q,)
+    eps: tuple[jax.Array, ...]
+    weight: jax.Array  # log weight
+
+
+def roam(form: Form, posed: Posed, phi: Phi, at: Place, key: jax.Array) -> tuple[Place, jax.Array]:
+    """One proposal along each orbit of a posed problem, given the hyper-parameters: the place, and how many were taken.
+
+    The log density of a place is that of the joint posterior in the frame's coordinates.
+    """
+
+    def density(place: Place) -> jax.Array:
+        own = posed.frame.log_likelihood(place.theta) - 0.5 * sum(jnp.sum(e**2) for e in place.eps)
+        return place.weight + own + log_prior(form, posed, place.theta, phi)
+
+    taken = jnp.zeros(())
+    for k, orbit in enumerate(posed.orbits):
+        pick, draw, lot = jax.random.split(jax.random.fold_in(key, k), 3)
+        size = jax.random.choice(pick, jnp.asarray(SIZES)) * orbit.size
+        r = (size if orbit.kind == "shift" else jnp.minimum(size, TURNING)) * jax.random.normal(draw)
+        point = orbit.moved(posed, r, place(posed.model, posed.frame, at.theta, at.eps))
+        theta, eps = jnp.concatenate([point.z, point.levels]), driving(posed.model, posed.frame, point)
+        tried = Place(theta, eps, log_weight(posed.model, posed.frame, theta, eps))
+        gain = density(tried) - density(at) + orbit.volume * r
+        if orbit.levels:  # the frame spreads eps otherwise at other levels
+            there, here = (volume(posed.model, posed.frame, one.theta) for one in (tried, at))
+            gain = gain - there + here
+        accepted = jnp.log(jax.random.uniform(lot)) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
+        at = jax.tree.map(lambda new, old, accepted=accepted: jnp.where(accepted, new, old), tried, at)
+        taken = taken + accepted
+    return at, taken / max(len(posed.orbits), 1)
+
+
+def orbits_of(problem: Problem, posed: Posed, covariance: np.ndarray) -> tuple[Orbit, ...]:
+    """The similarities that can be tried on a problem, for a covariance (M, M) of z by the frame."""
+    d, point = problem.network.dimension, posed.frame.point
+    owners: dict[str, list[int]] = {}
+    headings = []
+    for m, bias in enumerate(problem.biases):
+        if bias.component == "position" and bias.since is None:
+            owners.setdefault(bias.owner, []).append(m)
+        elif bias.component == "heading" and bias.since is None:
+            headings.append(m)
+    by_name = {node.name: node for node in problem.network.nodes if node.path is None}
+    whole = {name: own for name, own in owners.items() if len(own) == d and name in by_name}
+    if not whole or any(form is not None for form in problem.model.sampled):
+        return ()
+    base: Any = np.stack([by_name[name].position for name in whole])
+    spans = tuple(
+        tuple((a, b, name == "position") for name, a, b, axis in epochs.layout if name in VECTORS and axis)
+        for epochs in problem.epochs
+    )
+    pinned: Any = tuple(linalg.pseudo_inverse(np.asarray(part.L)) for part in problem.model.recursions)
+    places = tuple(tuple(own) for own in whole.values())
+    found: list[Orbit] = []
+    kinds: list[tuple[str, tuple[int, int], bool]] = [
+        ("turn", (a, b), False) for a in range(d) for b in range(a + 1, d)
+    ]
+    kinds += [("shift", (a, a), False) for a in range(d)] + [("size", (0, 0), False)]
+    driven = _levels(problem, spans)
+    kinds += [("size", (0, 0), True)] if driven else []
+    for kind, axes, free in kinds:
+        turning = tuple(headings) if kind == "turn" and axes == (0, 1) else ()
+        levels = driven if free else ()
+        volume = float(d * len(places) + _entries(problem, spans, levels)) if kind == "size" else 0.0
+        arrays: Any = (base, problem.scales, base.mean(0), pinned, np.array(1.0))
+        found.append(Orbit(kind, axes, places, turning, spans, levels, volume, *arrays))
+    tried = jax.device_put(tuple(found))
+    kept = []
+    for orbit, (miss, slope) in zip(tried, _tried(tried, posed, point), strict=True):
+        if float(miss) < CLOSE:
+            wide = np.asarray(slope) @ np.linalg.lstsq(covariance, np.asarray(slope), rcond=None)[0]
+            kept.append(replace(orbit, size=jnp.asarray(1.0 / np.sqrt(max(wide, 1e-12)))))
+    return tuple(kept)
+
+
+VECTORS = ("position", "velocity", "acceleration")
+
+
+def _levels(problem: Problem, spans: tuple[Any, ...]) -> tuple[int, ...]:
+    """Unknown levels of the process noise of places, which belong to nothing else."""
+    found: set[int] = set()
+    other: set[int] = set()
+    H = len(problem.levels)
+    for part, own in zip(problem.model.recursions, spans, strict=True):
+        mine = np.zeros(part.drift.shape[1], bool)
+        for start, stop, _ in own:
+            mine[start:stop] = True
+        L, level = np.asarray(part.L) != 0, np.asarray(part.level)
+        inside, outside = L[:, mine].any(1), L[:, ~mine].any(1)
+        found |= set(level[inside & ~np.asarray(part.first)[:, None]].tolist())
+        other |= set(level[outside].tolist())
+    for rows in problem.model.rows:
+        other |= set(np.asarray(rows.level).ravel().tolist())
+    return tuple(sorted(found - other - {H}))
+
+
+def _entries(problem: Problem, spans: tuple[Any, ...], levels: tuple[int, ...]) -> int:
+    """Whitened noises that grow with the scene: those of vectors, without those whose level grows along."""
+    count = 0
+    for part, own in zip(problem.model.recursions, spans, strict=True):
+        mine = np.zeros(part.drift.shape[1], bool)
+        for start, stop, _ in own:
+            mine[start:stop] = True
+        active = (np.asarray(part.L)[:, mine] != 0).any(1)
+        count += int((active & ~np.isin(np.asarray(part.level), levels)).sum())
+    return count
+
+
+@jax.jit
+def _tried(orbits: tuple[Orbit, ...], posed: Posed, point: Point) -> list[tuple[jax.Array, jax.Array]]:
+    """By how much, relative to their size, moved tracks miss the motion, and the slope (M,) of the biases by r."""
+    found = []
+    for orbit in orbits:
+        moved, miss = orbit.moved(posed, jnp.asarray(0.1), point), jnp.zeros(())
+        for part, x, u in zip(posed.model.recursions, moved.states, moved.noises, strict=True):
+            again = trajectory(part.F, factors(part, moved.levels), part.drift[:, :, None], u[:, :, None])[:, :, 0]
+            own = jnp.max(jnp.abs(again - x)) / (1.0 + jnp.max(jnp.abs(x)))
+            miss = jnp.maximum(miss, jnp.where(jnp.isfinite(own), own, jnp.inf))
+        turn = jax.jvp(lambda r, o=orbit: o.biases(r, point.z), (jnp.zeros(()),), (jnp.ones(()),))[1]
+        found.append((miss, turn))
+    return found

@@ -1,0 +1,358 @@
+"""The other side of a mirror: tracks and nodes reflected in the lines and planes of a network, polished and compared.
+
+Sensors that see a distance, a strength or a delay cannot tell the two sides of the line (in 3-D the plane) on which
+their nodes lie. A climb ends on one side, and pieces of a track may end on different ones. Candidates are screened by
+the misfit of the data at the reflected places with the prior spread of the biases added to the noise, so that a network
+that has no mirror pays for two looks at its data.
+"""
+
+from collections.abc import Iterator, Sequence
+from itertools import chain, pairwise
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.labels import AXES
+from probcal.priors import Precision
+from probcal.problem import Problem
+from probcal.smoothing.information import at_levels
+from probcal.smoothing.linearised import laplace
+from probcal.smoothing.mode import Mode, Point, find_mode
+from probcal.smoothing.start import follow_states, grid_start, known_places, profile, track_mode
+from probcal.types import float64
+
+WORSE = 0.4  # nats a datum by which a reflected place may fit worse and is still polished: 0 to 0.2 beside a mirror,
+# 0.9 to 5 in networks without one (models/, share 0.3)
+FAR = 6.0  # scales beyond which a node is not reflected
+APART = 0.1  # share of a reflection that must be left after polishing: below, it came back
+TRIED, BREAKS, ROUNDS = 8, 30, 5  # pieces of tracks that are polished, places where one may be cut, and rounds of it
+SHORTEST = 3  # epochs of a piece: fewer do not stay on another side than their neighbours
+STRAIN = 20.0  # sum of squares of a process noise from which a track may be cut there
+GAIN = 1.0  # nats from which a piece belongs on the other side
+SAME, NEAR = 3.0, 10.0  # nats within which another answer is as good, and within which it is mentioned
+MOST = 4  # answers that are kept
+WINDOWS, HEARD = 60, 4  # parts of a track in which nodes may be heard alone, and sets of such nodes that are looked at
+
+
+class Plane(NamedTuple):
+    """A line in 2-D or a plane in 3-D."""
+
+    name: str
+    centre: np.ndarray  # (d,)
+    normal: np.ndarray  # (d,) unit
+
+    def distance(self, place: np.ndarray) -> np.ndarray:
+        """Signed distance (...) of places (..., d)."""
+        return (place - self.centre) @ self.normal
+
+    def across(self, place: np.ndarray) -> np.ndarray:
+        """Places (..., d) on the other side."""
+        return place - 2.0 * self.distance(place)[..., None] * self.normal
+
+
+class Mirrored(NamedTuple):
+    """Another answer: what was reflected, and its evidence less that of the answer (under the declared scales)."""
+
+    name: str
+    gain: float
+    point: Point
+    shift: np.ndarray  # (M,) its biases z less those of the answer
+
+
+class Sides(NamedTuple):
+    """What a search on the other sides found."""
+
+    point: Point  # the best place
+    moved: bool  # whether it is another than the given one
+    others: tuple[Mirrored, ...]  # those within `NEAR` nats of it, the best first
+
+
+@float64
+def other_sides(problem: Problem, point: Point) -> Sides:
+    """Search the other sides of a point: pieces of tracks first, then all of the scene, polished and compared."""
+    scales = Precision.single(jnp.ones(problem.model.biases))
+    point, turned, pieces = _turned(problem, point)
+    best: Point | None = None
+    found: list[Mirrored] = []
+    whole = ((name, across, track_mode(problem, across)) for name, across in _candidates(problem, point))
+    for name, candidate, start in chain(whole, pieces):
+        best = _polished(problem, point, scales).point if best is None else best
+        polished = _polished(problem, start, scales).point
+        size = distance(problem, candidate, best)
+        if not new(problem, polished, [best, *(other.point for other in found)], size):
+            continue
+        worth = [float(laplace(problem.model, at, scales).evidence) for at in (polished, best)]
+        if np.isfinite(worth).all() and worth[0] - worth[1] > -NEAR:
+            found.append(Mirrored(name, worth[0] - worth[1], polished, np.asarray(polished.z - best.z)))
+    found.sort(key=lambda other: -other.gain)
+    if found and best is not None and found[0].gain > 0.1:
+        first = found[0]
+        rest = [o._replace(gain=o.gain - first.gain, shift=o.shift - first.shift) for o in found[1:]]
+        back = Mirrored(first.name, -first.gain, best, -first.shift)
+        kept = [other for other in (back, *rest) if other.gain > -NEAR]
+        return Sides(first.point, True, tuple(kept[:MOST]))
+    return Sides(point, turned, tuple(found[:MOST]))
+
+
+def planes(problem: Problem, z: np.ndarray) -> list[Plane]:
+    """Least-squares lines (in 3-D planes) at biases z (M,): of the known nodes, of all, of those heard together."""
+    d, place = problem.network.dimension, node_places(problem, z)
+    free = {b.owner for b in problem.biases if b.component == "position"}
+    groups = [("the known nodes", [name for name in place if name not in free]), ("the nodes", list(place))]
+    groups += [(_listed(names), names) for names in _heard(problem, set(place))]
+    found: list[Plane] = []
+    for name, group in groups:
+        points = np.array([place[n] for n in group]).reshape(-1, d)
+        if len(group) < d:
+            continue
+        centre = points.mean(0)
+        values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(np.cov(points.T))))
+        if values[1] <= 1e-9 * values[-1]:  # nodes at one place, or on one line in 3-D
+            continue
+        plane = Plane(f"the {'line' if d == 2 else 'plane'} of {name}", centre, vectors[:, 0])
+        size = float(np.sqrt(values[-1]))
+        same = (abs(plane.normal @ p.normal) > 1 - 1e-9 and abs(p.distance(centre)) < 1e-6 * size for p in found)
+        if not any(same):
+            found.append(plane)
+    return found
+
+
+def touched(problem: Problem, point: Point, variances: Sequence[np.ndarray]) -> tuple[float, str]:
+    """How near in sd a target comes to a plane of the nodes, at the least, and in words which, when and where.
+
+    `variances` are those (E, n) of the states of each recursion. On the plane the data do not tell how far off it a
+    target is, nor on which side it goes on: an approximation by a Gaussian around one track says too little there.
+    """
+    least, words = np.inf, ""
+    for plane in planes(problem, np.asarray(point.z)):
+        for epochs, states, variance, mine in zip(
+            problem.epochs, point.states, variances, _movable(problem), strict=True
+        ):
+            place = slice(*epochs.position)
+            away = np.abs(plane.distance(np.asarray(states)[:, place]))
+            sd = np.sqrt(np.asarray(variance)[:, place] @ plane.normal**2)
+            ratio = np.where(mine, away / np.maximum(sd, 1e-300), np.inf)
+            k = int(ratio.argmin())
+            if ratio[k] < least:
+                least = float(ratio[k])
+                words = f'target "{epochs.target[k]}" touches {plane.name} at {epochs.time[k]:.6g} s'
+    return least, words
+
+
+def _heard(problem: Problem, resting: set[str]) -> list[list[str]]:
+    """Sets of resting nodes that alone tell of a target for some time, those of most rows first."""
+    data, sensors = problem.measurements, problem.network.sensors
+    nodes = [sorted({node.name for node in sensor.nodes} & resting) for sensor in sensors]
+    rows: dict[tuple[str, ...], int] = {}
+    for k in range(len(data.target_names)):
+        mine = np.flatnonzero(data.target == k)
+        for window in np.array_split(mine[np.argsort(data.time[mine], kind="stable")], WINDOWS):
+            names = tuple(sorted({name for s in np.unique(data.sensor[window]) for name in nodes[s]}))
+            if 2 <= len(names) < len(resting):
+                rows[names] = rows.get(names, 0) + len(window)
+    return [list(names) for names in sorted(rows, key=lambda names: -rows[names])[:HEARD]]
+
+
+def _listed(names: list[str]) -> str:
+    """Names in a sentence."""
+    few = names[:4]
+    return ", ".join(few[:-1]) + f" and {few[-1]}" if len(names) <= 4 else f"{', '.join(few)} and {len(names) - 4} more"
+
+
+def node_places(problem: Problem, z: np.ndarray) -> dict[str, np.ndarray]:
+    """Place (d,) of every node that rests, by name, at biases z (M,)."""
+    d = problem.network.dimension
+    place = {
+        node.name: node.position + [problem.fixed.get(f"{node.name}.position_{axis}", 0.0) for axis in AXES[:d]]
+        for node in problem.network.nodes
+        if node.path is None
+    }
+    for m, bias in enumerate(problem.biases):
+        if bias.component == "position" and bias.owner in place and bias.since is None:
+            place[bias.owner][bias.axis] += z[m] * bias.scale
+    return place
+
+
+def reflect_nodes(problem: Problem, z: np.ndarray, plane: Plane) -> np.ndarray:
+    """Biases (M,) with every node of free place on the other side, where that is within `FAR` scales."""
+    place, moved = node_places(problem, z), np.array(z, float)
+    own: dict[str, list[int]] = {}
+    for m, bias in enumerate(problem.biases):
+        if bias.component == "position" and bias.owner in place and bias.since is None:
+            own.setdefault(bias.owner, []).append(m)
+    for name, members in own.items():
+        shift = plane.across(place[name]) - place[name]
+        new = z[members] + [shift[problem.biases[m].axis] / problem.scales[m] for m in members]
+        if len(members) == problem.network.dimension and np.abs(new).max() < FAR:
+            moved[members] = new
+        elif len(members) < problem.network.dimension:
+            free = np.array([problem.biases[m].axis for m in members])
+            held = np.delete(shift, free)
+            if np.abs(held).max(initial=0.0) < 1e-6 * max(np.abs(shift).max(), 1e-300) and np.abs(new).max() < FAR:
+                moved[members] = new
+    return moved
+
+
+def reflect(problem: Problem, point: Point, plane: Plane, chosen: list[np.ndarray], z: np.ndarray) -> Point:
+    """The point at biases z (M,) with the chosen epochs (E,) of each recursion on the other side of a plane."""
+    tracks = []
+    for epochs, states, mine in zip(problem.epochs, point.states, chosen, strict=True):
+        moved = np.array(states)
+        for name, start, stop, _ in epochs.layout:
+            if name == "position":
+                moved[mine, start:stop] = plane.across(moved[mine, start:stop])
+            elif name in ("velocity", "acceleration"):
+                vector = moved[mine, start:stop]
+                moved[mine, start:stop] = vector - 2.0 * (vector @ plane.normal)[:, None] * plane.normal
+        tracks.append(moved)
+    return at_levels(problem.model, follow_states(problem, tracks)._replace(z=jnp.asarray(z)), point.levels)
+
+
+def _movable(problem: Problem) -> list[np.ndarray]:
+    """Epochs (E,) of each recursion whose place the data tell, not the motion."""
+    found = []
+    for r, epochs in enumerate(problem.epochs):
+        _, known = known_places(problem, r, epochs.position)
+        found.append(~known)
+    return found
+
+
+def _losses(problem: Problem, z: np.ndarray, point: Point, plane: Plane | None) -> list[np.ndarray]:
+    """Robust misfit (E,) of the data of each epoch at the places of a point, or at those on the other side."""
+    found = []
+    for r, (epochs, states) in enumerate(zip(problem.epochs, point.states, strict=True)):
+        place = np.asarray(states)[:, slice(*epochs.position)]
+        place = place if plane is None else plane.across(place)
+        loss, _ = profile(problem.model, r, epochs.position, jnp.asarray(z), jnp.asarray(place))
+        found.append(np.nan_to_num(np.asarray(loss), nan=1e9, posinf=1e9))
+    return found
+
+
+def _counts(problem: Problem) -> list[np.ndarray]:
+    """Number of data (E,) at each epoch of each recursion."""
+    found = [np.zeros(len(epochs.time)) for epochs in problem.epochs]
+    model = problem.model
+    for there, epoch, r in zip(model.measured, model.epoch, model.recursion, strict=True):
+        np.add.at(found[r], np.asarray(epoch), np.asarray(there).sum(1))
+    return found
+
+
+def _candidates(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
+    """Reflections of the whole scene, and of the track of one target alone, that fit nearly as well unpolished."""
+    z, movable, counts = np.asarray(point.z), _movable(problem), _counts(problem)
+    targets = [name for epochs in problem.epochs for name in dict.fromkeys(epochs.target)]
+    every = sum(float(count.sum()) for count in counts)
+    for plane in planes(problem, z):
+        here, nodes = _losses(problem, z, point, None), reflect_nodes(problem, z, plane)
+        ways = [(z, "")] if np.array_equal(nodes, z) else [(nodes, " and nodes"), (z, "")]
+        for biases, word in ways:
+            there = _losses(problem, biases, point, plane)
+            worse = [b - a for a, b in zip(here, there, strict=True)]
+            total = sum(float(w[mine].sum()) for w, mine in zip(worse, movable, strict=True))
+            if any(mine.any() for mine in movable) and total < WORSE * every:
+                who = "the targets" if len(targets) > 1 else f'target "{targets[0]}"'
+                yield f"{who}{word} reflected in {plane.name}", reflect(problem, point, plane, movable, biases)
+            if len(targets) < 2 or word:
+                continue
+            for name in targets[:MOST]:
+                own = [m & (e.target == name) for m, e in zip(movable, problem.epochs, strict=True)]
+                much = sum(float(c[mine].sum()) for c, mine in zip(counts, own, strict=True))
+                loss = sum(float(w[mine].sum()) for w, mine in zip(worse, own, strict=True))
+                if any(mine.any() for mine in own) and loss < WORSE * much:
+                    yield f'target "{name}" reflected in {plane.name}', reflect(problem, point, plane, own, z)
+
+
+def distance(problem: Problem, a: Point, b: Point) -> float:
+    """Root of the sum of squares of what lies between the places of two points."""
+    places = [
+        np.sum((np.asarray(x) - np.asarray(y))[:, slice(*epochs.position)] ** 2)
+        for x, y, epochs in zip(a.states, b.states, problem.epochs, strict=True)
+    ]
+    return float(np.sqrt(sum(places)))
+
+
+def new(problem: Problem, point: Point, known: Sequence[Point], size: float) -> bool:
+    """Whether a point lies apart from all that are known, by a good part of the size of a reflection."""
+    return size > 0 and all(distance(problem, point, other) > APART * size for other in known)
+
+
+def _turned(problem: Problem, point: Point) -> tuple[Point, bool, list[tuple[str, Point, Point]]]:
+    """The point with those pieces of tracks on the other side that fit better there; whether any do.
+
+    Also those that fit about as well: names, reflected and polished points.
+    Where there is a piece to be tried the whole track is searched again too, at the biases reached so far.
+    """
+    scales = Precision.single(jnp.ones(problem.model.biases))
+    others: list[tuple[str, Point, Point]] = []
+    best: Mode | None = None
+    turned, again = False, True
+    for _ in range(ROUNDS):
+        if not again:
+            break
+        again, others = False, []
+        for name, candidate in _cut(problem, point):
+            best = _polished(problem, point, scales) if best is None else best
+            smoothed = track_mode(problem, candidate)
+            if not new(problem, smoothed, [best.point], distance(problem, candidate, best.point)):
+                continue  # it came back by itself
+            tried = _polished(problem, smoothed, scales)
+            if float(tried.cost) < float(best.cost) - GAIN:
+                point, best, turned, again = tried.point, tried, True, True
+            elif float(tried.cost) < float(best.cost) + NEAR:
+                others.append((name, candidate, tried.point))
+        if best is not None and not again:
+            searched = at_levels(problem.model, grid_start(problem, best.point.z, 30), point.levels)
+            tried = _polished(problem, searched, scales)
+            if float(tried.cost) < float(best.cost) - GAIN:
+                point, best, turned, again = tried.point, tried, True, True
+    return point, turned, others
+
+
+def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
+    """Pieces of tracks on the other side, those first that fit best there unpolished: names, and the points."""
+    z, movable, counts = np.asarray(point.z), _movable(problem), _counts(problem)
+    pieces = []
+    for plane in planes(problem, z):
+        here, there = _losses(problem, z, point, None), _losses(problem, z, point, plane)
+        for r, epochs in enumerate(problem.epochs):
+            worse = there[r] - here[r]
+            for target in dict.fromkeys(epochs.target):
+                mine = np.flatnonzero((epochs.target == target) & movable[r])
+                for own in _pieces(problem, point, plane, r, mine):
+                    gain = float(WORSE * counts[r][own].sum() - worse[own].sum())
+                    if gain > 0 and len(own) >= SHORTEST and counts[r][own].any():
+                        pieces.append((gain, r, own, plane, target))
+    for _, r, own, plane, target in sorted(pieces, key=lambda piece: -piece[0])[:TRIED]:
+        chosen = [np.zeros(len(epochs.time), bool) for epochs in problem.epochs]
+        chosen[r][own] = True
+        first, last = problem.epochs[r].time[own[[0, -1]]]
+        name = f'target "{target}" from {first:.6g} to {last:.6g} s reflected in {plane.name}'
+        yield name, reflect(problem, point, plane, chosen, z)
+
+
+def _polished(problem: Problem, point: Point, scales: Precision) -> Mode:
+    """The joint mode under the declared scales next to a point."""
+    return find_mode(problem.model, point, scales, 30, 1e-3)
+
+
+def _pieces(problem: Problem, point: Point, plane: Plane, r: int, mine: np.ndarray) -> list[np.ndarray]:
+    """Epochs of pieces of a track, and of all that follows each cut: cut where it nears the plane, strains, or gaps."""
+    if len(mine) < 2:
+        return []
+    epochs = problem.epochs[r]
+    away = plane.distance(np.asarray(point.states[r])[mine][:, slice(*epochs.position)])
+    strain = np.sum(np.asarray(point.noises[r])[mine] ** 2, 1)
+    gap = np.diff(epochs.time[mine], prepend=epochs.time[mine[0]])
+    size, usual = np.abs(away), max(float(np.median(gap[1:])), 1e-300)
+    near = np.zeros(len(mine), bool)
+    near[1:-1] = (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:])
+    crossed = np.concatenate([[False], np.sign(away[1:]) != np.sign(away[:-1])])
+    worth = near + 2.0 * crossed + (strain > STRAIN) * strain / STRAIN + (gap > 5 * usual) * gap / (5 * usual)
+    worth[0] = 0.0
+    cuts = np.sort(np.argsort(-worth, kind="stable")[:BREAKS])
+    cuts = cuts[worth[cuts] > 0]
+    ends = [0, *cuts.tolist(), len(mine)]
+    pieces = [mine[a:b] for a, b in pairwise(ends) if len(ends) > 2]
+    return [*pieces, *(mine[a:] for a in ends[2:-1])]

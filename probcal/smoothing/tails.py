@@ -1,0 +1,55 @@
+"""Process noise that is not Gaussian: the weights of its scale mixture, by their expectation over the trajectories.
+
+u_k ~ N(0, I / w_k) with w_k drawn anew at every epoch. Given all w everything is Gaussian; given the trajectory each
+w_k has a posterior of its own. A climb alternates: w_k is the mean of its posterior at the expected square of u_k, its
+smoothed variance (biases and trajectory) included, which maximises a lower bound of the evidence (variational Bayes).
+Weights at the mode of u alone would prefer small noises, the error of the joint mode again.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.model.model import Mixing, Model
+from probcal.problem import Problem
+from probcal.smoothing.linearised import linearise
+from probcal.smoothing.mode import Point, track
+
+ROUNDS, STILL = 50, 1e-3  # of precisions and trajectories in turn, and change of log precision at which they end
+
+
+def expected_mixing(model: Model, point: Point, covariance: jax.Array) -> Mixing:
+    """Mean precisions (E,) of every tail at a point, for a covariance (M, M) of z."""
+    at = linearise(model, point)
+    found = []
+    pairs = zip(model.recursions, point.noises, at.noise_variances(covariance), strict=True)
+    for part, u, variance in pairs:
+        squares = [jnp.sum((u**2 + variance)[:, slice(*tail.columns)], 1) / tail.weight for tail in part.tails]
+        means = [tail.family.mixing_mean(s, tail.size) for tail, s in zip(part.tails, squares, strict=True)]
+        found.append(tuple(jnp.where(tail.on, w, 1.0) for tail, w in zip(part.tails, means, strict=True)))
+    return tuple(found)
+
+
+def rewhitened(model: Model, point: Point, weights: Mixing) -> Point:
+    """The same states at other precisions of the process noise than those of the model: its noises are rescaled."""
+    if not model.tailed:
+        return point
+    after = model.with_mixing(weights)
+    pairs = zip(point.noises, model.recursions, after.recursions, strict=True)
+    return point._replace(noises=tuple(u * jnp.sqrt(new.weight / old.weight) for u, old, new in pairs))
+
+
+def settle(problem: Problem, point: Point, covariance: jax.Array) -> tuple[Problem, Point]:
+    """Precisions and trajectories that agree, at held biases of a covariance (M, M): the problem, and the point."""
+    for _ in range(ROUNDS if problem.model.tailed else 0):
+        point = track(problem.model, point)
+        weights = _expected(problem.model, point, covariance)
+        pairs = zip(jax.tree.leaves(problem.model.mixing), jax.tree.leaves(weights), strict=True)
+        moved = max(float(np.abs(np.log(np.asarray(b) / np.asarray(a))).max(initial=0.0)) for a, b in pairs)
+        point, problem = rewhitened(problem.model, point, weights), problem.with_mixing(weights)
+        if moved < STILL:
+            break
+    return problem, point
+
+
+_expected = jax.jit(expected_mixing)
