@@ -182,17 +182,20 @@ def _mirrored(fit: Fitted, tree: xr.DataTree) -> dict[int, str]:
     if "mirror" not in tree.children:
         return found
     group = tree["mirror"].to_dataset()
-    if (group["gain"].values > -group.attrs["same"]).any():
-        variances = [np.asarray(v) for v in fit.at.variances(jnp.asarray(fit.covariance))]
-        near, where = touched(fit.problem, fit.point, variances)
-        if near < BEYOND:
-            return dict.fromkeys(range(fit.problem.model.biases), f"{where}, which hides on which side it goes on")
-    for k in np.flatnonzero(group["gain"].values > -group.attrs["same"]):
+    alike = np.flatnonzero(group["gain"].values > -group.attrs["same"])
+    for k in alike:
         away = group["apart"].values[k]
         for m in np.flatnonzero(away > BEYOND):
             found.setdefault(
                 int(m), f"it is {away[m]:.1f} sd away in an answer that fits as well: {group['mirror'].values[k]}"
             )
+    if len(alike):
+        near, where = touched(
+            fit.problem, fit.point, [np.asarray(v) for v in fit.at.variances(jnp.asarray(fit.covariance))]
+        )
+        if near < BEYOND:
+            every = dict.fromkeys(range(fit.problem.model.biases), f"{where}, which hides on which side it goes on")
+            return every | found
     return found
 
 
