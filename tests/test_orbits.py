@@ -9,10 +9,10 @@ import pytest
 from scipy import stats
 
 import probcal
-from probcal import ConstantVelocity, Horseshoe, Network, Node, Problem, Target, Unknown, simulate
+from probcal import ARD, ConstantVelocity, Horseshoe, Laplace, Network, Node, Problem, Target, Unknown, simulate
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.orbits import Place, orbits_of, roam
-from probcal.inference.posed import Form, Posed
+from probcal.inference.posed import Form, Posed, prior_precision
 from probcal.inference.prior_draws import draw_prior
 from probcal.motion import RandomWalk
 from probcal.sensors import doa, ranger
@@ -109,12 +109,20 @@ def made_volume(problem, made, theta, orbit, r):
     return float(volume(problem.model, made.frame, moved) - volume(problem.model, made.frame, theta))
 
 
-@pytest.mark.parametrize("case", [(2, False, False), (3, False, True)])
-def test_a_draw_of_the_posterior_stays_one(case):
+@pytest.mark.parametrize(
+    ("case", "prior", "runs"),
+    [
+        ((2, False, False), probcal.Gaussian(), 1000),
+        ((2, False, False), Horseshoe(), 1000),
+        ((2, False, False), ARD(2.0, 2.0, by="node"), 1000),
+        ((3, False, True), Horseshoe(), 400),
+        pytest.param((2, False, False), Laplace(), 1000, marks=pytest.mark.slow),
+    ],
+)
+def test_a_draw_of_the_posterior_stays_one(case, prior, runs):
     """Truths from the prior, each with its own data, and ten proposals an orbit: together still the prior."""
     problem, _, made, orbits = posed(*case)
     with jax.enable_x64(True):
-        prior = probcal.Gaussian()
         form = Form(problem.model.biases, hierarchy_of(prior, problem))
         first = prior.precision(problem.labels, problem.surveyed)
 
@@ -123,21 +131,24 @@ def test_a_draw_of_the_posterior_stays_one(case):
             own = Posed(problem.model.with_values(drawn.y), made.frame, first, orbits)
             theta = jnp.concatenate([drawn.point.z, drawn.point.levels])
             eps = driving(own.model, made.frame, drawn.point)
-            at = Place(theta, eps, log_weight(own.model, made.frame, theta, eps))
+            at = Place(theta, eps, drawn.phi, log_weight(own.model, made.frame, theta, eps))
 
             def again(at, k):
-                return roam(form, own, drawn.phi, at, jax.random.fold_in(key, k))
+                return roam(form, own, at, jax.random.fold_in(key, k))
 
             last, taken = jax.lax.scan(again, at, jnp.arange(10))
             there = place(own.model, made.frame, last.theta, last.eps)
             begin = jnp.concatenate([u[0] for u in there.noises])
-            return last.theta, begin, jnp.mean(taken), jnp.max(jnp.abs(last.theta - theta))
+            alpha, _ = prior_precision(form, own, last.phi)
+            return last, jnp.sqrt(alpha) * last.theta, begin, jnp.mean(taken), jnp.max(jnp.abs(last.theta - theta))
 
-        theta, begin, taken, moved = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(4), 1000))
-    theta = np.asarray(theta) / np.append(np.ones(form.biases), np.asarray(problem.model.level_spread))
+        last, unit, begin, taken, moved = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(4), runs))
+        laws = form.hierarchy.hyper()
+        hyper = [np.asarray(law.cdf(last.phi[name])).reshape(runs, -1) for name, law in laws.items()]
     assert float(np.mean(np.asarray(taken))) > 0.05
     assert float(np.median(np.asarray(moved))) > 0.02
-    worst = min(stats.kstest(column, "norm").pvalue for column in np.c_[theta, begin].T)
-    assert worst > 1e-3 / (theta.shape[1] + begin.shape[1])
-    middle = np.concatenate([theta.ravel(), begin.ravel()])
-    assert abs((middle**2).mean() - 1.0) < 0.05
+    columns = [*np.asarray(unit).T, *np.asarray(begin).T]
+    worst = [stats.kstest(column, "norm").pvalue for column in columns]
+    worst += [stats.kstest(column, "uniform").pvalue for values in hyper for column in values.T]
+    assert min(worst) > 1e-3 / len(worst)
+    assert abs((np.stack(columns) ** 2).mean() - 1.0) < 0.05

@@ -21,6 +21,8 @@ THRESHOLD = 0.05  # of the distance a power, ArviZ's own
 def power_scaling(tree: xr.DataTree) -> xr.Dataset | None:
     """Sensitivity (bias_label) of each bias to prior and likelihood; None where the tree lacks one of them.
 
+    None too where the draws' densities have no tail to weigh by: those of an answer far from Gaussian, whose worst
+    draws lie so deep that all others are alike.
     `noise` is the largest sensitivity found after the draws of the densities were shuffled against those of the
     biases: with the log-likelihood of thousands of data it may exceed ArviZ's threshold of 0.05, and what stays
     below it tells nothing.
@@ -39,7 +41,12 @@ def power_scaling(tree: xr.DataTree) -> xr.Dataset | None:
         var = "bias" if name == "log_prior" else "y"
         flat = values[var].values.reshape(len(order), -1)[order]
         shuffled[name] = values.assign({var: (values[var].dims, flat.reshape(values[var].shape))})
-    found, chance = ({way: _distance(groups, way) for way in ("prior", "likelihood")} for groups in (kept, shuffled))
+    try:
+        found, chance = (
+            {way: _distance(groups, way) for way in ("prior", "likelihood")} for groups in (kept, shuffled)
+        )
+    except ValueError:
+        return None
     finite = np.isfinite(found["prior"]) & np.isfinite(found["likelihood"])
     noise = max(float(np.nanmax(c, initial=0.0)) for c in chance.values())
     labels = kept["posterior"]["bias_label"].values

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.gibbs import sweep
+from probcal.inference.gibbs import surrogate
 from probcal.inference.hierarchy import Phi
 from probcal.inference.orbits import Place, roam
 from probcal.inference.posed import Conditional, Form, Posed, conditional, prior_precision
@@ -34,21 +34,6 @@ class Chain(NamedTuple):
     phi: Phi
     weight: jax.Array  # log weight of theta and eps
     key: jax.Array
-
-
-def surrogate(
-    form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array, sweeps: int
-) -> tuple[jax.Array, Phi]:
-    """Some sweeps, all forwards or all backwards by a coin: reversible under the frame's posterior."""
-    keys = jax.random.split(key, sweeps + 1)
-
-    def run(backwards: bool) -> Any:
-        def one(carry: tuple[jax.Array, Phi], own: jax.Array) -> tuple[tuple[jax.Array, Phi], None]:
-            return sweep(form, posed, *carry, own, backwards=backwards), None
-
-        return lambda: jax.lax.scan(one, (theta, phi), keys[1:])[0]
-
-    return jax.lax.cond(jax.random.bernoulli(keys[0]), run(True), run(False))
 
 
 def ellipse(
@@ -196,7 +181,8 @@ class Collapsed(Sampler):
             phi = update(phi, chain.theta[learnt], jax.random.fold_in(keys[2], k))
         given = conditional(form, posed, phi)
         theta, eps, weight, tries = MOVES[self.move](form, posed, chain, given, keys[3])
-        (theta, eps, weight), roamed = roam(form, posed, phi, Place(theta, eps, weight), jax.random.fold_in(keys[4], 0))
+        moved, roamed = roam(form, posed, Place(theta, eps, phi, weight), jax.random.fold_in(keys[4], 0))
+        theta, eps, phi, weight = moved
         chain = Chain(theta, eps, phi, weight, key)
         joint = weight + posed.frame.log_likelihood(theta) - 0.5 * sum(jnp.sum(e**2) for e in eps)
         stats = {"acceptance_rate": rate, "tries": tries, "log_weight": weight}

@@ -1,4 +1,4 @@
-"""Gibbs sweeps on a Gaussian likelihood: what the pilot, the collapsed sampler and integrated precisions share."""
+"""Gibbs sweeps on a Gaussian likelihood: what the pilot, the samplers and integrated precisions share."""
 
 from typing import Any
 
@@ -29,3 +29,18 @@ def sweep(
     for step, own in zip(steps[::-1] if backwards else steps, jax.random.split(key, len(steps)), strict=True):
         theta, phi = step(theta, phi, own)
     return theta, phi
+
+
+def surrogate(
+    form: Form, posed: Quadratic, theta: jax.Array, phi: Phi, key: jax.Array, sweeps: int
+) -> tuple[jax.Array, Phi]:
+    """Some sweeps, all forwards or all backwards by a coin: reversible under the frame's posterior."""
+    keys = jax.random.split(key, sweeps + 1)
+
+    def run(backwards: bool) -> Any:
+        def one(carry: tuple[jax.Array, Phi], own: jax.Array) -> tuple[tuple[jax.Array, Phi], None]:
+            return sweep(form, posed, *carry, own, backwards=backwards), None
+
+        return lambda: jax.lax.scan(one, (theta, phi), keys[1:])[0]
+
+    return jax.lax.cond(jax.random.bernoulli(keys[0]), run(True), run(False))

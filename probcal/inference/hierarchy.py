@@ -30,6 +30,7 @@ else:
 SHARED, INNER = 15, 40  # nodes of what all biases share, and of what each has of its own
 HALF, SLABS = 8, (0.3, 0.6, 1.2, 3.0)  # nodes of a global scale where the slab is shared too, and those of the slab
 LEAST, MOST = 1e-12, 1e16  # precisions outside carry no mass that a draw could show
+CELLS, NEAR, FAR = 64, -10.0, 10.0  # by which scales of their own are proposed: even cells of their logarithm
 Phi = dict[str, jax.Array]
 Update = Callable[[Phi, jax.Array, jax.Array], Phi]  # phi, learnt z, key
 
@@ -52,6 +53,7 @@ class Hierarchy(ABC):
 
     sweeps: ClassVar[int] = 10  # Gibbs sweeps between two draws that pay for themselves
     by_bias: ClassVar[tuple[str, ...]] = ()  # hyper-parameters that have a value a governed bias
+    own: ClassVar[str] = ""  # the positive hyper-parameter of which each group has its own, independent of the others
 
     @property
     def count(self) -> int:
@@ -117,6 +119,41 @@ class Hierarchy(ABC):
         """Log density of the hyper-parameters."""
         return sum((jnp.sum(d.log_prob(phi[name])) for name, d in self.hyper().items()), jnp.zeros(()))
 
+    def cells(self, phi: Phi, z: jax.Array) -> jax.Array:
+        """Log probability (cells, groups) that the own value of a group lies in a cell, given the rest and z (L,).
+
+        The conditional density by its value in the middle: what a proposal needs that can be weighed both ways.
+        """
+        prior, group, width = self.hyper()[self.own], jnp.asarray(self.group), (FAR - NEAR) / CELLS
+
+        def density(log: jax.Array) -> jax.Array:
+            values = jnp.full(self.count, jnp.exp(log))
+            alpha = jnp.clip(self.governed(phi | {self.own: values}), LEAST, MOST)
+            told = jnp.zeros(self.count).at[group].add(0.5 * (jnp.log(alpha) - alpha * z**2))
+            return prior.log_prob(values) + log + told
+
+        return jax.nn.log_softmax(jax.vmap(density)(NEAR + width * (jnp.arange(CELLS) + 0.5)), 0)
+
+    def renewed(self, phi: Phi, here: jax.Array, there: jax.Array, key: jax.Array) -> tuple[Phi, jax.Array]:
+        """Own values drawn anew for biases that move from here to there (L,), and what the draw adds to a log ratio.
+
+        That is the prior of the new values over that of the old ones, and the density of the way back over that of
+        the way there; minus infinity where the old values lie outside the cells.
+        """
+        if not self.own:
+            return phi, jnp.zeros(())
+        keys, width = jax.random.split(key), (FAR - NEAR) / CELLS
+        back, forth = self.cells(phi, here), self.cells(phi, there)
+        new = jax.random.categorical(keys[0], forth, 0)
+        logs = NEAR + width * (new + jax.random.uniform(keys[1], new.shape))
+        before = jnp.log(phi[self.own])
+        old = jnp.floor((before - NEAR) / width).astype(int)
+        inside = (old >= 0) & (old < CELLS)
+        way = jnp.where(inside, back[jnp.clip(old, 0, CELLS - 1), jnp.arange(self.count)], -jnp.inf)
+        prior = self.hyper()[self.own]
+        own = prior.log_prob(jnp.exp(logs)) + logs - prior.log_prob(phi[self.own]) - before
+        return phi | {self.own: jnp.exp(logs)}, jnp.sum(own + way - forth[new, jnp.arange(self.count)])
+
     def constrain(self, free: Phi) -> tuple[Phi, jax.Array]:
         """Hyper-parameters of unconstrained values, and the log density of these under the prior."""
         phi, density = {}, jnp.zeros(())
@@ -172,6 +209,8 @@ class Known(Hierarchy):
 class Precisions(Hierarchy):
     """ARD: one precision a group with a Gamma hyper-prior; the biases are then Student-t."""
 
+    own = "alpha"
+
     def belongs(self, name):
         """Precisions are those of groups; where each bias is a group of its own, of the biases."""
         return "bias" if self.group == tuple(range(len(self.learnt))) else "group"
@@ -211,6 +250,7 @@ class Exponentials(Hierarchy):
     """Laplace density as a Gaussian of exponential variance (Park, Casella 2008)."""
 
     by_bias = ("variance",)
+    own = "variance"
 
     def hyper(self):
         """Variances, (L,)."""
@@ -241,6 +281,8 @@ class Exponentials(Hierarchy):
 
 class RegularisedHorseshoe(Hierarchy):
     """Half-Cauchy local and global scales, cut by a slab (Piironen, Vehtari 2017): alpha = 1/c^2 + 1/(tau lambda)^2."""
+
+    own = "local_scale"
 
     def belongs(self, name):
         """Local scales are those of groups; where each bias is a group of its own, of the biases."""

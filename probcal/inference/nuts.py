@@ -10,12 +10,14 @@ import jax.numpy as jnp
 
 from probcal.errors import InputError
 from probcal.inference.coordinates import Free, Parts, parts
+from probcal.inference.gibbs import surrogate
 from probcal.inference.hierarchy import Phi
 from probcal.inference.orbits import Place, roam
 from probcal.inference.posed import Form, Posed, conditional
 from probcal.inference.sampler import Sample, Sampler
 from probcal.lazy import Later
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
+from probcal.smoothing.frame import log_weight
 
 if TYPE_CHECKING:
     from numpyro.infer import hmc
@@ -79,7 +81,9 @@ class NUTS(Sampler):
         self._started(kernels, chain.z, chain.rng_key)  # hands its settings to the kernel; its state is not used
         chain = kernels[1](chain)
         found = parts(form, posed, chain.z)
-        chain, found, roamed = self._roamed(form, posed, chain, found)
+        jumps = dict[str, jax.Array]()
+        if posed.orbits:
+            chain, found, jumps = self._jumped(form, posed, chain, found)
         stats = {
             "acceptance_rate": chain.accept_prob,
             "diverging": chain.diverging,
@@ -88,21 +92,26 @@ class NUTS(Sampler):
             "energy": chain.energy,
             "step_size": chain.adapt_state.step_size,
         }
-        stats |= {"roamed": roamed} if posed.orbits else {}
-        return chain, Sample(found.theta, chain.z.eps, found.phi, found.joint, stats)
+        return chain, Sample(found.theta, chain.z.eps, found.phi, found.joint, stats | jumps)
 
-    def _roamed(self, form: Form, posed: Posed, chain: Any, found: Parts) -> tuple[Any, Parts, jax.Array]:
-        """The chain after a proposal along each orbit."""
-        if not posed.orbits:
-            return chain, found, jnp.zeros(())
-        square = sum(jnp.sum(e**2) for e in chain.z.eps)
-        weight = found.joint + 0.5 * square - posed.frame.log_likelihood(found.theta)
-        begun = Place(found.theta, chain.z.eps, weight)
-        at, roamed = roam(form, posed, found.phi, begun, jax.random.fold_in(chain.rng_key, 1))
-        given = conditional(form, posed, found.phi)
-        free = chain.z._replace(eta=given.factor.T @ (at.theta - given.mean), eps=at.eps)
+    def _jumped(self, form: Form, posed: Posed, chain: Any, found: Parts) -> tuple[Any, Parts, dict[str, jax.Array]]:
+        """The chain after jumps: which biases are large changed on the frame, and a proposal along each orbit.
+
+        The first is a few Gibbs sweeps on the frame's Gaussian, taken or refused by the weight of the joint posterior
+        as `Collapsed` does it: a gradient leads from one sparse answer to another only through what fits neither.
+        """
+        keys = jax.random.split(jax.random.fold_in(chain.rng_key, 1), 4)
+        at = Place(found.theta, chain.z.eps, found.phi, log_weight(posed.model, posed.frame, found.theta, chain.z.eps))
+        theta, phi = surrogate(form, posed, at.theta, at.phi, keys[0], form.hierarchy.sweeps)
+        tried = Place(theta, at.eps, phi, log_weight(posed.model, posed.frame, theta, at.eps))
+        leapt = jnp.log(jax.random.uniform(keys[1])) < tried.weight - at.weight
+        at = jax.tree.map(lambda new, old: jnp.where(leapt, new, old), tried, at)
+        at, roamed = roam(form, posed, at, keys[2])
+        given = conditional(form, posed, at.phi)
+        free = Free(form.hierarchy.relax(at.phi), given.factor.T @ (at.theta - given.mean), at.eps)
         energy, slope = jax.value_and_grad(lambda own: -parts(form, posed, own).density)(free)
-        return chain._replace(z=free, potential_energy=energy, z_grad=slope), parts(form, posed, free), roamed
+        chain = chain._replace(z=free, potential_energy=energy, z_grad=slope)
+        return chain, parts(form, posed, free), {"leapt": leapt, "roamed": roamed}
 
     def across(self, form: Form, here: Posed, there: Posed, chain: Any) -> tuple[Any, jax.Array]:
         """The same coordinates on the other side."""

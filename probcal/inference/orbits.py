@@ -104,28 +104,32 @@ class Place(NamedTuple):
 
     theta: jax.Array  # (Q,)
     eps: tuple[jax.Array, ...]
+    phi: Phi
     weight: jax.Array  # log weight
 
 
-def roam(form: Form, posed: Posed, phi: Phi, at: Place, key: jax.Array) -> tuple[Place, jax.Array]:
-    """One proposal along each orbit of a posed problem, given the hyper-parameters: the place, and how many were taken.
+def roam(form: Form, posed: Posed, at: Place, key: jax.Array) -> tuple[Place, jax.Array]:
+    """One proposal along each orbit of a posed problem: the place, and the share that was taken.
 
-    The log density of a place is that of the joint posterior in the frame's coordinates.
+    The log density of a place is that of the joint posterior in the frame's coordinates. Scales that each bias has of
+    its own are proposed along, by their conditional at the moved biases: small ones would hold the scene.
     """
+    learnt = jnp.asarray(form.hierarchy.learnt, int)
 
     def density(place: Place) -> jax.Array:
         own = posed.frame.log_likelihood(place.theta) - 0.5 * sum(jnp.sum(e**2) for e in place.eps)
-        return place.weight + own + log_prior(form, posed, place.theta, phi)
+        return place.weight + own + log_prior(form, posed, place.theta, place.phi)
 
     taken = jnp.zeros(())
     for k, orbit in enumerate(posed.orbits):
-        pick, draw, lot = jax.random.split(jax.random.fold_in(key, k), 3)
+        pick, draw, renew, lot = jax.random.split(jax.random.fold_in(key, k), 4)
         size = jax.random.choice(pick, jnp.asarray(SIZES)) * orbit.size
         r = (size if orbit.kind == "shift" else jnp.minimum(size, TURNING)) * jax.random.normal(draw)
         point = orbit.moved(posed, r, place(posed.model, posed.frame, at.theta, at.eps))
         theta, eps = jnp.concatenate([point.z, point.levels]), driving(posed.model, posed.frame, point)
-        tried = Place(theta, eps, log_weight(posed.model, posed.frame, theta, eps))
-        gain = density(tried) - density(at) + orbit.volume * r
+        phi, ratio = form.hierarchy.renewed(at.phi, at.theta[learnt], theta[learnt], renew)
+        tried = Place(theta, eps, phi, log_weight(posed.model, posed.frame, theta, eps))
+        gain = density(tried) - density(at) + orbit.volume * r + ratio
         if orbit.levels:  # the frame spreads eps otherwise at other levels
             there, here = (volume(posed.model, posed.frame, one.theta) for one in (tried, at))
             gain = gain - there + here
