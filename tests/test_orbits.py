@@ -144,7 +144,7 @@ def test_a_draw_of_the_posterior_stays_one(case, prior, runs):
 
         last, unit, begin, taken, moved = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(4), runs))
         laws = form.hierarchy.hyper()
-        hyper = [np.asarray(law.cdf(last.phi[name])).reshape(runs, -1) for name, law in laws.items()]
+        hyper = [np.asarray(jax.vmap(law.cdf)(last.phi[name])).reshape(runs, -1) for name, law in laws.items()]
     assert float(np.mean(np.asarray(taken))) > 0.05
     assert float(np.median(np.asarray(moved))) > 0.02
     columns = [*np.asarray(unit).T, *np.asarray(begin).T]
