@@ -332,3 +332,15 @@ def test_a_target_that_keeps_turning_has_noises_that_go_together():
     assert len(texts) == 1
     assert "goes together over time" in texts[0]
     assert "ConstantAcceleration" in texts[0]
+
+
+def test_bounds_take_the_fisher_information_of_the_family():
+    """Student-t noise of 3 degrees tells as Gaussian noise of sqrt(9 / 7) times the std: 4 entries an epoch."""
+    problem = turned()
+    width = np.sqrt(9.0 / 7.0)
+    wide = ConstantVelocity(0.4 * width)
+    like = Problem(problem.network, Target(wide, START), problem.measurements.table, fix=["b.shift"])
+    own, other = (probcal.bounds(p, "parametric")["bias"]["sd"].values for p in (problem, like))
+    np.testing.assert_allclose(own, other, rtol=1e-3)  # the automatic starts differ a little
+    plain = probcal.bounds(turned(family=None), "parametric")["bias"]["sd"].values
+    assert (own > plain).all()

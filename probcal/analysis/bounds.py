@@ -40,7 +40,7 @@ def bounds(
     a start that is not declared is drawn ten extents wide, and bounds over such draws mean little, so state it or give
     tracks. True biases come from `truth.biases`, else 0. The parametric kind takes the motion's mean for what a track
     leaves out, and the automatic start for a target without a track (for the biases too, without a truth). Unknown
-    noise levels are taken at their guesses.
+    noise levels are taken at their guesses, process noise that is not Gaussian by the Fisher information of its family.
 
     Groups: `bias` (`sd` and `covariance` in the unit of the bias, `unit`, `scale`, dim `bias_label`) and `track` (`sd`
     by `epoch` and `component`, `position_rmse` in m). A bias has no bound where it takes part in a direction of which
@@ -55,7 +55,7 @@ def bounds(
         raise InputError(f"bounds: draws={draws}; take at least one")
     given = Truth() if truth is None else truth
     keys = jax.random.split(as_key(key))
-    model, levels = problem.model, jnp.zeros(len(problem.levels))
+    model, levels = problem.model.by_information(), jnp.zeros(len(problem.levels))
     if kind == "parametric":
         z, states = true_point(problem, truth)
     else:

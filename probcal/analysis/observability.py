@@ -39,7 +39,7 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     """
     check_free(problem)
     point = standpoint(problem, point, truth)
-    at = linearise(problem.model, point)
+    at = linearise(problem.model.by_information(), point)
     found = _information(at)
     null = gauge(problem, point)
     directions = weak_directions(problem, found.information, point, null)

@@ -171,7 +171,7 @@ def _of_places(model: Model, point: Point, places: jax.Array, block: int, mine: 
 
 
 def _information(problem: Problem, point: Point) -> np.ndarray:
-    return np.asarray(marginal_information(problem.model, point))
+    return np.asarray(marginal_information(problem.model.by_information(), point))
 
 
 def _gains(problem: Problem, known: np.ndarray, with_it: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -334,6 +334,14 @@ class Model(Stepwise):
         ]
         return replace(self, recursions=tuple(parts))
 
+    def by_information(self) -> "Model":
+        """The model with Gaussian process noises of the same Fisher information, which bounds see of their family."""
+        weights = tuple(
+            tuple(jnp.where(tail.on, tail.family.mixing_information(tail.size), 1.0) for tail in part.tails)
+            for part in self.recursions
+        )
+        return self.with_mixing(weights)
+
     def draw_noises(self, key: jax.Array, r: int, count: int) -> jax.Array:
         """Process noises (E, n, count) of recursion r from the prior, of unit level."""
         part = self.recursions[r]

@@ -145,10 +145,13 @@ def _data_groups(answer: Answer, draws: Draws, before: Point) -> dict[str, xr.Da
 def _attrs(answer: Answer) -> dict[str, Any]:
     """What was asked for, what ran, and how it ended."""
     found: Summary = answer.posterior.summary
+    intervals = (answer.prior.note if found.kind == "Laplace" else "") or answer.method.note(answer.prior)
+    if found.kind == "Laplace" and answer.problem.model.tailed:
+        intervals += "; each epoch's precision of the heavy-tailed process noise is held at its mean"
     attrs = {
         "method": answer.method.name, "requested": answer.requested.name, "prior": type(answer.prior).__name__,
         "approximate": found.kind, "precisions": found.precisions, "correlated": int(bool(answer.prior.correlation)),
-        "intervals": (answer.prior.note if found.kind == "Laplace" else "") or answer.method.note(answer.prior),
+        "intervals": intervals,
         "settings": f"{answer.method!r}, {answer.prior!r}", "interval_probability": INTERVAL,
         "results_version": RESULTS_VERSION, "motion": answer.motion, "interrupted": int(answer.interrupted),
         "status": str(answer.status), "message": answer.message, "data": answer.problem.measurements.table.source,
