@@ -19,6 +19,7 @@ import numpy as np
 from probcal import Problem, StudentT, assess
 from probcal.inference.fit import calibrate
 from probcal.motion import LinearMotion
+from probcal.results.scores import position_rmse
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import networks
@@ -27,17 +28,6 @@ import sflab
 import tdoa_flight
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
-
-
-def position_error(problem, tree, truth):
-    """Root mean square error of the tracks in m."""
-    squares = []
-    for epochs, name in zip(problem.epochs, ("mean", "mean_0"), strict=False):
-        true = truth.positions(epochs.time, epochs.target, problem.network.dimension)
-        there = np.isfinite(true).all(1)
-        found = tree["track"][name].values[:, slice(*epochs.position)]
-        squares.append(((found - true)[there] ** 2).sum(1))
-    return float(np.sqrt(np.concatenate(squares).mean()))
 
 
 def run(number, tails):
@@ -52,7 +42,7 @@ def run(number, tails):
     error = float(np.sqrt(np.mean(((group["mean"].values - true) / problem.scales) ** 2)))
     findings = assess(problem, tree, answer=answer)["finding"]
     return {
-        "error": error, "track": position_error(problem, tree, truth), "held": held.mean(),
+        "error": error, "track": position_rmse(tree, truth)[1], "held": held.mean(),
         "nonzero": held[true != 0].mean(), "motion": "motion" in findings["kind"].values,
         "converged": tree.attrs["status"] == "converged", "seconds": seconds,
     }  # fmt: skip
@@ -105,7 +95,7 @@ def recordings():
             findings = assess(problem, tree, answer=answer)["finding"].to_dataset()
             named = findings["sentence"].values[findings["kind"].values == "motion"].tolist()
             level = dict(tree["level"]["std"].to_series().round(3)) if "level" in tree.children else "known"
-            error = position_error(problem, tree, truth())
+            error = position_rmse(tree, truth())[1]
             cells = [
                 name,
                 word,

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
         observability,
         sensitivity,
     )
-    from probcal.diagnostics import drift_table, scores
     from probcal.errors import FitError, InputError
     from probcal.inference import (
         EA,
@@ -57,8 +56,10 @@ if TYPE_CHECKING:
     from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
     from probcal.problem import Problem
     from probcal.results.build import add_scores
+    from probcal.results.drifts import drift_table
     from probcal.results.io import load, save
-    from probcal.results.read import outliers, summary
+    from probcal.results.read import outliers, summary, tracks
+    from probcal.results.scores import scores
     from probcal.sensor import Bias, Channel, Drift, Sensor, SensorType, sensor
     from probcal.simulate import Simulation, Truth, simulate
     from probcal.table import read_table
@@ -70,7 +71,8 @@ __all__ = lazy(
             "assess bound_map bounds compare interchangeable next_anchors next_passes next_sensors "
             "observability sensitivity"
         ),
-        "probcal.diagnostics": "drift_table scores",
+        "probcal.results.drifts": "drift_table",
+        "probcal.results.scores": "scores",
         "probcal.errors": "FitError InputError",
         "probcal.inference": (
             "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares Unscented coverage_table fit "
@@ -89,7 +91,7 @@ __all__ = lazy(
         "probcal.table": "read_table",
         "probcal.results.build": "add_scores",
         "probcal.results.io": "load save",
-        "probcal.results.read": "outliers summary",
+        "probcal.results.read": "outliers summary tracks",
     },
     submodules="motion noise priors sensors",
 )

@@ -1,4 +1,4 @@
-"""What a truth says of a saved fit or study: position and bias error, coverage; tables of studies, comparisons."""
+"""Tables of studies and comparisons."""
 
 from __future__ import annotations
 
@@ -8,44 +8,10 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from probcal.labels import AXES, step_of
 from probcal.status import Status
 
 if TYPE_CHECKING:
-    from probcal.simulate import Truth
-
-
-def position_rmse(tree: xr.DataTree, truth: Truth) -> tuple[float, float] | None:
-    """Root mean square position error in m without and with calibration, over the epochs that the truth covers."""
-    track = tree["track"].to_dataset()
-    squares = []
-    for name in (n for n in track.data_vars if str(n).startswith("mean")):
-        s = str(name).removeprefix("mean")
-        axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in track[f"component{s}"].values]
-        true = truth.positions(track[f"epoch_time{s}"].values, track[f"epoch_target{s}"].values, len(axes))
-        both = [track[f"{kind}{s}"].sel({f"component{s}": axes}).values for kind in ("before", "mean")]
-        known = np.isfinite(true).all(1)
-        squares.append([((value - true)[known] ** 2).sum(1) for value in both])
-    before, after = (np.concatenate([s[k] for s in squares]) for k in (0, 1))
-    return (float(np.sqrt(before.mean())), float(np.sqrt(after.mean()))) if len(before) else None
-
-
-def scores(tree: xr.DataTree, truth: Truth) -> dict[str, float]:
-    """Scores by name: position RMSE before and after, normalised bias RMSE and coverage of the intervals."""
-    found: dict[str, float] = {}
-    positions = position_rmse(tree, truth)
-    if positions is not None:
-        found |= {"position_rmse_before": positions[0], "position_rmse_after": positions[1]}
-    if "calibration" in tree.children and truth.biases:
-        group = tree["calibration"].to_dataset()
-        known = [str(label) for label in group["bias_label"].values if str(label) in truth.biases]
-        if known:
-            chosen = group.sel(bias_label=known)
-            true = np.array([truth.biases[label] for label in known])
-            error = (chosen["mean"].values - true) / chosen["scale"].values
-            inside = (chosen["lower"].values <= true) & (true <= chosen["upper"].values)
-            found |= {"bias_rmse": float(np.sqrt(np.mean(error**2))), "coverage": float(inside.mean())}
-    return found
+    pass
 
 
 def grid_of(study: xr.Dataset) -> list[str]:
@@ -70,44 +36,6 @@ def study_table(study: xr.Dataset) -> pd.DataFrame:
         frame[status] = frame["status"] == status
         table[status] = frame.reset_index().groupby([*grid_of(study), "estimator"], sort=False)[status].sum()
     return table.reset_index().rename(columns={"estimator": "method"}).dropna(axis=1, how="all")  # no sd of one run
-
-
-def drift_table(tree: xr.DataTree) -> pd.DataFrame:
-    """Values of the drifting biases of a fit, one row a piece: bias, unit, since (s), mean, sd, lower, upper.
-
-    A value is the bias and its steps so far, fixed ones included; mean and sd are exact sums, the interval is of the
-    draws. The first piece begins with the first datum, steps before it are in its value. Empty where nothing drifts.
-    """
-    columns = ["bias", "unit", "since", "mean", "sd", "lower", "upper"]
-    if not {"calibration", "posterior"} <= set(tree.children):
-        return pd.DataFrame(columns=columns)
-    group, draws = tree["calibration"].to_dataset(), tree["posterior"].to_dataset()["bias"].values
-    labels = group["bias_label"].values.astype(str).tolist()
-    constant = tree["constant_data"].to_dataset()
-    fixed = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
-    every = [*labels, *fixed]
-    units = dict(zip(labels, group["unit"].values, strict=True))
-    mean, covariance = group["mean"].values, group["covariance"].values
-    start = float(tree["observed_data"].to_dataset()["time"].min())
-    tail = (1 - tree.attrs["interval_probability"]) / 2
-    steps: dict[str, list[tuple[float, str]]] = {}
-    for label in every:
-        step = step_of(label, every)
-        if step is not None:
-            steps.setdefault(step[0], []).append((step[1], label))
-    table = []
-    for name, own in steps.items():
-        known = [label for label in (name, *(label for _, label in own)) if label in units]
-        if not known:
-            continue
-        for since in sorted({max(time, start) for time, _ in own} | {start}):
-            so_far = [name, *(label for time, label in own if time <= since)]
-            members = [labels.index(label) for label in so_far if label in units]
-            held = sum(fixed.get(label, 0.0) for label in so_far)
-            lower, upper = held + np.quantile(draws[..., members].sum(-1), [tail, 1 - tail])
-            sd = np.sqrt(covariance[np.ix_(members, members)].sum())
-            table.append((name, units[known[0]], since, held + mean[members].sum(), sd, lower, upper))
-    return pd.DataFrame(table, columns=columns)
 
 
 def comparison_rows(comparison: xr.DataTree) -> pd.DataFrame:

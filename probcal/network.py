@@ -163,6 +163,8 @@ class BiasRecord:
     component: str
     axis: int = 0
     since: float | None = None  # time of a step
+    vector: bool = False  # whether the component has one value an axis
+    sensor_type: str = ""  # none where it is a bias of a node
 
     def steps(self, drift: Drift | None) -> list["BiasRecord"]:
         """The steps of this bias in order of time."""
@@ -271,7 +273,9 @@ class Network:
                 for axis in range(self.dimension if vector else 1):
                     suffix = f"_{AXES[axis]}" if vector else ""
                     label = f"{node.name}.{component}{suffix}"
-                    record = BiasRecord(label, bias.unit, bias.scale, 0.0, kind, node.name, component, axis)
+                    record = BiasRecord(
+                        label, bias.unit, bias.scale, 0.0, kind, node.name, component, axis, vector=vector
+                    )
                     records += [record, *record.steps(bias.drift)]
         return records
 
@@ -281,6 +285,8 @@ class Network:
             for name, bias in placed.type.biases.items():
                 owner = placed.type.name if bias.shared else placed.name
                 label = f"{owner}.{name}"
-                record = BiasRecord(label, bias.unit, bias.scale, bias.nominal, "scale", owner, name)
+                record = BiasRecord(
+                    label, bias.unit, bias.scale, bias.nominal, "scale", owner, name, sensor_type=placed.type.name
+                )
                 records |= {r.label: r for r in (record, *record.steps(bias.drift))}
         return list(records.values())

@@ -15,8 +15,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from probcal import plots
-from probcal.diagnostics import drift_table
 from probcal.files import write_whole
+from probcal.results.drifts import drift_table
 from probcal.results.read import outliers
 from probcal.results.schema import EVIDENCES, evidence_in
 from probcal.status import INVALID, Status
@@ -228,7 +228,7 @@ def _biases(tree: xr.DataTree) -> tuple[list[str], list[dict[str, Any]]]:
     judged = tree["verdict"].to_dataset() if "verdict" in tree.children else None
     columns += ["verdict", "reason"] if judged is not None else []
     columns += [EXTRA[name] for name in extra] + (["true value"] if known else [])
-    table = {str(name): group[name].values for name in group.data_vars if group[name].ndim == 1}
+    table = {str(name): group[name].values for name in (*group.data_vars, "unit") if group[name].ndim == 1}
     rows = []
     for k, label in enumerate(group["bias_label"].values.tolist()):
         one = {name: values[k] for name, values in table.items()}

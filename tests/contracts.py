@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from probcal.results.read import each_track
 from probcal.status import Status
 
 TOLERANCE = 1e-10
@@ -24,28 +25,20 @@ def check_tree(tree, problem):
     assert Status(tree.attrs["status"]) is not Status.MISFIT
 
 
-def suffixes(dataset):
-    """Suffixes of the recursions in a group: "", or "_0", "_1", ..."""
-    return [str(n).removeprefix("epoch_target") for n in dataset.coords if str(n).startswith("epoch_target")]
-
-
-def at(dataset, suffix, target, time):
-    """Which epochs of a recursion are those of a target at a time."""
-    owner, when = (dataset[f"epoch_{what}{suffix}"].values for what in ("target", "time"))
-    return (owner == target) & (when == time)
+def only(tree):
+    """The track of the only target of a tree."""
+    ((_, track),) = each_track(tree)
+    return track
 
 
 def by_epoch(tree, linear, values, variable):
     """Pairs of a track variable of a fit and a flat vector of the reference, epoch by epoch."""
-    track = tree["track"].to_dataset()
-    found, offset = [], 0
+    tracked, found, offset = dict(each_track(tree)), [], 0
     for chain in linear.chains:
+        track = tracked[chain.target]
+        assert list(track["component"].values) == chain.names
         for time in chain.times:
-            rows = [(s, e) for s in suffixes(track) for e in np.flatnonzero(at(track, s, chain.target, time))]
-            assert len(rows) == 1
-            s, e = rows[0]
-            assert list(track[f"component{s}"].values) == chain.names
-            found.append((track[f"{variable}{s}"].values[e], values[offset : offset + len(chain.names)]))
+            found.append((track[variable].sel(time=time).values, values[offset : offset + len(chain.names)]))
             offset += len(chain.names)
     assert offset == len(values)
     return np.concatenate([a for a, _ in found]), np.concatenate([b for _, b in found])

@@ -37,6 +37,8 @@ from probcal.geometry import bearing, norm
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import sflab
 
+from probcal.results.read import each_track
+
 DATA = Path(__file__).parents[2] / "shared" / "data"
 TOLERANCE = 1e-8
 
@@ -112,8 +114,7 @@ def test_innovations_are_those_of_a_loop_filter(linear):
                 assert nis == pytest.approx(expected, rel=TOLERANCE, abs=1e-9)
         assert total == pytest.approx(square[chain.target].sum(), rel=TOLERANCE)
     assert check.attrs["used"] == pytest.approx(float(tree["calibration"]["gamma"].sum()), rel=1e-10)
-    epochs = out["epoch_check"].to_dataset()
-    counted = sum(int(epochs[name].sum()) for name in epochs.data_vars if str(name).startswith("data"))
+    counted = sum(int(epochs["data"].sum()) for _, epochs in each_track(out, "epoch_check"))
     assert counted == len(naive.data)
 
 
@@ -308,11 +309,11 @@ def test_the_true_model_raises_no_alarm(judged):
         check = out[name].to_dataset()
         assert ((check["lower"] < check["nis"]) & (check["nis"] < check["upper"])).all()
         assert check.sizes[dim] == {"sensor": 4, "target": 2, "part": 8}[dim]
-    epochs = out["epoch_check"].to_dataset()
-    outside = ((epochs["nis"] < epochs["lower"]) | (epochs["nis"] > epochs["upper"])).sum()
-    assert outside <= stats.binom.isf(1e-4, epochs.sizes["epoch"], 0.01)
+    epochs = dict(each_track(out, "epoch_check"))
+    outside = sum(int(((e["nis"] < e["lower"]) | (e["nis"] > e["upper"])).sum()) for e in epochs.values())
+    assert outside <= stats.binom.isf(1e-4, sum(e.sizes["time"] for e in epochs.values()), 0.01)
+    assert all(0.2 < e.attrs["nees"] < e.attrs["nees_upper"] for e in epochs.values())
     attrs = out["epoch_check"].attrs
-    assert 0.2 < attrs["nees"] < attrs["nees_upper"]
     assert attrs["nees_bias_lower"] < attrs["nees_bias"] < attrs["nees_bias_upper"]
     assert attrs["nees_bias_count"] == len(problem.labels)
     p = out["channel_check"].to_dataset()[["p_misfit", "p_mean"]].to_array().values
@@ -572,11 +573,11 @@ def test_a_known_target_has_no_error_to_be_judged():
     problem = probcal.Problem(network, motion, both)
     tracks = pd.DataFrame(path, columns=["position_x", "position_y"]).assign(time=np.arange(30.0))
     truth = probcal.Truth(pd.concat([tracks.assign(target=name) for name in motion], ignore_index=True))
-    check = assess(problem, probcal.fit(problem, EA()), truth=truth)["epoch_check"].to_dataset()
-    names = [name for name in check.attrs if name.startswith("nees")]
-    assert names
-    assert np.isfinite([check.attrs[name] for name in names]).all()
-    assert set(check["nees_target"].values) == {"car"}
+    check = assess(problem, probcal.fit(problem, EA()), truth=truth)
+    epochs = dict(each_track(check, "epoch_check"))
+    assert "nees" not in epochs["plane"]
+    assert np.isfinite(epochs["car"]["nees"].values).all()
+    assert np.isfinite([epochs["car"].attrs[name] for name in ("nees", "nees_lower", "nees_upper")]).all()
 
 
 @pytest.mark.slow

@@ -41,22 +41,20 @@ from probcal.analysis.maps import bound_map
 from probcal.analysis.sensitivity import sensitivity
 from probcal.plots import plot_bound_map, plot_sensitivity
 from probcal.priors import Precision
+from probcal.results.read import each_track
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Point, cost, factors, find_mode
 from probcal.smoothing.start import project
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import radars
+from contracts import only
 
 
 def close(found, expected, tolerance=1e-10):
     found, expected = np.asarray(found), np.asarray(expected)
     assert found.shape == expected.shape
     assert np.abs(found - expected).max() <= tolerance * np.abs(expected).max()
-
-
-def suffixes(problem):
-    return [""] if len(problem.epochs) == 1 else [f"_{r}" for r in range(len(problem.epochs))]
 
 
 # bounds of biases and tracks
@@ -99,10 +97,13 @@ def test_the_bound_of_a_linear_problem_is_the_inverse_hessian(name):
         assert list(tree["bias"]["bias_label"].values) == list(problem.labels)
         close(tree["bias"]["covariance"].values / scale, covariance)
         close(tree["bias"]["sd"].values, np.sqrt(np.diag(covariance)) * problem.scales)
-        for s, expected in zip(suffixes(problem), variances, strict=True):
-            close(tree["track"][f"sd{s}"].values.ravel(), np.sqrt(np.maximum(expected, 0)))
-            place = tree["track"][f"sd{s}"].sel({f"component{s}": ["position_x", "position_y"]}).values
-            close(tree["track"][f"position_rmse{s}"].values, np.sqrt((place**2).sum(1)))
+        tracked = dict(each_track(tree))
+        for epochs, expected in zip(problem.epochs, variances, strict=True):
+            own = [tracked[name] for name in dict.fromkeys(epochs.target.tolist())]
+            close(np.concatenate([track["sd"].values.ravel() for track in own]), np.sqrt(np.maximum(expected, 0)))
+            for track in own:
+                place = track["sd"].sel(component=["position_x", "position_y"]).values
+                close(track["position_rmse"].values, np.sqrt((place**2).sum(1)))
 
 
 @pytest.mark.ci
@@ -137,7 +138,7 @@ def test_the_trajectory_is_eliminated_from_the_averaged_system():
     problem = Problem(network, Target(Static(), {"position": (0.0, 3.0)}), table)
     tree = bounds(problem, draws=4000)
     assert tree["bias"]["sd"].item() ** -2 == pytest.approx(4 / 0.25 + 1 / 4, rel=0.2)
-    assert tree["track"]["sd"].values[0, 0] ** -2 == pytest.approx(1 / 0.25 + 1 / 9, rel=0.01)
+    assert only(tree)["sd"].values[0, 0] ** -2 == pytest.approx(1 / 0.25 + 1 / 9, rel=0.01)
     hybrid = bounds(problem, "hybrid", truth=Truth(biases={"a.offset": 2.0}))
     assert hybrid["bias"]["sd"].item() ** -2 == pytest.approx(2.0**2 / (0.25 + 9), rel=1e-9)
     assert hybrid.attrs["message"] == "Every bias has a bound within its scale."
@@ -172,14 +173,14 @@ def test_a_bias_without_a_bound_is_named_and_left_out():
         tree = bounds(problem, kind, truth=truth, draws=2)
         assert set(tree["unbounded"]["bias_label"].values) == {"a.clock", "a.range_offset"}
         assert "some combination of a.clock, a.range_offset; survey or fix" in tree.attrs["message"]
-        for group in (tree["bias"], tree["track"]):
+        for group in (tree["bias"].to_dataset(), only(tree)):
             assert all(np.isfinite(v).all() for v in group.data_vars.values() if v.dtype.kind == "f")
         fixed = bounds(whole, kind, truth=truth, draws=2)
         others = ["b.range_offset", "c.range_offset", "d.range_offset"]
         assert list(tree["bias"]["bias_label"].values) == others
         close(tree["bias"]["covariance"].values, fixed["bias"]["covariance"].sel(
             bias_label=others, bias_label_other=others).values, 1e-8)  # fmt: skip
-        close(tree["track"]["sd"].values, fixed["track"]["sd"].values, 1e-8)
+        close(only(tree)["sd"].values, only(fixed)["sd"].values, 1e-8)
     posterior = bounds(problem, truth=truth, draws=2)
     assert "unbounded" not in posterior.children
     sd = posterior["bias"]["sd"].sel(bias_label=["a.clock", "a.range_offset"]).values
@@ -201,7 +202,7 @@ def test_tracks_are_taken_as_they_are_given():
     found, same = (bounds(problem, "hybrid", truth=Truth(t), draws=3) for t in (track, stated))
     close(found["bias"]["sd"].values, same["bias"]["sd"].values)
     other = bounds(problem, "hybrid", truth=Truth(stated.assign(velocity_x=-20.0)), draws=3)
-    assert abs(other["track"]["sd"].values / same["track"]["sd"].values - 1).max() > 0.01
+    assert abs(only(other)["sd"].values / only(same)["sd"].values - 1).max() > 0.01
     with pytest.raises(InputError, match='the true track of "a" does not reach time 2; extend it or drop the rows'):
         bounds(problem, truth=Truth(track.assign(time=[0.0, 1.5])))
 
@@ -232,7 +233,14 @@ def test_more_data_never_raise_a_bound(seed):
     for blank in (fewer, gone):
         problem = Problem(network, motion, more.assign(**more[columns].mask(blank)), fix=fixed)
         tree = bounds(problem, draws=3)
-        sd.append(np.concatenate([tree["bias"]["sd"].values / problem.scales, tree["track"]["sd"].values.ravel()]))
+        sd.append(
+            np.concatenate(
+                [
+                    tree["bias"]["sd"].values / problem.scales,
+                    np.concatenate([track["sd"].values.ravel() for _, track in each_track(tree)]),
+                ]
+            )
+        )
     assert (sd[1] <= sd[0] * (1 + 1e-9)).all()
     assert (sd[1] < sd[0] * (1 - 1e-3)).any()
 
@@ -303,8 +311,8 @@ def test_a_turned_and_moved_world_has_the_same_bounds(world):
     assert unbounded[0] == unbounded[1]
     assert set(one) == set(two)
     np.testing.assert_allclose([one[k] for k in one], [two[k] for k in one], rtol=1e-6)
-    np.testing.assert_allclose(after["track"]["position_rmse"], before["track"]["position_rmse"], rtol=1e-6)
-    assert (before["track"]["position_rmse"] > 0).all()
+    np.testing.assert_allclose(only(after)["position_rmse"], only(before)["position_rmse"], rtol=1e-6)
+    assert (only(before)["position_rmse"] > 0).all()
 
 
 @pytest.mark.slow
@@ -530,7 +538,7 @@ def test_sensitivity_of_a_linear_network_is_the_predicted_one():
     assert found["rmse"].dims == ("a.*", "[bc].position_x")
     assert agree(found)
     np.testing.assert_allclose(found["rmse"] ** 2, (found["position_rmse"] ** 2).mean("run"))
-    plain = bounds(problem.rebuild(fix=["*"]), draws=1)["track"]["position_rmse"].values
+    plain = only(bounds(problem.rebuild(fix=["*"]), draws=1))["position_rmse"].values
     assert float(found["predicted"][0, 0]) == pytest.approx(np.sqrt((plain**2).mean()), rel=1e-9)
     alone = sensitivity(problem, {"c.position_y": [0.0]}, runs=300)
     np.testing.assert_allclose(alone["position_rmse"][0], found["position_rmse"][0, 0], rtol=1e-9)

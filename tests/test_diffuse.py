@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from contracts import only
 
 import probcal
 from probcal import Bias, Channel, ConstantVelocity, Network, Node, Problem, geometry, sensor
@@ -178,7 +179,7 @@ def test_fit(d, extent):
     F, L, prior = (np.asarray(array) for array in (part.F, part.L, part.drift))
     assert L[0].max() >= 10 * extent
     mean, sd = (tree["calibration"][name].values for name in ("mean", "sd"))
-    prior, states = prior.astype(WIDE), tree["track"]["mean"].values.astype(WIDE)
+    prior, states = prior.astype(WIDE), only(tree)["mean"].values.astype(WIDE)
     for k in range(1, EPOCHS):
         prior[k] += F[k].astype(WIDE) @ prior[k - 1]
     line = states[:, None, :d] - stations[None]
@@ -195,5 +196,5 @@ def test_fit(d, extent):
     np.testing.assert_allclose(mean / SCALE, solved, rtol=0, atol=1e-5 * (sd / SCALE).min())
     np.testing.assert_allclose(sd / SCALE, np.sqrt(np.diag(np.linalg.inv(matrix))), rtol=1e-6)
     spread = np.sqrt(np.diagonal(expected["covariances"], axis1=1, axis2=2))
-    assert (tree["track"]["sd"].values >= spread * (1 - 1e-6)).all()
+    assert (only(tree)["sd"].values >= spread * (1 - 1e-6)).all()
     assert (np.abs(mean - offset) < 4.0 * sd).all()

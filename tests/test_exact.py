@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from contracts import TOLERANCE, at, by_epoch, close, suffixes
+from contracts import TOLERANCE, by_epoch, close
 from scipy import stats
 from worlds import DRAWN, LINEAR, exact, fitted, linear, resting
 
 import probcal
 from probcal.priors import Precision
+from probcal.results.read import each_track
 from probcal.smoothing.mode import find_mode
 
 WORLDS = [pytest.param(name, marks=pytest.mark.ci if name in ("space", "extras") else ()) for name in LINEAR]
@@ -107,12 +108,10 @@ def test_draws(name):
     posterior = tree["posterior"].to_dataset()
     scales = np.array(list(linear.scales.values()))
     columns = [posterior["bias"].sel(bias_label=linear.labels).values.reshape(1000, -1) / scales]
+    tracked = dict(each_track(tree))
     for chain in linear.chains:
-        for time in chain.times:
-            for s in suffixes(posterior):
-                mine = at(posterior, s, chain.target, time)
-                if mine.any():
-                    columns.append(posterior[f"state{s}"].values[:, :, mine].reshape(1000, -1))
+        own = tracked[chain.target]["state"].sel(time=chain.times)
+        columns.append(own.transpose("chain", "draw", "time", "component").values.reshape(1000, -1))
     draws = np.concatenate(columns, 1)
     assert draws.shape == (1000, len(exact.mean))
     values, vectors = np.linalg.eigh(exact.covariance)

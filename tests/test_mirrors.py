@@ -24,6 +24,7 @@ from probcal.status import Status
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import networks
+from contracts import only
 
 PLACES = [(0, 0), (40, 3), (80, -2), (120, 1)]
 
@@ -79,8 +80,9 @@ def test_a_mirror_is_reported_with_its_biases_and_they_are_weak(name):
     there = group["bias"].isel(mirror=0).sel(bias_label=across).values
     np.testing.assert_allclose(there, -own, atol=1.5 * sd.max())
     level = {"line": 0.0, "ceiling": 3.0}[name]
-    track = tree["track"].to_dataset()["mean"].values[:, problem.network.dimension - 1]
-    np.testing.assert_allclose(group["position"].isel(mirror=0).sel(axis=axis) - level, level - track, atol=1.0)
+    track = only(tree)["mean"].values[:, problem.network.dimension - 1]
+    other = tree["mirror/target"]["position"]
+    np.testing.assert_allclose(other.isel(mirror=0).sel(axis=axis) - level, level - track, atol=1.0)
     legend = [text.get_text() for text in plot_map(tree).get_legend().get_texts()]
     assert "fits as well" in legend
     verdicts = probcal.assess(problem, tree)["verdict"].to_dataset()
@@ -97,7 +99,7 @@ def test_a_piece_on_the_wrong_side_is_turned():
     start = on_the_wrong_side(problem, 2)
     assert off(start.states[0], path) > 15
     tree = probcal.fit(problem, start=start)
-    assert off(tree["track"].to_dataset()["mean"].values, path) < 4
+    assert off(only(tree)["mean"].values, path) < 4
 
 
 @pytest.mark.slow
@@ -110,7 +112,7 @@ def test_pieces_of_fifty_tracks_are_turned():
     for seed in range(50):
         problem, path = beside(seed)
         tree = probcal.fit(problem, start=on_the_wrong_side(problem, seed), key=seed)
-        there = off(tree["track"].to_dataset()["mean"].values, path)
+        there = off(only(tree)["mean"].values, path)
         if there > 6 and "mirror" not in tree.children:
             lost.append((seed, there))
     assert not lost

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
+from contracts import only
 
 import probcal
 from probcal import ConstantVelocity, Network, Node, Target
@@ -37,7 +38,7 @@ for node in tree.subtree:
     for name, variable in node.dataset.variables.items():
         kinds[f"{node.path}/{name}"] = (type(variable.values).__name__, str(variable.dtype))
 group = tree["calibration"].to_dataset()
-track = tree["track"].to_dataset()
+track = here["only"](tree)
 print(json.dumps({
     "changed_by_import": sorted(k for k in after_import if after_import[k] != before.get(k, after_import[k])),
     "changed_by_fit": sorted(k for k in after_fit if after_fit[k] != after_import.get(k, after_fit[k])),
@@ -132,7 +133,7 @@ def test_a_fit_changes_no_configuration_and_answers_in_double_precision():
         for name, variable in node.dataset.variables.items():
             assert isinstance(variable.values, np.ndarray), name
             assert variable.dtype not in (np.float32, np.float16, np.int32), name
-    values = [tree["calibration"]["mean"], tree["track"]["mean"], tree["posterior"]["bias"][:, :3]]
+    values = [tree["calibration"]["mean"], only(tree)["mean"], tree["posterior"]["bias"][:, :3]]
     for found in values:
         numbers = found.values.ravel()
         assert (numbers != numbers.astype(np.float32)).mean() > 0.9
@@ -143,7 +144,7 @@ def test_results_are_numpy_in_double_precision(processes):
     kinds = processes["plain"]["kinds"]
     assert processes["plain"]["scales"] == "float64"
     assert {kind for kind, _ in kinds.values()} == {"ndarray"}
-    for name in ("/posterior/bias", "/calibration/mean", "/track/sd", "/optimisation/objective"):
+    for name in ("/posterior/bias", "/calibration/mean", "/track/target/sd", "/optimisation/objective"):
         assert kinds[name][1] == "float64"
     assert not [name for name, (_, dtype) in kinds.items() if dtype in ("float32", "float16", "int32")]
 

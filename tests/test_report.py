@@ -46,18 +46,19 @@ def calibration(labels, scale, status):
     )
 
 
-def track(dimension, owners, suffix):
-    s, count = suffix, len(owners)
-    mean = np.cumsum(np.random.default_rng(1).normal(size=(count, dimension)), 0)
-    shape = (f"epoch{s}", f"component{s}")
-    return xr.Dataset(
-        {f"mean{s}": (shape, mean), f"sd{s}": (shape, np.ones_like(mean)), f"before{s}": (shape, mean + 3.0)},
-        coords={
-            f"component{s}": [f"position_{axis}" for axis in AXES[:dimension]],
-            f"epoch_time{s}": (f"epoch{s}", np.arange(count) * 1.0),
-            f"epoch_target{s}": (f"epoch{s}", owners),
-        },
-    )
+def tracked(dimension, owners, start=1):
+    """Tracks by target of epochs that have these owners, a group each."""
+    mean = np.cumsum(np.random.default_rng(start).normal(size=(len(owners), dimension)), 0)
+    axes, found = [f"position_{axis}" for axis in AXES[:dimension]], {}
+    for name in dict.fromkeys(owners.tolist()):
+        own = mean[owners == name]
+        values = {"mean": own, "sd": np.ones_like(own), "before": own + 3.0}
+        found[f"track/{name}"] = xr.Dataset(
+            {key: (("time", "component"), value) for key, value in values.items()},
+            coords={"component": axes, "time": np.flatnonzero(owners == name) * 1.0},
+            attrs={"target": name},
+        )
+    return found
 
 
 def residuals(count=300):
@@ -78,12 +79,12 @@ def make(dimension=2, nodes=("north", "south"), status="converged", recursions=1
     states[1] = "pruned"
     if status in INVALID:
         states[0] = status
-    tracks = [track(dimension, np.where(np.arange(EPOCHS) % 2, "car", "lorry"), "" if recursions == 1 else "_0")]
-    tracks += [track(dimension, np.array(["tree_a", "tree_b"]), "_1")] if recursions == 2 else []
+    tracks = tracked(dimension, np.where(np.arange(EPOCHS) % 2, "car", "lorry"))
+    tracks |= tracked(dimension, np.array(["tree_a", "tree_b"])) if recursions == 2 else {}
     position = 40.0 * np.random.default_rng(3).normal(size=(len(nodes), dimension))
     groups = {
         "calibration": calibration(labels, np.full(len(labels), 10.0), states),
-        "track": xr.merge(tracks),
+        **tracks,
         "residual": residuals(),
         "optimisation": xr.Dataset({"objective": ("iteration", [-300.0, -250.0, -249.0])}),
         "constant_data": xr.Dataset(
@@ -217,8 +218,9 @@ def test_numbers_that_do_not_exist_are_dashes(tmp_path):
     for name in ("mean", "sd", "lower", "upper", "gamma"):
         tree["calibration"][name][0] = np.nan
     tree["calibration"]["covariance"][0] = np.nan
-    tree["track"]["mean"][:10] = np.nan
-    tree["track"]["before"][:] = np.nan
+    tree["track/car"]["mean"][:10] = np.nan
+    for node in tree["track"].children.values():
+        node["before"][:] = np.nan
     tree["residual"]["before"][:] = np.nan
     text = words(page_of(tree, tmp_path))
     assert report.NONE in text

@@ -24,6 +24,7 @@ from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Form, Posed, conditional, update_inclusions, whiten
 from probcal.inference.posterior import mixing
 from probcal.priors import Precision
+from probcal.results.read import each_track
 from probcal.smoothing.frame import driving, frame_at, log_weight, place, volume
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import laplace
@@ -264,7 +265,7 @@ def test_a_linear_problem_has_its_exact_posterior(name, method):
     assert tree.attrs["approximate"] == "exact"
     if method == "collapsed":
         assert np.allclose(tree["sample_stats"]["acceptance_rate"], 1.0), "the collapse is exact here"
-    states = np.concatenate([tree["track"][n].values.ravel() for n in tree["track"].data_vars if n.startswith("sd")])
+    states = np.concatenate([track["sd"].values.ravel() for _, track in each_track(tree)])
     assert np.isfinite(states).all()
 
 

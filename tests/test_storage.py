@@ -567,7 +567,7 @@ LACKS = [
     (without("residual", "weight"), "is incomplete: its group residual lacks"),
     (without("calibration", "covariance"), "is incomplete: its group calibration lacks"),
     (without("constant_data", "moving"), "is incomplete: its group constant_data lacks"),
-    (without("track", "sd"), "is incomplete: its group track lacks"),
+    (without("track/car", "sd"), "is incomplete: its group track lacks"),
     (without("verdict", "reason"), "is incomplete: its group verdict lacks"),
     (unset("method"), "is incomplete: it has no attribute method; fit again"),
     (unset("interval_probability"), "is incomplete: it has no attribute interval_probability"),

@@ -5,6 +5,7 @@ from dataclasses import replace
 import committed
 import numpy as np
 import pytest
+from contracts import only
 from worlds import linear, resting
 
 import probcal
@@ -65,7 +66,7 @@ def far_away(std, distance):
 def test_an_undeclared_start_of_a_small_array_reaches_far():
     """A target at 1 km, 50 arrays away: the track holds it within 3 sd, as with a start that is declared."""
     problem, path = far_away(0.0175, 1000.0)
-    track = probcal.fit(problem)["track"].to_dataset()
+    track = only(probcal.fit(problem))
     off = np.abs(track["mean"].values[:, :2] - path) / track["sd"].values[:, :2]
     assert off.max() < 3.0
 

@@ -17,7 +17,8 @@ from probcal.analysis.widen import rejection, widened
 from probcal.identifiability.remedies import WEAK
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.results.groups import suffix
+from probcal.results.groups import bias_coords, node_of
+from probcal.results.read import each_track
 from probcal.simulate import Key, Truth, as_key
 from probcal.smoothing.mirrors import touched
 from probcal.status import INVALID, Status
@@ -66,7 +67,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     drawn = predictive.draws_of(fit, tree, keys[0])
     replicas = predictive.check(fit, drawn, keys[1])
     found = residuals.innovations(fit, replicas.kurtosis)
-    groups: dict[str, xr.Dataset] = {"epoch_check": checks.by_epoch(fit, found.innovations)}
+    groups: dict[str, xr.Dataset] = {"epoch_check": xr.Dataset()} | checks.by_epoch(fit, found.innovations)
     groups["datum_check"], findings = checks.by_datum(fit, found.innovations, tree)
     groups["channel_check"], more = checks.by_channel(fit, found.innovations, replicas)
     findings += more
@@ -145,8 +146,7 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
     )
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}
-    labels = {"bias_label": list(problem.labels)}
-    group = xr.Dataset({name: ("bias_label", value) for name, value in values.items()}, labels)
+    group = xr.Dataset({name: ("bias_label", value) for name, value in values.items()}, bias_coords(problem))
     group.attrs |= {"rate": RATE, "limit": known.limit}
     return group
 
@@ -311,7 +311,7 @@ def _halves(
     sd = np.sqrt(inflation[index] / np.array([contrast[m].information[0, 0] for m in index])) * scale
     group = xr.Dataset(
         {"change": ("bias_label", change), "sd": ("bias_label", sd), "t": ("bias_label", change / sd)},
-        {"bias_label": [problem.labels[m] for m in index]},
+        bias_coords(problem, index),
     )
     group.attrs |= {"time": float(middle), "limit": float(np.sqrt(limit)), "rate": RATE}
     return group
@@ -321,21 +321,17 @@ def _score(
     fit: Fitted, tree: xr.DataTree, drawn: predictive.Drawn, truth: Truth, groups: dict[str, xr.Dataset]
 ) -> None:
     """Add NEES of positions by epoch to `epoch_check`, and those of all positions and biases to its attributes."""
-    check = groups["epoch_check"]
-    for r in range(len(fit.problem.epochs)):
-        s = suffix(fit.problem, r)
-        found = nees.of_positions(tree, np.asarray(drawn.states[r]), truth, s, RATE)
-        if found is not None:
-            track = tree["track"].to_dataset()
-            coords = {
-                f"nees_time{s}": (f"nees_epoch{s}", track[f"epoch_time{s}"].values[found.known]),
-                f"nees_target{s}": (f"nees_epoch{s}", track[f"epoch_target{s}"].values[found.known]),
-            }
-            check = check.assign_coords(coords).assign({f"nees{s}": (f"nees_epoch{s}", found.value)})
-            check.attrs |= {f"nees{s}": found.mean, f"nees_lower{s}": found.lower, f"nees_upper{s}": found.upper}
+    tracked = dict(each_track(tree))
+    for r, epochs in enumerate(fit.problem.epochs):
+        for target in dict.fromkeys(np.asarray(epochs.target, str).tolist()):
+            states = np.asarray(drawn.states[r])[:, epochs.target == target]
+            found = nees.of_positions(target, tracked[target], states, truth, RATE)
+            if found is not None:
+                name = f"epoch_check/{node_of(target)}"
+                check = groups[name].assign_coords(nees_time=tracked[target]["time"].values[found.known])
+                groups[name] = check.assign(nees=("nees_time", found.value))
+                groups[name].attrs |= {"nees": found.mean, "nees_lower": found.lower, "nees_upper": found.upper}
     biases = nees.of_biases(tree, truth, RATE)
     if biases is not None:
-        check.attrs |= dict(
-            zip(("nees_bias", "nees_bias_count", "nees_bias_lower", "nees_bias_upper"), biases, strict=True)
-        )
-    groups["epoch_check"] = check
+        names = ("nees_bias", "nees_bias_count", "nees_bias_lower", "nees_bias_upper")
+        groups["epoch_check"].attrs |= dict(zip(names, biases, strict=True))

@@ -15,7 +15,7 @@ from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, 
 from probcal.errors import InputError, nearest
 from probcal.model.model import At, Model
 from probcal.problem import Problem
-from probcal.results.groups import by_epoch
+from probcal.results.groups import bias_coords, by_target
 from probcal.simulate import Key, Truth, as_key
 from probcal.smoothing.linearised import Trajectory, state_variances, trajectories_of
 from probcal.smoothing.mode import Compressed, compress, eliminate_compressed
@@ -43,7 +43,7 @@ def bounds(
     noise levels are taken at their guesses, process noise that is not Gaussian by the Fisher information of its family.
 
     Groups: `bias` (`sd` and `covariance` in the unit of the bias, `unit`, `scale`, dim `bias_label`) and `track` (`sd`
-    by `epoch` and `component`, `position_rmse` in m). A bias has no bound where it takes part in a direction of which
+    by `time` and `component`, `position_rmse` in m). A bias has no bound where it takes part in a direction of which
     the elimination leaves less than 1e-12 of the information that its biases would have with all else known; such
     biases are left out of `bias`, listed in the group `unbounded` and named in the attribute `message`, which also
     names those whose bound exceeds their scale.
@@ -118,18 +118,19 @@ def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.n
 def _tree(
     problem: Problem, kind: str, count: int, covariance: np.ndarray, bounded: np.ndarray, variances: list[np.ndarray]
 ) -> xr.DataTree:
-    labels, units = np.array(problem.labels, str), np.array([b.unit for b in problem.biases], str)
+    labels = np.array(problem.labels, str)
     covariance = (covariance * np.outer(problem.scales, problem.scales))[np.ix_(bounded, bounded)]
-    own = {"sd": np.sqrt(np.diag(covariance)), "unit": units[bounded], "scale": problem.scales[bounded]}
-    coords = {"bias_label": labels[bounded], "bias_label_other": labels[bounded]}
+    own = {"sd": np.sqrt(np.diag(covariance)), "scale": problem.scales[bounded]}
+    coords = {**bias_coords(problem, bounded), "bias_label_other": labels[bounded]}
     bias = xr.Dataset({name: ("bias_label", value) for name, value in own.items()}, coords=coords)
     bias["covariance"] = (("bias_label", "bias_label_other"), covariance)
     place = [np.sqrt(v[:, slice(*epochs.position)].sum(1)) for epochs, v in zip(problem.epochs, variances, strict=True)]
-    groups = {"bias": bias, "track": by_epoch(problem, {"sd": [np.sqrt(v) for v in variances], "position_rmse": place})}
+    spread = (("time", "component"), [np.sqrt(v) for v in variances])
+    tracks = by_target(problem, {"sd": spread, "position_rmse": (("time",), place)})
+    groups = {"bias": bias, **{f"track/{name}": group for name, group in tracks.items()}}
     message = _message(labels, bounded, np.sqrt(np.diag(covariance)) > problem.scales[bounded])
     if not bounded.all():
-        own = {"unit": ("bias_label", units[~bounded])}
-        groups["unbounded"] = xr.Dataset(own, coords={"bias_label": labels[~bounded]})
+        groups["unbounded"] = xr.Dataset(coords=bias_coords(problem, ~bounded))
     tree = xr.DataTree.from_dict(groups)
     tree.attrs.update(kind=kind, draws=count, message=message, data=problem.measurements.table.source)
     return tree

@@ -11,7 +11,7 @@ from probcal.analysis import leave, predictive, residuals
 from probcal.analysis.findings import LAGGED, NAMES, NOTABLE, PRACTICAL, Finding
 from probcal.analysis.fitted import Fitted
 from probcal.analysis.verdict import RATE
-from probcal.results.groups import suffix
+from probcal.results.groups import by_target
 
 GAIN = 5.0  # nats that a calibration must win before it is a finding
 
@@ -109,10 +109,9 @@ def _unlike_replicas(kind: str, names: list[str], p: np.ndarray, draws: int) -> 
     return found
 
 
-def by_epoch(fit: Fitted, found: residuals.Innovations) -> xr.Dataset:
-    """NIS of every epoch with data, its number of data and limits (false-alarm rate 1 % of each epoch)."""
-    values: dict[str, Any] = {}
-    coords: dict[str, Any] = {}
+def by_epoch(fit: Fitted, found: residuals.Innovations) -> dict[str, xr.Dataset]:
+    """NIS of every epoch with data, its number of data and limits (false-alarm rate 1 % of each epoch), by target."""
+    parts, kept = list[residuals.Squares](), list[np.ndarray]()
     model = fit.problem.model
     pairs = zip(model.measured, model.epoch, model.recursion, strict=True)
     places, owners = zip(
@@ -121,15 +120,14 @@ def by_epoch(fit: Fitted, found: residuals.Innovations) -> xr.Dataset:
     )
     epoch, owner = fit.flat(places), fit.flat(owners)
     for r, epochs in enumerate(fit.problem.epochs):
-        s, mine = suffix(fit.problem, r), owner == r
+        mine = owner == r
         there, group = np.unique(epoch[mine], return_inverse=True)
-        part = residuals.squares(residuals.Innovations(*(v[mine] for v in found)), group, len(there), RATE)
-        values |= {f"{name}{s}": (f"epoch{s}", value) for name, value in part._asdict().items()}
-        coords |= {
-            f"epoch_time{s}": (f"epoch{s}", epochs.time[there]),
-            f"epoch_target{s}": (f"epoch{s}", np.asarray(epochs.target, str)[there]),
-        }
-    return xr.Dataset(values, coords)
+        parts.append(residuals.squares(residuals.Innovations(*(v[mine] for v in found)), group, len(there), RATE))
+        kept.append(np.isin(np.arange(len(epochs.time)), there))
+    names = residuals.Squares._fields
+    columns = {name: (("time",), [np.asarray(getattr(part, name)) for part in parts]) for name in names}
+    groups = by_target(fit.problem, columns, kept=kept)
+    return {f"epoch_check/{name}": group for name, group in groups.items()}
 
 
 def by_datum(fit: Fitted, found: residuals.Innovations, tree: xr.DataTree) -> tuple[xr.Dataset, list[Finding]]:

@@ -14,9 +14,10 @@ from probcal.errors import InputError
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
-from probcal.problem import Problem
+from probcal.problem import Epochs, Problem
 from probcal.results.answer import Answer
-from probcal.results.groups import datum_of, gather, suffix, weight_name
+from probcal.results.groups import datum_of, gather, weight_name
+from probcal.results.read import each_track
 from probcal.smoothing import mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import Linearisation
@@ -87,7 +88,7 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
         raise InputError("assess: the tree is no fit; give the problem and the DataTree that fit() returned for it")
     if fit.attrs.get("motion") == "left out":
         problem = problem.unlinked() if answer is None else answer.problem
-    problem = _weighted(problem, fit["track"].to_dataset()) if answer is None else answer.problem
+    problem = _weighted(problem, dict(each_track(fit))) if answer is None else answer.problem
     group = fit["calibration"].to_dataset()
     if group["bias_label"].values.tolist() != list(problem.labels):
         raise InputError("assess: the tree was fitted with other free biases; give the problem as it was fitted")
@@ -100,21 +101,32 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
     return Fitted(problem, at, _prior(group), covariance, picks, data)
 
 
-def _weighted(problem: Problem, track: xr.Dataset) -> Problem:
-    """The problem with the precisions of its process noise that a tree holds."""
-    weights = []
-    for r, part in enumerate(problem.model.recursions):
-        names = [weight_name(problem, r, k) for k in range(len(part.tails))]
-        if any(name not in track or len(track[name]) != len(part.time) for name in names):
-            raise InputError("assess: the tree was fitted with other process noise; give the problem as it was fitted")
-        weights.append(tuple(jnp.asarray(track[name].values) for name in names))
-    return problem.with_mixing(tuple(weights))
+def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
+    """The problem with the precisions of its process noise that the tracks of a tree hold."""
+    names = [[weight_name(problem, r, k) for k in range(len(p.tails))] for r, p in enumerate(problem.model.recursions)]
+    return problem.with_mixing(
+        tuple(
+            tuple(jnp.asarray(_saved(epochs, tracked, name, "process noise")) for name in own)
+            for epochs, own in zip(problem.epochs, names, strict=True)
+        )
+    )
+
+
+def _saved(epochs: Epochs, tracked: dict[str, xr.Dataset], name: str, what: str) -> np.ndarray:
+    """A variable of the tracks of a tree at the epochs of a recursion, (E, ...)."""
+    parts = []
+    for target in dict.fromkeys(np.asarray(epochs.target, str).tolist()):
+        own = tracked.get(target)
+        if own is None or name not in own or own.sizes["time"] != int((epochs.target == target).sum()):
+            raise InputError(f"assess: the tree was fitted with other {what}; give the problem as it was fitted")
+        parts.append(own[name].values)
+    return np.concatenate(parts)
 
 
 def _point(problem: Problem, fit: xr.DataTree) -> Point:
     """Biases and levels of the tree, trajectories at their mode, searched from the saved ones."""
-    track = fit["track"].to_dataset()
-    saved = [track[f"mean{suffix(problem, r)}"].values for r in range(len(problem.epochs))]
+    tracked = dict(each_track(fit))
+    saved = [_saved(epochs, tracked, "mean", "targets") for epochs in problem.epochs]
     point = follow_states(problem, saved)
     if problem.levels:
         level = fit["level"].to_dataset()

@@ -25,19 +25,17 @@ class Nees(NamedTuple):
     upper: float
 
 
-def of_positions(tree: xr.DataTree, states: np.ndarray, truth: Truth, suffix: str, rate: float) -> Nees | None:
-    """NEES of the positions of one recursion, a dimension, from draws of its states (D, E, n); None without a truth.
+def of_positions(target: str, track: xr.Dataset, states: np.ndarray, truth: Truth, rate: float) -> Nees | None:
+    """NEES of the positions of one target, a dimension, from draws of its states (D, E, n); None without a truth.
 
     Errors of neighbouring epochs are alike: the limits of the mean are those of the posterior's own draws.
     """
-    track = tree["track"].to_dataset()
-    axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in track[f"component{suffix}"].values]
+    names, times = track["component"].values.tolist(), track["time"].values
+    axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in names]
     if truth.tracks is None:
         return None
-    chosen = {f"component{suffix}": axes}
-    true = truth.positions(track[f"epoch_time{suffix}"].values, track[f"epoch_target{suffix}"].values, len(axes))
+    true = truth.positions(times, np.full(len(times), target), len(axes))
     known = np.isfinite(true).all(1)
-    names = track[f"component{suffix}"].values.tolist()
     draws = states[:, known][:, :, [names.index(axis) for axis in axes]]  # (S, E, d)
     if not known.any() or len(draws) < 10 * len(axes):
         return None
@@ -49,7 +47,7 @@ def of_positions(tree: xr.DataTree, states: np.ndarray, truth: Truth, suffix: st
     known[known] = free
     draws, deviation, covariance = draws[:, free], deviation[:, free], covariance[free]
     whiten = np.asarray(jax.vmap(linalg.inverse_cholesky)(jnp.asarray(covariance)))
-    error = track[f"mean{suffix}"].sel(chosen).values[known] - true[known]
+    error = track["mean"].sel(component=axes).values[known] - true[known]
     value = (np.einsum("eij,ej->ei", whiten, error) ** 2).mean(1)
     own = (np.einsum("eij,sej->sei", whiten, deviation) ** 2).mean((1, 2))
     lower, upper = np.quantile(own, [rate / 2, 1 - rate / 2])

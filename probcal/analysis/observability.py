@@ -13,7 +13,7 @@ from probcal.identifiability.remedies import WEAK
 from probcal.problem import Problem
 from probcal.results.answer import tracks_of
 from probcal.results.build import bands
-from probcal.results.groups import constant_group, datum_of, direction_group, gather, track_group
+from probcal.results.groups import bias_coords, constant_group, datum_of, direction_group, gather, track_groups
 from probcal.simulate import Truth
 from probcal.smoothing.linearised import Linearisation, linearise
 from probcal.smoothing.mode import Point
@@ -47,7 +47,7 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
         "bias": _biases(problem, found),
         "spectrum": _spectrum(found.information),
         **_leverage_groups(problem, at, found),
-        "track": track_group(problem, bands(tracks_of(at, jnp.asarray(found.covariance)), point)),
+        **track_groups(problem, bands(tracks_of(at, jnp.asarray(found.covariance)), point)),
         "constant_data": constant_group(problem),
     }
     if directions:
@@ -97,14 +97,13 @@ def _status(least: float, gauge: bool) -> str:
 def _biases(problem: Problem, found: Information) -> xr.Dataset:
     scales, labels = problem.scales, list(problem.labels)
     columns = {
-        "unit": np.array([b.unit for b in problem.biases], str),
         "scale": scales,
         "kind": np.array([b.kind for b in problem.biases], str),
         "share": found.share,
         "sd": np.sqrt(np.diag(found.covariance)) * scales,
         "verdict": np.array([narrowed(share) for share in found.share]),
     }
-    group = xr.Dataset({k: ("bias_label", v) for k, v in columns.items()}, coords={"bias_label": labels})
+    group = xr.Dataset({k: ("bias_label", v) for k, v in columns.items()}, coords=bias_coords(problem))
     matrix = (("bias_label", "bias_label_other"), found.information)
     return group.assign(information=matrix).assign_coords(bias_label_other=labels)
 

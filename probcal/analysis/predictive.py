@@ -17,7 +17,7 @@ from probcal.analysis.fitted import Fitted
 from probcal.model.model import At, Model
 from probcal.model.rows import standardised
 from probcal.noise import Bernoulli, Gaussian
-from probcal.results.groups import suffix
+from probcal.results.read import each_track, saved_states
 from probcal.smoothing.draws import draw
 
 DRAWS = 400
@@ -109,7 +109,7 @@ def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Drawn:
     the Gaussian of the problem linearised at the fit.
     """
     posterior, problem = tree["posterior"].to_dataset(), fit.problem
-    names = [f"state{suffix(problem, r)}" for r in range(len(problem.epochs))]
+    tracked = dict(each_track(tree))
     total = posterior.sizes["chain"] * posterior.sizes["draw"]
     most = min(DRAWS, total, max(VALUES // problem.model.state_size, LEAST))
     chosen = np.linspace(0, total - 1, most).astype(int)
@@ -122,10 +122,10 @@ def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Drawn:
     if "level" in posterior:
         guess = np.array([level.guess for level in problem.levels])
         levels = jnp.asarray(np.log(thin(posterior["level"].values) / guess))
-    if not set(names) <= set(posterior.data_vars):
+    if any("state" not in track for track in tracked.values()):
         drawn = draw(fit.at, z, levels, key)
         return Drawn(z, levels, drawn.states, None)
-    states = tuple(jnp.asarray(thin(posterior[name].values)) for name in names)
+    states = tuple(jnp.asarray(thin(own)) for own in saved_states(problem, tracked))
     replicas = tree["posterior_predictive"].to_dataset()["y"] if "posterior_predictive" in tree.children else None
     if replicas is None or replicas.sizes["draw"] < posterior.sizes["draw"]:
         return Drawn(z, levels, states, None)

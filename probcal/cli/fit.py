@@ -56,7 +56,7 @@ def run(
                 tree = assess(problem, tree, truth=truth, key=seed, answer=answer)
     tree.attrs["model"] = model.stem
     if truth is not None:
-        from probcal.diagnostics import scores
+        from probcal.results.scores import scores
 
         add_scores(tree, scores(tree, truth), truth.biases)
     print(table_text(tree))

@@ -27,7 +27,6 @@ from probcal.model.model import Model
 from probcal.model.rows import Block, Rows
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem, check_linear
-from probcal.results.groups import suffix
 from probcal.results.read import apply
 from probcal.smoothing.frame import frame_at
 from probcal.smoothing.information import at_levels
@@ -40,6 +39,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
 DENSE = (Horseshoe, Gaussian, Laplace, ARD, Flat)  # priors with a density
+
+
+def suffix(problem: Problem, r: int) -> str:
+    """What the sites of recursion r end with: nothing where there is one only."""
+    return "" if len(problem.epochs) == 1 else f"_{r}"
 
 
 class Measured(dist.Distribution):

@@ -36,7 +36,7 @@ from probcal.inference.uniformity import NOMINAL
 from probcal.model import variants
 from probcal.priors import Precision, Prior
 from probcal.problem import Problem
-from probcal.results.groups import suffix
+from probcal.results.read import each_track, saved_states
 from probcal.simulate import Key, as_key
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import Point, find_mode
@@ -238,9 +238,10 @@ def _twice(problem: Problem, y: tuple[jax.Array, ...]) -> Problem:
 
 def _of_tree(problem: Problem, tree: xr.DataTree) -> Pool:
     """The draws of a saved fit of a problem."""
-    names = [f"state{suffix(problem, r)}" for r in range(len(problem.epochs))]
+    tracked = dict(each_track(tree))
     group = tree["posterior"].to_dataset() if "posterior" in tree.children else xr.Dataset()
-    if not {"bias", *names} <= set(group.data_vars) or set(problem.labels) != set(group["bias_label"].values.tolist()):
+    kept = "bias" in group and all("state" in tracked.get(name, ()) for name in problem.measurements.target_names)
+    if not kept or set(problem.labels) != set(group["bias_label"].values.tolist()):
         raise InputError(
             "sbc: around must be a fit of this problem that kept its draws of biases and states; fit it again with"
             ' save=("states",)'
@@ -255,7 +256,7 @@ def _of_tree(problem: Problem, tree: xr.DataTree) -> Pool:
         drawn, held = group.get("level"), tree["level"].to_dataset()["std"]
         std = held.sel(level=level.label) if drawn is None else drawn.sel(level_label=level.label)
         levels[:, h] = np.log(np.ravel(std.values) / level.guess)
-    points = Points(z, levels, tuple(flat(group[name].values) for name in names))
+    points = Points(z, levels, tuple(flat(states) for states in saved_states(problem, tracked)))
     return Pool(points, {}, group.sizes["chain"], True, False, "read")
 
 

@@ -7,6 +7,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from probcal.plots.base import COLOURS, NAMED, POINTS, ROWS, colour, new_axes, plain
+from probcal.results.read import each_track
 
 # the words of a verdict, each with its colour and mark
 VERDICTS = {
@@ -47,14 +48,9 @@ def plot_shrinkage(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
 def plot_nis(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw the NIS a datum of every epoch with its limits, and how many lie outside."""
     ax = new_axes(ax, 9.0, 3.4)
-    check = tree["epoch_check"].to_dataset()
     outside = total = 0
-    for k, name in enumerate(n for n in check.data_vars if str(n).split("_")[0] == "nis"):
-        s = str(name).removeprefix("nis")
-        order = np.argsort(check[f"epoch_time{s}"].values, kind="stable")
-        time, nis, lower, upper = (
-            check[f"{part}{s}"].values[order] for part in ("epoch_time", "nis", "lower", "upper")
-        )
+    for k, (_, check) in enumerate(each_track(tree, "epoch_check")):
+        time, nis, lower, upper = (check[part].values for part in ("time", "nis", "lower", "upper"))
         out = (nis < lower) | (nis > upper)
         outside, total = outside + int(out.sum()), total + len(out)
         shown = np.union1d(np.arange(0, len(time), len(time) // POINTS + 1), np.flatnonzero(out))

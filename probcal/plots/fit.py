@@ -15,7 +15,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch
 from matplotlib.ticker import MaxNLocator
 
-from probcal.diagnostics import drift_table
 from probcal.labels import label_parts
 from probcal.plots.base import (
     ALL_POINTS,
@@ -32,6 +31,8 @@ from probcal.plots.base import (
     plain,
     probability,
 )
+from probcal.results.drifts import drift_table
+from probcal.results.read import each_track
 from probcal.results.schema import EVIDENCES, evidence_in
 from probcal.status import INVALID
 
@@ -212,21 +213,11 @@ def _bias(label: str) -> str:
 
 
 def _tracks(tree: xr.DataTree) -> Iterator[_Track]:
-    """Positions of every target of every recursion (suffixes `_0`, `_1` where there are several)."""
-    group = tree["track"].to_dataset()
-    for name in group.data_vars:
-        if not str(name).startswith("mean"):
-            continue
-        s = str(name).removeprefix("mean")
-        axes = ["position_x", "position_y"]
-        if not np.isin(axes, group[f"component{s}"].values).all():
-            continue
-        before, after = (group[f"{kind}{s}"].sel({f"component{s}": axes}).values for kind in ("before", "mean"))
-        times, owners = group[f"epoch_time{s}"].values, group[f"epoch_target{s}"].values
-        for target in dict.fromkeys(owners.tolist()):
-            mine = np.nonzero(owners == target)[0]
-            mine = mine[np.argsort(times[mine], kind="stable")]
-            yield _Track(str(target), before[mine], after[mine])
+    """Positions of every target that has some."""
+    axes = ["position_x", "position_y"]
+    for target, group in each_track(tree):
+        if np.isin(axes, group["component"].values).all():
+            yield _Track(target, *(group[kind].sel(component=axes).values for kind in ("before", "mean")))
 
 
 def _mirrored(tree: xr.DataTree) -> Iterator[_Track]:
@@ -235,18 +226,12 @@ def _mirrored(tree: xr.DataTree) -> Iterator[_Track]:
         return
     group = tree["mirror"].to_dataset()
     same = group.attrs["same"]
-    group = group.isel(mirror=int(group["gain"].values.argmax()))
-    if group["gain"].item() <= -same:
+    best = int(group["gain"].values.argmax())
+    if group["gain"].values[best] <= -same:
         return
-    for name in group.data_vars:
-        if str(name).startswith("position"):
-            s = str(name).removeprefix("position")
-            places, owners = group[name].values[:, :2], group[f"epoch_target{s}"].values
-            times = group[f"epoch_time{s}"].values
-            for target in dict.fromkeys(owners.tolist()):
-                mine = np.nonzero(owners == target)[0]
-                mine = mine[np.argsort(times[mine], kind="stable")]
-                yield _Track(str(target), places[mine], places[mine])
+    for target, there in each_track(tree, "mirror"):
+        places = there["position"].isel(mirror=best).values[:, :2]
+        yield _Track(target, places, places)
 
 
 def _draw_mirrored(ax: Axes, tracks: list[_Track]) -> list[Line2D]:

@@ -14,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from probcal.labels import label_parts
 from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, new_axes, plain, write_figure
 from probcal.plots.bounds import plot_bound_map
+from probcal.results.read import each_track
 
 REACH = 0.12  # longest arrow of a direction, in widths of the map
 SHOWN = 6  # directions on one map
@@ -94,14 +95,10 @@ def draw_check(tree: xr.DataTree, passes: xr.Dataset, bound: xr.Dataset, path: s
 
 def _draw_scene(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
     """Draw nodes and tracks, and return their legend entries."""
-    nodes, track = tree["constant_data"].to_dataset(), tree["track"].to_dataset()
-    for name in (str(n) for n in track.data_vars if str(n).startswith("mean")):
-        s = name.removeprefix("mean")
-        places = track[name].sel({f"component{s}": ["position_x", "position_y"]}).values
-        owners = track[f"epoch_target{s}"].values
-        for target in dict.fromkeys(owners.tolist()):
-            mine = owners == target
-            ax.plot(*places[mine].T, "." if mine.sum() == 1 else "-", color=BEFORE, linewidth=1.0, zorder=1)
+    nodes = tree["constant_data"].to_dataset()
+    for _, track in each_track(tree):
+        places = track["mean"].sel(component=["position_x", "position_y"]).values
+        ax.plot(*places.T, "." if len(places) == 1 else "-", color=BEFORE, linewidth=1.0, zorder=1)
     stated = nodes["node_position"].values[:, :2]
     style: dict[str, Any] = {"color": "black", "markerfacecolor": "none", "markersize": 6}
     ax.plot(*stated.T, "s", zorder=5, **style)

@@ -12,15 +12,17 @@ import numpy as np
 
 from probcal.labels import AXES
 from probcal.lazy import Later
+from probcal.results.accessor import register
 from probcal.results.answer import Answer, Draws, Summary, Tracks, uncalibrated
 from probcal.results.groups import (
     Band,
+    bias_coords,
+    by_target,
     constant_group,
     datum_of,
     direction_group,
     gather,
-    suffix,
-    track_group,
+    track_groups,
 )
 from probcal.results.schema import BOUND, EVIDENCE, INTERVAL, RESULTS_VERSION
 from probcal.smoothing.draws import residuals
@@ -51,9 +53,9 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
     before = track_mode(problem, uncalibrated(posterior.point))
     tracks = bands(posterior.tracks(), before)
     groups = {
-        "posterior": _posterior_group(answer, draws, track_group(problem, tracks)),
+        "posterior": _posterior_group(answer, draws),
         "calibration": _calibration_group(answer),
-        "track": track_group(problem, tracks),
+        **track_groups(problem, tracks, draws.states, _sample(draws) if len(draws.states) else None),
         "constant_data": constant_group(problem),
         **_data_groups(answer, draws, before),
     }
@@ -74,6 +76,7 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
         groups["direction"] = direction_group(problem.labels, directions)
     for group in groups.values():
         group.attrs.update(inference_library="probcal", inference_library_version=version("probcal"))
+    register()
     tree = xr.DataTree.from_dict(groups)
     tree.attrs.update(_attrs(answer))
     return tree
@@ -89,18 +92,15 @@ def bands(tracks: Sequence[Tracks], before: Point) -> list[Band]:
     return [Band(own.mean, own.sd, np.asarray(old)) for own, old in zip(tracks, before.states, strict=True)]
 
 
-def _posterior_group(answer: Answer, draws: Draws, track: xr.Dataset) -> xr.Dataset:
+def _posterior_group(answer: Answer, draws: Draws) -> xr.Dataset:
     """Draws of the biases, and of what else varies with them."""
     problem = answer.problem
     values: dict[str, Any] = {"bias": ((*SAMPLE, "bias_label"), draws.z * problem.scales)}
-    for r, states in enumerate(draws.states):
-        s = suffix(problem, r)
-        values[f"state{s}"] = ((*SAMPLE, f"epoch{s}", f"component{s}"), states)
-    further: dict[str, Any] = {str(k): v for k, v in track.coords.items()} if len(draws.states) else {}
+    further: dict[str, Any] = {}
     for name, (dims, drawn, *own) in answer.posterior.variables.items():
         values[name] = ((*SAMPLE, *dims), drawn)
         further |= own[0] if own else {}
-    return xr.Dataset(values, coords={**_sample(draws), **further, "bias_label": list(problem.labels)})
+    return xr.Dataset(values, coords={**_sample(draws), **further, **bias_coords(problem)})
 
 
 def _calibration_group(answer: Answer) -> xr.Dataset:
@@ -110,7 +110,7 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
     columns = {
         "mean": found.mean * scales, "sd": found.sd * scales, "lower": found.lower * scales,
         "upper": found.upper * scales, "gamma": found.gamma, "precision": found.precision, "scale": scales,
-        "status": np.array(answer.bias_status, str), "unit": np.array([b.unit for b in problem.biases], str),
+        "status": np.array(answer.bias_status, str),
         "kind": np.array([b.kind for b in problem.biases], str), **found.columns,
     }  # fmt: skip
     matrices = {"covariance": found.covariance * np.outer(scales, scales), "information": found.information}
@@ -118,7 +118,7 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
         matrices["coupling"] = np.asarray(answer.prior.precision(problem.labels, problem.surveyed).coupling)
     values: dict[str, Any] = {name: ("bias_label", column) for name, column in columns.items()}
     values |= {name: (("bias_label", "bias_label_other"), matrix) for name, matrix in matrices.items()}
-    return xr.Dataset(values, coords={"bias_label": labels, "bias_label_other": labels})
+    return xr.Dataset(values, coords={**bias_coords(problem), "bias_label_other": labels})
 
 
 def _data_groups(answer: Answer, draws: Draws, before: Point) -> dict[str, xr.Dataset]:
@@ -181,7 +181,8 @@ def _rounded(log_likelihood: np.ndarray) -> np.ndarray:
 
 def build_tracks(problem: Problem, tracks: Sequence[Band]) -> xr.DataTree:
     """A tree of tracks alone, for data to which a calibration was applied."""
-    tree = xr.DataTree.from_dict({"track": track_group(problem, tracks)})
+    register()
+    tree = xr.DataTree.from_dict(track_groups(problem, tracks))
     tree.attrs["data"] = problem.measurements.table.source
     return tree
 
@@ -217,15 +218,15 @@ def add_mirrors(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
         "bias": (("mirror", "bias_label"), (mean + shifts) * problem.scales),
         "apart": (("mirror", "bias_label"), np.abs(shifts) / np.maximum(sd, 1e-12)),
     }
-    coords: dict[str, Any] = {"mirror": [other.name for other in others], "bias_label": list(problem.labels)}
-    for r, epochs in enumerate(problem.epochs):
-        s, span = suffix(problem, r), slice(*epochs.position)
-        places = np.stack([np.asarray(other.point.states[r])[:, span] for other in others])
-        values[f"position{s}"] = (("mirror", f"epoch{s}", "axis"), places)
-        coords |= {f"epoch_time{s}": (f"epoch{s}", epochs.time)}
-        coords |= {f"epoch_target{s}": (f"epoch{s}", np.asarray(epochs.target, str))}
-    coords["axis"] = list(AXES[: problem.network.dimension])
-    tree["mirror"] = xr.DataTree(xr.Dataset(values, coords=coords, attrs={"same": SAME}))
+    names = [other.name for other in others]
+    group = xr.Dataset(values, coords={"mirror": names, **bias_coords(problem)}, attrs={"same": SAME})
+    places = [
+        np.stack([np.asarray(other.point.states[r])[:, slice(*epochs.position)] for other in others])
+        for r, epochs in enumerate(problem.epochs)
+    ]
+    axes = {"axis": list(AXES[: problem.network.dimension])}
+    tracks = by_target(problem, {"position": (("mirror", "time", "axis"), places)}, axes)
+    tree["mirror"] = xr.DataTree.from_dict({"/": group, **tracks})
     return tree
 
 

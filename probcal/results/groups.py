@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from probcal.labels import AXES
 from probcal.lazy import Later
 
 if TYPE_CHECKING:
@@ -25,9 +26,28 @@ class Band(NamedTuple):
     before: np.ndarray
 
 
-def suffix(problem: Problem, r: int) -> str:
-    """What the names of recursion r end with: nothing where there is one only."""
-    return "" if len(problem.epochs) == 1 else f"_{r}"
+def bias_coords(problem: Problem, chosen: Any = None) -> dict[str, Any]:
+    """Coordinates of all biases, or of those `chosen` (boolean or numbers): label, and what xarray can select by.
+
+    `owner` (node, sensor, or sensor type where it is shared), `component` and `axis` (empty for a number),
+    `sensor_type` (empty for a node's bias), `unit`, and `since`, the time in s of a step, the first of the table for
+    what is constant.
+    """
+    biases = list(problem.biases)
+    if chosen is not None:
+        index = np.asarray(chosen)
+        biases = [biases[m] for m in (np.flatnonzero(index) if index.dtype == bool else index)]
+    columns = {
+        "owner": [b.owner for b in biases],
+        "component": [b.component for b in biases],
+        "axis": [AXES[b.axis] if b.vector else "" for b in biases],
+        "sensor_type": [b.sensor_type for b in biases],
+        "unit": [b.unit for b in biases],
+    }
+    found: dict[str, Any] = {name: ("bias_label", np.array(values, str)) for name, values in columns.items()}
+    first = float(problem.measurements.time.min())
+    since = np.array([first if b.since is None else b.since for b in biases], float)
+    return {"bias_label": [b.label for b in biases], **found, "since": ("bias_label", since)}
 
 
 def datum_of(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
@@ -71,13 +91,22 @@ def direction_group(labels: Sequence[str], directions: Sequence[Any]) -> xr.Data
     return group.assign(vector=vectors).assign_coords(direction=[d.name for d in directions], bias_label=list(labels))
 
 
-def track_group(problem: Problem, tracks: Sequence[Band]) -> xr.Dataset:
-    """Mean, sd and uncalibrated mean of every state, with times and targets of the epochs."""
-    found = by_epoch(problem, {name: [getattr(t, name) for t in tracks] for name in ("mean", "sd", "before")})
-    for r, part in enumerate(problem.model.recursions):
+def track_groups(
+    problem: Problem, tracks: Sequence[Band], states: Sequence[np.ndarray] = (), chains: Mapping[str, Any] | None = None
+) -> dict[str, xr.Dataset]:
+    """Mean, sd and uncalibrated mean of every state, a group `track/<target>` each; draws of the states if given."""
+    columns: dict[str, tuple[tuple[str, ...], Sequence[Any]]] = {
+        name: (("time", "component"), [getattr(t, name) for t in tracks]) for name in ("mean", "sd", "before")
+    }
+    if len(states):
+        columns["state"] = (("chain", "draw", "time", "component"), states)
+    found = by_target(problem, columns, chains or {})
+    for r, (part, epochs) in enumerate(zip(problem.model.recursions, problem.epochs, strict=True)):
         for k, tail in enumerate(part.tails):
-            found[weight_name(problem, r, k)] = ((f"epoch{suffix(problem, r)}",), np.asarray(tail.weight))
-    return found
+            for name in dict.fromkeys(epochs.target):
+                weight = np.asarray(tail.weight)[epochs.target == name]
+                found[node_of(name)][weight_name(problem, r, k)] = ("time", weight)
+    return {f"track/{name}": group for name, group in found.items()}
 
 
 def weight_name(problem: Problem, r: int, k: int) -> str:
@@ -87,26 +116,41 @@ def weight_name(problem: Problem, r: int, k: int) -> str:
     """
     tails = problem.model.recursions[r].tails
     twin = [tail.name for tail in tails[:k]].count(tails[k].name)
-    return f"weight_{tails[k].name}{f'_{1 + twin}' if twin else ''}{suffix(problem, r)}"
+    return f"weight_{tails[k].name}{f'_{1 + twin}' if twin else ''}"
 
 
-def by_epoch(problem: Problem, variables: Mapping[str, Sequence[np.ndarray]]) -> xr.Dataset:
-    """Variables of each recursion, (E, n) by state component or (E,), with times and targets of the epochs.
+def node_of(target: str) -> str:
+    """The name of a target's node: its own, with a sign that may stand in a path; its attribute `target` has it."""
+    name = str(target).replace("/", "\N{DIVISION SLASH}")
+    return f"{name}_" if set(name) <= {"."} else name
 
-    Their names and dimensions carry a suffix where a problem has several recursions.
+
+def by_target(
+    problem: Problem,
+    variables: Mapping[str, tuple[tuple[str, ...], Sequence[Any]]],
+    coords: Mapping[str, Any] | None = None,
+    kept: Sequence[np.ndarray] | None = None,
+) -> dict[str, xr.Dataset]:
+    """Variables of each recursion as one dataset a target, by node name: times of its epochs, components of its state.
+
+    A variable is its dimensions and its values by recursion; the dimension `time` of these counts the epochs of the
+    recursion, or those `kept` of it (E,).
     """
-    values: dict[str, Any] = {}
-    coords: dict[str, Any] = {}
+    found = dict[str, xr.Dataset]()
     for r, epochs in enumerate(problem.epochs):
-        s = suffix(problem, r)
-        coords |= {
-            f"component{s}": list(epochs.components),
-            f"epoch_time{s}": (f"epoch{s}", epochs.time),
-            f"epoch_target{s}": (f"epoch{s}", np.asarray(epochs.target, str)),
-        }
-        for name, parts in variables.items():
-            values[f"{name}{s}"] = ((f"epoch{s}", f"component{s}")[: parts[r].ndim], parts[r])
-    return xr.Dataset(values, coords=coords)
+        there = np.ones(len(epochs.time), bool) if kept is None else kept[r]
+        times, owners = epochs.time[there], np.asarray(epochs.target, str)[there]
+        for name in dict.fromkeys(np.asarray(epochs.target, str).tolist()):
+            mine = np.flatnonzero(owners == name)
+            values = {
+                key: (dims, np.take(np.asarray(parts[r]), mine, dims.index("time")))
+                for key, (dims, parts) in variables.items()
+            }
+            own: dict[str, Any] = {"time": times[mine], **(coords or {})}
+            if any("component" in dims for dims, _ in variables.values()):
+                own["component"] = list(epochs.components)
+            found[node_of(name)] = xr.Dataset(values, coords=own, attrs={"target": name})
+    return found
 
 
 def constant_group(problem: Problem) -> xr.Dataset:
@@ -121,7 +165,7 @@ def constant_group(problem: Problem) -> xr.Dataset:
         "stated": ("value", np.array(numbers)),
     }
     coords: dict[str, Any] = {
-        "node": [n.name for n in nodes], "axis": ["x", "y", "z"][:d],
+        "node": [n.name for n in nodes], "axis": list(AXES[:d]),
         "stated_node": ("value", np.array(owners)), "stated_component": ("value", np.array(components)),
     }  # fmt: skip
     if problem.fixed:

@@ -12,6 +12,7 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.files import write_whole
 from probcal.lazy import Later
+from probcal.results.accessor import register
 from probcal.results.schema import ATTRIBUTES, JUDGED, NEEDED, RESULTS_VERSION, SUMMARY, TRACKED
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ def load(path: str | PathLike[str]) -> xr.DataTree:
     except Exception as error:  # whatever the netCDF and HDF5 libraries say of foreign bytes
         raise InputError(f"{path} is not a fit written by probcal ({type(error).__name__}: {error})") from None
     check_content(tree, path)
+    register()
     return tree
 
 
@@ -95,7 +97,7 @@ def _sealed(path: Path) -> bool:
 
 def check_content(tree: xr.DataTree, path: Path) -> None:
     """Raise `InputError` where a fit lacks what its readers need."""
-    if "calibration" not in tree.children or not set(SUMMARY[1:]) <= set(tree["calibration"].data_vars):
+    if "calibration" not in tree.children or not set(SUMMARY[1:]) <= set(tree["calibration"].variables):
         raise InputError(f"{path} is not a fit written by probcal: its group calibration is missing or incomplete")
     if (found := tree.attrs.get("results_version")) != RESULTS_VERSION:
         age = "a newer" if isinstance(found, (int, np.integer)) and found > RESULTS_VERSION else "an older"
@@ -106,9 +108,8 @@ def check_content(tree: xr.DataTree, path: Path) -> None:
     for group, names in JUDGED.items():
         if group in tree.children and not set(names) <= set(tree[group].variables):
             raise InputError(f"{path} is incomplete: its group {group} lacks what a fit holds; fit again")
-    tracked = {str(name) for name in tree["track"].variables}
-    means = [name.removeprefix("mean") for name in tracked if name.startswith("mean")]
-    if not means or any(f"{name}{s}" not in tracked for s in means for name in TRACKED):
+    tracks = tree["track"].children if "track" in tree.children else {}
+    if not tracks or any(name not in node.variables for node in tracks.values() for name in TRACKED):
         raise InputError(f"{path} is incomplete: its group track lacks what a fit holds; fit again")
     if missing := [name for name in ATTRIBUTES if name not in tree.attrs]:
         raise InputError(f"{path} is incomplete: it has no attribute {missing[0]}; fit again")

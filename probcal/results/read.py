@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -26,9 +27,41 @@ def summary(tree: xr.DataTree) -> Any:
     columns = [*SUMMARY, "precision", "status", *(name for name in MORE if name in tree["calibration"])]
     if "verdict" in tree.children:
         judged = tree["verdict"].to_dataset()[["verdict", "reason"]]
-        group, columns = group.merge(judged), [*columns, *judged.data_vars]
+        group, columns = group.assign(judged.data_vars), [*columns, *judged.data_vars]
     frame = group[columns[1:]].to_dataframe().reset_index()
     return frame.rename(columns={"bias_label": "bias"})[columns]
+
+
+def each_track(tree: xr.DataTree, group: str = "track") -> Iterator[tuple[str, xr.Dataset]]:
+    """Name and dataset of every target of a tree, in the order of the problem; none where it has no such group."""
+    if group in tree.children:
+        for node in tree[group].children.values():
+            yield str(node.attrs["target"]), node.to_dataset(inherit=False)
+
+
+def tracks(tree: xr.DataTree) -> pd.DataFrame:
+    """Tracks as a table, one row an epoch of a target: time (s), target, each state component and its sd.
+
+    A component that a target lacks is empty there.
+    """
+    import pandas as pd  # loaded where a table is made
+
+    parts = []
+    for target, group in each_track(tree):
+        columns: dict[str, np.ndarray] = {"time": group["time"].values, "target": np.full(group.sizes["time"], target)}
+        for component in group["component"].values:
+            columns[str(component)] = group["mean"].sel(component=component).values
+            columns[f"{component}_sd"] = group["sd"].sel(component=component).values
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)
+
+
+def saved_states(problem: Problem, tracked: Mapping[str, xr.Dataset]) -> list[np.ndarray]:
+    """Draws of the states (chain, draw, E, n) of each recursion that the tracks of a tree hold."""
+    return [
+        np.concatenate([tracked[name]["state"].values for name in dict.fromkeys(map(str, epochs.target))], 2)
+        for epochs in problem.epochs
+    ]
 
 
 def outliers(tree: xr.DataTree, below: float = 0.5) -> pd.DataFrame:

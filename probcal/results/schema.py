@@ -3,18 +3,17 @@
 from collections.abc import Container, Hashable
 
 INTERVAL = 0.89  # probability of lower to upper
-RESULTS_VERSION = 2  # of the groups and variables that a fit writes; a reader refuses any other
+RESULTS_VERSION = 3  # of the groups and variables that a fit writes; a reader refuses any other
 MORE = ("r_hat", "ess", "ess_tail", "inclusion", "included", "contraction")  # columns of samplers
 SUMMARY = ("bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma")
 NEEDED = {  # what readers of a fit take for granted
     "posterior": ("bias",),
     "calibration": (*SUMMARY[1:], "bias_label", "covariance", "information", "precision", "status", "kind"),
-    "track": (),
     "observed_data": ("y", "sensor", "channel", "target", "time", "row"),
     "residual": ("before", "after", "std", "weight"),
     "constant_data": ("node_position", "node_heading", "moving", "stated", "stated_node", "stated_component"),
 }
-TRACKED = ("mean", "sd", "before", "epoch_time", "epoch_target", "component")  # of each recursion
+TRACKED = ("mean", "sd", "before", "time", "component")  # of each target
 JUDGED = {"verdict": ("verdict", "reason"), "finding": ("sentence",), "level": ("std", "guess")}  # where they are
 ATTRIBUTES = ("method", "prior", "seed", "status", "message", "intervals", "settings", "interval_probability", "data")
 ROPE = 0.1  # scales within which a bias is practically zero

@@ -1,0 +1,51 @@
+"""The drifting biases of a saved fit, piece by piece."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from probcal.labels import step_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def drift_table(tree: xr.DataTree) -> pd.DataFrame:
+    """Values of the drifting biases of a fit, one row a piece: bias, unit, since (s), mean, sd, lower, upper.
+
+    A value is the bias and its steps so far, fixed ones included; mean and sd are exact sums, the interval is of the
+    draws. The first piece begins with the first datum, steps before it are in its value. Empty where nothing drifts.
+    """
+    columns = ["bias", "unit", "since", "mean", "sd", "lower", "upper"]
+    if not {"calibration", "posterior"} <= set(tree.children):
+        return pd.DataFrame(columns=columns)
+    group, draws = tree["calibration"].to_dataset(), tree["posterior"].to_dataset()["bias"].values
+    labels = group["bias_label"].values.astype(str).tolist()
+    constant = tree["constant_data"].to_dataset()
+    fixed = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
+    every = [*labels, *fixed]
+    units = dict(zip(labels, group["unit"].values, strict=True))
+    mean, covariance = group["mean"].values, group["covariance"].values
+    start = float(tree["observed_data"].to_dataset()["time"].min())
+    tail = (1 - tree.attrs["interval_probability"]) / 2
+    steps: dict[str, list[tuple[float, str]]] = {}
+    for label in every:
+        step = step_of(label, every)
+        if step is not None:
+            steps.setdefault(step[0], []).append((step[1], label))
+    table = []
+    for name, own in steps.items():
+        known = [label for label in (name, *(label for _, label in own)) if label in units]
+        if not known:
+            continue
+        for since in sorted({max(time, start) for time, _ in own} | {start}):
+            so_far = [name, *(label for time, label in own if time <= since)]
+            members = [labels.index(label) for label in so_far if label in units]
+            held = sum(fixed.get(label, 0.0) for label in so_far)
+            lower, upper = held + np.quantile(draws[..., members].sum(-1), [tail, 1 - tail])
+            sd = np.sqrt(covariance[np.ix_(members, members)].sum())
+            table.append((name, units[known[0]], since, held + mean[members].sum(), sd, lower, upper))
+    return pd.DataFrame(table, columns=columns)
