@@ -36,7 +36,7 @@ from probcal import (
     simulate,
 )
 from probcal.geometry import bearing, norm
-from probcal.noise import Gaussian
+from probcal.noise import Normal
 from probcal.sensors import radar, ranger, rss, toa
 
 NAMES = ("beacons", "clocks", "pass", "signal", "bearings", "line", "ceiling", "corners")
@@ -100,7 +100,7 @@ NETWORKS |= {"line": _line, "ceiling": _ceiling, "corners": _beacons}
 
 
 STEPS = {"beacons": 0.5, "clocks": 0.5, "pass": 0.3, "signal": 0.3, "bearings": 0.03, "line": 0.5, "ceiling": 0.5}
-TAILS = {"gaussian": Gaussian(), "student": StudentT(4.0), "heavy": StudentT(2.0)}
+TAILS = {"gaussian": Normal(), "student": StudentT(4.0), "heavy": StudentT(2.0)}
 
 
 def motion(network, noise=None, tails="gaussian"):

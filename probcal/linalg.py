@@ -74,7 +74,7 @@ def observe(root: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array, 
     return root, jnp.stack(gains, 1), jnp.stack(stds)
 
 
-def regress(rows: jax.Array, known: jax.Array) -> jax.Array:
+def regress_rows(rows: jax.Array, known: jax.Array) -> jax.Array:
     """The C (p, n) for which rows (p, m) less C known are orthogonal to the rows `known` (n, m), of any rank.
 
     Modified Gram-Schmidt of both together. Of a known row that is lost in rounding beside the others C has zero.
@@ -223,7 +223,7 @@ def log_normal(residual: jax.Array, root: jax.Array) -> jax.Array:
     return -0.5 * jnp.sum(white**2) - (jnp.sum(jnp.log(jnp.diagonal(lower))) + 0.5 * len(white) * math.log(2 * math.pi))
 
 
-def driving(residual: jax.Array, root: jax.Array) -> jax.Array:
+def shortest_drive(residual: jax.Array, root: jax.Array) -> jax.Array:
     """The shortest u (m,) with root @ u the residual (n,), for a root (n, m) of full rank."""
     _, inverse = factor_and_inverse(root @ root.T)
     return root.T @ (inverse.T @ (inverse @ residual))

@@ -19,7 +19,7 @@ from probcal.labels import AXES, step_of
 from probcal.lazy import Later
 from probcal.network import ANGLES, POSE_UNITS, Node
 from probcal.sensor import Bias
-from probcal.table import Table, factor, header, name_of, numbers, read_table
+from probcal.table import Table, header, name_as_text, numbers, read_table, unit_factor
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -228,7 +228,7 @@ def _labels(table: Table, cells: pd.DataFrame) -> list[str]:
     column = cells[found[0]]
     labels: list[str] = []
     for row, (value, blank) in enumerate(zip(column, column.isna(), strict=True)):
-        label = "" if blank else name_of(value)
+        label = "" if blank else name_as_text(value)
         if not label:
             raise InputError(f'{table.where(row)} column "{found[0]}" is blank; name the node')
         if label in labels:
@@ -260,7 +260,7 @@ def _stated_place(table: Table, column: pd.Series, name: str, unit: str | None) 
     blank = np.flatnonzero(~there)
     if len(blank):
         raise InputError(f'{table.where(blank[0])} column "{name}" is blank; state it for every node')
-    return values * factor(table, name, unit, PLACE_UNITS[name])
+    return values * unit_factor(table, name, unit, PLACE_UNITS[name])
 
 
 def _to_frame(
@@ -297,7 +297,7 @@ def _columns(table: Table, cells: pd.DataFrame, units: Mapping[str, str | None])
         unit = units[name] or default
         values, there = numbers(table, cells[name], name)
         if component in POSE_UNITS and component != "clock":
-            values = values * factor(table, name, unit, default)
+            values = values * unit_factor(table, name, unit, default)
             unit = default
         other = first.setdefault(component, (name, unit))
         if other[1] != unit:

@@ -43,7 +43,7 @@ def guess_of(level: Level) -> float:
 
 def check_driving(noise: Any, what: str) -> None:
     """Raise `InputError` unless a family can drive a motion: Gaussian, or a scale mixture around zero."""
-    if isinstance(noise, Gaussian) or (isinstance(noise, ScaleMixture) and not getattr(noise, "delay", 0.0)):
+    if isinstance(noise, Normal) or (isinstance(noise, ScaleMixture) and not getattr(noise, "delay", 0.0)):
         return
     raise InputError(f"{what} is {noise!r}, which cannot drive a motion: give Gaussian(), StudentT(df) or a Mixture")
 
@@ -108,7 +108,7 @@ class _Location:
 
 
 @dataclass(frozen=True)
-class Gaussian(_Location):
+class Normal(_Location):
     """Additive Gaussian noise of standard deviation `std`."""
 
     def log_likelihood(self, y, predicted, std, period):

@@ -30,13 +30,13 @@ from probcal.model.motions import (
     tails_of,
 )
 from probcal.model.rows import Block, Rows, addresses, make_block, pose_entries, pose_vector
-from probcal.model.sampled import Sampled
+from probcal.model.sampled import SampledMotion
 from probcal.model.variants import aligned
 from probcal.motion import Layout, LinearMotion, Static, Target, White, as_motion, labels_of
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, guess_of
 from probcal.sensor import Sensor
-from probcal.table import Measurements, Table, factor, header, measure, read_table
+from probcal.table import Measurements, Table, header, measure, read_table, unit_factor
 from probcal.types import float64
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ class Problem:
                 for k in np.unique(data.sensor[data.measured[:, j]]):
                     channel = dict(self.network.sensors[k].type.expand(self.network.dimension))[name]
                     mine = (data.sensor == k) & data.measured[:, j]
-                    column[mine] = value[mine, j] / factor(data.table, name, units[name], channel.unit)
+                    column[mine] = value[mine, j] / unit_factor(data.table, name, units[name], channel.unit)
                 frame[frame.columns[names.index(name)]] = column
         other = copy(self)
         other.measurements = replace(data, value=value, table=replace(data.table, frame=frame))
@@ -260,7 +260,7 @@ class Problem:
         targets = {name: self.target(name) for name in data.target_names}
         motions = {name: as_motion(target.motion) for name, target in targets.items()}
         levels, area = Levels(self.levels if begun else ()), self.area
-        forms: dict[tuple[Layout, Sampled | None], list[str]] = {}
+        forms: dict[tuple[Layout, SampledMotion | None], list[str]] = {}
         for name, motion in motions.items():
             layout, sampled = form_of(name, motion, levels, self.network.dimension)
             if "position" not in {component for component, *_ in layout}:

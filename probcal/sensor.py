@@ -14,7 +14,7 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.fingerprint import computes
 from probcal.labels import AXES
-from probcal.noise import Bernoulli, Family, Gaussian, Level, check_level
+from probcal.noise import Bernoulli, Family, Level, Normal, check_level
 from probcal.types import PoseView, TargetView
 
 VECTORS = ("position", "velocity", "acceleration", "moment")  # have one value an axis without being declared so
@@ -102,7 +102,7 @@ class Channel:
 
     unit: str
     std: Level = 1.0
-    noise: Family = field(default_factory=Gaussian)
+    noise: Family = field(default_factory=Normal)
     wrap: bool = False
     per_axis: bool = False
 
@@ -112,7 +112,7 @@ class Channel:
         if not hasattr(self.noise, "log_likelihood"):
             raise InputError(
                 f"Channel({self.unit!r}, noise={self.noise!r}): give a noise family such as StudentT(4), Mixture(), "
-                f"Bernoulli() or probcal.noise.Gaussian(); probcal.Gaussian is a prior"
+                f"Bernoulli() or probcal.noise.Normal(); probcal.Gaussian is a prior"
             )
         if not isinstance(self.noise, Bernoulli):
             check_level(self.std, f"Channel({self.unit!r}): std")

@@ -21,7 +21,7 @@ from probcal.model.sampled import path
 from probcal.network import Network
 from probcal.noise import Bernoulli
 from probcal.problem import Epochs, Problem
-from probcal.table import Table, factor, header, name_of, numbers, read_table
+from probcal.table import Table, header, name_as_text, numbers, read_table, unit_factor
 from probcal.types import float64
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class Truth:
             return None
         track = self.tracks
         if "target" in track:
-            track = track[track["target"].map(name_of) == target]
+            track = track[track["target"].map(name_as_text) == target]
         if not len(track):
             return None
         track = track.sort_values("time")
@@ -144,7 +144,7 @@ def _columns(table: Table, **wanted: str) -> pd.DataFrame:
         blank = np.flatnonzero(~there)
         if len(blank):
             raise InputError(f'truth {table.where(blank[0])} column "{name}" is blank; drop the row')
-        frame = frame.assign(**{name: values * factor(table, name, units[name], unit)})
+        frame = frame.assign(**{name: values * unit_factor(table, name, units[name], unit)})
     return frame
 
 

@@ -239,7 +239,7 @@ def _seconds(column: pd.Series) -> np.ndarray:
         return np.full(len(column), np.nan)
 
 
-def name_of(value: Any) -> str:
+def name_as_text(value: Any) -> str:
     """A sensor, target or node name as text: 1, 1.0 and " 1" are one name, 01 is another."""
     text = str(value).strip()
     whole, _, rest = text.partition(".")
@@ -247,8 +247,8 @@ def name_of(value: Any) -> str:
 
 
 def _sensors(table: Table, column: pd.Series, network: Network) -> np.ndarray:
-    number = {name_of(placed.name): k for k, placed in enumerate(network.sensors)}
-    text = [name_of(value) for value in column]
+    number = {name_as_text(placed.name): k for k, placed in enumerate(network.sensors)}
+    text = [name_as_text(value) for value in column]
     blank = column.isna().to_numpy()
     found = np.array([-1 if gone else number.get(name, -1) for name, gone in zip(text, blank, strict=True)], int)
     unknown = np.flatnonzero(found < 0)
@@ -262,7 +262,7 @@ def _sensors(table: Table, column: pd.Series, network: Network) -> np.ndarray:
 def _targets(table: Table, column: pd.Series | None, rows: int) -> tuple[tuple[str, ...], np.ndarray]:
     if column is None:
         return ("target",), np.zeros(rows, int)
-    text = pd.Series([name_of(value) for value in column], dtype=object)
+    text = pd.Series([name_as_text(value) for value in column], dtype=object)
     blank = np.flatnonzero(column.isna().to_numpy() | (text == "").to_numpy())
     if len(blank):
         raise InputError(f'{table.where(blank[0])} column "target" is blank; name the target or drop the column')
@@ -296,14 +296,14 @@ def _to_channel(
                 )
             continue
         for column, array in ((name, value), (f"{name}_std", std)):
-            array[kinds == k, j] *= factor(table, column, units.get(column), channel.unit)
+            array[kinds == k, j] *= unit_factor(table, column, units.get(column), channel.unit)
         if isinstance(channel.noise, Bernoulli):
             wrong = np.flatnonzero(rows & ~channel.noise.check(value[:, j]))
             if len(wrong):
                 raise InputError(f'{table.where(wrong[0])} column "{name}": {value[wrong[0], j]:g} is not 0 or 1')
 
 
-def factor(table: Table, name: str, unit: str | None, wanted: str) -> float:
+def unit_factor(table: Table, name: str, unit: str | None, wanted: str) -> float:
     """What takes a column from its unit (None: already there) to the wanted one; raises `InputError`."""
     if unit is None or unit == wanted:
         return 1.0

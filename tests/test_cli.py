@@ -15,7 +15,7 @@ from terminal import call
 
 import probcal
 from probcal.cli.kernels import keep_kernels
-from probcal.cli.models import choose_prior, load_model, load_problem
+from probcal.cli.models import load_model, load_problem, prior_named
 from probcal.inference import METHODS
 from probcal.results.read import each_track
 
@@ -190,8 +190,8 @@ def test_a_model_may_bring_its_prior(model):
         ("ea", "ard", probcal.ARD()),
         ("map", None, None),
     ):
-        assert choose_prior(module, *METHODS[method], name) == wanted
-    assert choose_prior(load_model(MODEL), *METHODS["ea"], None) is None
+        assert prior_named(module, *METHODS[method], name) == wanted
+    assert prior_named(load_model(MODEL), *METHODS["ea"], None) is None
 
 
 def edit(rows, change):

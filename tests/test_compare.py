@@ -12,7 +12,7 @@ from terminal import call
 import probcal
 from probcal import diagnostics
 from probcal.analysis import compare, interchangeable
-from probcal.analysis.compare import named
+from probcal.analysis.compare import fits_by_name
 from probcal.analysis.differences import NARROW
 from probcal.analysis.overlap import ZERO, of_draws, of_gaussian, overlap, wasserstein
 from probcal.cli.compare import estimates_text, methods_text
@@ -270,8 +270,8 @@ def test_what_cannot_be_compared_is_said(call_, text):
 
 def test_names_are_made_unique():
     other = changed(lambda t: t.attrs.update(method="MAP", prior="Gaussian"))
-    assert list(named([GOOD, other, GOOD, GOOD])) == ["EA (ARD)", "MAP (Gaussian)", "EA (ARD) 2", "EA (ARD) 3"]
-    assert list(named({"a": GOOD, "b": GOOD})) == ["a", "b"]
+    assert list(fits_by_name([GOOD, other, GOOD, GOOD])) == ["EA (ARD)", "MAP (Gaussian)", "EA (ARD) 2", "EA (ARD) 3"]
+    assert list(fits_by_name({"a": GOOD, "b": GOOD})) == ["a", "b"]
 
 
 def without(tree, label):

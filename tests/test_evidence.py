@@ -24,7 +24,7 @@ from probcal import (
     sensor,
 )
 from probcal.inference.evidence import PARTICLES, RUNS, combined, effective, log_evidence, resampled
-from probcal.inference.hierarchy import Exponentials, Precisions, RegularisedHorseshoe
+from probcal.inference.hierarchy import GammaPrecision, LaplaceMixture, RegularisedHorseshoe
 
 TIMES = np.arange(5.0)
 
@@ -143,7 +143,7 @@ def test_many_precisely_known_biases_have_their_exact_evidence(size, std):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
-    [(RegularisedHorseshoe, Horseshoe()), (Precisions, ARD(rate=0.5)), (Exponentials, Laplace())],
+    [(RegularisedHorseshoe, Horseshoe()), (GammaPrecision, ARD(rate=0.5)), (LaplaceMixture, Laplace())],
     ids=lambda kind: type(kind[1]).__name__,
 )
 def test_scales_are_integrated(kind):

@@ -217,3 +217,19 @@ def test_every_mutation_still_has_its_line():
     """The table of `mutations.py` follows the code: each old text stands in its file once."""
     lost = [(m.file, m.old) for m in MUTATIONS if (ROOT / m.file).read_text().count(m.old) != 1]
     assert not lost
+
+
+BY_MODULE = {  # names that a reader meets behind their module: `rows.predict`, `cli.fit.run`
+    "linearise", "log_likelihood", "predict", "run", "sample", "slopes",
+}  # fmt: skip
+
+
+def test_a_public_name_is_defined_once():
+    """One word, one meaning: a second class or function of a name needs another name, or a line in `BY_MODULE`."""
+    found = dict[str, list[str]]()
+    for path in sorted(ROOT.rglob("*.py")):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+                found.setdefault(node.name, []).append(path.stem)
+    assert {name for name, files in found.items() if len(files) > 1} == BY_MODULE
+    assert not BY_MODULE & set(probcal.__all__)

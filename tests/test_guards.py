@@ -281,8 +281,8 @@ def test_status_follows_the_gravest():
 def test_verdicts_stand_no_higher_than_the_status(status, ended, word, reason):
     problem, _ = linear("plane")
     M = len(problem.labels)
-    known = verdict.Evidence(np.full(M, 0.9), np.zeros(M), np.zeros(M), 3.0)
-    words, reasons = verdict.judge(problem, Status(status), [ended] * M, known, {}, {}, "", {})
+    known = verdict.Grounds(np.full(M, 0.9), np.zeros(M), np.zeros(M), 3.0)
+    words, reasons = verdict.judge_biases(problem, Status(status), [ended] * M, known, {}, {}, "", {})
     assert set(words) == {word}
     assert all(reason in text for text in reasons)
 
@@ -290,9 +290,9 @@ def test_verdicts_stand_no_higher_than_the_status(status, ended, word, reason):
 def test_a_bias_that_shares_an_open_combination_is_weak_and_names_it():
     problem, _ = linear("plane")
     M = len(problem.labels)
-    known = verdict.Evidence(np.full(M, 0.9), np.zeros(M), np.zeros(M), 3.0)
+    known = verdict.Grounds(np.full(M, 0.9), np.zeros(M), np.zeros(M), 3.0)
     shared = {1: "a common gain of all (information 0.01)"}
-    words, reasons = verdict.judge(problem, Status.CONVERGED, ["estimated"] * M, known, {}, {}, "", shared)
+    words, reasons = verdict.judge_biases(problem, Status.CONVERGED, ["estimated"] * M, known, {}, {}, "", shared)
     assert words[1] == "weak"
     assert "it belongs to a common gain of all" in reasons[1]
     assert {word for m, word in enumerate(words) if m != 1} == {"determined"}

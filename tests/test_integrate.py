@@ -10,15 +10,15 @@ from contracts import check_tree, close
 import probcal
 from probcal import ARD, EA, MAP, BernoulliGaussian, Gaussian, Horseshoe, Laplace, fit
 from probcal.errors import InputError
-from probcal.inference.hierarchy import Exponentials, Precisions, RegularisedHorseshoe, SpikeAndSlab, hierarchy_of
-from probcal.inference.integrate import CHAINS, KEPT, Integration, begin, likelihood, moments, run
+from probcal.inference.hierarchy import GammaPrecision, LaplaceMixture, RegularisedHorseshoe, SpikeAndSlab, hierarchy_of
+from probcal.inference.integrate import CHAINS, KEPT, Integration, begin, likelihood, moments, run_sweeps
 from probcal.inference.posed import Form, Natural
 from probcal.inference.propagate import nodes_of, propagate
 from probcal.priors import Precision
 from probcal.smoothing.start import track_mode
 
 PRIORS = [ARD(shape=1.5, rate=0.5), Laplace(), Horseshoe(), BernoulliGaussian(share=0.4)]
-KINDS = {ARD: Precisions, Laplace: Exponentials, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab}
+KINDS = {ARD: GammaPrecision, Laplace: LaplaceMixture, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab}
 SOME = [pytest.param(p, marks=pytest.mark.ci) if isinstance(p, ARD | Laplace) else p for p in PRIORS]
 G = np.array([[4.0, 2.5, 0.0], [2.5, 3.0, 0.5], [0.0, 0.5, 9.0]])  # two that trade against each other, one seen well
 PULL = np.array([5.0, 2.0, -1.0])
@@ -31,7 +31,7 @@ def mixture(prior, matrix=G, pull=PULL, group=(0, 1, 2), key=0):
     with jax.enable_x64(True):
         known = Natural(jnp.asarray(matrix), jnp.asarray(pull), jnp.zeros(0), Precision.single(jnp.ones(3)))
         keys = jax.random.split(jax.random.key(key))
-        _, swept = run(form, known, begin(form, known, keys[0]), keys[1], KEPT)
+        _, swept = run_sweeps(form, known, begin(form, known, keys[0]), keys[1], KEPT)
         found = jax.tree.map(np.asarray, moments(form, known, swept.phi))
         return found, np.asarray(swept.z), np.asarray(swept.mean)
 

@@ -20,7 +20,7 @@ from probcal.inference.methods import choose_prior
 from probcal.inference.run import Context, maximise
 from probcal.inference.sampler import Sampler
 from probcal.model.model import At
-from probcal.noise import Gaussian as Normal
+from probcal.noise import Normal
 from probcal.priors import PRIORS, Precision
 from probcal.results.schema import TYPE_II
 from probcal.smoothing.esteps import EStep, Expected
@@ -240,12 +240,12 @@ def test_paper_b_marginalises_each_epoch_alone():
     """R-bar = R + H P H' built row by row (Paper B 10-17) gives the covariance, mean step and evidence reported."""
     from probcal.priors import Precision
     from probcal.smoothing.information import paper_b
-    from probcal.smoothing.mode import track
+    from probcal.smoothing.mode import smooth_tracks
 
     problem, naive = linear("shifted")
     alpha, M = np.full(len(naive.labels), 0.7), len(naive.labels)
     with jax.enable_x64(True):
-        point = track(problem.model, jax.tree.map(jnp.asarray, resting(problem)))
+        point = smooth_tracks(problem.model, jax.tree.map(jnp.asarray, resting(problem)))
         found, step = jax.jit(paper_b)(problem.model, point, Precision.single(jnp.asarray(alpha)))
     held = reference.dense(naive, None, hold=np.zeros(M))
     order = [problem.labels.index(label) for label in naive.labels]

@@ -16,7 +16,7 @@ from probcal.inference.posed import Form, Posed, prior_precision
 from probcal.inference.prior_draws import draw_prior
 from probcal.motion import RandomWalk
 from probcal.sensors import doa, ranger
-from probcal.smoothing.frame import driving, frame_at, log_weight, place, volume
+from probcal.smoothing.frame import frame_at, log_weight, place, unit_normals, volume
 from probcal.smoothing.start import automatic_start
 
 
@@ -87,7 +87,7 @@ def test_its_volume_is_the_determinant_of_its_derivative(case):
             parts = jnp.split(rest, np.cumsum(sizes)[:-1].tolist())
             eps = tuple(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
             moved = orbit.moved(made, r, place(problem.model, made.frame, theta, eps))
-            new = driving(problem.model, made.frame, moved)
+            new = unit_normals(problem.model, made.frame, moved)
             return jnp.concatenate([moved.z, moved.levels, *(e.ravel() for e in new)])
 
         flat = jnp.concatenate([made.frame.theta, jnp.asarray(random.normal(size=sum(sizes)))])
@@ -130,7 +130,7 @@ def test_a_draw_of_the_posterior_stays_one(case, prior, runs):
             drawn = draw_prior(form, problem.model, first, key)
             own = Posed(problem.model.with_values(drawn.y), made.frame, first, orbits)
             theta = jnp.concatenate([drawn.point.z, drawn.point.levels])
-            eps = driving(own.model, made.frame, drawn.point)
+            eps = unit_normals(own.model, made.frame, drawn.point)
             at = Place(theta, eps, drawn.phi, log_weight(own.model, made.frame, theta, eps))
 
             def again(at, k):

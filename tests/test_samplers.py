@@ -17,7 +17,7 @@ from worlds import LINEAR, linear, resting
 import probcal
 from probcal import ARD, NUTS, SVI, BernoulliGaussian, Collapsed, Flat, Gaussian, Horseshoe, InputError, Laplace
 from probcal.analysis.assess import assess
-from probcal.inference.collapsed import Chain, swing
+from probcal.inference.collapsed import CollapsedState, hmc_step
 from probcal.inference.draws import inverse_gaussian, slice_step
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.pose import pareto_khat
@@ -25,10 +25,10 @@ from probcal.inference.posed import Form, Posed, conditional, update_inclusions,
 from probcal.inference.posterior import mixing
 from probcal.priors import Precision
 from probcal.results.read import each_track
-from probcal.smoothing.frame import driving, frame_at, log_weight, place, volume
+from probcal.smoothing.frame import frame_at, log_weight, place, unit_normals, volume
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import factors, find_mode, track
+from probcal.smoothing.mode import factors, find_mode, smooth_tracks
 from probcal.smoothing.start import automatic_start
 
 PRIORS = [ARD(shape=2.0, rate=0.7), ARD(by="node", rate=0.5), Laplace(), Horseshoe()]
@@ -36,7 +36,7 @@ ALARM = 1e-4  # rate at which a right sampler fails one of these tests, for each
 
 
 # one kernel each, where every operation alone would be one
-PLACE, DRIVING, VOLUME = jax.jit(place), jax.jit(driving), jax.jit(volume)
+PLACE, DRIVING, VOLUME = jax.jit(place), jax.jit(unit_normals), jax.jit(volume)
 WEIGHT, CONDITIONAL = jax.jit(log_weight), jax.jit(conditional, static_argnums=0)
 
 
@@ -49,7 +49,7 @@ def double():
 @cache
 def made(name, prior):
     problem, naive = linear(name)
-    point = track(problem.model, resting(problem))
+    point = smooth_tracks(problem.model, resting(problem))
     posed = Posed(problem.model, frame_at(problem.model, point),
                   prior.precision(problem.labels, problem.surveyed))  # fmt: skip
     return problem, Form(problem.model.biases, hierarchy_of(prior, problem)), posed, naive
@@ -168,7 +168,7 @@ def test_a_frame_follows_its_levels():
     network = probcal.Network([placed.on(s.nodes[0]) for s in network.sensors])
     problem = probcal.Problem(network, unknown, table.filter(regex="^(?!.*_std)"))
     start = resting(problem)._replace(levels=jnp.zeros(len(problem.levels)))
-    frame = frame_at(problem.model, track(problem.model, start))
+    frame = frame_at(problem.model, smooth_tracks(problem.model, start))
     keys = jax.random.split(jax.random.key(9), 200)
 
     @jax.jit
@@ -306,8 +306,8 @@ def test_what_a_spike_keeps_out_has_no_part_in_a_swing(monkeypatch):
         return jnp.where(out, 1e3, drawn) if shape == theta.shape else drawn
 
     monkeypatch.setattr(jax.random, "normal", pushed)
-    chain = Chain(theta, eps, phi, weight, jax.random.key(1))
-    move = jax.jit(lambda key: swing(form, posed, chain, given, key))
+    chain = CollapsedState(theta, eps, phi, weight, jax.random.key(1))
+    move = jax.jit(lambda key: hmc_step(form, posed, chain, given, key))
     ends = [move(jax.random.key(k)) for k in range(5)]
     assert all((np.asarray(end[0])[out] == 0).all() for end in ends)
     moved = [not np.array_equal(end[1][0], eps[0]) for end in ends]

@@ -9,12 +9,12 @@ from worlds import linear, posed_of, resting, small, two_motions
 
 from probcal import NUTS, SVI, Gaussian, Horseshoe, InputError
 from probcal.inference.coordinates import Free
-from probcal.inference.guides import Fitted, LowRank, MeanField, Structured
+from probcal.inference.guides import GuideParameters, LowRank, MeanField, Structured
 from probcal.inference.pose import pareto_khat
 from probcal.inference.sampling import sample
-from probcal.inference.svi import plain
-from probcal.smoothing.frame import driving, place
-from probcal.smoothing.mode import track
+from probcal.inference.svi import noncentred
+from probcal.smoothing.frame import place, unit_normals
+from probcal.smoothing.mode import smooth_tracks
 from probcal.smoothing.start import automatic_start
 
 ALARM = 5.0  # standard errors: a right sampler fails one comparison in a million
@@ -31,7 +31,7 @@ def test_guides_know_their_density_and_its_slope(guide):
     """Against the change of variables by automatic differentiation, and the derivative of the density by x."""
     size, keys = 5, jax.random.split(jax.random.key(0), 4)
     rest = jax.tree.map(lambda a: 0.7 * jax.random.normal(keys[0], a.shape), guide.first(size, keys[1]))
-    fitted = Fitted(jax.random.normal(keys[2], (size,)), 0.3 * jnp.arange(size) - 0.5, rest)
+    fitted = GuideParameters(jax.random.normal(keys[2], (size,)), 0.3 * jnp.arange(size) - 0.5, rest)
     n = jax.random.normal(keys[3], (1, size))
     by_n = jax.jacfwd(lambda n: guide.place(fitted, n[None])[0])(n[0])
     unit = -0.5 * np.sum(np.asarray(n) ** 2) - 0.5 * size * np.log(2 * np.pi)
@@ -57,10 +57,10 @@ def test_any_point_has_coordinates_in_the_frame():
     keys = jax.random.split(jax.random.key(3), 3)
     phi = jax.jit(lambda key: form.hierarchy.relax(form.hierarchy.draw(key)))(keys[0])
     noises = tuple(0.1 * jax.random.normal(keys[1], x.shape) + x for x in posed.frame.point.noises)
-    at = jax.jit(plain, static_argnums=0)(
+    at = jax.jit(noncentred, static_argnums=0)(
         form, posed, Free(phi, 0.1 * jax.random.normal(keys[2], posed.frame.theta.shape), noises)
     )
-    driven = jax.jit(driving)(posed.model, posed.frame, at.point)
+    driven = jax.jit(unit_normals)(posed.model, posed.frame, at.point)
     again = jax.jit(place)(posed.model, posed.frame, at.theta, driven)
     assert len(again.states) == 2
     assert again.levels.shape == (1,)
@@ -70,7 +70,7 @@ def test_any_point_has_coordinates_in_the_frame():
 def solved(name, method, prior):
     """A linear case by a method, and its exact posterior."""
     problem, naive = linear(name)
-    start = track(problem.model, resting(problem))
+    start = smooth_tracks(problem.model, resting(problem))
     run = sample(problem, method, prior, start, jax.random.key(4))
     return run, reference.dense(naive, np.ones(len(naive.labels)))
 

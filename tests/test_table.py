@@ -25,7 +25,7 @@ from probcal import (
     simulate,
 )
 from probcal.geometry import norm
-from probcal.table import UNITS, factor, measure
+from probcal.table import UNITS, measure, unit_factor
 
 sys.path.insert(0, str(committed.DATA))
 
@@ -174,9 +174,9 @@ def test_every_unit_has_the_size_of_its_definition():
     given = read_table(recorded())
     for wanted, sizes in UNIT_SIZES.items():
         for unit, size in sizes.items():
-            assert factor(given, "x", unit, wanted) == pytest.approx(size, rel=1e-12), unit
-            assert factor(given, "x", wanted, unit) == pytest.approx(1 / size, rel=1e-12), unit
-        assert factor(given, "x", None, wanted) == 1.0
+            assert unit_factor(given, "x", unit, wanted) == pytest.approx(size, rel=1e-12), unit
+            assert unit_factor(given, "x", wanted, unit) == pytest.approx(1 / size, rel=1e-12), unit
+        assert unit_factor(given, "x", None, wanted) == 1.0
 
 
 def test_values_and_stds_are_converted_each_by_its_own_unit():

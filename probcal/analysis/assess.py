@@ -65,7 +65,7 @@ def _absurd(tree: xr.DataTree) -> bool:
 def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Array) -> xr.DataTree:
     keys = jax.random.split(key, 3)
     drawn = predictive.draws_of(fit, tree, keys[0])
-    replicas = predictive.check(fit, drawn, keys[1])
+    replicas = predictive.check_replicas(fit, drawn, keys[1])
     found = residuals.innovations(fit, replicas.kurtosis)
     groups: dict[str, xr.Dataset] = {"epoch_check": xr.Dataset()} | checks.by_epoch(fit, found.innovations)
     groups["datum_check"], findings = checks.by_datum(fit, found.innovations, tree)
@@ -78,7 +78,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     findings += [
         Finding("wrapping", *pair) for pair in residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     ]
-    findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups) + process.check(fit, keys[2])
+    findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups) + process.check_process_noise(fit, keys[2])
     groups["verdict"] = _verdicts(fit, tree, found, groups)
     if "mirror" in tree.children:
         group = tree["mirror"].to_dataset()
@@ -135,13 +135,13 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
             else:
                 disagreements[change.bias] = _disagreement(problem, change, limit_of(M, change.contrast.freedom))
     z, alpha = np.asarray(fit.point.z), np.asarray(fit.prior.alpha)
-    known = verdict.Evidence(
+    known = verdict.Grounds(
         verdict.contraction(calibration["information"].values), square,
         verdict.pull(z, alpha, calibration["gamma"].values, inflation), float(np.sqrt(limit_of(M))),
     )  # fmt: skip
     ended = calibration["status"].values.tolist()
     status = Status(tree.attrs["status"])
-    words, reasons = verdict.judge(
+    words, reasons = verdict.judge_biases(
         problem, status, ended, known, drifts, disagreements, first, _shared(tree), _mirrored(fit, tree)
     )
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
@@ -318,7 +318,7 @@ def _halves(
 
 
 def _score(
-    fit: Fitted, tree: xr.DataTree, drawn: predictive.Drawn, truth: Truth, groups: dict[str, xr.Dataset]
+    fit: Fitted, tree: xr.DataTree, drawn: predictive.FitDraws, truth: Truth, groups: dict[str, xr.Dataset]
 ) -> None:
     """Add NEES of positions by epoch to `epoch_check`, and those of all positions and biases to its attributes."""
     tracked = dict(each_track(tree))

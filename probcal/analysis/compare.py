@@ -45,7 +45,7 @@ def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
     else the first that has draws of its own, else the first. Raises `InputError` for fits of different data, scales or
     units, and where no bias is common.
     """
-    known = named(fits, names)
+    known = fits_by_name(fits, names)
     labels = _common(known)
     order = loo.same_data(known)
     groups: dict[str, xr.Dataset] = {"estimate": _estimates(known, labels), "pair": _pairs(known, labels)}
@@ -72,7 +72,7 @@ def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
     return tree
 
 
-def named(fits: Fits, names: Sequence[str] | None = None) -> dict[str, xr.DataTree]:
+def fits_by_name(fits: Fits, names: Sequence[str] | None = None) -> dict[str, xr.DataTree]:
     """Fits by name; a fit without one is called by its method and prior, "EA (ARD)", numbered where that is taken."""
     if isinstance(fits, Mapping):
         if names is not None:

@@ -16,7 +16,7 @@ import xarray as xr
 from probcal.analysis.fitted import Fitted
 from probcal.model.model import At, Model
 from probcal.model.rows import standardised
-from probcal.noise import Bernoulli, Gaussian
+from probcal.noise import Bernoulli, Normal
 from probcal.results.read import each_track, saved_states
 from probcal.smoothing.draws import draw
 
@@ -25,7 +25,7 @@ VALUES = 20_000_000  # of all states drawn
 LEAST = 20  # draws, however many states there are
 
 
-class Drawn(NamedTuple):
+class FitDraws(NamedTuple):
     """Draws of biases (D, M), log levels (D, H) and states (D, E, n); replicas (D, N, C) where a tree holds them."""
 
     z: jax.Array
@@ -48,12 +48,12 @@ class Predictive(NamedTuple):
 
 @partial(jax.jit, static_argnames="count")
 def _discrepancies(
-    model: Model, levels: jax.Array, drawn: Drawn, sensors: tuple[jax.Array, ...], count: int,
+    model: Model, levels: jax.Array, drawn: FitDraws, sensors: tuple[jax.Array, ...], count: int,
     key: jax.Array,
 ) -> tuple[list[jax.Array], list[jax.Array]]:  # fmt: skip
     """By draw, data or replica, sensor and channel (D, 2, 2, S, C): -log p and sum of scores; fourth powers (N, C)."""
 
-    def one(fourth: list[jax.Array], given: tuple[Drawn, jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
+    def one(fourth: list[jax.Array], given: tuple[FitDraws, jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
         draw, seed = given
         at = At(draw.states, draw.z, draw.levels)
         replicas = model.sample(at, seed) if draw.replicas is None else draw.replicas
@@ -76,10 +76,10 @@ def _discrepancies(
     return found, [power / total for power in fourth]
 
 
-def check(fit: Fitted, drawn: Drawn, key: jax.Array) -> Predictive:
+def check_replicas(fit: Fitted, drawn: FitDraws, key: jax.Array) -> Predictive:
     """P-values by sensor and channel, and kurtosis, at draws of a fit."""
     problem = fit.problem
-    gaussian = all(isinstance(noise, Gaussian) for noises in problem.model.noises for noise in noises)
+    gaussian = all(isinstance(noise, Normal) for noises in problem.model.noises for noise in noises)
     sensors = tuple(jnp.asarray(problem.measurements.sensor[index]) for index in problem.row_index)
     count = len(problem.network.sensors)
     found, fourth = _discrepancies(problem.model, fit.point.levels, drawn, sensors, count, key)
@@ -102,7 +102,7 @@ def _exact(fit: Fitted, kurtosis: np.ndarray) -> np.ndarray:
     return np.maximum(np.where(fit.flat(answers), 1 / np.maximum(variance, 1e-12) - 6, kurtosis), -2.0)
 
 
-def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Drawn:
+def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> FitDraws:
     """Up to 400 draws of a fit, biases and levels as its tree has them.
 
     The states are those of the tree where it holds them; else a trajectory is drawn for each draw of the biases, from
@@ -124,15 +124,15 @@ def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> Drawn:
         levels = jnp.asarray(np.log(thin(posterior["level"].values) / guess))
     if any("state" not in track for track in tracked.values()):
         drawn = draw(fit.at, z, levels, key)
-        return Drawn(z, levels, drawn.states, None)
+        return FitDraws(z, levels, drawn.states, None)
     states = tuple(jnp.asarray(thin(own)) for own in saved_states(problem, tracked))
     replicas = tree["posterior_predictive"].to_dataset()["y"] if "posterior_predictive" in tree.children else None
     if replicas is None or replicas.sizes["draw"] < posterior.sizes["draw"]:
-        return Drawn(z, levels, states, None)
+        return FitDraws(z, levels, states, None)
     flat, blocks, start = thin(replicas.values), [], 0
     for there, (row, channel) in zip(problem.model.measured, fit.picks, strict=True):
         block = np.zeros((most, *there.shape))
         block[:, row, channel] = flat[:, start : start + len(row)]
         blocks.append(jnp.asarray(block))
         start += len(row)
-    return Drawn(z, levels, states, blocks)
+    return FitDraws(z, levels, states, blocks)

@@ -16,7 +16,7 @@ from probcal.analysis.fitted import Fitted
 from probcal.model.motions import linear_of
 from probcal.motion import as_motion
 from probcal.motion.base import GAUSSIAN, level_name
-from probcal.noise import Gaussian, guess_of
+from probcal.noise import Normal, guess_of
 
 REPLICAS, MOST = 200, 2e7  # drawn, and entries of all of them together
 FEWEST = 30  # epochs, and replicas, below which nothing is said
@@ -36,7 +36,7 @@ class Driven(NamedTuple):
     replicas: np.ndarray  # (epochs, entries, D) likewise
 
 
-def check(fit: Fitted, key: jax.Array) -> list[Finding]:
+def check_process_noise(fit: Fitted, key: jax.Array) -> list[Finding]:
     """Findings on the process noises of every target whose motion declares Gaussian ones."""
     size = max(sum(part.drift.size for part in fit.problem.model.recursions), 1)
     count = int(min(REPLICAS, MOST / size))
@@ -77,7 +77,7 @@ def _driven(fit: Fitted, key: jax.Array, count: int) -> Iterator[Driven]:
             for component in linear_of(as_motion(problem.target(name).motion)):
                 width = component.noise_factor(np.ones(1), problem.network.dimension).shape[2]
                 own, start = slice(start, start + width), start + width
-                gaussian = isinstance(getattr(component, "noise", GAUSSIAN), Gaussian)
+                gaussian = isinstance(getattr(component, "noise", GAUSSIAN), Normal)
                 if not gaussian or guess_of(component.std) == 0 or mine.sum() < FEWEST:
                     continue
                 sd = columns[mine, own].std(2)

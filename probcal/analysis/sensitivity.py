@@ -15,7 +15,7 @@ from probcal.model.model import At, Model
 from probcal.problem import Problem
 from probcal.simulate import Key, Truth, as_key
 from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mode import Point, track
+from probcal.smoothing.mode import Point, smooth_tracks
 from probcal.smoothing.start import follow_states
 from probcal.types import float64
 
@@ -113,7 +113,7 @@ def _errors(
         cell, run = pair[0], pair[1]
         states, z = tuple(x[run] for x in true), spread[cell] * unit[run]
         measured = model.with_values(model.sample(At(states, z, start.levels[run]), keys[run]))
-        found = track(measured, jax.tree.map(lambda leaf: leaf[run], start), ITERATIONS)
+        found = smooth_tracks(measured, jax.tree.map(lambda leaf: leaf[run], start), ITERATIONS)
         pairs = zip(found.states, states, spans, strict=True)
         squares = [jnp.sum((x - x_true)[:, a:b] ** 2) for x, x_true, (a, b) in pairs]
         return jnp.sum(jnp.stack(squares)) / sum(x.shape[0] for x in states)

@@ -33,7 +33,7 @@ PRIOR_ONLY, WEAK = 0.05, 0.5
 VERDICTS = ("determined", "prior only", "weak", "drifting", "conflicting")
 
 
-class Evidence(NamedTuple):
+class Grounds(NamedTuple):
     """What the verdicts rest on, each (M,) in z."""
 
     contraction: np.ndarray  # s
@@ -66,11 +66,11 @@ def limit_of(count: int, freedom: int = 1) -> float:
     return float(special.chdtri(freedom, RATE / max(count, 1)))
 
 
-def judge(
+def judge_biases(
     problem: Problem,
     status: Status,
     ended: Sequence[str],
-    known: Evidence,
+    known: Grounds,
     drifts: Mapping[int, str],
     disagreements: Mapping[int, str],
     first: str,

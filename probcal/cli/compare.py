@@ -9,7 +9,7 @@ import pandas as pd
 import xarray as xr
 
 from probcal.analysis import compare
-from probcal.analysis.compare import chosen_pair, named
+from probcal.analysis.compare import chosen_pair, fits_by_name
 from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.diagnostics import comparison_rows
 from probcal.files import Outputs
@@ -25,7 +25,7 @@ def run(
     outputs: Outputs | None,
 ) -> int:
     """Put fits of the same data side by side: estimates, distances, gamma, coverage, prediction, evidence, cost."""
-    fits = named([load(path) for path in folders], names)
+    fits = fits_by_name([load(path) for path in folders], names)
     drawn = [chosen_pair(fits, pair) for pair in pairs]
     comparison = compare(fits)
     print(estimates_text(comparison))

@@ -12,7 +12,7 @@ import xarray as xr
 
 from probcal.cli.files import can_plot, report_of, say_written, write_csv
 from probcal.cli.kernels import keep_kernels
-from probcal.cli.models import choose_prior, load_problem, load_truth
+from probcal.cli.models import load_problem, load_truth, prior_named
 from probcal.cli.progress import line
 from probcal.files import Outputs
 from probcal.inference import METHODS, calibrate
@@ -39,7 +39,7 @@ def run(
     value = replace(value, **sizes) if sizes else value
     began = time.perf_counter()
     module, problem = load_problem(model, data, fix)
-    chosen = choose_prior(module, value, implied, prior)
+    chosen = prior_named(module, value, implied, prior)
     truth = load_truth(module, model, data, problem)
     store = None if outputs is None else outputs.folder / "draws"
     if outputs is not None and overwrite:

@@ -96,7 +96,7 @@ def load_truth(module: ModuleType, model: Path, data: Path | None, problem: "Pro
     return truth
 
 
-def choose_prior(module: ModuleType, method: "Method", implied: "Prior | None", name: str | None) -> "Prior | None":
+def prior_named(module: ModuleType, method: "Method", implied: "Prior | None", name: str | None) -> "Prior | None":
     """The prior that is named, else that of the method's name, else the model's own `PRIOR` if the method takes it."""
     from probcal.priors import PRIORS
 

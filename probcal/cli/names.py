@@ -6,7 +6,7 @@
 from typing import NamedTuple
 
 
-class Known(NamedTuple):
+class KnownMethod(NamedTuple):
     """What the command line knows of a method."""
 
     title: str  # its name in results
@@ -27,22 +27,22 @@ _HORSESHOE = ("horseshoe", "horseshoe-vector")
 _SAMPLED = (*_FIXED, "ard-gamma", *_HORSESHOE)
 _INTEGRATED = ("laplace", *_LEARNT, *_HORSESHOE, "bernoulli-gaussian")
 METHODS = {
-    "ea": Known("EA", False, _INTEGRATED),
-    "ea-maximised": Known("EA", False, _LEARNT),
-    "ea-printed": Known("EA", False, _LEARNT),
-    "ea-em": Known("EA", False, _LEARNT),
-    "paper-b": Known("EA", False, _LEARNT),
-    "em-ea": Known("EM-EA", False, _LEARNT),
-    "em": Known("EM", False, _FIXED),
-    "em-ml": Known("EM", False, _FIXED),
-    "map": Known("MAP", False, _FIXED),
-    "map-l1": Known("MAP", False, _FIXED),
-    "ml": Known("MAP", False, _FIXED),
-    "nls": Known("least squares", False, ("flat",)),
-    "collapsed": Known("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
-    "collapsed-spike": Known("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
-    "nuts": Known("NUTS", True, _SAMPLED),
-    "svi": Known("SVI", True, _SAMPLED),
-    "svi-mean-field": Known("SVI", True, _SAMPLED),
-    "svi-low-rank": Known("SVI", True, _SAMPLED),
+    "ea": KnownMethod("EA", False, _INTEGRATED),
+    "ea-maximised": KnownMethod("EA", False, _LEARNT),
+    "ea-printed": KnownMethod("EA", False, _LEARNT),
+    "ea-em": KnownMethod("EA", False, _LEARNT),
+    "paper-b": KnownMethod("EA", False, _LEARNT),
+    "em-ea": KnownMethod("EM-EA", False, _LEARNT),
+    "em": KnownMethod("EM", False, _FIXED),
+    "em-ml": KnownMethod("EM", False, _FIXED),
+    "map": KnownMethod("MAP", False, _FIXED),
+    "map-l1": KnownMethod("MAP", False, _FIXED),
+    "ml": KnownMethod("MAP", False, _FIXED),
+    "nls": KnownMethod("least squares", False, ("flat",)),
+    "collapsed": KnownMethod("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
+    "collapsed-spike": KnownMethod("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
+    "nuts": KnownMethod("NUTS", True, _SAMPLED),
+    "svi": KnownMethod("SVI", True, _SAMPLED),
+    "svi-mean-field": KnownMethod("SVI", True, _SAMPLED),
+    "svi-low-rank": KnownMethod("SVI", True, _SAMPLED),
 }

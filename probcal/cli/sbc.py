@@ -9,7 +9,7 @@ import xarray as xr
 
 from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.cli.kernels import keep_kernels
-from probcal.cli.models import choose_prior, load_problem
+from probcal.cli.models import load_problem, prior_named
 from probcal.cli.progress import bar
 from probcal.files import Outputs
 from probcal.inference import METHODS, sbc
@@ -29,7 +29,7 @@ def run(
     value, implied = METHODS[method]
     value = value if full else short(value)
     module, problem = load_problem(model, data, fix)
-    chosen = choose_prior(module, value, implied, prior)
+    chosen = prior_named(module, value, implied, prior)
     began = time.perf_counter()
     if outputs is not None and overwrite:
         outputs.begin()

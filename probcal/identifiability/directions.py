@@ -12,7 +12,7 @@ from probcal.identifiability.gauge import Gauge
 from probcal.identifiability.patterns import DILATION, Pattern, cause, common_shifts, rigid_motions
 from probcal.identifiability.remedies import WEAK, Direction, with_remedies
 from probcal.identifiability.spaces import complete, inside, orthonormal, readable
-from probcal.identifiability.wording import amount, in_words, involved, name_of, owner_of
+from probcal.identifiability.wording import amount, in_words, involved, name_without_owner, owner_of
 from probcal.problem import Problem
 from probcal.smoothing.mode import Point
 
@@ -135,7 +135,7 @@ class _Naming:
             moved = self._moved_along(along, np.abs(vector).max())
             if moved:
                 words += f" and the {' and '.join(name.replace('_', ' ') for name in moved)}s with them"
-                anchors = (*anchors, *((label,) for label in self.labels if name_of(label) in moved))
+                anchors = (*anchors, *((label,) for label in self.labels if name_without_owner(label) in moved))
             if moved and pattern.name.startswith(DILATION):
                 remedy += f", or fix one {moved[0].replace('_', ' ')}"
         if kind == "gauge" and strength >= WEAK:
@@ -148,7 +148,7 @@ class _Naming:
         """Components other than those of a pattern that a direction moves most, by name."""
         most: dict[str, float] = {}
         for label, size in zip(self.labels, np.abs(along), strict=True):
-            most[name_of(label)] = max(most.get(name_of(label), 0.0), float(size))
+            most[name_without_owner(label)] = max(most.get(name_without_owner(label), 0.0), float(size))
         return [name for name, size in most.items() if size > max(ALONG * largest, 0.5 * max(most.values()))]
 
     def _combination(self, vector: np.ndarray) -> Pattern:
@@ -156,12 +156,15 @@ class _Naming:
         problem, labels = self.problem, involved(self.labels, vector, np.abs(vector).max())
         first = labels[0]
         alone = tuple((label,) for label in labels)
-        placed = any(name_of(label).startswith("position_") or name_of(label) == "heading" for label in labels[:3])
+        placed = any(
+            name_without_owner(label).startswith("position_") or name_without_owner(label) == "heading"
+            for label in labels[:3]
+        )
         cause = self.cause if placed else ""
         if len(labels) == 1:
             return Pattern(f"{in_words(first)} alone", f"the data hardly depend on it{cause}", vector, "", alone)
         one = len({owner_of(label) for label in labels[:3]}) == 1
-        others = " and ".join(name_of(label) if one else in_words(label) for label in labels[1:3])
+        others = " and ".join(name_without_owner(label) if one else in_words(label) for label in labels[1:3])
         more = f" and {len(labels) - 3} more" if len(labels) > 3 else ""
         amounts = ", ".join(amount(problem, label, vector[self.labels.index(label)]) for label in labels[:3])
         name = f"{in_words(first)} against {'its ' if one else ''}{others}{more}"

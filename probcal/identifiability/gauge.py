@@ -23,7 +23,7 @@ HELD = 1e30  # precision of a state that is known
 ENOUGH = 0.5  # share of the data in epochs with more data than unknowns from which on a gauge can be counted
 
 
-class Free(NamedTuple):
+class FreeStates(NamedTuple):
     """Information (M, M) of the biases with the states of every epoch free, and with them known; ranks by epoch."""
 
     information: jax.Array
@@ -39,7 +39,7 @@ class Gauge(NamedTuple):
 
 
 @jax.jit
-def free_states(model: Model, point: Point, hold: tuple[jax.Array, ...]) -> Free:
+def free_states(model: Model, point: Point, hold: tuple[jax.Array, ...]) -> FreeStates:
     """Information about the biases with the state of every epoch free but for the precisions `hold` (E, n)."""
     lins = model.linearise(point, expected=True)
     compressed = compress(model, lins)
@@ -50,7 +50,7 @@ def free_states(model: Model, point: Point, hold: tuple[jax.Array, ...]) -> Free
         flat = linalg.forward(root, cross).reshape(-1, cross.shape[2])
         information = information - linalg.gram(flat, flat)
         ranks.append(jnp.sum((jnp.diagonal(root, axis1=1, axis2=2) > 0) & (precision < HELD), 1))
-    return Free(information, known, tuple(ranks))
+    return FreeStates(information, known, tuple(ranks))
 
 
 @jax.jit
@@ -111,7 +111,7 @@ def gauge(problem: Problem, point: Point) -> Gauge:
     return Gauge(basis, _countable(problem, free))
 
 
-def _countable(problem: Problem, free: Free) -> bool:
+def _countable(problem: Problem, free: FreeStates) -> bool:
     """Whether at least half of the data stand in epochs with more data than unknowns."""
     inside = total = 0.0
     counts = variants.counts(problem.model, lambda mask: mask.sum(1))

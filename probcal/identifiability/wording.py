@@ -15,7 +15,7 @@ def owner_of(label: str) -> str:
     return label_parts(label)[0]
 
 
-def name_of(label: str) -> str:
+def name_without_owner(label: str) -> str:
     """What a bias is, without its owner."""
     return label_parts(label)[1]
 

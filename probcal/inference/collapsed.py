@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.gibbs import surrogate
+from probcal.inference.gibbs import delayed_acceptance
 from probcal.inference.hierarchy import Phi
 from probcal.inference.orbits import Place, roam
 from probcal.inference.posed import Conditional, Form, Posed, conditional, prior_precision
@@ -26,7 +26,7 @@ SHRINKINGS = 40  # most times that an ellipse is cut
 STEP = 1.3  # of a swing, over the fourth root of the dimension (Beskos and others 2013)
 
 
-class Chain(NamedTuple):
+class CollapsedState(NamedTuple):
     """Where a chain stands."""
 
     theta: jax.Array
@@ -36,8 +36,8 @@ class Chain(NamedTuple):
     key: jax.Array
 
 
-def ellipse(
-    form: Form, posed: Posed, chain: Chain, given: Conditional, key: jax.Array
+def elliptical_slice_step(
+    form: Form, posed: Posed, chain: CollapsedState, given: Conditional, key: jax.Array
 ) -> tuple[jax.Array, tuple[jax.Array, ...], jax.Array, jax.Array]:
     """Elliptical slice sampling of theta and eps given phi: new theta, eps, log weight and the tries it took."""
     keys = jax.random.split(key, 4)
@@ -67,8 +67,8 @@ def ellipse(
     return theta, eps, jnp.where(found, last[5], chain.weight), last[3]
 
 
-def swing(
-    form: Form, posed: Posed, chain: Chain, given: Conditional, key: jax.Array
+def hmc_step(
+    form: Form, posed: Posed, chain: CollapsedState, given: Conditional, key: jax.Array
 ) -> tuple[jax.Array, tuple[jax.Array, ...], jax.Array, jax.Array]:
     """Hamiltonian step of theta and eps given phi, a quarter turn in the frame's coordinates; as `ellipse` returns.
 
@@ -118,7 +118,7 @@ def swing(
     return *jax.tree.map(lambda new, old: jnp.where(taken, new, old), *found), jnp.asarray(count)
 
 
-MOVES = {"ellipse": ellipse, "swing": swing}
+MOVES = {"ellipse": elliptical_slice_step, "swing": hmc_step}
 
 
 @dataclass(frozen=True)
@@ -159,18 +159,20 @@ class Collapsed(Sampler):
             return replace(fallback, chains=self.chains, draws=self.draws), fallback.name
         return replace(self, move="swing"), "the swing"
 
-    def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Chain:
+    def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> CollapsedState:
         """A chain at a draw of the frame's posterior."""
         keys = jax.random.split(key, len(posed.frame.loops) + 1)
         pairs = zip(keys, posed.frame.point.states, strict=False)
         eps = tuple(jax.random.normal(k, x.shape) for k, x in pairs)
         weight = log_weight(posed.model, posed.frame, theta, eps)
-        return Chain(theta, eps, phi, weight, keys[-1])
+        return CollapsedState(theta, eps, phi, weight, keys[-1])
 
-    def step(self, form: Form, posed: Posed, chain: Chain) -> tuple[Chain, Sample]:
+    def step(self, form: Form, posed: Posed, chain: CollapsedState) -> tuple[CollapsedState, Sample]:
         """One draw."""
         key, *keys = jax.random.split(chain.key, 6)
-        theta, phi = surrogate(form, posed, chain.theta, chain.phi, keys[0], self.sweeps or form.hierarchy.sweeps)
+        theta, phi = delayed_acceptance(
+            form, posed, chain.theta, chain.phi, keys[0], self.sweeps or form.hierarchy.sweeps
+        )
         weight = log_weight(posed.model, posed.frame, theta, chain.eps)
         rate = jnp.exp(jnp.minimum(weight - chain.weight, 0.0))
         taken = jax.random.uniform(keys[1]) < rate
@@ -183,13 +185,13 @@ class Collapsed(Sampler):
         theta, eps, weight, tries = MOVES[self.move](form, posed, chain, given, keys[3])
         moved, roamed = roam(form, posed, Place(theta, eps, phi, weight), jax.random.fold_in(keys[4], 0))
         theta, eps, phi, weight = moved
-        chain = Chain(theta, eps, phi, weight, key)
+        chain = CollapsedState(theta, eps, phi, weight, key)
         joint = weight + posed.frame.log_likelihood(theta) - 0.5 * sum(jnp.sum(e**2) for e in eps)
         stats = {"acceptance_rate": rate, "tries": tries, "log_weight": weight}
         stats |= {"roamed": roamed} if posed.orbits else {}
         return chain, Sample(theta, eps, phi, joint, stats)
 
-    def across(self, form: Form, here: Posed, there: Posed, chain: Chain) -> tuple[Chain, jax.Array]:
+    def across(self, form: Form, here: Posed, there: Posed, chain: CollapsedState) -> tuple[CollapsedState, jax.Array]:
         """theta by the same unit normals on the other side, hyper-parameters and those of the trajectories kept."""
         own, other = conditional(form, here, chain.phi), conditional(form, there, chain.phi)
         eta = own.factor.T @ (chain.theta - own.mean)

@@ -11,7 +11,7 @@ from probcal.inference.uniformity import p_value, shape, share, spread_p_value
 ALARM = 0.01  # probability of a false alarm, over all quantities together
 
 
-def judge(tree: xr.DataTree) -> None:
+def judge_coverage(tree: xr.DataTree) -> None:
     """Add uniformity, coverage and the verdict."""
     group = tree["sbc"].to_dataset()
     place, kinds = group["place"].values, group["kind"].values

@@ -29,7 +29,7 @@ from probcal.problem import Problem
 from probcal.smoothing.information import paper_b, update_levels
 from probcal.smoothing.linearised import laplace_of
 from probcal.smoothing.marginal import find_marginal_mode
-from probcal.smoothing.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, mixing_gain, track
+from probcal.smoothing.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, mixing_gain, smooth_tracks
 
 RULES = ("mackay", "em")
 MODES = ("joint", "marginal")
@@ -95,7 +95,7 @@ def _density(model: Model, prior: Prior, given: Given, point: Point) -> jax.Arra
 def _iterate_paper_b(model: Model, prior: Prior, given: Given, state: State, rule: str) -> State:
     """Smooth at the current biases, then their posterior (16)-(17) for the precisions (25) of Paper B."""
     model, state = _learnt(model, prior, given, state, rule)
-    point = track(model, state.point)
+    point = smooth_tracks(model, state.point)
     found, step = paper_b(model, point, given.prior._replace(alpha=state.alpha))
     refused = state.refused & ~jnp.all(jnp.isfinite(step))
     step = jnp.where(jnp.isfinite(step), jnp.clip(step, -1.0, 1.0), 0.0)

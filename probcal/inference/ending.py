@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from probcal.inference.mixture import Mixture
+from probcal.inference.mixture import MixturePosterior
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, Normal, Posterior, Summary
+from probcal.results.answer import Answer, NormalPosterior, Posterior, Summary
 from probcal.smoothing.information import squares_of
 from probcal.smoothing.mode import Point
 from probcal.status import Status
@@ -69,9 +69,9 @@ def _posterior(
 ) -> Posterior:
     """The Gaussian at the end of a climb, or the mixture that the integration made of it."""
     if how is None or mixed is None:
-        return Normal.of(problem, prior, state.point, state.found, np.asarray(state.alpha))
+        return NormalPosterior.of(problem, prior, state.point, state.found, np.asarray(state.alpha))
     first = np.asarray(prior.precision(problem.labels, problem.surveyed).alpha)
-    return Mixture.of(problem, prior, how.form, first, mixed, float(state.found.evidence))
+    return MixturePosterior.of(problem, prior, how.form, first, mixed, float(state.found.evidence))
 
 
 def _bias_status(problem: Problem, summary: Summary, low: np.ndarray, far: np.ndarray) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.gibbs import sweep
+from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.methods import check_problem
 from probcal.inference.pose import pareto_khat, pose, weights
@@ -178,7 +178,7 @@ def _moved(form: Form, posed: Posed, phi: Phi, keys: jax.Array) -> tuple[Phi, ja
         theta = draw_given(form, posed, phi, keys[0])
 
         def again(carry: tuple[jax.Array, Phi], own: jax.Array) -> tuple[tuple[jax.Array, Phi], None]:
-            return sweep(form, posed, *carry, own, backwards=False), None
+            return gibbs_sweep(form, posed, *carry, own, backwards=False), None
 
         return jax.lax.scan(again, (theta, phi), keys[1:])[0]
 

@@ -9,7 +9,7 @@ from probcal.inference.hierarchy import Phi, SpikeAndSlab
 from probcal.inference.posed import Form, Quadratic, draw_given, update_inclusions
 
 
-def sweep(
+def gibbs_sweep(
     form: Form, posed: Quadratic, theta: jax.Array, phi: Phi, key: jax.Array, *, backwards: bool
 ) -> tuple[jax.Array, Phi]:
     """Gibbs on the frame: hyper-parameters given the biases, then theta given them; `backwards` in reverse order."""
@@ -31,7 +31,7 @@ def sweep(
     return theta, phi
 
 
-def surrogate(
+def delayed_acceptance(
     form: Form, posed: Quadratic, theta: jax.Array, phi: Phi, key: jax.Array, sweeps: int
 ) -> tuple[jax.Array, Phi]:
     """Some sweeps, all forwards or all backwards by a coin: reversible under the frame's posterior."""
@@ -39,7 +39,7 @@ def surrogate(
 
     def run(backwards: bool) -> Any:
         def one(carry: tuple[jax.Array, Phi], own: jax.Array) -> tuple[tuple[jax.Array, Phi], None]:
-            return sweep(form, posed, *carry, own, backwards=backwards), None
+            return gibbs_sweep(form, posed, *carry, own, backwards=backwards), None
 
         return lambda: jax.lax.scan(one, (theta, phi), keys[1:])[0]
 

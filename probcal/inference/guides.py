@@ -15,7 +15,7 @@ import numpy as np
 from probcal import linalg
 
 
-class Fitted(NamedTuple):
+class GuideParameters(NamedTuple):
     """Parameters of a guide over D coordinates."""
 
     mean: jax.Array  # (D,)
@@ -43,15 +43,15 @@ class Guide(ABC):
     def volume(self, rest: tuple[jax.Array, ...], n: jax.Array) -> jax.Array:
         """Log determinant (K,) of the derivative of f."""
 
-    def place(self, fitted: Fitted, n: jax.Array) -> jax.Array:
+    def place(self, fitted: GuideParameters, n: jax.Array) -> jax.Array:
         """Coordinates (K, D) of unit normals."""
         return fitted.mean[None] + jnp.exp(fitted.log_scale)[None] * self.turned(fitted.rest, n)
 
-    def slope(self, fitted: Fitted, n: jax.Array) -> jax.Array:
+    def slope(self, fitted: GuideParameters, n: jax.Array) -> jax.Array:
         """Slope (K, D) of the log density by the coordinates."""
         return jnp.exp(-fitted.log_scale)[None] * self.pulled(fitted.rest, n)
 
-    def log_density(self, fitted: Fitted, n: jax.Array) -> jax.Array:
+    def log_density(self, fitted: GuideParameters, n: jax.Array) -> jax.Array:
         """Log density (K,) of the coordinates of unit normals."""
         unit = -0.5 * jnp.sum(n**2, 1) - 0.5 * n.shape[1] * np.log(2 * np.pi)
         return unit - jnp.sum(fitted.log_scale) - self.volume(fitted.rest, n)

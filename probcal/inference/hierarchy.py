@@ -35,7 +35,7 @@ Phi = dict[str, jax.Array]
 Update = Callable[[Phi, jax.Array, jax.Array], Phi]  # phi, learnt z, key
 
 
-class Nodes(NamedTuple):
+class QuadratureNodes(NamedTuple):
     """The prior of one bias as a finite mixture of Gaussians, at nodes of what all biases share."""
 
     variance: Any  # (K, J) of each Gaussian
@@ -83,7 +83,7 @@ class Hierarchy(ABC):
     def drawn(self) -> dict[str, Callable[[jax.Array], jax.Array]]:
         """How each of them is drawn by a key; apart from `hyper`, so that what only draws need not load numpyro."""
 
-    def nodes(self) -> Nodes:
+    def nodes(self) -> QuadratureNodes:
         """The same prior as finite mixtures, for expectation propagation."""
         raise AssertionError("a known prior has no scales to integrate")
 
@@ -181,12 +181,12 @@ def _shares(count: int) -> np.ndarray:
     return (np.arange(count) + 0.5) / count
 
 
-def _alone(variance: np.ndarray) -> Nodes:
+def _alone(variance: np.ndarray) -> QuadratureNodes:
     """Nodes of biases that share nothing."""
-    return Nodes(variance[None], np.full((1, len(variance)), -np.log(len(variance))), np.zeros(1))
+    return QuadratureNodes(variance[None], np.full((1, len(variance)), -np.log(len(variance))), np.zeros(1))
 
 
-class Known(Hierarchy):
+class NoHyperprior(Hierarchy):
     """A prior without hyper-parameters: Gaussian or flat."""
 
     def hyper(self):
@@ -206,7 +206,7 @@ class Known(Hierarchy):
         return []
 
 
-class Precisions(Hierarchy):
+class GammaPrecision(Hierarchy):
     """ARD: one precision a group with a Gamma hyper-prior; the biases are then Student-t."""
 
     own = "alpha"
@@ -246,7 +246,7 @@ class Precisions(Hierarchy):
         return [alpha]
 
 
-class Exponentials(Hierarchy):
+class LaplaceMixture(Hierarchy):
     """Laplace density as a Gaussian of exponential variance (Park, Casella 2008)."""
 
     by_bias = ("variance",)
@@ -324,7 +324,7 @@ class RegularisedHorseshoe(Hierarchy):
         variance = 1.0 / (1.0 / slab[:, None, None] + 1.0 / scale[None] ** 2)
         prior = -0.5 * self.prior.slab_df * (np.log(slab) + declared / slab)
         shape = len(slab) * HALF, INNER
-        return Nodes(variance.reshape(shape), np.full(shape, -np.log(INNER)), np.repeat(prior, HALF))
+        return QuadratureNodes(variance.reshape(shape), np.full(shape, -np.log(INNER)), np.repeat(prior, HALF))
 
     def governed(self, phi):
         """Slab and shrinkage added."""
@@ -404,7 +404,7 @@ class SpikeAndSlab(Hierarchy):
         share = betaincinv(self.prior.a, self.prior.b, _shares(SHARED)) if given is None else np.array([given])
         weight = np.stack([1.0 - share, share], 1)
         variance = np.broadcast_to([1e-12, self.prior.slab**2], weight.shape)
-        return Nodes(variance, np.log(weight), np.zeros(len(share)))
+        return QuadratureNodes(variance, np.log(weight), np.zeros(len(share)))
 
     def governed(self, phi):
         """The slab."""
@@ -443,11 +443,11 @@ def hierarchy_of(prior: Prior, problem: Problem) -> Hierarchy:
     learnt = np.flatnonzero(~problem.surveyed)
     groups = np.unique(prior.groups(problem.members)[learnt], return_inverse=True)[1] if len(learnt) else learnt
     kinds: dict[type, type[Hierarchy]] = {
-        ARD: Precisions, Laplace: Exponentials, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab,
+        ARD: GammaPrecision, Laplace: LaplaceMixture, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab,
     }  # fmt: skip
     kind = kinds.get(type(prior))
     if kind is None or not len(learnt):
-        return Known(prior, (), ())
+        return NoHyperprior(prior, (), ())
     if isinstance(prior, ARD) and prior.rate == 0.0:
         raise InputError(
             "a sampler needs a proper hyper-prior: ARD(shape=1, rate=0) is flat and its posterior does not exist;"

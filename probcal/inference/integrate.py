@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.scipy.special import ndtr
 
 from probcal import linalg
-from probcal.inference.gibbs import sweep
+from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Natural, activity, draw_given, prior_precision
 from probcal.inference.propagate import Propagated, nodes_of, propagate
@@ -22,7 +22,7 @@ from probcal.model.model import Model
 from probcal.priors import Precision
 from probcal.results.schema import INTERVAL
 from probcal.smoothing.marginal import volume_slope
-from probcal.smoothing.mode import Point, eliminate, track
+from probcal.smoothing.mode import Point, eliminate, smooth_tracks
 
 CHAINS, BURN, FIRST, KEPT = (
     4,
@@ -79,7 +79,7 @@ def integrate(
     for turn in range(MOVES if search else 1):
         own = jax.random.fold_in(key, turn + 2)
         if nodes is None:
-            chains, swept = run(how.form, known, chains, own, FIRST)
+            chains, swept = run_sweeps(how.form, known, chains, own, FIRST)
             mean, spread = swept.mean, swept.spread
         else:
             found = propagate(how.form, known, nodes, own, CHAINS * KEPT)
@@ -90,9 +90,9 @@ def integrate(
             break
     if nodes is not None:
         return _propagated(how, model, known, point, propagate(how.form, known, nodes, key, CHAINS * KEPT))
-    _, swept = run(how.form, known, chains, jax.random.fold_in(key, 1), KEPT)
+    _, swept = run_sweeps(how.form, known, chains, jax.random.fold_in(key, 1), KEPT)
     total = moments(how.form, known, swept.phi)
-    return Integrated(placed(model, point, total.mean), known.information, total, swept.z, swept.phi)
+    return Integrated(point_at(model, point, total.mean), known.information, total, swept.z, swept.phi)
 
 
 def _propagated(how: Integration, model: Model, known: Natural, point: Point, found: Propagated) -> Integrated:
@@ -101,7 +101,7 @@ def _propagated(how: Integration, model: Model, known: Natural, point: Point, fo
     lower, upper = jnp.percentile(found.z, jnp.array([tail, 100.0 - tail]), axis=0)
     total = Moments(found.mean, found.covariance, lower, upper, found.gamma)
     z = found.z.reshape(CHAINS, KEPT, how.form.biases)
-    return Integrated(placed(model, point, found.mean), known.information, total, z, {})
+    return Integrated(point_at(model, point, found.mean), known.information, total, z, {})
 
 
 @partial(jax.jit, static_argnames="how")
@@ -116,14 +116,14 @@ def likelihood(how: Integration, model: Model, first: Precision, point: Point) -
     return Natural(solved.information, pull, jnp.zeros(0), first), sound & jnp.all(jnp.isfinite(pull))
 
 
-def placed(model: Model, point: Point, z: jax.Array) -> Point:
+def point_at(model: Model, point: Point, z: jax.Array) -> Point:
     """The point at biases z (M,), trajectories at their mode."""
-    return track(model, point._replace(z=z))
+    return smooth_tracks(model, point._replace(z=z))
 
 
 def recentred(how: Integration, model: Model, point: Point, known: Natural, mean: jax.Array) -> tuple[Point, Natural]:
     """Point and likelihood at a mean (M,); as they were where there is no likelihood at the mean."""
-    moved = placed(model, point, mean)
+    moved = point_at(model, point, mean)
     after, sound = likelihood(how, model, known.first, moved)
     return chosen(sound, (moved, after), (point, known))
 
@@ -155,13 +155,13 @@ class Swept(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="form")
-def run(form: Form, known: Natural, chains: Any, key: jax.Array, count: int) -> tuple[Any, Swept]:
+def run_sweeps(form: Form, known: Natural, chains: Any, key: jax.Array, count: int) -> tuple[Any, Swept]:
     """`count` sweeps of every chain from where it stands, after those of the burn-in; also where the chains end."""
 
     def chain(pair: tuple[Any, jax.Array]) -> tuple[Any, Any]:
         def one(k: jax.Array, state: Any) -> Any:
             (theta, phi), drawn = state
-            at = sweep(form, known, theta, phi, jax.random.fold_in(pair[1], k), backwards=False)
+            at = gibbs_sweep(form, known, theta, phi, jax.random.fold_in(pair[1], k), backwards=False)
             return at, jax.tree.map(lambda kept, leaf: kept.at[jnp.maximum(k - BURN, 0)].set(leaf), drawn, at)
 
         blank = jax.tree.map(lambda leaf: jnp.zeros((KEPT, *leaf.shape), leaf.dtype), pair[0])

@@ -16,14 +16,14 @@ from probcal.inference.integrate import Integrated
 from probcal.inference.posed import Form
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Draws, Posterior, Summary, Tracks, log_normal, tracks_of
+from probcal.results.answer import Draws, Posterior, Summary, Tracks, log_prior_normal, tracks_of
 from probcal.results.schema import ROPE
 from probcal.smoothing.draws import draw, draws_a_chain
 from probcal.smoothing.linearised import laplace
 
 
 @dataclass(frozen=True, eq=False)
-class Mixture(Posterior):
+class MixturePosterior(Posterior):
     """A mixture of Gaussians of the biases around a point, noise levels held."""
 
     found: Integrated
@@ -36,7 +36,7 @@ class Mixture(Posterior):
     @classmethod
     def of(
         cls, problem: Problem, prior: Prior, form: Form, first: np.ndarray, found: Integrated, evidence: float
-    ) -> Mixture:
+    ) -> MixturePosterior:
         """The mixture of an integration; `first` (M,) are the precisions of what no hierarchy governs.
 
         `evidence` is that under the declared scales.
@@ -94,7 +94,7 @@ class Mixture(Posterior):
         phi = {name: jnp.asarray(values) for name, values in self.hyper.items()}
         first = jnp.asarray(self.first)
         alpha = np.asarray(jax.vmap(jax.vmap(lambda one: self.hierarchy.alpha(one, first)))(phi))
-        return log_normal(draws.z, np.clip(alpha, LEAST, MOST))
+        return log_prior_normal(draws.z, np.clip(alpha, LEAST, MOST))
 
     @property
     def variables(self) -> Mapping[str, Any]:

@@ -18,7 +18,7 @@ from probcal import linalg
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, log_prior
 from probcal.problem import Problem
-from probcal.smoothing.frame import driving, log_weight, place, volume
+from probcal.smoothing.frame import log_weight, place, unit_normals, volume
 from probcal.smoothing.mode import Point, factors
 from probcal.smoothing.recursion import trajectory
 
@@ -126,7 +126,7 @@ def roam(form: Form, posed: Posed, at: Place, key: jax.Array) -> tuple[Place, ja
         size = jax.random.choice(pick, jnp.asarray(SIZES)) * orbit.size
         r = (size if orbit.kind == "shift" else jnp.minimum(size, TURNING)) * jax.random.normal(draw)
         point = orbit.moved(posed, r, place(posed.model, posed.frame, at.theta, at.eps))
-        theta, eps = jnp.concatenate([point.z, point.levels]), driving(posed.model, posed.frame, point)
+        theta, eps = jnp.concatenate([point.z, point.levels]), unit_normals(posed.model, posed.frame, point)
         phi, ratio = form.hierarchy.renewed(at.phi, at.theta[learnt], theta[learnt], renew)
         tried = Place(theta, eps, phi, log_weight(posed.model, posed.frame, theta, eps))
         gain = density(tried) - density(at) + orbit.volume * r + ratio

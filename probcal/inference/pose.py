@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.inference.gibbs import sweep
+from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.posed import Form, Posed, activity, conditional
 from probcal.inference.psis import smoothed
@@ -17,7 +17,7 @@ from probcal.model.model import Model
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.smoothing.frame import Frame, frame_at, log_weight, place, refined
-from probcal.smoothing.mode import Point, track
+from probcal.smoothing.mode import Point, smooth_tracks
 
 PILOTS = 4  # chains of the pilot
 BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, sweeps between two
@@ -60,7 +60,7 @@ def pilot(form: Form, posed: Posed, key: jax.Array) -> Pilot:
 
         def one(carry: Any, k: jax.Array) -> tuple[Any, Any]:
             theta, phi = carry
-            found = sweep(form, posed, theta, phi, jax.random.fold_in(run, k), backwards=False)
+            found = gibbs_sweep(form, posed, theta, phi, jax.random.fold_in(run, k), backwards=False)
             return found, found
 
         _, found = jax.lax.scan(one, (theta, phi), jnp.arange(BURN + STRIDE * KEPT))
@@ -88,7 +88,7 @@ def moved(model: Model, frame: Frame, theta: jax.Array, key: jax.Array) -> Frame
     """The frame at the mean of draws theta (D, Q), trajectories at their mode, then fitted to the draws."""
     resting = tuple(jnp.zeros_like(x) for x in frame.point.states)
     mean = jnp.mean(theta, 0)
-    frame = frame_at(model, track(model, place(model, frame, mean, resting)))
+    frame = frame_at(model, smooth_tracks(model, place(model, frame, mean, resting)))
     for k in range(FITTINGS):
         keys = jax.random.split(jax.random.fold_in(key, k), len(resting))
         eps = tuple(jax.random.normal(s, (FITTED, *x.shape)) for s, x in zip(keys, resting, strict=True))

@@ -13,11 +13,11 @@ import numpy as np
 from probcal.inference.ending import ABSURD, FAR, misfit_sentence
 from probcal.inference.hierarchy import LEAST, MOST, SpikeAndSlab
 from probcal.inference.pose import pareto_khat
-from probcal.inference.sampling import Sampled
+from probcal.inference.sampling import SamplerRun
 from probcal.lazy import Later
 from probcal.priors import PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_normal
+from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
 from probcal.results.schema import INTERVAL, ROPE
 from probcal.smoothing.draws import draws_a_chain, predictive
 from probcal.smoothing.information import at_levels, mean_square
@@ -67,13 +67,13 @@ def _both_tails(draws: np.ndarray) -> bool:
 class Chains(Posterior):
     """The draws of a sampler."""
 
-    run: Sampled
+    run: SamplerRun
 
     chained: ClassVar[bool] = True
     held: ClassVar[bool] = False
 
     @classmethod
-    def of(cls, problem: Problem, prior: Prior, run: Sampled, mixed: Mapping[str, np.ndarray]) -> Chains:
+    def of(cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> Chains:
         """The posterior of a run, whose quantities mixed as they did."""
         z, M, gamma = run.z, run.form.biases, np.asarray(run.draws.gamma).mean((0, 1))
         flat = z.reshape(-1, M)  # one draw has no spread: then its variances given the hyper-parameters
@@ -116,7 +116,7 @@ class Chains(Posterior):
         run = self.run
         if isinstance(self.prior, Flat) or self.prior.correlation or isinstance(run.form.hierarchy, SpikeAndSlab):
             return None
-        return log_normal(run.z, np.clip(_alpha(run), LEAST, MOST))
+        return log_prior_normal(run.z, np.clip(_alpha(run), LEAST, MOST))
 
     @property
     def variables(self) -> Mapping[str, Any]:
@@ -143,11 +143,11 @@ class Chains(Posterior):
         return {name: float(value) for name, value in found.items()}
 
 
-def conclude_draws(problem: Problem, prior: Prior, run: Sampled) -> Answer:
+def conclude_draws(problem: Problem, prior: Prior, run: SamplerRun) -> Answer:
     """The answer of a sampler's run."""
     mixed = mixing(within_sides(np.asarray(run.draws.theta), run.side))
     posterior = Chains.of(problem, prior, run, mixed)
-    status, message = judge(problem, prior, run, mixed, posterior.point)
+    status, message = judge_chains(problem, prior, run, mixed, posterior.point)
     ended = _bias_status(problem, mixed, run.form.biases)
     return Answer(
         problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
@@ -163,12 +163,12 @@ def within_sides(draws: np.ndarray, side: np.ndarray) -> np.ndarray:
     return found
 
 
-def heaviest(run: Sampled) -> int:
+def heaviest(run: SamplerRun) -> int:
     """The side of a mirror that most draws are on."""
     return int(np.bincount(run.side.ravel()).argmax())
 
 
-def _mirrors(run: Sampled) -> tuple[Mirrored, ...]:
+def _mirrors(run: SamplerRun) -> tuple[Mirrored, ...]:
     """The other sides that draws are on, seen from the heaviest: log ratio of weights, and shift of the means."""
     first, share = heaviest(run), np.bincount(run.side.ravel(), minlength=len(run.sides) + 1) / run.side.size
     middle = run.z[run.side == first].mean(0)
@@ -182,7 +182,7 @@ def _mirrors(run: Sampled) -> tuple[Mirrored, ...]:
     return tuple(found)
 
 
-def mean_point(problem: Problem, run: Sampled) -> Point:
+def mean_point(problem: Problem, run: SamplerRun) -> Point:
     """Posterior means of biases and levels on the heaviest side, trajectories at their mode there."""
     side = heaviest(run)
     start = run.posed.frame.point if side == 0 else run.sides[side - 1].point
@@ -192,7 +192,7 @@ def mean_point(problem: Problem, run: Sampled) -> Point:
 
 
 def _by_datum(
-    problem: Problem, run: Sampled, key: jax.Array, keep: tuple[str, ...]
+    problem: Problem, run: SamplerRun, key: jax.Array, keep: tuple[str, ...]
 ) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
     """Which draws (kept,) of each chain have values by datum; log-likelihood and replicas (chain, kept, N, C) there."""
     chains, draws = run.z.shape[:2]
@@ -213,7 +213,7 @@ def _by_datum(
     return kept, likelihood, replicas
 
 
-def _alpha(run: Sampled) -> np.ndarray:
+def _alpha(run: SamplerRun) -> np.ndarray:
     """Prior precision (chain, draw, M) of each bias, draw by draw."""
     phi = {name: jnp.asarray(a) for name, a in run.draws.phi.items()}
     first = run.posed.first.alpha
@@ -222,7 +222,7 @@ def _alpha(run: Sampled) -> np.ndarray:
     return np.asarray(jax.vmap(jax.vmap(lambda one: run.form.hierarchy.alpha(one, first)))(phi))
 
 
-def _columns(run: Sampled, mixed: Mapping[str, np.ndarray], M: int) -> dict[str, np.ndarray]:
+def _columns(run: SamplerRun, mixed: Mapping[str, np.ndarray], M: int) -> dict[str, np.ndarray]:
     """Columns by bias beyond the usual ones."""
     found = {name: values[:M] for name, values in mixed.items()}
     found["contraction"] = 1.0 - run.z.var((0, 1))
@@ -233,7 +233,7 @@ def _columns(run: Sampled, mixed: Mapping[str, np.ndarray], M: int) -> dict[str,
     return found
 
 
-def _variables(problem: Problem, run: Sampled) -> dict[str, Any]:
+def _variables(problem: Problem, run: SamplerRun) -> dict[str, Any]:
     """Further posterior variables, name -> (dims beyond chain and draw, values, coords)."""
     found: dict[str, Any] = {
         "gamma": (("bias_label",), np.asarray(run.draws.gamma)),
@@ -247,7 +247,7 @@ def _variables(problem: Problem, run: Sampled) -> dict[str, Any]:
     return found
 
 
-def _stats(run: Sampled) -> dict[str, np.ndarray]:
+def _stats(run: SamplerRun) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in run.draws.stats.items()}
 
 
@@ -257,8 +257,8 @@ def _bias_status(problem: Problem, mixed: Mapping[str, np.ndarray], M: int) -> t
     return tuple("not mixed" if bad else words[b.kind] for b, bad in zip(problem.biases, lost, strict=True))
 
 
-def judge(
-    problem: Problem, prior: Prior, run: Sampled, mixed: Mapping[str, np.ndarray], mean: Point
+def judge_chains(
+    problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray], mean: Point
 ) -> tuple[Status, str]:
     """Status of a run whose posterior has this mean, and one or more sentences on what hurts and what to do."""
     said = [run.note] if run.note else []
@@ -293,7 +293,7 @@ def judge(
     return Status.CONVERGED if good else Status.NOT_CONVERGED, " ".join(said)
 
 
-def _say_sides(run: Sampled, said: list[str]) -> bool:
+def _say_sides(run: SamplerRun, said: list[str]) -> bool:
     """What each side of a mirror weighs, and whether the chains agree on it."""
     counts = [np.bincount(own, minlength=len(run.sides) + 1) / len(own) for own in run.side]
     share = np.mean(counts, 0)
@@ -308,7 +308,7 @@ def _say_sides(run: Sampled, said: list[str]) -> bool:
     return True
 
 
-def _say_steps(run: Sampled, said: list[str]) -> bool:
+def _say_steps(run: SamplerRun, said: list[str]) -> bool:
     """What the steps of NUTS or of the Metropolis correction say; whether all is well."""
     found, good = _stats(run), True
     if "diverging" in found and found["diverging"].any():

@@ -18,7 +18,7 @@ from probcal.smoothing.mode import Point, factors
 from probcal.smoothing.recursion import trajectory
 
 
-class Drawn(NamedTuple):
+class SimulatedTruth(NamedTuple):
     """One simulated truth and its data."""
 
     phi: Phi
@@ -38,7 +38,7 @@ def check_drawable(prior: Prior, problem: Problem) -> None:
 
 
 @partial(jax.jit, static_argnames="form")
-def draw_prior(form: Form, model: Model, first: Precision, key: jax.Array) -> Drawn:
+def draw_prior(form: Form, model: Model, first: Precision, key: jax.Array) -> SimulatedTruth:
     """A truth from the prior and its data: hyper-parameters, biases given them, levels, trajectories, every row."""
     keys = jax.random.split(key, 5)
     phi = form.hierarchy.draw(keys[0])
@@ -54,7 +54,7 @@ def draw_prior(form: Form, model: Model, first: Precision, key: jax.Array) -> Dr
         states.append(path[:, :, 0])
         noises.append(noise)
     point = Point(tuple(states), tuple(noises), z, levels)
-    return Drawn(phi, point, draw_data(model, point, keys[4]))
+    return SimulatedTruth(phi, point, draw_data(model, point, keys[4]))
 
 
 @jax.jit

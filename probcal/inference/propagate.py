@@ -14,7 +14,7 @@ import numpy as np
 from jax.scipy.special import logsumexp
 
 from probcal import linalg
-from probcal.inference.hierarchy import Nodes
+from probcal.inference.hierarchy import QuadratureNodes
 from probcal.inference.posed import Form, Natural
 
 ROUNDS, CLOSE = 60, 1e-4  # rounds at most, and the share of an sd that the means may still move
@@ -47,7 +47,7 @@ class Propagated(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("form", "count"))
-def propagate(form: Form, known: Natural, nodes: Nodes, key: jax.Array, count: int) -> Propagated:
+def propagate(form: Form, known: Natural, nodes: QuadratureNodes, key: jax.Array, count: int) -> Propagated:
     """What a hierarchy makes of a Gaussian likelihood, and `count` draws of it."""
     learnt = jnp.asarray(form.hierarchy.learnt, int)
     group = jnp.asarray(form.hierarchy.group, int)
@@ -66,7 +66,7 @@ def propagate(form: Form, known: Natural, nodes: Nodes, key: jax.Array, count: i
         precision = jnp.maximum(1.0 / own - sites.tau, LEAST)
         return precision, (mean[learnt] / own - sites.nu) / precision
 
-    def tilt(precision: jax.Array, middle: jax.Array, at: Nodes) -> tuple[Tilted, jax.Array]:
+    def tilt(precision: jax.Array, middle: jax.Array, at: QuadratureNodes) -> tuple[Tilted, jax.Array]:
         """Marginals of cavity and prior, and the log of what each group's prior integrates to."""
         spread = 1.0 / precision[:, None] + at.variance[None]
         own = -0.5 * jnp.log(2 * jnp.pi * spread) - 0.5 * middle[:, None] ** 2 / spread
@@ -76,7 +76,7 @@ def propagate(form: Form, known: Natural, nodes: Nodes, key: jax.Array, count: i
         part = at.variance[None] / spread
         return Tilted(share, middle[:, None] * part, part / precision[:, None]), jnp.sum(total)
 
-    def one(sites: Sites, at: Nodes) -> tuple[Sites, Any]:
+    def one(sites: Sites, at: QuadratureNodes) -> tuple[Sites, Any]:
         def renew(state: tuple[Sites, jax.Array, jax.Array]) -> tuple[Sites, jax.Array, jax.Array]:
             sites, _, turn = state
             mean, covariance, _, _ = solve(sites)
@@ -141,6 +141,6 @@ def _draws(
     return normal.at[:, learnt].set(jnp.take_along_axis(jnp.sort(alone, 0), rank, 0))
 
 
-def nodes_of(form: Form) -> Nodes:
+def nodes_of(form: Form) -> QuadratureNodes:
     """The nodes of a hierarchy as arrays on the device."""
-    return jax.tree.map(jnp.asarray, Nodes(*(np.asarray(part, float) for part in form.hierarchy.nodes())))
+    return jax.tree.map(jnp.asarray, QuadratureNodes(*(np.asarray(part, float) for part in form.hierarchy.nodes())))

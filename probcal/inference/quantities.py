@@ -17,10 +17,10 @@ import numpy as np
 
 from probcal.errors import FitError
 from probcal.inference.hierarchy import Hierarchy, Phi
-from probcal.inference.mixture import Mixture
+from probcal.inference.mixture import MixturePosterior
 from probcal.inference.posed import Form, Posed, log_prior
 from probcal.inference.posterior import Chains
-from probcal.inference.sampling import Sampled
+from probcal.inference.sampling import SamplerRun
 from probcal.inference.uniformity import NOMINAL, randomised_rank
 from probcal.lazy import Later
 from probcal.model.model import At, Model
@@ -55,7 +55,7 @@ class Pool:
     chained: bool  # draws depend on each other
     held: bool  # levels are the same in every draw
     status: str
-    run: Sampled | None = None  # of a sampler
+    run: SamplerRun | None = None  # of a sampler
     hierarchy: Hierarchy | None = None  # that the hyper-parameters belong to
 
     @property
@@ -83,7 +83,9 @@ def pool_of(answer: Answer, key: jax.Array) -> Pool:
     hyper = {name: flat(a) for name, a in posterior.hyper.items()}
     taken = answer.method != answer.requested
     run = posterior.run if isinstance(posterior, Chains) else None
-    hierarchy = posterior.hierarchy if isinstance(posterior, Mixture) else None if run is None else run.form.hierarchy
+    hierarchy = (
+        posterior.hierarchy if isinstance(posterior, MixturePosterior) else None if run is None else run.form.hierarchy
+    )
     status = TAKEN if taken else str(answer.status) if run is None else "sampled"
     return Pool(points, hyper, drawn.z.shape[0], posterior.chained, posterior.held, status, run, hierarchy)
 

@@ -25,7 +25,7 @@ from probcal.priors import Laplace as LaplacePrior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.information import mean_square
-from probcal.smoothing.linearised import Laplace
+from probcal.smoothing.linearised import LaplaceApproximation
 from probcal.smoothing.mode import Point
 from probcal.smoothing.tails import expected_mixing, rewhitened
 
@@ -47,7 +47,7 @@ class State(NamedTuple):
 
     point: Point
     alpha: jax.Array  # (M,)
-    found: Laplace
+    found: LaplaceApproximation
     objective: jax.Array  # ()
     worth: jax.Array  # () what is maximised where precisions or levels are learnt: evidence and their hyper-prior
     best: jax.Array  # () the best of it so far
@@ -182,7 +182,7 @@ def first_state(given: Given, model: Model, start: Point, carry: Any, seed: jax.
     """State before the first iteration."""
     alpha, low = given.prior.alpha, np.array(-np.inf)
     M = alpha.shape[0]
-    nothing = Laplace(*jax.device_put((np.zeros((M, M)), np.zeros((M, M)), np.zeros(M), low)))
+    nothing = LaplaceApproximation(*jax.device_put((np.zeros((M, M)), np.zeros((M, M)), np.zeros(M), low)))
     worst, refused, done = jax.device_put((low, np.array(True), np.array(False)))
     return State(start, alpha, nothing, worst, worst, worst, refused, done, seed, carry, model.mixing)
 

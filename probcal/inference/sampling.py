@@ -33,7 +33,7 @@ ROAMING = 0.6  # acceptance of independent draws of the frame below which chains
 
 
 @dataclass(frozen=True, eq=False)
-class Sampled:
+class SamplerRun:
     """What a sampler leaves: its draws, and how the run went."""
 
     method: Sampler
@@ -79,7 +79,7 @@ def sample(
     storage: Storage | None = None,
     threads: int | None = None,
     fallback: Sampler | None = None,
-) -> Sampled:
+) -> SamplerRun:
     """Draws of a method from the posterior of a problem.
 
     `storage` keeps draws and state, and what it holds is gone on with. `fallback` takes over where the frame does not
@@ -117,7 +117,7 @@ def sample(
             while box.count * method.chunk < total:
                 state, draws = runs.advance(state, pool)
                 kept = max(0, min((box.count + 1) * method.chunk - method.warmup, method.chunk))
-                box.add({n: a[:, method.chunk - kept :] for n, a in named(draws).items()}, jax.tree.leaves(state))
+                box.add({n: a[:, method.chunk - kept :] for n, a in flat_arrays(draws).items()}, jax.tree.leaves(state))
                 if progress is not None:
                     progress(method.name, min(box.count * method.chunk, total), float(np.mean(draws.density)))
         except KeyboardInterrupt:
@@ -130,10 +130,10 @@ def sample(
             f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them"
         )
     seconds = time.perf_counter() - began
-    return Sampled(method, asked, form, posed, worth, drawn, seconds, interrupted, note, tuple(sides))
+    return SamplerRun(method, asked, form, posed, worth, drawn, seconds, interrupted, note, tuple(sides))
 
 
-def named(draws: Draw) -> dict[str, np.ndarray]:
+def flat_arrays(draws: Draw) -> dict[str, np.ndarray]:
     """Draws as arrays (chains, draws, ...) by flat names, as a storage keeps them."""
     found: dict[str, Any] = {name: getattr(draws, name) for name in ("theta", "gamma", "variance", "density")}
     found |= {f"phi_{name}": value for name, value in draws.phi.items()}

@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.errors import FitError, InputError
-from probcal.inference.coverage import judge
+from probcal.inference.coverage import judge_coverage
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.methods import NUTS, check_problem, choose_prior
@@ -283,7 +283,7 @@ def _tree(engine: _Engine, records: dict[int, dict[str, np.ndarray]], interrupte
         "run": xr.Dataset({name: ("run", stacked[name]) for name in of_run}, coords={"run": runs}),
     }
     tree = xr.DataTree.from_dict(groups)
-    judge(tree)
+    judge_coverage(tree)
     tree.attrs |= {
         "method": engine.method.name, "settings": f"{engine.method!r}, {engine.prior!r}", "runs": len(good),
         "prior": type(engine.prior).__name__, "source": engine.around or type(engine.source).__name__,

@@ -16,12 +16,12 @@ from jax.flatten_util import ravel_pytree
 from probcal import linalg
 from probcal.errors import InputError, nearest
 from probcal.inference.coordinates import Free, parts
-from probcal.inference.guides import Fitted, Guide, LowRank, MeanField, Structured
+from probcal.inference.guides import Guide, GuideParameters, LowRank, MeanField, Structured
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, log_prior, prior_precision, whiten
 from probcal.inference.sampler import Sample, Sampler
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
-from probcal.smoothing.frame import driving, log_joint, place
+from probcal.smoothing.frame import log_joint, place, unit_normals
 from probcal.smoothing.mode import Point, factors, mixed_density
 from probcal.smoothing.recursion import trajectory
 
@@ -32,12 +32,12 @@ STEEP = 2.0  # steps are at most slope / STEEP long: a coordinate of unit spread
 SMOOTH = 0.95  # of the running bound
 
 
-class Chain(NamedTuple):
+class Optimisation(NamedTuple):
     """Where one optimisation stands."""
 
-    fitted: Fitted
-    slope: Fitted  # running mean of the gradients
-    square: Fitted  # and of their squares
+    fitted: GuideParameters
+    slope: GuideParameters  # running mean of the gradients
+    square: GuideParameters  # and of their squares
     steps: jax.Array  # done, those that draw included
     bound: jax.Array  # running evidence lower bound
     trace: jax.Array  # (warmup,) the running bound of each step
@@ -53,7 +53,7 @@ class Plain(NamedTuple):
     density: jax.Array  # of the coordinates
 
 
-def plain(form: Form, posed: Posed, free: Free) -> Plain:
+def noncentred(form: Form, posed: Posed, free: Free) -> Plain:
     """Biases, hyper-parameters and trajectories of non-centred coordinates that know nothing of the frame.
 
     eta is theta over its prior sd (a declared scale where the prior is flat), eps the whitened noises of the problem.
@@ -112,7 +112,7 @@ class SVI(Sampler):
                 f" least one particle is needed, at a positive rate"
             )
 
-    def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Chain:
+    def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Optimisation:
         """An optimisation that starts at phi and the frame's posterior, or narrowly around theta and phi."""
         keys = jax.random.split(key)
         if self.guide == "structured":
@@ -126,11 +126,13 @@ class SVI(Sampler):
             mean, log_scale = Free(form.hierarchy.relax(phi), eta, noises), float(np.log(NARROW))
         flat = ravel_pytree(mean)[0]
         rest = self._guide(form, posed).first(flat.shape[0], keys[0])
-        fitted = Fitted(flat, jnp.full_like(flat, log_scale), rest)
+        fitted = GuideParameters(flat, jnp.full_like(flat, log_scale), rest)
         zero = jax.tree.map(jnp.zeros_like, fitted)
-        return Chain(fitted, zero, zero, jnp.zeros((), int), jnp.full((), -jnp.inf), jnp.zeros(self.warmup), keys[1])
+        return Optimisation(
+            fitted, zero, zero, jnp.zeros((), int), jnp.full((), -jnp.inf), jnp.zeros(self.warmup), keys[1]
+        )
 
-    def step(self, form: Form, posed: Posed, chain: Chain) -> tuple[Chain, Sample]:
+    def step(self, form: Form, posed: Posed, chain: Optimisation) -> tuple[Optimisation, Sample]:
         """One step of Adam until `warmup` of them are done, and one draw of the guide."""
         keys = jax.random.split(chain.key, 3)
         moved = jax.lax.cond(
@@ -146,7 +148,7 @@ class SVI(Sampler):
         }
         return moved._replace(steps=chain.steps + 1, key=keys[2]), sample._replace(stats=stats)
 
-    def _improved(self, form: Form, posed: Posed, chain: Chain, key: jax.Array) -> Chain:
+    def _improved(self, form: Form, posed: Posed, chain: Optimisation, key: jax.Array) -> Optimisation:
         """One step of Adam up the bound; a gradient that is not finite is left out."""
         guide, fitted = self._guide(form, posed), chain.fitted
         half = jax.random.normal(key, ((self.particles + 1) // 2, fitted.mean.shape[0]))
@@ -154,7 +156,7 @@ class SVI(Sampler):
         density = self._density(form, posed)
         still = guide.slope(fitted, n)
 
-        def bound(fitted: Fitted) -> tuple[jax.Array, jax.Array]:
+        def bound(fitted: GuideParameters) -> tuple[jax.Array, jax.Array]:
             x = guide.place(fitted, n)
             value = jax.vmap(density)(x)
             return jnp.mean(value - jnp.sum(still * x, 1)), jnp.mean(value - guide.log_density(fitted, n))
@@ -184,7 +186,7 @@ class SVI(Sampler):
     def _density(self, form: Form, posed: Posed) -> Any:
         """Log density of flat coordinates."""
         back = ravel_pytree(_template(form, posed))[1]
-        of = parts if self.guide == "structured" else plain
+        of = parts if self.guide == "structured" else noncentred
 
         def density(x: jax.Array) -> jax.Array:
             found = of(form, posed, back(x))
@@ -199,8 +201,8 @@ class SVI(Sampler):
             found = parts(form, posed, free)
             density = found.density + _constant(form, posed, found.phi)
             return Sample(found.theta, free.eps, found.phi, found.joint, {}), density
-        at = plain(form, posed, free)
-        eps = driving(posed.model, posed.frame, at.point)
+        at = noncentred(form, posed, free)
+        eps = unit_normals(posed.model, posed.frame, at.point)
         joint = log_joint(posed.model, posed.frame, at.theta, eps)
         return Sample(at.theta, eps, at.phi, joint, {}), at.density + _constant(form, posed, at.phi)
 

@@ -17,7 +17,7 @@ from probcal import linalg
 from probcal.errors import InputError
 from probcal.model import rows as waist
 from probcal.model.rows import Block, Linearised, Rows
-from probcal.model.sampled import Sampled, check_densities
+from probcal.model.sampled import SampledMotion, check_densities
 
 State = tuple[Any, ...]  # (T, n) of each recursion, or a pytree with T leading
 
@@ -62,7 +62,7 @@ class Stepwise:
     recursion: tuple[int, ...]
     targets: tuple[int, ...]
     full_rank: bool
-    sampled: tuple[Sampled | None, ...]
+    sampled: tuple[SampledMotion | None, ...]
     recursions: tuple[Any, ...]
     rows: tuple[Rows, ...]
     level_spread: jax.Array
@@ -94,7 +94,7 @@ class Stepwise:
         return tuple(found)
 
     def _moved(
-        self, form: Sampled, key: jax.Array, states: Any, r: int, epoch: Epoch, levels: jax.Array
+        self, form: SampledMotion, key: jax.Array, states: Any, r: int, epoch: Epoch, levels: jax.Array
     ) -> tuple[Any, ...]:
         """States (T leading) of what has no linear form in recursion r, after an epoch."""
         target = epoch.target[r]
@@ -126,7 +126,7 @@ class Stepwise:
             if old is not None and new is not None:
                 away, root = new[target] - _mean(old, move, target), _root(move, levels)
                 total = linalg.log_normal(away, root)
-                noise = linalg.driving(away, root) if move.mixed else away
+                noise = linalg.shortest_drive(away, root) if move.mixed else away
                 for tail, on in zip(self.recursions[r].tails, move.mixed, strict=True):
                     square = jnp.sum(noise[slice(*tail.columns)] ** 2)
                     total = total + jnp.where(on, tail.family.mixing_density(square, tail.size), 0.0)

@@ -16,7 +16,7 @@ import numpy as np
 from probcal.model import rows as waist
 from probcal.model.epochs import Epoch, Stepwise, merged, most_rows
 from probcal.model.rows import Block, Linearised, Rows
-from probcal.model.sampled import Sampled
+from probcal.model.sampled import SampledMotion
 
 BATCH = 512  # rows whose responses to all biases are formed at once
 
@@ -109,7 +109,7 @@ class Model(Stepwise):
     driven: bool  # whether a process noise has an unknown level
     targets: tuple[int, ...]  # T, number of targets of each recursion
     full_rank: bool  # whether the noise reaches every direction of every state, so that steps have a density
-    sampled: tuple[Sampled | None, ...]  # of each recursion, what its motion does that has no linear form
+    sampled: tuple[SampledMotion | None, ...]  # of each recursion, what its motion does that has no linear form
     recursions: tuple[Recursion, ...]
     rows: tuple[Rows, ...]  # of each block
     level_spread: jax.Array  # (H,) standard deviation of each log level

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.model.sampled import Sampled, sampled_of
+from probcal.model.sampled import SampledMotion, sampled_of
 from probcal.motion import Layout, Motion, Target, as_motion
 from probcal.motion.base import level_name
 from probcal.motion.layout import layout_of, stacked
@@ -76,7 +76,7 @@ def linear_of(motion: Motion) -> tuple[Any, ...]:
     return () if vector is None else vector.components
 
 
-def form_of(name: str, motion: Motion, levels: Levels, d: int) -> tuple[Layout, Sampled | None]:
+def form_of(name: str, motion: Motion, levels: Levels, d: int) -> tuple[Layout, SampledMotion | None]:
     """What rows read of a target's state in d axes, and the static form of a motion that is not linear."""
     others = motion.split[1]
     if not others:

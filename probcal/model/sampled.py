@@ -22,7 +22,7 @@ from probcal.motion.layout import check_once, layout_of
 
 
 @dataclass(frozen=True, eq=False)
-class Sampled:
+class SampledMotion:
     """What the targets of one recursion do beyond a linear motion; a state x is that of the `motion` as declared."""
 
     motion: Motion
@@ -53,7 +53,7 @@ class Sampled:
         return hashlib.sha256("".join(parts).encode()).hexdigest()
 
     def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, Sampled) and self.fingerprint == other.fingerprint)
+        return self is other or (isinstance(other, SampledMotion) and self.fingerprint == other.fingerprint)
 
     def __hash__(self) -> int:
         return hash(self.fingerprint)
@@ -108,7 +108,7 @@ class Sampled:
 
 
 @partial(jax.jit, static_argnums=0)
-def path(sampled: Sampled, first: jax.Array, dt: jax.Array, key: jax.Array, levels: jax.Array) -> tuple[Any, ...]:
+def path(sampled: SampledMotion, first: jax.Array, dt: jax.Array, key: jax.Array, levels: jax.Array) -> tuple[Any, ...]:
     """States of the others along all epochs of a recursion (E leading), drawn from the motion."""
 
     def one(others: tuple[Any, ...], epoch: tuple[jax.Array, ...]) -> tuple[Any, Any]:
@@ -120,7 +120,7 @@ def path(sampled: Sampled, first: jax.Array, dt: jax.Array, key: jax.Array, leve
     return jax.lax.scan(one, start, (first, dt, jax.random.split(key, len(first))))[1]
 
 
-def sampled_of(motion: Motion, dimension: int, levels: Mapping[str, int], values: Mapping[str, float]) -> Sampled:
+def sampled_of(motion: Motion, dimension: int, levels: Mapping[str, int], values: Mapping[str, float]) -> SampledMotion:
     """The static form of a motion; `levels` numbers its unknown ones. Raises `InputError` where it cannot work."""
     linear, others = motion.split
     layout = list(layout_of(() if linear is None else linear.components, dimension))
@@ -152,7 +152,7 @@ def sampled_of(motion: Motion, dimension: int, levels: Mapping[str, int], values
             layout.append((component, offset, offset + width, bool(value.shape)))
             offset += width
     check_once(name for name, *_ in layout)
-    return Sampled(motion, tuple(layout), tuple((name, values[name], levels[name]) for name in values))
+    return SampledMotion(motion, tuple(layout), tuple((name, values[name], levels[name]) for name in values))
 
 
 def has_density(motion: Motion) -> bool:
@@ -160,7 +160,7 @@ def has_density(motion: Motion) -> bool:
     return all(getattr(type(motion), name) is not getattr(Motion, name) for name in ("log_density", "log_initial"))
 
 
-def check_densities(sampled: tuple[Sampled | None, ...]) -> None:
+def check_densities(sampled: tuple[SampledMotion | None, ...]) -> None:
     """Raise `InputError` for a motion without density."""
     for form in sampled:
         for motion in () if form is None else form.others:

@@ -73,7 +73,7 @@ def _block(block: Block, data: Rows, point: Where, states: jax.Array, covariance
     return Linearised(score, weight, by_state, jnp.einsum("s,sncp->ncp", points.weight, by_bias))
 
 
-def regress(model: Model, point: Where, covariances: Sequence[jax.Array], rule: Rule) -> list[Linearised]:
+def regress_blocks(model: Model, point: Where, covariances: Sequence[jax.Array], rule: Rule) -> list[Linearised]:
     """Every block regressed on the states over their smoothed densities; what is left over widens the noise."""
     return [
         _block(block, data, point, point.states[r], covariances[r], rule)

@@ -20,10 +20,10 @@ import numpy as np
 from probcal import linalg
 from probcal.errors import InputError
 from probcal.motion.layout import Layout, Start, check_once, labels_of, layout_of, pieces, stacked
-from probcal.noise import Gaussian, Level, guess_of
+from probcal.noise import Level, Normal, guess_of
 
 NO_START: Start = MappingProxyType({})
-GAUSSIAN = Gaussian()
+GAUSSIAN = Normal()
 
 
 class Linear(NamedTuple):
@@ -193,7 +193,7 @@ class LinearMotion(Motion):
         mean, root = self._step(before, dt, levels)
         density = linalg.log_normal(state - mean, root)
         mixed = self.mixed(self._dimension(state))
-        noise = linalg.driving(state - mean, root) if mixed else state
+        noise = linalg.shortest_drive(state - mean, root) if mixed else state
         for family, start, stop in mixed:
             density = density + family.mixing_density(jnp.sum(noise[start:stop] ** 2), stop - start)
         return density
@@ -216,7 +216,7 @@ class LinearMotion(Motion):
         found, column = [], 0
         for component in self.components:
             width = component.noise_factor(np.ones(1), dimension).shape[2]
-            if not isinstance(getattr(component, "noise", GAUSSIAN), Gaussian):
+            if not isinstance(getattr(component, "noise", GAUSSIAN), Normal):
                 found.append((component.noise, column, column + width))
             column += width
         return found

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from probcal.plots.base import COLOURS, NAMED, POINTS, ROWS, colour, new_axes, plain
+from probcal.plots.base import COLOURS, NAMED, POINTS, ROWS, colour, new_axes, plain_text
 from probcal.results.read import each_track
 
 # the words of a verdict, each with its colour and mark
@@ -36,7 +36,7 @@ def plot_shrinkage(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     alarmed = np.isin(words, ["drifting", "conflicting"])
     if alarmed.sum() <= NAMED // 4:
         for k in np.flatnonzero(alarmed):
-            ax.annotate(plain(labels[k]), (shrunk[k], group["gamma"].values[k]), xytext=(5, 4),
+            ax.annotate(plain_text(labels[k]), (shrunk[k], group["gamma"].values[k]), xytext=(5, 4),
                         textcoords="offset points", fontsize=7)  # fmt: skip
     ax.set(xlabel="posterior contraction 1 - sd\N{SUPERSCRIPT TWO} / scale\N{SUPERSCRIPT TWO}", ylabel="gamma",
            ylim=(-0.05, 1.05))  # fmt: skip
@@ -115,7 +115,7 @@ def plot_halves(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
 
 def _named(ax: Axes, rows: Any, names: Any) -> None:
     """Names down the left side, the first on top."""
-    ax.set_yticks(rows, [plain(name) for name in names], fontsize=8 if len(rows) <= NAMED else 6)
+    ax.set_yticks(rows, [plain_text(name) for name in names], fontsize=8 if len(rows) <= NAMED else 6)
     ax.set_ylim(len(rows) - 0.4, -0.6)
     ax.grid(axis="x", color="0.9", zorder=0)
     ax.set_axisbelow(True)

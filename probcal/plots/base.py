@@ -42,7 +42,7 @@ def colour(k: int) -> str:
     return COLOURS[k % len(COLOURS)]
 
 
-def plain(text: object, longest: int = 40) -> str:
+def plain_text(text: object, longest: int = 40) -> str:
     """Text that matplotlib shows as it stands: no formula, no hidden legend entry, not too long."""
     text = str(text).replace("\n", " ")
     text = text if len(text) <= longest else text[: longest // 2] + "..." + text[-longest // 2 + 3 :]
@@ -54,7 +54,7 @@ def probability(tree: xr.DataTree) -> float:
     return float(tree.attrs.get("interval_probability", INTERVAL))
 
 
-def ellipse(centre: Sequence[float], covariance: np.ndarray, probability: float, **style: Any) -> Ellipse:
+def ellipse_patch(centre: Sequence[float], covariance: np.ndarray, probability: float, **style: Any) -> Ellipse:
     """Ellipse that holds a probability of a Gaussian in the plane, covariance (2, 2)."""
     (xx, xy), (_, yy) = covariance
     spread = np.hypot((xx - yy) / 2, xy)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 
 from probcal.errors import InputError
-from probcal.plots.base import COLOURS, NAMED, new_axes, plain
+from probcal.plots.base import COLOURS, NAMED, new_axes, plain_text
 
 SURFACE = "viridis"
 WIDE = 20.0  # ratio of largest to smallest value above which the colours are logarithmic
@@ -27,7 +27,7 @@ def plot_bound_map(found: xr.Dataset, ax: Axes | None = None) -> Axes:
     if len(nodes) <= NAMED:
         for name, place in zip(found["node"].values, nodes, strict=True):
             ax.annotate(
-                plain(name), place, xytext=(6, 6), textcoords="offset points", zorder=5, fontsize=8,
+                plain_text(name), place, xytext=(6, 6), textcoords="offset points", zorder=5, fontsize=8,
                 annotation_clip=True, bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8},
             )  # fmt: skip
     for side, limit in ((found["x"].values, ax.set_xlim), (found["y"].values, ax.set_ylim)):
@@ -35,7 +35,7 @@ def plot_bound_map(found: xr.Dataset, ax: Axes | None = None) -> Axes:
         limit(side.min() - half, side.max() + half)
     height = f" at z = {float(found['z']):g} m" if "z" in found.coords else ""
     ax.set(xlabel="x in m", ylabel="y in m")
-    ax.set_title(f"Least position error{height}, biases {plain(found.attrs['biases'])}", loc="left")
+    ax.set_title(f"Least position error{height}, biases {plain_text(found.attrs['biases'])}", loc="left")
     return ax
 
 
@@ -51,7 +51,7 @@ def plot_sensitivity(found: xr.Dataset, ax: Axes | None = None) -> Axes:
         ax = new_axes(ax, 6.0, 3.8)
         ax.plot(found[dims[0]], found["rmse"], "o", color=COLOURS[0], markersize=4, label="simulated")
         ax.plot(found[dims[0]], found["predicted"], "-", color=COLOURS[1], label="to first order")
-        ax.set(xlabel=f"std of {plain(dims[0])}", ylabel="RMS position error in m", ylim=(0.0, None))
+        ax.set(xlabel=f"std of {plain_text(dims[0])}", ylabel="RMS position error in m", ylim=(0.0, None))
         ax.grid(color="0.9")
         ax.legend(frameon=False)
         return ax
@@ -59,7 +59,7 @@ def plot_sensitivity(found: xr.Dataset, ax: Axes | None = None) -> Axes:
     down, across = dims
     values = np.ma.masked_array(found["rmse"].values)
     _surface(ax, found[across].values, found[down].values, values, "RMS position error in m", np.inf)
-    ax.set(xlabel=f"std of {plain(across)}", ylabel=f"std of {plain(down)}")
+    ax.set(xlabel=f"std of {plain_text(across)}", ylabel=f"std of {plain_text(down)}")
     ax.set_title("Tracks that ignore the biases", loc="left")
     return ax
 

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from probcal.analysis.compare import Fits, chosen_pair, interchangeable, named, plugged_in
-from probcal.plots.base import LINEAR, ROWS, colour, ellipse, new_axes, plain, probability, write_figure
+from probcal.analysis.compare import Fits, chosen_pair, fits_by_name, interchangeable, plugged_in
+from probcal.plots.base import LINEAR, ROWS, colour, ellipse_patch, new_axes, plain_text, probability, write_figure
 from probcal.status import INVALID
 
 SCATTER = 2_000  # draws of one fit in the picture of a pair
@@ -37,7 +37,7 @@ def plot_methods(comparison: xr.DataTree, ax: Axes | None = None) -> Axes:
         place = rows + (k - (count - 1) / 2) * 0.8 / count
         ax.hlines(place, lower, upper, color=colour(k), linewidth=1.6, zorder=2)
         status = comparison[f"method/{name}"].attrs["status"]
-        label = plain(name) + (f", {status}" if status in INVALID else "")
+        label = plain_text(name) + (f", {status}" if status in INVALID else "")
         ax.plot(mean, place, "o", color=colour(k), markersize=3.5, label=label, zorder=3)
         if status not in INVALID:
             seen += [lower, upper]
@@ -53,7 +53,7 @@ def plot_methods(comparison: xr.DataTree, ax: Axes | None = None) -> Axes:
         ax.set_xscale("symlog", linthresh=3.0)
     margin = 0.04 * (high - low)
     ax.set_xlim(low - margin, high + margin)  # what diverged is cut
-    ax.set_yticks(rows, [plain(label) for label in labels], fontsize=7.5)
+    ax.set_yticks(rows, [plain_text(label) for label in labels], fontsize=7.5)
     ax.set_ylim(len(rows) - 0.4, -0.6)
     ax.grid(axis="x", color="0.9", zorder=0)
     ax.set_xlabel(f"bias in units of its scale, {probability(comparison):.0%} interval")
@@ -76,8 +76,8 @@ def plot_gammas(comparison: xr.DataTree, ax: Axes | None = None) -> Axes:
             ax.vlines(
                 across, method["gamma_lower"], method["gamma_upper"], color=tint, linewidth=0.9, alpha=0.5, zorder=2
             )
-        ax.plot(across, gamma.sel(estimator=name), "o", color=tint, markersize=4, label=plain(name), zorder=3)
-    ax.set(xlim=(-0.04, 1.04), ylim=(-0.04, 1.04), xlabel=f"gamma by {plain(first)}", ylabel="gamma by the others")
+        ax.plot(across, gamma.sel(estimator=name), "o", color=tint, markersize=4, label=plain_text(name), zorder=3)
+    ax.set(xlim=(-0.04, 1.04), ylim=(-0.04, 1.04), xlabel=f"gamma by {plain_text(first)}", ylabel="gamma by the others")
     ax.grid(color="0.9")
     ax.set_title("How well the data determine each bias (0 prior only)", loc="left")
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
@@ -89,7 +89,7 @@ def plot_pair(fits: Fits, labels: Sequence[str], names: Sequence[str] | None = N
 
     `labels` are two labels that all fits have, for instance of `interchangeable`; raises `InputError` for others.
     """
-    known = named(fits, names)
+    known = fits_by_name(fits, names)
     first, second = chosen_pair(known, labels)
     ax = new_axes(ax, 6.5, 4.8)
     plugged = next((name for name, tree in known.items() if plugged_in(tree)), None)
@@ -99,21 +99,21 @@ def plot_pair(fits: Fits, labels: Sequence[str], names: Sequence[str] | None = N
         if name == plugged:
             covariance = group["covariance"].sel(bias_label_other=[first, second]).values
             style: dict[str, Any] = {"facecolor": "none", "edgecolor": colour(k), "linewidth": 1.8, "zorder": 4}
-            ax.add_patch(ellipse(group["mean"].values.tolist(), covariance, probability(tree), **style))
+            ax.add_patch(ellipse_patch(group["mean"].values.tolist(), covariance, probability(tree), **style))
             ax.plot(*group["mean"].values, "+", color=colour(k), markersize=9, markeredgewidth=1.8, zorder=4)
-            keys.append(Line2D([], [], color=colour(k), label=f"{plain(name)}, {probability(tree):.0%} ellipse"))
+            keys.append(Line2D([], [], color=colour(k), label=f"{plain_text(name)}, {probability(tree):.0%} ellipse"))
             continue
         draws = tree["posterior"].to_dataset()["bias"].sel(bias_label=[first, second])
         z = draws.transpose("chain", "draw", "bias_label").values.reshape(-1, 2)
         z = z[np.linspace(0, len(z) - 1, min(SCATTER, len(z))).astype(int)]
         ax.plot(*z.T, ".", color=colour(k), markersize=2.5, alpha=0.4, zorder=2, rasterized=True)
-        keys.append(Line2D([], [], marker=".", linestyle="", color=colour(k), label=f"{plain(name)}, draws"))
+        keys.append(Line2D([], [], marker=".", linestyle="", color=colour(k), label=f"{plain_text(name)}, draws"))
     true = {label: value for tree in known.values() for label, value in _true(tree).items()}
     if first in true and second in true:
         ax.plot(true[first], true[second], "x", color="#d00000", markersize=8, markeredgewidth=1.8, zorder=5)
         keys.append(Line2D([], [], marker="x", linestyle="", color="#d00000", label="true"))
     unit = next(iter(known.values()))["calibration"].to_dataset()["unit"].to_series()
-    ax.set(xlabel=f"{plain(first)} [{unit[first]}]", ylabel=f"{plain(second)} [{unit[second]}]")
+    ax.set(xlabel=f"{plain_text(first)} [{unit[first]}]", ylabel=f"{plain_text(second)} [{unit[second]}]")
     ax.grid(color="0.9")
     ax.set_title("Posterior of a pair of biases", loc="left")
     ax.legend(handles=keys, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
@@ -135,7 +135,7 @@ def draw_compare(
     `fits` are those compared; where no pair is given the most interchangeable ones of the reference are drawn.
     """
     names = comparison["estimate"].to_dataset()["estimator"].values.tolist()
-    known = named(list(fits.values()) if isinstance(fits, Mapping) else fits, names)
+    known = fits_by_name(list(fits.values()) if isinstance(fits, Mapping) else fits, names)
     estimate = comparison["estimate"].to_dataset()
     labels = estimate["bias_label"].values.tolist()
     if not pairs:

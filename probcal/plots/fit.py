@@ -26,9 +26,9 @@ from probcal.plots.base import (
     POINTS,
     ROWS,
     colour,
-    ellipse,
+    ellipse_patch,
     new_axes,
-    plain,
+    plain_text,
     probability,
 )
 from probcal.results.drifts import drift_table
@@ -84,7 +84,7 @@ def plot_biases(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     if np.isfinite(true).any():
         ax.plot(true, rows, "x", color="#d00000", markersize=6, markeredgewidth=1.6, zorder=4)
     _mark_status(ax, group["status"].values, _text_size(len(rows)))
-    ax.set_yticks(rows, [plain(label) for label in labels], fontsize=_text_size(len(rows)))
+    ax.set_yticks(rows, [plain_text(label) for label in labels], fontsize=_text_size(len(rows)))
     ax.set_ylim(len(rows) - 0.3, -0.7)
     ax.grid(axis="x", color="0.9", zorder=0)
     _scale_axis(ax, np.concatenate([lower, upper, true, [-1.0, 1.0]]))
@@ -123,7 +123,7 @@ def plot_outliers(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     ax.plot(time[shown], ratio[shown], ".", color=BEFORE, markersize=2, rasterized=True, label="inlying")
     for k, name in enumerate(dict.fromkeys(sensors[out].tolist())):
         mine = out & (sensors == name)
-        label = plain(name) if k < 10 else None
+        label = plain_text(name) if k < 10 else None
         ax.plot(time[mine], ratio[mine], "x", color=colour(k), markersize=4, label=label)
     linear = max(LINEAR, float(np.quantile(np.abs(ratio), 0.9)))
     if np.abs(ratio).max() > 2 * linear:
@@ -163,7 +163,7 @@ def plot_drift(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
         time = np.append(pieces["since"], max(end, pieces["since"].max()))
         held = pd.concat([pieces, pieces.tail(1)])[["mean", "lower", "upper"]] / scales[name]
         mean, lower, upper = held.to_numpy().T
-        ax.plot(time, mean, drawstyle="steps-post", color=colour(k), label=plain(name))
+        ax.plot(time, mean, drawstyle="steps-post", color=colour(k), label=plain_text(name))
         ax.fill_between(time, lower, upper, step="post", color=colour(k), alpha=0.2, linewidth=0)
     ax.axhline(0.0, color="0.7", linewidth=0.8, zorder=0)
     ax.set(xlabel="time in s", ylabel="bias / scale")
@@ -190,10 +190,10 @@ def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
             marker,
             color=colour(k),
             markersize=size,
-            label=plain(name),
+            label=plain_text(name),
         )
     if len(labels) <= NAMED:
-        ax.set_xticks(np.arange(len(labels)), [plain(label) for label in labels[order]], rotation=90, fontsize=7)
+        ax.set_xticks(np.arange(len(labels)), [plain_text(label) for label in labels[order]], rotation=90, fontsize=7)
     else:
         ax.set_xlabel("bias, sorted by gamma")
     ax.set(ylim=(-0.04, 1.04), ylabel="gamma")
@@ -265,7 +265,7 @@ def _draw_tracks(ax: Axes, tracks: list[_Track]) -> list[Line2D]:
         return [*keys, Line2D([], [], color=colour(0), label=f"{len(tracks)} targets, after")]
     for k, track in enumerate(tracks):
         style: dict[str, Any] = {"marker": "o", "linestyle": ""} if len(track.after) == 1 else {"linestyle": "-"}
-        keys.append(Line2D([], [], color=colour(k), markersize=5, label=f"{plain(track.target)}, after", **style))
+        keys.append(Line2D([], [], color=colour(k), markersize=5, label=f"{plain_text(track.target)}, after", **style))
     return keys
 
 
@@ -318,7 +318,7 @@ def _draw_nodes(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
     if len(names) <= NAMED:
         for name, place in zip(names, stated, strict=True):
             ax.annotate(
-                plain(name), place, xytext=(6, 6), textcoords="offset points", zorder=7, bbox=box,
+                plain_text(name), place, xytext=(6, 6), textcoords="offset points", zorder=7, bbox=box,
                 fontsize=8 if len(names) <= 25 else 6, annotation_clip=True,
             )  # fmt: skip
     return keys
@@ -335,7 +335,7 @@ def _draw_shift(ax: Axes, tree: xr.DataTree, name: str, start: np.ndarray, end: 
     if not np.isfinite(covariance).all():
         return
     shape: dict[str, Any] = {"facecolor": "#00000018", "edgecolor": "black", "linewidth": 0.8, "zorder": 4}
-    ax.add_patch(ellipse(end.tolist(), covariance, probability(tree), **shape))
+    ax.add_patch(ellipse_patch(end.tolist(), covariance, probability(tree), **shape))
 
 
 def _position_covariance(tree: xr.DataTree, name: str) -> np.ndarray:
@@ -481,7 +481,7 @@ def _draw_residuals(ax: Axes, channel: str, group: xr.Dataset) -> None:
         label="standard normal",
     )
     ax.set(xlim=(-limit, limit), xlabel="residual / std", ylabel="density")
-    ax.set_title(f"{plain(channel)} ({group.sizes['datum']} data)", loc="left", fontsize=10)
+    ax.set_title(f"{plain_text(channel)} ({group.sizes['datum']} data)", loc="left", fontsize=10)
     ax.set_ylim(0.0, 1.45 * ax.get_ylim()[1])
     ax.legend(fontsize=7, frameon=False, loc="upper right")
 

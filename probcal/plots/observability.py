@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from probcal.labels import label_parts
-from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, new_axes, plain, write_figure
+from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, new_axes, plain_text, write_figure
 from probcal.plots.bounds import plot_bound_map
 from probcal.results.read import each_track
 
@@ -52,7 +52,7 @@ def plot_directions(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
         for k in range(min(SHOWN, group.sizes["direction"])):
             chosen = group.isel(direction=k)
             _draw_direction(ax, tree, chosen["vector"].to_series(), width, colour(k))
-            text = f"{plain(chosen['direction'].item(), 60)} ({chosen['information'].item():.1g})"
+            text = f"{plain_text(chosen['direction'].item(), 60)} ({chosen['information'].item():.1g})"
             keys.append(Line2D([], [], color=colour(k), label=text))
         left = group.sizes["direction"] - SHOWN
         title = f"Directions that the data hardly determine{f', {left} more not shown' if left > 0 else ''}"
@@ -104,7 +104,7 @@ def _draw_scene(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
     ax.plot(*stated.T, "s", zorder=5, **style)
     if len(stated) <= NAMED:
         for name, place in zip(nodes["node"].values, stated, strict=True):
-            ax.annotate(plain(name), place, xytext=(6, 6), textcoords="offset points", fontsize=7, zorder=6)
+            ax.annotate(plain_text(name), place, xytext=(6, 6), textcoords="offset points", fontsize=7, zorder=6)
     ax.set(xlabel="x in m", ylabel="y in m")
     return [
         Line2D([], [], marker="s", linestyle="", label="stated position", **style),
@@ -135,5 +135,5 @@ def _draw_direction(ax: Axes, tree: xr.DataTree, vector: pd.Series, width: float
     for name, place in zip(names, stated, strict=True):
         mine = [label for label in rest if label_parts(label)[0] == name]
         if mine and len(names) <= NAMED:
-            text = ", ".join(plain(label_parts(label)[1], 16) for label in mine[:2])
+            text = ", ".join(plain_text(label_parts(label)[1], 16) for label in mine[:2])
             ax.annotate(text, place, xytext=(6, -10), textcoords="offset points", fontsize=6, color=shade, zorder=6)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure, FigureBase
 
 from probcal.errors import InputError, nearest
 from probcal.inference.uniformity import band
-from probcal.plots.base import BEFORE, colour, new_axes, plain, write_figure
+from probcal.plots.base import BEFORE, colour, new_axes, plain_text, write_figure
 
 COLUMNS = 5
 WIDTH, HEIGHT = 13.0, 2.3  # of the picture and of a row of panels, inches
@@ -52,7 +52,7 @@ def plot_ranks(
     for name, ax in zip(chosen, axes, strict=True):
         ax.fill_between(x, low - x, high - x, color=BEFORE, alpha=0.3, linewidth=0)
         found = p_value[name]
-        ax.set_title(f"{plain(name, 30)}\np {found:.2g}", fontsize=8, color=WORST if found < limit else "black")
+        ax.set_title(f"{plain_text(name, 30)}\np {found:.2g}", fontsize=8, color=WORST if found < limit else "black")
         ax.set(xlabel="", ylabel="")
         ax.tick_params(labelsize=7)
     figure.supxlabel("place of the truth among the draws", fontsize=9)
@@ -109,5 +109,5 @@ def draw_sbc(tree: xr.DataTree, path: str | PathLike[str]) -> None:
     plot_coverage(tree, lower.subplots(1, 3)[1])
     for ax in lower.axes[::2]:
         ax.remove()
-    figure.suptitle(plain(f"{tree.attrs['method']}, {tree.attrs['prior']}: {tree.attrs['status']}", 80))
+    figure.suptitle(plain_text(f"{tree.attrs['method']}, {tree.attrs['prior']}: {tree.attrs['status']}", 80))
     write_figure(figure, path, 120)

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from probcal.errors import InputError
-from probcal.plots.base import colour, plain, write_figure
+from probcal.plots.base import colour, plain_text, write_figure
 
 
 def plot_study(study: xr.Dataset, variable: str = "bias_rmse", axes: Sequence[Axes] | None = None) -> list[Axes]:
@@ -32,10 +32,10 @@ def plot_study(study: xr.Dataset, variable: str = "bias_rmse", axes: Sequence[Ax
         for m, method in enumerate(study["estimator"].values):
             values = chosen.sel(estimator=method)
             mean, sd = values.mean("run").values, values.std("run").values
-            ax.plot(study[along], mean, "o-", color=colour(m), markersize=3.5, label=plain(method))
+            ax.plot(study[along], mean, "o-", color=colour(m), markersize=3.5, label=plain_text(method))
             ax.fill_between(study[along], mean, mean + sd, color=colour(m), alpha=0.15, linewidth=0)
         top = chosen.mean("run").max().item()
-        ax.set(xlabel=plain(along), ylim=(0.0, 1.25 * top if np.isfinite(top) else None))
+        ax.set(xlabel=plain_text(along), ylim=(0.0, 1.25 * top if np.isfinite(top) else None))
         names = facets["facet"].values[k] if others else ()
         ax.set_title(", ".join(f"{name} {value}" for name, value in zip(others, np.atleast_1d(names), strict=True)))
         ax.grid(color="0.9")

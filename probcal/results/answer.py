@@ -19,7 +19,7 @@ import numpy as np
 from probcal.priors import Prior
 from probcal.results.schema import INTERVAL
 from probcal.smoothing.draws import draw, draw_biases, draws_a_chain
-from probcal.smoothing.linearised import Laplace, Linearisation, linearise
+from probcal.smoothing.linearised import LaplaceApproximation, Linearisation, linearise
 from probcal.smoothing.mirrors import Mirrored
 from probcal.smoothing.mode import Point
 from probcal.status import Status
@@ -152,16 +152,18 @@ class Posterior(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class Normal(Posterior):
+class NormalPosterior(Posterior):
     """A Gaussian of the biases around a point, noise levels held."""
 
-    found: Laplace
+    found: LaplaceApproximation
 
     chained: ClassVar[bool] = False
     held: ClassVar[bool] = True
 
     @classmethod
-    def of(cls, problem: Problem, prior: Prior, point: Point, found: Laplace, alpha: np.ndarray) -> Normal:
+    def of(
+        cls, problem: Problem, prior: Prior, point: Point, found: LaplaceApproximation, alpha: np.ndarray
+    ) -> NormalPosterior:
         """The Gaussian at a point, with the precisions alpha (M,) that a method ended with."""
         mean, covariance = np.asarray(point.z), np.asarray(found.covariance)
         with np.errstate(invalid="ignore"):  # a singular problem has no sd
@@ -199,7 +201,7 @@ class Normal(Posterior):
     def log_prior(self, draws: Draws) -> np.ndarray | None:
         """Log density (chain, draw, M) of each bias given its precision; None for flat or correlated ones."""
         independent = self.prior.proper and not self.prior.correlation
-        return log_normal(draws.z, self.summary.precision) if independent else None
+        return log_prior_normal(draws.z, self.summary.precision) if independent else None
 
 
 def tracks_of(at: Linearisation, covariance: jax.Array) -> list[Tracks]:
@@ -208,7 +210,7 @@ def tracks_of(at: Linearisation, covariance: jax.Array) -> list[Tracks]:
     return [Tracks(np.asarray(x), np.sqrt(np.maximum(np.asarray(variance), 0.0))) for x, variance in pairs]
 
 
-def log_normal(z: np.ndarray, precision: np.ndarray) -> np.ndarray:
+def log_prior_normal(z: np.ndarray, precision: np.ndarray) -> np.ndarray:
     """Log density of each entry of z, Gaussian around zero with its precision."""
     return 0.5 * (np.log(precision / (2 * np.pi)) - precision * z**2)
 

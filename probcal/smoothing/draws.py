@@ -18,7 +18,7 @@ LEAST, MOST = 10, 250  # draws of a chain
 DATA = 10_000_000  # values by datum and draw up to which every chain has the most draws
 
 
-class Drawn(NamedTuple):
+class JointDraws(NamedTuple):
     """Draws of trajectories and of what hangs on them; empty where it was not asked for."""
 
     states: tuple[jax.Array, ...]  # (D, E, n) of each recursion
@@ -41,7 +41,7 @@ def draw_biases(point: Point, covariance: jax.Array, key: jax.Array, count: int)
 
 def draw(
     at: Linearisation, z: jax.Array, levels: jax.Array, key: jax.Array, keep: tuple[str, ...] = ("states",)
-) -> Drawn:
+) -> JointDraws:
     """A trajectory for each draw of the biases z (D, M), and what is to be kept of them.
 
     `levels` (H,) or (D, H) are those of the densities and replicas. `keep` names "states", "log_likelihood",
@@ -59,7 +59,7 @@ def draw(
         by_datum: tuple[Data, Data] = ((), ())
         if {"log_likelihood", "replicas"} & set(keep):
             by_datum = predictive(at.model, log_levels[chosen], mine, states, seeds[1], keep)
-        kept = Drawn(states if "states" in keep else (), *by_datum)
+        kept = JointDraws(states if "states" in keep else (), *by_datum)
         passes.append(jax.tree.map(lambda leaf, most=count - start: np.asarray(leaf)[:most], kept))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *passes)
 

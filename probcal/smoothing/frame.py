@@ -30,7 +30,7 @@ from probcal.smoothing.mode import (
     follow,
     log_density,
     mixed_density,
-    track,
+    smooth_tracks,
     widening,
 )
 
@@ -136,7 +136,7 @@ def _at(model: Model, point: Point, levels: jax.Array) -> tuple[jax.Array, jax.A
     """Marginal log-likelihood (D,) and its slope by z (D, M) at levels (D, H), trajectories at their mode."""
 
     def one(levels: jax.Array) -> tuple[jax.Array, jax.Array]:
-        moved = track(model, at_levels(model, point, levels))
+        moved = smooth_tracks(model, at_levels(model, point, levels))
         lins = model.linearise(moved, expected=True)
         solved = eliminate_compressed(model, moved.noises, levels, compress(model, lins))
         return log_density(model, moved) - 0.5 * solved.logdet, solved.score
@@ -269,7 +269,7 @@ def _placed(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, 
     return at_levels(model, point, theta[M:]) if theta.shape[0] > M else point
 
 
-def driving(model: Model, frame: Frame, point: Point) -> tuple[jax.Array, ...]:
+def unit_normals(model: Model, frame: Frame, point: Point) -> tuple[jax.Array, ...]:
     """The unit normals eps (E, n) of each recursion that `place` makes a consistent point of."""
     step = point.z - frame.point.z
     noises = at_levels(model, point, frame.point.levels).noises

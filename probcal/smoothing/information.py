@@ -7,11 +7,11 @@ from probcal import linalg
 from probcal.model.model import Data, Model
 from probcal.priors import Precision
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.linearised import Laplace, linearise
+from probcal.smoothing.linearised import LaplaceApproximation, linearise
 from probcal.smoothing.mode import Point, compress, factors, log_likelihood
 
 
-def paper_b(model: Model, point: Point, prior: Precision) -> tuple[Laplace, jax.Array]:
+def paper_b(model: Model, point: Point, prior: Precision) -> tuple[LaplaceApproximation, jax.Array]:
     """Paper B (10)-(17), (22)-(23) at smoothed trajectories: the posterior of z, and the step to its mean.
 
     The smoothed density of each epoch alone is taken as the prior of its state, R-bar = R + H_x P H_x'; what
@@ -42,7 +42,7 @@ def paper_b(model: Model, point: Point, prior: Precision) -> tuple[Laplace, jax.
     evidence = likelihood + own + 0.5 * slope @ step - 0.5 * (logdet + spread)
     evidence = evidence - 0.5 * jnp.sum((point.levels / model.level_spread) ** 2)
     gamma = jnp.clip(1.0 - prior.alpha * jnp.diagonal(covariance), 0.0, 1.0)
-    return Laplace(information, covariance, gamma, evidence), step
+    return LaplaceApproximation(information, covariance, gamma, evidence), step
 
 
 @jax.jit

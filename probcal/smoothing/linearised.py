@@ -29,7 +29,7 @@ from probcal.smoothing.mode import (
 from probcal.smoothing.solves import Dense
 
 
-class Laplace(NamedTuple):
+class LaplaceApproximation(NamedTuple):
     """Gaussian approximation of the posterior of z at one consistent point, trajectories marginalised."""
 
     information: jax.Array  # (M, M) of the data about z
@@ -68,7 +68,7 @@ class Linearisation(NamedTuple):
         """The precision of the biases under a prior, ready to be solved."""
         return Dense.of(self.information + prior.matrix())
 
-    def laplace(self, prior: Precision) -> Laplace:
+    def laplace(self, prior: Precision) -> LaplaceApproximation:
         """Covariance of the biases, gamma and evidence under a prior (see `laplace`)."""
         return laplace_of(self.model, self.point, self.solved, prior)
 
@@ -173,7 +173,7 @@ def marginal_information(model: Model, point: Point) -> jax.Array:
 
 
 @jax.jit
-def laplace(model: Model, point: Point, prior: Precision) -> Laplace:
+def laplace(model: Model, point: Point, prior: Precision) -> LaplaceApproximation:
     """Evidence and covariance with every trajectory marginalised exactly, at the mode for a prior.
 
     A precision of 0 is a flat prior: its density counts as one. The expected information is used throughout. Where
@@ -182,7 +182,7 @@ def laplace(model: Model, point: Point, prior: Precision) -> Laplace:
     return laplace_of(model, point, eliminate(model, point, expected=True), prior)
 
 
-def laplace_of(model: Model, point: Point, solved: Eliminated, prior: Precision) -> Laplace:
+def laplace_of(model: Model, point: Point, solved: Eliminated, prior: Precision) -> LaplaceApproximation:
     """Evidence and covariance at a mode, of the system eliminated there with the expected information."""
     biases = Dense.of(solved.information + prior.matrix())
     own = 0.5 * prior.log_determinant() - 0.5 * prior.square(point.z)
@@ -191,4 +191,4 @@ def laplace_of(model: Model, point: Point, solved: Eliminated, prior: Precision)
     evidence = density + own + spread - 0.5 * (solved.logdet + biases.log_determinant())
     covariance = biases.covariance()
     gamma = jnp.clip(1.0 - prior.alpha * jnp.diagonal(covariance), 0.0, 1.0)
-    return Laplace(solved.information, covariance, gamma, evidence)
+    return LaplaceApproximation(solved.information, covariance, gamma, evidence)

@@ -283,7 +283,7 @@ def find_mode(
     return Mode(last.point, last.cost, last.iteration, converged, ~last.moved & ~converged, gained, jnp.zeros(()))
 
 
-def track(model: Model, point: Point, iterations: int = 20) -> Point:
+def smooth_tracks(model: Model, point: Point, iterations: int = 20) -> Point:
     """Trajectories at the point's biases: iterated EKS."""
     flat = Precision.single(jnp.zeros_like(point.z))
     return find_mode(model, point, flat, iterations, 1e-6, joint=False).point

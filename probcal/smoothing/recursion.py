@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from probcal.linalg import forward, multiply, observe, regress, semi_cholesky, tria
+from probcal.linalg import forward, multiply, observe, regress_rows, semi_cholesky, tria
 
 
 class Gains(NamedTuple):
@@ -58,7 +58,7 @@ def gains(F: jax.Array, L: jax.Array, J: jax.Array, used: tuple[int, ...]) -> Ga
     keep = jnp.eye(n, dtype=F.dtype)[None] - gain @ data.mT
     before = jnp.concatenate([jnp.zeros_like(updated[:1]), updated[:-1]])
     causes = jnp.pad(before, ((0, 0), (0, n), (0, n))).at[:, n:, n:].set(jnp.eye(n, dtype=F.dtype))
-    shares = jax.vmap(regress)(causes, jnp.concatenate([F @ before, L], 2))
+    shares = jax.vmap(regress_rows)(causes, jnp.concatenate([F @ before, L], 2))
     logdet = 2.0 * jnp.sum(jnp.log(std))
     return Gains(data, solve, predicted, updated, whiten, gain, keep, shares[:, :n], shares[:, n:], logdet)
 

@@ -21,7 +21,7 @@ from probcal.model.rows import Linearised
 from probcal.priors import Precision
 from probcal.problem import Problem, check_linear
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Point, cost, factors, find_mode, track
+from probcal.smoothing.mode import Point, cost, factors, find_mode, smooth_tracks
 from probcal.types import float64
 
 WINDOWS = 60  # at most so many windows a target
@@ -236,7 +236,7 @@ def automatic_start(problem: Problem, iterations: int = 30) -> Point:
 
 def track_mode(problem: Problem, point: Point, iterations: int = 100) -> Point:
     """Trajectories at held biases: iterated EKS from a point."""
-    return track(problem.model, point, iterations)
+    return smooth_tracks(problem.model, point, iterations)
 
 
 def _swaps(problem: Problem) -> np.ndarray:

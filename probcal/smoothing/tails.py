@@ -13,7 +13,7 @@ import numpy as np
 from probcal.model.model import Mixing, Model
 from probcal.problem import Problem
 from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mode import Point, track
+from probcal.smoothing.mode import Point, smooth_tracks
 
 ROUNDS, STILL = 50, 1e-3  # of precisions and trajectories in turn, and change of log precision at which they end
 
@@ -42,7 +42,7 @@ def rewhitened(model: Model, point: Point, weights: Mixing) -> Point:
 def settle(problem: Problem, point: Point, covariance: jax.Array) -> tuple[Problem, Point]:
     """Precisions and trajectories that agree, at held biases of a covariance (M, M): the problem, and the point."""
     for _ in range(ROUNDS if problem.model.tailed else 0):
-        point = track(problem.model, point)
+        point = smooth_tracks(problem.model, point)
         weights = _expected(problem.model, point, covariance)
         pairs = zip(jax.tree.leaves(problem.model.mixing), jax.tree.leaves(weights), strict=True)
         moved = max(float(np.abs(np.log(np.asarray(b) / np.asarray(a))).max(initial=0.0)) for a, b in pairs)
