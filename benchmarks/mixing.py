@@ -55,8 +55,8 @@ CASES |= {"thesis": shipped(thesis), "microphones": shipped(microphones)}
 CASES |= {
     "sflab": recorded(sflab, "sflab_mic_toa", "dataset_1_exp2.mat"),
     "flight": recorded(tdoa_flight, "uwb_tdoa"),
-    "robots": recorded(robots, "mrclam"),
-    "receivers": recorded(receivers, "mlat_locards"),
+    "robots": recorded(robots, "mrclam", "MRCLAM_Dataset6"),
+    "receivers": recorded(receivers, "mlat_locards", "set_1.csv"),
 }
 
 

@@ -312,7 +312,8 @@ def _say_steps(run: SamplerRun, said: list[str]) -> bool:
     """What the steps of NUTS or of the Metropolis correction say; whether all is well."""
     found, good = _stats(run), True
     if "diverging" in found and found["diverging"].any():
-        said.append(f"{int(found['diverging'].sum())} divergences: raise target (0.95), or take collapsed.")
+        remedy = ", or take collapsed" if run.asked is run.method else ""
+        said.append(f"{int(found['diverging'].sum())} divergences: take NUTS with a higher target (0.95){remedy}.")
         good = False
     if "tree_depth" in found:
         share = float((found["tree_depth"] >= getattr(run.method, "depth", np.inf)).mean())
