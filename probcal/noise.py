@@ -97,7 +97,7 @@ class ScaleMixture(Protocol):
         """Draws of w."""
 
 
-class _Location:
+class AdditiveNoise:
     """Noise added to the predicted value; a wrapped channel compares angles around the circle."""
 
     def innovation(self, y, predicted, period):
@@ -108,7 +108,7 @@ class _Location:
 
 
 @dataclass(frozen=True)
-class Normal(_Location):
+class Normal(AdditiveNoise):
     """Additive Gaussian noise of standard deviation `std`."""
 
     def log_likelihood(self, y, predicted, std, period):
@@ -142,7 +142,7 @@ class Normal(_Location):
 
 
 @dataclass(frozen=True)
-class StudentT(_Location):
+class StudentT(AdditiveNoise):
     """Additive Student-t noise with scale `std` and `df` degrees of freedom, for channels with outliers."""
 
     df: float = 4.0
@@ -213,7 +213,7 @@ class StudentT(_Location):
 
 
 @dataclass(frozen=True)
-class Mixture(_Location):
+class Mixture(AdditiveNoise):
     """Inliers of standard deviation `std`, and a `share` of echoes: `scale` times wider, `delay` stds later.
 
     An echo of sound or radio comes late: with a positive `delay` the second component is centred there.

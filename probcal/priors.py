@@ -52,8 +52,8 @@ class Precision(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Prior:
-    """What all priors share; `learns` those whose precisions follow the data, `proper` those with an evidence."""
+class Prior:
+    """What every prior is and has; `learns` those whose precisions follow the data, `proper` those with an evidence."""
 
     correlation: Any = ()
 
@@ -108,7 +108,7 @@ class _Prior:
 
 
 @dataclass(frozen=True)
-class Flat(_Prior):
+class Flat(Prior):
     """No prior: maximum likelihood."""
 
     proper: ClassVar[bool] = False
@@ -116,7 +116,7 @@ class Flat(_Prior):
 
 
 @dataclass(frozen=True)
-class Gaussian(_Prior):
+class Gaussian(Prior):
     """Zero-mean Gaussian with the declared scale of each bias as its standard deviation (l2, thesis 4.14a).
 
     `correlation={"mic_*.position_x": 0.9}` correlates the biases that a pattern matches, surveyed or not.
@@ -124,7 +124,7 @@ class Gaussian(_Prior):
 
 
 @dataclass(frozen=True)
-class Laplace(_Prior):
+class Laplace(Prior):
     """Zero-mean Laplace density with the declared scale as its standard deviation: l1 (thesis 4.14b, lambda 2/beta).
 
     Its mode is found as a Gaussian scale mixture: precision sqrt(2) / |z|, renewed at every iteration.
@@ -160,7 +160,7 @@ def grouped(members: Members, by: str | None) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class ARD(_Prior):
+class ARD(Prior):
     """Automatic relevance determination: one precision a bias, with a Gamma(shape, rate) hyper-prior.
 
     The default, shape 1 and rate 0, is the flat hyper-prior of the papers (Paper B 11, Paper C 18). `by` shares a
@@ -206,7 +206,7 @@ class ARD(_Prior):
 
 
 @dataclass(frozen=True)
-class Horseshoe(_Prior):
+class Horseshoe(Prior):
     """Regularised horseshoe: half-Cauchy global and local scales, a slab of inverse-Gamma variance.
 
     `expected` is the share of biases expected to be non-zero, `slab_scale` (in declared scales) and `slab_df` bound
@@ -234,7 +234,7 @@ class Horseshoe(_Prior):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BernoulliGaussian(_Prior):
+class BernoulliGaussian(Prior):
     """Spike and slab, the generating model of Papers B and C: each bias is zero or Gaussian of `slab` declared scales.
 
     `share` of the biases is non-zero; None learns it under a Beta(a, b) prior, uniform by default.
@@ -254,7 +254,6 @@ class BernoulliGaussian(_Prior):
                 raise InputError(f"BernoulliGaussian({name}={getattr(self, name)}): give a positive number")
 
 
-Prior = Flat | Gaussian | Laplace | ARD | Horseshoe | BernoulliGaussian
 # names on the command line
 PRIORS: dict[str, Prior] = {
     "flat": Flat(),
