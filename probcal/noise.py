@@ -2,12 +2,13 @@
 
 Steps of an algorithm use the positive step weight; covariance, gamma and evidence use the expected
 information (for a Student-t the two differ).
-To add a family, write a frozen dataclass with the methods of `Gaussian`. To let it drive a motion too, write those of
-`ScaleMixture`: a vector of noise is then normal given a precision that is drawn anew at every epoch.
+To add a family, write a frozen dataclass that inherits `AdditiveNoise` with its density and how it is drawn. To let it
+drive a motion too, write the methods of `ScaleMixture`: a vector of noise is then normal given a precision drawn anew
+at every epoch.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -60,6 +61,10 @@ def check_level(level: Level, what: str, *, zero: bool = False) -> None:
         raise InputError(f"{what} is {value:g}: it must be positive")
 
 
+NEAR = 0.1  # std within which a residual has the weight of one at that distance: a density may have a kink at zero
+FARTHEST = 30.0  # asinh of the farthest point of a quadrature, in std
+
+
 class Family(Protocol):
     """What a noise family answers; `y`, `predicted`, `std` are arrays of one shape, `period` a number or None."""
 
@@ -98,13 +103,92 @@ class ScaleMixture(Protocol):
 
 
 class AdditiveNoise:
-    """Noise added to the predicted value; a wrapped channel compares angles around the circle."""
+    """Noise added to the predicted value, std times e; a wrapped channel compares angles around the circle.
+
+    A family of your own is a frozen dataclass that inherits this with the density of e and how it is drawn; all the
+    rest follows from them, and a family may write its own where it knows better (all of these do).
+
+    >>> @dataclass(frozen=True)
+    ... class Logistic(AdditiveNoise):
+    ...     def log_density(self, e):
+    ...         return -2.0 * jnp.logaddexp(0.5 * e, -0.5 * e)
+    ...
+    ...     def draw(self, key, shape):
+    ...         return jax.random.logistic(key, shape)
+    >>> round(Logistic().unit_information(), 6)
+    0.333333
+    """
+
+    def log_density(self, e):
+        """Log density of the noise at std 1, arrays of one shape."""
+        raise NotImplementedError(f"{type(self).__name__}: write log_density(self, e), or log_likelihood")
+
+    def draw(self, key, shape):
+        """Draws of the noise at std 1."""
+        raise NotImplementedError(f"{type(self).__name__}: write draw(self, key, shape), or sample")
 
     def innovation(self, y, predicted, period):
+        """Measured value minus the predicted one."""
         return y - predicted if period is None else wrap(y - predicted, period)
 
+    def log_likelihood(self, y, predicted, std, period):
+        """Log density of each datum."""
+        return self.log_density(self.innovation(y, predicted, period) / std) - jnp.log(std)
+
+    def score(self, y, predicted, std, period):
+        """Derivative of the log density by the predicted value."""
+        return -self._slope(self.innovation(y, predicted, period) / std) / std
+
+    def weight(self, y, predicted, std, period):
+        """Positive curvature used by a step: score over innovation, which outliers make small.
+
+        Where the two have different signs (a density that is not symmetric) it is the expected information.
+        """
+        e = self.innovation(y, predicted, period) / std
+        e = jnp.where(jnp.abs(e) < NEAR, NEAR, e)
+        ratio = -self._slope(e) / e
+        return jnp.where(ratio > 0, ratio, self.unit_information()) / std**2
+
+    def information(self, predicted, std):
+        """Expected information about the predicted value."""
+        return self.unit_information() * jnp.ones_like(predicted) / std**2
+
+    def level_score(self, y, predicted, std, period):
+        """One plus the derivative of the log density by log std."""
+        e = self.innovation(y, predicted, period) / std
+        return -e * self._slope(e)
+
+    def reliance(self, y, predicted, std, period):
+        """Weight of each datum over that of one without residual, one at most."""
+        there, none = self.weight(y, predicted, std, period), self.weight(predicted, predicted, std, period)
+        return jnp.minimum(there / none, 1.0)
+
+    def sample(self, key, predicted, std):
+        """Draw measured values around the predicted ones."""
+        return predicted + std * self.draw(key, predicted.shape)
+
     def check(self, y):
+        """Which values are legal: all."""
         return np.ones(y.shape, bool)
+
+    def unit_information(self) -> float:
+        """Expected information at std 1, by quadrature of the squared score."""
+        return _information_of(self)
+
+    def _slope(self, e):
+        """Derivative of the log density by e."""
+        return jax.jvp(self.log_density, (e,), (jnp.ones_like(e),))[1]
+
+
+@lru_cache
+def _information_of(family: AdditiveNoise) -> float:
+    """Mean square of a family's score at std 1; points are even in asinh, so that tails of any weight are reached."""
+    t = np.linspace(-FARTHEST, FARTHEST, 20_001)
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        e = jnp.asarray(np.sinh(t))
+        density, slope = np.exp(np.asarray(family.log_density(e))), np.asarray(family._slope(e))
+    inside = density > 0
+    return float(np.trapezoid(np.where(inside, slope**2 * density * np.cosh(t), 0.0), t))
 
 
 @dataclass(frozen=True)
