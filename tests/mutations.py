@@ -36,6 +36,18 @@ MUTATIONS = [
     Mutation("smoothing/recursion.py", "noises + gain.drive @ states @ gain.drive.mT", "noises", "test_formulas.py"),
     Mutation("smoothing/recursion.py", "gain.gain @ innovation + force", "gain.gain @ innovation", "test_diffuse.py"),
     Mutation("smoothing/recursion.py", "return states @ earlier + later", "return states @ b + later", "test_diffuse.py"),
+    # inference/hierarchy.py, orbits.py: scales of their own that move along
+    Mutation("inference/hierarchy.py", "jnp.sum(own + way - forth", "jnp.sum(own - forth", "test_orbits.py"),
+    Mutation("inference/hierarchy.py", "jnp.exp(logs)) + logs - prior", "jnp.exp(logs)) - prior", "test_orbits.py"),
+    Mutation("inference/orbits.py", "orbit.volume * r + ratio", "orbit.volume * r", "test_orbits.py"),
+    # noise.py: what a density implies
+    Mutation("noise.py", "return -e * self._slope(e)", "return e * self._slope(e)", "test_methods.py"),
+    Mutation("noise.py", "slope**2 * density * np.cosh(t)", "slope**2 * density", "test_methods.py"),
+    Mutation("noise.py", "return -self._slope(self.innovation(y, predicted, period) / std) / std", "return -self._slope(self.innovation(y, predicted, period) / std)", "test_methods.py"),
+    # model/model.py
+    Mutation("model/model.py", "jnp.where(tail.on, tail.family.mixing_information(tail.size), 1.0)", "jnp.ones_like(tail.weight)", "test_tails.py"),
+    # results/groups.py
+    Mutation("results/groups.py", "mine = np.flatnonzero(owners == name)", "mine = np.flatnonzero(owners == owners[0])", "test_exact.py"),
     # linalg.py
     Mutation("linalg.py", "(seen / (1.0 + std))", "(seen / std)", "test_exact.py"),
     Mutation("linalg.py", "least = LOST * jnp", "least = 1e7 * LOST * jnp", "test_diffuse.py"),

@@ -334,6 +334,11 @@ def test_a_target_that_keeps_turning_has_noises_that_go_together():
     assert "ConstantAcceleration" in texts[0]
 
 
+def test_a_start_keeps_its_density_where_the_noise_goes_by_its_information():
+    ((weight,),) = turned().model.by_information().mixing
+    np.testing.assert_allclose(np.asarray(weight), [1.0, *(len(TIME) - 1) * [7 / 9]])
+
+
 @pytest.mark.ci
 def test_bounds_take_the_fisher_information_of_the_family():
     """Student-t noise of 3 degrees tells as Gaussian noise of sqrt(9 / 7) times the std: 4 entries an epoch."""
