@@ -60,14 +60,16 @@ CASES |= {
 }
 
 
-def line(name, method):
+def line(name, method, key=0):
     """The line of a case."""
     try:
         problem, prior = CASES[name]()
     except (InputError, FileNotFoundError) as error:
         return f"| {name} | left out: {error} |"
     began = time.perf_counter()
-    tree, answer = calibrate(problem, method, prior=prior if prior is not None and method.takes(prior) else None, key=0)
+    tree, answer = calibrate(
+        problem, method, prior=prior if prior is not None and method.takes(prior) else None, key=key
+    )
     seconds = time.perf_counter() - began
     group = tree["calibration"].to_dataset()
     ran = f"{answer.method.name}, k-hat {tree.attrs['frame_khat']:.2g}"
@@ -89,11 +91,12 @@ def main():
     ask = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     ask.add_argument("--case", action="append", choices=list(CASES))
     ask.add_argument("--method", default="collapsed", choices=[n for n, (m, _) in METHODS.items() if not m.climbs])
+    ask.add_argument("--key", type=int, default=0)
     given = ask.parse_args()
     head = ("case", "size", "who sampled", "status", "r_hat", "least ESS", "orbits taken", "s")
     print(f"| {' | '.join(head)} |", "|---" * len(head) + "|", sep="\n", flush=True)
     for name in given.case or CASES:
-        print(line(name, METHODS[given.method][0]), flush=True)
+        print(line(name, METHODS[given.method][0], given.key), flush=True)
 
 
 if __name__ == "__main__":

@@ -81,7 +81,7 @@ def test_a_mirror_is_reported_with_its_biases_and_they_are_weak(name):
     np.testing.assert_allclose(there, -own, atol=1.5 * sd.max())
     level = {"line": 0.0, "ceiling": 3.0}[name]
     track = only(tree)["mean"].values[:, problem.network.dimension - 1]
-    other = tree["mirror/target"]["position"]
+    other = tree["mirror/track/target"]["position"]
     np.testing.assert_allclose(other.isel(mirror=0).sel(axis=axis) - level, level - track, atol=1.0)
     legend = [text.get_text() for text in plot_map(tree).get_legend().get_texts()]
     assert "fits as well" in legend

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.gibbs import delayed_acceptance
+from probcal.inference.gibbs import reversible_sweeps
 from probcal.inference.hierarchy import Phi
 from probcal.inference.orbits import Place, roam
 from probcal.inference.posed import Conditional, Form, Posed, conditional, prior_precision
@@ -170,7 +170,7 @@ class Collapsed(Sampler):
     def step(self, form: Form, posed: Posed, chain: CollapsedState) -> tuple[CollapsedState, Sample]:
         """One draw."""
         key, *keys = jax.random.split(chain.key, 6)
-        theta, phi = delayed_acceptance(
+        theta, phi = reversible_sweeps(
             form, posed, chain.theta, chain.phi, keys[0], self.sweeps or form.hierarchy.sweeps
         )
         weight = log_weight(posed.model, posed.frame, theta, chain.eps)

@@ -31,7 +31,7 @@ def gibbs_sweep(
     return theta, phi
 
 
-def delayed_acceptance(
+def reversible_sweeps(
     form: Form, posed: Quadratic, theta: jax.Array, phi: Phi, key: jax.Array, sweeps: int
 ) -> tuple[jax.Array, Phi]:
     """Some sweeps, all forwards or all backwards by a coin: reversible under the frame's posterior."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from probcal.errors import InputError
 from probcal.inference.coordinates import Free, Parts, parts
-from probcal.inference.gibbs import delayed_acceptance
+from probcal.inference.gibbs import reversible_sweeps
 from probcal.inference.hierarchy import Phi
 from probcal.inference.orbits import Place, roam
 from probcal.inference.posed import Form, Posed, conditional
@@ -102,7 +102,7 @@ class NUTS(Sampler):
         """
         keys = jax.random.split(jax.random.fold_in(chain.rng_key, 1), 4)
         at = Place(found.theta, chain.z.eps, found.phi, log_weight(posed.model, posed.frame, found.theta, chain.z.eps))
-        theta, phi = delayed_acceptance(form, posed, at.theta, at.phi, keys[0], form.hierarchy.sweeps)
+        theta, phi = reversible_sweeps(form, posed, at.theta, at.phi, keys[0], form.hierarchy.sweeps)
         tried = Place(theta, at.eps, phi, log_weight(posed.model, posed.frame, theta, at.eps))
         leapt = jnp.log(jax.random.uniform(keys[1])) < tried.weight - at.weight
         at = jax.tree.map(lambda new, old: jnp.where(leapt, new, old), tried, at)

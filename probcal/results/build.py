@@ -226,7 +226,7 @@ def add_mirrors(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
     ]
     axes = {"axis": list(AXES[: problem.network.dimension])}
     tracks = by_target(problem, {"position": (("mirror", "time", "axis"), places)}, axes)
-    tree["mirror"] = xr.DataTree.from_dict({"/": group, **tracks})
+    tree["mirror"] = xr.DataTree.from_dict({"/": group, **{f"track/{name}": own for name, own in tracks.items()}})
     return tree
 
 

@@ -109,7 +109,7 @@ def check_content(tree: xr.DataTree, path: Path) -> None:
         if group in tree.children and not set(names) <= set(tree[group].variables):
             raise InputError(f"{path} is incomplete: its group {group} lacks what a fit holds; fit again")
     tracks = tree["track"].children if "track" in tree.children else {}
-    if not tracks or any(name not in node.variables for node in tracks.values() for name in TRACKED):
+    if not tracks or any(not {*TRACKED} <= {*node.variables} or "target" not in node.attrs for node in tracks.values()):
         raise InputError(f"{path} is incomplete: its group track lacks what a fit holds; fit again")
     if missing := [name for name in ATTRIBUTES if name not in tree.attrs]:
         raise InputError(f"{path} is incomplete: it has no attribute {missing[0]}; fit again")
