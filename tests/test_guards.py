@@ -25,6 +25,7 @@ from probcal import (
     Node,
     Problem,
     StudentT,
+    Target,
     assess,
     sensor,
     simulate,
@@ -35,10 +36,12 @@ from probcal.errors import FitError
 from probcal.geometry import bearing, norm
 from probcal.inference.ending import End, conclude
 from probcal.inference.ending import verdict as status_of
+from probcal.inference.fit import calibrate
 from probcal.inference.run import Context, first_state, given_of
 from probcal.noise import Bernoulli
 from probcal.priors import Precision
 from probcal.report import COLOURS
+from probcal.sensors import doa
 from probcal.smoothing.information import mean_square, squares_of
 from probcal.smoothing.linearised import laplace
 from probcal.smoothing.mode import _proposal, find_mode
@@ -369,3 +372,22 @@ def test_a_hyper_prior_may_cost_evidence():
     trace = strict["optimisation"]["objective"].values
     assert trace.max() - trace[-1] > 1.0, "the evidence alone falls"
     assert strict.attrs["status"] == "converged"
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_an_answer_far_from_gaussian_is_weak(stated):
+    """Four direction finders on 20 m and a target 1 km away: its range is a factor, unless stated."""
+    places = [(0.0, 0.0), (20.0, 0.0), (20.0, 20.0), (0.0, 20.0)]
+    free = {"heading": np.deg2rad(3.0)}
+    nodes = [doa.on(Node(f"d{k}", place, scale=free if k else None)) for k, place in enumerate(places)]
+    time = np.arange(60.0)
+    track = np.stack([-600.0 + 20.0 * time, 1000.0 + 0.0 * time], 1)
+    motion = ConstantVelocity(0.3)
+    drawn = simulate(Network(nodes), motion, time, 0, share=1.0, tracks={"target": track})
+    start = {"position": ((-600.0, 1000.0), 50.0), "velocity": ((20.0, 0.0), 5.0)}
+    problem = Problem(Network(nodes), Target(motion, start) if stated else motion, drawn.table)
+    tree, answer = calibrate(problem, key=0)
+    checked = assess(problem, tree, answer=answer)
+    kinds, words = checked["finding"]["kind"].values.tolist(), checked["verdict"]["verdict"].values.tolist()
+    assert ("shape" in kinds) is (not stated)
+    assert words == ["determined" if stated else "weak"] * 3

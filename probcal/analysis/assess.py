@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal.analysis import checks, leave, nees, pieces, predictive, process, residuals, scaling, verdict
+from probcal.analysis import checks, leave, nees, pieces, predictive, process, residuals, scaling, shape, verdict
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.pieces import Change, Pieces
@@ -79,7 +79,9 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
         Finding("wrapping", *pair) for pair in residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     ]
     findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups) + process.check_process_noise(fit, keys[2])
-    groups["verdict"] = _verdicts(fit, tree, found, groups)
+    bent = None if _absurd(tree) else shape.check_shape(fit, tree)
+    findings += [] if bent is None else [bent]
+    groups["verdict"] = _verdicts(fit, tree, found, groups, bent)
     if "mirror" in tree.children:
         group = tree["mirror"].to_dataset()
         findings += [
@@ -110,7 +112,9 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     return result
 
 
-def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups: dict[str, xr.Dataset]) -> xr.Dataset:
+def _verdicts(
+    fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups: dict[str, xr.Dataset], bent: Finding | None
+) -> xr.Dataset:
     """Group `verdict`; adds the group `halves` where the recording can be divided."""
     problem, calibration = fit.problem, tree["calibration"].to_dataset()
     M, inflation, square = problem.model.biases, np.ones(problem.model.biases), np.zeros(problem.model.biases)
@@ -141,8 +145,9 @@ def _verdicts(fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups:
     )  # fmt: skip
     ended = calibration["status"].values.tolist()
     status = Status(tree.attrs["status"])
+    doubts = {} if bent is None else dict.fromkeys(range(M), "the answer is far from Gaussian, so its interval is none")
     words, reasons = verdict.judge_biases(
-        problem, status, ended, known, drifts, disagreements, first, _shared(tree), _mirrored(fit, tree)
+        problem, status, ended, known, drifts, disagreements, first, _shared(tree), doubts | _mirrored(fit, tree)
     )
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}

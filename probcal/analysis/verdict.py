@@ -9,9 +9,9 @@ conflicting  it lies beyond the limit of its survey (or of its scale under a pri
 prior only   s < 0.05
 weak         s < 0.5 (information below 1), or one scale along a combination of biases that the data leave open would
              put it more than 1.8 sd off, or it is another one in an answer that fits as well (a mirror, all biases
-             where a target touches it), or the fit is no answer (not converged, at bound, diverged), or the chains of
-             the bias have not mixed, or it was pruned: held at zero by a precision that was maximised; "conflicting"
-             where the fit explains nothing (misfit)
+             where a target touches it), or the answer is far from Gaussian, or the fit is no answer (not converged,
+             at bound, diverged), or the chains of the bias have not mixed, or it was pruned: held at zero by a
+             precision that was maximised; "conflicting" where the fit explains nothing (misfit)
 determined   none of these
 
 Limits have a false-alarm rate of 1 % over all biases together, and the standard deviations behind them carry the
@@ -75,12 +75,12 @@ def judge_biases(
     disagreements: Mapping[int, str],
     first: str,
     shared: Mapping[int, str],
-    mirrored: Mapping[int, str] | None = None,
+    doubts: Mapping[int, str] | None = None,
 ) -> tuple[list[str], list[str]]:
     """Verdict and reason of every bias, from the evidence and the reasons of those that change, `first` most.
 
     `status` is that of the fit, `ended` that of each bias, `shared` the open combination that some belong to,
-    `mirrored` how some differ in another answer that fits as well.
+    `doubts` why the answer of some is not one bell: another answer that fits as well, or draws that fit badly.
     """
     verdicts, sentences = [], []
     for m, bias in enumerate(problem.biases):
@@ -100,8 +100,8 @@ def judge_biases(
             verdict, reason = "prior only", f"the data hardly narrow its {declared} ({information})"
         elif s < WEAK:
             verdict, reason = "weak", f"the data narrow its {sizes} only ({information})"
-        elif mirrored and m in mirrored:
-            verdict, reason = "weak", mirrored[m]
+        elif doubts and m in doubts:
+            verdict, reason = "weak", doubts[m]
         elif m in shared:
             verdict, reason = "weak", f"it belongs to {shared[m]}, which the data leave open"
         elif status is Status.MISFIT:

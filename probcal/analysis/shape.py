@@ -1,0 +1,35 @@
+"""Is a Gaussian answer one? How much worse the data fit at its draws than at its mode.
+
+At draws from a Gaussian posterior of a linear model the log-likelihood lies below that of the mode by half the number
+of parameters that the data tell, so by half a nat a datum at most. Draws that leave a curved ridge of the likelihood
+fall without limit: bearings of an array that is small beside the distance tell the range by a factor only.
+"""
+
+import jax
+import numpy as np
+import xarray as xr
+
+from probcal.analysis.findings import Finding
+from probcal.analysis.fitted import Fitted
+from probcal.smoothing import mode
+
+MOST = 0.5  # nats a datum, of a linear model
+GAUSSIAN = ("Laplace", "mixture")  # kinds of answers that draw from Gaussians around a mode
+
+_log_likelihood = jax.jit(mode.log_likelihood)
+
+
+def check_shape(fit: Fitted, tree: xr.DataTree) -> Finding | None:
+    """A finding where the draws of a Gaussian answer fit the data far worse than its mode."""
+    if tree.attrs["approximate"] not in GAUSSIAN or "log_likelihood" not in tree.children:
+        return None
+    drawn = tree["log_likelihood"].to_dataset()["y"].values  # (chain, draw, data)
+    fall = (float(_log_likelihood(fit.problem.model, fit.point)) - float(np.median(drawn.sum(2)))) / drawn.shape[2]
+    if fall <= MOST:
+        return None
+    text = (
+        f"the answer is far from Gaussian: at its draws the data fit {fall:.2g} nats a datum worse than at its mode"
+        f" ({MOST:g} at most if it were), so its intervals are none; state where the targets start, and compare with"
+        " NUTS()"
+    )
+    return Finding("shape", "fit", text)
