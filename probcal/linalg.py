@@ -31,14 +31,15 @@ def tria(columns: jax.Array) -> jax.Array:
     if n > UNROLL:
         return jnp.linalg.qr(columns.T, mode="r").T
     below = jnp.arange(n)
-    left, lower = columns, []
-    for j in range(n):
+
+    def project(j: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        left, lower = carry
         length = jnp.sqrt(jnp.sum(left[j] ** 2))
         unit = left[j] / jnp.where(length > 0, length, 1.0)
         column = jnp.where(below >= j, jnp.sum(left * unit[None, :], 1), 0.0)
-        left = left - column[:, None] * unit[None, :]
-        lower.append(column)
-    return jnp.stack(lower, 1)
+        return left - column[:, None] * unit[None, :], lower.at[:, j].set(column)
+
+    return jax.lax.fori_loop(0, n, project, (columns, jnp.zeros((n, n), columns.dtype)))[1]
 
 
 def inverse_cholesky(matrix: jax.Array) -> jax.Array:
@@ -54,6 +55,9 @@ def inverse_cholesky(matrix: jax.Array) -> jax.Array:
         left = left - jnp.where(below > j, pivot[:n], 0.0)[:, None] * pivot[None, :]
         rows.append(pivot[n:])
     return jnp.stack(rows)
+
+
+inverse_choleskys = jax.jit(jax.vmap(inverse_cholesky))  # of matrices (E, n, n)
 
 
 def observe(root: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

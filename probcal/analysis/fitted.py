@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -11,17 +10,14 @@ import xarray as xr
 
 from probcal import linalg
 from probcal.errors import InputError
-from probcal.model.model import Model
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
 from probcal.problem import Epochs, Problem
 from probcal.results.answer import Answer
 from probcal.results.groups import datum_of, gather, weight_name
 from probcal.results.read import each_track
-from probcal.smoothing import mode
 from probcal.smoothing.information import at_levels
-from probcal.smoothing.linearised import Linearisation
-from probcal.smoothing.linearised import linearise as linearised_at
+from probcal.smoothing.linearised import Linearisation, linearise
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import follow_states, track_mode
 
@@ -69,15 +65,6 @@ class Fitted(NamedTuple):
         return found.reshape(M + 1, count)[:M]
 
 
-@jax.jit
-def linearise(model: Model, point: Point) -> tuple[Linearised, ...]:
-    """All rows linearised at a point with the expected information."""
-    return model.linearise(point, expected=True)
-
-
-eliminate_rows = jax.jit(mode.eliminate_rows)
-
-
 def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) -> Fitted:
     """The fit of a problem from its tree, and from the answer behind it where that is at hand.
 
@@ -96,7 +83,7 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
     if not np.array_equal(datum["y"], fit["observed_data"].to_dataset()["y"].values):
         raise InputError("assess: the tree was fitted to other data; give the problem as it was fitted")
     covariance = group["covariance"].values / np.outer(problem.scales, problem.scales)
-    at = linearised_at(problem.model, _point(problem, fit)) if answer is None else answer.posterior.linearised
+    at = linearise(problem.model, _point(problem, fit)) if answer is None else answer.posterior.linearised
     data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
     return Fitted(problem, at, _prior(group), covariance, picks, data)
 

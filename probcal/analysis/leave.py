@@ -18,13 +18,14 @@ import xarray as xr
 from scipy import special
 
 from probcal import linalg
-from probcal.analysis.fitted import Fitted, eliminate_rows, linearise
+from probcal.analysis.fitted import Fitted
 from probcal.inference.pose import TAILED
 from probcal.inference.psis import smoothed
 from probcal.model import variants
 from probcal.model.model import Model, scaled
 from probcal.model.rows import Linearised, standardised
 from probcal.priors import Precision
+from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
 from probcal.smoothing.mode import Eliminated, Point, cost, find_mode, follow
 
 STEPS = 20  # Gauss-Newton steps of a refit
@@ -84,13 +85,13 @@ class _Refits:
             frozen = variants.without(model, held)
             start = point._replace(z=jnp.asarray(np.where(held, 0.0, point.z)))
             point = find_mode(frozen, start, prior, STEPS, TOLERANCE).point
-            lins = linearise(frozen, point)
-            solved, model = eliminate_rows(frozen, point, lins), frozen
+            lins = linearise_rows(frozen, point)
+            (_, solved), model = compress_and_eliminate(frozen, point, lins), frozen
         elif out is None:
             solved = fit.at.solved
         else:
             lins = scaled(lins, model.measured)
-            solved = eliminate_rows(model, point, lins)
+            _, solved = compress_and_eliminate(model, point, lins)
         found = _stepped(model, point, prior, lins, solved, jnp.asarray(held))
         return float(found.evidence) + 0.5 * _logdet(fit.prior.coupling, alpha, held), float(found.square)
 

@@ -11,9 +11,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.analysis.fitted import Fitted, eliminate_rows
+from probcal.analysis.fitted import Fitted
 from probcal.model import variants
 from probcal.model.model import Model
+from probcal.smoothing.linearised import compress_and_eliminate
 
 Limit = Callable[[int], float]  # chi-square by degrees of freedom
 Patterns = dict[str, np.ndarray]
@@ -59,7 +60,7 @@ def divide(fit: Fitted, piece: np.ndarray, count: int) -> Pieces:
     """Give every piece its own biases; `piece` (rows,) is that of each row of the table, below `count`."""
     model = copied(fit, piece, count)
     point = fit.point._replace(z=jnp.asarray(np.tile(fit.point.z, count)))
-    solved = eliminate_rows(model, point, fit.lins)
+    _, solved = compress_and_eliminate(model, point, tuple(fit.lins))
     return Pieces(
         np.asarray(solved.information),
         np.asarray(solved.score),

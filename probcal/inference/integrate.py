@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.special import ndtr
 
 from probcal import linalg
@@ -21,8 +22,9 @@ from probcal.inference.propagate import Propagated, nodes_of, propagate
 from probcal.model.model import Model
 from probcal.priors import Precision
 from probcal.results.schema import INTERVAL
+from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
 from probcal.smoothing.marginal import volume_slope
-from probcal.smoothing.mode import Point, eliminate, smooth_tracks
+from probcal.smoothing.mode import Eliminated, Point, smooth_tracks
 
 CHAINS, BURN, FIRST, KEPT = (
     4,
@@ -86,7 +88,7 @@ def integrate(
             mean, spread = found.mean, jnp.sqrt(jnp.diagonal(found.covariance))
         before = point.z
         point, known = recentred(how, model, point, known, mean)
-        if search and float(jnp.max(jnp.abs(point.z - before) / jnp.maximum(spread, 1e-9))) < NEAR:
+        if search and np.max(np.abs(np.asarray(point.z) - before) / np.maximum(spread, 1e-9), initial=0.0) < NEAR:
             break
     if nodes is not None:
         return _propagated(how, model, known, point, propagate(how.form, known, nodes, key, CHAINS * KEPT))
@@ -104,12 +106,18 @@ def _propagated(how: Integration, model: Model, known: Natural, point: Point, fo
     return Integrated(point_at(model, point, found.mean), known.information, total, z, {})
 
 
-@partial(jax.jit, static_argnames="how")
 def likelihood(how: Integration, model: Model, first: Precision, point: Point) -> tuple[Natural, jax.Array]:
     """The Gaussian likelihood of the biases at a point, and whether it is one."""
-    solved = eliminate(model, point, expected=True)
+    _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
+    return _natural(model, point, first, solved, marginal=how.marginal)
+
+
+@partial(jax.jit, static_argnames="marginal")
+def _natural(
+    model: Model, point: Point, first: Precision, solved: Eliminated, *, marginal: bool
+) -> tuple[Natural, jax.Array]:
     score, sound = solved.score, jnp.all(jnp.isfinite(solved.information))
-    if how.marginal:
+    if marginal:
         volume, smooth = volume_slope(model, point, solved)
         score, sound = score - 0.5 * volume, sound & smooth
     pull = solved.information @ point.z + score

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.inference.hierarchy import LEAST, MOST, Hierarchy, SpikeAndSlab
+from probcal.inference.hierarchy import LEAST, MOST, Hierarchy, Phi, SpikeAndSlab
 from probcal.inference.integrate import Integrated
 from probcal.inference.posed import Form
 from probcal.priors import PRECISION_BOUNDS, Prior
@@ -91,9 +91,7 @@ class MixturePosterior(Posterior):
         """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
         if self.prior.correlation or isinstance(self.hierarchy, SpikeAndSlab) or not self.found.phi:
             return None
-        phi = {name: jnp.asarray(values) for name, values in self.hyper.items()}
-        first = jnp.asarray(self.first)
-        alpha = np.asarray(jax.vmap(jax.vmap(lambda one: self.hierarchy.alpha(one, first)))(phi))
+        alpha = np.asarray(_precisions(self.hierarchy, dict(self.hyper), self.first))
         return log_prior_normal(draws.z, np.clip(alpha, LEAST, MOST))
 
     @property
@@ -111,3 +109,9 @@ class MixturePosterior(Posterior):
     def attrs(self) -> Mapping[str, float]:
         """The limit of inclusion."""
         return {"rope": ROPE}
+
+
+@partial(jax.jit, static_argnames="hierarchy")
+def _precisions(hierarchy: Hierarchy, phi: Phi, first: jax.Array) -> jax.Array:
+    """Precisions of all biases for draws of hyper-parameters, (chain, draw, M)."""
+    return jax.vmap(jax.vmap(lambda one: hierarchy.alpha(one, first)))(phi)

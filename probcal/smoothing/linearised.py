@@ -134,14 +134,26 @@ class Linearisation(NamedTuple):
 
 
 @jax.jit
-def linearise(model: Model, point: Point) -> Linearisation:
-    """Linearise a problem at a consistent point and eliminate its trajectories."""
-    rows = model.linearise(point, expected=True)
+def linearise_rows(model: Model, point: Point) -> tuple[Linearised, ...]:
+    """All rows linearised at a point with the expected information."""
+    return model.linearise(point, expected=True)
+
+
+@jax.jit
+def compress_and_eliminate(model: Model, point: Point, rows: tuple[Linearised, ...]) -> tuple[Compressed, Eliminated]:
+    """Linearised rows compressed, and the system without its trajectories."""
     system = compress(model, rows)
-    solved = eliminate_compressed(model, point.noises, point.levels, system)
+    return system, eliminate_compressed(model, point.noises, point.levels, system)
+
+
+def linearise(model: Model, point: Point) -> Linearisation:
+    """Linearise a problem at a consistent point and eliminate its trajectories; three kernels that others share."""
+    rows = linearise_rows(model, point)
+    system, solved = compress_and_eliminate(model, point, rows)
     return Linearisation(model, point, rows, system, solved, trajectories_of(model, point.levels, solved))
 
 
+@jax.jit
 def trajectories_of(model: Model, levels: jax.Array, solved: Eliminated) -> tuple[Trajectory, ...]:
     """Trajectories of each recursion given the biases, where they were eliminated at log levels (H,)."""
     found = []
@@ -172,16 +184,16 @@ def marginal_information(model: Model, point: Point) -> jax.Array:
     return eliminate(model, point, expected=True).information
 
 
-@jax.jit
 def laplace(model: Model, point: Point, prior: Precision) -> LaplaceApproximation:
     """Evidence and covariance with every trajectory marginalised exactly, at the mode for a prior.
 
     A precision of 0 is a flat prior: its density counts as one. The expected information is used throughout. Where
     process noise is not Gaussian it is the variational lower bound of the evidence (see `mixing_gain`).
     """
-    return laplace_of(model, point, eliminate(model, point, expected=True), prior)
+    return laplace_of(model, point, compress_and_eliminate(model, point, linearise_rows(model, point))[1], prior)
 
 
+@jax.jit
 def laplace_of(model: Model, point: Point, solved: Eliminated, prior: Precision) -> LaplaceApproximation:
     """Evidence and covariance at a mode, of the system eliminated there with the expected information."""
     biases = Dense.of(solved.information + prior.matrix())
