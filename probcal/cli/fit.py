@@ -11,7 +11,7 @@ from typing import Any
 import xarray as xr
 
 from probcal.cli.files import can_plot, report_of, say_written, write_csv
-from probcal.cli.kernels import keep_kernels
+from probcal.cli.kernels import keep_kernels, load_ahead
 from probcal.cli.models import load_problem, load_truth, prior_named
 from probcal.cli.progress import line
 from probcal.files import Outputs
@@ -24,7 +24,7 @@ from probcal.results.schema import evidence_in
 from probcal.status import Status
 
 FINDINGS = 8  # sentences of an assessment that are printed
-LONG = 10.0  # s of a fit that is written before it is assessed
+LONG = 60.0  # s of a fit that is written before it is assessed
 
 
 def run(
@@ -34,6 +34,7 @@ def run(
 ) -> int:  # fmt: skip
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
     keep_kernels()
+    load_ahead(["arviz_stats", *(["probcal.report"] if outputs is not None and can_plot() else [])] if assessed else [])
     known, implied = METHODS[method]
     value: Any = known
     value = replace(value, **sizes) if sizes else value

@@ -1,4 +1,8 @@
-"""Compiled kernels are kept between runs of the command line."""
+"""The first seconds of a command: compiled kernels are kept between runs, packages load while others compile."""
+
+import importlib
+import threading
+from collections.abc import Sequence
 
 import jax
 import platformdirs
@@ -17,3 +21,16 @@ def keep_kernels() -> None:
     jax.config.update("jax_compilation_cache_max_size", 10**9)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def load_ahead(names: Sequence[str]) -> None:
+    """Import modules that are needed later while kernels compile; what fails to load fails where it is needed."""
+
+    def load() -> None:
+        for name in names:
+            try:
+                importlib.import_module(name)
+            except Exception:
+                return
+
+    threading.Thread(target=load, daemon=True).start()
