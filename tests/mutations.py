@@ -78,7 +78,7 @@ MUTATIONS = [
     Mutation("inference/collapsed.py", "return weight + posed.frame.log_likelihood(theta) - 0.5 * square + volume", "return weight - 0.5 * square + volume", "test_mirrors.py"),
     Mutation("inference/relevance.py", "change / (1.0 + change * row[m])", "change / (1.0 - change * row[m])", "test_relevance.py"),
     # inference/integrate.py, propagate.py
-    Mutation("inference/integrate.py", "solved.information @ point.z + score", "solved.information @ point.z - score", "test_integrate.py"),
+    Mutation("inference/integrate.py", "solved.information @ z + score", "solved.information @ z - score", "test_integrate.py"),
     Mutation("inference/integrate.py", "clip(1.0 - alpha * jnp.diagonal(covariance)", "clip(1.0 - jnp.diagonal(covariance)", "test_integrate.py"),
     Mutation("inference/integrate.py", "total / count + jnp.cov(", "total / count + 0 * jnp.cov(", "test_integrate.py"),
     Mutation("inference/propagate.py", "1.0 / own - sites.tau, LEAST", "1.0 / own, LEAST", "test_integrate.py"),

@@ -1,6 +1,7 @@
 """Modes and evidence: EA, MAP and weighted least squares, with every trajectory marginalised."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -41,6 +42,7 @@ PRECISIONS = ("integrated", "maximised")
 TRAJECTORIES = (*MODES, "smoothed")
 
 
+@partial(jax.jit, static_argnames=("prior", "rule"))
 def _learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -> tuple[Model, State]:
     """Model and state with precisions and levels that follow from what the last iteration found, if there was one."""
     fresh = jnp.isneginf(state.objective)
@@ -65,13 +67,24 @@ def _climb(
     return mode, eliminate(model, mode.point, expected=True)
 
 
+def _alone(model: Model, prior: Prior, trajectory: str) -> bool:
+    """Whether a climb is to one marginal mode, nothing being learnt between steps."""
+    return trajectory == "marginal" and not (prior.learns or model.level_spread.shape[0] or model.tailed)
+
+
 def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, trajectory: str) -> State:
     """New precisions and levels, then the mode and the evidence at that mode: all of one state belongs together."""
     model, state = _learnt(model, prior, given, state, rule)
     now = given.prior._replace(alpha=state.alpha)
     steps = FEW if (prior.learns or model.tailed) and trajectory == "marginal" else STEPS
     mode, solved = _climb(model, state.point, now, steps, 1e-2 * given.tolerance, trajectory)
-    found = laplace_of(model, mode.point, solved, now)
+    return _settled(model, prior, given, state, mode, solved)
+
+
+@partial(jax.jit, static_argnames="prior")
+def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode, solved: Eliminated) -> State:
+    """The state at a mode, with the evidence there."""
+    found = laplace_of(model, mode.point, solved, given.prior._replace(alpha=state.alpha))
     objective = (
         found.evidence if prior.proper or not prior.learns else _density(model, prior, given, mode.point) - mode.volume
     )
@@ -223,6 +236,10 @@ class EA(Maximiser):
             " narrow; Horseshoe() or ARD(rate=0.5) is integrated."
         )
 
+    def steps_on_host(self, model: Model, prior: Prior) -> bool:
+        """Where the marginal mode is all that is climbed to: each iteration is then long."""
+        return _alone(model, prior, self.trajectory)
+
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Mode (or smoothed trajectory), evidence, new precisions."""
         if self.trajectory == "smoothed":
@@ -249,6 +266,10 @@ class MAP(Maximiser):
     def __post_init__(self):
         if self.trajectory not in MODES:
             raise InputError(f'{self.name}(trajectory="{self.trajectory}"): give one of {", ".join(MODES)}')
+
+    def steps_on_host(self, model: Model, prior: Prior) -> bool:
+        """Where the marginal mode is all that is climbed to: each iteration is then long."""
+        return _alone(model, prior, self.trajectory)
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Mode and its covariance."""

@@ -109,19 +109,20 @@ def _propagated(how: Integration, model: Model, known: Natural, point: Point, fo
 def likelihood(how: Integration, model: Model, first: Precision, point: Point) -> tuple[Natural, jax.Array]:
     """The Gaussian likelihood of the biases at a point, and whether it is one."""
     _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
-    return _natural(model, point, first, solved, marginal=how.marginal)
+    volume, smooth = (
+        volume_slope(model, point, solved) if how.marginal else (jnp.zeros_like(point.z), jnp.ones((), bool))
+    )
+    return _natural(point.z, first, solved, volume, smooth)
 
 
-@partial(jax.jit, static_argnames="marginal")
+@jax.jit
 def _natural(
-    model: Model, point: Point, first: Precision, solved: Eliminated, *, marginal: bool
+    z: jax.Array, first: Precision, solved: Eliminated, volume: jax.Array, smooth: jax.Array
 ) -> tuple[Natural, jax.Array]:
-    score, sound = solved.score, jnp.all(jnp.isfinite(solved.information))
-    if marginal:
-        volume, smooth = volume_slope(model, point, solved)
-        score, sound = score - 0.5 * volume, sound & smooth
-    pull = solved.information @ point.z + score
-    return Natural(solved.information, pull, jnp.zeros(0), first), sound & jnp.all(jnp.isfinite(pull))
+    score = solved.score - 0.5 * volume
+    pull = solved.information @ z + score
+    sound = smooth & jnp.all(jnp.isfinite(solved.information)) & jnp.all(jnp.isfinite(pull))
+    return Natural(solved.information, pull, jnp.zeros(0), first), sound
 
 
 def point_at(model: Model, point: Point, z: jax.Array) -> Point:

@@ -135,6 +135,10 @@ class Maximiser(Method, ABC):
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """One outer iteration."""
 
+    def steps_on_host(self, model: Model, prior: Prior) -> bool:
+        """Whether iterations are long and few, so that kernels shared with the rest of a fit beat one of their own."""
+        return False
+
     def begin(self, model: Model, start: Point) -> Any:
         """What is carried to the first iteration: nothing, unless said otherwise."""
         return ()
@@ -249,9 +253,13 @@ def maximise(
     state = state if alpha is None else state._replace(alpha=jnp.asarray(alpha))
     trace = np.zeros(0)
     while len(trace) < method.iterations and not bool(state.done):
-        left = method.iterations - len(trace)
-        state, (objective, idle) = chunk(kernel(method), problem.model, prior, given, state, left)
-        trace = np.concatenate([trace, np.asarray(objective)[~np.asarray(idle)]])
+        if method.steps_on_host(problem.model, prior):
+            state = stepped(method, problem.model, prior, given, state)
+            trace = np.append(trace, float(state.objective))
+        else:
+            left = method.iterations - len(trace)
+            state, (objective, idle) = chunk(kernel(method), problem.model, prior, given, state, left)
+            trace = np.concatenate([trace, np.asarray(objective)[~np.asarray(idle)]])
         if context.progress is not None:
             context.progress(method.name, len(trace), float(trace[-1]))
     return state, trace

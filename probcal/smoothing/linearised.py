@@ -103,25 +103,27 @@ class Linearisation(NamedTuple):
         root = linalg.factor(covariance)
         return self.model.spread(self.rows, [own.response @ root for own in self.trajectories], root)
 
-    @jax.jit
     def draw(self, z: jax.Array, key: jax.Array) -> tuple[jax.Array, ...]:
         """Trajectories (D, E, n) of each recursion given biases z (D, M): draws from the prior, less their smoothed
         selves.
 
         All draws are columns of one pass of the simulation smoother (Durbin and Koopman 2002).
         """
+        return self._around(z, self._simulated(key, len(z)))
+
+    @jax.jit
+    def _around(self, z: jax.Array, simulated: list[tuple[jax.Array, rec.Smoothed]]) -> tuple[jax.Array, ...]:
         drawn = []
-        pairs = zip(self.trajectories, self.point.states, self._simulated(key, len(z)), strict=True)
-        for own, mean, (prior, smooth) in pairs:
+        for own, mean, (prior, smooth) in zip(self.trajectories, self.point.states, simulated, strict=True):
             free = prior - smooth.states + own.response @ (z - self.point.z[None, :]).T
             drawn.append(jnp.moveaxis(mean[:, :, None] + free, 2, 0))
         return tuple(drawn)
 
-    @partial(jax.jit, static_argnames="count")
     def smoothed_noises(self, key: jax.Array, count: int) -> tuple[jax.Array, ...]:
         """Smoothed noises (E, n, count) of each recursion for data drawn from the linearised model, biases held."""
         return tuple(smooth.noises for _, smooth in self._simulated(key, count))
 
+    @partial(jax.jit, static_argnames="count")
     def _simulated(self, key: jax.Array, count: int) -> list[tuple[jax.Array, rec.Smoothed]]:
         """Trajectories (E, n, count) drawn from the motion, less its drift, and what smoothing makes of their data."""
         found = []

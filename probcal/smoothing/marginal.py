@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from probcal.model.model import At, Model
 from probcal.priors import Precision
 from probcal.smoothing import recursion as rec
+from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
 from probcal.smoothing.mode import (
     DAMPING,
     HALVINGS,
@@ -39,6 +40,7 @@ TRACK_STEPS, SETTLED = 5, 1e-10  # of Gauss-Newton after every step of the biase
 # moves with the trajectories to first order
 
 
+@jax.jit
 def volume_slope(model: Model, point: Point, solved: Eliminated) -> tuple[jax.Array, jax.Array]:
     """Derivative (M,) of log det W by z at a point whose trajectories are at their mode, these following.
 
@@ -141,11 +143,6 @@ class _Search(NamedTuple):
     done: jax.Array
 
 
-def _valued(model: Model, point: Point, prior: Precision) -> tuple[Eliminated, jax.Array]:
-    solved = eliminate(model, point, expected=True)
-    return solved, cost(model, point, prior) + 0.5 * solved.logdet
-
-
 def _secant(matrix: jax.Array, step: jax.Array, change: jax.Array) -> jax.Array:
     """What makes a curvature (M, M) agree with the change of the slope along a step: BFGS, where it stays positive."""
     image, curved = matrix @ step, step @ change
@@ -158,8 +155,81 @@ def _secant(matrix: jax.Array, step: jax.Array, change: jax.Array) -> jax.Array:
 
 
 @jax.jit
+def _begun(model: Model, start: Point) -> _Search:
+    """The search before the first look."""
+    M, zero, no = model.biases, jnp.zeros(()), jnp.zeros((), bool)
+    blank = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: eliminate(model, start, expected=True))
+    )
+    none = jnp.zeros(M)
+    return _Search(
+        start, blank, zero * jnp.nan, zero, none, jnp.zeros((M, M)), none, zero, jnp.ones(()), zero, no,
+        jnp.zeros((), int), no, no,
+    )  # fmt: skip
+
+
+@jax.jit
+def _tried(model: Model, s: _Search) -> Point:
+    """The point that is looked at next, its tracks not yet at their mode: the start, or a part of the step away."""
+    moved = follow(model, s.point, s.solved, s.share * s.step)
+    return jax.tree.map(lambda new, old: jnp.where(s.iteration == 0, old, new), moved, s.point)
+
+
+@jax.jit
+def _valued(
+    model: Model, s: _Search, point: Point, prior: Precision, solved: Eliminated
+) -> tuple[jax.Array, jax.Array]:
+    """Negative log marginal density of a point, and whether it is the next of the search."""
+    value = cost(model, point, prior) + 0.5 * solved.logdet
+    better = (s.value - value >= ENOUGH * s.share * s.promised) & (value <= s.value)
+    return value, better | (s.iteration == 0)
+
+
+@jax.jit
+def _turned(
+    s: _Search, point: Point, solved: Eliminated, value: jax.Array, volume: jax.Array, prior: Precision, tolerance: Any
+) -> _Search:
+    """The search at a better point, with the next step."""
+    score = solved.score - prior.pull(point.z) - 0.5 * volume
+    matrix = solved.information + prior.matrix()
+    bent = s.bent + _secant(matrix + s.bent, point.z - s.point.z, s.score - score)
+    damping = jnp.where(s.share >= SHORT, s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
+    damping = jnp.where(damping < 1e-6, 0.0, damping)
+    step = Dense.of(matrix + bent + damping * jnp.eye(len(score))).solve(score)
+    promised = 0.5 * score @ step
+    found = (promised <= tolerance) & (damping <= 1.0) & jnp.isfinite(value)
+    first = s.iteration == 0
+    return _Search(
+        point, solved, value, jnp.where(first, value, s.begun), score, bent, step, promised, jnp.ones(()), damping,
+        s.moved | ~first, s.iteration + 1, found, found | ~jnp.isfinite(value),
+    )  # fmt: skip
+
+
+@jax.jit
+def _shorter(s: _Search, prior: Precision) -> _Search:
+    """The search with half the step, or with more damping where that was tried often enough.
+
+    A step that promised less than the rounding of the density, and shows nothing, is the end.
+    """
+    found = (s.promised <= ROUNDING * jnp.abs(s.value)) & (s.damping <= 1.0)
+    spent = s.share <= 0.5**HALVINGS
+    damping = jnp.where(spent, jnp.maximum(s.damping * 10.0, 1e-3), s.damping)
+    matrix = s.solved.information + prior.matrix() + s.bent + damping * jnp.eye(len(s.score))
+    step = jnp.where(spent, Dense.of(matrix).solve(s.score), s.step)
+    return s._replace(
+        step=step, promised=0.5 * s.score @ step, share=jnp.where(spent, 1.0, 0.5 * s.share), damping=damping,
+        iteration=s.iteration + spent, converged=found, done=found | (damping > DAMPING),
+    )  # fmt: skip
+
+
+@jax.jit
+def _ended(s: _Search) -> Mode:
+    refused, volume = ~s.moved & ~s.converged, 0.5 * s.solved.logdet
+    return Mode(s.point, s.value, s.iteration - 1, s.converged, refused, s.begun - s.value, volume)
+
+
 def find_marginal_mode(
-    model: Model, start: Point, prior: Precision, iterations: int, tolerance: float
+    model: Model, start: Point, prior: Precision, iterations: int, tolerance: Any
 ) -> tuple[Mode, Eliminated]:
     """Climb to the mode of the marginal density until a step promises less than `tolerance`; levels are held.
 
@@ -167,61 +237,34 @@ def find_marginal_mode(
     secants say of log det W (BFGS), which along what motion noise alone fixes doubles it. A step that does not bring
     its share of what it promises is halved, then damped. The cost of the mode is that of the marginal density; the
     system eliminated there comes with it.
+
+    Called from Python it goes from step to step by kernels that other parts of a fit use too; inside a compiled
+    function it is a loop of that.
     """
     flat = Precision.single(jnp.zeros_like(start.z))
 
+    def look(s: _Search) -> tuple[Point, Eliminated, jax.Array, jax.Array]:
+        point = find_mode(model, _tried(model, s), flat, TRACK_STEPS, SETTLED, joint=False).point
+        _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
+        return point, solved, *_valued(model, s, point, prior, solved)
+
     def turned(s: _Search, point: Point, solved: Eliminated, value: jax.Array) -> _Search:
-        """The search at a better point, with the next step."""
         volume, _ = volume_slope(model, point, solved)
-        score = solved.score - prior.pull(point.z) - 0.5 * volume
-        matrix = solved.information + prior.matrix()
-        bent = s.bent + _secant(matrix + s.bent, point.z - s.point.z, s.score - score)
-        damping = jnp.where(s.share >= SHORT, s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
-        damping = jnp.where(damping < 1e-6, 0.0, damping)
-        step = Dense.of(matrix + bent + damping * jnp.eye(model.biases)).solve(score)
-        promised = 0.5 * score @ step
-        found = (promised <= tolerance) & (damping <= 1.0) & jnp.isfinite(value)
-        first = s.iteration == 0
-        return _Search(
-            point, solved, value, jnp.where(first, value, s.begun), score, bent, step, promised, jnp.ones(()), damping,
-            s.moved | ~first, s.iteration + 1, found, found | ~jnp.isfinite(value),
-        )  # fmt: skip
+        return _turned(s, point, solved, value, volume, prior, tolerance)
 
     def shorter(s: _Search, *_: Any) -> _Search:
-        """The search with half the step, or with more damping where that was tried often enough.
+        return _shorter(s, prior)
 
-        A step that promised less than the rounding of the density, and shows nothing, is the end.
-        """
-        found = (s.promised <= ROUNDING * jnp.abs(s.value)) & (s.damping <= 1.0)
-        spent = s.share <= 0.5**HALVINGS
-        damping = jnp.where(spent, jnp.maximum(s.damping * 10.0, 1e-3), s.damping)
-        matrix = s.solved.information + prior.matrix() + s.bent + damping * jnp.eye(model.biases)
-        step = jnp.where(spent, Dense.of(matrix).solve(s.score), s.step)
-        return s._replace(
-            step=step, promised=0.5 * s.score @ step, share=jnp.where(spent, 1.0, 0.5 * s.share), damping=damping,
-            iteration=s.iteration + spent, converged=found, done=found | (damping > DAMPING),
-        )  # fmt: skip
+    s = _begun(model, start)
+    if not isinstance(s.value, jax.core.Tracer):
+        while not s.done and s.iteration <= iterations:
+            point, solved, value, better = look(s)
+            s = turned(s, point, solved, value) if better else shorter(s)
+        return _ended(s), s.solved
 
     def body(s: _Search) -> _Search:
-        first = s.iteration == 0
-        tried = follow(model, s.point, s.solved, s.share * s.step)
-        tried = jax.tree.map(lambda new, old: jnp.where(first, old, new), tried, s.point)
-        tried = find_mode(model, tried, flat, TRACK_STEPS, SETTLED, joint=False).point
-        solved, value = _valued(model, tried, prior)
-        better = (s.value - value >= ENOUGH * s.share * s.promised) & (value <= s.value)
-        return jax.lax.cond(better | first, turned, shorter, s, tried, solved, value)
+        point, solved, value, better = look(s)
+        return jax.lax.cond(better, turned, shorter, s, point, solved, value)
 
-    M, zero, no = model.biases, jnp.zeros(()), jnp.zeros((), bool)
-    blank = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: eliminate(model, start, expected=True))
-    )
-    none = jnp.zeros(M)
-    first = _Search(
-        start, blank, zero * jnp.nan, zero, none, jnp.zeros((M, M)), none, zero, jnp.ones(()), zero, no,
-        jnp.zeros((), int), no, no,
-    )  # fmt: skip
-    last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration <= iterations), body, first)
-    refused, volume = ~last.moved & ~last.converged, 0.5 * last.solved.logdet
-    gained = last.begun - last.value
-    mode = Mode(last.point, last.value, last.iteration - 1, last.converged, refused, gained, volume)
-    return mode, last.solved
+    last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration <= iterations), body, s)
+    return _ended(last), last.solved
