@@ -37,7 +37,7 @@ def first(benchmark, work):
 def test_a_map_of_100_x_100_cells(benchmark, biases):
     """All cells in one call; `ratio` is what a Python loop over the compiled bound of one cell takes over it."""
     problem, _ = radars.setting()
-    first(benchmark, lambda: bound_map(problem, AREA, CELLS, biases=biases))
+    first(benchmark, lambda: bound_map(problem, AREA, cells=CELLS, biases=biases))
     at = snapshot(problem)
     M = len(at.labels)
     places = np.random.default_rng(0).uniform(0, radars.AREA, (1 + SAMPLE, 1, 2))

@@ -48,7 +48,7 @@ def beacons(run, change=None, noise=0.5, path=None, outliers=0.0):
         time = 0.5 * np.arange(100)
         route = path(time) if path else np.stack([40 + 30 * np.cos(time / 7), 22 + 16 * np.sin(time / 4.5)], 1)
         drawn = simulate(
-            placed, networks.motion("beacons"), time, run,
+            placed, networks.motion("beacons"), time, key=run,
             biases=drawn.truth.biases, tracks={"target": route}, outliers=outliers,
         )  # fmt: skip
     table = drawn.table.copy()
@@ -88,7 +88,7 @@ def directions(run, places, free, path, motion):
     """Direction finders, the first one known; biases drawn at their scales."""
     network = Network([doa.on(Node(f"d{k}", place, scale=free if k else None)) for k, place in enumerate(places)])
     time = np.arange(float(len(path)))
-    drawn = simulate(network, motion, time, run, share=1.0, tracks={"target": path})
+    drawn = simulate(network, motion, time, key=run, share=1.0, tracks={"target": path})
     return Problem(network, motion, drawn.table), drawn.truth
 
 

@@ -61,7 +61,7 @@ def biases(key=0):
 
 def scenario(key=0):
     """Table and truth of one run."""
-    return simulate(network(), motion(), TIME, key, biases=biases(key), tracks={"target": path()})
+    return simulate(network(), motion(), TIME, key=key, biases=biases(key), tracks={"target": path()})
 
 
 def problem(data=None):

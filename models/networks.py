@@ -183,7 +183,7 @@ def recording(network="beacons", run=0, share=0.3):
         loss = 4.0 * rng.normal()
         biases |= {label: loss + 0.3 * rng.normal() for label in biases if label.endswith("gain")}
     path = pd_frame(_path(network, time, rng))
-    return placed, simulate(placed, motion(network), time, run, biases=biases, tracks={"target": path})
+    return placed, simulate(placed, motion(network), time, key=run, biases=biases, tracks={"target": path})
 
 
 def own_path(network="beacons", run=0, share=0.3, noise=0.05):
@@ -192,7 +192,7 @@ def own_path(network="beacons", run=0, share=0.3, noise=0.05):
     middle = np.mean([node.position for node in placed.nodes], 0)
     begin = {"position": (tuple(middle + rng.uniform(-15, 15, 2)), 1.0), "velocity": ((0.0, 0.0), 0.5)}
     target = Target(motion(network, noise), begin)
-    drawn = simulate(placed, target, times(network), run, share=share)
+    drawn = simulate(placed, target, times(network), key=run, share=share)
     return Problem(placed, target, drawn.table), drawn.truth
 
 

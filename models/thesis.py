@@ -51,7 +51,7 @@ def nodes(**spread):
 def scenario(key=0):
     """Table and truth of one run of the flight-time sensors."""
     network = Network([flight_time.on(node) for node in nodes(scale=SCALE)])
-    return simulate(network, target(), np.arange(float(SCANS)), key, share=SHARE, tracks={"target": path()})
+    return simulate(network, target(), np.arange(float(SCANS)), key=key, share=SHARE, tracks={"target": path()})
 
 
 def problem(data=None):

@@ -22,7 +22,11 @@ from probcal.geometry import wrap
 
 @dataclass(frozen=True)
 class Unknown:
-    """A noise level that is estimated along: a guess, known to within a factor (one standard deviation)."""
+    """A noise level that is estimated along: a guess, known to within a factor (one standard deviation).
+
+    >>> Unknown(0.5, factor=3.0).guess
+    0.5
+    """
 
     guess: float
     factor: float = 3.0
@@ -227,7 +231,11 @@ class Normal(AdditiveNoise):
 
 @dataclass(frozen=True)
 class StudentT(AdditiveNoise):
-    """Additive Student-t noise with scale `std` and `df` degrees of freedom, for channels with outliers."""
+    """Additive Student-t noise with scale `std` and `df` degrees of freedom, for channels with outliers.
+
+    >>> bool(StudentT(4.0).log_likelihood(10.0, 0.0, 1.0, None) > -10.0)  # a Gaussian has -50.9
+    True
+    """
 
     df: float = 4.0
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from os import PathLike
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -58,6 +58,24 @@ class Epochs:
         return next((start, stop) for name, start, stop, _ in self.layout if name == "position")
 
 
+class _Chained(NamedTuple):
+    """The targets of one recursion, one after the other."""
+
+    recursion: Recursion
+    epochs: Epochs
+    epoch_of: np.ndarray  # (rows,) of the table, -1 of other targets
+
+
+class _Gathered(NamedTuple):
+    """The rows of one sensor type that one recursion explains."""
+
+    block: Block
+    rows: Rows
+    recursion: int
+    mine: np.ndarray  # rows of the table
+    columns: tuple[str, ...]  # channels
+
+
 class Problem:
     """A network, the motion of its targets and a table of rows, compiled to arrays.
 
@@ -65,6 +83,10 @@ class Problem:
     path or a DataFrame. `fix` holds biases at a value: labels or patterns (`"beacon_0.*"`) at 0, or a mapping
     to values. `silent` names the sensors without rows: `fit` refuses them, `track` does not. Raises `InputError`
     naming what is wrong.
+
+    >>> free = Problem(network, motion, run.table, fix="sonar_0.*")
+    >>> free.model.biases, problem.model.biases
+    (8, 12)
     """
 
     @float64
@@ -256,88 +278,88 @@ class Problem:
 
     def _compile(self, begun: Mapping[str, float] = MappingProxyType({})) -> None:
         """Arrays of the rows; the targets in `begun` go on from an earlier epoch at that time."""
-        data = self.measurements
-        targets = {name: self.target(name) for name in data.target_names}
-        motions = {name: as_motion(target.motion) for name, target in targets.items()}
-        levels, area = Levels(self.levels if begun else ()), self.area
-        forms: dict[tuple[Layout, SampledMotion | None], list[str]] = {}
-        for name, motion in motions.items():
-            layout, sampled = form_of(name, motion, levels, self.network.dimension)
-            if "position" not in {component for component, *_ in layout}:
-                raise InputError(f'target "{name}": the motion has no position; add ConstantVelocity(std) or Static()')
-            forms.setdefault((layout, sampled), []).append(name)
-        recursions: list[Any] = []
-        self.epochs: list[Epochs] = []
-        epoch_of = np.zeros(len(data.time), int)
-        recursion_of = np.zeros(len(data.time), int)
-        for r, ((layout, _), names) in enumerate(forms.items()):
-            parts: list[Any] = []
-            offset = 0
-            times: list[np.ndarray] = []
-            owners = []
-            drives: list[tuple[Any, int]] = []
-            for name in names:
-                rows = data.target == data.target_names.index(name)
-                time = np.unique(data.time[rows])
-                if getattr(motions[name], "static", False) and name not in begun:
-                    time = time[:1]
-                else:
-                    epoch_of[rows] = np.searchsorted(time, data.time[rows])
-                epoch_of[rows] += offset
-                recursion_of[rows] = r
-                offset += len(time)
-                arrays = chain(name, targets[name], time, levels, begun.get(name), area)
-                first = np.arange(len(time)) == (0 if name not in begun else -1)
-                dt = np.diff(time, prepend=begun.get(name, time[0]))
-                own = tails_of(targets[name], len(time), name not in begun, self.network.dimension)
-                drives += [(tail, offset - len(time)) for tail in own]
-                parts.append((*arrays, time, dt, first, np.full(len(time), len(times))))
-                times.append(time)
-                owners.append(np.full(len(time), name))
-            columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
-            recursions.append(Recursion(*columns)._replace(tails=_tails(drives, offset)))
-            components = labels_of(layout, self.network.dimension)
-            self.epochs.append(Epochs(np.concatenate(times), np.concatenate(owners), layout, components))
-        blocks: list[Block] = []
-        rows_of: list[Any] = []
-        recursion_index: list[int] = []
-        self.row_index: list[np.ndarray] = []  # rows of the table behind each block
-        self.columns: list[tuple[str, ...]] = []  # their channels
-        for kind in self.network.types:
-            level_of = channel_levels(kind, self.network.dimension, levels)
-            for r, epochs in enumerate(self.epochs):
-                chosen = self._rows_of(kind, recursion_of == r)
-                if len(chosen):
-                    block = make_block(self.network, kind, epochs.layout)
-                    blocks.append(block)
-                    rows_of.append(Rows(**self._rows(block, chosen, epoch_of[chosen], level_of)))
-                    recursion_index.append(r)
-                    self.row_index.append(chosen)
-                    self.columns.append(tuple(name for name, _ in kind.expand(self.network.dimension)))
+        levels = Levels(self.levels if begun else ())
+        forms = self._forms(levels)
+        chained = [self._chained(layout, names, levels, begun) for (layout, _), names in forms.items()]
+        self.epochs = [own.epochs for own in chained]
+        gathered = self._gathered(levels, chained)
+        self.row_index = [own.mine for own in gathered]  # rows of the table behind each block
+        self.columns = [own.columns for own in gathered]  # their channels
         self.levels = tuple(levels.records)
+        free = len(self.levels)
+        recursions = tuple(_numbered(own.recursion, free) for own in chained)
+        rows = tuple(_numbered(own.rows, free) for own in gathered)
         sampled_of_each = tuple(sampled for _, sampled in forms)
-        driven = any((r.level >= 0).any() for r in recursions) or any(
+        driven = any((own.recursion.level >= 0).any() for own in chained) or any(
             number >= 0 for sampled in sampled_of_each if sampled is not None for *_, number in sampled.levels
         )
         spread: Any = np.array([np.log(level.factor) for level in self.levels])
-        recursions = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in recursions]
-        rows_of = [r._replace(level=np.where(r.level < 0, len(self.levels), r.level)) for r in rows_of]
         # put, not `asarray`: that compiles a copy for every new shape
         self.model = jax.device_put(
             Model(
-                tuple(blocks),
-                tuple(recursion_index),
+                tuple(own.block for own in gathered),
+                tuple(own.recursion for own in gathered),
                 len(self.biases),
                 driven,
                 tuple(len(dict.fromkeys(epochs.target)) for epochs in self.epochs),
                 all(bool((np.linalg.slogdet(part.L)[0] != 0).all()) for part in recursions),
                 sampled_of_each,
-                tuple(recursions),
-                tuple(rows_of),
+                recursions,
+                rows,
                 spread,
             ),
             may_alias=False,
         )
+
+    def _forms(self, levels: Levels) -> dict[tuple[Layout, SampledMotion | None], list[str]]:
+        """The targets whose states are alike, by layout and motion without linear form: one recursion each."""
+        forms: dict[tuple[Layout, SampledMotion | None], list[str]] = {}
+        for name in self.measurements.target_names:
+            layout, sampled = form_of(name, as_motion(self.target(name).motion), levels, self.network.dimension)
+            if "position" not in {component for component, *_ in layout}:
+                raise InputError(f'target "{name}": the motion has no position; add ConstantVelocity(std) or Static()')
+            forms.setdefault((layout, sampled), []).append(name)
+        return forms
+
+    def _chained(self, layout: Layout, names: list[str], levels: Levels, begun: Mapping[str, float]) -> _Chained:
+        """The epochs of some targets, one target after the other, and the epoch of each of their rows."""
+        data, area, dimension = self.measurements, self.area, self.network.dimension
+        epoch_of = np.full(len(data.time), -1)
+        parts, drives, times = list[Any](), list[tuple[Any, int]](), list[np.ndarray]()
+        offset = 0
+        for name in names:
+            target = self.target(name)
+            rows = data.target == data.target_names.index(name)
+            time = np.unique(data.time[rows])
+            if getattr(as_motion(target.motion), "static", False) and name not in begun:
+                time = time[:1]
+            epoch_of[rows] = offset + np.minimum(np.searchsorted(time, data.time[rows]), len(time) - 1)
+            arrays = chain(name, target, time, levels, begun.get(name), area)
+            first = np.arange(len(time)) == (0 if name not in begun else -1)
+            dt = np.diff(time, prepend=begun.get(name, time[0]))
+            drives += [(tail, offset) for tail in tails_of(target, len(time), name not in begun, dimension)]
+            parts.append((*arrays, time, dt, first, np.full(len(time), len(times))))
+            times.append(time)
+            offset += len(time)
+        columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        recursion = Recursion(*columns)._replace(tails=_tails(drives, offset))
+        owners = np.repeat(names, [len(time) for time in times])
+        epochs = Epochs(np.concatenate(times), owners, layout, labels_of(layout, dimension))
+        return _Chained(recursion, epochs, epoch_of)
+
+    def _gathered(self, levels: Levels, chained: list[_Chained]) -> list[_Gathered]:
+        """Rows by sensor type and recursion."""
+        found = []
+        for kind in self.network.types:
+            level_of = channel_levels(kind, self.network.dimension, levels)
+            columns = tuple(name for name, _ in kind.expand(self.network.dimension))
+            for r, own in enumerate(chained):
+                chosen = self._rows_of(kind, own.epoch_of >= 0)
+                if len(chosen):
+                    block = make_block(self.network, kind, own.epochs.layout)
+                    rows = Rows(**self._rows(block, chosen, own.epoch_of[chosen], level_of))
+                    found.append(_Gathered(block, rows, r, chosen, columns))
+        return found
 
     def _rows_of(self, kind: Any, inside: np.ndarray) -> np.ndarray:
         ours = [k for k, placed in enumerate(self.network.sensors) if placed.type == kind]
@@ -418,6 +440,12 @@ class Problem:
                     if b.label in number:
                         bias[s, j], scale[s, j] = number[b.label], b.scale
         return {"bias": bias, "scale": scale, "base": base}, starts
+
+
+def _numbered[P: (Recursion, Rows)](part: P, free: int) -> P:
+    """Arrays whose known levels have the number after those of the `free` ones."""
+    level: Any = np.where(part.level < 0, free, part.level)
+    return part._replace(level=level)
 
 
 def _tails(drives: list[tuple[Any, int]], epochs: int) -> tuple[Tail, ...]:

@@ -30,6 +30,9 @@ class Drift:
     `std`, in the bias's unit s^-1/2, makes a random walk: a step over dt has the known standard deviation
     std * sqrt(dt). `scale`, in its unit, is that of every step and governed by the prior chosen at the fit: a sparse
     one finds jumps. Raises `InputError` unless one of the two is positive and the times increase.
+
+    >>> Drift([0.0, 60.0, 120.0], scale=0.5).scale
+    0.5
     """
 
     times: Any
@@ -69,6 +72,9 @@ class Bias:
     The function receives nominal + bias, tables report the bias. `shared="type"` gives one bias to all
     sensors of the type. With a `drift` it changes in time: `<label>@<time>` is its step at that time, to the
     millisecond.
+
+    >>> Bias("m", 5.0).scale
+    5.0
     """
 
     unit: str
@@ -98,6 +104,9 @@ class Channel:
 
     `wrap=True` compares angles around the circle; `per_axis=True` makes one channel a coordinate
     (`position_x`, `position_y`, ...).
+
+    >>> Channel("rad", std=0.01, wrap=True).period  # doctest: +ELLIPSIS
+    6.28...
     """
 
     unit: str
@@ -297,6 +306,13 @@ def sensor(
     keyword-only arguments are its biases. `vectors` names the components of targets and poses that have one value an
     axis (`vectors=("wind",)`), besides position, velocity, acceleration and moment, which always do; all others are
     numbers. Raises `InputError` naming function and argument.
+
+    >>> from probcal.geometry import norm
+    >>> @sensor(range=Channel("m", std=0.5))
+    ... def sounder(target, pose, *, offset=Bias("m", 2.0)):
+    ...     return {"range": norm(target.position - pose.position) + offset}
+    >>> list(sounder.biases)
+    ['offset']
     """
     if isinstance(vectors, (str, Channel)) or not all(isinstance(name, str) for name in vectors):
         raise InputError(f'sensor vectors={vectors!r}: give the names of components, as in vectors=("wind",)')

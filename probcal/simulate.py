@@ -48,6 +48,9 @@ class Truth:
 
     `tracks` is a path or a DataFrame, in s and m where its headers state no unit. Raises `InputError` naming file, row
     and column.
+
+    >>> Truth(biases={"sonar_1.range_offset": 8.0}).biases
+    {'sonar_1.range_offset': 8.0}
     """
 
     tracks: pd.DataFrame | str | PathLike[str] | None = None
@@ -167,8 +170,8 @@ def simulate(
     network: Network,
     motion: Any,
     time: Any,
-    key: Key = 0,
     *,
+    key: Key = 0,
     share: float = 1.0,
     biases: Mapping[str, float] | None = None,
     tracks: Mapping[str, Any] | None = None,
@@ -182,6 +185,10 @@ def simulate(
     Biases are drawn from their scales, a `share` of them non-zero, unless given by label. `tracks` maps
     target names to positions (T, d) or to frames with state columns; what they leave out is drawn from the
     motion. `missing` data are left blank, `outliers` get `outlier_scale` times the noise on top.
+
+    >>> again = simulate(network, motion, np.arange(60.0), key=0, share=0.2, missing=0.1)
+    >>> again.table.columns.tolist()
+    ['time', 'sensor', 'range', 'azimuth']
     """
     for name, value in (("share", share), ("missing", missing), ("outliers", outliers)):
         if not 0 <= value <= 1:

@@ -71,7 +71,13 @@ class Measurements:
 
 
 def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
-    """Read a CSV file or take a DataFrame; raises `InputError` naming the file if it is not a table."""
+    """Read a CSV file or take a DataFrame; raises `InputError` naming the file if it is not a table.
+
+    >>> import pandas as pd
+    >>> table = read_table(pd.DataFrame({"time": [0.0, 1.0], "sensor": "sonar_0", "range": [52.1, None]}))
+    >>> table.source
+    'data'
+    """
     if isinstance(source, Table):
         return source
     if isinstance(source, pd.DataFrame):

@@ -133,7 +133,7 @@ MUTATIONS = [
     Mutation("model/epochs.py", "jnp.where(epoch.recursion == r, jnp.where", "jnp.where(epoch.recursion >= 0, jnp.where", "test_motion_protocol.py"),
     Mutation("model/epochs.py", "total = total + jax.lax.cond(", "total = jax.lax.cond(", "test_motion_protocol.py"),
     # problem.py
-    Mutation("problem.py", "epoch_of[rows] += offset", "epoch_of[rows] += 0", "test_exact.py"),
+    Mutation("problem.py", "epoch_of[rows] = offset + np.minimum(", "epoch_of[rows] = np.minimum(", "test_exact.py"),
     Mutation("problem.py", "side=\"right\") - 1", "side=\"left\") - 1", "test_exact.py test_drift.py"),
     Mutation("problem.py", "level=np.where(own, -1,", "level=np.where(own, 0,", "test_formulas.py"),
     Mutation("model/motions.py", "pace, wander = area.wide * extent / duration", "pace, wander = area.wide * extent", "test_formulas.py test_model.py"),

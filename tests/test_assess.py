@@ -552,7 +552,7 @@ def small(sensors_=3, **spread):
     nodes = [Node(f"n{k}", place, **spread) for k, place in enumerate(places)]
     network = Network([probcal.sensors.ranger.on(node) for node in nodes])
     path = np.stack([20 + 2.0 * np.arange(30), 40 + 20 * np.sin(0.2 * np.arange(30))], 1)
-    run = simulate(network, ConstantVelocity(1.0), np.arange(30.0), 2, share=0.0, tracks={"car": path})
+    run = simulate(network, ConstantVelocity(1.0), np.arange(30.0), key=2, share=0.0, tracks={"car": path})
     return network, path, run.table
 
 
@@ -587,7 +587,7 @@ def test_events_that_hardly_ever_happen_raise_no_alarm():
     seen = [probcal.sensors.presence.on(Node(f"q{k}", place, scale=2.0)) for k, place in enumerate(places)]
     network, path, _ = small()
     network = Network([*network.sensors, *seen])
-    run = simulate(network, ConstantVelocity(1.0), np.arange(30.0), 2, share=0.0, tracks={"car": path})
+    run = simulate(network, ConstantVelocity(1.0), np.arange(30.0), key=2, share=0.0, tracks={"car": path})
     problem = probcal.Problem(network, ConstantVelocity(1.0), run.table)
     out = assess(problem, probcal.fit(problem, EA()))
     kinds = list(zip(out["finding"]["kind"].values, out["finding"]["subject"].values, strict=True))

@@ -89,7 +89,7 @@ def test_the_bound_of_a_linear_problem_is_the_inverse_hessian(name):
     gauge = {"mixed": {"box.clock": 0.3}}.get(name, {})  # beside a free difference_offset
     problem = Problem(network, motion, table, fix=fixed | gauge)
     for kind, precision in (("posterior", np.ones(len(problem.labels))), ("hybrid", problem.surveyed.astype(float))):
-        tree = bounds(problem, kind, draws=2)
+        tree = bounds(problem, kind=kind, draws=2)
         with jax.enable_x64(True):
             covariance, variances = hessian(problem, precision)
         scale = np.outer(problem.scales, problem.scales)
@@ -113,7 +113,7 @@ def test_the_posterior_bound_is_the_hybrid_one_and_the_prior():
     problem = Problem(network, motion, table)
     track = pd.DataFrame({"time": [0.0, 5.0], "position_x": [0.0, 3.0], "position_y": [1.0, 1.0]})
     found = {
-        kind: bounds(problem, kind, truth=Truth(track, {"a.position_x": 1.0}), draws=3)
+        kind: bounds(problem, kind=kind, truth=Truth(track, {"a.position_x": 1.0}), draws=3)
         for kind in ("posterior", "hybrid", "parametric")
     }
     information = {k: np.linalg.inv(tree["bias"]["covariance"].values) for k, tree in found.items()}
@@ -139,12 +139,14 @@ def test_the_trajectory_is_eliminated_from_the_averaged_system():
     tree = bounds(problem, draws=4000)
     assert tree["bias"]["sd"].item() ** -2 == pytest.approx(4 / 0.25 + 1 / 4, rel=0.2)
     assert only(tree)["sd"].values[0, 0] ** -2 == pytest.approx(1 / 0.25 + 1 / 9, rel=0.01)
-    hybrid = bounds(problem, "hybrid", truth=Truth(biases={"a.offset": 2.0}))
+    hybrid = bounds(problem, kind="hybrid", truth=Truth(biases={"a.offset": 2.0}))
     assert hybrid["bias"]["sd"].item() ** -2 == pytest.approx(2.0**2 / (0.25 + 9), rel=1e-9)
     assert hybrid.attrs["message"] == "Every bias has a bound within its scale."
-    loose = bounds(problem, "hybrid", truth=Truth(biases={"a.offset": 0.5})).attrs["message"]
+    loose = bounds(problem, kind="hybrid", truth=Truth(biases={"a.offset": 0.5})).attrs["message"]
     assert loose == "Bounded beyond their scale, the data leave them to a prior: a.offset."
-    assert "some combination of a.offset" in bounds(problem, "hybrid").attrs["message"], "at 0 nothing is said of it"
+    assert "some combination of a.offset" in bounds(problem, kind="hybrid").attrs["message"], (
+        "at 0 nothing is said of it"
+    )
 
 
 @sensor(arrival=Channel("m", std=1.0))
@@ -170,12 +172,12 @@ def test_a_bias_without_a_bound_is_named_and_left_out():
     problem, truth = anchored(clock=True)
     whole, _ = anchored(clock=False)
     for kind in ("parametric", "hybrid"):
-        tree = bounds(problem, kind, truth=truth, draws=2)
+        tree = bounds(problem, kind=kind, truth=truth, draws=2)
         assert set(tree["unbounded"]["bias_label"].values) == {"a.clock", "a.range_offset"}
         assert "some combination of a.clock, a.range_offset; survey or fix" in tree.attrs["message"]
         for group in (tree["bias"].to_dataset(), only(tree)):
             assert all(np.isfinite(v).all() for v in group.data_vars.values() if v.dtype.kind == "f")
-        fixed = bounds(whole, kind, truth=truth, draws=2)
+        fixed = bounds(whole, kind=kind, truth=truth, draws=2)
         others = ["b.range_offset", "c.range_offset", "d.range_offset"]
         assert list(tree["bias"]["bias_label"].values) == others
         close(tree["bias"]["covariance"].values, fixed["bias"]["covariance"].sel(
@@ -199,9 +201,9 @@ def test_tracks_are_taken_as_they_are_given():
     problem = Problem(network, Target(ConstantVelocity(0.1), {"position": ((30, 90), 1), "velocity": (9, 0.1)}), table)
     track = pd.DataFrame({"time": [0.0, 3.0], "target": "a", "position_x": [0.0, 60.0], "position_y": [80.0, 50.0]})
     stated = track.assign(velocity_x=20.0, velocity_y=-10.0)
-    found, same = (bounds(problem, "hybrid", truth=Truth(t), draws=3) for t in (track, stated))
+    found, same = (bounds(problem, kind="hybrid", truth=Truth(t), draws=3) for t in (track, stated))
     close(found["bias"]["sd"].values, same["bias"]["sd"].values)
-    other = bounds(problem, "hybrid", truth=Truth(stated.assign(velocity_x=-20.0)), draws=3)
+    other = bounds(problem, kind="hybrid", truth=Truth(stated.assign(velocity_x=-20.0)), draws=3)
     pairs = zip(each_track(other), each_track(same), strict=True)
     assert max(abs(one["sd"].values / two["sd"].values - 1).max() for (_, one), (_, two) in pairs) > 0.01
     with pytest.raises(InputError, match='the true track of "a" does not reach time 2; extend it or drop the rows'):
@@ -212,9 +214,9 @@ def test_tracks_are_taken_as_they_are_given():
 def test_the_parametric_bound_without_tracks_takes_the_automatic_start():
     problem, truth = radars.setting(0, share=0.0, scenario="C2")
     problem = problem.rebuild(fix=["radar_0.*", "radar_1.*"])
-    known = bounds(problem, "parametric", truth=truth)["bias"]["sd"].values
+    known = bounds(problem, kind="parametric", truth=truth)["bias"]["sd"].values
     for given_truth in (None, Truth(biases=dict.fromkeys(problem.labels, 0.0))):
-        found = bounds(problem, "parametric", truth=given_truth)["bias"]["sd"].values
+        found = bounds(problem, kind="parametric", truth=given_truth)["bias"]["sd"].values
         change = np.abs(np.log(found / known))
         assert 0 < np.median(change) < np.log(1.1), "a start within noise of the truth has nearly its bounds"
         assert change.max() < np.log(2)
@@ -272,7 +274,7 @@ def test_errors_of_maximum_likelihood_at_low_noise_reach_the_parametric_bound():
     path = np.stack([50 + 15 * time, 100 + 5 * time + 20 * np.sin(time / 2)], 1)
     truth = Truth(pd.DataFrame({"time": time, "position_x": path[:, 0], "position_y": path[:, 1]}),
                   {"r1.heading": 0.1, "r2.position_x": -4.0, "r0.range_offset": 8.0})  # fmt: skip
-    tree = bounds(problem, "parametric", truth=truth)
+    tree = bounds(problem, kind="parametric", truth=truth)
     with jax.enable_x64(True):
         states = np.hstack([path, np.gradient(path, axis=0)])
         z = np.array([truth.biases.get(label, 0.0) for label in problem.labels]) / problem.scales
@@ -300,7 +302,7 @@ def test_a_turned_and_moved_world_has_the_same_bounds(world):
             pd.DataFrame(np.array(p) + time[:, None] * np.array(v), columns=axes).assign(time=time, target=name)
             for name, (p, v) in moved.starts.items()
         ]
-        tree = bounds(moved.problem(table), "parametric", truth=Truth(pd.concat(frames)))
+        tree = bounds(moved.problem(table), kind="parametric", truth=Truth(pd.concat(frames)))
         groups = {}
         for label, sd in tree["bias"]["sd"].to_series().items():
             groups.setdefault(label.split("_x")[0].split("_y")[0].split("_z")[0], []).append(sd**2)
@@ -331,7 +333,9 @@ def test_posterior_bound_of_c1_against_500_runs():
     problem, truth = setting(0)
     tree = bounds(problem, truth=Truth(truth.tracks), draws=200)
     bound = (tree["bias"]["sd"].values / problem.scales) ** 2
-    found = probcal.study(lambda run, share: setting(run), {"share": [1.0]}, {"map": (probcal.MAP(), Gaussian())}, runs)
+    found = probcal.study(
+        lambda run, share: setting(run), {"share": [1.0]}, {"map": (probcal.MAP(), Gaussian())}, runs=runs
+    )
     squares = found["error"].squeeze().transpose("run", "bias_label").values ** 2
     error, spread = squares.mean(), squares.mean(1).std() / np.sqrt(runs)
     each = squares.mean(0) / bound
@@ -397,13 +401,13 @@ def test_the_map_of_direction_finders_is_that_of_the_thesis():
     places, network = finders()
     problem = declared(wide_finders(network), azimuth=0.0)
     sigma = np.deg2rad(10.0)
-    known = bound_map(problem, AREA, (9, 7))
+    known = bound_map(problem, AREA, cells=(9, 7))
     assert known.sizes == {"y": 7, "x": 9, "node": 8, "axis": 2}
     assert known["determined"].all()
     np.testing.assert_allclose(known["x"][:2], [-20 + 140 / 18, -20 + 3 * 140 / 18])
     np.testing.assert_allclose(known["rmse"].values.ravel(), closed_form(places, cells_of(known), sigma), rtol=1e-10)
     prior = np.kron(np.eye(8), np.diag([4.0, 4.0, 0.01]))
-    unknown = bound_map(problem, AREA, (9, 7), biases="unknown")
+    unknown = bound_map(problem, AREA, cells=(9, 7), biases="unknown")
     expected = closed_form(places, cells_of(unknown), sigma, prior)
     np.testing.assert_allclose(unknown["rmse"].values.ravel(), expected, rtol=1e-10)
     assert (unknown["rmse"] > known["rmse"]).all()
@@ -430,7 +434,7 @@ def test_the_map_of_a_fit_has_its_means_and_its_covariance():
     root = 0.3 * scale[:, None] * random.standard_normal((len(kept), len(kept)))
     tree = calibration(kept, 0.5 * scale * random.standard_normal(len(kept)), root @ root.T, {"d0.heading": 0.2})
     problem = declared(network, azimuth=0.0)
-    found = bound_map(problem, AREA, 5, biases=tree)
+    found = bound_map(problem, AREA, cells=5, biases=tree)
     group, labels = tree["calibration"].to_dataset(), network.labels
     shift = group["mean"].to_series().reindex(labels, fill_value=0.0).to_numpy().reshape(8, 3)
     covariance = group["covariance"].reindex(bias_label=list(labels), bias_label_other=list(labels), fill_value=0.0)
@@ -440,23 +444,23 @@ def test_the_map_of_a_fit_has_its_means_and_its_covariance():
     np.testing.assert_allclose(found["rmse"].values.ravel(), expected, rtol=1e-8)
     assert found.attrs["biases"] == "fitted"
     with pytest.raises(InputError, match="bound_map: the tree of biases has no group calibration; give the result"):
-        bound_map(problem, AREA, 5, biases=tree["constant_data"])
+        bound_map(problem, AREA, cells=5, biases=tree["constant_data"])
 
 
 def test_a_turned_and_moved_world_has_a_turned_and_moved_map():
     places, network = finders()
-    found = bound_map(declared(network, azimuth=0.0), AREA, (9, 7), biases="unknown")
+    found = bound_map(declared(network, azimuth=0.0), AREA, cells=(9, 7), biases="unknown")
     shift = np.array([300.0, -70.0])
     turned = network_of(np.stack([-places[:, 1], places[:, 0]], 1) + shift, np.full(8, np.pi / 2))
     area = ((-110 + shift[0], 10 + shift[0]), (-20 + shift[1], 120 + shift[1]))
-    other = bound_map(declared(turned, azimuth=0.0), area, (7, 9), biases="unknown")
+    other = bound_map(declared(turned, azimuth=0.0), area, cells=(7, 9), biases="unknown")
     np.testing.assert_allclose(other["rmse"].values, found["rmse"].values[::-1].T, rtol=1e-8)
 
 
 def test_a_position_that_is_not_determined_is_capped_and_marked():
     """Two direction finders say nothing along the line through both."""
     network = Network([sensors.doa.on(Node("a", (0, 0))), sensors.doa.on(Node("b", (40, 0)))])
-    found = bound_map(declared(network, azimuth=0.0), ((-50, 90), (-30, 30)), (7, 5))
+    found = bound_map(declared(network, azimuth=0.0), ((-50, 90), (-30, 30)), cells=(7, 5))
     assert (found["determined"].values == (np.abs(found["y"].values) > 1)[:, None]).all()
     size = np.hypot(140, 60)
     np.testing.assert_allclose(found["rmse"].where(~found["determined"], drop=True), size)
@@ -469,7 +473,7 @@ def test_further_components_are_marginalised_and_known_ones_are_not():
     places = np.random.default_rng(1).uniform(0, 100, (5, 2))
     network = Network([sensors.toa.on(Node(f"t{k}", p)) for k, p in enumerate(places)])
     wide, tight = (
-        bound_map(declared(network, ConstantVelocity(1.0) + White("emission", "m", std), arrival=0.0), AREA, 4)
+        bound_map(declared(network, ConstantVelocity(1.0) + White("emission", "m", std), arrival=0.0), AREA, cells=4)
         for std in (1e5, 1e-5)
     )
     for found, projector in ((wide, np.eye(5) - 0.2), (tight, np.eye(5))):
@@ -485,9 +489,9 @@ def test_a_map_in_space_at_a_height_with_a_moving_node():
     first = pd.DataFrame({"time": [5.0], "sensor": ["b"], "azimuth": [0.0]})
     motion = {"plane": ConstantVelocity(1.0), "post": Static()}
     problem = Problem(network, motion, first.assign(target="plane"))
-    low, high = (bound_map(problem, AREA, 4, z=z, target="post") for z in (30.0, 300.0))
+    low, high = (bound_map(problem, AREA, cells=4, z=z, target="post") for z in (30.0, 300.0))
     np.testing.assert_allclose(low["node_position"].sel(node="mover"), [40.0, 0.0, 5.0])
-    late = bound_map(problem, AREA, 4, z=30.0, target="post", time=10.0)
+    late = bound_map(problem, AREA, cells=4, z=30.0, target="post", time=10.0)
     np.testing.assert_allclose(late["node_position"].sel(node="mover"), [80.0, 0.0, 5.0])
     assert abs(late["rmse"] / low["rmse"] - 1).max() > 0.05
     assert (low["rmse"] < high["rmse"]).all()
@@ -569,7 +573,7 @@ def test_sensitivity_of_ranges_to_small_biases_is_the_predicted_one():
 
 @pytest.mark.ci
 def test_pictures():
-    found = bound_map(declared(finders()[1], azimuth=0.0), AREA, (9, 7))
+    found = bound_map(declared(finders()[1], azimuth=0.0), AREA, cells=(9, 7))
     ax = plot_bound_map(found)
     assert ax.get_title(loc="left") == "Least position error, biases known"
     drawn = ax.collections[0].get_array()
@@ -595,14 +599,14 @@ def root(target, pose):
 @pytest.mark.parametrize(
     ("call", "text"),
     [
-        (lambda p: bounds(p, "bayes"), 'bounds: kind is "bayes"; known: parametric, posterior, hybrid'),
+        (lambda p: bounds(p, kind="bayes"), 'bounds: kind is "bayes"; known: parametric, posterior, hybrid'),
         (lambda p: bounds(p, draws=0), "bounds: draws=0; take at least one"),
         (lambda p: bounds(p, truth=Truth(biases={"a.gain": 1})), 'the truth names the bias "a.gain", which the'),
         (lambda p: bounds(declared(Network([root.on(Node("a", (0, 0)))]), level=0.0)),
          "bounds: a sensor is not finite at the trajectories drawn; give truth=Truth(tracks)"),
         (lambda p: bound_map(p, ((0, 0), (0, 1))), "bound_map: area is ((0, 0), (0, 1)); give ((x0, x1), (y0, y1))"),
-        (lambda p: bound_map(p, AREA, 0), "bound_map: cells is 0; give a positive number, or one along x"),
-        (lambda p: bound_map(p, AREA, 2.5), "bound_map: cells is 2.5; give a positive number"),
+        (lambda p: bound_map(p, AREA, cells=0), "bound_map: cells is 0; give a positive number, or one along x"),
+        (lambda p: bound_map(p, AREA, cells=2.5), "bound_map: cells is 2.5; give a positive number"),
         (lambda p: bound_map(p, AREA, biases="free"), "bound_map: biases is 'free'; give \"known\", \"unknown\" or"),
         (lambda p: bound_map(p, AREA, z=1.0), "bound_map: the network is 2-D; leave z out"),
         (lambda p: bound_map(p, AREA, target="cat"), 'there is no target "cat"'),
@@ -628,4 +632,4 @@ def test_a_known_target_needs_no_track():
     problem = Problem(network, Known(path), table)
     r = np.hypot(10 * np.arange(10), 50)
     expected = np.linalg.inv(np.array([[10, r.sum()], [r.sum(), (r**2).sum()]]))
-    close(bounds(problem, "hybrid", draws=2)["bias"]["covariance"].values, expected, 1e-9)
+    close(bounds(problem, kind="hybrid", draws=2)["bias"]["covariance"].values, expected, 1e-9)

@@ -110,7 +110,7 @@ def test_every_sensor_simulates_and_fits(name, d):
     kind = catalogue()[name]
     network = place(kind, d)
     motion = CV + EXTRAS[name] if name in EXTRAS else CV
-    run = simulate(network, motion, np.arange(25.0), 1, share=0.5, missing=0.1, tracks={"target": path(d)})
+    run = simulate(network, motion, np.arange(25.0), key=1, share=0.5, missing=0.1, tracks={"target": path(d)})
     problem = Problem(network, motion, run.table)
     tree = fit(problem, MAP(), save=("states", "predictive"))
     check_tree(tree, problem)
@@ -161,7 +161,7 @@ def test_every_method_on_a_mixed_network(method, d):
     )
     motions = {"car": Target(CV), "van": CV + POWER, "mast": Static()}
     tracks = {"car": path(d), "van": path(d, phase=2.0), "mast": path(d)[:1]}
-    run = simulate(network, motions, np.arange(25.0), 5, tracks=tracks, missing=0.2, outliers=0.0)
+    run = simulate(network, motions, np.arange(25.0), key=5, tracks=tracks, missing=0.2, outliers=0.0)
     late = run.table["sensor"].str.startswith("pole") & (run.table["target"] != "mast")
     table = run.table.drop(run.table[late & (run.table["time"] % 2 == 1)].index)
     problem = Problem(network, motions, table)
@@ -190,7 +190,7 @@ def test_a_small_mixed_network_is_fitted_from_the_table_alone():
     nodes.append(Node("robot", path=walk, survey={"heading": 0.01}))
     pairs = [sensors.tdoa.on(a, b) for a, b in itertools.pairwise(nodes[:4])]
     network = Network([*(sensors.radar.on(node) for node in nodes), *pairs])
-    run = simulate(network, CV, np.arange(15.0), 5, tracks={"target": path(2, 15)}, missing=0.2)
+    run = simulate(network, CV, np.arange(15.0), key=5, tracks={"target": path(2, 15)}, missing=0.2)
     late = (run.table["sensor"].str.contains("-")) & (run.table["time"] % 2 == 1)
     problem = Problem(network, CV, run.table[~late])
     tree = fit(problem, EA(precisions="maximised"))
@@ -217,7 +217,7 @@ MOTIONS = [
 @pytest.mark.parametrize(("motion", "d"), MOTIONS)
 def test_every_motion_tracks(motion, d):
     network = place(sensors.ranger, d)
-    run = simulate(network, motion, np.arange(25.0), 2, share=0.0, tracks={"target": path(d)})
+    run = simulate(network, motion, np.arange(25.0), key=2, share=0.0, tracks={"target": path(d)})
     problem = Problem(network, motion, run.table)
     tree = fit(problem, MAP())
     check_tree(tree, problem)
@@ -241,7 +241,7 @@ def test_a_known_track_calibrates(d, std):
     plan = [(t, node.name, target) for target, times in seen.items() for t in times for node in network.nodes]
     schedule = pd.DataFrame(plan, columns=["time", "sensor", "target"])
     tracks = {"car": path(d, phase=2.0)}
-    run = simulate(network, drawn, np.arange(25.0), 4, share=0.5, tracks=tracks, schedule=schedule)
+    run = simulate(network, drawn, np.arange(25.0), key=4, share=0.5, tracks=tracks, schedule=schedule)
     problem = Problem(network, drawn | {"plane": Known(frame(d), std)}, run.table)
     assert len(problem.epochs) == 1
     tree = fit(problem, MAP())
@@ -573,7 +573,7 @@ def test_a_microphone_and_a_geophone_share_the_displacement_of_their_node():
     motion = CV + EXTRAS["microphone"] + EXTRAS["geophone"]
     moved = {"node_3.position_x": 6.0, "node_3.position_y": -4.0}
     tracks = {"target": path(2)}
-    run = simulate(network, motion, np.arange(25.0), 3, tracks=tracks, biases=moved)
+    run = simulate(network, motion, np.arange(25.0), key=3, tracks=tracks, biases=moved)
 
     def sds(table):
         """Displacement over its sd, and the sd."""

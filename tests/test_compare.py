@@ -227,7 +227,7 @@ def test_interchangeable_pairs_trade_most():
     assert [pair[:2] for pair in others] == [("a.gain", "b.gain")], "a.heading and b.gain move together"
     assert not interchangeable(tree, among=["a.heading", "b.gain"]), "on two nodes they move together"
     z[..., 1] *= -1.0  # of one node the data may know the difference
-    assert interchangeable(synthetic([0, 0, 0], [1, 1, 1], draws=z), 1)[0][:2] == ("a.heading", "a.gain")
+    assert interchangeable(synthetic([0, 0, 0], [1, 1, 1], draws=z), count=1)[0][:2] == ("a.heading", "a.gain")
 
 
 GOOD = synthetic([0, 0, 0], [1, 1, 1], truth=TRUE)
@@ -242,10 +242,10 @@ def changed(change):
 ERRORS = [
     (lambda: compare([GOOD]), "compare: 1 fit(s) given; give at least two"),
     (lambda: compare([GOOD, xr.DataTree()]), "compare: number 2 of the fits is no result of fit(); give trees"),
-    (lambda: compare({"a": GOOD, "b": GOOD}, ["c", "d"]), "the fits have names already; give names to a sequence"),
-    (lambda: compare([GOOD, GOOD], ["a"]), "compare: 1 names for 2 fits; give each fit a name of its own"),
-    (lambda: compare([GOOD, GOOD], ["a", "a"]), "compare: 2 names for 2 fits; give each fit a name of its own"),
-    (lambda: compare([GOOD, GOOD], ["a", "b/c"]), 'compare: a fit cannot be called "b/c"; give a name of letters'),
+    (lambda: compare({"a": GOOD, "b": GOOD}, names=["c", "d"]), "names already; give names to a sequence"),
+    (lambda: compare([GOOD, GOOD], names=["a"]), "compare: 1 names for 2 fits; give each fit a name of its own"),
+    (lambda: compare([GOOD, GOOD], names=["a", "a"]), "compare: 2 names for 2 fits; give each fit a name of its own"),
+    (lambda: compare([GOOD, GOOD], names=["a", "b/c"]), 'a fit cannot be called "b/c"; give a name of letters'),
     (lambda: compare([GOOD, synthetic([0], [1], ["c.x"])]),
      '"EA (ARD)" and the others have no bias in common; compare'),
     (lambda: compare([GOOD, changed(lambda t: t["calibration"]["scale"].__setitem__(1, 2.0))]),
@@ -295,7 +295,7 @@ def saved():
 
 @pytest.mark.filterwarnings("ignore:Estimated shape parameter")
 def test_saved_fits_and_two_networks(saved):
-    found = compare(saved, ["EA", "MAP", "without"])
+    found = compare(saved, names=["EA", "MAP", "without"])
     labels = committed.tree("ea")["calibration"]["bias_label"].values.tolist()
     assert found["estimate"]["bias_label"].values.tolist() == [label for label in labels if label != "c.heading"]
     assert "1 of EA (c.heading), 1 of MAP (c.heading)" in sentences(found, "labels")[0]

@@ -62,7 +62,7 @@ def test_steps_have_times_scales_and_labels():
     assert walk.steps == ((1.0, 0.5), (5.0, 1.0))
     assert jumps.steps == ((0.25, 3.0),)
     network, motion = watched(walk, jumps)
-    table = simulate(network, motion, np.arange(8.0), 0).table
+    table = simulate(network, motion, np.arange(8.0), key=0).table
     problem = Problem(network, motion, table)
     kinds = {b.label: (b.kind, b.scale, b.since) for b in problem.biases if b.axis == 0}
     assert kinds == {
@@ -102,7 +102,7 @@ def test_what_it_refuses():
 def moved():
     """A recording in which `b` wanders, its truth, and the fit of the problem that lets it drift."""
     network, motion = watched(Drift(TIMES, std=0.8))
-    recording = simulate(network, motion, np.arange(50.0), 3)
+    recording = simulate(network, motion, np.arange(50.0), key=3)
     problem = Problem(network, motion, recording.table)
     return problem, recording, probcal.fit(problem, MAP(), prior=Gaussian())
 
@@ -169,7 +169,7 @@ def test_values_hold_fixed_steps_and_steps_before_the_data():
 @pytest.mark.slow
 def test_steps_before_and_after_the_data_change_nothing_else():
     network, motion = watched()
-    table = simulate(network, motion, np.arange(12.0), 1).table
+    table = simulate(network, motion, np.arange(12.0), key=1).table
     still = probcal.fit(Problem(network, motion, table), MAP(), prior=Gaussian())
     late = watched(Drift((0.0, 100.0), std=0.1))[0]
     tree = probcal.fit(Problem(late, motion, table), MAP(), prior=Gaussian())
@@ -196,7 +196,7 @@ def test_evidence_tells_a_drift_from_a_constant_bias():
     constant, motion = watched()
     walk = watched(Drift(TIMES, std=0.8))[0]
     for drifts, seed in ((False, 5), (True, 6)):
-        table = simulate(walk if drifts else constant, motion, np.arange(50.0), seed).table
+        table = simulate(walk if drifts else constant, motion, np.arange(50.0), key=seed).table
         fits = [probcal.fit(Problem(n, motion, table), MAP(), prior=Gaussian()) for n in (constant, walk)]
         still, moving = (tree.attrs["log_evidence"] for tree in fits)
         compared = probcal.compare({"constant": fits[0], "drifting": fits[1]})
@@ -214,7 +214,7 @@ def test_a_sparse_prior_finds_the_jump():
     """One step of a bias is large, the others zero: its inclusion stands out."""
     network, motion = watched(Drift(TIMES, scale=2.0))
     truth = {"b.position_x": 0.0, "b.position_x@20": 3.0}
-    table = simulate(network, motion, np.arange(50.0), 2, biases=truth).table
+    table = simulate(network, motion, np.arange(50.0), key=2, biases=truth).table
     problem = Problem(network, motion, table)
     tree = probcal.fit(problem, Collapsed(chains=2, draws=300, warmup=200), prior=BernoulliGaussian(), key=1)
     share = tree["calibration"].to_dataset()["inclusion"].to_series()
@@ -243,7 +243,7 @@ def test_a_clock_of_its_own_type_may_drift():
     network = Network([receiver.on(Node(name, (0.0, 0.0))) for name in "ab"])
     assert network.labels == ("receiver.delay", "receiver.delay@5")
     motion = Target(ConstantVelocity(0.1), start={"position": (0.0, 1.0), "velocity": (0.0, 1.0)})
-    problem = Problem(network, motion, simulate(network, motion, np.arange(10.0), 0).table)
+    problem = Problem(network, motion, simulate(network, motion, np.arange(10.0), key=0).table)
     assert [m["component"] for m in problem.members] == ["delay", "delay_step"]
 
 
@@ -274,7 +274,7 @@ def test_fixed_steps_and_steps_before_the_data_count_in_the_values():
     """A step fixed at its true 5 m, one 5 s before the data, one free: each piece has the sum of what began by then."""
     network, motion = watched(Drift((-9.0, -5.0, 4.0, 8.0), scale=3.0))
     truth = {"b.position_x": 1.0, "b.position_x@4": 5.0}
-    table = simulate(network, motion, np.arange(12.0), 0, biases=truth).table
+    table = simulate(network, motion, np.arange(12.0), key=0, biases=truth).table
     problem = Problem(network, motion, table, fix={"b.position_x@4": 5.0})
     found = drift_table(probcal.fit(problem, MAP(), prior=Gaussian())).query("bias == 'b.position_x'")
     assert list(found["since"]) == [0.0, 4.0, 8.0]
@@ -289,7 +289,7 @@ def test_fixed_steps_and_steps_before_the_data_count_in_the_values():
 def test_a_drifting_sensor_is_checked_whole():
     """Noise spoilt after the step is the sensor's, though its first piece is fine; and its node may be written."""
     network, motion = watched()
-    table = simulate(network, motion, np.arange(40.0), 0).table
+    table = simulate(network, motion, np.arange(40.0), key=0).table
     late = (table["sensor"] == "b") & (table["time"] > 8)
     table.loc[late, "position_x"] += 2.0 * np.random.default_rng(0).standard_normal(late.sum())
     node = Node("b", (50.0, 10.0), scale={"position": Bias("m", 2.0, drift=Drift((0.0, 8.0), std=1e-4))})
@@ -311,6 +311,6 @@ def test_a_node_stands_still_though_its_sensor_drifts(tmp_path):
     nodes = [Node(n, place, scale=1.0) for n, place in zip("abcd", [(0, 0), (50, 0), (0, 50), (60, 60)], strict=True)]
     target = Target(ConstantVelocity(0.3), start={"position": (20.0, 5.0), "velocity": (1.0, 1.0)})
     network = Network([kind.on(node) for node in nodes])
-    problem = Problem(network, target, simulate(network, target, np.arange(8.0), 0).table)
+    problem = Problem(network, target, simulate(network, target, np.arange(8.0), key=0).table)
     tree = probcal.fit(problem, MAP(), prior=Gaussian())
     assert len(probcal.write_nodes(tmp_path / "n.csv", tree).read_text().splitlines()) == 5

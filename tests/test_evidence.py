@@ -134,7 +134,7 @@ def test_many_precisely_known_biases_have_their_exact_evidence(size, std):
     G, h, height = likelihood(*of)
     matrix = G + np.eye(size)
     exact = height + 0.5 * (h @ np.linalg.solve(matrix, h) - np.linalg.slogdet(matrix)[1])
-    found = log_evidence(problem, Gaussian())
+    found = log_evidence(problem, prior=Gaussian())
     assert found.value == pytest.approx(exact, abs=1e-6)
     assert found.error < 1e-6
     assert found.khat == 0.0
@@ -150,7 +150,7 @@ def test_scales_are_integrated(kind):
     """Four biases against 4e5 draws of their scales, 12 keys: (value - exact) / error has an rms of one."""
     problem, *of = shifted(4, 0.3)
     exact, own = averaged(kind, problem, *of)
-    found = [log_evidence(problem, kind[1], key=k) for k in range(12)]
+    found = [log_evidence(problem, prior=kind[1], key=k) for k in range(12)]
     ratio = np.array([(one.value - exact) / np.hypot(one.error, own) for one in found])
     print(kind[1], np.round(ratio, 1))
     assert np.abs(ratio).max() < 4.0
@@ -167,7 +167,7 @@ def test_scales_of_many_precisely_known_biases_are_integrated(prior, size, std):
     problem, *of = shifted(size, std, walk=1e-5, spread=1e-5, share=0.2)
     exact = apart(prior, *of, std)
     for key in range(2):
-        found = log_evidence(problem, prior, key=key)
+        found = log_evidence(problem, prior=prior, key=key)
         print(prior, size, key, found.value - exact, found.error)
         assert abs(found.value - exact) < 3.0 * found.error
         assert found.error < 0.6

@@ -1,22 +1,49 @@
-"""The examples in docstrings run."""
+"""The examples in docstrings run; `problem`, `run` and `tree` in them are those of the README."""
 
 import doctest
 import importlib
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 import probcal
+from probcal import EA, Bias, Channel, ConstantVelocity, Network, Node, Problem, fit, load, sensor, simulate
+from probcal.geometry import bearing, norm
 
 ROOT = Path(probcal.__file__).parent
 SHOWN = [path for path in sorted(ROOT.rglob("*.py")) if ">>>" in path.read_text()]
 
 
+@sensor(range=Channel("m", std=1.0), azimuth=Channel("rad", std=0.01, wrap=True))
+def sonar(target, pose, *, range_offset=Bias("m", 5.0)):
+    line = target.position - pose.position
+    return {"range": norm(line) + range_offset, "azimuth": bearing(line) - pose.heading}
+
+
+@pytest.fixture(scope="module")
+def names():
+    """What the README has declared, simulated and fitted."""
+    turned = {"heading": np.deg2rad(5)}
+    nodes = [
+        Node("sonar_0", (0.0, 0.0), survey={"position": 0.05}, scale=turned),
+        Node("sonar_1", (200.0, 0.0), survey={"position": 0.05}, scale=turned),
+        Node("sonar_2", (80.0, 150.0), scale={"position": 5.0} | turned),
+    ]
+    network, motion = Network([sonar.on(node) for node in nodes]), ConstantVelocity(std=0.5)
+    path = np.stack([np.linspace(-50, 250, 60), 80 + 40 * np.sin(np.linspace(0, 6, 60))], axis=1)
+    biases = {"sonar_1.range_offset": 8.0, "sonar_2.heading": 0.1}
+    run = simulate(network, motion, np.arange(60.0), key=0, biases=biases, tracks={"target": path})
+    problem = Problem(network, motion, run.table)
+    found = {"network": network, "motion": motion, "run": run, "problem": problem, "tree": fit(problem, EA())}
+    return found | {"np": np, "Problem": Problem, "load": load}
+
+
 @pytest.mark.parametrize("path", SHOWN, ids=lambda path: path.stem)
-def test_the_examples_of_a_module_run(path):
+def test_the_examples_of_a_module_run(path, names):
     module = importlib.import_module(".".join(["probcal", *path.relative_to(ROOT).with_suffix("").parts]))
     with jax.enable_x64(True):
-        found = doctest.testmod(module)
+        found = doctest.testmod(module, extraglobs=names)
     assert found.attempted
     assert not found.failed

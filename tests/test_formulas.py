@@ -160,5 +160,5 @@ def test_a_drawn_angle_lies_where_it_is_predicted():
     network = Network([finder.on(Node("a", (0.0, 0.0)))])
     angle = np.linspace(-3.0, 3.0, 9)
     path = 10.0 * np.stack([np.cos(angle), np.sin(angle)], 1)
-    found = simulate(network, ConstantVelocity(1.0), np.arange(9.0), 0, tracks={"one": path}).table["azimuth"]
+    found = simulate(network, ConstantVelocity(1.0), np.arange(9.0), key=0, tracks={"one": path}).table["azimuth"]
     np.testing.assert_allclose(found, angle, atol=1e-3)

@@ -86,7 +86,7 @@ def gauges():
     network = Network([gauge.on(node) for node in nodes])
     path = np.stack([np.linspace(5, 40, 12), 10 + 20 * np.sin(np.linspace(0, 3, 12))], 1)
     biases = {label: 3.0 if label.startswith("gauge_1") else 0.0 for label in network.labels}
-    drawn = simulate(network, ConstantVelocity(0.5), np.arange(12.0), 3, tracks={"target": path}, biases=biases)
+    drawn = simulate(network, ConstantVelocity(0.5), np.arange(12.0), key=3, tracks={"target": path}, biases=biases)
     return network, drawn.table
 
 
@@ -236,7 +236,7 @@ def test_a_scene_that_collapses_is_no_answer():
     biases = dict.fromkeys(network.labels, 0.0) | {"d1.heading": np.deg2rad(4), "d2.position_x": 15.0}
     time = np.arange(0.0, 80.0, 2.0)
     path = np.stack([100 + 80 * np.cos(time / 12), 75 + 50 * np.sin(time / 7)], 1)
-    drawn = simulate(network, ConstantVelocity(0.5), time, 1, biases=biases, tracks={"target": path})
+    drawn = simulate(network, ConstantVelocity(0.5), time, key=1, biases=biases, tracks={"target": path})
     problem = Problem(network, ConstantVelocity(0.5), drawn.table)
     tree = probcal.fit(problem, EA.as_printed())
     trace = tree["optimisation"]["objective"].values
@@ -305,13 +305,13 @@ def test_a_bias_that_shares_an_open_combination_is_weak_and_names_it():
 def test_a_study_counts_misfits():
     def setting(run, spoilt):
         network = Network([ruler.on(Node(f"n{k}", (0.0, float(k)))) for k in range(2)])
-        drawn = simulate(network, ConstantVelocity(1.0), np.arange(4.0), run)
+        drawn = simulate(network, ConstantVelocity(1.0), np.arange(4.0), key=run)
         table = drawn.table.copy()
         if spoilt:
             table.loc[0, "height"] = -9999.0
         return Problem(network, ConstantVelocity(1.0), table), drawn.truth
 
-    found = probcal.study(setting, {"spoilt": [False, True]}, ["ea"], 2)
+    found = probcal.study(setting, {"spoilt": [False, True]}, ["ea"], runs=2)
     assert found["status"].sel(spoilt=True).values.ravel().tolist() == ["misfit"] * 2
     assert "misfit" not in found["status"].sel(spoilt=False).values
     assert study_table(found)["misfit"].tolist() == [0, 2]
@@ -321,7 +321,7 @@ def test_outliers_of_heavy_noise_and_rare_events_are_no_misfit():
     network = Network([heavy.on(Node("n", (0.0, 0.0)))])
     time = np.arange(8.0)
     drawn = simulate(
-        network, ConstantVelocity(1.0), time, 0, tracks={"target": np.zeros((8, 2))}, biases={"n.shift": 0.0}
+        network, ConstantVelocity(1.0), time, key=0, tracks={"target": np.zeros((8, 2))}, biases={"n.shift": 0.0}
     )
     table = drawn.table.assign(height=0.0, echo=0.0, seen=1.0)
     table.loc[3, ["height", "echo"]] = 500.0
@@ -383,7 +383,7 @@ def test_an_answer_far_from_gaussian_is_weak(stated):
     time = np.arange(60.0)
     track = np.stack([-600.0 + 20.0 * time, 1000.0 + 0.0 * time], 1)
     motion = ConstantVelocity(0.3)
-    drawn = simulate(Network(nodes), motion, time, 0, share=1.0, tracks={"target": track})
+    drawn = simulate(Network(nodes), motion, time, key=0, share=1.0, tracks={"target": track})
     start = {"position": ((-600.0, 1000.0), 50.0), "velocity": ((20.0, 0.0), 5.0)}
     problem = Problem(Network(nodes), Target(motion, start) if stated else motion, drawn.table)
     tree, answer = calibrate(problem, key=0)

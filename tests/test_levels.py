@@ -44,7 +44,7 @@ def gauges(std):
 @pytest.mark.ci
 def test_unknown_noise_and_process_noise_are_estimated_along():
     motion = probcal.Target(ConstantVelocity(1.5), {"position": ((30.0, 30.0), 1.0), "velocity": (0.0, 1.0)})
-    run = simulate(gauges(2.0), motion, np.arange(0, 60, 0.5), 3, share=0.3)
+    run = simulate(gauges(2.0), motion, np.arange(0, 60, 0.5), key=3, share=0.3)
     guess = probcal.Target(ConstantVelocity(Unknown(0.5, 5.0)), dict(motion.start))
     tree = fit(Problem(gauges(Unknown(0.8, 5.0)), guess, run.table), EA())
     assert tree.attrs["status"] == "converged"
@@ -67,7 +67,7 @@ def test_unknown_noise_and_process_noise_are_estimated_along():
 def test_every_method_estimates_an_unknown_level(method):
     path = np.stack([np.linspace(5, 55, 60), 30 + 20 * np.sin(np.linspace(0, 6, 60))], 1)
     biases, tracks = {"gauge_1.range_offset": 3.0}, {"target": path}
-    run = simulate(gauges(1.0), ConstantVelocity(0.5), np.arange(60.0), 1, biases=biases, tracks=tracks)
+    run = simulate(gauges(1.0), ConstantVelocity(0.5), np.arange(60.0), key=1, biases=biases, tracks=tracks)
     problem = Problem(gauges(Unknown(3.0, 5.0)), ConstantVelocity(0.5), run.table, fix=["gauge_0.range_offset"])
     tree = fit(problem, method)
     std = float(tree["level"]["std"].values[0])
@@ -80,7 +80,7 @@ def test_every_method_estimates_an_unknown_level(method):
 @pytest.mark.slow
 def test_a_gamma_hyper_prior_moves_the_fixed_point():
     path = np.stack([np.linspace(5, 55, 40), 30 + 20 * np.sin(np.linspace(0, 6, 40))], 1)
-    run = simulate(gauges(1.0), ConstantVelocity(0.5), np.arange(40.0), 1, tracks={"target": path})
+    run = simulate(gauges(1.0), ConstantVelocity(0.5), np.arange(40.0), key=1, tracks={"target": path})
     problem = Problem(gauges(1.0), ConstantVelocity(0.5), run.table)
     for prior in (ARD(), ARD(2.0, 1.5)):
         tree = fit(problem, EA(tolerance=1e-9), prior=prior)
@@ -98,7 +98,7 @@ def test_the_start_finds_the_track_without_any_hint():
     far = np.stack([np.linspace(150, 260, 40), np.linspace(-120, 80, 40)], 1)
     near = np.stack([np.linspace(5, 55, 40), 30 + 20 * np.sin(np.linspace(0, 6, 40))], 1)
     tracks = {"far": far, "near": near}
-    run = simulate(gauges(1.0), {"far": ConstantVelocity(0.5), "near": ConstantVelocity(0.5)}, np.arange(40.0), 2,
+    run = simulate(gauges(1.0), {"far": ConstantVelocity(0.5), "near": ConstantVelocity(0.5)}, np.arange(40.0), key=2,
                    share=0.0, tracks=tracks)  # fmt: skip
     tree = fit(Problem(gauges(1.0), ConstantVelocity(0.5), run.table), EA())
     assert probcal.scores(tree, run.truth)["position_rmse_after"] < 3.0

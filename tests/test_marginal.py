@@ -39,7 +39,7 @@ def test_the_gradient_is_that_of_differences(name):
     world = bent.WORLDS[name]()
     network = world.network()
     biases = dict.fromkeys(network.labels, 0.0)
-    table = simulate(network, world.motion(), np.array(world.time), 1, biases=biases).table
+    table = simulate(network, world.motion(), np.array(world.time), key=1, biases=biases).table
     problem = world.problem(table)
     with jax.enable_x64(True):
         model, prior = problem.model, Precision.single(jnp.ones(problem.model.biases))
@@ -95,7 +95,7 @@ def scene(seed):
     network = Network([camera.on(Node(f"cam_{k}", p, **spread)) for k, p in enumerate(PLACES)])
     biases = dict.fromkeys(network.labels, 0.0) | dict(zip(LABELS, 2.0 * rng.standard_normal(12), strict=True))
     motion = probcal.Target(ConstantVelocity(0.03), {"position": ((30.0, 20.0), 0.01), "velocity": ((0.2, -0.1), 0.01)})
-    drawn = simulate(network, motion, 0.5 * np.arange(400.0), seed, biases=biases)
+    drawn = simulate(network, motion, 0.5 * np.arange(400.0), key=seed, biases=biases)
     return Problem(network, ConstantVelocity(0.03), drawn.table), np.array([biases[label] for label in LABELS])
 
 

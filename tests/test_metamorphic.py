@@ -83,7 +83,7 @@ def base(name):
     true = {"r0.range_offset": 25.0, "r1.range_offset": -25.0, "r1.position_x": 12.0, "r1.heading": 0.25}
     biases = true if name == "pair" else None  # else drawn from their scales
     time = np.array(world.time)
-    table = probcal.simulate(world.network(), world.motion(), time, 5, biases=biases, missing=0.1).table
+    table = probcal.simulate(world.network(), world.motion(), time, key=5, biases=biases, missing=0.1).table
     return world, table, estimate(world.problem(table))
 
 

@@ -153,7 +153,7 @@ def test_least_squares_does_not_know_the_origin():
     for shift in (0.0, 4e6):
         nodes = [probcal.Node(f"n{k}", p + shift) for k, p in enumerate(corners)]
         network = probcal.Network([kind.on(node) for node in nodes])
-        run = probcal.simulate(network, probcal.ConstantVelocity(0.5), np.arange(12.0), 1, biases={},
+        run = probcal.simulate(network, probcal.ConstantVelocity(0.5), np.arange(12.0), key=1, biases={},
                                tracks={"target": path + shift})  # fmt: skip
         problem = probcal.Problem(network, probcal.ConstantVelocity(0.5), run.table, fix=["*.range_scale"])
         found.append(probcal.fit(problem, probcal.LeastSquares()))
@@ -188,7 +188,7 @@ def test_sigma_points_where_sensors_are_bent(method, rule):
     nodes = [probcal.Node(f"n{k}", p, scale={"heading": 0.1}) for k, p in enumerate([(0, 0), (60, 0), (30, 50)])]
     network = probcal.Network([kind.on(node) for node in nodes])
     path = np.stack([np.linspace(5, 55, 30), 20 + 8 * np.sin(np.linspace(0, 6, 30))], 1)
-    run = probcal.simulate(network, probcal.ConstantVelocity(1.0), np.arange(30.0), 3, tracks={"target": path})
+    run = probcal.simulate(network, probcal.ConstantVelocity(1.0), np.arange(30.0), key=3, tracks={"target": path})
     problem = probcal.Problem(network, probcal.ConstantVelocity(1.0), run.table)
     found = [probcal.fit(problem, method(step)) for step in (Extended(), rule)]
     means = [tree["calibration"]["mean"].values for tree in found]
@@ -368,7 +368,7 @@ def test_outlying_rows_are_listed(noise, method):
     network = probcal.Network([kind.on(probcal.Node(f"gauge_{k}", p)) for k, p in enumerate(corners)])
     path = np.stack([np.linspace(5, 55, 40), 30 + 20 * np.sin(np.linspace(0, 6, 40))], 1)
     tracks, motion = {"target": path}, probcal.ConstantVelocity(0.5)
-    run = probcal.simulate(network, motion, np.arange(40.0), 4, share=0.5, tracks=tracks)
+    run = probcal.simulate(network, motion, np.arange(40.0), key=4, share=0.5, tracks=tracks)
     table = run.table.copy()
     clean = np.hypot(*(path[table["time"].astype(int)] - np.array(corners)[table["sensor"].str[-1].astype(int)]).T)
     clean = clean + table["sensor"].map(lambda s: run.truth.biases[f"{s}.range_offset"])

@@ -34,7 +34,7 @@ def beside(seed, kind=ranger, share=0.3):
     network = Network([kind.on(Node(f"b{k}", place)) for k, place in enumerate(PLACES)])
     time = np.arange(0, 60, 0.5)
     path = np.stack([-10 + 2.3 * time, 12 * np.sin(time / 9)], 1)
-    drawn = simulate(network, ConstantVelocity(0.5), time, seed, share=share, tracks={"target": path})
+    drawn = simulate(network, ConstantVelocity(0.5), time, key=seed, share=share, tracks={"target": path})
     return Problem(network, ConstantVelocity(0.5), drawn.table), path
 
 
@@ -182,7 +182,7 @@ def test_chains_visit_both_sides_by_their_weights(method):
     path = np.stack([-10 + 3.8 * time, 15 + 8 * np.sin(time / 4)], 1)
     target = probcal.Target(ConstantVelocity(0.5), {"position": ((-10.0, 1.0), 6.0)})
     biases = {"b1.position_y": 4.0, "b2.position_y": -3.0}
-    drawn = simulate(network, ConstantVelocity(0.5), time, 0, biases=biases, tracks={"target": path})
+    drawn = simulate(network, ConstantVelocity(0.5), time, key=0, biases=biases, tracks={"target": path})
     problem = Problem(network, target, drawn.table, fix=networks.FIXED["line"])
     gain = probcal.fit(problem, probcal.MAP(trajectory="joint"))["mirror"]["gain"].item()
     assert -2.5 < gain < -0.4

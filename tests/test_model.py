@@ -79,7 +79,7 @@ def test_its_density_is_that_of_the_samplers(case):
     names = [f"noise_{r}" for r in range(2)] if several else ["noise"]
     with jax.enable_x64(True):
         form, posed = posed_of(problem, prior)
-        model, M = numpyro_model(problem, prior), form.biases
+        model, M = numpyro_model(problem, prior=prior), form.biases
         eps = tuple(jnp.zeros_like(x) for x in posed.frame.point.states)
         phi = jax.jit(lambda key: form.hierarchy.relax(form.hierarchy.draw(key)))(jax.random.key(0))
         flat, back = ravel_pytree(Free(phi, jnp.zeros_like(posed.frame.theta), eps))
@@ -128,7 +128,7 @@ def test_prior_draws_have_the_moments_of_the_declaration():
     naive.data, observed = [], naive.data  # the prior: nothing is measured
     prior = reference.dense(naive, np.ones(4))
     with jax.enable_x64(True):
-        model, D = numpyro_model(problem, Gaussian()), 4000
+        model, D = numpyro_model(problem, prior=Gaussian()), 4000
         drawn = Predictive(model, num_samples=D)(jax.random.key(5), observed=False)
         free = Predictive(model, num_samples=2)(jax.random.key(5))
     drawn = {name: np.asarray(values) for name, values in drawn.items()}
@@ -158,7 +158,7 @@ def test_numpyros_own_sampler_finds_the_exact_posterior():
     exact = reference.dense(reference.Linear(network, motion, table), np.ones(4))
     mean, covariance = exact.z
     with jax.enable_x64(True):
-        run = MCMC(NUTS(numpyro_model(problem, Gaussian())), num_warmup=300, num_samples=1500, progress_bar=False)
+        run = MCMC(NUTS(numpyro_model(problem, prior=Gaussian())), num_warmup=300, num_samples=1500, progress_bar=False)
         run.run(jax.random.key(0))
         z = np.asarray(run.get_samples()["z"])
     sd = np.sqrt(np.diag(covariance))
@@ -172,7 +172,7 @@ def test_numpyros_own_sampler_finds_the_exact_posterior():
 def test_other_data_take_the_place_of_the_tables():
     problem = small()
     with jax.enable_x64(True):
-        model, y = numpyro_model(problem, Gaussian()), problem.model.rows[0].y
+        model, y = numpyro_model(problem, prior=Gaussian()), problem.model.rows[0].y
         seeded = numpyro.handlers.seed(model, jax.random.key(0))
         mask = np.asarray(problem.model.rows[0].mask)
         same = log_density(seeded, (), {}, {})[0]
@@ -229,7 +229,7 @@ STARTED = ("gaussian", "two recursions", "horseshoe", "ard", "levels and Student
 def test_a_start_has_every_latent_site_and_the_trajectories_of_its_point(case):
     prior, settings = CASES[case]
     problem = small(**settings)
-    model = numpyro_model(problem, prior)
+    model = numpyro_model(problem, prior=prior)
     random, noises, states = np.random.default_rng(0), [], []
     for part in problem.model.recursions:
         F, drift, u = np.asarray(part.F), np.asarray(part.drift), random.standard_normal(part.drift.shape)
@@ -256,7 +256,7 @@ def test_a_start_has_every_latent_site_and_the_trajectories_of_its_point(case):
 def test_every_site_has_dims_and_every_bias_its_label(case):
     prior, settings = CASES[case]
     problem = small(**settings)
-    model = numpyro_model(problem, prior)
+    model = numpyro_model(problem, prior=prior)
     dims, coords = model.dims, model.coords
     assert dims["bias"] == dims["z"] == ["bias_label"]
     assert coords["bias_label"] == list(problem.labels)
@@ -282,7 +282,7 @@ def tree_of(problem, z, held=None):
 def test_a_start_takes_the_biases_of_a_fit():
     problem = small()
     z = np.linspace(-1.0, 1.0, len(problem.labels))
-    found = numpyro_model(problem, Gaussian()).start(tree_of(problem, z))
+    found = numpyro_model(problem, prior=Gaussian()).start(tree_of(problem, z))
     np.testing.assert_allclose(found["z"], z, rtol=1e-12)
     assert np.abs(found["noise"]).max() < 10.0
 
@@ -298,7 +298,7 @@ def test_numpyros_kernels_and_guides_agree_with_the_samplers_from_a_start():
     problem = Problem(network, ConstantVelocity(1.0), drawn.table)
     own = az.extract(probcal.fit(problem, probcal.NUTS(draws=500), prior=Gaussian(), key=1), var_names="bias").values
     mean, sd = own.mean(1), own.std(1)
-    model = numpyro_model(problem, Gaussian())
+    model = numpyro_model(problem, prior=Gaussian())
     with jax.enable_x64(True), jax.numpy_rank_promotion("allow"):
         init = init_to_value(values=model.start())
         run = MCMC(NUTS(model, init_strategy=init), num_warmup=500, num_samples=1000, progress_bar=False)
@@ -318,7 +318,7 @@ def test_numpyros_kernels_and_guides_agree_with_the_samplers_from_a_start():
 def test_a_guide_of_full_rank_from_a_start_has_the_moments_of_the_posterior():
     problem = small()
     own = az.extract(probcal.fit(problem, probcal.NUTS(draws=500), prior=Gaussian(), key=1), var_names="bias").values
-    model = numpyro_model(problem, Gaussian())
+    model = numpyro_model(problem, prior=Gaussian())
     with jax.enable_x64(True), jax.numpy_rank_promotion("allow"):
         guide = AutoMultivariateNormal(model, init_loc_fn=init_to_value(values=model.start()), init_scale=0.01)
         svi = SVI(model, guide, numpyro.optim.ClippedAdam(0.005), Trace_ELBO(num_particles=4))
@@ -332,9 +332,9 @@ def test_a_guide_of_full_rank_from_a_start_has_the_moments_of_the_posterior():
 def test_what_it_refuses():
     problem = small()
     with pytest.raises(InputError, match=r"start: the fit holds b\.position_x fixed; give the Problem of this"):
-        numpyro_model(problem, Gaussian()).start(tree_of(problem, np.zeros(len(problem.labels)), "b.position_x"))
+        numpyro_model(problem, prior=Gaussian()).start(tree_of(problem, np.zeros(len(problem.labels)), "b.position_x"))
     with pytest.raises(InputError, match="BernoulliGaussian has no density that numpyro could take"):
-        numpyro_model(problem, BernoulliGaussian())
+        numpyro_model(problem, prior=BernoulliGaussian())
     with pytest.raises(InputError, match=r"runs in double precision only: call numpyro\.enable_x64"):
         numpyro.handlers.seed(numpyro_model(problem), 0)()
 

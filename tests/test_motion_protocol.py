@@ -170,7 +170,7 @@ def table_of(powered=False):
     network, motion = (POWERED, CV + POWER) if powered else (PLANE, CV)
     plan = plan_of(network, TIMES)
     motion = {name: Target(motion, START) for name in TIMES}
-    return simulate(network, motion, [0.0], 3, schedule=plan, biases={}).table
+    return simulate(network, motion, [0.0], key=3, schedule=plan, biases={}).table
 
 
 LINEAR = {name: Target(CV, START) for name in TIMES}
@@ -388,7 +388,7 @@ def test_targets_on_a_road_are_simulated_on_it(corners, d):
     """Two targets at asynchronous times: every true position lies on an edge, they move, data scatter about them."""
     nodes = [Node(name, (10.0 * k,) * d) for k, name in enumerate("ab")]
     network = Network([fix.on(node, name=f"fix_{node.name}") for node in nodes])
-    run = simulate(network, {name: Road(corners) for name in TIMES}, [0.0], 4, schedule=plan_of(network, TIMES))
+    run = simulate(network, {name: Road(corners) for name in TIMES}, [0.0], key=4, schedule=plan_of(network, TIMES))
     columns = [f"position_{axis}" for axis in "xyz"[:d]]
     corners = np.array(corners)
     for name, when in TIMES.items():
@@ -402,7 +402,7 @@ def test_targets_on_a_road_are_simulated_on_it(corners, d):
         assert np.linalg.norm(np.diff(places, axis=0), axis=1).min() > 0.05
         seen = run.table[run.table["target"] == name][columns].to_numpy(float).reshape(len(when), 2, d)
         assert np.abs(seen.mean(1) - places).max() < 6.0 * fix.channels["position"].std
-    same, other = (simulate(network, {n: Road(corners) for n in TIMES}, [0.0], k,
+    same, other = (simulate(network, {n: Road(corners) for n in TIMES}, [0.0], key=k,
                             schedule=plan_of(network, TIMES)) for k in (4, 5))  # fmt: skip
     assert run.table.equals(same.table)
     assert not run.table.equals(other.table)
@@ -413,7 +413,7 @@ def test_particles_follow_a_road_through_rows_that_came_later(kept_kernels):
     """A road declared again is equal, and its epochs, of the first rows and of later ones, take one kernel."""
     network = Network([spot.on(Node("a", (0.0, 0.0)))])
     time = np.arange(12.0)
-    run = simulate(network, Road(PLANE_ROAD), time, 2)
+    run = simulate(network, Road(PLANE_ROAD), time, key=2)
     early = run.table["time"] < 8.0
     problems = [Problem(network, Road(PLANE_ROAD), run.table[early]) for _ in range(2)]
     assert problems[0].model.sampled == problems[1].model.sampled

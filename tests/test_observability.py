@@ -124,7 +124,7 @@ def problem_of(kinds, dimension, scale, motion=None, fix=(), count=5):
     network = Network(placed)
     motion = motion or ConstantVelocity(3.0)
     track = path(dimension)[: 1 if isinstance(motion, Static) else None]
-    run = simulate(network, motion, TIME, 1, share=0.0, tracks={"target": track})
+    run = simulate(network, motion, TIME, key=1, share=0.0, tracks={"target": track})
     return Problem(network, motion, run.table, fix=fix)
 
 
@@ -242,7 +242,7 @@ def test_a_surveyed_anchor_counts_as_one():
     nodes = [Node(f"node_{k}", p, scale=FREE) for k, p in enumerate(places(5, 2))]
     anchored = [Node("node_0", places(5, 2)[0], survey={"position": 0.1, "heading": 0.01}), *nodes[1:]]
     network = Network([scanner.on(node) for node in anchored])
-    run = simulate(network, ConstantVelocity(3.0), TIME, 1, share=0.0, tracks={"target": path(2)})
+    run = simulate(network, ConstantVelocity(3.0), TIME, key=1, share=0.0, tracks={"target": path(2)})
     problem = Problem(network, ConstantVelocity(3.0), run.table)
     tree = observability(problem, point=truth_of(problem))
     assert tree.attrs["gauge"] == 0
@@ -258,7 +258,7 @@ def test_a_straight_pass_trades_a_range_offset_for_a_position():
     network = Network([plain_range.on(node) for node in (*known, free)])
 
     def check(track):
-        run = simulate(network, ConstantVelocity(0.1), TIME, 0, share=0.0, tracks={"target": track})
+        run = simulate(network, ConstantVelocity(0.1), TIME, key=0, share=0.0, tracks={"target": track})
         problem = Problem(network, ConstantVelocity(0.1), run.table, fix=offsets)
         return observability(problem, point=truth_of(problem, {"target": track}))
 
@@ -354,7 +354,7 @@ def test_leverages_are_those_of_a_dense_regression():
     """With known states the leverage of a datum is the diagonal of the hat matrix of a ridge regression."""
     network = Network([plain_range.on(Node(f"n_{k}", p, scale=5.0)) for k, p in enumerate(places(2, 2))])
     motion = Known((TIME, path(2)))
-    table = simulate(network, ConstantVelocity(3.0), TIME, 0, tracks={"target": path(2)}).table
+    table = simulate(network, ConstantVelocity(3.0), TIME, key=0, tracks={"target": path(2)}).table
     problem = Problem(network, motion, table)
     point = resting(problem)
     H = by_bias(problem, point)
@@ -456,7 +456,7 @@ def test_a_gauge_is_that_of_two_recursions_and_missing_rows():
     network = Network([scanner.on(node) for node in nodes])
     motion = {"car": ConstantVelocity(3.0), "mast": Static()}
     tracks = {"car": path(2), "mast": np.array([[222.0, 111.0]])}
-    run = simulate(network, motion, TIME, 1, share=0.0, tracks=tracks, missing=0.3)
+    run = simulate(network, motion, TIME, key=1, share=0.0, tracks=tracks, missing=0.3)
     problem = Problem(network, motion, run.table)
     assert gauge_count(problem, truth_of(problem, tracks)) == 3
 

@@ -32,7 +32,7 @@ def posed(dimension=2, singular=False, unknown=False):
     start = {"position": ((15.0, 10.0, 2.0)[:dimension], 5.0), "velocity": ((1.0, 0.5, 0.0)[:dimension], 1.0)}
     target = Target(motion, start)
     held = ["*.range_*"] if dimension == 3 else []
-    problem = Problem(network, target, simulate(network, target, np.arange(12.0), 1).table, fix=held)
+    problem = Problem(network, target, simulate(network, target, np.arange(12.0), key=1).table, fix=held)
     with jax.enable_x64(True):
         point = automatic_start(problem)
         prior = Horseshoe()

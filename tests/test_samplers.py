@@ -396,7 +396,7 @@ def test_the_evidence_integrates_every_hyper_parameter():
     problem, naive = linear("plane")
     start = resting(problem)
     exact = reference.dense(naive, np.ones(len(naive.labels))).evidence
-    found = probcal.log_evidence(problem, Gaussian(), start=start)
+    found = probcal.log_evidence(problem, prior=Gaussian(), start=start)
     assert found.value == pytest.approx(exact, rel=1e-10)
     assert found.error < 1e-8
     prior, total = BernoulliGaussian(share=0.1, slab=3.0), []
@@ -405,11 +405,11 @@ def test_the_evidence_integrates_every_hyper_parameter():
         spread = np.ones(len(naive.labels))
         spread[learnt] *= 9.0 * np.array(pattern)
         total.append(reference.dense(naive, np.diag(spread)).evidence + np.log(np.where(pattern, 0.1, 0.9)).sum())
-    found = probcal.log_evidence(problem, prior, start=start)
+    found = probcal.log_evidence(problem, prior=prior, start=start)
     assert abs(found.value - np.logaddexp.reduce(total)) < 4.5 * found.error + 1e-6
     assert found.khat == 0.0
     with pytest.raises(InputError, match="a flat prior has no evidence"):
-        probcal.log_evidence(problem, Flat())
+        probcal.log_evidence(problem, prior=Flat())
 
 
 def test_khat_is_that_of_the_heavy_right_tail():
@@ -453,7 +453,7 @@ def test_a_process_noise_hardly_known_keeps_its_lower_tail():
     network = probcal.Network([kind.on(node) for node in nodes])
     start = {"position": (0.0, 20.0), "velocity": (0.0, 1.0)}
     table = probcal.simulate(
-        network, probcal.Target(probcal.ConstantVelocity(0.02), start), np.arange(30.0), 2
+        network, probcal.Target(probcal.ConstantVelocity(0.02), start), np.arange(30.0), key=2
     ).table  # fmt: skip
     unknown = probcal.Target(probcal.ConstantVelocity(probcal.Unknown(0.3, 5.0)), start)
     problem = probcal.Problem(network, unknown, table)

@@ -224,7 +224,7 @@ def test_a_spike_is_exactly_zero_and_its_share_uniform():
 def test_a_prior_without_draws_is_refused(prior):
     method = MAP() if isinstance(prior, Flat) else EA()
     with pytest.raises(InputError, match="no truth can be drawn from"):
-        sbc(linear(), method, prior, 4)
+        sbc(linear(), method, prior=prior, runs=4)
 
 
 def test_other_measured_values():
@@ -252,7 +252,7 @@ def test_other_measured_values():
 
 def test_a_method_that_is_exact_is_uniform():
     """MAP on a linear network, 40 runs; coverage within 4 standard errors."""
-    tree = sbc(linear(), MAP(), Gaussian(), 40, threads=2)
+    tree = sbc(linear(), MAP(), prior=Gaussian(), runs=40, threads=2)
     assert tree.attrs["status"] == "uniform", tree.attrs["verdict"]
     table = coverage_table(tree)
     assert (abs(table["all"] - table["nominal"]) < 4 * table["all_se"]).all()
@@ -263,7 +263,7 @@ def test_a_method_that_is_exact_is_uniform():
 
 @pytest.mark.ci
 def test_noise_taken_20_per_cent_too_small_is_caught():
-    tree = sbc(linear(), Overconfident(), Gaussian(), 100, threads=2)
+    tree = sbc(linear(), Overconfident(), prior=Gaussian(), runs=100, threads=2)
     assert tree.attrs["status"] == "not uniform"
     assert "not uniform: log likelihood" in tree.attrs["verdict"]
 
@@ -271,7 +271,7 @@ def test_noise_taken_20_per_cent_too_small_is_caught():
 @pytest.mark.ci
 def test_coverage_under_another_prior():
     """EA learns its precisions; truths that are mostly zero: the non-zero ones are counted apart."""
-    tree = sbc(linear(), EA(), None, 12, simulate_from=BernoulliGaussian(share=0.3), threads=2)
+    tree = sbc(linear(), EA(), prior=None, runs=12, simulate_from=BernoulliGaussian(share=0.3), threads=2)
     assert "not from the prior of the fit" in tree.attrs["message"]
     table = coverage_table(tree)
     assert {"nominal", "all", "all_se", "nonzero", "nonzero_se", "plain", "plain_se"} == set(table.columns)
@@ -280,7 +280,7 @@ def test_coverage_under_another_prior():
 
 
 def quick(method, prior, runs=40, problem=None):
-    return sbc(problem or radars(), method, prior, runs, start="truth", fallback=False, threads=2)
+    return sbc(problem or radars(), method, prior=prior, runs=runs, start="truth", fallback=False, threads=2)
 
 
 @pytest.mark.slow
@@ -330,7 +330,7 @@ def test_samplers_are_uniform_over_500_simulations(method, prior):
 def test_nine_tenths_hold_on_networks_of_the_size_of_c1():
     """Ten radars, 100 scans, 300 simulations from the prior of the fit: the 90 % interval holds 88 to 92 %."""
     path = Path(__file__).parents[1] / "models" / "radars.py"
-    tree = sbc(load_model(path).problem(), short(Collapsed()), SPIKE, 300, start="truth")
+    tree = sbc(load_model(path).problem(), short(Collapsed()), prior=SPIKE, runs=300, start="truth")
     assert tree.attrs["status"] == "uniform", tree.attrs["verdict"]
     table = coverage_table(tree).set_index("nominal")
     print(f"\n{table.round(3)}")
@@ -371,7 +371,7 @@ def test_around_the_data(fitted):
     """Truths from the posterior, every row measured twice: uniform for an exact method, from data or from a fit."""
     problem, tree = fitted
     for around in ("data", tree):
-        found = sbc(problem, MAP(), Gaussian(), 40, around=around, threads=2)
+        found = sbc(problem, MAP(), prior=Gaussian(), runs=40, around=around, threads=2)
         assert found.attrs["status"] == "uniform", found.attrs["verdict"]
     mean, sd = (tree["calibration"][name].values for name in ("mean", "sd"))
     truth = found["sbc"].to_dataset()["truth"].values[:, : len(mean)]
@@ -383,7 +383,7 @@ def test_around_the_data(fitted):
 @pytest.mark.slow
 def test_around_a_sampler_keeps_hyper_parameters():
     method = Collapsed(chains=2, warmup=50, draws=150)
-    found = sbc(radars(), method, HORSESHOE, 3, around="data", start="truth", fallback=False)
+    found = sbc(radars(), method, prior=HORSESHOE, runs=3, around="data", start="truth", fallback=False)
     assert {"global_scale", "slab_variance"} <= set(found["sbc"]["quantity"].values)
     assert "log joint" not in found["sbc"]["quantity"].values
 
@@ -391,15 +391,15 @@ def test_around_a_sampler_keeps_hyper_parameters():
 def test_around_what_is_no_fit(fitted):
     problem, tree = fitted
     with pytest.raises(InputError, match="around must be a fit of this problem that kept its draws"):
-        sbc(problem, MAP(), Gaussian(), 4, around=tree.drop_nodes("posterior"))
+        sbc(problem, MAP(), prior=Gaussian(), runs=4, around=tree.drop_nodes("posterior"))
     with pytest.raises(InputError, match='sbc: around is "prior"'):
-        sbc(problem, MAP(), Gaussian(), 4, around="prior")
+        sbc(problem, MAP(), prior=Gaussian(), runs=4, around="prior")
 
 
 def test_a_wide_start_is_said():
     problem = linear()
     wide = Problem(problem.network, ConstantVelocity(0.5), problem.measurements.table)
-    tree = sbc(wide, MAP(), Gaussian(), 3, start="truth")
+    tree = sbc(wide, MAP(), prior=Gaussian(), runs=3, start="truth")
     assert "network sizes wide" in tree.attrs["message"]
 
 
@@ -410,28 +410,28 @@ def test_a_wide_start_is_said():
 def test_runs_are_resumed(tmp_path):
     """An interrupted run, taken up again by other threads and for more runs, gives the same numbers."""
     problem, method = linear(), MAP()
-    whole = sbc(problem, method, Gaussian(), 42, threads=2)
+    whole = sbc(problem, method, prior=Gaussian(), runs=42, threads=2)
 
-    def stop(done, total):
-        if done >= 6:
+    def stop(at):
+        if at.done >= 6:
             raise KeyboardInterrupt
 
-    part = sbc(problem, method, Gaussian(), 40, store=tmp_path, threads=1, progress=stop)
+    part = sbc(problem, method, prior=Gaussian(), runs=40, store=tmp_path, threads=1, progress=stop)
     assert part.attrs["interrupted"] == 1
     assert 2 <= part.attrs["runs"] < 40
     assert "resume to go on" in part.attrs["message"]
     (tmp_path / ".runs-000099.npz.probcal-0123abcd.part").write_bytes(b"half written")
     seen = []
     rest = dict(store=tmp_path, resume=True, threads=1)
-    again = sbc(problem, method, Gaussian(), 42, **rest, progress=lambda *at: seen.append(at))
-    assert seen[-1] == (42, 42)
+    again = sbc(problem, method, prior=Gaussian(), runs=42, **rest, progress=seen.append)
+    assert seen[-1] == ("runs", 42, 42, None)
     xr.testing.assert_identical(whole["sbc"].to_dataset(), again["sbc"].to_dataset())
     assert again.attrs == whole.attrs | {"identity": part.attrs["identity"]}
     with pytest.raises(InputError, match="the seed has changed since the run there began; resume it as it began"):
-        sbc(problem, method, Gaussian(), 42, store=tmp_path, resume=True, key=1)
+        sbc(problem, method, prior=Gaussian(), runs=42, store=tmp_path, resume=True, key=1)
     with pytest.raises(InputError, match=r"holds the runs of an sbc \(MAP.* already; give --resume"):
-        sbc(problem, method, Gaussian(), 42, store=tmp_path)
-    fresh = sbc(problem, method, Gaussian(), 3, store=tmp_path, key=1, overwrite=True)
+        sbc(problem, method, prior=Gaussian(), runs=42, store=tmp_path)
+    fresh = sbc(problem, method, prior=Gaussian(), runs=3, store=tmp_path, key=1, overwrite=True)
     assert sorted(os.listdir(tmp_path)) == ["probcal-run.json", "runs-000000.npz", "runs-000001.npz"]
     assert not np.allclose(fresh["sbc"]["truth"], whole["sbc"]["truth"][:3])
 
@@ -448,13 +448,13 @@ def test_a_run_without_posterior_is_counted_apart(monkeypatch):
     module = importlib.import_module("probcal.inference.sbc")  # the name in the package is the function
     given = module.pool_of
     monkeypatch.setattr(module, "pool_of", fails)
-    tree = sbc(linear(), MAP(), Gaussian(), 6, threads=1)
+    tree = sbc(linear(), MAP(), prior=Gaussian(), runs=6, threads=1)
     assert tree.attrs["failed"] == 1
     assert "1 runs left no posterior and are not counted" in tree.attrs["message"]
     assert tree["run"]["run"].values.tolist() == [0, 2, 3, 4, 5]
     monkeypatch.setattr(module, "pool_of", lambda *_: (_ for _ in ()).throw(FitError("none")))
     with pytest.raises(FitError, match="of 3 runs left no posterior: none"):
-        sbc(linear(), MAP(), Gaussian(), 3)
+        sbc(linear(), MAP(), prior=Gaussian(), runs=3)
 
 
 def test_arguments_are_checked():
@@ -477,7 +477,7 @@ def test_short_samplers():
 
 
 def test_pictures_of_a_saved_calibration(tmp_path):
-    save(sbc(linear(), MAP(), Gaussian(), 20, threads=2), tmp_path / "sbc.nc")
+    save(sbc(linear(), MAP(), prior=Gaussian(), runs=20, threads=2), tmp_path / "sbc.nc")
     with xr.open_datatree(tmp_path / "sbc.nc") as opened:
         tree = opened.load()
     draw_sbc(tree, tmp_path / "sbc.png")

@@ -435,8 +435,9 @@ def whole():
 
 @pytest.mark.ci
 def test_an_interrupted_fit_is_resumed_with_the_same_draws(tmp_path, whole):
-    def stop(name, count, value):
-        if count >= 150:
+    def stop(at):
+        assert (at.what, at.total) == ("Collapsed", 250)
+        if at.done >= 150:
             raise KeyboardInterrupt
 
     tree = fitted(progress=stop, store=tmp_path)
@@ -455,7 +456,7 @@ def test_an_interrupted_fit_is_resumed_with_the_same_draws(tmp_path, whole):
 
 
 def test_ctrl_c_in_the_warm_up_leaves_nothing_to_report():
-    def early(name, count, value):
+    def early(at):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -112,8 +112,8 @@ def test_a_study_is_resumed_with_the_same_numbers(tmp_path):
     """Stopped, taken up for more runs, a file lost; an edited model is refused."""
     whole = study(heights, {}, ["em", "ml"], runs=25)
 
-    def stop(done, total):
-        if done >= 20:
+    def stop(at):
+        if at.done >= 20:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -121,12 +121,10 @@ def test_a_study_is_resumed_with_the_same_numbers(tmp_path):
     assert (tmp_path / "fits-000000.npz").exists()
     seen = []
     for lost in ("fits-000020.npz", "fits-000000.npz"):
-        again = study(
-            heights, {}, ["em", "ml"], runs=25, store=tmp_path, resume=True, progress=lambda *at: seen.append(at)
-        )
+        again = study(heights, {}, ["em", "ml"], runs=25, store=tmp_path, resume=True, progress=seen.append)
         xr.testing.assert_equal(again, whole)
         (tmp_path / lost).unlink()
-    assert seen[-1] == (50, 50)
+    assert seen[-1] == ("fits", 50, 50, None)
     with pytest.raises(InputError, match="the list of methods has changed since the run there began"):
         study(heights, {}, ["em"], runs=25, store=tmp_path, resume=True)
     with pytest.raises(InputError, match=r"holds the fits of a study already; give --resume"):

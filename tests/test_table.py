@@ -53,7 +53,7 @@ def network(names=("a", "b", "c", "d")):
 
 @cache
 def run():
-    return simulate(network(), CV, np.arange(20.0), 1, tracks={"target": PATH})
+    return simulate(network(), CV, np.arange(20.0), key=1, tracks={"target": PATH})
 
 
 def recorded(names=("a", "b", "c", "d")):
@@ -75,7 +75,7 @@ def test_names_that_are_numbers_are_one_name():
     problem = Problem(network(names=("1", "2", "3", "4")), {7: CV}, mixed)
     assert problem.measurements.target_names == ("7",)
     assert len(problem.epochs[0].time) == 20
-    same = simulate(network(), {7: CV}, np.arange(20.0), 1, tracks={7: PATH})
+    same = simulate(network(), {7: CV}, np.arange(20.0), key=1, tracks={7: PATH})
     np.testing.assert_allclose(same.truth.tracks[["position_x", "position_y"]], PATH)
 
 
@@ -86,7 +86,7 @@ def test_a_sensor_type_needs_only_the_components_of_the_targets_it_sees():
     grid = [(t, s, o) for o, names in (("shot", ["ear"]), ("car", [f"mast_{k}" for k in range(4)]))
             for t in range(20) for s in names]  # fmt: skip
     plan = pd.DataFrame(grid, columns=["time", "sensor", "target"])
-    run = simulate(built, motion, np.arange(20.0), 1, tracks={"shot": PATH, "car": PATH}, schedule=plan)
+    run = simulate(built, motion, np.arange(20.0), key=1, tracks={"shot": PATH, "car": PATH}, schedule=plan)
     assert Problem(built, motion, run.table).labels[0] == "ear.clock"
 
 
@@ -108,7 +108,7 @@ def test_exact_labels_with_brackets_can_be_fixed_and_rebuilt():
             lambda: Network(ALIKE),
             'types are called "gauge"',
         ),
-        (lambda: simulate(network(), CV, [2.0, 1.0, 0.0], 1), "time must be one increasing column"),
+        (lambda: simulate(network(), CV, [2.0, 1.0, 0.0], key=1), "time must be one increasing column"),
         (
             lambda: Problem(
                 Network([sensors.ranger.on(Node("m", path=Path([0, 10], [[0, 0], [10, 0]])))]),

@@ -268,7 +268,7 @@ def test_what_it_refuses():
             make(Mixture(0.1, 10.0, delay=2.0))
         make(StudentT(4.0))
     with pytest.raises(InputError, match="process noise"):
-        probcal.log_evidence(turned(), probcal.Gaussian())
+        probcal.log_evidence(turned(), prior=probcal.Gaussian())
 
 
 @pytest.mark.ci
@@ -280,7 +280,7 @@ def test_targets_of_several_families_and_motions_stand_side_by_side():
         "jumpy": Target(ConstantVelocity(0.4, noise=Mixture(0.1, 20.0)), START),
         "bent": Target(ConstantVelocity(0.4, singular=True, noise=StudentT(3.0)), START),
     }
-    drawn = simulate(network, motion, TIME, 3)
+    drawn = simulate(network, motion, TIME, key=3)
     problem = Problem(network, motion, drawn.table)
     tree = probcal.fit(problem)
     assert tree.attrs["status"] == "converged"
@@ -302,7 +302,7 @@ def turning(noise, run=0):
     angle = np.cumsum(np.where((time % 11) > 10, np.pi / 4, 0.0))
     path = np.cumsum(1.5 * np.stack([np.cos(angle), np.sin(angle)], 1), 0)
     network = Network([finder.on(Node("a", (0.0, 0.0))), finder.on(Node("b", (5.0, 1.0)))])
-    drawn = simulate(network, ConstantVelocity(0.5), time, run, tracks={"target": path}, biases={"a.shift": 0.7})
+    drawn = simulate(network, ConstantVelocity(0.5), time, key=run, tracks={"target": path}, biases={"a.shift": 0.7})
     return Problem(network, ConstantVelocity(probcal.Unknown(0.5), noise=noise), drawn.table)
 
 
@@ -324,7 +324,7 @@ def test_a_target_that_keeps_turning_has_noises_that_go_together():
     time = 0.5 * np.arange(120)
     path = np.stack([20 * np.cos(time / 6), 20 * np.sin(time / 6)], 1)
     network = Network([finder.on(Node("a", (0.0, 0.0))), finder.on(Node("b", (5.0, 1.0)))])
-    drawn = simulate(network, ConstantVelocity(0.5), time, 0, tracks={"target": path})
+    drawn = simulate(network, ConstantVelocity(0.5), time, key=0, tracks={"target": path})
     problem = Problem(network, ConstantVelocity(0.3), drawn.table)
     tree, answer = calibrate(problem)
     findings = probcal.assess(problem, tree, answer=answer)["finding"].to_dataset()
@@ -346,7 +346,7 @@ def test_bounds_take_the_fisher_information_of_the_family():
     width = np.sqrt(9.0 / 7.0)
     wide = ConstantVelocity(0.4 * width)
     like = Problem(problem.network, Target(wide, START), problem.measurements.table, fix=["b.shift"])
-    own, other = (probcal.bounds(p, "parametric")["bias"]["sd"].values for p in (problem, like))
+    own, other = (probcal.bounds(p, kind="parametric")["bias"]["sd"].values for p in (problem, like))
     np.testing.assert_allclose(own, other, rtol=1e-3)  # the automatic starts differ a little
-    plain = probcal.bounds(turned(family=None), "parametric")["bias"]["sd"].values
+    plain = probcal.bounds(turned(family=None), kind="parametric")["bias"]["sd"].values
     assert (own > plain).all()

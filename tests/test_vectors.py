@@ -153,7 +153,7 @@ def test_a_network_of_three_node_sensors_is_simulated_and_fitted():
     sets = [(0, 1, 2), (1, 2, 3), (2, 3, 4), (0, 2, 4), (0, 3, 1), (1, 4, 2)]
     network = Network([trio.on(*(nodes[k] for k in own)) for own in sets] + [sodar.on(nodes[0], name="s")])
     motion = Target(CV.motion + WIND, CV.start)
-    run = simulate(network, motion, np.arange(20.0), 3)
+    run = simulate(network, motion, np.arange(20.0), key=3)
     problem = Problem(network, motion, run.table)
     found = fit(problem, MAP(), prior=priors.Gaussian())["calibration"].to_dataset()
     true = np.array([run.truth.biases[label] for label in problem.labels])

@@ -23,7 +23,7 @@ def anchored():
     biases = dict.fromkeys(network.labels, 0.0) | {"d1.heading": 0.07, "d2.position_x": 15.0, "d4.position_y": -9.0}
     time = np.arange(80.0)
     path = np.stack([100 + 80 * np.cos(time / 12), 75 + 50 * np.sin(time / 7)], 1)
-    drawn = simulate(network, ConstantVelocity(0.5), time, 0, biases=biases, tracks={"target": path})
+    drawn = simulate(network, ConstantVelocity(0.5), time, key=0, biases=biases, tracks={"target": path})
     return Problem(network, ConstantVelocity(0.5), drawn.table)
 
 
@@ -58,7 +58,7 @@ def far_away(std, distance):
     )
     time = np.arange(60.0)
     path = np.stack([distance + 20 * time, 0.3 * distance + 5 * time], 1)
-    drawn = simulate(network, ConstantVelocity(0.1), time, 0, share=1.0, tracks={"target": path})
+    drawn = simulate(network, ConstantVelocity(0.1), time, key=0, share=1.0, tracks={"target": path})
     return Problem(network, ConstantVelocity(0.1), drawn.table), path
 
 

@@ -219,7 +219,7 @@ def ruler(target, pose, *, shift=Bias("m", 1.0)):
 def heights(run, size=2):
     """A problem of `size` rulers and its truth, for studies: a new world with every run."""
     network = Network([ruler.on(Node(f"n{k}", (0.0, float(k)))) for k in range(size)])
-    drawn = probcal.simulate(network, ConstantVelocity(1.0), np.arange(4.0), run)
+    drawn = probcal.simulate(network, ConstantVelocity(1.0), np.arange(4.0), key=run)
     return probcal.Problem(network, ConstantVelocity(1.0), drawn.table), drawn.truth
 
 

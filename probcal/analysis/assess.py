@@ -52,6 +52,10 @@ def assess(
     Limits have a false-alarm rate of 1 %: of one epoch in `epoch_check`, else of all comparisons of a kind together.
     Refits of large networks are one step from the fit (attribute `refits` of the group). Of a misfit nothing is left
     out and no halves are compared. Raises `InputError` where the tree is no fit of the problem.
+
+    >>> checked = assess(problem, tree)
+    >>> checked["verdict"]["verdict"].sel(bias_label="sonar_1.range_offset").item()
+    'determined'
     """
     fit = take_up(problem, tree, answer)
     with np.errstate(all="ignore" if _absurd(tree) else None):  # squares of absurd residuals overflow

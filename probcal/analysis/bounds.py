@@ -28,7 +28,7 @@ INVOLVED = 1e-5  # entry of such a direction above which a bias has none
 
 @float64
 def bounds(
-    problem: Problem, kind: str = "posterior", *, truth: Truth | None = None, draws: int = 50, key: Key = 0
+    problem: Problem, *, kind: str = "posterior", truth: Truth | None = None, draws: int = 50, key: Key = 0
 ) -> xr.DataTree:
     """Cramer-Rao bounds: of each bias with all trajectories marginalised, of each state with the biases marginalised.
 
@@ -48,6 +48,9 @@ def bounds(
     biases are left out of `bias`, listed in the group `unbounded` and named in the attribute `message`, which also
     names those whose bound exceeds their scale.
     Raises `InputError` for an unknown kind or label, tracks with gaps, and draws at which a sensor is not finite.
+
+    >>> bounds(problem)["bias"]["sd"].sizes["bias_label"]
+    12
     """
     if kind not in KINDS:
         raise InputError(f'bounds: kind is "{kind}"{nearest(kind, KINDS)}')

@@ -26,7 +26,7 @@ TOTALS = (*EVIDENCES, "log_evidence_se", "seconds")
 TEXTS = ("method", "requested", "prior", "status", "message", "settings", "intervals", "approximate", "precisions")
 
 
-def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
+def compare(fits: Fits, *, names: Sequence[str] | None = None) -> xr.DataTree:
     """Put fits of the same data side by side, whatever their methods, priors and sensor models.
 
     `fits` are results of `fit` (or loaded ones), by name or in a sequence with `names`, which default to method and
@@ -44,6 +44,9 @@ def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
     The attribute `reference` names the fit whose posterior the others are judged by: the first whose draws are exact,
     else the first that has draws of its own, else the first. Raises `InputError` for fits of different data, scales or
     units, and where no bias is common.
+
+    >>> compare({"all": tree, "again": tree}).attrs["reference"]
+    'all'
     """
     known = fits_by_name(fits, names)
     labels = _common(known)
@@ -100,13 +103,17 @@ def plugged_in(tree: xr.DataTree) -> bool:
 
 
 def interchangeable(
-    tree: xr.DataTree, count: int = 3, among: Sequence[str] | None = None
+    tree: xr.DataTree, *, count: int = 3, among: Sequence[str] | None = None
 ) -> list[tuple[str, str, float]]:
     """The pairs of biases that a fit cannot tell apart, with their posterior correlation, those that trade most first.
 
     What a pair trades is its negative correlation, where the data know the sum and not the parts, times the smaller
     sd in declared scales; within one node or sensor the size of the correlation counts, for there the data may know a
     difference. A pair that trades next to nothing is left out; `among` are the labels to choose from.
+
+    >>> first, second, correlation = interchangeable(tree, count=1)[0]
+    >>> correlation < 0
+    True
     """
     draws = tree["posterior"].to_dataset()["bias"].transpose("chain", "draw", "bias_label")
     draws = draws if among is None else draws.sel(bias_label=list(among))

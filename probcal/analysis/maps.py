@@ -28,8 +28,8 @@ LOST = 1e-13  # share of the information of a position below which a direction c
 def bound_map(
     problem: Problem,
     area: Sequence[Sequence[float]],
-    cells: int | tuple[int, int] = 100,
     *,
+    cells: int | tuple[int, int] = 100,
     biases: str | xr.DataTree = "known",
     z: float | None = None,
     target: str | None = None,
@@ -46,6 +46,9 @@ def bound_map(
     of the information J in 1/m^2 (RSS paper 20-21), `determined`. A bound beyond the diagonal of the area is no
     position in it: there, as where J is singular, `rmse` is the diagonal and `determined` is False. Also
     `node_position` (node, axis). Raises `InputError` for an area, cells, biases, target or time that cannot be used.
+
+    >>> bound_map(problem, ((-50, 250), (0, 150)), cells=(6, 3))["rmse"].shape
+    (3, 6)
     """
     x, y = _axes(area, cells)
     d = problem.network.dimension

@@ -36,6 +36,9 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     `datum`, `sensor` and `target` (how many biases each determines: their leverages, which add up with what the motion
     tells), `track`. Attributes: `status` (determined; weak; open, where the data say next to nothing of a direction),
     `rule`, counts. Raises `InputError` where no bias is free.
+
+    >>> observability(problem).attrs["status"]
+    'determined'
     """
     check_free(problem)
     point = standpoint(problem, point, truth)

@@ -76,6 +76,9 @@ def next_anchors(
     `survey` is its std over the scale of the bias, `std` the same in the unit of the bias. `gain` is what it tells of
     all other biases, `own` that and what it says of itself. Biases that have a survey are left out where others have
     none. Best first. Raises `InputError` unless `survey` is positive.
+
+    >>> bool(next_anchors(problem)["gain"][0] > 0)
+    True
     """
     if not (np.isfinite(survey) and survey > 0):
         raise InputError(f"next_anchors: survey={survey} must be positive, a std over the scale of a bias")
@@ -127,6 +130,9 @@ def next_sensors(
 
     It sees every target at every epoch; its own biases are free. `places` (P, d) in m are by default a grid over the
     area; the second node of a two-node type is that of its first sensor. Best first. Raises `InputError` for the shape.
+
+    >>> bool(next_sensors(problem, places=[(100.0, -50.0), (300.0, 80.0)])["gain"][0] > 0)
+    True
     """
     check_free(problem)
     point = standpoint(problem, point, truth)

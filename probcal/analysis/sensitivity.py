@@ -29,9 +29,9 @@ Spans = tuple[tuple[int, int], ...]
 def sensitivity(
     problem: Problem,
     stds: Mapping[str, Sequence[float]],
+    *,
     runs: int = 50,
     key: Key = 0,
-    *,
     truth: Truth | None = None,
 ) -> xr.Dataset:
     """RMS position error in m of tracks that take every bias as 0, over a grid of standard deviations of the biases.

@@ -13,6 +13,7 @@ from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem
 from probcal.cli.progress import line
 from probcal.files import Outputs
+from probcal.inference.progress import Progress
 from probcal.problem import Problem
 from probcal.results.io import save
 from probcal.smoothing.start import automatic_start
@@ -31,7 +32,7 @@ def run(model: Path, data: Path | None, fix: Sequence[str], outputs: Outputs | N
     _, problem = load_problem(model, data, fix)
     with line() as progress:
         if progress is not None:
-            progress("check", 0, 0.0)
+            progress(Progress("check", 0, 1))
         start = automatic_start(problem)
         tree = observability(problem, point=start)
         passes = next_passes(problem, point=start)
@@ -116,6 +117,6 @@ def _write(problem: Problem, tree: xr.DataTree, passes: xr.Dataset, out: Path) -
         low, high = passes["path"].values.min((0, 1)), passes["path"].values.max((0, 1))
         height = float((low + high)[2] / 2) if len(low) == 3 else None
         sides = [(a, b) for a, b in zip(low[:2], high[:2], strict=True)]
-        bound = bound_map(problem, sides, MAP_CELLS, biases="unknown", z=height)
+        bound = bound_map(problem, sides, cells=MAP_CELLS, biases="unknown", z=height)
         draw_check(tree, passes, bound, files[-1])
     say_written(files)

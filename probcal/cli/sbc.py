@@ -35,7 +35,7 @@ def run(
         outputs.begin()
     with bar() as advance:
         tree = sbc(
-            problem, value, chosen, runs, simulate_from=PRIORS[truths] if truths is not None else None,
+            problem, value, prior=chosen, runs=runs, simulate_from=PRIORS[truths] if truths is not None else None,
             around="data" if posterior else None, key=seed, progress=advance, resume=resume,
             overwrite=overwrite, store=None if outputs is None else outputs.folder / "runs",
         )  # fmt: skip

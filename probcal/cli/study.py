@@ -33,7 +33,7 @@ def run(
     with bar() as advance:
         found = study(
             lambda run, **point: call(module, model, "setting", run, **point),
-            grid, chosen, range(seed, seed + runs), progress=advance, resume=resume, overwrite=overwrite,
+            grid, chosen, runs=range(seed, seed + runs), progress=advance, resume=resume, overwrite=overwrite,
             store=None if outputs is None else outputs.folder / "runs",
         )  # fmt: skip
     table = study_table(found)

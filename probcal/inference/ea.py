@@ -137,6 +137,9 @@ class EA(Maximiser):
     maximised. `update` of maximised precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed points,
     slower). `tolerance` is the change of log evidence, in nats, at which it stops; `iterations` caps the outer loop.
     Raises `InputError` for another update, trajectory or kind of precisions.
+
+    >>> type(EA().first_prior()), type(EA.as_printed().first_prior())
+    (<class 'probcal.priors.Horseshoe'>, <class 'probcal.priors.ARD'>)
     """
 
     iterations: int = 200

@@ -39,7 +39,7 @@ class Evidence(NamedTuple):
 
 
 @float64
-def log_evidence(problem: Problem, prior: Prior | None = None, *, key: Key = 0, start: Point | None = None) -> Evidence:
+def log_evidence(problem: Problem, *, prior: Prior | None = None, key: Key = 0, start: Point | None = None) -> Evidence:
     """Log of the density of the data under a prior (`Horseshoe()` by default), everything unknown integrated.
 
     The frame marginalises trajectories (Laplace), and biases and noise levels given the hyper-parameters, in closed

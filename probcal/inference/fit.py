@@ -18,7 +18,8 @@ from probcal.identifiability.watch import runs, strained_starts
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.manifest import stored_run
 from probcal.inference.methods import EA, NUTS, check_problem, choose_prior
-from probcal.inference.run import Context, Method, Progress
+from probcal.inference.progress import OnProgress
+from probcal.inference.run import Context, Method
 from probcal.inference.solve import solve
 from probcal.inference.storage import Storage
 from probcal.priors import Prior
@@ -53,7 +54,7 @@ def fit(
     key: Key = 0,
     start: Point | None = None,
     starts: int = 1,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
     save: Collection[str] = (),
     store: str | PathLike[str] | None = None,
     resume: bool = False,
@@ -71,6 +72,10 @@ def fit(
     leaves what was drawn. A folder that holds a run is refused without `resume` or `overwrite`. The attributes `status`
     and `message` say what the fit is worth. Raises `InputError` for a prior that the method does not take and
     `FitError` where a flat prior leaves a singular problem without any interval.
+
+    >>> found = fit(problem)
+    >>> found.attrs["status"]
+    'converged'
     """
     found, _ = calibrate(
         problem, method, prior=prior, key=key, start=start, starts=starts, progress=progress, save=save, store=store,
@@ -82,7 +87,7 @@ def fit(
 @float64
 def calibrate(
     problem: Problem, method: Method | None = None, *, prior: Prior | None = None, key: Key = 0,
-    start: Point | None = None, starts: int = 1, progress: Progress | None = None, save: Collection[str] = (),
+    start: Point | None = None, starts: int = 1, progress: OnProgress | None = None, save: Collection[str] = (),
     store: str | PathLike[str] | None = None, resume: bool = False, overwrite: bool = False,
 ) -> tuple[xr.DataTree, Answer]:  # fmt: skip
     """The tree of `fit`, and the answer behind it, which `assess` takes so that it need not be found again."""
@@ -213,6 +218,10 @@ def track(problem: Problem, calibration: xr.DataTree) -> xr.DataTree:
 
     The biases are held at the calibrated means; the sd carries their covariance. Biases are matched by label;
     raises `InputError` if the calibration lacks one.
+
+    >>> later = track(Problem(network, motion, run.table), tree)
+    >>> later["track/target"]["mean"].dims
+    ('time', 'component')
     """
     found = apply(problem, calibration)
     problem, covariance = found.problem, jnp.asarray(found.covariance)

@@ -106,7 +106,7 @@ class Mixed(dist.Distribution):
 
 
 @float64
-def numpyro_model(problem: Problem, prior: Prior | None = None) -> NumpyroModel:
+def numpyro_model(problem: Problem, *, prior: Prior | None = None) -> NumpyroModel:
     """The joint posterior of a problem as a numpyro model `model(data=None, *, observed=True)`.
 
     `model()` conditions on the problem's own rows. `data` maps sites `y_TYPE` to other values (N, C), NaN where

@@ -6,7 +6,6 @@ of its outer loop, and where needed `close`, what it computes at the end of a ch
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
@@ -18,6 +17,7 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.inference.ending import conclude
 from probcal.inference.integrate import Integration, integrate
+from probcal.inference.progress import OnProgress, Progress
 from probcal.inference.storage import Storage
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, PRECISION_BOUNDS, Precision, Prior
@@ -30,7 +30,6 @@ from probcal.smoothing.mode import Point
 from probcal.smoothing.tails import expected_mixing, rewhitened
 
 CHUNK = 5  # outer iterations between two reports of progress
-Progress = Callable[[str, int, float], None]  # method, iterations done, current objective
 
 
 class Given(NamedTuple):
@@ -62,7 +61,7 @@ class Context(NamedTuple):
     """What a run is given beside the problem."""
 
     key: jax.Array
-    progress: Progress | None = None
+    progress: OnProgress | None = None
     storage: Storage | None = None  # where a sampler keeps its draws
     threads: int | None = None
     fallback: Any = None  # the sampler that takes over where a collapse does not fit
@@ -261,5 +260,5 @@ def maximise(
             state, (objective, idle) = chunk(kernel(method), problem.model, prior, given, state, left)
             trace = np.concatenate([trace, np.asarray(objective)[~np.asarray(idle)]])
         if context.progress is not None:
-            context.progress(method.name, len(trace), float(trace[-1]))
+            context.progress(Progress(method.name, len(trace), method.iterations, float(trace[-1])))
     return state, trace

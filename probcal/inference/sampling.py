@@ -19,6 +19,7 @@ from probcal.inference.hierarchy import SpikeAndSlab
 from probcal.inference.orbits import orbits_of
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Posed
+from probcal.inference.progress import OnProgress, Progress
 from probcal.inference.storage import Chunks, Storage
 from probcal.priors import Prior
 from probcal.problem import Problem
@@ -26,7 +27,6 @@ from probcal.smoothing.mirrors import Mirrored, distance, new, other_sides
 from probcal.smoothing.mode import Point
 
 if TYPE_CHECKING:
-    from probcal.inference.run import Progress
     from probcal.inference.sampler import Sampler
 
 ROAMING = 0.6  # acceptance of independent draws of the frame below which chains also move along orbits
@@ -75,7 +75,7 @@ def sample(
     start: Point,
     key: jax.Array,
     *,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
     storage: Storage | None = None,
     threads: int | None = None,
     fallback: Sampler | None = None,
@@ -119,7 +119,8 @@ def sample(
                 kept = max(0, min((box.count + 1) * method.chunk - method.warmup, method.chunk))
                 box.add({n: a[:, method.chunk - kept :] for n, a in flat_arrays(draws).items()}, jax.tree.leaves(state))
                 if progress is not None:
-                    progress(method.name, min(box.count * method.chunk, total), float(np.mean(draws.density)))
+                    done, density = min(box.count * method.chunk, total), float(np.mean(draws.density))
+                    progress(Progress(method.name, done, total, density))
         except KeyboardInterrupt:
             interrupted = True
             if box.count * method.chunk <= method.warmup:

@@ -9,7 +9,6 @@ target whose start is not declared would pass many network sizes away.
 
 import os
 import time
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from copy import copy
 from dataclasses import replace
@@ -27,6 +26,7 @@ from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.methods import NUTS, check_problem, choose_prior
 from probcal.inference.posed import Form
 from probcal.inference.prior_draws import check_drawable, draw_data, draw_prior, far_start
+from probcal.inference.progress import OnProgress, Progress
 from probcal.inference.quantities import TAKEN, Points, Pool, Trial, pool_of, ranked
 from probcal.inference.run import Context, Method
 from probcal.inference.sampler import Sampler
@@ -47,16 +47,15 @@ BATCH = 5  # runs of one file
 FAR = 2.0  # extents of the network beyond which the start of a target is called wide
 SHORT = {"chains": 2, "warmup": 150, "draws": 150}  # of a sampler whose draws are only ranked
 STARTS = ("automatic", "truth")
-Advance = Callable[[int, int], None]  # runs done, runs in all
 
 
 @float64
 def sbc(
     problem: Problem,
     method: Method,
+    *,
     prior: Prior | None = None,
     runs: int = 200,
-    *,
     simulate_from: Prior | None = None,
     around: str | xr.DataTree | None = None,
     start: str = "automatic",
@@ -67,7 +66,7 @@ def sbc(
     overwrite: bool = False,
     fallback: bool = True,
     threads: int | None = None,
-    progress: Advance | None = None,
+    progress: OnProgress | None = None,
 ) -> xr.DataTree:
     """Simulation-based calibration of a method on a problem: ranks, coverage of intervals, and a verdict.
 
@@ -108,7 +107,7 @@ def sbc(
 
 
 def _runs(
-    engine: "_Engine", box: Records, runs: int, threads: int | None, progress: Advance | None
+    engine: "_Engine", box: Records, runs: int, threads: int | None, progress: OnProgress | None
 ) -> tuple[dict[int, dict[str, np.ndarray]], bool]:
     """Records of all runs, those kept and those made now, and whether Ctrl-C stopped them."""
     missing = [k for k in range(runs) if k not in box.records]
@@ -120,7 +119,7 @@ def _runs(
 
     def told() -> None:
         if progress is not None:
-            progress(sum(k in box.records for k in range(runs)), runs)
+            progress(Progress("runs", sum(k in box.records for k in range(runs)), runs))
 
     interrupted = False
     try:

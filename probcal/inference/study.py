@@ -19,6 +19,7 @@ from probcal.inference.ending import conclude
 from probcal.inference.identity import identity, problem_digest
 from probcal.inference.integrate import Integrated, Integration, integrate
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
+from probcal.inference.progress import OnProgress, Progress
 from probcal.inference.run import (
     Context,
     Given,
@@ -52,7 +53,6 @@ VECTORS = ("error", "lower", "upper", "true", "sd", "gamma")  # by bias, over it
 SEED = 0  # of what an E-step draws
 NOTHING = np.zeros(0)  # the trace of a batch, which keeps none
 Setting = Callable[..., tuple[Problem, Truth]]
-Advance = Callable[[int, int], None]  # fits done, fits in all
 
 
 class _Solved(NamedTuple):
@@ -253,12 +253,12 @@ def study(
     setting: Setting,
     grid: Mapping[str, Sequence[Any]],
     methods: Sequence[str] | Mapping[str, Any] = ("ml", "em-ea", "ea", ORACLE),
-    runs: int | Sequence[int] = 20,
     *,
+    runs: int | Sequence[int] = 20,
     store: str | PathLike[str] | None = None,
     resume: bool = False,
     overwrite: bool = False,
-    progress: Advance | None = None,
+    progress: OnProgress | None = None,
 ) -> xr.Dataset:
     """Fit every run of every setting by every method: errors, coverage and status by setting, method and run.
 
@@ -294,7 +294,7 @@ def study(
 
 def _fits(
     setting: Setting, points: list[dict[str, Any]], numbers: list[int],
-    methods: Mapping[str, tuple[Method, Prior]], kept: "_Kept", progress: Advance | None,
+    methods: Mapping[str, tuple[Method, Prior]], kept: "_Kept", progress: OnProgress | None,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Records of all methods at all points and runs, those kept and those made now."""
     wanted = {_case(point, run) for point in points for run in numbers}
@@ -315,7 +315,7 @@ def _fits(
     def take(found: list[dict[str, Any]]) -> None:
         records.extend(found)
         if progress is not None:
-            progress(len(records), total)
+            progress(Progress("fits", len(records), total))
 
     if batches:
         take(one(batches[0], firsts[0]))  # compiles

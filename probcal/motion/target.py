@@ -17,6 +17,10 @@ class Target:
     """A target with a motion of its own and, where known, its start: component -> (mean, std).
 
     A motion without linear form draws its own start.
+
+    >>> from probcal.motion import ConstantVelocity
+    >>> Target(ConstantVelocity(0.5), {"position": ((0.0, 0.0), 10.0), "velocity": ((5.0, 0.0), 1.0)}).start["velocity"]
+    ((5.0, 0.0), 1.0)
     """
 
     motion: Any

@@ -139,7 +139,7 @@ def draw_compare(
     estimate = comparison["estimate"].to_dataset()
     labels = estimate["bias_label"].values.tolist()
     if not pairs:
-        found = interchangeable(known[str(comparison.attrs["reference"])], PAIRS, labels)
+        found = interchangeable(known[str(comparison.attrs["reference"])], count=PAIRS, among=labels)
         pairs = [(first, second) for first, second, _ in found]
     height = min(1.8 + (0.16 + 0.09 * len(known)) * min(len(labels), ROWS), 30.0)
     figure = Figure(figsize=(17.0, max(height, 4.2 * (1 + len(pairs)))), layout="constrained")

@@ -34,11 +34,11 @@ class Accessor:
 
         return tracks(self._tree)
 
-    def outliers(self, below: float = 0.5) -> pd.DataFrame:
+    def outliers(self, *, below: float = 0.5) -> pd.DataFrame:
         """Data that count less than `below`, as `probcal.outliers`."""
         from probcal.results.read import outliers
 
-        return outliers(self._tree, below)
+        return outliers(self._tree, below=below)
 
     def drifts(self) -> pd.DataFrame:
         """One row a piece of a drifting bias, as `probcal.drift_table`."""

@@ -18,6 +18,9 @@ def drift_table(tree: xr.DataTree) -> pd.DataFrame:
 
     A value is the bias and its steps so far, fixed ones included; mean and sd are exact sums, the interval is of the
     draws. The first piece begins with the first datum, steps before it are in its value. Empty where nothing drifts.
+
+    >>> len(drift_table(tree))  # nothing drifts
+    0
     """
     columns = ["bias", "unit", "since", "mean", "sd", "lower", "upper"]
     if not {"calibration", "posterior"} <= set(tree.children):

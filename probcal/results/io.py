@@ -28,6 +28,12 @@ def save(tree: xr.DataTree, path: str | PathLike[str]) -> Path:
     """Write netCDF in one step, compressed and with checksums: a file of that name is whole or absent.
 
     Raises `InputError` where it cannot be written.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = save(tree, folder + "/fit.nc")
+    ...     load(path).attrs["status"]
+    'converged'
     """
     content = tree.to_netcdf(engine="h5netcdf", encoding=_encoding(tree))  # in memory: HDF5 dies on a full disk
     return write_whole(path, b"".join([content, SEAL, hashlib.sha256(content).digest()]))

@@ -22,6 +22,9 @@ def summary(tree: xr.DataTree) -> Any:
     """One row a bias as a DataFrame: bias, unit, scale, mean, sd, lower, upper, gamma, precision, status.
 
     After `assess` also verdict and reason.
+
+    >>> summary(tree).set_index("bias").loc["sonar_1.range_offset", "unit"]
+    'm'
     """
     group = tree["calibration"].to_dataset()
     columns = [*SUMMARY, "precision", "status", *(name for name in MORE if name in tree["calibration"])]
@@ -44,6 +47,9 @@ def tracks(tree: xr.DataTree) -> pd.DataFrame:
     """Tracks as a table, one row an epoch of a target: time (s), target, each state component and its sd.
 
     A component that a target lacks is empty there.
+
+    >>> tracks(tree).columns[:3].tolist()
+    ['time', 'target', 'position_x']
     """
     import pandas as pd  # loaded where a table is made
 
@@ -65,10 +71,13 @@ def saved_states(problem: Problem, tracked: Mapping[str, xr.Dataset]) -> list[np
     ]
 
 
-def outliers(tree: xr.DataTree, below: float = 0.5) -> pd.DataFrame:
+def outliers(tree: xr.DataTree, *, below: float = 0.5) -> pd.DataFrame:
     """Data that count less than `below` (heavy-tailed noise), the least first: row, time, sensor, residual, weight.
 
     The weight is that of a Student-t over its largest, or the probability that a datum is no echo of a mixture.
+
+    >>> len(outliers(tree))  # its noise is Gaussian
+    0
     """
     frame = tree["residual"].to_dataset().to_dataframe().reset_index(drop=True)
     frame["residual/std"] = frame["after"] / frame["std"]

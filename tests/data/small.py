@@ -37,4 +37,4 @@ def problem(data=None):
 
 def scenario(key=0):
     """A recording of both targets, a quarter of it missing."""
-    return simulate(network(), ConstantVelocity(0.5), TIME, key, tracks=TRACKS, missing=0.25)
+    return simulate(network(), ConstantVelocity(0.5), TIME, key=key, tracks=TRACKS, missing=0.25)
