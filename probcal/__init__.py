@@ -1,4 +1,7 @@
-"""probcal: Bayesian calibration of sensor networks from targets of opportunity."""
+"""probcal: Bayesian calibration of sensor networks from targets of opportunity.
+
+In examples `network`, `motion`, `run`, `problem` and `tree` are those of the README: three sonars, one passing target.
+"""
 
 from typing import TYPE_CHECKING
 
