@@ -53,12 +53,14 @@ class Precision(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """What every prior is and has; `learns` those whose precisions follow the data, `proper` those with an evidence."""
+    """What every prior is and has: a method takes it by what it can do."""
 
     correlation: Any = ()
 
-    learns: ClassVar[bool] = False
-    proper: ClassVar[bool] = True
+    learns: ClassVar[bool] = False  # precisions follow the data in a climb
+    hierarchical: ClassVar[bool] = False  # hyper-parameters of its own, with a class in `inference.hierarchy`
+    dense: ClassVar[bool] = True  # no bias is exactly zero
+    proper: ClassVar[bool] = True  # an evidence
     first: ClassVar[float] = 1.0  # precision to start from
     note: ClassVar[str] = ""  # what the intervals of every method are worth, where the prior decides it
 
@@ -131,6 +133,7 @@ class Laplace(Prior):
     """
 
     learns: ClassVar[bool] = True
+    hierarchical: ClassVar[bool] = True
     proper: ClassVar[bool] = False  # what Laplace's method gives at a corner is no evidence
     rate: ClassVar[float] = float(np.sqrt(2.0))
     note: ClassVar[str] = "l1: given the scale mixture at the mode, no posterior intervals"
@@ -173,6 +176,7 @@ class ARD(Prior):
     by: str | None = None
 
     learns: ClassVar[bool] = True
+    hierarchical: ClassVar[bool] = True
 
     def __post_init__(self):
         super().__post_init__()
@@ -219,6 +223,8 @@ class Horseshoe(Prior):
     slab_df: float = 4.0
     by: str | None = None
 
+    hierarchical: ClassVar[bool] = True
+
     def __post_init__(self):
         super().__post_init__()
         if not 0 < self.expected < 1:
@@ -244,6 +250,9 @@ class BernoulliGaussian(Prior):
     slab: float = 1.0
     a: float = 1.0
     b: float = 1.0
+
+    hierarchical: ClassVar[bool] = True
+    dense: ClassVar[bool] = False
 
     def __post_init__(self):
         super().__post_init__()

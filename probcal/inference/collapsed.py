@@ -19,7 +19,7 @@ from probcal.inference.hierarchy import Phi
 from probcal.inference.orbits import Place, roam
 from probcal.inference.posed import Conditional, Form, Posed, conditional, prior_precision
 from probcal.inference.sampler import Sample, Sampler
-from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace, Prior
+from probcal.priors import Horseshoe, Prior
 from probcal.smoothing.frame import log_weight
 
 SHRINKINGS = 40  # most times that an ellipse is cut
@@ -139,7 +139,8 @@ class Collapsed(Sampler):
     move: str = "ellipse"
 
     name: ClassVar[str] = "Collapsed"
-    priors: ClassVar[tuple[type, ...]] = (Horseshoe, BernoulliGaussian, Gaussian, Laplace, ARD, Flat)
+    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
+    atoms: ClassVar[bool] = True
     crosses: ClassVar[bool] = True
     roams: ClassVar[bool] = True
     chunk: ClassVar[int] = 50

@@ -25,7 +25,7 @@ from probcal.inference.run import (
     valued,
 )
 from probcal.model.model import Model
-from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
+from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
 from probcal.smoothing.information import paper_b, update_levels
 from probcal.smoothing.linearised import laplace_of
@@ -149,7 +149,7 @@ class EA(Maximiser):
     precisions: str = "integrated"
 
     name: ClassVar[str] = "EA"
-    priors: ClassVar[tuple[type, ...]] = (Horseshoe, ARD, Laplace, BernoulliGaussian)
+    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
     intervals: ClassVar[str] = (
         "a mixture over the precisions around the Gaussian likelihood at one point; unknown noise levels are held"
     )
@@ -179,7 +179,7 @@ class EA(Maximiser):
 
     def takes(self, prior: Prior) -> bool:
         """Any hierarchical prior where precisions are integrated, else ARD."""
-        return isinstance(prior, self.priors if self.precisions == "integrated" else ARD)
+        return prior.hierarchical if self.precisions == "integrated" else isinstance(prior, ARD)
 
     def climb(self, problem: Problem, prior: Prior, start: Point, context: Context) -> tuple[State, np.ndarray]:
         """The outer loop; where each precision is maximised alone, again from better ones while there are any."""

@@ -25,7 +25,7 @@ from probcal.inference.posed import Form, Posed
 from probcal.model import rows
 from probcal.model.model import Model
 from probcal.model.rows import Block, Rows
-from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
+from probcal.priors import PRIORS, Flat, Horseshoe, Precision, Prior
 from probcal.problem import Problem, check_linear
 from probcal.results.read import apply
 from probcal.smoothing.frame import frame_at
@@ -37,8 +37,6 @@ from probcal.types import float64
 
 if TYPE_CHECKING:
     import xarray as xr
-
-DENSE = (Horseshoe, Gaussian, Laplace, ARD, Flat)  # priors with a density
 
 
 def suffix(problem: Problem, r: int) -> str:
@@ -142,10 +140,10 @@ def numpyro_model(problem: Problem, *, prior: Prior | None = None) -> NumpyroMod
     unknown sites and for values of another shape.
     """
     prior = Horseshoe() if prior is None else prior
-    if not isinstance(prior, DENSE):
+    if not prior.dense:
         raise InputError(
             f"numpyro_model: {type(prior).__name__} has no density that numpyro could take; give one of"
-            f" {', '.join(kind.__name__ for kind in DENSE)}, or fit BernoulliGaussian by Collapsed()"
+            f" {', '.join(name for name, known in PRIORS.items() if known.dense)}, or fit it by Collapsed()"
         )
     check_linear(problem)
     return NumpyroModel(problem, hierarchy_of(prior, problem), prior.precision(problem.labels, problem.surveyed))

@@ -16,7 +16,7 @@ from probcal.inference.orbits import Place, roam
 from probcal.inference.posed import Form, Posed, conditional
 from probcal.inference.sampler import Sample, Sampler
 from probcal.lazy import Later
-from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
+from probcal.priors import Horseshoe, Prior
 from probcal.smoothing.frame import log_weight
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class NUTS(Sampler):
     dense: bool = False
 
     name: ClassVar[str] = "NUTS"
-    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Gaussian, Laplace, ARD, Flat)
+    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
     crosses: ClassVar[bool] = True
     roams: ClassVar[bool] = True
     chunk: ClassVar[int] = 20

@@ -29,6 +29,7 @@ class Sampler(Method, ABC):
     draws: int
     chunk: ClassVar[int]  # steps between two checkpoints
     exact: ClassVar[bool] = True  # whether its draws are those of the posterior
+    atoms: ClassVar[bool] = False  # whether it takes priors under which a bias may be exactly zero
     crosses: ClassVar[bool] = False  # whether its chains visit other sides of a mirror, by `across`
     roams: ClassVar[bool] = False  # whether its chains move along orbits where the frame fits badly, by `roam`
     intervals: ClassVar[str] = "quantiles of the exact posterior"
@@ -40,8 +41,10 @@ class Sampler(Method, ABC):
                 raise InputError(f"{self.name}({field}={getattr(self, field)}): it must be at least {least}")
 
     def takes(self, prior: Prior) -> bool:
-        """Whether there is a posterior to draw from: a flat hyper-prior of ARD leaves none."""
-        return super().takes(prior) and not (isinstance(prior, ARD) and prior.rate == 0.0)
+        """Whether there is a posterior to draw from, and the method can: a flat hyper-prior of ARD leaves none."""
+        return (
+            super().takes(prior) and (prior.dense or self.atoms) and not (isinstance(prior, ARD) and prior.rate == 0.0)
+        )
 
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Draws of the posterior around a start, and what they say."""

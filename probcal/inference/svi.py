@@ -20,7 +20,7 @@ from probcal.inference.guides import Guide, GuideParameters, LowRank, MeanField,
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, log_prior, prior_precision, whiten
 from probcal.inference.sampler import Sample, Sampler
-from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace
+from probcal.priors import Horseshoe, Prior
 from probcal.smoothing.frame import log_joint, place, unit_normals
 from probcal.smoothing.mode import Point, factors, mixed_density
 from probcal.smoothing.recursion import trajectory
@@ -95,7 +95,7 @@ class SVI(Sampler):
     particles: int = 4
 
     name: ClassVar[str] = "SVI"
-    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Gaussian, Laplace, ARD, Flat)
+    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
     chunk: ClassVar[int] = 50
     exact: ClassVar[bool] = False
     intervals: ClassVar[str] = (
