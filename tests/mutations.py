@@ -37,7 +37,7 @@ MUTATIONS = [
     Mutation("smoothing/recursion.py", "gain.gain @ innovation + force", "gain.gain @ innovation", "test_diffuse.py"),
     Mutation("smoothing/recursion.py", "return states @ earlier + later", "return states @ b + later", "test_diffuse.py"),
     # analysis/shape.py
-    Mutation("analysis/shape.py", "if fall <= MOST:", "if fall > MOST:", "test_guards.py"),
+    Mutation("analysis/shape.py", "if not fall > MOST:", "if fall > MOST:", "test_guards.py"),
     # inference/hierarchy.py, orbits.py: scales of their own that move along
     Mutation("inference/hierarchy.py", "jnp.sum(own + way - forth", "jnp.sum(own - forth", "test_orbits.py"),
     Mutation("inference/hierarchy.py", "jnp.exp(logs)) + logs - prior", "jnp.exp(logs)) - prior", "test_orbits.py"),

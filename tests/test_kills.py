@@ -33,7 +33,7 @@ def network():
 def scenario(key=0):
     track = np.stack([np.linspace(10, 50, 12), 25 + 10 * np.sin(np.linspace(0, 3, 12))], 1)
     true = {"gauge_0.range_offset": 0.0, "gauge_1.range_offset": 3.0, "gauge_2.range_offset": 0.0}
-    return simulate(network(), ConstantVelocity(0.5), np.arange(12.0), key, tracks={"car": track}, biases=true)
+    return simulate(network(), ConstantVelocity(0.5), np.arange(12.0), key=key, tracks={"car": track}, biases=true)
 
 
 def problem(data=None):

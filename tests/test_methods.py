@@ -21,7 +21,7 @@ from probcal.inference.run import Context, maximise
 from probcal.inference.sampler import Sampler
 from probcal.model.model import At
 from probcal.noise import AdditiveNoise, Normal
-from probcal.priors import PRIORS, Precision
+from probcal.priors import PRIORS, Precision, Prior
 from probcal.results.schema import TYPE_II
 from probcal.smoothing.esteps import EStep, Expected
 from probcal.smoothing.linearised import linearise
@@ -527,3 +527,12 @@ ERRORS = [
 def test_error_texts(call, text):
     with pytest.raises(InputError, match=text):
         call()
+
+
+def test_a_prior_whose_hyper_parameters_nobody_draws_is_refused():
+    @dataclass(frozen=True)
+    class Scales(Prior):
+        hierarchical = True
+
+    with pytest.raises(InputError, match="Scales has hyper-parameters but no class that draws them"):
+        probcal.fit(linear("plane")[0], probcal.EA(), prior=Scales())

@@ -83,7 +83,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
         Finding("wrapping", *pair) for pair in residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     ]
     findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups) + process.check_process_noise(fit, keys[2])
-    bent = None if _absurd(tree) else shape.check_shape(fit, tree)
+    bent = None if tree.attrs["status"] in INVALID else shape.check_shape(fit, tree)
     findings += [] if bent is None else [bent]
     groups["verdict"] = _verdicts(fit, tree, found, groups, bent)
     if "mirror" in tree.children:

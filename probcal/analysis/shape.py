@@ -13,7 +13,7 @@ from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted
 from probcal.smoothing import mode
 
-MOST = 0.5  # nats a datum, of a linear model
+LINEAR, MOST = 0.5, 0.75  # nats a datum: at most of a linear model, and from which it is a finding
 GAUSSIAN = ("Laplace", "mixture")  # kinds of answers that draw from Gaussians around a mode
 
 _log_likelihood = jax.jit(mode.log_likelihood)
@@ -25,11 +25,11 @@ def check_shape(fit: Fitted, tree: xr.DataTree) -> Finding | None:
         return None
     drawn = tree["log_likelihood"].to_dataset()["y"].values  # (chain, draw, data)
     fall = (float(_log_likelihood(fit.problem.model, fit.point)) - float(np.median(drawn.sum(2)))) / drawn.shape[2]
-    if fall <= MOST:
+    if not fall > MOST:
         return None
     text = (
         f"the answer is far from Gaussian: at its draws the data fit {fall:.2g} nats a datum worse than at its mode"
-        f" ({MOST:g} at most if it were), so its intervals are none; state where the targets start, and compare with"
+        f" ({LINEAR:g} at most if it were), so its intervals are none; state where the targets start, and compare with"
         " NUTS()"
     )
     return Finding("shape", "fit", text)

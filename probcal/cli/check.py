@@ -13,7 +13,6 @@ from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem
 from probcal.cli.progress import line
 from probcal.files import Outputs
-from probcal.inference.progress import Progress
 from probcal.problem import Problem
 from probcal.results.io import save
 from probcal.smoothing.start import automatic_start
@@ -30,9 +29,7 @@ def run(model: Path, data: Path | None, fix: Sequence[str], outputs: Outputs | N
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
     keep_kernels()
     _, problem = load_problem(model, data, fix)
-    with line() as progress:
-        if progress is not None:
-            progress(Progress("check", 0, 1))
+    with line():
         start = automatic_start(problem)
         tree = observability(problem, point=start)
         passes = next_passes(problem, point=start)

@@ -34,7 +34,7 @@ def run(
 ) -> int:  # fmt: skip
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
     keep_kernels()
-    load_ahead(["arviz_stats", *(["probcal.report"] if outputs is not None and can_plot() else [])] if assessed else [])
+    load_ahead(["scipy.stats", *(["probcal.report"] if outputs is not None and can_plot() else [])] if assessed else [])
     known, implied = METHODS[method]
     value: Any = known
     value = replace(value, **sizes) if sizes else value

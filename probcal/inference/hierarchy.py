@@ -438,7 +438,8 @@ class SpikeAndSlab(Hierarchy):
 def hierarchy_of(prior: Prior, problem: Problem) -> Hierarchy:
     """The hierarchy of a prior for the biases of a problem; those with a survey keep their own Gaussian.
 
-    Raises `InputError` for an ARD prior whose hyper-prior is not proper: no posterior of the biases exists then.
+    Raises `InputError` for an ARD prior whose hyper-prior is not proper: no posterior of the biases exists then; and
+    for a prior with hyper-parameters that has no class here.
     """
     learnt = np.flatnonzero(~problem.surveyed)
     groups = np.unique(prior.groups(problem.members)[learnt], return_inverse=True)[1] if len(learnt) else learnt
@@ -446,6 +447,9 @@ def hierarchy_of(prior: Prior, problem: Problem) -> Hierarchy:
         ARD: GammaPrecision, Laplace: LaplaceMixture, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab,
     }  # fmt: skip
     kind = kinds.get(type(prior))
+    if kind is None and (prior.hierarchical or prior.learns):
+        name = type(prior).__name__
+        raise InputError(f"{name} has hyper-parameters but no class that draws them; add one to inference/hierarchy.py")
     if kind is None or not len(learnt):
         return NoHyperprior(prior, (), ())
     if isinstance(prior, ARD) and prior.rate == 0.0:

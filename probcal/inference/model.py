@@ -125,7 +125,7 @@ def numpyro_model(problem: Problem, *, prior: Prior | None = None) -> NumpyroMod
     from numpyro.infer import MCMC, NUTS, init_to_value
 
     with jax.enable_x64(True):
-        model = numpyro_model(problem, prior)
+        model = numpyro_model(problem, prior=prior)
         mcmc = MCMC(NUTS(model, init_strategy=init_to_value(values=model.start())), num_warmup=500, num_samples=500)
         mcmc.run(jax.random.key(0))
         tree = az.from_numpyro(mcmc, dims=model.dims, coords=model.coords)
@@ -141,9 +141,10 @@ def numpyro_model(problem: Problem, *, prior: Prior | None = None) -> NumpyroMod
     """
     prior = Horseshoe() if prior is None else prior
     if not prior.dense:
+        known = dict.fromkeys(type(one).__name__ for one in PRIORS.values() if one.dense)
         raise InputError(
             f"numpyro_model: {type(prior).__name__} has no density that numpyro could take; give one of"
-            f" {', '.join(name for name, known in PRIORS.items() if known.dense)}, or fit it by Collapsed()"
+            f" {', '.join(known)}, or fit it by Collapsed()"
         )
     check_linear(problem)
     return NumpyroModel(problem, hierarchy_of(prior, problem), prior.precision(problem.labels, problem.surveyed))

@@ -254,6 +254,7 @@ def maximise(
     while len(trace) < method.iterations and not bool(state.done):
         if method.steps_on_host(problem.model, prior):
             state = stepped(method, problem.model, prior, given, state)
+            state = method.close(problem.model.with_mixing(state.mixing), prior, given, state)
             trace = np.append(trace, float(state.objective))
         else:
             left = method.iterations - len(trace)

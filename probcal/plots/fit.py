@@ -229,7 +229,7 @@ def _mirrored(tree: xr.DataTree) -> Iterator[_Track]:
     best = int(group["gain"].values.argmax())
     if group["gain"].values[best] <= -same:
         return
-    for target, there in each_track(tree, "mirror/track"):
+    for target, there in each_track(tree.children["mirror"]):
         places = there["position"].isel(mirror=best).values[:, :2]
         yield _Track(target, places, places)
 

@@ -37,9 +37,8 @@ def summary(tree: xr.DataTree) -> Any:
 
 def each_track(tree: xr.DataTree, group: str = "track") -> Iterator[tuple[str, xr.Dataset]]:
     """Name and dataset of every target of a tree, in the order of the problem; none where it has no such group."""
-    found = tree.get(group)
-    if found is not None:
-        for node in found.children.values():
+    if group in tree.children:
+        for node in tree[group].children.values():
             yield str(node.attrs["target"]), node.to_dataset(inherit=False)
 
 

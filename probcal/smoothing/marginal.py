@@ -256,7 +256,7 @@ def find_marginal_mode(
         return _shorter(s, prior)
 
     s = _begun(model, start)
-    if not isinstance(s.value, jax.core.Tracer):
+    if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((s, model, start, prior, tolerance))):
         while not s.done and s.iteration <= iterations:
             point, solved, value, better = look(s)
             s = turned(s, point, solved, value) if better else shorter(s)
