@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probcal import ConstantVelocity, Network, Node, Problem, assess, simulate
+from probcal import ConstantVelocity, Network, Node, Problem, Target, assess, simulate
 from probcal.errors import FitError
 from probcal.inference.fit import calibrate
 from probcal.sensors import doa
@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import networks
 import radars
 
+STATED = {"position": ((-600.0, 1000.0), 50.0), "velocity": ((20.0, 0.0), 5.0)}  # start of `compact`
 FAR, PULLED = 4.0, 0.9  # sd of a wrong answer, gamma of a bias that the data tell
 
 
@@ -92,12 +93,12 @@ def directions(run, places, free, path, motion):
     return Problem(network, motion, drawn.table), drawn.truth
 
 
-def compact(run):
-    """An array of 20 m and a target at 1 km, its start not declared."""
+def compact(run, motion=ConstantVelocity(0.3)):
+    """An array of 20 m and a target at 1 km, its start not declared unless `motion` is a target that has one."""
     time = np.arange(60.0)
     path = np.stack([-600 + 20 * time, 1000 + 0 * time], 1)
     places = [(0, 0), (20, 0), (20, 20), (0, 20)]
-    return directions(run, places, {"heading": np.deg2rad(3)}, path, ConstantVelocity(0.3))
+    return directions(run, places, {"heading": np.deg2rad(3)}, path, motion)
 
 
 def anchored(scale):
@@ -130,6 +131,7 @@ WRONG = {
     "drifting": lambda run: beacons(run, added(lambda time: 0.08 * time)),
     "late": lambda run: beacons(run, late),
     "compact": compact,
+    "compact-stated": lambda run: compact(run, Target(ConstantVelocity(0.3), STATED)),
     "anchored-10": anchored(10.0),
     "anchored-30": anchored(30.0),
     "signal": right("signal", 0.3),

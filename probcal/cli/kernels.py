@@ -3,6 +3,7 @@
 import importlib
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 
 import jax
 import platformdirs
@@ -28,9 +29,7 @@ def load_ahead(names: Sequence[str]) -> None:
 
     def load() -> None:
         for name in names:
-            try:
+            with suppress(ImportError):
                 importlib.import_module(name)
-            except Exception:
-                return
 
     threading.Thread(target=load, daemon=True).start()

@@ -149,7 +149,6 @@ class EA(Maximiser):
     precisions: str = "integrated"
 
     name: ClassVar[str] = "EA"
-    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
     intervals: ClassVar[str] = (
         "a mixture over the precisions around the Gaussian likelihood at one point; unknown noise levels are held"
     )
