@@ -93,12 +93,12 @@ def directions(run, places, free, path, motion):
     return Problem(network, motion, drawn.table), drawn.truth
 
 
-def compact(run, motion=ConstantVelocity(0.3)):
-    """An array of 20 m and a target at 1 km, its start not declared unless `motion` is a target that has one."""
+def compact(run, start=None):
+    """An array of 20 m and a target at 1 km, its start not declared unless given."""
     time = np.arange(60.0)
     path = np.stack([-600 + 20 * time, 1000 + 0 * time], 1)
     places = [(0, 0), (20, 0), (20, 20), (0, 20)]
-    return directions(run, places, {"heading": np.deg2rad(3)}, path, motion)
+    return directions(run, places, {"heading": np.deg2rad(3)}, path, Target(ConstantVelocity(0.3), start))
 
 
 def anchored(scale):
@@ -131,7 +131,7 @@ WRONG = {
     "drifting": lambda run: beacons(run, added(lambda time: 0.08 * time)),
     "late": lambda run: beacons(run, late),
     "compact": compact,
-    "compact-stated": lambda run: compact(run, Target(ConstantVelocity(0.3), STATED)),
+    "compact-stated": lambda run: compact(run, STATED),
     "anchored-10": anchored(10.0),
     "anchored-30": anchored(30.0),
     "signal": right("signal", 0.3),
