@@ -98,7 +98,7 @@ def compact(run, start=None):
     time = np.arange(60.0)
     path = np.stack([-600 + 20 * time, 1000 + 0 * time], 1)
     places = [(0, 0), (20, 0), (20, 20), (0, 20)]
-    return directions(run, places, {"heading": np.deg2rad(3)}, path, Target(ConstantVelocity(0.3), start))
+    return directions(run, places, {"heading": np.deg2rad(3)}, path, Target(ConstantVelocity(0.3), start or {}))
 
 
 def anchored(scale):
