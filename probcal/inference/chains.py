@@ -1,5 +1,6 @@
 """Draws of a chain, and the kernels that run many steps of it between two checkpoints."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -44,12 +45,18 @@ def keep(form: Form, posed: Posed, sample: Sample) -> Draw:
     return Draw(sample.theta, sample.phi, gamma, variance, point.states, density, sample.stats)
 
 
+def repeated(step: Callable[[Any], tuple[Any, Sample]], state: Any, thin: jax.Array) -> tuple[Any, Sample]:
+    """The state after `thin` steps, and the last draw."""
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(step, state)[1])
+    return jax.lax.fori_loop(0, thin, lambda _, at: step(at[0]), (state, blank))
+
+
 @partial(jax.jit, static_argnames=("method", "form"))
-def run_chunk(method: Any, form: Form, posed: Posed, chain: Any) -> tuple[Any, Draw]:
-    """`method.chunk` steps of one chain, all kept; leading dims of the draws are (chunk,)."""
+def run_chunk(method: Any, form: Form, posed: Posed, chain: Any, thin: jax.Array) -> tuple[Any, Draw]:
+    """`method.chunk` draws of one chain, every `thin`-th kept; leading dims of the draws are (chunk,)."""
 
     def one(chain: Any, _: None) -> tuple[Any, Draw]:
-        chain, sample = method.step(form, posed, chain)
+        chain, sample = repeated(partial(method.step, form, posed), chain, thin)
         return chain, keep(form, posed, sample)
 
     return jax.lax.scan(one, chain, None, length=method.chunk)
@@ -69,28 +76,31 @@ def side_of(sides: Posed, side: Any) -> Posed:
 
 
 @partial(jax.jit, static_argnames=("method", "form"))
-def run_sided(method: Any, form: Form, sides: Posed, state: Sided) -> tuple[Sided, Draw]:
-    """`method.chunk` steps of one chain as in `run_chunk`, each followed by an attempt to cross to another side.
+def run_sided(method: Any, form: Form, sides: Posed, state: Sided, thin: jax.Array) -> tuple[Sided, Draw]:
+    """Draws of one chain as in `run_chunk`, each step followed by an attempt to cross to another side.
 
     Crossing keeps hyper-parameters and the coordinates that the frame of a side whitens, an involution between any two
     sides, and is accepted by the joint density there (`method.across`).
     """
     count = jax.tree.leaves(sides.frame)[0].shape[0]
 
-    def one(state: Sided, _: None) -> tuple[Sided, Draw]:
+    def step(state: Sided) -> tuple[Sided, Sample]:
         here = side_of(sides, state.side)
         chain, sample = method.step(form, here, state.chain)
         key, pick, lot = jax.random.split(state.key, 3)
         other = (state.side + 1 + jax.random.randint(pick, (), 0, count - 1)) % count
         moved, gain = method.across(form, here, side_of(sides, other), chain)
         taken = jnp.log(jax.random.uniform(lot)) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
-        draw = keep(form, here, sample)
-        draw = draw._replace(stats=draw.stats | {"side": state.side, "crossed": taken})
         after = jax.tree.map(lambda new, old: jnp.where(taken, new, old), (moved, other), (chain, state.side))
-        return Sided(after[0], after[1], key), draw
+        stats = sample.stats | {"side": state.side, "crossed": taken}
+        return Sided(after[0], after[1], key), sample._replace(stats=stats)
+
+    def one(state: Sided, _: None) -> tuple[Sided, Draw]:
+        state, sample = repeated(step, state, thin)
+        return state, keep(form, side_of(sides, sample.stats["side"]), sample)
 
     return jax.lax.scan(one, state, None, length=method.chunk)
 
 
-run_sideds = jax.jit(jax.vmap(run_sided, in_axes=(None, None, None, 0)), static_argnums=(0, 1))
-run_chunks = jax.jit(jax.vmap(run_chunk, in_axes=(None, None, None, 0)), static_argnums=(0, 1))
+run_sideds = jax.jit(jax.vmap(run_sided, in_axes=(None, None, None, 0, None)), static_argnums=(0, 1))
+run_chunks = jax.jit(jax.vmap(run_chunk, in_axes=(None, None, None, 0, None)), static_argnums=(0, 1))

@@ -1,9 +1,7 @@
 """Collapsed sampling: trajectories marginalised by the frame, Gibbs on what is left, every draw made exact.
 
-One draw: a few Gibbs sweeps on the frame's Gaussian likelihood propose hyper-parameters and biases together
-(surrogate transition, Liu 2001; delayed acceptance, Christen, Fox 2005), taken or refused by the weight of the joint
-posterior; the hyper-parameters are drawn anew; biases and trajectories then move along an ellipse (Murray, Adams,
-MacKay 2010).
+One draw: leaps of hyper-parameters and biases together by Gibbs sweeps on the frame's Gaussian likelihood; the
+hyper-parameters drawn anew; then a Hamiltonian swing of biases and all trajectories.
 """
 
 from dataclasses import dataclass, replace
@@ -14,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.gibbs import reversible_sweeps
 from probcal.inference.hierarchy import Phi
-from probcal.inference.orbits import Place, roam
+from probcal.inference.leaps import Place, leap
+from probcal.inference.orbits import roam
 from probcal.inference.posed import Conditional, Form, Posed, conditional, prior_precision
 from probcal.inference.sampler import Sample, Sampler
 from probcal.priors import Horseshoe, Prior
 from probcal.smoothing.frame import log_weight
 
-SHRINKINGS = 40  # most times that an ellipse is cut
+LEAPS = 4  # tries before a swing, which costs more than all of them
 STEP = 1.3  # of a swing, over the fourth root of the dimension (Beskos and others 2013)
 
 
@@ -36,43 +34,13 @@ class CollapsedState(NamedTuple):
     key: jax.Array
 
 
-def elliptical_slice_step(
-    form: Form, posed: Posed, chain: CollapsedState, given: Conditional, key: jax.Array
-) -> tuple[jax.Array, tuple[jax.Array, ...], jax.Array, jax.Array]:
-    """Elliptical slice sampling of theta and eps given phi: new theta, eps, log weight and the tries it took."""
-    keys = jax.random.split(key, 4)
-    turn = given.deviation(keys[0])
-    seeds = jax.random.split(keys[1], len(chain.eps))
-    other = tuple(jax.random.normal(k, e.shape) for k, e in zip(seeds, chain.eps, strict=True))
-    level = chain.weight - jax.random.exponential(keys[2])
-    mean = jnp.where(given.active, given.mean, 0.0)
-
-    def at(angle: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        c, s = jnp.cos(angle), jnp.sin(angle)
-        theta = mean + c * (chain.theta - mean) + s * turn
-        return theta, tuple(c * e + s * o for e, o in zip(chain.eps, other, strict=True))
-
-    def attempt(state: Any) -> Any:
-        low, high, key, tries, _, _ = state
-        key, draw = jax.random.split(key)
-        angle = low + (high - low) * jax.random.uniform(draw)
-        weight = log_weight(posed.model, posed.frame, *at(angle))
-        return jnp.where(angle < 0, angle, low), jnp.where(angle < 0, high, angle), key, tries + 1, angle, weight
-
-    start = 2 * jnp.pi * jax.random.uniform(keys[3])
-    first = (start - 2 * jnp.pi, start, key, jnp.zeros((), int), jnp.zeros(()), jnp.full((), -jnp.inf, float))
-    last = jax.lax.while_loop(lambda s: ~(s[5] >= level) & (s[3] < SHRINKINGS), attempt, first)
-    found = last[5] >= level
-    theta, eps = at(jnp.where(found, last[4], 0.0))
-    return theta, eps, jnp.where(found, last[5], chain.weight), last[3]
-
-
 def hmc_step(
     form: Form, posed: Posed, chain: CollapsedState, given: Conditional, key: jax.Array
 ) -> tuple[jax.Array, tuple[jax.Array, ...], jax.Array, jax.Array]:
-    """Hamiltonian step of theta and eps given phi, a quarter turn in the frame's coordinates; as `ellipse` returns.
+    """Hamiltonian step of theta and eps given phi, a quarter turn in the frame's coordinates.
 
-    Its short steps hold where many epochs together leave the frame, and an ellipse could only creep.
+    Returns theta, eps, log weight and whether the step was taken. Its steps are short enough for many epochs that
+    together leave the frame.
     """
     keys = jax.random.split(key, 3)
     free = (given.factor.T @ (chain.theta - given.mean), chain.eps)
@@ -115,10 +83,7 @@ def hmc_step(
     gain = before + kinetic(momentum) - value - kinetic(after)
     taken = jnp.log(jax.random.uniform(keys[2])) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
     found = (place(last), last[1], weight), (chain.theta, chain.eps, chain.weight)
-    return *jax.tree.map(lambda new, old: jnp.where(taken, new, old), *found), jnp.asarray(count)
-
-
-MOVES = {"ellipse": elliptical_slice_step, "swing": hmc_step}
+    return *jax.tree.map(lambda new, old: jnp.where(taken, new, old), *found), taken
 
 
 @dataclass(frozen=True)
@@ -126,17 +91,17 @@ class Collapsed(Sampler):
     """Exact posterior of biases, hyper-parameters and trajectories, sampled with the trajectories marginalised.
 
     Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it (None: as pays for the prior)
-    between two draws of each of `chains`. Biases and trajectories also move together, along an "ellipse" or by a
-    Hamiltonian "swing". Where the frame fits badly it is moved; where that fails the joint sampler `NUTS` takes over,
-    or, for a spike, the swing.
-    Raises `InputError` for another move or less than one sweep.
+    between two draws of each of `chains`. Biases and trajectories also move together, by a Hamiltonian swing. Where the
+    frame fits badly it is moved; where that fails the joint sampler `NUTS` takes over if it has the prior. Draws that
+    have not mixed are made anew with 4 times as many steps from one to the next, up to `patience`.
+    Raises `InputError` for less than one sweep or step.
     """
 
     chains: int = 4
     warmup: int = 100
     draws: int = 500
     sweeps: int | None = None
-    move: str = "ellipse"
+    patience: int = 16
 
     name: ClassVar[str] = "Collapsed"
     priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
@@ -147,18 +112,17 @@ class Collapsed(Sampler):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.move not in MOVES or (self.sweeps is not None and self.sweeps < 1):
-            raise InputError(f'Collapsed(sweeps={self.sweeps}, move="{self.move}"): move is one of {", ".join(MOVES)}')
+        for name, value in (("sweeps", self.sweeps), ("patience", self.patience)):
+            if value is not None and value < 1:
+                raise InputError(f"Collapsed({name}={value}): it must be at least 1")
 
     def kernel(self) -> "Collapsed":
         """The method whatever the number of its chains and draws."""
-        return replace(self, chains=1, warmup=0, draws=1)
+        return replace(self, chains=1, warmup=0, draws=1, patience=1)
 
-    def instead(self, prior: Prior, fallback: Any) -> tuple[Sampler, str]:
-        """The fallback where it has the prior, else the swing, which needs no frame that fits."""
-        if fallback.takes(prior):
-            return replace(fallback, chains=self.chains, draws=self.draws), fallback.name
-        return replace(self, move="swing"), "the swing"
+    def instead(self, prior: Prior, fallback: Any) -> Sampler | None:
+        """The fallback where it has the prior."""
+        return replace(fallback, chains=self.chains, draws=self.draws) if fallback.takes(prior) else None
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> CollapsedState:
         """A chain at a draw of the frame's posterior."""
@@ -170,27 +134,19 @@ class Collapsed(Sampler):
 
     def step(self, form: Form, posed: Posed, chain: CollapsedState) -> tuple[CollapsedState, Sample]:
         """One draw."""
-        key, *keys = jax.random.split(chain.key, 6)
-        theta, phi = reversible_sweeps(
-            form, posed, chain.theta, chain.phi, keys[0], self.sweeps or form.hierarchy.sweeps
-        )
-        weight = log_weight(posed.model, posed.frame, theta, chain.eps)
-        rate = jnp.exp(jnp.minimum(weight - chain.weight, 0.0))
-        taken = jax.random.uniform(keys[1]) < rate
-        proposed = chain._replace(theta=theta, phi=phi, weight=weight)
-        chain = jax.tree.map(lambda new, old: jnp.where(taken, new, old), proposed, chain._replace(key=chain.key))
-        phi, learnt = chain.phi, jnp.asarray(form.hierarchy.learnt, int)
+        key, *keys = jax.random.split(chain.key, 5)
+        at = Place(chain.theta, chain.eps, chain.phi, chain.weight)
+        at, rate = leap(form, posed, at, keys[0], LEAPS, self.sweeps or form.hierarchy.sweeps)
+        phi, learnt = at.phi, jnp.asarray(form.hierarchy.learnt, int)
         for k, update in enumerate(form.hierarchy.updates()):
-            phi = update(phi, chain.theta[learnt], jax.random.fold_in(keys[2], k))
+            phi = update(phi, at.theta[learnt], jax.random.fold_in(keys[1], k))
         given = conditional(form, posed, phi)
-        theta, eps, weight, tries = MOVES[self.move](form, posed, chain, given, keys[3])
-        moved, roamed = roam(form, posed, Place(theta, eps, phi, weight), jax.random.fold_in(keys[4], 0))
-        theta, eps, phi, weight = moved
-        chain = CollapsedState(theta, eps, phi, weight, key)
-        joint = weight + posed.frame.log_likelihood(theta) - 0.5 * sum(jnp.sum(e**2) for e in eps)
-        stats = {"acceptance_rate": rate, "tries": tries, "log_weight": weight}
+        theta, eps, weight, swung = hmc_step(form, posed, chain._replace(**at._asdict()), given, keys[2])
+        at, roamed = roam(form, posed, Place(theta, eps, phi, weight), keys[3])
+        joint = at.weight + posed.frame.log_likelihood(at.theta) - 0.5 * sum(jnp.sum(e**2) for e in at.eps)
+        stats = {"acceptance_rate": rate, "swung": swung, "log_weight": at.weight}
         stats |= {"roamed": roamed} if posed.orbits else {}
-        return chain, Sample(theta, eps, phi, joint, stats)
+        return CollapsedState(*at, key), Sample(at.theta, at.eps, at.phi, joint, stats)
 
     def across(self, form: Form, here: Posed, there: Posed, chain: CollapsedState) -> tuple[CollapsedState, jax.Array]:
         """theta by the same unit normals on the other side, hyper-parameters and those of the trajectories kept."""

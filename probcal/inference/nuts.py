@@ -10,9 +10,9 @@ import jax.numpy as jnp
 
 from probcal.errors import InputError
 from probcal.inference.coordinates import Free, Parts, parts
-from probcal.inference.gibbs import reversible_sweeps
 from probcal.inference.hierarchy import Phi
-from probcal.inference.orbits import Place, roam
+from probcal.inference.leaps import Place, leap
+from probcal.inference.orbits import roam
 from probcal.inference.posed import Form, Posed, conditional
 from probcal.inference.sampler import Sample, Sampler
 from probcal.lazy import Later
@@ -95,18 +95,11 @@ class NUTS(Sampler):
         return chain, Sample(found.theta, chain.z.eps, found.phi, found.joint, stats | jumps)
 
     def _jumped(self, form: Form, posed: Posed, chain: Any, found: Parts) -> tuple[Any, Parts, dict[str, jax.Array]]:
-        """The chain after jumps: which biases are large changed on the frame, and a proposal along each orbit.
-
-        The first is a few Gibbs sweeps on the frame's Gaussian, taken or refused by the weight of the joint posterior
-        as `Collapsed` does it: a gradient leads from one sparse answer to another only through what fits neither.
-        """
-        keys = jax.random.split(jax.random.fold_in(chain.rng_key, 1), 4)
+        """The chain after a leap on the frame, and a proposal along each orbit."""
+        keys = jax.random.split(jax.random.fold_in(chain.rng_key, 1))
         at = Place(found.theta, chain.z.eps, found.phi, log_weight(posed.model, posed.frame, found.theta, chain.z.eps))
-        theta, phi = reversible_sweeps(form, posed, at.theta, at.phi, keys[0], form.hierarchy.sweeps)
-        tried = Place(theta, at.eps, phi, log_weight(posed.model, posed.frame, theta, at.eps))
-        leapt = jnp.log(jax.random.uniform(keys[1])) < tried.weight - at.weight
-        at = jax.tree.map(lambda new, old: jnp.where(leapt, new, old), tried, at)
-        at, roamed = roam(form, posed, at, keys[2])
+        at, leapt = leap(form, posed, at, keys[0], 1, form.hierarchy.sweeps)
+        at, roamed = roam(form, posed, at, keys[1])
         given = conditional(form, posed, at.phi)
         free = Free(form.hierarchy.relax(at.phi), given.factor.T @ (at.theta - given.mean), at.eps)
         energy, slope = jax.value_and_grad(lambda own: -parts(form, posed, own).density)(free)

@@ -8,14 +8,14 @@ a random angle, shift or factor, -r as likely as r, and accepted by the joint de
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.inference.hierarchy import Phi
+from probcal.inference.leaps import Place
 from probcal.inference.posed import Form, Posed, log_prior
 from probcal.problem import Problem
 from probcal.smoothing.frame import log_weight, place, unit_normals, volume
@@ -97,15 +97,6 @@ class Orbit:
             idle = jnp.einsum("eij,ej->ei", part.L, old * u)  # columns that reach no state stay as they are
             noises.append((old * u + jnp.einsum("eij,ej->ei", inverse, source - idle)) / new)
         return Point(states, tuple(noises), self.biases(r, point.z), levels)
-
-
-class Place(NamedTuple):
-    """Where a chain stands, in the frame's coordinates."""
-
-    theta: jax.Array  # (Q,)
-    eps: tuple[jax.Array, ...]
-    phi: Phi
-    weight: jax.Array  # log weight
 
 
 def roam(form: Form, posed: Posed, at: Place, key: jax.Array) -> tuple[Place, jax.Array]:

@@ -22,8 +22,10 @@ from probcal.smoothing.mode import Point, smooth_tracks
 PILOTS = 4  # chains of the pilot
 BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, sweeps between two
 MOVES = 4  # most times that the frame is moved
-GOOD, LOST = 0.5, 0.7  # Pareto k-hat at which a frame is left alone, and above which it has failed
-SCARCE = 0.5  # acceptance of independent draws below which it has failed too: the ellipse creeps there
+FITS = 0.5  # Pareto k-hat at which, and
+GOOD = 0.9  # acceptance of a new theta at which a frame is left alone
+SCARCE = 0.1  # acceptance below which it has failed: leaps are rare
+ROUNDS = 4  # trajectories at which that acceptance is judged
 TAILED = 25  # draws below which a Pareto tail cannot be fitted
 FITTINGS, FITTED = 2, 20  # rounds and draws (with mirror images) that a frame is fitted to
 SPREAD = 1.5  # by how much chains start further out than the pilot's draws
@@ -40,13 +42,23 @@ class Worth(NamedTuple):
     """How well a frame stands for the joint posterior."""
 
     khat: float  # Pareto k-hat of the weights of its draws
-    acceptance: float  # of independent draws of it
+    acceptance: float  # of a new theta, trajectories held in the frame's coordinates
     moves: int
 
     @property
     def failed(self) -> bool:
-        """Whether the frame's draws cannot stand for the posterior."""
-        return self.khat > LOST or self.acceptance < SCARCE
+        """Whether leaps on the frame would hardly ever be taken."""
+        return self.acceptance < SCARCE
+
+    @property
+    def good(self) -> bool:
+        """Whether the frame may be left where it is."""
+        return self.khat < FITS and self.acceptance > GOOD
+
+    @property
+    def order(self) -> tuple[float, float]:
+        """The better one is larger."""
+        return min(self.acceptance, GOOD), -self.khat
 
 
 @partial(jax.jit, static_argnames="form")
@@ -81,6 +93,18 @@ def weights(form: Form, posed: Posed, theta: jax.Array, key: jax.Array) -> jax.A
         return log_weight(posed.model, posed.frame, pair[0], eps)
 
     return jax.lax.map(one, (theta, jax.random.split(key, theta.shape[0])))
+
+
+@jax.jit
+def weights_along(posed: Posed, theta: jax.Array, key: jax.Array) -> jax.Array:
+    """Log weights (ROUNDS, D) of draws theta (D, Q), all of a round with the same trajectories from the frame."""
+
+    def one(key: jax.Array) -> jax.Array:
+        keys = jax.random.split(key, len(posed.frame.loops))
+        eps = tuple(jax.random.normal(k, x.shape) for k, x in zip(keys, posed.frame.point.states, strict=True))
+        return jax.lax.map(lambda own: log_weight(posed.model, posed.frame, own, eps), theta)
+
+    return jax.lax.map(one, jax.random.split(key, ROUNDS))
 
 
 @jax.jit
@@ -126,10 +150,11 @@ def pose(problem: Problem, prior: Prior, start: Point, key: jax.Array) -> tuple[
         keys = jax.random.split(jax.random.fold_in(key, move), 3)
         found = pilot(form, posed, keys[0])
         logs = np.asarray(weights(form, posed, found.theta, keys[1]))
-        worth = Worth(pareto_khat(logs), acceptance(logs), move)
-        if best is None or worth.acceptance > best[2].acceptance:
+        held = np.asarray(weights_along(posed, found.theta[::ROUNDS], keys[1]))
+        worth = Worth(pareto_khat(logs), float(np.mean([acceptance(own) for own in held])), move)
+        if best is None or worth.order > best[2].order:
             best = posed, found, worth
-        if move and worth.khat < GOOD:
+        if worth.good:
             break
         draws = found.theta
         frame = moved(model, posed.frame, draws, keys[2])

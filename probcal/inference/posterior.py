@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +12,9 @@ import numpy as np
 
 from probcal.inference.ending import ABSURD, FAR, misfit_sentence
 from probcal.inference.hierarchy import LEAST, MOST, SpikeAndSlab
+from probcal.inference.mixed import ESS, R_HAT, UNSURE, mixing, weights_of_sides, within_sides
 from probcal.inference.pose import pareto_khat
 from probcal.inference.sampling import SamplerRun
-from probcal.lazy import Later
 from probcal.priors import PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
@@ -26,41 +26,8 @@ from probcal.smoothing.mode import Point
 from probcal.smoothing.start import track_mode
 from probcal.status import Status
 
-if TYPE_CHECKING:
-    from arviz_stats.base import array_stats
-else:
-    array_stats = Later("arviz_stats.base.array_stats")
-
-R_HAT = 1.01  # above which chains have not mixed
-ESS = 100  # effective draws a chain below which its quantiles are not to be trusted
-UNSURE = 0.1  # standard error of the weight of a side above which it is not known
+RARE = 0.05  # share of leaps taken below which it is said
 BFMI = 0.3  # below which the energy is not explored (Betancourt 2016)
-
-
-def mixing(draws: np.ndarray) -> dict[str, np.ndarray]:
-    """Rank-normalised r_hat, bulk and tail ess of draws (chain, draw, P), each (P,).
-
-    A quantity that is the same in every draw counts as mixed: r_hat 1, as many effective draws as there are.
-    """
-    still = np.ptp(draws, axis=(0, 1)) == 0
-    names = ["ess", "ess_tail", *(["r_hat"] if draws.shape[0] > 1 else [])]
-    whole = {"ess": float(draws[..., 0].size), "ess_tail": float(draws[..., 0].size), "r_hat": 1.0}
-    found = {name: np.full(draws.shape[2], whole[name]) for name in names}
-    for m in np.flatnonzero(~still):
-        found["ess"][m] = array_stats.ess(draws[..., m], method="bulk")
-        # in the tails of a spike every draw may be the same: there the bulk is all there is
-        tail = (
-            array_stats.ess(draws[..., m], method="tail", prob=(0.05, 0.95)) if _both_tails(draws[..., m]) else np.nan
-        )
-        found["ess_tail"][m] = tail if np.isfinite(tail) else found["ess"][m]
-        if "r_hat" in found:
-            found["r_hat"][m] = array_stats.rhat(draws[..., m])
-    return {name: np.nan_to_num(values, nan=whole[name]) for name, values in found.items()}
-
-
-def _both_tails(draws: np.ndarray) -> bool:
-    """Whether some, but not all, draws lie beyond each of the quantiles that a tail ess looks at."""
-    return all(0 < (draws <= q).mean() < 1 for q in np.quantile(draws, (0.05, 0.95)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +105,7 @@ class Chains(Posterior):
         """Seconds, the frame's worth, and the limits used."""
         run = self.run
         found = {"seconds": run.seconds, "rope": ROPE, "frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
+        found |= {"thin": run.thin}
         if not run.method.exact:
             found["khat"] = pareto_khat(_stats(run)["log_weight"].ravel())
         return {name: float(value) for name, value in found.items()}
@@ -153,14 +121,6 @@ def conclude_draws(problem: Problem, prior: Prior, run: SamplerRun) -> Answer:
         problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
         interrupted=run.interrupted, mirrors=_mirrors(run),
     )  # fmt: skip
-
-
-def within_sides(draws: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """Draws (chain, draw, P) less the mean of their side of a mirror (chain, draw): what must mix on each."""
-    found = np.array(draws)
-    for k in np.unique(side):
-        found[side == k] -= draws[side == k].mean(0)
-    return found
 
 
 def heaviest(run: SamplerRun) -> int:
@@ -295,11 +255,9 @@ def judge_chains(
 
 def _say_sides(run: SamplerRun, said: list[str]) -> bool:
     """What each side of a mirror weighs, and whether the chains agree on it."""
-    counts = [np.bincount(own, minlength=len(run.sides) + 1) / len(own) for own in run.side]
-    share = np.mean(counts, 0)
+    share, error = weights_of_sides(run.side, len(run.sides) + 1)
     if np.count_nonzero(share) < 2:
         return True
-    error = np.std(counts, 0) / np.sqrt(max(len(counts) - 1, 1))
     listed = ", ".join(f"{share[k]:.2f} ± {error[k]:.2f}" for k in np.flatnonzero(share))
     said.append(f"The posterior has {np.count_nonzero(share)} sides, of weights {listed}; r_hat is within sides.")
     if error.max() > UNSURE:
@@ -327,9 +285,6 @@ def _say_steps(run: SamplerRun, said: list[str]) -> bool:
         if bfmi.min() < BFMI:
             said.append(f"BFMI {bfmi.min():.2f} is below {BFMI}: the energy is hardly explored; take more draws.")
             good = False
-    if "tries" in found and run.worth.failed:
-        said.append(
-            f"The collapse fits badly (Pareto k-hat {run.worth.khat:.1f}), the Metropolis step accepts "
-            f"{found['acceptance_rate'].mean():.0%}: draws are exact but far from independent."
-        )
+    if "swung" in found and (rate := found["acceptance_rate"].mean()) < RARE:
+        said.append(f"Leaps are taken in {rate:.1%} of the tries: draws are exact but far from independent.")
     return good

@@ -28,6 +28,7 @@ class Sampler(Method, ABC):
     warmup: int
     draws: int
     chunk: ClassVar[int]  # steps between two checkpoints
+    patience: int = 1  # most steps from one draw to the next, where those after fewer have not mixed
     exact: ClassVar[bool] = True  # whether its draws are those of the posterior
     atoms: ClassVar[bool] = False  # whether it takes priors under which a bias may be exactly zero
     crosses: ClassVar[bool] = False  # whether its chains visit other sides of a mirror, by `across`
@@ -58,8 +59,8 @@ class Sampler(Method, ABC):
         """The method without what does not change its kernels, so that these are compiled once."""
         return self
 
-    def instead(self, prior: Prior, fallback: Sampler) -> tuple[Sampler, str] | None:
-        """What takes over, and its name, where the frame does not stand for the posterior; None: this one goes on."""
+    def instead(self, prior: Prior, fallback: Sampler) -> Sampler | None:
+        """What takes over where the frame does not stand for the posterior; None: this one goes on."""
         return None
 
     @abstractmethod

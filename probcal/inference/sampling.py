@@ -16,6 +16,7 @@ import numpy as np
 from probcal.errors import FitError, InputError
 from probcal.inference.chains import Draw, Sided, run_chunk, run_chunks, run_sided, run_sideds
 from probcal.inference.hierarchy import SpikeAndSlab
+from probcal.inference.mixed import settled
 from probcal.inference.orbits import orbits_of
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Posed
@@ -29,7 +30,8 @@ from probcal.smoothing.mode import Point
 if TYPE_CHECKING:
     from probcal.inference.sampler import Sampler
 
-ROAMING = 0.6  # acceptance of independent draws of the frame below which chains also move along orbits
+GROWTH = 4  # by how many times more steps a draw is tried again that has not mixed
+ROAMING = 0.9  # acceptance of leaps below which chains also move along orbits
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,7 @@ class SamplerRun:
     interrupted: bool
     note: str  # what happened on the way, a sentence or nothing
     sides: tuple[Mirrored, ...] = ()  # other sides of a mirror that the chains visit, numbered from 1
+    thin: int = 1  # steps from one draw to the next
 
     @property
     def z(self) -> np.ndarray:
@@ -55,7 +58,7 @@ class SamplerRun:
     @property
     def side(self) -> np.ndarray:
         """Which side of a mirror each draw (chain, draw) is on, 0 where there is none."""
-        return np.asarray(self.draws.stats["side"]) if "side" in self.draws.stats else np.zeros(self.z.shape[:2], int)
+        return _side(self.draws)
 
     @property
     def levels(self) -> np.ndarray:
@@ -66,6 +69,66 @@ class SamplerRun:
     def states(self) -> list[np.ndarray]:
         """States (chain, draw, E, n) of each recursion."""
         return [np.asarray(x) for x in self.draws.states]
+
+
+def _side(draws: Draw) -> np.ndarray:
+    """Which side of a mirror each draw (chain, draw) is on, 0 where there is none."""
+    return np.asarray(draws.stats.get("side", np.zeros(np.shape(draws.theta)[:2], int)))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Which chunks are drawn, and which draws are kept: first every one, then fewer of more where those do not do."""
+
+    method: Sampler
+    thin: int = 1
+    before: Plan | None = None
+
+    @property
+    def begin(self) -> int:
+        """The first chunk."""
+        return 0 if self.before is None else self.before.end
+
+    @property
+    def end(self) -> int:
+        """The chunk after the last."""
+        return self.begin - (-(self._unkept + self.method.draws) // self.method.chunk)
+
+    @property
+    def start(self) -> int:
+        """How many draws were kept before its own."""
+        return 0 if self.before is None else self.before.start + self.before.done(self.begin)
+
+    @property
+    def _unkept(self) -> int:
+        return self.method.warmup if self.before is None else 0
+
+    @property
+    def last(self) -> bool:
+        """Whether the method has no patience for a longer one."""
+        return self.thin * GROWTH > self.method.patience
+
+    def longer(self) -> Plan:
+        """The next, of more steps between two draws; those before it are its warm-up."""
+        return Plan(self.method, self.thin * GROWTH, self)
+
+    def kept(self, chunk: int) -> int:
+        """How many draws of a chunk are kept, the last ones."""
+        size = self.method.chunk
+        return max(0, min((chunk - self.begin + 1) * size - self._unkept, size))
+
+    def done(self, count: int) -> int:
+        """Draws that are there after so many chunks."""
+        return max(0, (count - self.begin) * self.method.chunk - self._unkept)
+
+    def steps(self, count: int) -> int:
+        """Steps of a chain after so many chunks."""
+        own = (count - self.begin) * self.method.chunk * self.thin
+        return own + (0 if self.before is None else self.before.steps(self.begin))
+
+    def cut(self, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Its own draws of all that were kept."""
+        return {name: array[:, self.start : self.start + self.method.draws] for name, array in arrays.items()}
 
 
 def sample(
@@ -93,10 +156,10 @@ def sample(
     form, posed, found, worth = pose(problem, prior, start, keys[0])
     asked, note = method, ""
     if worth.failed and fallback is not None and (taken := method.instead(prior, fallback)) is not None:
-        method, name = taken
+        method = taken
         note = (
-            f"The collapse does not fit (Pareto k-hat {worth.khat:.2g} after {worth.moves} moves of the frame):"
-            f" {name} took over."
+            f"The collapse does not fit (its steps would be taken in {worth.acceptance:.0%} of the tries):"
+            f" {method.name} took over."
         )
     sides, poses = list[Mirrored](), [(posed, found)]
     for k, other in enumerate(around.others if around is not None and method.crosses else ()):
@@ -111,27 +174,36 @@ def sample(
         poses = [(one._replace(orbits=orbits), drawn) for one, drawn in poses]
     runs = _Run(method, form, [one for one, _ in poses], [draws for _, draws in poses], keys[1])
     state = runs.restored(box.state) if box.state is not None else runs.first()
-    total, interrupted = method.warmup + method.draws, False
+    plan, interrupted = Plan(method), False
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         try:
-            while box.count * method.chunk < total:
-                state, draws = runs.advance(state, pool)
-                kept = max(0, min((box.count + 1) * method.chunk - method.warmup, method.chunk))
-                box.add({n: a[:, method.chunk - kept :] for n, a in flat_arrays(draws).items()}, jax.tree.leaves(state))
-                if progress is not None:
-                    done, density = min(box.count * method.chunk, total), float(np.mean(draws.density))
-                    progress(Progress(method.name, done, total, density))
+            while True:
+                while box.count < plan.end:
+                    state, draws = runs.advance(state, plan.thin, pool)
+                    kept = plan.kept(box.count)
+                    box.add(
+                        {n: a[:, a.shape[1] - kept :] for n, a in flat_arrays(draws).items()}, jax.tree.leaves(state)
+                    )
+                    if progress is not None:
+                        density = float(np.mean(draws.density))
+                        progress(Progress(method.name, plan.steps(box.count), plan.steps(plan.end), density))
+                drawn = gathered(plan.cut(box.joined()))
+                if plan.last or settled(np.asarray(drawn.theta), _side(drawn), len(poses)):
+                    break
+                plan = plan.longer()
         except KeyboardInterrupt:
             interrupted = True
             if box.count * method.chunk <= method.warmup:
                 raise
-    drawn = gathered({name: array[:, : method.draws] for name, array in box.joined().items()})
+            if plan.before is not None and plan.done(box.count) * GROWTH < method.draws:
+                plan = plan.before
+    drawn = gathered(plan.cut(box.joined()))
     if not np.isfinite(np.asarray(drawn.theta)).all():
         raise FitError(
             f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them"
         )
     seconds = time.perf_counter() - began
-    return SamplerRun(method, asked, form, posed, worth, drawn, seconds, interrupted, note, tuple(sides))
+    return SamplerRun(method, asked, form, posed, worth, drawn, seconds, interrupted, note, tuple(sides), plan.thin)
 
 
 def flat_arrays(draws: Draw) -> dict[str, np.ndarray]:
@@ -192,16 +264,16 @@ class _Run:
             )
         return jax.tree.unflatten(jax.tree.structure(form), [jnp.asarray(leaf) for leaf in leaves])
 
-    def advance(self, state: Any, pool: ThreadPoolExecutor) -> tuple[Any, Draw]:
-        """All chains one chunk further."""
+    def advance(self, state: Any, thin: int, pool: ThreadPoolExecutor) -> tuple[Any, Draw]:
+        """All chains one chunk further, every `thin`-th step kept."""
         alone, together = (run_sided, run_sideds) if self.mirrored else (run_chunk, run_chunks)
         if not self.apart:
-            return together(self.method.kernel(), self.form, self.posed, state)
+            return together(self.method.kernel(), self.form, self.posed, state, jnp.asarray(thin))
 
         def one(k: int) -> tuple[Any, Draw]:
             with jax.enable_x64(True):
                 own = jax.tree.map(lambda leaf: leaf[k], state)
-                return jax.block_until_ready(alone(self.method.kernel(), self.form, self.posed, own))
+                return jax.block_until_ready(alone(self.method.kernel(), self.form, self.posed, own, jnp.asarray(thin)))
 
         found = list(pool.map(one, range(self.method.chains)))
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
