@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior
+from probcal.inference.sides import Sided, shifted, side_of
 from probcal.smoothing.frame import place
 
 
@@ -62,38 +63,36 @@ def run_chunk(method: Any, form: Form, posed: Posed, chain: Any, thin: jax.Array
     return jax.lax.scan(one, chain, None, length=method.chunk)
 
 
-class Sided(NamedTuple):
-    """Where a chain stands that visits several sides of a mirror."""
-
-    chain: Any
-    side: jax.Array  # () which frame it moves in
-    key: jax.Array
-
-
-def side_of(sides: Posed, side: Any) -> Posed:
-    """The posterior posed on one side, of frames with a leading dim."""
-    return sides._replace(frame=jax.tree.map(lambda leaf: leaf[side], sides.frame))
-
-
 @partial(jax.jit, static_argnames=("method", "form"))
 def run_sided(method: Any, form: Form, sides: Posed, state: Sided, thin: jax.Array) -> tuple[Sided, Draw]:
-    """Draws of one chain as in `run_chunk`, each step followed by an attempt to cross to another side.
+    """Draws of one chain as in `run_chunk`, each step followed by attempts to cross to another side.
 
-    Crossing keeps hyper-parameters and the coordinates that the frame of a side whitens, an involution between any two
-    sides, and is accepted by the joint density there (`method.across`).
+    The first keeps hyper-parameters and the coordinates that the frame of a side whitens, an involution between any two
+    sides, and is accepted by the joint density there (`method.across`); the second is a shift (`shifted`).
     """
     count = jax.tree.leaves(sides.frame)[0].shape[0]
+
+    def by_coordinates(here: Posed, there: Posed, chain: Any) -> tuple[Any, jax.Array]:
+        return method.across(form, here, there, chain)
+
+    def by_shift(here: Posed, there: Posed, chain: Any) -> tuple[Any, jax.Array]:
+        at, gain = shifted(form, here, there, method.place(form, here, chain))
+        return method.put(form, there, chain, at), gain
 
     def step(state: Sided) -> tuple[Sided, Sample]:
         here = side_of(sides, state.side)
         chain, sample = method.step(form, here, state.chain)
-        key, pick, lot = jax.random.split(state.key, 3)
-        other = (state.side + 1 + jax.random.randint(pick, (), 0, count - 1)) % count
-        moved, gain = method.across(form, here, side_of(sides, other), chain)
-        taken = jnp.log(jax.random.uniform(lot)) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
-        after = jax.tree.map(lambda new, old: jnp.where(taken, new, old), (moved, other), (chain, state.side))
-        stats = sample.stats | {"side": state.side, "crossed": taken}
-        return Sided(after[0], after[1], key), sample._replace(stats=stats)
+        side, (key, *keys), crossed = state.side, jax.random.split(state.key, 3), jnp.zeros((), bool)
+        for way, own in zip((by_coordinates, by_shift), keys, strict=True):
+            pick, lot = jax.random.split(own)
+            other = (side + 1 + jax.random.randint(pick, (), 0, count - 1)) % count
+            moved, gain = way(side_of(sides, side), side_of(sides, other), chain)
+            taken = jnp.log(jax.random.uniform(lot)) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
+            pairs = ((moved, other), (chain, side))
+            chain, side = jax.tree.map(lambda new, old, taken=taken: jnp.where(taken, new, old), *pairs)
+            crossed = crossed | taken
+        stats = sample.stats | {"side": state.side, "crossed": crossed}
+        return Sided(chain, side, key), sample._replace(stats=stats)
 
     def one(state: Sided, _: None) -> tuple[Sided, Draw]:
         state, sample = repeated(step, state, thin)

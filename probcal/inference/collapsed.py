@@ -135,8 +135,9 @@ class Collapsed(Sampler):
     def step(self, form: Form, posed: Posed, chain: CollapsedState) -> tuple[CollapsedState, Sample]:
         """One draw."""
         key, *keys = jax.random.split(chain.key, 5)
-        at = Place(chain.theta, chain.eps, chain.phi, chain.weight)
-        at, rate = leap(form, posed, at, keys[0], LEAPS, self.sweeps or form.hierarchy.sweeps)
+        at, rate = leap(
+            form, posed, self.place(form, posed, chain), keys[0], LEAPS, self.sweeps or form.hierarchy.sweeps
+        )
         phi, learnt = at.phi, jnp.asarray(form.hierarchy.learnt, int)
         for k, update in enumerate(form.hierarchy.updates()):
             phi = update(phi, at.theta[learnt], jax.random.fold_in(keys[1], k))
@@ -147,6 +148,14 @@ class Collapsed(Sampler):
         stats = {"acceptance_rate": rate, "swung": swung, "log_weight": at.weight}
         stats |= {"roamed": roamed} if posed.orbits else {}
         return CollapsedState(*at, key), Sample(at.theta, at.eps, at.phi, joint, stats)
+
+    def place(self, form: Form, posed: Posed, chain: CollapsedState) -> Place:
+        """Where a chain stands."""
+        return Place(chain.theta, chain.eps, chain.phi, chain.weight)
+
+    def put(self, form: Form, posed: Posed, chain: CollapsedState, at: Place) -> CollapsedState:
+        """The chain at another place."""
+        return CollapsedState(*at, chain.key)
 
     def across(self, form: Form, here: Posed, there: Posed, chain: CollapsedState) -> tuple[CollapsedState, jax.Array]:
         """theta by the same unit normals on the other side, hyper-parameters and those of the trajectories kept."""

@@ -83,7 +83,7 @@ class NUTS(Sampler):
         found = parts(form, posed, chain.z)
         jumps = dict[str, jax.Array]()
         if posed.orbits:
-            chain, found, jumps = self._jumped(form, posed, chain, found)
+            chain, found, jumps = self._jumped(form, posed, chain)
         stats = {
             "acceptance_rate": chain.accept_prob,
             "diverging": chain.diverging,
@@ -94,17 +94,26 @@ class NUTS(Sampler):
         }
         return chain, Sample(found.theta, chain.z.eps, found.phi, found.joint, stats | jumps)
 
-    def _jumped(self, form: Form, posed: Posed, chain: Any, found: Parts) -> tuple[Any, Parts, dict[str, jax.Array]]:
+    def _jumped(self, form: Form, posed: Posed, chain: Any) -> tuple[Any, Parts, dict[str, jax.Array]]:
         """The chain after a leap on the frame, and a proposal along each orbit."""
         keys = jax.random.split(jax.random.fold_in(chain.rng_key, 1))
-        at = Place(found.theta, chain.z.eps, found.phi, log_weight(posed.model, posed.frame, found.theta, chain.z.eps))
-        at, leapt = leap(form, posed, at, keys[0], 1, form.hierarchy.sweeps)
+        at, leapt = leap(form, posed, self.place(form, posed, chain), keys[0], 1, form.hierarchy.sweeps)
         at, roamed = roam(form, posed, at, keys[1])
+        chain = self.put(form, posed, chain, at)
+        return chain, parts(form, posed, chain.z), {"leapt": leapt, "roamed": roamed}
+
+    def place(self, form: Form, posed: Posed, chain: Any) -> Place:
+        """Where a chain stands."""
+        found = parts(form, posed, chain.z)
+        weight = log_weight(posed.model, posed.frame, found.theta, chain.z.eps)
+        return Place(found.theta, chain.z.eps, found.phi, weight)
+
+    def put(self, form: Form, posed: Posed, chain: Any, at: Place) -> Any:
+        """The chain at another place."""
         given = conditional(form, posed, at.phi)
         free = Free(form.hierarchy.relax(at.phi), given.factor.T @ (at.theta - given.mean), at.eps)
         energy, slope = jax.value_and_grad(lambda own: -parts(form, posed, own).density)(free)
-        chain = chain._replace(z=free, potential_energy=energy, z_grad=slope)
-        return chain, parts(form, posed, free), {"leapt": leapt, "roamed": roamed}
+        return chain._replace(z=free, potential_energy=energy, z_grad=slope)
 
     def across(self, form: Form, here: Posed, there: Posed, chain: Any) -> tuple[Any, jax.Array]:
         """The same coordinates on the other side."""

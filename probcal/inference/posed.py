@@ -60,6 +60,7 @@ class Posed(NamedTuple):
     frame: Frame
     first: Precision
     orbits: tuple[Any, ...] = ()  # `orbits.Orbit`s that chains move along
+    away: Any = None  # how far this side of a mirror is from the first, a `Point`
 
     @property
     def information(self) -> jax.Array:

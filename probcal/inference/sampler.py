@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from probcal.errors import InputError
 from probcal.inference.chains import Sample
 from probcal.inference.hierarchy import Phi
+from probcal.inference.leaps import Place
 from probcal.inference.posed import Form, Posed
 from probcal.inference.posterior import conclude_draws
 from probcal.inference.run import Context, Method
@@ -70,6 +71,14 @@ class Sampler(Method, ABC):
     @abstractmethod
     def step(self, form: Form, posed: Posed, chain: Any) -> tuple[Any, Sample]:
         """The next state, and the draw it stands for."""
+
+    def place(self, form: Form, posed: Posed, chain: Any) -> Place:
+        """Where a chain stands; needed of a sampler that crosses."""
+        raise AssertionError(f"{self.name} does not cross")
+
+    def put(self, form: Form, posed: Posed, chain: Any, at: Place) -> Any:
+        """The chain at another place."""
+        raise AssertionError(f"{self.name} does not cross")
 
     def across(self, form: Form, here: Posed, there: Posed, chain: Any) -> tuple[Any, jax.Array]:
         """The chain on another side, and by how much the log density of its coordinates is larger there.

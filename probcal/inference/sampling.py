@@ -14,13 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.inference.chains import Draw, Sided, run_chunk, run_chunks, run_sided, run_sideds
+from probcal.inference.chains import Draw, run_chunk, run_chunks, run_sided, run_sideds
 from probcal.inference.hierarchy import SpikeAndSlab
 from probcal.inference.mixed import settled
 from probcal.inference.orbits import orbits_of
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Posed
 from probcal.inference.progress import OnProgress, Progress
+from probcal.inference.sides import Sided, distances, stacked
 from probcal.inference.storage import Chunks, Storage
 from probcal.priors import Prior
 from probcal.problem import Problem
@@ -168,6 +169,9 @@ def sample(
         if new(problem, there.frame.point, [one.frame.point for one, _ in poses], size):  # none is visited twice
             sides.append(other)
             poses.append((there, drawn_there))
+    if len(poses) > 1:
+        away = distances(problem, [start, *(other.point for other in sides)])
+        poses = [(one._replace(away=own), drawn) for (one, drawn), own in zip(poses, away, strict=True)]
     if worth.acceptance < ROAMING and method.roams and not isinstance(form.hierarchy, SpikeAndSlab):
         covariance = np.cov(np.asarray(found.theta)[:, : form.biases].T).reshape(form.biases, form.biases)
         orbits = orbits_of(problem, posed, covariance)
@@ -238,9 +242,7 @@ class _Run:
         self.keys = jax.random.split(key, method.chains)
         self.apart = jax.default_backend() == "cpu"
         self.mirrored = len(posed) > 1
-        frames = [one.frame for one in posed]
-        frame = jax.tree.map(lambda *leaves: jnp.stack(leaves), *frames) if self.mirrored else frames[0]
-        self.posed = posed[0]._replace(frame=frame)
+        self.posed = stacked(posed) if self.mirrored else posed[0]
 
     def first(self) -> Any:
         """State of all chains, leading dim (chains,)."""
