@@ -11,7 +11,8 @@ from scipy import stats
 import probcal
 from probcal import ARD, ConstantVelocity, Horseshoe, Laplace, Network, Node, Problem, Target, Unknown, simulate
 from probcal.inference.hierarchy import hierarchy_of
-from probcal.inference.orbits import Place, orbits_of, roam
+from probcal.inference.leaps import Place
+from probcal.inference.orbits import orbits_of, roam
 from probcal.inference.posed import Form, Posed, prior_precision
 from probcal.inference.prior_draws import draw_prior
 from probcal.motion import RandomWalk

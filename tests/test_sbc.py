@@ -46,8 +46,10 @@ from probcal import (
 )
 from probcal.cli.models import load_model
 from probcal.inference import uniformity
+from probcal.inference.chains import Sample
 from probcal.inference.collapsed import Collapsed
 from probcal.inference.coverage import coverage_table
+from probcal.inference.gibbs import reversible_sweeps
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.nuts import NUTS
 from probcal.inference.pose import pareto_khat
@@ -117,10 +119,12 @@ class Uncorrected(Collapsed):
     """Collapsed that takes the frame for the posterior: every proposal is taken, trajectories come from the frame."""
 
     def step(self, form, posed, chain):
-        free = jax.random.split(chain.key, len(chain.eps) + 1)
-        eps = tuple(jax.random.normal(k, e.shape) for k, e in zip(free, chain.eps, strict=False))
-        chain, sample = super().step(form, posed, chain._replace(eps=eps, weight=jnp.full((), -1e300), key=free[-1]))
-        return chain, sample
+        key, run, *free = jax.random.split(chain.key, len(chain.eps) + 2)
+        eps = tuple(jax.random.normal(k, e.shape) for k, e in zip(free, chain.eps, strict=True))
+        theta, phi = reversible_sweeps(form, posed, chain.theta, chain.phi, run, 10)
+        stats = {"acceptance_rate": jnp.ones(()), "swung": jnp.ones((), bool), "log_weight": jnp.zeros(())}
+        sample = Sample(theta, eps, phi, posed.frame.log_likelihood(theta), stats)
+        return chain._replace(theta=theta, eps=eps, phi=phi, key=key), sample
 
 
 # ranks

@@ -17,6 +17,9 @@ R_HAT = 1.01  # above which chains have not mixed
 ESS = 100  # effective draws a chain below which its quantiles are not to be trusted
 UNSURE = 0.1  # standard error of the weight of a side above which it is not known
 
+FEW = 0.25  # share of few draws that must be effective
+NOISE = 4.0  # over the draws of a chain: by how much r_hat is above 1 without a reason
+
 
 def mixing(draws: np.ndarray) -> dict[str, np.ndarray]:
     """Rank-normalised r_hat, bulk and tail ess of draws (chain, draw, P), each (P,).
@@ -59,7 +62,8 @@ def weights_of_sides(side: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarr
 
 
 def settled(draws: np.ndarray, side: np.ndarray, count: int) -> bool:
-    """Whether draws (chain, draw, P) on these sides (chain, draw) may be taken for the posterior."""
-    found = mixing(within_sides(draws, side))
-    mixed = found["ess"].min() >= ESS * draws.shape[0] and ("r_hat" not in found or found["r_hat"].max() <= R_HAT)
-    return bool(mixed and weights_of_sides(side, count)[1].max() <= UNSURE)
+    """Whether draws (chain, draw, P) on these sides (chain, draw) have mixed as well as so many can show."""
+    found, (chains, number) = mixing(within_sides(draws, side)), draws.shape[:2]
+    enough = found["ess"].min() >= min(ESS, FEW * number) * chains
+    alike = "r_hat" not in found or found["r_hat"].max() <= max(R_HAT, 1 + NOISE / number)
+    return bool(enough and alike and weights_of_sides(side, count)[1].max() <= UNSURE)

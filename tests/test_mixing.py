@@ -1,0 +1,145 @@
+"""When draws may be taken, how more are made where they may not, and how chains cross from one side to another."""
+
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import probcal
+from probcal import Collapsed, Gaussian, Problem
+from probcal.inference import sampling
+from probcal.inference.hierarchy import hierarchy_of
+from probcal.inference.leaps import Place, leap
+from probcal.inference.mixed import settled, weights_of_sides
+from probcal.inference.posed import Form, Posed, log_prior
+from probcal.inference.sampling import Plan
+from probcal.inference.sides import distances, shifted
+from probcal.smoothing.frame import frame_at, log_joint, log_weight, unit_normals, volume
+from probcal.smoothing.mirrors import other_sides
+from probcal.smoothing.start import automatic_start, track_mode
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
+import networks
+from worlds import plane, resting
+
+METHOD = Collapsed(chains=2, warmup=50, draws=100, sweeps=1, patience=4)
+
+
+def test_chains_that_agree_have_settled_and_others_have_not():
+    random = np.random.default_rng(0)
+    draws, side = random.normal(size=(4, 500, 3)), np.zeros((4, 500), int)
+    assert settled(draws, side, 1)
+    assert not settled(draws + np.arange(4)[:, None, None], side, 1), "one chain lies apart"
+    assert not settled(np.repeat(draws[:, :100], 5, 1), side, 1), "few are effective"
+    apart = side + np.arange(4)[:, None] % 2
+    assert not settled(draws, apart, 2), "no chain crosses"
+    assert settled(draws + 100.0 * (one := random.integers(0, 2, side.shape))[..., None], one, 2), "sides may differ"
+    np.testing.assert_allclose(weights_of_sides(apart, 2), [[0.5, 0.5], [0.5 / np.sqrt(3)] * 2])
+
+
+@pytest.mark.parametrize(("warmup", "draws"), [(100, 500), (30, 70), (0, 1), (120, 130)])
+def test_a_plan_keeps_the_draws_that_were_asked_for(warmup, draws):
+    """Chunks are numbered through; each plan cuts its own draws from all that were kept, whatever the chunks' size."""
+    plan = Plan(Collapsed(warmup=warmup, draws=draws, patience=16))
+    numbers, thin = [], []
+    while True:
+        for chunk in range(plan.begin, plan.end):
+            whole = 1000 * chunk + np.arange(Collapsed.chunk)
+            numbers.append(whole[len(whole) - plan.kept(chunk) :])
+        cut = plan.cut({"n": np.concatenate(numbers)[None]})["n"][0]
+        assert len(cut) == draws
+        assert cut[0] // 1000 >= plan.begin
+        assert plan.done(plan.end) >= draws
+        thin.append(plan.thin)
+        if plan.last:
+            break
+        assert plan.longer().begin == plan.end
+        plan = plan.longer()
+    assert thin == [1, 4, 16]
+    assert plan.steps(plan.end) == 50 * (-(-(warmup + draws) // 50) + 20 * -(-draws // 50))
+
+
+def drawn(method=METHOD, **options):
+    network, motion, table, _ = plane()
+    problem = Problem(network, motion, table)
+    return probcal.fit(problem, method, prior=Gaussian(), start=resting(problem), key=5, **options)
+
+
+@pytest.mark.ci
+def test_what_has_not_mixed_is_drawn_anew_and_resumed(tmp_path, monkeypatch):
+    assert drawn().attrs["thin"] == 1
+    monkeypatch.setattr(sampling, "settled", lambda *_: False)
+    seen = []
+    longer = drawn(progress=seen.append, store=tmp_path)
+    assert longer.attrs["thin"] == 4
+    assert longer["posterior"].sizes["draw"] == 100
+    assert [(at.done, at.total) for at in seen] == [(50, 150), (100, 150), (150, 150), (350, 550), (550, 550)]
+    again = drawn(store=tmp_path, resume=True)
+    assert np.array_equal(again["posterior"]["bias"], longer["posterior"]["bias"])
+
+    def stop(at):
+        if at.done >= 350:
+            raise KeyboardInterrupt
+
+    short = drawn(progress=stop, store=tmp_path, overwrite=True)
+    assert (short.attrs["thin"], short["posterior"].sizes["draw"]) == (4, 50), "50 draws of 4 steps are more than 100"
+    assert np.array_equal(short["posterior"]["bias"], longer["posterior"]["bias"][:, :50])
+
+
+def two_sides():
+    """The beacons on a line, posed on both sides of it, and a place on the first."""
+    problem, _ = networks.setting(0, "line")
+    around = other_sides(problem, automatic_start(problem))
+    points = [around.point, around.others[0].point]
+    form = Form(problem.model.biases, hierarchy_of(Gaussian(), problem))
+    first = Gaussian().precision(problem.labels, problem.surveyed)
+    away = distances(problem, points)
+    poses = [
+        Posed(problem.model, frame_at(problem.model, track_mode(problem, point)), first, (), own)
+        for point, own in zip(points, away, strict=True)
+    ]
+    keys = jax.random.split(jax.random.key(0))
+    frame = poses[0].frame
+    theta = frame.theta + 0.1 * jax.random.normal(keys[0], frame.theta.shape)
+    eps = tuple(jax.random.normal(keys[1], x.shape) for x in frame.point.states)
+    return form, poses, Place(theta, eps, {}, log_weight(problem.model, frame, theta, eps))
+
+
+def test_a_shift_to_the_other_side_and_back_is_none():
+    """An involution whose gain is the difference of the joint densities in biases and process noises."""
+    with jax.enable_x64(True):
+        form, (here, there), at = two_sides()
+        over, gain = jax.jit(shifted, static_argnums=0)(form, here, there, at)
+        back, loss = jax.jit(shifted, static_argnums=0)(form, there, here, over)
+
+        def density(posed, place):
+            whole = log_joint(posed.model, posed.frame, place.theta, place.eps)
+            return whole - volume(posed.model, posed.frame, place.theta) + log_prior(form, posed, place.theta, {})
+
+        difference = density(there, over) - density(here, at)
+    assert not np.allclose(over.theta, at.theta, atol=0.1) or not np.allclose(over.eps[0], at.eps[0], atol=0.1)
+    np.testing.assert_allclose(gain, difference, rtol=1e-8)
+    np.testing.assert_allclose(gain, -loss, rtol=1e-8)
+    np.testing.assert_allclose(back.theta, at.theta, atol=1e-8)
+    np.testing.assert_allclose(back.eps[0], at.eps[0], atol=1e-5)
+    np.testing.assert_allclose(back.weight, at.weight, atol=1e-5)
+
+
+def test_where_the_frame_is_exact_every_leap_is_taken():
+    network, motion, table, _ = plane()
+    problem = Problem(network, motion, table)
+    with jax.enable_x64(True):
+        posed = Posed(
+            problem.model, frame_at(problem.model, track_mode(problem, resting(problem))),
+            Gaussian().precision(problem.labels, problem.surveyed),
+        )  # fmt: skip
+        form = Form(problem.model.biases, hierarchy_of(Gaussian(), problem))
+        eps = unit_normals(problem.model, posed.frame, posed.frame.point)
+        at = Place(posed.frame.theta, eps, {}, log_weight(problem.model, posed.frame, posed.frame.theta, eps))
+        move = jax.jit(leap, static_argnums=(0, 4, 5))
+        ends = [move(form, posed, at, jax.random.key(k), 4, 1) for k in range(20)]
+    assert all(float(rate) == pytest.approx(1.0, abs=1e-6) for _, rate in ends)
+    assert all(np.array_equal(end.eps[0], eps[0]) for end, _ in ends), "trajectories keep their coordinates"
+    assert len({float(np.asarray(end.theta)[0]) for end, _ in ends}) == 20
