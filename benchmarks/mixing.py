@@ -4,8 +4,9 @@ uv run python benchmarks/mixing.py --case plaza --case bearings
 uv run python benchmarks/mixing.py --method nuts
 
 `Collapsed()` as it is (the joint sampler takes over where its collapse does not fit), from the automatic start. A line
-a case: largest r_hat and least ESS over the biases, share of the proposals along orbits that were taken, seconds of the
-whole fit with compiling. Recordings that lie beside the project are left out where they do not.
+a case: largest r_hat and least ESS over the biases, steps from one draw to the next, shares of the leaps on the frame
+and of the proposals along orbits that were taken, seconds of the whole fit with compiling. Recordings that lie beside
+the project are left out where they do not.
 """
 
 import argparse
@@ -72,18 +73,14 @@ def line(name, method, key=0):
     )
     seconds = time.perf_counter() - began
     group = tree["calibration"].to_dataset()
-    ran = f"{answer.method.name}, k-hat {tree.attrs['frame_khat']:.2g}"
+    stats = tree["sample_stats"].to_dataset()
+    leaps = stats["leapt" if "leapt" in stats else "acceptance_rate"] if "swung" in stats or "leapt" in stats else None
+    taken = " | ".join("" if one is None else f"{float(one.mean()):.2f}" for one in (leaps, stats.get("roamed")))
     size = f"{problem.model.biases} biases, {len(problem.measurements.time)} rows"
     return (
-        f"| {name} | {size} | {ran} | {tree.attrs['status']} | {float(group['r_hat'].max()):.3f} |"
-        f" {float(group['ess'].min()):.0f} | {_roamed(tree)} | {seconds:.0f} |"
+        f"| {name} | {size} | {answer.method.name} | {tree.attrs['status']} | {float(group['r_hat'].max()):.3f} |"
+        f" {float(group['ess'].min()):.0f} | {tree.attrs['thin']:.0f} | {taken} | {seconds:.0f} |"
     )
-
-
-def _roamed(tree):
-    """Share of the proposals along orbits that were taken."""
-    stats = tree["sample_stats"].to_dataset()
-    return f"{float(stats['roamed'].mean()):.2f}" if "roamed" in stats else "none"
 
 
 def main():
@@ -93,7 +90,7 @@ def main():
     ask.add_argument("--method", default="collapsed", choices=[n for n, (m, _) in METHODS.items() if not m.climbs])
     ask.add_argument("--key", type=int, default=0)
     given = ask.parse_args()
-    head = ("case", "size", "who sampled", "status", "r_hat", "least ESS", "orbits taken", "s")
+    head = ("case", "size", "who sampled", "status", "r_hat", "least ess", "steps", "leaps", "orbits", "s")
     print(f"| {' | '.join(head)} |", "|---" * len(head) + "|", sep="\n", flush=True)
     for name in given.case or CASES:
         print(line(name, METHODS[given.method][0], given.key), flush=True)
