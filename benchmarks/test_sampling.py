@@ -16,7 +16,7 @@ import numpyro.distributions as dist
 import pytest
 
 from probcal import NUTS, SVI, BernoulliGaussian, Collapsed, Horseshoe
-from probcal.inference.posterior import mixing
+from probcal.inference.mixed import mixing
 from probcal.inference.sampling import sample
 from probcal.smoothing.start import automatic_start
 from probcal.types import float64
@@ -28,8 +28,8 @@ import radars
 PRIOR = Horseshoe(expected=0.3 / 1.3, slab_scale=1.0, slab_df=4.0)  # tau ~ HalfCauchy(0.3), c^2 ~ InverseGamma(2, 2)
 SHARE = 0.4
 METHODS = {
-    "collapsed": (Collapsed(draws=1000), PRIOR),
-    "collapsed-spike": (Collapsed(), BernoulliGaussian()),
+    "collapsed": (Collapsed(draws=1000, patience=1), PRIOR),
+    "collapsed-spike": (Collapsed(patience=1), BernoulliGaussian()),
     "nuts": (NUTS(), PRIOR),
     "svi": (SVI(), PRIOR),
 }

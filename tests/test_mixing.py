@@ -13,7 +13,7 @@ from probcal.inference import sampling
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.leaps import Place, leap
 from probcal.inference.mixed import settled, weights_of_sides
-from probcal.inference.posed import Form, Posed, log_prior
+from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.sampling import Plan
 from probcal.inference.sides import distances, shifted
 from probcal.smoothing.frame import frame_at, log_joint, log_weight, unit_normals, volume
@@ -43,12 +43,12 @@ def test_chains_that_agree_have_settled_and_others_have_not():
 def test_a_plan_keeps_the_draws_that_were_asked_for(warmup, draws):
     """Chunks are numbered through; each plan cuts its own draws from all that were kept, whatever the chunks' size."""
     plan = Plan(Collapsed(warmup=warmup, draws=draws, patience=16))
-    numbers, thin = [], []
+    numbers, thin = {}, []
     while True:
         for chunk in range(plan.begin, plan.end):
             whole = 1000 * chunk + np.arange(Collapsed.chunk)
-            numbers.append(whole[len(whole) - plan.kept(chunk) :])
-        cut = plan.cut({"n": np.concatenate(numbers)[None]})["n"][0]
+            numbers[chunk] = whole[len(whole) - plan.kept(chunk) :]
+        cut = np.concatenate([numbers[chunk] for chunk in range(plan.begin, plan.end)])[:draws]
         assert len(cut) == draws
         assert cut[0] // 1000 >= plan.begin
         assert plan.done(plan.end) >= draws
@@ -143,3 +143,27 @@ def test_where_the_frame_is_exact_every_leap_is_taken():
     assert all(float(rate) == pytest.approx(1.0, abs=1e-6) for _, rate in ends)
     assert all(np.array_equal(end.eps[0], eps[0]) for end, _ in ends), "trajectories keep their coordinates"
     assert len({float(np.asarray(end.theta)[0]) for end, _ in ends}) == 20
+
+
+def test_a_leap_is_taken_by_the_weight_of_the_posterior():
+    """Independent draws of a wrong frame, each leapt 20 times, have the mean of the posterior, not the frame's."""
+    network, motion, table, _ = plane()
+    problem = Problem(network, motion, table)
+    with jax.enable_x64(True):
+        form = Form(problem.model.biases, hierarchy_of(Gaussian(), problem))
+        right = frame_at(problem.model, track_mode(problem, resting(problem)))
+        wrong = right._replace(score=right.score + 0.5 * right.information @ np.ones(right.score.shape))
+        posed = Posed(problem.model, wrong, Gaussian().precision(problem.labels, problem.surveyed))
+        exact = conditional(form, posed._replace(frame=right), {})
+        resting_eps = tuple(np.zeros(x.shape) for x in right.point.states)
+
+        def one(key):
+            keys = jax.random.split(key)
+            theta = conditional(form, posed, {}).draw(keys[0])
+            at = Place(theta, resting_eps, {}, log_weight(problem.model, wrong, theta, resting_eps))
+            return leap(form, posed, at, keys[1], 20, 1)
+
+        ends, rate = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(3), 2000))
+        error = np.sqrt(np.asarray(exact.variance) / 2000)
+    assert 0.2 < np.asarray(rate).mean() < 0.9
+    np.testing.assert_array_less(np.abs(np.asarray(ends.theta).mean(0) - np.asarray(exact.mean)), 5 * error)

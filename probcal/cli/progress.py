@@ -22,7 +22,7 @@ def line() -> Iterator[OnProgress | None]:
 
 
 def _text(at: At) -> str:
-    done = f"{at.what}: {at.done} of at most {at.total}"
+    done = f"{at.what}: {at.done} of {at.total}"
     return done if at.objective is None else f"{done}, objective {at.objective:.3f}"
 
 

@@ -54,7 +54,7 @@ def repeated(step: Callable[[Any], tuple[Any, Sample]], state: Any, thin: jax.Ar
 
 @partial(jax.jit, static_argnames=("method", "form"))
 def run_chunk(method: Any, form: Form, posed: Posed, chain: Any, thin: jax.Array) -> tuple[Any, Draw]:
-    """`method.chunk` draws of one chain, every `thin`-th kept; leading dims of the draws are (chunk,)."""
+    """`method.chunk` draws of one chain, `thin` steps apart; leading dims of the draws are (chunk,)."""
 
     def one(chain: Any, _: None) -> tuple[Any, Draw]:
         chain, sample = repeated(partial(method.step, form, posed), chain, thin)

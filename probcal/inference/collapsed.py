@@ -91,9 +91,9 @@ class Collapsed(Sampler):
     """Exact posterior of biases, hyper-parameters and trajectories, sampled with the trajectories marginalised.
 
     Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it (None: as pays for the prior)
-    between two draws of each of `chains`. Biases and trajectories also move together, by a Hamiltonian swing. Where the
-    frame fits badly it is moved; where that fails the joint sampler `NUTS` takes over if it has the prior. Draws that
-    have not mixed are made anew with 4 times as many steps from one to the next, up to `patience`.
+    a leap of each of `chains`, four leaps a draw. Biases and trajectories also move together, by a Hamiltonian swing.
+    Where the frame fits badly it is moved; where that fails the joint sampler `NUTS` takes over if it has the prior.
+    Draws that have not mixed are made anew with 4 times as many steps from one to the next, up to `patience`.
     Raises `InputError` for less than one sweep or step.
     """
 

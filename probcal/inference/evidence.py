@@ -59,7 +59,7 @@ def log_evidence(problem: Problem, *, prior: Prior | None = None, key: Key = 0, 
         )
     keys = jax.random.split(as_key(key), 3)
     point = automatic_start(problem) if start is None else start
-    form, posed, _, _ = pose(problem, prior, point, keys[0])
+    form, posed, _, _ = pose(problem, prior, point, keys[0], whole=True)
     runs = tempered_runs(form, posed, keys[1])
     corrections = np.asarray(weights(form, posed, runs.theta, keys[2]))
     khat = pareto_khat(corrections)

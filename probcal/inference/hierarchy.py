@@ -51,7 +51,7 @@ class Hierarchy(ABC):
     learnt: tuple[int, ...]
     group: tuple[int, ...]
 
-    sweeps: ClassVar[int] = 10  # Gibbs sweeps between two draws that pay for themselves
+    sweeps: ClassVar[int] = 10  # Gibbs sweeps a leap that pay for themselves
     by_bias: ClassVar[tuple[str, ...]] = ()  # hyper-parameters that have a value a governed bias
     own: ClassVar[str] = ""  # the positive hyper-parameter of which each group has its own, independent of the others
 

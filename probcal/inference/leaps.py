@@ -34,7 +34,7 @@ def leap(form: Form, posed: Posed, at: Place, key: jax.Array, tries: int, sweeps
         tried = Place(theta, at.eps, phi, log_weight(posed.model, posed.frame, theta, at.eps))
         rate = jnp.exp(jnp.minimum(tried.weight - at.weight, 0.0))
         taken = jax.random.uniform(lot) < rate
-        return jax.tree.map(lambda new, old: jnp.where(taken, new, old), tried, at), rate
+        return jax.tree.map(lambda new, old: jnp.where(taken, new, old), tried, at), jnp.nan_to_num(rate)
 
     at, rates = jax.lax.scan(one, at, jax.random.split(key, tries))
     return at, jnp.mean(rates)

@@ -22,10 +22,9 @@ from probcal.smoothing.mode import Point, smooth_tracks
 PILOTS = 4  # chains of the pilot
 BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, sweeps between two
 MOVES = 4  # most times that the frame is moved
-FITS = 0.5  # Pareto k-hat at which, and
-GOOD = 0.9  # acceptance of a new theta at which a frame is left alone
+FITS, GOOD = 0.5, 0.9  # Pareto k-hat and acceptance of a new theta at which a frame is left alone
 SCARCE = 0.1  # acceptance below which it has failed: leaps are rare
-ROUNDS = 4  # trajectories at which that acceptance is judged
+ROUNDS = 4  # trajectories at which that acceptance is judged, each by as small a part of the draws
 TAILED = 25  # draws below which a Pareto tail cannot be fitted
 FITTINGS, FITTED = 2, 20  # rounds and draws (with mirror images) that a frame is fitted to
 SPREAD = 1.5  # by how much chains start further out than the pilot's draws
@@ -43,6 +42,7 @@ class Worth(NamedTuple):
 
     khat: float  # Pareto k-hat of the weights of its draws
     acceptance: float  # of a new theta, trajectories held in the frame's coordinates
+    whole: float  # acceptance of theta and trajectories together
     moves: int
 
     @property
@@ -55,10 +55,9 @@ class Worth(NamedTuple):
         """Whether the frame may be left where it is."""
         return self.khat < FITS and self.acceptance > GOOD
 
-    @property
-    def order(self) -> tuple[float, float]:
-        """The better one is larger."""
-        return min(self.acceptance, GOOD), -self.khat
+    def order(self, *, whole: bool) -> tuple[float, float]:
+        """The better one is larger, for leaps or for independent draws of the whole."""
+        return (self.whole if whole else min(self.acceptance, GOOD)), -self.khat
 
 
 @partial(jax.jit, static_argnames="form")
@@ -137,10 +136,13 @@ def acceptance(log_weights: np.ndarray) -> float:
     return float(np.minimum(weight[:, None], weight[None, :]).mean() / weight.mean())
 
 
-def pose(problem: Problem, prior: Prior, start: Point, key: jax.Array) -> tuple[Form, Posed, Pilot, Worth]:
+def pose(
+    problem: Problem, prior: Prior, start: Point, key: jax.Array, *, whole: bool = False
+) -> tuple[Form, Posed, Pilot, Worth]:
     """The posterior of a problem posed around a start, the draws of its pilot, and the frame's worth.
 
-    The frame is moved to the mean of the pilot's draws, by their weights, until these say that it fits.
+    The frame is moved to the mean of the pilot's draws until their weights say that it fits. The best one is that for
+    leaps, or where the `whole` is drawn at once that for independent draws.
     """
     model = problem.model
     form = Form(model.biases, hierarchy_of(prior, problem))
@@ -151,8 +153,8 @@ def pose(problem: Problem, prior: Prior, start: Point, key: jax.Array) -> tuple[
         found = pilot(form, posed, keys[0])
         logs = np.asarray(weights(form, posed, found.theta, keys[1]))
         held = np.asarray(weights_along(posed, found.theta[::ROUNDS], keys[1]))
-        worth = Worth(pareto_khat(logs), float(np.mean([acceptance(own) for own in held])), move)
-        if best is None or worth.order > best[2].order:
+        worth = Worth(pareto_khat(logs), float(np.mean([acceptance(own) for own in held])), acceptance(logs), move)
+        if best is None or worth.order(whole=whole) > best[2].order(whole=whole):
             best = posed, found, worth
         if worth.good:
             break

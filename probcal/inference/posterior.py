@@ -26,7 +26,7 @@ from probcal.smoothing.mode import Point
 from probcal.smoothing.start import track_mode
 from probcal.status import Status
 
-RARE = 0.05  # share of leaps taken below which it is said
+RARE = 0.05  # share of leaps, or of swings, taken below which it is said
 BFMI = 0.3  # below which the energy is not explored (Betancourt 2016)
 
 
@@ -105,6 +105,7 @@ class Chains(Posterior):
         """Seconds, the frame's worth, and the limits used."""
         run = self.run
         found = {"seconds": run.seconds, "rope": ROPE, "frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
+        found |= {"frame_acceptance": run.worth.acceptance}
         found |= {"thin": run.thin}
         if not run.method.exact:
             found["khat"] = pareto_khat(_stats(run)["log_weight"].ravel())
@@ -226,7 +227,13 @@ def judge_chains(
     good = True
     names = [*problem.labels, *(level.label for level in problem.levels)]
     if run.interrupted:
-        said.append(f"Interrupted after {draws} of {run.method.draws} draws a chain; --resume goes on.")
+        again = draws == run.method.draws
+        how = (
+            "while more steps were made, as the draws had not mixed"
+            if again
+            else f"after {draws} of {run.method.draws}"
+        )
+        said.append(f"Interrupted {how}{'' if again else ' draws a chain'}; --resume goes on.")
         good = False
     if "r_hat" in mixed and mixed["r_hat"].max() > R_HAT:
         worst = int(mixed["r_hat"].argmax())
@@ -286,5 +293,8 @@ def _say_steps(run: SamplerRun, said: list[str]) -> bool:
             said.append(f"BFMI {bfmi.min():.2f} is below {BFMI}: the energy is hardly explored; take more draws.")
             good = False
     if "swung" in found and (rate := found["acceptance_rate"].mean()) < RARE:
-        said.append(f"Leaps are taken in {rate:.1%} of the tries: draws are exact but far from independent.")
+        said.append(f"Leaps are taken in {rate:.1%} of the tries: biases move by swings alone.")
+    if "swung" in found and (rate := found["swung"].mean(1).min()) < RARE:
+        said.append(f"A chain takes {rate:.1%} of its swings: its tracks hardly move; take nuts.")
+        good = False
     return good

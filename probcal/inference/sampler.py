@@ -28,7 +28,7 @@ class Sampler(Method, ABC):
     chains: int
     warmup: int
     draws: int
-    chunk: ClassVar[int]  # steps between two checkpoints
+    chunk: ClassVar[int]  # draws between two checkpoints
     patience: int = 1  # most steps from one draw to the next, where those after fewer have not mixed
     exact: ClassVar[bool] = True  # whether its draws are those of the posterior
     atoms: ClassVar[bool] = False  # whether it takes priors under which a bias may be exactly zero

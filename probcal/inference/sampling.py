@@ -21,7 +21,7 @@ from probcal.inference.orbits import orbits_of
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Posed
 from probcal.inference.progress import OnProgress, Progress
-from probcal.inference.sides import Sided, distances, stacked
+from probcal.inference.sides import Sided, distances, side_by_side
 from probcal.inference.storage import Chunks, Storage
 from probcal.priors import Prior
 from probcal.problem import Problem
@@ -79,7 +79,7 @@ def _side(draws: Draw) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Plan:
-    """Which chunks are drawn, and which draws are kept: first every one, then fewer of more where those do not do."""
+    """Which chunks are drawn: first every step is a draw; where these have not mixed, all anew, more steps a draw."""
 
     method: Sampler
     thin: int = 1
@@ -94,11 +94,6 @@ class Plan:
     def end(self) -> int:
         """The chunk after the last."""
         return self.begin - (-(self._unkept + self.method.draws) // self.method.chunk)
-
-    @property
-    def start(self) -> int:
-        """How many draws were kept before its own."""
-        return 0 if self.before is None else self.before.start + self.before.done(self.begin)
 
     @property
     def _unkept(self) -> int:
@@ -127,9 +122,10 @@ class Plan:
         own = (count - self.begin) * self.method.chunk * self.thin
         return own + (0 if self.before is None else self.before.steps(self.begin))
 
-    def cut(self, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Its own draws of all that were kept."""
-        return {name: array[:, self.start : self.start + self.method.draws] for name, array in arrays.items()}
+    def drawn(self, box: Chunks) -> Draw:
+        """Its own draws of those in a box."""
+        arrays = box.joined(self.begin, self.end)
+        return gathered({name: array[:, : self.method.draws] for name, array in arrays.items()})
 
 
 def sample(
@@ -159,7 +155,7 @@ def sample(
     if worth.failed and fallback is not None and (taken := method.instead(prior, fallback)) is not None:
         method = taken
         note = (
-            f"The collapse does not fit (its steps would be taken in {worth.acceptance:.0%} of the tries):"
+            f"The collapse does not fit (its leaps would be taken in {worth.acceptance:.0%} of the tries):"
             f" {method.name} took over."
         )
     sides, poses = list[Mirrored](), [(posed, found)]
@@ -191,7 +187,7 @@ def sample(
                     if progress is not None:
                         density = float(np.mean(draws.density))
                         progress(Progress(method.name, plan.steps(box.count), plan.steps(plan.end), density))
-                drawn = gathered(plan.cut(box.joined()))
+                drawn = plan.drawn(box)
                 if plan.last or settled(np.asarray(drawn.theta), _side(drawn), len(poses)):
                     break
                 plan = plan.longer()
@@ -201,7 +197,7 @@ def sample(
                 raise
             if plan.before is not None and plan.done(box.count) * GROWTH < method.draws:
                 plan = plan.before
-    drawn = gathered(plan.cut(box.joined()))
+            drawn = plan.drawn(box)
     if not np.isfinite(np.asarray(drawn.theta)).all():
         raise FitError(
             f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them"
@@ -242,7 +238,7 @@ class _Run:
         self.keys = jax.random.split(key, method.chains)
         self.apart = jax.default_backend() == "cpu"
         self.mirrored = len(posed) > 1
-        self.posed = stacked(posed) if self.mirrored else posed[0]
+        self.posed = side_by_side(posed) if self.mirrored else posed[0]
 
     def first(self) -> Any:
         """State of all chains, leading dim (chains,)."""

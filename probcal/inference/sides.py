@@ -70,7 +70,7 @@ def shifted(form: Form, here: Posed, there: Posed, at: Place) -> tuple[Place, ja
     return at._replace(theta=theta, eps=eps, weight=log_weight(model, there.frame, theta, eps)), gain
 
 
-def stacked(poses: Sequence[Posed]) -> Posed:
+def side_by_side(poses: Sequence[Posed]) -> Posed:
     """The sides of one problem as one: frames and distances with a leading dim."""
     frame, away = jax.tree.map(lambda *leaves: jnp.stack(leaves), *((one.frame, one.away) for one in poses))
     return poses[0]._replace(frame=frame, away=away)

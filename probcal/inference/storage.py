@@ -183,12 +183,12 @@ class Chunks:
         self.storage.add(self.count, {f"draws_{name}": array for name, array in chunk.items()} | leaves)
         self.state = list(leaves.values())
 
-    def joined(self) -> dict[str, np.ndarray]:
-        """All draws, (chains, draws, ...) by name."""
+    def joined(self, first: int = 0, last: int | None = None) -> dict[str, np.ndarray]:
+        """Draws (chains, draws, ...) by name of the chunks from the first up to the last, without it."""
         prefix = "draws_"
         chunks = [
             {name.removeprefix(prefix): array for name, array in part.items() if name.startswith(prefix)}
-            for part in map(self.storage.read, self.storage.numbers)
+            for part in map(self.storage.read, self.storage.numbers[first:last])
         ]
         return {name: np.concatenate([chunk[name] for chunk in chunks], 1) for name in chunks[-1]}
 
