@@ -35,6 +35,7 @@ from probcal.model.variants import aligned
 from probcal.motion import Layout, LinearMotion, Static, Target, White, as_motion, labels_of
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, guess_of
+from probcal.plausible import check_plausible
 from probcal.sensor import Sensor
 from probcal.table import Measurements, Table, header, measure, read_table, unit_factor
 from probcal.types import float64
@@ -105,6 +106,7 @@ class Problem:
         self.scales = np.array([bias.scale for bias in self.biases])
         self.surveyed = np.array([bias.kind != "scale" for bias in self.biases], bool)
         self.measurements = measure(read_table(data), network)
+        check_plausible(self.measurements, network)
         self.silent = _check_rows(self.measurements, network)
         self.levels: tuple[LevelRecord, ...]
         self._compile()

@@ -1,0 +1,123 @@
+"""Numbers that are well formed and cannot be meant: refused at the door, with the row and what to do.
+
+A wrong unit or a sentinel is no outlier: robust noise explains it away, and the fit converges on nothing.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from probcal.errors import InputError
+from probcal.network import Network
+from probcal.noise import Bernoulli
+from probcal.table import Measurements, header, unit_factor
+
+EPOCHS = (("ns", 1e17), ("us", 1e14), ("ms", 1e11))  # a bare time from here on counts these since 1970
+GAP = 3.2e9  # s between two rows of one table: a hundred years
+TURNS = 10.0  # rad in a wrapped channel of no stated unit: more than a turn and a half
+SENTINELS = (-9999.0, -999.0, -99999.0, 9999.0, 99999.0, 999999.0, -999999.0, 32767.0, -32768.0, 65535.0, -1e30, 1e30)
+APART = 20.0  # spreads of its column from which a sentinel is one
+FAR = 1e6  # spreads from which any value is nonsense
+FEW = 8  # values below which a column has no spread
+NARROW, WIDE = 1e-9, 1e6  # of the size of a column: smallest and largest std
+
+
+def check_plausible(data: Measurements, network: Network) -> None:
+    """Raise `InputError` for times, values and stds that cannot be meant, naming row, column and remedy."""
+    units = header(data.table)[1]
+    _check_times(data, units.get("time"))
+    kinds = np.array([network.types.index(placed.type) for placed in network.sensors])[data.sensor]
+    for j, name in enumerate(data.channels):
+        for k, kind in enumerate(network.types):
+            rows = np.flatnonzero((kinds == k) & data.measured[:, j])
+            channel = dict(kind.expand(network.dimension)).get(name)
+            if channel is None or not len(rows):
+                continue
+            _check_unit(data, name, units, channel.unit)
+            if isinstance(channel.noise, Bernoulli):
+                continue
+            if channel.wrap and channel.unit == "rad":
+                _check_angles(data, name, j, rows, units.get(name))
+            _check_values(data, name, j, rows, unit_factor(data.table, name, units.get(name), channel.unit))
+            _check_sizes(data, name, j, rows)
+
+
+def _check_times(data: Measurements, unit: str | None) -> None:
+    """Epochs in another unit than seconds, and gaps of centuries."""
+    first = int(np.abs(data.time).argmax())
+    if unit is None:
+        for name, least in EPOCHS:
+            if abs(data.time[first]) >= least:
+                raise InputError(
+                    f'{data.table.where(first)} column "time": {data.time[first]:.6g} s looks like {name} since 1970;'
+                    f" write the header as time [{name}]"
+                )
+    order = np.argsort(data.time, kind="stable")
+    gaps = np.diff(data.time[order])
+    if len(gaps) and gaps.max() > GAP:
+        k = int(gaps.argmax())
+        raise InputError(
+            f'{data.table.where(int(order[k + 1]))} column "time": {gaps[k]:.3g} s after the row before it in time'
+            f" ({data.table.where(int(order[k]))}); check the time and its unit"
+        )
+
+
+def _check_unit(data: Measurements, name: str, units: Mapping[str, str | None], wanted: str) -> None:
+    """A value column with a unit of its own beside a std column without one."""
+    own = units.get(name)
+    if own is not None and own != wanted and f"{name}_std" in units and units[f"{name}_std"] is None:
+        raise InputError(
+            f'{data.table.source} column "{name}_std" has no unit beside "{name} [{own}]": write {name}_std [{own}], or'
+            f" {name}_std [{wanted}]"
+        )
+
+
+def _check_angles(data: Measurements, name: str, j: int, rows: np.ndarray, unit: str | None) -> None:
+    """Degrees in a channel of radians."""
+    worst = rows[int(np.abs(data.value[rows, j]).argmax())]
+    if unit is None and abs(data.value[worst, j]) > TURNS:
+        raise InputError(
+            f'{data.table.where(int(worst))} column "{name}": {data.value[worst, j]:g} rad looks like degrees; write'
+            f" the header as {name} [deg], or as {name} [rad] where radians are meant"
+        )
+
+
+def _check_values(data: Measurements, name: str, j: int, rows: np.ndarray, factor: float) -> None:
+    """Sentinels for a missing value, and cells many orders of magnitude from their column."""
+    if len(rows) < FEW:
+        return
+    value = data.value[rows, j]
+    middle = float(np.median(value))
+    low, high = np.quantile(value, [0.1, 0.9])
+    spread = max(float(high - low), 1e-3 * abs(middle))
+    if spread == 0.0:
+        return
+    away = np.abs(value - middle) / spread
+    raw = value / factor  # as it stands in the table
+    mark = np.isclose(raw[:, None], SENTINELS, rtol=1e-12, atol=0.0).any(1) & (away > APART)
+    for chosen, words in ((mark, "looks like a mark for a missing value"), (away > FAR, "is far from all others")):
+        if chosen.any():
+            k = int(np.flatnonzero(chosen)[0])
+            raise InputError(
+                f'{data.table.where(int(rows[k]))} column "{name}": {raw[k]:g} {words} (the usual is about'
+                f" {middle / factor:.4g}); leave the cell blank"
+            )
+
+
+def _check_sizes(data: Measurements, name: str, j: int, rows: np.ndarray) -> None:
+    """Stds that are absurd beside the values that they belong to."""
+    rows = rows[data.has_std[rows, j]]
+    if len(rows) < FEW:
+        return
+    value = data.value[rows, j]
+    size = max(float(np.quantile(np.abs(value), 0.9)), float(np.ptp(np.quantile(value, [0.1, 0.9]))))
+    if size == 0.0:
+        return
+    std = data.std[rows, j] / size
+    for chosen, words in ((std < NARROW, "smaller"), (std > WIDE, "larger")):
+        if chosen.any():
+            row = int(rows[np.flatnonzero(chosen)[0]])
+            raise InputError(
+                f'{data.table.where(row)} column "{name}_std": a std of {data.std[row, j]:g} is many orders of'
+                f" magnitude {words} than the values (about {size:.3g}); check its unit, or leave the cell blank"
+            )
