@@ -15,7 +15,7 @@ FLOORS = {
     0: ("linalg", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files", "status"),
     1: ("sensor", "motion", "priors", "noise"),
     2: ("sensors",),
-    3: ("network", "table", "nodes"),
+    3: ("network", "table", "nodes", "plausible"),
     4: ("model", "problem", "simulate"),
     5: ("smoothing",),
     6: ("identifiability", "results"),
@@ -29,7 +29,7 @@ SHARED = tuple(
     f"inference.{name}"
     for name in (
         "run", "ending", "sampler", "sampling", "chains", "posterior", "hierarchy", "posed", "pose", "gibbs",
-        "coordinates", "guides", "psis",
+        "coordinates", "guides", "psis", "leaps", "sides", "mixed",
     )
 )  # fmt: skip  # what they share: it knows none of them
 LOW = {"jax", "numpy", "filelock"}  # third parties of floor 0, besides the standard library
