@@ -15,7 +15,7 @@ from terminal import call
 
 import probcal
 from probcal.cli.kernels import keep_kernels
-from probcal.cli.models import load_model, load_problem, prior_named
+from probcal.cli.models import load_model, load_problem, load_truth, prior_named
 from probcal.inference import METHODS
 from probcal.results.read import each_track
 
@@ -282,6 +282,9 @@ def test_other_bad_arguments(model, rows, tmp_path):
         (("fit", model, rows, "--prior", "gaussian"), "EA does not take the prior Gaussian; it takes: laplace"),
         (("fit", model, rows, "--fix", "gauge_9.*"), 'no bias is called "gauge_9.*"'),
         (("fit", model, rows, "--fix", "*"), "no free bias"),
+        (("fit", model, rows, "--set", "sped=1"), "problem() has no argument sped; it takes the data alone"),
+        (("fit", model, rows, "--set", "speed"), '--set "speed": write name=value'),
+        (("check", model, rows, "--set", "a=1", "--set", "a=2"), "--set a: it is given twice; write a=value,value"),
         (("track", model, rows), "track needs --calibration DIR"),
         (("track", model, rows, "--calibration", tmp_path), "is not a fit written by probcal"),
         (("report", tmp_path), "is not a fit written by probcal"),
@@ -292,6 +295,24 @@ def test_other_bad_arguments(model, rows, tmp_path):
         assert code == 2, arguments
         assert text in err
         assert err.count("\n") == 1
+
+
+def test_arguments_of_a_model_come_from_the_command_line(rows, tmp_path):
+    path = tmp_path / "wide.py"
+    text = SMALL.replace("STD", "1.0").replace("SCALE", "2.0")
+    text = text.replace("data=None):", "data=None, *, motion=9.0, places=(), name=''):").replace("(0.5)", "(motion)")
+    path.write_text(text + "\ndef truth(data=None, motion=0.0):\n    seen.append(motion)\n\nseen = []\n")
+    given = {"motion": 0.25, "places": (3, 4), "name": "a"}
+    module, problem = load_problem(path, rows, (), given)
+    assert "0.25" in repr(problem.motion)
+    load_truth(module, path, rows, problem, given)
+    assert module.seen == [0.25], "the truth takes those that it has"
+    with pytest.raises(probcal.InputError, match=r"has no argument motio; did you mean .motion"):
+        load_problem(path, rows, (), {"motio": 1})
+    given = ("--set", "motion=0.25", "--set", "places=3,4", "--set", "name=a")
+    code, _, err = call("fit", path, rows, *given, "--method", "map", "--no-assess", "--out", tmp_path / "fit")
+    assert code in (0, 1), err
+    assert probcal.load(tmp_path / "fit").attrs["set"] == "motion=0.25, places=(3, 4), name=a"
 
 
 def test_a_fit_that_fails_to_be_written_leaves_nothing_behind(tmp_path, monkeypatch):

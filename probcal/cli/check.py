@@ -1,7 +1,8 @@
 """`check`: what the data can and cannot determine, by name, what to do, and what to measure next."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,10 +26,10 @@ STATUS = {
 }
 
 
-def run(model: Path, data: Path | None, fix: Sequence[str], outputs: Outputs | None) -> int:
+def run(model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, Any], outputs: Outputs | None) -> int:
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
     keep_kernels()
-    _, problem = load_problem(model, data, fix)
+    _, problem = load_problem(model, data, fix, given)
     with line():
         start = automatic_start(problem)
         tree = observability(problem, point=start)

@@ -20,6 +20,9 @@ Model = Annotated[Path, typer.Argument(help="model file that defines problem(dat
 Data = Annotated[Path | None, typer.Argument(help="table of rows (CSV); the model's own data if left out")]
 Method = Annotated[str, typer.Option(help=" | ".join(METHODS))]
 Fix = Annotated[list[str] | None, typer.Option(help="hold biases at 0, by label or pattern (repeat)")]
+Given = Annotated[
+    list[str] | None, typer.Option("--set", help="an argument of problem(): swap=3,4 (repeat)", show_default=False)
+]
 LARGEST_SEED = 2**62
 Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="seed of everything random")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace the run in --out: the files that probcal wrote")]
@@ -50,6 +53,7 @@ def fit_command(
         str | None, typer.Option(help=" | ".join(PRIORS) + "; the model's or the method's own if left out")
     ] = None,
     fix: Fix = None,
+    given: Given = None,
     starts: Annotated[int, typer.Option(min=1, help="starts of the search; the best optimum is reported")] = 1,
     seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(help="folder for fit.nc, summary.csv, report.html")] = None,
@@ -76,14 +80,16 @@ def fit_command(
         raise InputError("--resume needs --out, the folder of the run to go on with")
     options.check_resumed(method, resume)
     kept = options.saved_names(save)
+    arguments = options.given(given or ())
     options.check_files(model, data)
     with outputs.results_of_a_run(out, outputs.FIT, "draws", resume=resume, overwrite=overwrite) as results:
         from probcal.cli import fit
 
         raise typer.Exit(
             fit.run(
-                model, data, method=method, prior=prior, fix=fix or (), starts=starts, seed=seed, outputs=results,
-                sizes=sizes, resume=resume, overwrite=overwrite, kept=kept, assessed=assessed,
+                model, data, method=method, prior=prior, fix=fix or (), given=arguments, starts=starts,
+                seed=seed, outputs=results, sizes=sizes, resume=resume, overwrite=overwrite, kept=kept,
+                assessed=assessed,
             )
         )  # fmt: skip
 
@@ -109,14 +115,16 @@ def check_command(
     model: Model,
     data: Data = None,
     fix: Fix = None,
+    given: Given = None,
     out: Annotated[Path | None, typer.Option(help="folder for check.nc, check.csv, check.png")] = None,
 ) -> None:
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
     options.check_files(model, data)
+    arguments = options.given(given or ())
     results = None if out is None else outputs.replaceable(out, outputs.CHECK)
     from probcal.cli import check
 
-    raise typer.Exit(check.run(model, data, fix or (), results))
+    raise typer.Exit(check.run(model, data, fix or (), arguments, results))
 
 
 @app.command(name="track")
@@ -124,6 +132,7 @@ def track_command(
     model: Model,
     data: Data = None,
     calibration: Annotated[Path | None, typer.Option(help="folder (or fit.nc) of a fit", show_default=False)] = None,
+    given: Given = None,
     out: Annotated[Path, typer.Option(help="table of tracks to write")] = Path("tracks.csv"),
 ) -> None:
     """Tracks of other data with a calibration applied: time, target, each state component with its sd."""
@@ -131,10 +140,11 @@ def track_command(
         raise InputError("track needs --calibration DIR, the folder of a fit")
     options.check_fit(calibration)
     options.check_files(model, data)
+    arguments = options.given(given or ())
     results = outputs.replaceable(out.parent, (out.name,))
     from probcal.cli import track
 
-    raise typer.Exit(track.run(model, data, calibration, results))
+    raise typer.Exit(track.run(model, data, arguments, calibration, results))
 
 
 @app.command(name="study")
@@ -217,6 +227,7 @@ def sbc_command(
         str | None, typer.Option("--from", help="prior that the truths are drawn from; that of the fit if left out")
     ] = None,
     fix: Fix = None,
+    given: Given = None,
     runs: Annotated[int, typer.Option(min=2, help="simulations")] = 200,
     seed: Seed = 0,
     posterior: Annotated[
@@ -239,12 +250,13 @@ def sbc_command(
     if resume and out is None:
         raise InputError("sbc: --resume needs --out DIR, the folder of the runs to go on with")
     options.check_files(model, data)
+    arguments = options.given(given or ())
     with outputs.results_of_a_run(out, outputs.SBC, "runs", resume=resume, overwrite=overwrite) as results:
         from probcal.cli import sbc
 
         raise typer.Exit(
             sbc.run(
-                model, data, method=method, prior=prior, truths=truths, fix=fix or (), runs=runs, seed=seed,
-                posterior=posterior, full=full, outputs=results, resume=resume, overwrite=overwrite,
+                model, data, method=method, prior=prior, truths=truths, fix=fix or (), given=arguments, runs=runs,
+                seed=seed, posterior=posterior, full=full, outputs=results, resume=resume, overwrite=overwrite,
             )
         )  # fmt: skip

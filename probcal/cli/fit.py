@@ -28,9 +28,9 @@ LONG = 60.0  # s of a fit that is written before it is assessed
 
 
 def run(
-    model: Path, data: Path | None, *, method: str, prior: str | None, fix: Sequence[str], starts: int, seed: int,
-    outputs: Outputs | None, sizes: Mapping[str, int], resume: bool, overwrite: bool, kept: Sequence[str],
-    assessed: bool,
+    model: Path, data: Path | None, *, method: str, prior: str | None, fix: Sequence[str], given: Mapping[str, Any],
+    starts: int, seed: int, outputs: Outputs | None, sizes: Mapping[str, int], resume: bool, overwrite: bool,
+    kept: Sequence[str], assessed: bool,
 ) -> int:  # fmt: skip
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
     keep_kernels()
@@ -39,9 +39,9 @@ def run(
     value: Any = known
     value = replace(value, **sizes) if sizes else value
     began = time.perf_counter()
-    module, problem = load_problem(model, data, fix)
+    module, problem = load_problem(model, data, fix, given)
     chosen = prior_named(module, value, implied, prior)
-    truth = load_truth(module, model, data, problem)
+    truth = load_truth(module, model, data, problem, given)
     store = None if outputs is None else outputs.folder / "draws"
     if outputs is not None and overwrite:
         outputs.begin()
@@ -56,6 +56,8 @@ def run(
             with _safe(tree, outputs, time.perf_counter() - began > LONG):
                 tree = assess(problem, tree, truth=truth, key=seed, answer=answer)
     tree.attrs["model"] = model.stem
+    if given:
+        tree.attrs["set"] = ", ".join(f"{name}={value}" for name, value in given.items())
     if truth is not None:
         from probcal.results.scores import scores
 

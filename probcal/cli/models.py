@@ -1,15 +1,16 @@
 """Model files: imported, their functions called, whatever they raise in one sentence."""
 
 import importlib.util
+import inspect
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from probcal.cli.options import check_files
-from probcal.errors import FitError, InputError
+from probcal.errors import FitError, InputError, nearest
 
 if TYPE_CHECKING:
     from probcal.inference.run import Method
@@ -64,11 +65,18 @@ def call(module: ModuleType, path: Path, name: str, /, *arguments: Any, **option
         return function(*arguments, **options)
 
 
-def load_problem(model: Path, data: Path | None, fix: Sequence[str] | None = ()) -> "tuple[ModuleType, Problem]":
-    """A model file and its problem with the given data, some biases held at 0."""
+def load_problem(
+    model: Path, data: Path | None, fix: Sequence[str] | None = (), given: Mapping[str, Any] | None = None
+) -> "tuple[ModuleType, Problem]":
+    """A model file and its problem with the given data and further arguments, some biases held at 0."""
     check_files(model, data)
-    module = load_model(model)
-    problem = call(module, model, "problem", data)
+    module, given = load_model(model), given or {}
+    taken = arguments(module, "problem")
+    for name in given:
+        if taken is not None and name not in taken:
+            known = nearest(name, taken) or f"; it takes {', '.join(taken) or 'the data alone'}"
+            raise InputError(f"{model.name}: problem() has no argument {name}{known}")
+    problem = call(module, model, "problem", data, **given)
     from probcal.problem import Problem  # loaded by the model, if it is one
 
     if not isinstance(problem, Problem):
@@ -80,15 +88,33 @@ def load_problem(model: Path, data: Path | None, fix: Sequence[str] | None = ())
     return module, problem
 
 
-def load_truth(module: ModuleType, model: Path, data: Path | None, problem: "Problem") -> "Truth | None":
-    """The truth beside the data, else the model's own; checked before a fit rather than at its scores."""
+def arguments(module: ModuleType, name: str) -> list[str] | None:
+    """Names of the arguments of a function of a model file after its first; None where it takes any, or is none."""
+    try:
+        found = list(inspect.signature(getattr(module, name)).parameters.values())
+    except (AttributeError, TypeError, ValueError):
+        return None
+    if any(one.kind is one.VAR_KEYWORD for one in found):
+        return None
+    return [one.name for one in found[1:] if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
+
+
+def load_truth(
+    module: ModuleType, model: Path, data: Path | None, problem: "Problem", given: Mapping[str, Any] | None = None
+) -> "Truth | None":
+    """The truth beside the data, else the model's own with those of the further arguments that it has.
+
+    It is checked before a fit rather than at its scores.
+    """
     import numpy as np
 
     from probcal.simulate import Truth, truth_beside
 
     truth = truth_beside(data) if data is not None else None
     if truth is None and hasattr(module, "truth"):
-        truth = call(module, model, "truth", data)
+        taken = arguments(module, "truth")
+        own = {name: value for name, value in (given or {}).items() if taken is None or name in taken}
+        truth = call(module, model, "truth", data, **own)
         if not isinstance(truth, Truth | None):
             raise InputError(f"{model.name}: truth() returned {type(truth).__name__}; return a probcal.Truth or None")
     if truth is not None:

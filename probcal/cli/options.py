@@ -108,6 +108,16 @@ def parse_values(text: str) -> tuple[str, list[Any]]:
     return name.strip(), found
 
 
+def given(settings: Sequence[str]) -> dict[str, Any]:
+    """Arguments of a model by name: a number, a text, or several of them separated by commas as a tuple."""
+    found: dict[str, Any] = {}
+    for name, values in map(parse_values, settings):
+        if name in found:
+            raise InputError(f"--set {name}: it is given twice; write {name}=value,value for a tuple")
+        found[name] = values[0] if len(values) == 1 else tuple(values)
+    return found
+
+
 def _number(text: str) -> Any:
     """An integer or a float where the text is one, else the text."""
     for kind in (int, float):

@@ -1,8 +1,9 @@
 """`sbc`: a method checked on a model by simulation."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import xarray as xr
@@ -21,6 +22,7 @@ from probcal.results.io import save
 
 def run(
     model: Path, data: Path | None, *, method: str, prior: str | None, truths: str | None, fix: Sequence[str],
+    given: Mapping[str, Any],
     runs: int, seed: int, posterior: bool, full: bool, outputs: Outputs | None,
     resume: bool, overwrite: bool,
 ) -> int:  # fmt: skip
@@ -28,7 +30,7 @@ def run(
     keep_kernels()
     value, implied = METHODS[method]
     value = value if full else short(value)
-    module, problem = load_problem(model, data, fix)
+    module, problem = load_problem(model, data, fix, given)
     chosen = prior_named(module, value, implied, prior)
     began = time.perf_counter()
     if outputs is not None and overwrite:

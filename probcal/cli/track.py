@@ -1,6 +1,8 @@
 """`track`: tracks of other data with a calibration applied."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from probcal.cli.files import write_csv
 from probcal.cli.kernels import keep_kernels
@@ -14,7 +16,7 @@ from probcal.results.scores import scores
 from probcal.status import INVALID
 
 
-def run(model: Path, data: Path | None, calibration: Path, outputs: Outputs) -> int:
+def run(model: Path, data: Path | None, given: Mapping[str, Any], calibration: Path, outputs: Outputs) -> int:
     """Tracks of other data with a calibration applied: time, target, each state component with its sd."""
     known = load(calibration)
     if known.attrs.get("status") in INVALID:
@@ -22,8 +24,8 @@ def run(model: Path, data: Path | None, calibration: Path, outputs: Outputs) -> 
             f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first"
         )
     keep_kernels()
-    module, problem = load_problem(model, data)
-    truth = load_truth(module, model, data, problem)
+    module, problem = load_problem(model, data, (), given)
+    truth = load_truth(module, model, data, problem, given)
     tree = track(problem, known)
     frame = tracks(tree)
     out = outputs.folder / outputs.names[0]
