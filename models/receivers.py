@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from probcal import Bias, Channel, InputError, Known, Network, Node, Problem, StudentT, Unknown, White, sensor
+from probcal import Bias, Channel, InputError, Known, LocalFrame, Network, Node, Problem, StudentT, Unknown, White, sensor
 from probcal.geometry import norm
 
 SPEED = 299_792_458 / 1.0003  # m/s, in air
@@ -28,25 +28,6 @@ EMISSION = 1e3  # m, spread of the emission ranges about what the loader takes o
 def receiver(target, pose, *, delay=Bias("m", 30.0)):
     """Arrival time of a message times the propagation speed, with the delay of the receiver's electronics."""
     return dict(arrival=norm(target.position - pose.position) + target.emission + delay)
-
-
-def earth_fixed(latitude, longitude, height):
-    """WGS84 coordinates (N,), degrees and metres, to positions (N, 3) in m, earth-centred and earth-fixed."""
-    axis, flattening = 6_378_137.0, 1 / 298.257223563
-    squared = flattening * (2 - flattening)
-    phi, lam = np.deg2rad(latitude), np.deg2rad(longitude)
-    normal = axis / np.sqrt(1 - squared * np.sin(phi) ** 2)
-    across = (normal + height) * np.cos(phi)
-    return np.stack([across * np.cos(lam), across * np.sin(lam), (normal * (1 - squared) + height) * np.sin(phi)], -1)
-
-
-def local(place, origin):
-    """Positions east, north and up of an origin (latitude, longitude), from earth-fixed ones (N, 3)."""
-    phi, lam = np.deg2rad(origin)
-    east = [-np.sin(lam), np.cos(lam), 0.0]
-    north = [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)]
-    up = [np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)]
-    return (place - earth_fixed(*origin, 0.0)) @ np.array([east, north, up]).T
 
 
 def read(data, name=None):
@@ -87,12 +68,12 @@ def problem(data=None):
     rows = rows[rows.groupby("message")["message"].transform("size") >= 2]
     reports = reports.loc[reports.index.isin(rows["message"])]
     stations = read(data, "sensors.csv").set_index("serial").loc[sorted(rows["serial"].unique())]
-    origin = stations["latitude"].mean(), stations["longitude"].mean()
-    place = local(earth_fixed(stations["latitude"], stations["longitude"], stations["height"]), origin)
+    frame = LocalFrame(stations["latitude"].mean(), stations["longitude"].mean())
+    place = frame.to_local(stations["latitude"], stations["longitude"], stations["height"])
     station = dict(zip(stations.index, place, strict=True))
     nodes = [Node(f"receiver_{serial}", position) for serial, position in station.items()]
 
-    spot = local(earth_fixed(reports["latitude"], reports["longitude"], reports["geoAltitude"]), origin)
+    spot = frame.to_local(reports["latitude"], reports["longitude"], reports["geoAltitude"])
     spot = pd.DataFrame(spot, reports.index, ["position_x", "position_y", "position_z"])
     spot = spot.assign(time=reports["timeAtServer"], target="aircraft_" + reports["aircraft"].astype(str))
     motions = {
