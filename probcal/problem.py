@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from numbers import Real
 from os import PathLike
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -82,8 +83,9 @@ class Problem:
 
     `motion` is one motion for all targets, or a mapping from target name to motion or `Target`. `data` is a
     path or a DataFrame. `fix` holds biases at a value: labels or patterns (`"beacon_0.*"`) at 0, or a mapping
-    to values. `silent` names the sensors without rows: `fit` refuses them, `track` does not. Raises `InputError`
-    naming what is wrong.
+    to values. `epoch` brings rows to common epochs: each time is rounded to a whole multiple of so many seconds
+    (where a target moves at v it is off by up to v epoch / 2). `silent` names the sensors without rows: `fit`
+    refuses them, `track` does not. Raises `InputError` naming what is wrong.
 
     >>> free = Problem(network, motion, run.table, fix="sonar_0.*")
     >>> free.model.biases, problem.model.biases
@@ -98,6 +100,7 @@ class Problem:
         data: str | PathLike[str] | pd.DataFrame | Table,
         *,
         fix: Mapping[str, float] | Iterable[str] = (),
+        epoch: float | None = None,
     ):
         self.network = network
         self.motion = {str(name): value for name, value in motion.items()} if isinstance(motion, Mapping) else motion
@@ -105,11 +108,18 @@ class Problem:
         self.biases: tuple[BiasRecord, ...] = tuple(b for b in network.biases if b.label not in self.fixed)
         self.scales = np.array([bias.scale for bias in self.biases])
         self.surveyed = np.array([bias.kind != "scale" for bias in self.biases], bool)
-        self.measurements = measure(read_table(data), network)
-        check_plausible(self.measurements, network)
+        self.epoch = _positive(epoch)
+        whole = measure(read_table(data), network)
+        check_plausible(whole, network)
+        self.measurements = self._at_epochs(whole)
+        self.epoch_shift = float(np.abs(self.measurements.time - whole.time).max())  # s, of the rows to their epochs
         self.silent = _check_rows(self.measurements, network)
         self.levels: tuple[LevelRecord, ...]
         self._compile()
+
+    def _at_epochs(self, data: Measurements) -> Measurements:
+        """Rows at common epochs, where these are asked for."""
+        return data if self.epoch is None else replace(data, time=np.round(data.time / self.epoch) * self.epoch)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -140,7 +150,7 @@ class Problem:
         check_linear(self)
         names = self.measurements.target_names
         motion = {name: self._unlinked(name, self.target(name)) for name in names}
-        return Problem(self.network, motion, self.measurements.table, fix=self.fixed)
+        return Problem(self.network, motion, self.measurements.table, fix=self.fixed, epoch=self.epoch)
 
     def _unlinked(self, name: str, target: Target) -> Target:
         """Each component that links epochs replaced by one drawn anew, as wide as an undeclared start."""
@@ -193,7 +203,7 @@ class Problem:
 
     def rebuild(self, data: Any = None, **changes: Any) -> Problem:
         """The same problem with other data or fixed biases."""
-        settings: dict[str, Any] = {"fix": self.fixed} | changes
+        settings: dict[str, Any] = {"fix": self.fixed, "epoch": self.epoch} | changes
         return Problem(self.network, self.motion, self.measurements.table if data is None else data, **settings)
 
     def select(self, rows: np.ndarray) -> Problem:
@@ -252,7 +262,7 @@ class Problem:
         a row that is not later, for a new target, and where an epoch has more rows than its size.
         """
         other = copy(self)
-        other.measurements = measure(read_table(data), self.network)
+        other.measurements = self._at_epochs(measure(read_table(data), self.network))
         other.silent = _check_rows(other.measurements, self.network)
         last = {str(name): float(e.time[e.target == name][-1]) for e in self.epochs for name in dict.fromkeys(e.target)}
         measured = other.measurements
@@ -483,6 +493,13 @@ def _fixed(network: Network, fix: Mapping[str, float] | Iterable[str]) -> dict[s
             raise InputError(f'fix "{pattern}": the value must be finite, got {value}')
         fixed |= dict.fromkeys(found, float(value))
     return fixed
+
+
+def _positive(epoch: float | None) -> float | None:
+    """The length of an epoch; raises `InputError` where it is none."""
+    if epoch is not None and not (isinstance(epoch, Real) and np.isfinite(epoch) and epoch > 0):
+        raise InputError(f"Problem(epoch={epoch!r}): give seconds, a positive number, or leave it out")
+    return None if epoch is None else float(epoch)
 
 
 def _check_rows(data: Measurements, network: Network) -> tuple[str, ...]:

@@ -10,15 +10,18 @@ import pandas as pd
 import pytest
 
 from probcal import (
+    MAP,
     Bias,
     Channel,
     ConstantVelocity,
+    Gaussian,
     InputError,
     Network,
     Node,
     Path,
     Problem,
     White,
+    fit,
     read_table,
     sensor,
     sensors,
@@ -202,3 +205,29 @@ def test_rows_are_named_by_the_line_of_the_file_and_by_the_index_of_a_frame(tmp_
     with pytest.raises(InputError, match=r"data row 80 column .range.: .x. is no number"):
         measure(read_table(frame), network())
     assert read_table(path).lines.tolist() == [2, 3]
+
+
+def test_rows_are_brought_to_common_epochs(tmp_path):
+    """Jittered stamps of three sensors share an epoch; what is rebuilt, selected and applied keeps it."""
+    random = np.random.default_rng(0)
+    nodes = [Node(f"gauge_{k}", place, scale=1.0) for k, place in enumerate([(0, 0), (50, 0), (0, 50)])]
+    network = Network([sensors.ranger.on(node) for node in nodes])
+    time = np.repeat(0.1 * np.arange(40), 3)
+    table = pd.DataFrame({
+        "time": time + random.uniform(-0.04, 0.04, 120), "sensor": [f"gauge_{k}" for k in range(3)] * 40,
+        "range": 30 + time + random.normal(size=120),
+    })  # fmt: skip
+    free = Problem(network, ConstantVelocity(1.0), table)
+    problem = Problem(network, ConstantVelocity(1.0), table, epoch=0.1)
+    assert [len(p.epochs[0].time) for p in (free, problem)] == [120, 40]
+    np.testing.assert_allclose(problem.measurements.time, time, atol=1e-12)
+    assert problem.epoch_shift == pytest.approx(np.abs(table["time"] - time).max())
+    assert free.epoch_shift == 0.0
+    for other in (problem.rebuild(fix=["gauge_0.*"]), problem.select(np.arange(60)), problem.unlinked()):
+        assert other.epoch == 0.1
+        assert len(other.epochs[0].time) == len(np.unique(other.measurements.time))
+    tree = fit(problem, MAP(), prior=Gaussian())
+    assert (tree.attrs["epoch"], tree.attrs["epoch_shift"]) == (0.1, problem.epoch_shift)
+    for bad in (0.0, -1.0, np.nan, "0.1"):
+        with pytest.raises(InputError, match=r"Problem\(epoch=.*give seconds, a positive number"):
+            Problem(network, ConstantVelocity(1.0), table, epoch=bad)

@@ -113,6 +113,8 @@ def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
     )  # fmt: skip
     print(f"{attrs['method']} ({attrs['prior']}): {attrs['status']} after {work}, {seconds:.1f} s")
     print(f"intervals are {attrs['interval_probability']:.0%}; {attrs['intervals']}")
+    if "epoch" in attrs:
+        print(f"rows at epochs of {attrs['epoch']:g} s, shifted by {attrs['epoch_shift']:.3g} s at most")
     if "level" in tree.children:
         for label, std in tree["level"].to_dataset()["std"].to_series().items():
             print(f"estimated {label} = {std:.4g}")

@@ -156,7 +156,7 @@ def _attrs(answer: Answer) -> dict[str, Any]:
         "results_version": RESULTS_VERSION, "motion": answer.motion, "interrupted": int(answer.interrupted),
         "status": str(answer.status), "message": answer.message, "data": answer.problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
-        **answer.posterior.attrs,
+        **answer.posterior.attrs, **_epoch(answer.problem),
     }  # fmt: skip
     if found.evidence is not None:
         tailed = answer.problem.model.tailed
@@ -184,7 +184,13 @@ def build_tracks(problem: Problem, tracks: Sequence[Band]) -> xr.DataTree:
     register()
     tree = xr.DataTree.from_dict(track_groups(problem, tracks))
     tree.attrs["data"] = problem.measurements.table.source
+    tree.attrs.update(_epoch(problem))
     return tree
+
+
+def _epoch(problem: Problem) -> dict[str, float]:
+    """Length of common epochs in s and the largest shift of a row to one; nothing where rows keep their times."""
+    return {} if problem.epoch is None else {"epoch": problem.epoch, "epoch_shift": problem.epoch_shift}
 
 
 def add_optima(tree: xr.DataTree, answers: Sequence[Answer], best: int) -> xr.DataTree:
