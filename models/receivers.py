@@ -16,7 +16,20 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from probcal import Bias, Channel, InputError, Known, LocalFrame, Network, Node, Problem, StudentT, Unknown, White, sensor
+from probcal import (
+    Bias,
+    Channel,
+    InputError,
+    Known,
+    LocalFrame,
+    Network,
+    Node,
+    Problem,
+    StudentT,
+    Unknown,
+    White,
+    sensor,
+)
 from probcal.geometry import norm
 
 SPEED = 299_792_458 / 1.0003  # m/s, in air

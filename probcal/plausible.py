@@ -14,7 +14,7 @@ from probcal.table import Measurements, header, unit_factor
 
 EPOCHS = (("ns", 1e17), ("us", 1e14), ("ms", 1e11))  # a bare time from here on counts these since 1970
 GAP = 3.2e9  # s between two rows of one table: a hundred years
-TURNS = 10.0  # rad in a wrapped channel of no stated unit: more than a turn and a half
+TURNS = 20.0  # rad in a wrapped channel of no stated unit: more than three turns
 SENTINELS = (-9999.0, -999.0, -99999.0, 9999.0, 99999.0, 999999.0, -999999.0, 32767.0, -32768.0, 65535.0, -1e30, 1e30)
 APART = 20.0  # spreads of its column from which a sentinel is one
 FAR = 1e6  # spreads from which any value is nonsense

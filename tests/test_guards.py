@@ -49,6 +49,12 @@ from probcal.smoothing.start import automatic_start
 from probcal.status import INVALID, Status
 
 
+@pytest.fixture(autouse=True)
+def open_door(monkeypatch):
+    """What the door refuses, as if it had passed: these are the guards behind it."""
+    monkeypatch.setattr("probcal.problem.check_plausible", lambda *_: None)
+
+
 @sensor(range=Channel("m", std=0.5), azimuth=Channel("rad", std=0.02, wrap=True))
 def gauge(target, pose, *, range_offset=Bias("m", 2.0)):
     line = target.position - pose.position

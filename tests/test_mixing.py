@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import networks
 from worlds import plane, resting
 
+WEIGHT, NORMALS = jax.jit(log_weight), jax.jit(unit_normals)
 METHOD = Collapsed(chains=2, warmup=50, draws=100, sweeps=1, patience=4)
 
 
@@ -104,9 +105,10 @@ def two_sides():
     frame = poses[0].frame
     theta = frame.theta + 0.1 * jax.random.normal(keys[0], frame.theta.shape)
     eps = tuple(jax.random.normal(keys[1], x.shape) for x in frame.point.states)
-    return form, poses, Place(theta, eps, {}, log_weight(problem.model, frame, theta, eps))
+    return form, poses, Place(theta, eps, {}, WEIGHT(problem.model, frame, theta, eps))
 
 
+@pytest.mark.ci
 def test_a_shift_to_the_other_side_and_back_is_none():
     """An involution whose gain is the difference of the joint densities in biases and process noises."""
     with jax.enable_x64(True):
@@ -114,6 +116,7 @@ def test_a_shift_to_the_other_side_and_back_is_none():
         over, gain = jax.jit(shifted, static_argnums=0)(form, here, there, at)
         back, loss = jax.jit(shifted, static_argnums=0)(form, there, here, over)
 
+        @jax.jit
         def density(posed, place):
             whole = log_joint(posed.model, posed.frame, place.theta, place.eps)
             return whole - volume(posed.model, posed.frame, place.theta) + log_prior(form, posed, place.theta, {})
@@ -136,8 +139,8 @@ def test_where_the_frame_is_exact_every_leap_is_taken():
             Gaussian().precision(problem.labels, problem.surveyed),
         )  # fmt: skip
         form = Form(problem.model.biases, hierarchy_of(Gaussian(), problem))
-        eps = unit_normals(problem.model, posed.frame, posed.frame.point)
-        at = Place(posed.frame.theta, eps, {}, log_weight(problem.model, posed.frame, posed.frame.theta, eps))
+        eps = NORMALS(problem.model, posed.frame, posed.frame.point)
+        at = Place(posed.frame.theta, eps, {}, WEIGHT(problem.model, posed.frame, posed.frame.theta, eps))
         move = jax.jit(leap, static_argnums=(0, 4, 5))
         ends = [move(form, posed, at, jax.random.key(k), 4, 1) for k in range(20)]
     assert all(float(rate) == pytest.approx(1.0, abs=1e-6) for _, rate in ends)
@@ -160,7 +163,7 @@ def test_a_leap_is_taken_by_the_weight_of_the_posterior():
         def one(key):
             keys = jax.random.split(key)
             theta = conditional(form, posed, {}).draw(keys[0])
-            at = Place(theta, resting_eps, {}, log_weight(problem.model, wrong, theta, resting_eps))
+            at = Place(theta, resting_eps, {}, WEIGHT(problem.model, wrong, theta, resting_eps))
             return leap(form, posed, at, keys[1], 20, 1)
 
         ends, rate = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(3), 2000))

@@ -10,24 +10,22 @@ import pandas as pd
 import pytest
 
 from probcal import (
-    MAP,
     Bias,
     Channel,
     ConstantVelocity,
-    Gaussian,
     InputError,
     Network,
     Node,
     Path,
     Problem,
     White,
-    fit,
     read_table,
     sensor,
     sensors,
     simulate,
 )
 from probcal.geometry import norm
+from probcal.results import build
 from probcal.table import UNITS, measure, unit_factor
 
 sys.path.insert(0, str(committed.DATA))
@@ -226,8 +224,8 @@ def test_rows_are_brought_to_common_epochs(tmp_path):
     for other in (problem.rebuild(fix=["gauge_0.*"]), problem.select(np.arange(60)), problem.unlinked()):
         assert other.epoch == 0.1
         assert len(other.epochs[0].time) == len(np.unique(other.measurements.time))
-    tree = fit(problem, MAP(), prior=Gaussian())
-    assert (tree.attrs["epoch"], tree.attrs["epoch_shift"]) == (0.1, problem.epoch_shift)
+    assert build._epoch(problem) == {"epoch": 0.1, "epoch_shift": problem.epoch_shift}
+    assert build._epoch(free) == {}
     for bad in (0.0, -1.0, np.nan, "0.1"):
         with pytest.raises(InputError, match=r"Problem\(epoch=.*give seconds, a positive number"):
             Problem(network, ConstantVelocity(1.0), table, epoch=bad)
