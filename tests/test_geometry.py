@@ -59,7 +59,7 @@ def test_nodes_and_paths_take_an_attitude_by_name():
         (np.stack([np.eye(3), 2 * np.eye(3)]), "rotation 1 is none"),
         (np.full((3, 3), np.nan), "rotation 0 is none"),
         (np.zeros(4), "a quaternion must be finite and not 0"),
-        (np.zeros((2, 3)), r"got \(2, 3\)"),
+        (np.zeros((2, 3)), r"attitude: give matrices .* or quaternions \(\.\.\., 4\); got"),
     ],
 )
 def test_what_is_no_rotation_is_refused(given, says):
