@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probcal.labels import AXES
+from probcal.results.alignment import align as laid_on
 from probcal.results.read import each_track
 
 if TYPE_CHECKING:
@@ -15,30 +16,40 @@ if TYPE_CHECKING:
     from probcal.simulate import Truth
 
 
-def position_rmse(tree: xr.DataTree, truth: Truth) -> tuple[float, float] | None:
-    """Root mean square position error in m without and with calibration, over the epochs that the truth covers."""
-    squares = []
+def position_rmse(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> tuple[float, float] | None:
+    """Root mean square position error in m without and with calibration, over the epochs that the truth covers.
+
+    With `align` ("rigid", "similarity") each is first laid on the truth, which may live in another frame then.
+    """
+    pairs = []
     for name, track in each_track(tree):
         axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in track["component"].values]
         times = track["time"].values
         true = truth.positions(times, np.full(len(times), name), len(axes))
-        both = [track[kind].sel(component=axes).values for kind in ("before", "mean")]
         known = np.isfinite(true).all(1)
-        squares.append([((value - true)[known] ** 2).sum(1) for value in both])
-    before, after = (np.concatenate([s[k] for s in squares]) for k in (0, 1))
-    return (float(np.sqrt(before.mean())), float(np.sqrt(after.mean()))) if len(before) else None
+        pairs.append([track[kind].sel(component=axes).values[known] for kind in ("before", "mean")] + [true[known]])
+    before, after, true = (np.concatenate([part[k] for part in pairs]) for k in range(3))
+    if not len(true):
+        return None
+    if align is not None:
+        before, after = (laid_on(places, true, align)(places) for places in (before, after))
+    first, second = (float(np.sqrt(((places - true) ** 2).sum(1).mean())) for places in (before, after))
+    return first, second
 
 
-def scores(tree: xr.DataTree, truth: Truth) -> dict[str, float]:
+def scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> dict[str, float]:
     """Scores by name: position RMSE before and after, normalised bias RMSE and coverage of the intervals.
+
+    A truth whose tracks live in another frame is met by `align`, "rigid" or "similarity": the tracks are laid on it
+    first, and the scores say so (`position_rmse_after_rigid`). Raises `InputError` for another kind.
 
     >>> bool(scores(tree, run.truth)["position_rmse_after"] < 1.0)
     True
     """
     found: dict[str, float] = {}
-    positions = position_rmse(tree, truth)
+    positions, suffix = position_rmse(tree, truth, align=align), "" if align is None else f"_{align}"
     if positions is not None:
-        found |= {"position_rmse_before": positions[0], "position_rmse_after": positions[1]}
+        found |= {f"position_rmse_before{suffix}": positions[0], f"position_rmse_after{suffix}": positions[1]}
     if "calibration" in tree.children and truth.biases:
         group = tree["calibration"].to_dataset()
         known = [str(label) for label in group["bias_label"].values if str(label) in truth.biases]
