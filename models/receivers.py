@@ -103,7 +103,7 @@ def problem(data=None):
     count, number = rows["serial"].value_counts(), groups(rows)
     references = {max((s for s in number if number[s] == n), key=count.get) for n in set(number.values())}
     return Problem(
-        Network([receiver.on(node) for node in nodes]),
+        Network([receiver.on(node) for node in nodes], frame=frame),
         motions,
         table[["time", "sensor", "target", "arrival"]],
         fix=[f"receiver_{serial}.delay" for serial in sorted(references)],

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         sensitivity,
     )
     from probcal.errors import FitError, InputError
+    from probcal.geodesy import LocalFrame
     from probcal.inference import (
         EA,
         EM,
@@ -54,15 +55,14 @@ if TYPE_CHECKING:
         White,
     )
     from probcal.network import Network, Node, Path
-    from probcal.nodes import LocalFrame, read_nodes, write_nodes
+    from probcal.nodes import read_nodes, write_nodes
     from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
     from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
     from probcal.problem import Problem
-    from probcal.results.build import add_scores
     from probcal.results.drifts import drift_table
     from probcal.results.io import load, save
     from probcal.results.read import outliers, summary, tracks
-    from probcal.results.scores import scores
+    from probcal.results.scores import add_scores, scores
     from probcal.sensor import Bias, Channel, Drift, Sensor, SensorType, sensor
     from probcal.simulate import Simulation, Truth, simulate
     from probcal.table import read_table
@@ -75,8 +75,9 @@ __all__ = lazy(
             "observability sensitivity"
         ),
         "probcal.results.drifts": "drift_table",
-        "probcal.results.scores": "scores",
+        "probcal.results.scores": "add_scores scores",
         "probcal.errors": "FitError InputError",
+        "probcal.geodesy": "LocalFrame",
         "probcal.inference": (
             "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares Unscented coverage_table fit "
             "log_evidence numpyro_model sbc study track"
@@ -85,14 +86,13 @@ __all__ = lazy(
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"
         ),
         "probcal.network": "Network Node Path",
-        "probcal.nodes": "LocalFrame read_nodes write_nodes",
+        "probcal.nodes": "read_nodes write_nodes",
         "probcal.noise": "Bernoulli Mixture StudentT Unknown",
         "probcal.priors": "ARD BernoulliGaussian Flat Gaussian Horseshoe Laplace",
         "probcal.problem": "Problem",
         "probcal.sensor": "Bias Channel Drift Sensor SensorType sensor",
         "probcal.simulate": "Simulation Truth simulate",
         "probcal.table": "read_table",
-        "probcal.results.build": "add_scores",
         "probcal.results.io": "load save",
         "probcal.results.read": "outliers summary tracks",
     },

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from probcal.errors import InputError, nearest
+from probcal.geodesy import LocalFrame
 from probcal.geometry import slopes
 from probcal.labels import AXES
 from probcal.sensor import Bias, Drift, Sensor, SensorType
@@ -190,15 +191,19 @@ class BiasRecord:
 class Network:
     """Placed sensors with their nodes; the biases follow, in the order of nodes, then sensors.
 
-    Raises `InputError` for names used twice, mixed dimensions, or a biased component that no sensor reads.
+    `frame` is the `LocalFrame` of the coordinates where they come from latitude and longitude (that of `read_nodes`):
+    maps then show meridians and parallels. Raises `InputError` for names used twice, mixed dimensions, or a biased
+    component that no sensor reads.
 
     >>> from probcal.sensors import radar
     >>> Network([radar.on(Node("mast", (0.0, 40.0), scale={"heading": 0.05}))]).labels[0]
     'mast.heading'
     """
 
-    def __init__(self, sensors: Sequence[Sensor]):
-        self.sensors = tuple(sensors)
+    def __init__(self, sensors: Sequence[Sensor], *, frame: LocalFrame | None = None):
+        self.sensors, self.frame = tuple(sensors), frame
+        if not isinstance(frame, LocalFrame | None):
+            raise InputError(f"Network: frame is {frame!r}; give a LocalFrame(latitude, longitude)")
         if not self.sensors:
             raise InputError("the network has no sensor; place some with sensor_type.on(node)")
         for placed in self.sensors:

@@ -1,12 +1,11 @@
-"""Nodes from and to files (CSV, GeoJSON), and the local frame of places given by latitude and longitude."""
+"""Nodes from and to files: CSV and GeoJSON, in metres or in latitude and longitude."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from difflib import get_close_matches
-from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,6 +14,7 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.files import write_whole
+from probcal.geodesy import GEODETIC, LocalFrame, check_place, earth_axes
 from probcal.labels import AXES, step_of
 from probcal.lazy import Later
 from probcal.network import ANGLES, POSE_UNITS, Node
@@ -23,15 +23,12 @@ from probcal.table import Table, header, name_as_text, numbers, read_table, unit
 
 if TYPE_CHECKING:
     import pandas as pd
-    import pyproj
     import xarray as xr
 else:
     pd = Later("pandas")
-    pyproj = Later("pyproj")
     xr = Later("xarray")
 
-EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563  # WGS84: radius in m
-LOCAL, GEODETIC = ("x", "y", "z"), ("latitude", "longitude", "height")
+LOCAL = ("x", "y", "z")
 PLACE_UNITS = dict.fromkeys((*LOCAL, "height"), "m") | dict.fromkeys(GEODETIC[:2], "deg")
 OWN = tuple(name for name in POSE_UNITS if name != "position")  # components that every node has
 KINDS = ("survey", "scale")
@@ -40,87 +37,10 @@ KNOWN = (*OWN, "position", *(f"{kind}_{name}" for kind in KINDS for name in ("po
 GEOJSON = (".geojson", ".json")
 
 
-@dataclass(frozen=True)
-class LocalFrame:
-    """Local frame in m: x east, y north of an origin in degrees (WGS84), `height` in m above the ellipsoid.
-
-    With heights it is the topocentric frame of the origin, z up: exact in space, so that a line of sight is straight
-    over any distance. Without, it is the azimuthal equidistant map at the origin's height: distances from the origin
-    are true, those across it grow by (d / R)^2 / 6, which is 4 cm a km at d = 100 km.
-
-    >>> bool(abs(LocalFrame(48.0, 11.0).to_local([48.001], [11.0])[0, 1] - 111.2) < 0.1)  # a thousandth of a degree
-    True
-    """
-
-    latitude: float
-    longitude: float
-    height: float = 0.0
-
-    def __post_init__(self):
-        _check_place("LocalFrame", self.latitude, self.longitude, self.height)
-        for name in GEODETIC:
-            object.__setattr__(self, name, float(getattr(self, name)))
-
-    @cached_property
-    def _maps(self) -> dict[int, Any]:
-        """Transformers between longitude and latitude (and height) and the frame, by dimension."""
-        a, b = EQUATOR + self.height, EQUATOR * (1 - FLATTENING) + self.height
-        origin = f"+lat_0={self.latitude!r} +lon_0={self.longitude!r}"
-        space = f"+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 {origin} +h_0={self.height!r}"
-        return {
-            2: pyproj.Transformer.from_pipeline(f"+proj=aeqd {origin} +a={a!r} +b={b!r}"),
-            3: pyproj.Transformer.from_pipeline(f"+proj=pipeline {space}"),
-        }
-
-    def to_local(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
-        """Positions in m, shape (..., 2) or with heights (..., 3), of places in degrees and m."""
-        _check_place("LocalFrame.to_local", latitude, longitude, 0.0 if height is None else height)
-        given = (longitude, latitude) if height is None else (longitude, latitude, height)
-        places = np.broadcast_arrays(*(np.array(part, float) for part in given))
-        return np.stack(self._maps[len(places)].transform(*places), -1)
-
-    def to_geodetic(self, position: Any) -> tuple[np.ndarray, ...]:
-        """Latitude and longitude in degrees, of positions (..., 3) also height in m: the inverse of `to_local`."""
-        position = np.array(position, float)
-        if position.shape[-1:] not in ((2,), (3,)) or not np.isfinite(position).all():
-            raise InputError("LocalFrame.to_geodetic: positions must be finite metres of shape (..., 2) or (..., 3)")
-        parts = np.moveaxis(position, -1, 0)
-        found = self._maps[len(parts)].transform(*parts, direction="INVERSE")
-        longitude, latitude, *height = (np.asarray(part) for part in found)
-        return (latitude, longitude, *height)
-
-    def axes(self, latitude: Any, longitude: Any) -> np.ndarray:
-        """Axes east, north and up at places in degrees, as rows in this frame, shape (..., 3, 3).
-
-        `velocity @ axes` takes a velocity (east, north, up) at the place into the frame.
-        """
-        return _axes(latitude, longitude) @ _axes(self.latitude, self.longitude).T
-
-
 class Nodes(dict[str, Node]):
     """Nodes by name, and the `frame` of their coordinates (None where the file states metres)."""
 
     frame: LocalFrame | None = None
-
-
-def _check_place(what: str, latitude: Any, longitude: Any, height: Any) -> None:
-    try:
-        phi, lam, h = (np.asarray(part, float) for part in (latitude, longitude, height))
-    except (TypeError, ValueError):
-        raise InputError(f"{what}: latitude, longitude and height must be numbers") from None
-    if not ((np.abs(phi) <= 90).all() and (np.abs(lam) <= 360).all()):
-        raise InputError(f"{what}: latitude must lie between -90 and 90 degrees, longitude between -360 and 360")
-    if not (np.abs(h) <= EQUATOR).all():
-        raise InputError(f"{what}: height must be metres above the ellipsoid, between -{EQUATOR:.0f} and {EQUATOR:.0f}")
-
-
-def _axes(latitude: Any, longitude: Any) -> np.ndarray:
-    """Axes east, north and up at places in degrees, as rows in earth-centred coordinates, shape (..., 3, 3)."""
-    phi, lam = np.broadcast_arrays(np.deg2rad(latitude), np.deg2rad(longitude))
-    east = np.stack([-np.sin(lam), np.cos(lam), np.zeros_like(lam)], -1)
-    north = np.stack([-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)], -1)
-    up = np.stack([np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)], -1)
-    return np.stack([east, north, up], -2)
 
 
 def _reference(frame: LocalFrame, place: np.ndarray) -> np.ndarray:
@@ -271,11 +191,11 @@ def _to_frame(
 ) -> tuple[LocalFrame, np.ndarray, np.ndarray]:
     """Local frame, axes of the attitudes (N, 3, 3) and positions (N, d) of nodes at geodetic places (N, d)."""
     for row, (latitude, longitude, *height) in enumerate(place):
-        _check_place(table.where(row), latitude, longitude, height[0] if height else 0.0)
+        check_place(table.where(row), latitude, longitude, height[0] if height else 0.0)
     if isinstance(origin, LocalFrame):
         frame = origin
     elif origin is None:  # by the mean of directions, which knows no date line
-        x, y, z = _axes(place[:, 0], place[:, 1])[:, 2].mean(axis=0).tolist()
+        x, y, z = earth_axes(place[:, 0], place[:, 1])[:, 2].mean(axis=0).tolist()
         middle = np.rad2deg([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)])
         frame = LocalFrame(*middle.tolist(), *place[:, 2:].mean(axis=0).tolist())
     elif isinstance(origin, (Sequence, np.ndarray)) and len(origin) in (2, 3):

@@ -63,7 +63,7 @@ def make():
             found = probcal.fit(problem, method, store=folder)
         found = probcal.assess(problem, found, truth=simulation.truth)
         found.attrs["model"] = "small"
-        add_scores(found, probcal.scores(found, simulation.truth), simulation.truth.biases)
+        add_scores(found, simulation.truth)
         probcal.save(shortened(found, draws), DATA / f"{name}.nc")
 
 

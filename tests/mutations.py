@@ -145,7 +145,7 @@ MUTATIONS = [
     Mutation("table.py", "(\"length\", 1609.344)", "(\"length\", 1609.0)", "test_table.py"),
     Mutation("table.py", "return size / UNITS[wanted][1]", "return size * UNITS[wanted][1]", "test_table.py"),
     # nodes.py
-    Mutation("nodes.py", "@ _axes(self.latitude, self.longitude).T", "@ _axes(self.latitude, self.longitude)", "test_nodes.py"),
+    Mutation("geodesy.py", "@ earth_axes(self.latitude, self.longitude).T", "@ earth_axes(self.latitude, self.longitude)", "test_nodes.py"),
     Mutation("nodes.py", "turn = np.arctan2(axes[:, 0, 1], axes[:, 0, 0])", "turn = -np.arctan2(axes[:, 0, 1], axes[:, 0, 0])", "test_nodes.py"),
     Mutation("nodes.py", "round(float(np.rad2deg(value)), 12)", "round(float(value), 12)", "test_nodes.py"),
     # geometry.py

@@ -15,7 +15,7 @@ FLOORS = {
     0: ("linalg", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files", "status"),
     1: ("sensor", "motion", "priors", "noise"),
     2: ("sensors",),
-    3: ("network", "table", "nodes", "plausible"),
+    3: ("geodesy", "network", "table", "nodes", "plausible"),
     4: ("model", "problem", "simulate"),
     5: ("smoothing",),
     6: ("identifiability", "results"),

@@ -13,7 +13,7 @@ import pytest
 import probcal
 from probcal import ConstantVelocity, Network, Node, Problem, simulate
 from probcal.inference import solve
-from probcal.plots.fit import plot_map
+from probcal.plots.map import plot_map
 from probcal.sensors import radar, ranger
 from probcal.smoothing import recursion
 from probcal.smoothing.information import at_levels

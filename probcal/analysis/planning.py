@@ -303,7 +303,10 @@ def _with_sensor(problem: Problem, kind: SensorType) -> tuple[Problem, int, jax.
     blank = {column: np.nan for c, column in columns.items() if c not in ("time", "target", "sensor")}
     rows = seen.assign(**blank).assign(**own, **{columns["sensor"]: name})
     table = Table(pd.concat([frame, rows], ignore_index=True), data.table.source, np.arange(len(frame) + len(rows)))
-    wider = Problem(Network([*network.sensors, placed]), problem.motion, table, fix=problem.fixed, epoch=problem.epoch)
+    wider = Problem(
+        Network([*network.sensors, placed], frame=network.frame), problem.motion, table, fix=problem.fixed,
+        epoch=problem.epoch,
+    )  # fmt: skip
     number = len(wider.network.sensors) - 1
     for block, index in enumerate(wider.row_index):
         mine = wider.measurements.sensor[index] == number

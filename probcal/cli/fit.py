@@ -17,7 +17,6 @@ from probcal.cli.progress import line
 from probcal.files import Outputs
 from probcal.inference import METHODS, calibrate
 from probcal.inference.manifest import remove_run
-from probcal.results.build import add_scores
 from probcal.results.io import save
 from probcal.results.read import outliers, summary
 from probcal.results.schema import evidence_in
@@ -59,9 +58,9 @@ def run(
     if given:
         tree.attrs["set"] = ", ".join(f"{name}={value}" for name, value in given.items())
     if truth is not None:
-        from probcal.results.scores import scores
+        from probcal.results.scores import add_scores
 
-        add_scores(tree, scores(tree, truth), truth.biases)
+        add_scores(tree, truth)
     print(table_text(tree))
     _print_verdict(tree, time.perf_counter() - began)
     if outputs is not None and store is not None:

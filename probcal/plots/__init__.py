@@ -13,11 +13,12 @@ if TYPE_CHECKING:
         plot_biases,
         plot_drift,
         plot_gamma,
-        plot_map,
         plot_objective,
         plot_outliers,
         plot_residuals,
     )
+    from probcal.plots.interactive import interactive_map
+    from probcal.plots.map import plot_map
     from probcal.plots.observability import draw_check, plot_directions, plot_passes, plot_spectrum
     from probcal.plots.sbc import draw_sbc, plot_coverage, plot_ranks
     from probcal.plots.study import draw_study, plot_study
@@ -29,7 +30,9 @@ __all__ = lazy(
         "probcal.plots.base": "INTERVAL",
         "probcal.plots.bounds": "plot_bound_map plot_sensitivity",
         "probcal.plots.compare": "draw_compare plot_gammas plot_methods plot_pair",
-        "probcal.plots.fit": "plot_biases plot_drift plot_gamma plot_map plot_objective plot_outliers plot_residuals",
+        "probcal.plots.fit": "plot_biases plot_drift plot_gamma plot_objective plot_outliers plot_residuals",
+        "probcal.plots.interactive": "interactive_map",
+        "probcal.plots.map": "plot_map",
         "probcal.plots.observability": "draw_check plot_directions plot_passes plot_spectrum",
         "probcal.plots.sbc": "draw_sbc plot_coverage plot_ranks",
         "probcal.plots.study": "draw_study plot_study",

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from probcal.files import write_whole
+from probcal.plots.scene import ellipse
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#5d3a9b")
 BEFORE = "#a6a6a6"
@@ -56,9 +57,5 @@ def probability(tree: xr.DataTree) -> float:
 
 def ellipse_patch(centre: Sequence[float], covariance: np.ndarray, probability: float, **style: Any) -> Ellipse:
     """Ellipse that holds a probability of a Gaussian in the plane, covariance (2, 2)."""
-    (xx, xy), (_, yy) = covariance
-    spread = np.hypot((xx - yy) / 2, xy)
-    variances = np.maximum([(xx + yy) / 2 + spread, (xx + yy) / 2 - spread], 0.0)
-    width, height = 2.0 * np.sqrt(-2.0 * np.log1p(-probability) * variances)
-    angle = float(np.degrees(np.arctan2(2 * xy, xx - yy) / 2))
-    return Ellipse((float(centre[0]), float(centre[1])), width, height, angle=angle, **style)
+    width, height, angle = ellipse(covariance, probability)
+    return Ellipse((float(centre[0]), float(centre[1])), width, height, angle=float(np.degrees(angle)), **style)

@@ -1,7 +1,6 @@
-"""Pictures of a saved fit: map, biases, residuals, objective, gamma; matplotlib figures without pyplot."""
+"""Pictures of a saved fit: biases, residuals, objective, drift, gamma; matplotlib figures without pyplot."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import FancyArrowPatch
 from matplotlib.ticker import MaxNLocator
 
 from probcal.labels import label_parts
@@ -23,46 +20,15 @@ from probcal.plots.base import (
     GAMMA,
     LINEAR,
     NAMED,
-    POINTS,
     ROWS,
     colour,
-    ellipse_patch,
     new_axes,
     plain_text,
     probability,
 )
 from probcal.results.drifts import drift_table
-from probcal.results.read import each_track
 from probcal.results.schema import EVIDENCES, evidence_in
 from probcal.status import INVALID
-
-
-@dataclass(frozen=True)
-class _Track:
-    """Positions (E, 2) of one target in order of time."""
-
-    target: str
-    before: np.ndarray
-    after: np.ndarray
-
-
-def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
-    """Draw stated and calibrated nodes with their ellipses, the tracks before and after calibration.
-
-    Dashed: the tracks of an answer on the other side of a mirror that fits as well.
-    """
-    ax = new_axes(ax, 9.0, 6.5)
-    ax.set_aspect("equal", adjustable="box")
-    tracks, mirrored = list(_tracks(tree)), list(_mirrored(tree))
-    _limit(ax, tree, [*tracks, *mirrored])
-    keys = _draw_tracks(ax, tracks) + _draw_mirrored(ax, mirrored)
-    keys += _draw_nodes(ax, tree)
-    nodes = tree["constant_data"].to_dataset()
-    space = nodes.sizes["axis"] > 2
-    ax.set(xlabel="x in m", ylabel="y in m")
-    ax.set_title("Map of nodes and tracks" + (" (x-y plane, z not shown)" if space else ""), loc="left")
-    ax.legend(handles=keys, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
-    return ax
 
 
 def plot_biases(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
@@ -207,185 +173,6 @@ def _bias(label: str) -> str:
     """Name of a bias without its owner: `heading` of `radar_2.heading`, `heading_step` of `radar_2.heading@0.5`."""
     name, _, time = label_parts(label)[1].partition("@")
     return f"{name}_step" if time else name
-
-
-# Map
-
-
-def _tracks(tree: xr.DataTree) -> Iterator[_Track]:
-    """Positions of every target that has some."""
-    axes = ["position_x", "position_y"]
-    for target, group in each_track(tree):
-        if np.isin(axes, group["component"].values).all():
-            yield _Track(target, *(group[kind].sel(component=axes).values for kind in ("before", "mean")))
-
-
-def _mirrored(tree: xr.DataTree) -> Iterator[_Track]:
-    """Tracks of the best answer on the other side of a mirror, where one fits as well."""
-    if "mirror" not in tree.children:
-        return
-    group = tree["mirror"].to_dataset()
-    same = group.attrs["same"]
-    best = int(group["gain"].values.argmax())
-    if group["gain"].values[best] <= -same:
-        return
-    for target, there in each_track(tree.children["mirror"]):
-        places = there["position"].isel(mirror=best).values[:, :2]
-        yield _Track(target, places, places)
-
-
-def _draw_mirrored(ax: Axes, tracks: list[_Track]) -> list[Line2D]:
-    """Draw the tracks of the other side and return the legend entry."""
-    most = min(POINTS, max(2, ALL_POINTS // max(len(tracks), 1)))
-    for k, track in enumerate(tracks):
-        ax.plot(*_thin(track.after, most).T, "--", color=colour(k), linewidth=1.0, alpha=0.7, zorder=2.5)
-    return [Line2D([], [], color="0.3", linestyle="--", label="fits as well")] if tracks else []
-
-
-def _thin(path: np.ndarray, most: int) -> np.ndarray:
-    """At most `most` points of a path (E, 2), evenly spaced, both ends kept."""
-    if len(path) <= most:
-        return path
-    return path[np.linspace(0, len(path) - 1, most).round().astype(int)]
-
-
-def _draw_tracks(ax: Axes, tracks: list[_Track]) -> list[Line2D]:
-    """Draw all tracks and return the legend entries."""
-    most = min(POINTS, max(2, ALL_POINTS // max(len(tracks), 1)))
-    for k, track in enumerate(tracks):
-        before, after = _thin(track.before, most), _thin(track.after, most)
-        if len(after) == 1:
-            ax.plot(*before.T, "o", color=BEFORE, markersize=3, zorder=2)
-            ax.plot(*after.T, "o", color=colour(k), markersize=5, zorder=3)
-        else:
-            ax.plot(*before.T, "-", color=BEFORE, linewidth=0.7, zorder=2)
-            ax.plot(*after.T, "-", color=colour(k), linewidth=1.2, zorder=3)
-    keys = [Line2D([], [], color=BEFORE, linewidth=0.9, label="before calibration")] if tracks else []
-    if len(tracks) > 12:
-        return [*keys, Line2D([], [], color=colour(0), label=f"{len(tracks)} targets, after")]
-    for k, track in enumerate(tracks):
-        style: dict[str, Any] = {"marker": "o", "linestyle": ""} if len(track.after) == 1 else {"linestyle": "-"}
-        keys.append(Line2D([], [], color=colour(k), markersize=5, label=f"{plain_text(track.target)}, after", **style))
-    return keys
-
-
-def _stated(nodes: xr.Dataset) -> np.ndarray:
-    return nodes["node_position"].values[:, :2]
-
-
-def _shifts(tree: xr.DataTree) -> dict[str, float]:
-    """Value of every bias, estimated or fixed, by label."""
-    group, nodes = tree["calibration"].to_dataset(), tree["constant_data"].to_dataset()
-    found = dict(zip(group["bias_label"].values.tolist(), group["mean"].values.tolist(), strict=True))
-    if "fixed" in nodes:
-        found |= dict(zip(nodes["fixed_label"].values.tolist(), nodes["fixed"].values.tolist(), strict=True))
-    return found
-
-
-def _calibrated(tree: xr.DataTree) -> np.ndarray:
-    """Positions (node, 2) with their biases added."""
-    nodes, shifts = tree["constant_data"].to_dataset(), _shifts(tree)
-    axes = ("position_x", "position_y")
-    moved = [[shifts.get(f"{node}.{axis}", 0.0) for axis in axes] for node in nodes["node"].values]
-    return _stated(nodes) + np.array(moved)
-
-
-def _draw_nodes(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
-    """Draw all nodes and return the legend entries."""
-    nodes = tree["constant_data"].to_dataset()
-    names, stated, calibrated = nodes["node"].values.astype(str), _stated(nodes), _calibrated(tree)
-    labels = set(tree["calibration"].to_dataset()["bias_label"].values.tolist())
-    free = [f"{name}.position_x" in labels or f"{name}.position_y" in labels for name in names]
-    keys = []
-    for moving, marker, text in ((False, "s", "stated position"), (True, "D", "start of a moving node")):
-        chosen = nodes["moving"].values.astype(bool) == moving
-        if chosen.any():
-            style: dict[str, Any] = {
-                "color": "black",
-                "markerfacecolor": "none",
-                "markersize": 7 if len(names) <= 25 else 4,
-            }
-            ax.plot(*stated[chosen].T, marker, zorder=5, **style)
-            keys.append(Line2D([], [], marker=marker, linestyle="", label=text, **style))
-    if any(free):
-        ax.plot(*calibrated[free].T, ".", color="black", markersize=6, zorder=6)
-        for name, start, end in zip(names[free], stated[free], calibrated[free], strict=True):
-            _draw_shift(ax, tree, name, start, end)
-        label = f"calibrated, {probability(tree):.0%} ellipse"
-        keys.append(Line2D([], [], marker=".", linestyle="", color="black", label=label))
-    keys += _draw_headings(ax, tree, calibrated)
-    box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8}
-    if len(names) <= NAMED:
-        for name, place in zip(names, stated, strict=True):
-            ax.annotate(
-                plain_text(name), place, xytext=(6, 6), textcoords="offset points", zorder=7, bbox=box,
-                fontsize=8 if len(names) <= 25 else 6, annotation_clip=True,
-            )  # fmt: skip
-    return keys
-
-
-def _draw_shift(ax: Axes, tree: xr.DataTree, name: str, start: np.ndarray, end: np.ndarray) -> None:
-    """Draw the arrow from the stated to the calibrated position, unless too short to see, and the ellipse."""
-    if not np.isfinite(end).all():
-        return
-    if np.linalg.norm(end - start) > 0.01 * np.ptp(ax.get_xlim()):
-        style: dict[str, Any] = {"arrowstyle": "->", "mutation_scale": 10.0, "shrinkA": 0.0, "shrinkB": 0.0}
-        ax.add_patch(FancyArrowPatch(tuple(start), tuple(end), color="black", linewidth=0.9, zorder=5, **style))
-    covariance = _position_covariance(tree, name)
-    if not np.isfinite(covariance).all():
-        return
-    shape: dict[str, Any] = {"facecolor": "#00000018", "edgecolor": "black", "linewidth": 0.8, "zorder": 4}
-    ax.add_patch(ellipse_patch(end.tolist(), covariance, probability(tree), **shape))
-
-
-def _position_covariance(tree: xr.DataTree, name: str) -> np.ndarray:
-    """Covariance (2, 2) of x and y of a node; a coordinate that is no bias has none."""
-    group = tree["calibration"].to_dataset()
-    axes = [f"{name}.position_x", f"{name}.position_y"]
-    chosen = group["covariance"].reindex(bias_label=axes, bias_label_other=axes, fill_value=0.0)
-    return chosen.values
-
-
-def _draw_headings(ax: Axes, tree: xr.DataTree, calibrated: np.ndarray) -> list[Line2D]:
-    """Draw the calibrated heading of nodes with a heading bias, where the stated ones are saved."""
-    nodes, shifts = tree["constant_data"].to_dataset(), _shifts(tree)
-    if "node_heading" not in nodes:
-        return []
-    names = nodes["node"].values.astype(str)
-    turned = np.array([f"{name}.heading" in shifts for name in names])
-    if not turned.any():
-        return []
-    angle = nodes["node_heading"].values[turned] + [shifts[f"{name}.heading"] for name in names[turned]]
-    ax.quiver(
-        *calibrated[turned].T, np.cos(angle), np.sin(angle), color="#d00000", angles="xy",
-        scale_units="width", scale=22.0 if len(names) <= 25 else 45.0, width=0.004,
-        headwidth=1.0, headlength=0.0, headaxislength=0.0, zorder=5,
-    )  # fmt: skip
-    return [Line2D([], [], color="#d00000", label="calibrated heading")]
-
-
-def _limit(ax: Axes, tree: xr.DataTree, tracks: list[_Track]) -> None:
-    """Fit the axes to nodes and tracks; what flew off before calibration, or in a diverged fit, is cut."""
-    stated = _stated(tree["constant_data"].to_dataset())
-    after = [_calibrated(tree), *(track.after for track in tracks)]
-    before = _known([track.before for track in tracks])
-    before = np.quantile(before, [0.01, 0.99], axis=0) if len(before) else before
-    anchor, rest = _known([stated, *after]), before
-    if tree.attrs.get("status") == "diverged":
-        anchor, rest = _known([stated, before]), _known(after)
-    low, high = anchor.min(0), anchor.max(0)
-    reach = max(float((high - low).max()), 1.0)
-    both = np.concatenate([anchor, np.clip(rest, low - reach, high + reach)])
-    low, high = both.min(0), both.max(0)
-    margin = 0.07 * max(float((high - low).max()), 1.0)
-    ax.set_xlim(low[0] - margin, high[0] + margin)
-    ax.set_ylim(low[1] - margin, high[1] + margin)
-
-
-def _known(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Finite points (N, 2) of all parts."""
-    points = np.concatenate([np.empty((0, 2)), *parts])
-    return points[np.isfinite(points).all(1)]
 
 
 # Forest

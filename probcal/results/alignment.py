@@ -37,6 +37,10 @@ class Alignment:
         """Places (..., d) of the answer in the frame of the truth."""
         return self.scale * np.asarray(places) @ self.rotation.T + self.shift
 
+    def back(self, places: Any) -> np.ndarray:
+        """Places (..., d) of the truth in the frame of the answer."""
+        return (np.asarray(places) - self.shift) @ self.rotation / self.scale
+
 
 def align(places: Any, truth: Any, kind: str) -> Alignment:
     """The rotation, shift and, of a "similarity", scale that lay places (N, d) on true ones (N, d) in least squares.

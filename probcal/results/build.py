@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -233,15 +233,4 @@ def add_mirrors(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
     axes = {"axis": list(AXES[: problem.network.dimension])}
     tracks = by_target(problem, {"position": (("mirror", "time", "axis"), places)}, axes)
     tree["mirror"] = xr.DataTree.from_dict({"/": group, **{f"track/{name}": own for name, own in tracks.items()}})
-    return tree
-
-
-def add_scores(tree: xr.DataTree, scores: Mapping[str, float], biases: Mapping[str, float]) -> xr.DataTree:
-    """Add what the truth says of a fit: scores as attributes, true biases to the calibration group."""
-    tree.attrs.update({name: float(value) for name, value in scores.items()})
-    known = {label: value for label, value in biases.items() if label in tree["calibration"]["bias_label"]}
-    if known:
-        tree["truth"] = xr.DataTree(
-            xr.Dataset({"bias": ("bias_label", list(known.values()))}, coords={"bias_label": list(known)})
-        )
     return tree

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from probcal.geodesy import GEODETIC
 from probcal.labels import AXES
 from probcal.lazy import Later
 
@@ -154,10 +155,11 @@ def by_target(
 
 
 def constant_group(problem: Problem) -> xr.Dataset:
-    """Stated values of the nodes (positions, headings, every component), which of them move, and the fixed biases."""
+    """Stated values of the nodes, which of them move, what is placed on them, and the fixed biases."""
     d, nodes = problem.network.dimension, problem.network.nodes
     stated = [(n.name, component, float(value)) for n in nodes for component, value in n.numbers.items()]
     owners, components, numbers = zip(*stated, strict=True)
+    placed = [(sensor, node) for sensor in problem.network.sensors for node in sensor.nodes]
     values = {
         "node_position": (("node", "axis"), np.stack([n.position for n in nodes])),
         "node_heading": ("node", np.array([float(n.components["heading"]) for n in nodes])),
@@ -167,8 +169,12 @@ def constant_group(problem: Problem) -> xr.Dataset:
     coords: dict[str, Any] = {
         "node": [n.name for n in nodes], "axis": list(AXES[:d]),
         "stated_node": ("value", np.array(owners)), "stated_component": ("value", np.array(components)),
+        "placed_sensor": ("placement", np.array([s.name for s, _ in placed])),
+        "placed_node": ("placement", np.array([n.name for _, n in placed])),
     }  # fmt: skip
     if problem.fixed:
         values["fixed"] = ("fixed_label", np.array(list(problem.fixed.values())))
         coords["fixed_label"] = list(problem.fixed)
-    return xr.Dataset(values, coords=coords)
+    frame = problem.network.frame
+    origin = {} if frame is None else {name: getattr(frame, name) for name in GEODETIC}
+    return xr.Dataset(values, coords=coords, attrs=origin)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probcal.labels import AXES
+from probcal.lazy import Later
+from probcal.results.alignment import Alignment
 from probcal.results.alignment import align as laid_on
 from probcal.results.read import each_track
 
@@ -14,6 +16,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from probcal.simulate import Truth
+else:
+    xr = Later("xarray")
 
 
 def position_rmse(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> tuple[float, float] | None:
@@ -21,20 +25,34 @@ def position_rmse(tree: xr.DataTree, truth: Truth, *, align: str | None = None) 
 
     With `align` ("rigid", "similarity") each is first laid on the truth, which may live in another frame then.
     """
-    pairs = []
-    for name, track in each_track(tree):
-        axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in track["component"].values]
-        times = track["time"].values
-        true = truth.positions(times, np.full(len(times), name), len(axes))
-        known = np.isfinite(true).all(1)
-        pairs.append([track[kind].sel(component=axes).values[known] for kind in ("before", "mean")] + [true[known]])
-    before, after, true = (np.concatenate([part[k] for part in pairs]) for k in range(3))
+    before, after, true = _met(tree, truth)
     if not len(true):
         return None
     if align is not None:
         before, after = (laid_on(places, true, align)(places) for places in (before, after))
     first, second = (float(np.sqrt(((places - true) ** 2).sum(1).mean())) for places in (before, after))
     return first, second
+
+
+def _axes(track: xr.Dataset) -> list[str]:
+    return [f"position_{axis}" for axis in AXES if f"position_{axis}" in track["component"].values]
+
+
+def _true(name: str, track: xr.Dataset, truth: Truth) -> np.ndarray:
+    """True positions (E, d) at the epochs of a track, NaN where the truth does not cover them."""
+    times = track["time"].values
+    return truth.positions(times, np.full(len(times), name), len(_axes(track)))
+
+
+def _met(tree: xr.DataTree, truth: Truth) -> list[np.ndarray]:
+    """Positions (N, d) without and with calibration and true ones, of every epoch that the truth covers."""
+    pairs = []
+    for name, track in each_track(tree):
+        true = _true(name, track, truth)
+        known = np.isfinite(true).all(1)
+        pairs.append([track[kind].sel(component=_axes(track)).values[known] for kind in ("before", "mean")])
+        pairs[-1].append(true[known])
+    return [np.concatenate([part[k] for part in pairs]) for k in range(3)]
 
 
 def scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> dict[str, float]:
@@ -60,3 +78,32 @@ def scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> dict
             inside = (chosen["lower"].values <= true) & (true <= chosen["upper"].values)
             found |= {"bias_rmse": float(np.sqrt(np.mean(error**2))), "coverage": float(inside.mean())}
     return found
+
+
+def add_scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> xr.DataTree:
+    """Add what a truth says of a fit: `scores` as attributes, true biases (group `truth`), true tracks (`true`).
+
+    Returns the tree. Reports and maps show it then. True tracks that live in another frame are shown in that of the
+    answer, by the inverse of their `align`. Raises `InputError` as `scores` does.
+
+    >>> add_scores(tree, run.truth)["truth/bias"].sel(bias_label="sonar_1.range_offset").item()
+    8.0
+    """
+    tree.attrs.update(scores(tree, truth, align=align))
+    labels = tree["calibration"].to_dataset()["bias_label"].values.tolist() if "calibration" in tree.children else []
+    known = {label: float(value) for label, value in truth.biases.items() if label in labels}
+    if known:
+        tree["truth"] = xr.DataTree(
+            xr.Dataset({"bias": ("bias_label", list(known.values()))}, coords={"bias_label": list(known)})
+        )
+    if "track" not in tree.children:
+        return tree
+    _, after, true = _met(tree, truth)
+    frame: Alignment | None = None if align is None or not len(true) else laid_on(after, true, align)
+    for node in tree["track"].children.values() if len(true) else ():
+        track = node.to_dataset(inherit=False)
+        places = _true(str(node.attrs["target"]), track, truth)
+        columns = np.full(track["mean"].shape, np.nan)
+        columns[:, np.isin(track["component"].values, _axes(track))] = places if frame is None else frame.back(places)
+        node["true"] = (("time", "component"), columns)
+    return tree

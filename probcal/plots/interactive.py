@@ -1,0 +1,260 @@
+"""The map of a fit in a browser: zoom, a word on every node and epoch, layers before and after calibration."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from bokeh.layouts import column
+from bokeh.models import (
+    BasicTickFormatter,
+    ColumnDataSource,
+    DataRange1d,
+    HoverTool,
+    LayoutDOM,
+    WheelZoomTool,
+)
+from bokeh.models.annotations.legends import Legend, LegendItem
+from bokeh.plotting import figure
+
+from probcal.geodesy import LocalFrame
+from probcal.labels import AXES
+from probcal.plots.base import BEFORE, NAMED, colour, probability
+from probcal.plots.scene import Scene, Track, ellipse, scene
+
+POINTS = 8_000  # epochs of all tracks together
+CORNERS = 32  # of an ellipse
+ENCIRCLED = 2_000  # nodes above which there are no ellipses
+LISTED = 12  # targets in the legend, and biases in the words of a node
+LINES = 6  # meridians, and parallels, across the map
+MIDDLE = "#767676"  # readable on white and on black
+TEXT: dict[str, Any] = {"text_color": MIDDLE, "text_font_size": "12px"}
+HEIGHTS = (320, 620)  # px of the plan
+LAYERS = {
+    "before": "before calibration", "after": "after", "truth": "truth", "mirror": "fits as well",
+    "ellipses": "ellipses", "names": "names",
+}  # fmt: skip
+
+
+def interactive_map(tree: xr.DataTree) -> LayoutDOM:
+    """Map of a fit for the browser, a Bokeh layout: `bokeh.io.show` shows it, also in a notebook.
+
+    Nodes as stated and calibrated with their ellipses and headings, tracks before and after calibration, the truth
+    where `add_scores` has met it, meridians and parallels where the network has a `frame`. Every node and epoch has a
+    word. In 3-D a second panel shows the heights. Layers carry a tag: before, after, truth, mirror, ellipses, names.
+
+    >>> interactive_map(tree).select_one({"name": "map"}).x_range.name
+    'x'
+    """
+    shown = scene(tree)
+    sources = _sources(tree, shown)
+    plan = _panel(shown, sources, (0, 1), probability(tree))
+    if shown.dimension == 2:
+        return plan
+    heights = _panel(shown, sources, (0, 2), probability(tree))
+    heights.x_range = plan.x_range
+    return column(plan, heights, sizing_mode="stretch_width")
+
+
+def layers(shown: Scene) -> dict[str, str]:
+    """Tags of the layers that a map has, and what they are called."""
+    has = {
+        "before": bool(shown.tracks), "after": bool(shown.tracks), "mirror": bool(shown.mirrored),
+        "truth": any(np.isfinite(track.true).any() for track in shown.tracks),
+        "ellipses": _encircled(shown), "names": len(shown.nodes.name) <= NAMED,
+    }  # fmt: skip
+    return {tag: text for tag, text in LAYERS.items() if has[tag]}
+
+
+def _encircled(shown: Scene) -> bool:
+    return bool(shown.nodes.free.any()) and len(shown.nodes.name) <= ENCIRCLED
+
+
+# Data
+
+
+def _sources(tree: xr.DataTree, shown: Scene) -> dict[str, ColumnDataSource]:
+    """Columns that all panels share: epochs, nodes."""
+    nodes, d = shown.nodes, shown.dimension
+    most = max(2, POINTS // max(len(shown.tracks), 1))
+    tracks = [track.thin(most) for track in shown.tracks]
+    epochs: dict[str, Any] = {
+        "target": [track.target for track in tracks for _ in track.time],
+        "time": np.concatenate([np.empty(0), *(track.time for track in tracks)]),
+        "colour": [colour(k) for k, track in enumerate(tracks) for _ in track.time],
+    }
+    for axis in range(d):
+        epochs[AXES[axis]] = np.concatenate([np.empty(0), *(track.after[:, axis] for track in tracks)])
+        epochs[f"sd_{AXES[axis]}"] = np.concatenate(
+            [np.empty(0, "f4"), *(track.sd[:, axis].astype("f4") for track in tracks)]
+        )
+    points: dict[str, Any] = {"name": nodes.name.tolist(), "words": list(_words(tree, shown))}
+    for axis in range(d):
+        points[AXES[axis]], points[f"to_{AXES[axis]}"] = nodes.stated[:, axis], nodes.calibrated[:, axis]
+    return {"epochs": ColumnDataSource(data=epochs), "nodes": ColumnDataSource(data=points)}
+
+
+def _words(tree: xr.DataTree, shown: Scene) -> Iterator[str]:
+    """What the map says of each node: where it is, and its biases and those of its sensors."""
+    group, constant = tree["calibration"].to_dataset(), tree["constant_data"].to_dataset()
+    owners = group["owner"].values.tolist() if "owner" in group else [""] * group.sizes["bias_label"]
+    said: dict[str, list[str]] = {}
+    columns = (group[name].values.tolist() for name in ("bias_label", "mean", "sd", "unit"))
+    for owner, label, mean, sd, unit in zip(owners, *columns, strict=True):
+        value = f"{mean:.4g} ± {sd:.2g} {'' if unit == '1' else unit}".rstrip()
+        said.setdefault(owner, []).append(f"{label.removeprefix(f'{owner}.')} {value}")
+    placed: dict[str, list[str]] = {}
+    if "placement" in constant.dims:
+        for sensor, node in zip(constant["placed_sensor"].values, constant["placed_node"].values, strict=True):
+            placed.setdefault(str(node), []).append(str(sensor))
+    for name, place in zip(shown.nodes.name.tolist(), shown.nodes.stated, strict=True):
+        own = [text for owner in dict.fromkeys([name, *placed.get(name, [])]) for text in said.get(owner, [])]
+        more = [f"and {len(own) - LISTED} more"] if len(own) > LISTED else []
+        where = ", ".join(f"{axis} {value:.6g}" for axis, value in zip(AXES, place, strict=False))
+        yield "\n".join([f"stated {where} m", *own[:LISTED], *more])
+
+
+# Panels
+
+
+def _panel(shown: Scene, sources: dict[str, ColumnDataSource], axes: tuple[int, int], probability: float) -> figure:
+    """One plane of the map."""
+    x, y = (AXES[axis] for axis in axes)
+    plane, flat = list(axes), axes == (0, 1)
+    wheel = WheelZoomTool(modifiers={"ctrl": True})
+    wide, tall = (shown.high - shown.low)[plane]
+    height = int(np.clip(800 * tall / wide, *HEIGHTS)) if flat else HEIGHTS[0] // 4 * 3
+    sheet = figure(
+        name="map" if flat else "heights", sizing_mode="stretch_width", height=height, match_aspect=flat,
+        tools=["pan", "box_zoom", wheel, "zoom_in", "zoom_out", "reset", "save"], active_scroll=wheel,
+        x_axis_label=f"{x} in m", y_axis_label=f"{y} in m", toolbar_location="above",
+        background_fill_alpha=0.0, border_fill_alpha=0.0, outline_line_color=MIDDLE,
+    )  # fmt: skip
+    sheet.toolbar.logo = None
+    sheet.axis.formatter = BasicTickFormatter(use_scientific=False)
+    (left, bottom), (right, top) = low, high = shown.low[plane], shown.high[plane]
+    frame = sheet.quad(left=left, right=right, bottom=bottom, top=top, alpha=0.0)  # what the limits hold
+    sheet.x_range, sheet.y_range = (DataRange1d(name=name, renderers=[frame], range_padding=0.0) for name in (x, y))
+    sheet.grid.visible = (flat and shown.frame is None) or not flat
+    sheet.grid.grid_line_color, sheet.grid.grid_line_alpha = MIDDLE, 0.25
+    if flat and shown.frame is not None:
+        _draw_graticule(sheet, shown.frame, low, high, shown.dimension)
+    _draw_tracks(sheet, shown, sources["epochs"], plane)
+    _draw_nodes(sheet, shown, sources["nodes"], plane, probability)
+    return sheet
+
+
+def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: list[int]) -> None:
+    """Lines by layer, and a dot at each epoch that says where it is."""
+    most = max(2, POINTS // max(len(shown.tracks), 1))
+    tracks = [track.thin(most) for track in shown.tracks]
+
+    def lines(tag: str, chosen: Sequence[Track], part: str, **style: Any) -> Any:
+        places = [getattr(track, part)[:, plane].T.astype("f4" if part == "before" else float) for track in chosen]
+        source = {"xs": [p[0] for p in places], "ys": [p[1] for p in places]}
+        colours = [colour(k) for k in range(len(chosen))] if "line_color" not in style else None
+        source |= {"colour": colours} if colours else {}
+        style: dict[str, Any] = {"line_color": "colour"} | style
+        return _tagged(tag, sheet.multi_line("xs", "ys", source=ColumnDataSource(data=source), **style))
+
+    if not tracks:
+        return
+    lines("before", tracks, "before", line_color=BEFORE, line_width=1)
+    after = lines("after", tracks, "after", line_width=1.5)
+    if any(np.isfinite(track.true).any() for track in tracks):
+        lines("truth", tracks, "true", line_color=MIDDLE, line_dash="dotted", line_width=2)
+    if shown.mirrored:
+        lines("mirror", [track.thin(most) for track in shown.mirrored], "after", line_dash="dashed", line_width=1.5)
+    x, y = (AXES[axis] for axis in plane)
+    style: dict[str, Any] = {"fill_color": "colour", "line_color": None, "hover_fill_color": "#d00000"}
+    dots = _tagged("after", sheet.scatter(x, y, source=epochs, size=3, **style))
+    where = "".join(
+        f"<div>{AXES[a]} @{AXES[a]}{{0.000}} ± @sd_{AXES[a]}{{0.000}} m</div>" for a in range(shown.dimension)
+    )
+    said = f"<b>@target</b><div>time @time{{0.000}} s</div>{where}"
+    sheet.add_tools(HoverTool(renderers=[dots], tooltips=said, description="Epochs", name="epochs"))
+    if plane == [0, 1] and 1 < len(tracks) <= LISTED:
+        items = [LegendItem(label=track.target, renderers=[after], index=k) for k, track in enumerate(tracks)]
+        sheet.add_layout(Legend(items=items, border_line_color=None, background_fill_alpha=0.5), "center")
+
+
+def _draw_nodes(sheet: figure, shown: Scene, source: ColumnDataSource, plane: list[int], probability: float) -> None:
+    """Stated and calibrated places, ellipses, headings, names."""
+    nodes, (x, y) = shown.nodes, (AXES[axis] for axis in plane)
+    moved = nodes.calibrated[:, plane]
+    if _encircled(shown):
+        rings = [
+            _ring(moved[k], nodes.covariance[k][np.ix_(plane, plane)], probability) for k in np.flatnonzero(nodes.free)
+        ]
+        rings = [ring for ring in rings if np.isfinite(ring).all()]
+        corners = ColumnDataSource(data={"xs": [ring[0] for ring in rings], "ys": [ring[1] for ring in rings]})
+        style: dict[str, Any] = {"fill_color": MIDDLE, "fill_alpha": 0.2, "line_color": MIDDLE}
+        _tagged("ellipses", sheet.patches("xs", "ys", source=corners, **style))
+    sheet.segment(x, y, f"to_{x}", f"to_{y}", source=source, line_color=MIDDLE, line_width=1.5)
+    turned = np.isfinite(nodes.heading)
+    if plane == [0, 1] and turned.any():
+        size = 0.04 * float((shown.high - shown.low)[:2].max())
+        tips = moved[turned] + size * np.stack([np.cos(nodes.heading[turned]), np.sin(nodes.heading[turned])], 1)
+        sheet.segment(*moved[turned].T, *tips.T, line_color="#d00000", line_width=2)
+    stated = sheet.scatter(x, y, source=source, marker="square", size=10, fill_color=None, line_color=MIDDLE)
+    found = sheet.scatter(f"to_{x}", f"to_{y}", source=source, size=6, fill_color=MIDDLE, line_color=None)
+    said = '<b>@name</b><div style="white-space: pre-line">@words</div>'
+    sheet.add_tools(HoverTool(renderers=[stated, found], tooltips=said, description="Nodes", name="nodes"))
+    if len(nodes.name) <= NAMED:
+        _tagged("names", sheet.text(x, y, text="name", source=source, x_offset=8, y_offset=-6, **TEXT))
+
+
+def _tagged(layer: str, renderer: Any) -> Any:
+    renderer.tags = [layer]
+    return renderer
+
+
+def _ring(centre: np.ndarray, covariance: np.ndarray, probability: float) -> np.ndarray:
+    """Corners (2, CORNERS) of an ellipse."""
+    width, height, angle = ellipse(covariance, probability)
+    turn = np.linspace(0.0, 2 * np.pi, CORNERS, endpoint=False)
+    along, across = width / 2 * np.cos(turn), height / 2 * np.sin(turn)
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([centre[0] + c * along - s * across, centre[1] + s * along + c * across])
+
+
+# Meridians and parallels
+
+
+def _draw_graticule(sheet: figure, frame: LocalFrame, low: np.ndarray, high: np.ndarray, dimension: int) -> None:
+    """Meridians and parallels at round degrees over three times the map, named where they enter it."""
+    lines = list(graticule(frame, low, high, dimension))
+    places = ColumnDataSource(data={"xs": [line[:, 0] for _, line in lines], "ys": [line[:, 1] for _, line in lines]})
+    sheet.multi_line("xs", "ys", source=places, line_color=MIDDLE, line_alpha=0.45, line_dash="dotdash")
+    entries = [(text, line[((line > low) & (line < high)).all(1)][:1]) for text, line in lines]
+    named = [(text, *place[0].tolist()) for text, place in entries if len(place)]
+    columns = {key: [entry[k] for entry in named] for k, key in enumerate(("text", "x", "y"))}
+    sheet.text("x", "y", text="text", source=ColumnDataSource(data=columns), x_offset=3, y_offset=-2, **TEXT)
+
+
+def graticule(frame: LocalFrame, low: np.ndarray, high: np.ndarray, dimension: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Name and places (P, 2) in m of each meridian and parallel over three times the box from `low` to `high`."""
+    middle, reach = (low + high) / 2, 1.5 * (high - low)
+    sides = [np.linspace(m - r, m + r, 9) for m, r in zip(middle, reach, strict=True)]
+    grid = np.stack(np.meshgrid(*sides), -1)
+    corners = grid if dimension == 2 else np.concatenate([grid, np.zeros((*grid.shape[:2], 1))], -1)
+    latitude, longitude = frame.to_geodetic(corners)[:2]
+    longitude = frame.longitude + (longitude - frame.longitude + 180.0) % 360.0 - 180.0
+    spans = [(part.min(), part.max()) for part in (latitude, longitude)]
+    height = [] if dimension == 2 else [frame.height]
+    for own, (first, last) in enumerate(spans):
+        step = _round_step((last - first) / (3 * LINES))
+        along = np.linspace(*spans[1 - own], 61)
+        for value in np.arange(np.ceil(first / step), np.floor(last / step) + 1) * step:
+            fixed = np.full(len(along), value)
+            pair = (fixed, along) if own == 0 else (along, fixed)
+            side = ("N", "S") if own == 0 else ("E", "W")
+            shown = value if own == 0 else (value + 180.0) % 360.0 - 180.0
+            text = f"{np.format_float_positional(abs(round(shown, 9)), trim='-')}° {side[int(shown < 0)]}"
+            yield text, frame.to_local(*pair, *height)[:, :2]
+
+
+def _round_step(step: float) -> float:
+    """The next of 1, 2 and 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(step))
+    return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= step * (1 - 1e-9))

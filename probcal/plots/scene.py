@@ -1,0 +1,151 @@
+"""What a map shows: nodes as stated and as calibrated, tracks without and with calibration, the truth, a mirror."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from probcal.geodesy import GEODETIC, LocalFrame
+from probcal.labels import AXES
+from probcal.results.read import each_track
+
+
+@dataclass(frozen=True)
+class Track:
+    """Positions (E, d) of one target in order of time, in m; `true` is NaN where nothing is known."""
+
+    target: str
+    time: np.ndarray  # (E,) in s
+    before: np.ndarray
+    after: np.ndarray
+    sd: np.ndarray
+    true: np.ndarray
+
+    def thin(self, most: int) -> "Track":
+        """At most `most` epochs, evenly spaced, both ends kept."""
+        if len(self.time) <= most:
+            return self
+        kept = np.linspace(0, len(self.time) - 1, most).round().astype(int)
+        parts = (self.time, self.before, self.after, self.sd, self.true)
+        return Track(self.target, *(part[kept] for part in parts))
+
+
+@dataclass(frozen=True)
+class Places:
+    """Nodes: positions (N, d) in m, which of them are biased, which move, headings (N,) in rad where one is biased."""
+
+    name: np.ndarray
+    stated: np.ndarray
+    calibrated: np.ndarray
+    covariance: np.ndarray  # (N, d, d) of the calibrated positions, 0 where a coordinate is no bias
+    free: np.ndarray  # (N,) bool: some coordinate is an estimated bias
+    moving: np.ndarray
+    heading: np.ndarray  # calibrated; NaN where it is no bias
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that a map shows, and the limits (d,) of what is worth looking at."""
+
+    nodes: Places
+    tracks: list[Track]
+    mirrored: list[Track]  # of the best answer on the other side of a mirror, where one fits as well
+    low: np.ndarray
+    high: np.ndarray
+    frame: LocalFrame | None  # of the coordinates, where they come from latitude and longitude
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates."""
+        return self.nodes.stated.shape[1]
+
+
+def scene(tree: xr.DataTree) -> Scene:
+    """Read the map of a fit."""
+    nodes, tracks, mirrored = _places(tree), list(_tracks(tree)), list(_mirrored(tree))
+    attrs = tree["constant_data"].attrs
+    frame = LocalFrame(*(float(attrs[name]) for name in GEODETIC)) if GEODETIC[0] in attrs else None
+    low, high = _limits(nodes, [*tracks, *mirrored], diverged=tree.attrs.get("status") == "diverged")
+    return Scene(nodes, tracks, mirrored, low, high, frame)
+
+
+def ellipse(covariance: np.ndarray, probability: float) -> tuple[float, float, float]:
+    """Width, height and angle (rad) of the ellipse that holds a probability of a Gaussian with covariance (2, 2)."""
+    (xx, xy), (_, yy) = covariance
+    spread = np.hypot((xx - yy) / 2, xy)
+    variances = np.maximum([(xx + yy) / 2 + spread, (xx + yy) / 2 - spread], 0.0)
+    width, height = 2.0 * np.sqrt(-2.0 * np.log1p(-probability) * variances)
+    return float(width), float(height), float(np.arctan2(2 * xy, xx - yy) / 2)
+
+
+def shifts(tree: xr.DataTree) -> dict[str, float]:
+    """Value of every bias, estimated or fixed, by label."""
+    group, nodes = tree["calibration"].to_dataset(), tree["constant_data"].to_dataset()
+    found = dict(zip(group["bias_label"].values.tolist(), group["mean"].values.tolist(), strict=True))
+    if "fixed" in nodes:
+        found |= dict(zip(nodes["fixed_label"].values.tolist(), nodes["fixed"].values.tolist(), strict=True))
+    return found
+
+
+def _places(tree: xr.DataTree) -> Places:
+    group, nodes, moved = tree["calibration"].to_dataset(), tree["constant_data"].to_dataset(), shifts(tree)
+    names, stated = nodes["node"].values.astype(str), nodes["node_position"].values
+    labels = [[f"{name}.position_{axis}" for axis in AXES[: stated.shape[1]]] for name in names]
+    index = {label: k for k, label in enumerate(group["bias_label"].values.tolist())}
+    at = np.array([[index.get(label, -1) for label in own] for own in labels])
+    covariance = np.pad(group["covariance"].values, (0, 1))[at[:, :, None], at[:, None, :]]
+    turned = [moved.get(f"{name}.heading", np.nan) for name in names]
+    return Places(
+        names, stated, stated + np.array([[moved.get(label, 0.0) for label in own] for own in labels]),
+        covariance, (at >= 0).any(1), nodes["moving"].values.astype(bool),
+        (nodes["node_heading"].values if "node_heading" in nodes else np.nan) + np.array(turned),
+    )  # fmt: skip
+
+
+def _tracks(tree: xr.DataTree) -> Iterator[Track]:
+    """Positions of every target that has some."""
+    for target, group in each_track(tree):
+        axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in group["component"].values]
+        if len(axes) > 1:
+            part = group.sel(component=axes)
+            after = part["mean"].values
+            true = part["true"].values if "true" in part else np.full(after.shape, np.nan)
+            yield Track(target, group["time"].values, part["before"].values, after, part["sd"].values, true)
+
+
+def _mirrored(tree: xr.DataTree) -> Iterator[Track]:
+    """Tracks of the best answer on the other side of a mirror, where one fits as well."""
+    if "mirror" not in tree.children:
+        return
+    group = tree["mirror"].to_dataset()
+    best = int(group["gain"].values.argmax())
+    if group["gain"].values[best] <= -group.attrs["same"]:
+        return
+    for target, there in each_track(tree.children["mirror"]):
+        places = there["position"].isel(mirror=best).values
+        nothing = np.full(places.shape, np.nan)
+        yield Track(target, there["time"].values, places, places, nothing, nothing)
+
+
+def _limits(nodes: Places, tracks: list[Track], *, diverged: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of nodes and tracks; what flew off before calibration, or in a diverged fit, is cut."""
+    d = nodes.stated.shape[1]
+    after = [nodes.calibrated, *(track.after for track in tracks)]
+    before = _known([track.before for track in tracks], d)
+    before = np.quantile(before, [0.01, 0.99], axis=0) if len(before) else before
+    anchor, rest = _known([nodes.stated, *after], d), before
+    if diverged:
+        anchor, rest = _known([nodes.stated, before], d), _known(after, d)
+    low, high = anchor.min(0), anchor.max(0)
+    reach = max(float((high - low).max()), 1.0)
+    both = np.concatenate([anchor, np.clip(rest, low - reach, high + reach)])
+    low, high = both.min(0), both.max(0)
+    margin = 0.07 * max(float((high - low).max()), 1.0)
+    return low - margin, high + margin
+
+
+def _known(parts: Sequence[np.ndarray], d: int) -> np.ndarray:
+    """Finite points (N, d) of all parts."""
+    points = np.concatenate([np.empty((0, d)), *parts])
+    return points[np.isfinite(points).all(1)]
