@@ -150,12 +150,10 @@ def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: l
     tracks = [track.thin(most) for track in shown.tracks]
 
     def lines(tag: str, chosen: Sequence[Track], part: str, **style: Any) -> Any:
-        places = [getattr(track, part)[:, plane].T.astype("f4" if part == "before" else float) for track in chosen]
-        source = {"xs": [p[0] for p in places], "ys": [p[1] for p in places]}
-        colours = [colour(k) for k in range(len(chosen))] if "line_color" not in style else None
-        source |= {"colour": colours} if colours else {}
-        style: dict[str, Any] = {"line_color": "colour"} | style
-        return _tagged(tag, sheet.multi_line("xs", "ys", source=ColumnDataSource(data=source), **style))
+        places = [getattr(track, part)[:, plane].T for track in chosen]
+        columns = {"xs": [p[0] for p in places], "ys": [p[1] for p in places]}
+        source = ColumnDataSource(data=columns | {"colour": [colour(k) for k in range(len(chosen))]})
+        return _tagged(tag, sheet.multi_line("xs", "ys", source=source, **({"line_color": "colour"} | style)))
 
     if not tracks:
         return
@@ -166,16 +164,15 @@ def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: l
     if shown.mirrored:
         lines("mirror", [track.thin(most) for track in shown.mirrored], "after", line_dash="dashed", line_width=1.5)
     x, y = (AXES[axis] for axis in plane)
-    style: dict[str, Any] = {"fill_color": "colour", "line_color": None, "hover_fill_color": "#d00000"}
-    dots = _tagged("after", sheet.scatter(x, y, source=epochs, size=3, **style))
-    where = "".join(
-        f"<div>{AXES[a]} @{AXES[a]}{{0.000}} ± @sd_{AXES[a]}{{0.000}} m</div>" for a in range(shown.dimension)
-    )
+    dots = _tagged("after", sheet.scatter(x, y, source=epochs, size=3, fill_color="colour", line_color=None))
+    axes = AXES[: shown.dimension]
+    where = "".join(f"<div>{axis} @{axis}{{0.000}} ± @sd_{axis}{{0.000}} m</div>" for axis in axes)
     said = f"<b>@target</b><div>time @time{{0.000}} s</div>{where}"
     sheet.add_tools(HoverTool(renderers=[dots], tooltips=said, description="Epochs", name="epochs"))
     if plane == [0, 1] and 1 < len(tracks) <= LISTED:
         items = [LegendItem(label=track.target, renderers=[after], index=k) for k, track in enumerate(tracks)]
-        sheet.add_layout(Legend(items=items, border_line_color=None, background_fill_alpha=0.5), "center")
+        key: dict[str, Any] = {"items": items, "border_line_color": None, "background_fill_alpha": 0.5}
+        sheet.add_layout(Legend(**key), "center")
 
 
 def _draw_nodes(sheet: figure, shown: Scene, source: ColumnDataSource, plane: list[int], probability: float) -> None:
@@ -200,8 +197,15 @@ def _draw_nodes(sheet: figure, shown: Scene, source: ColumnDataSource, plane: li
     found = sheet.scatter(f"to_{x}", f"to_{y}", source=source, size=6, fill_color=MIDDLE, line_color=None)
     said = '<b>@name</b><div style="white-space: pre-line">@words</div>'
     sheet.add_tools(HoverTool(renderers=[stated, found], tooltips=said, description="Nodes", name="nodes"))
-    if len(nodes.name) <= NAMED:
-        _tagged("names", sheet.text(x, y, text="name", source=source, x_offset=8, y_offset=-6, **TEXT))
+    if plane == [0, 1] and len(nodes.name) <= NAMED:
+        inner = nodes.stated[:, 0] < shown.low[0] + 0.75 * (shown.high - shown.low)[0]  # names stay on the sheet
+        side: dict[str, Any] = {
+            "x_offset": np.where(inner, 8, -8), "text_align": np.where(inner, "left", "right").tolist()
+        }  # fmt: skip
+        columns = {"x": nodes.stated[:, 0], "y": nodes.stated[:, 1], "name": nodes.name.tolist()} | side
+        named = ColumnDataSource(data=columns)
+        aside: dict[str, Any] = {key: key for key in side}
+        _tagged("names", sheet.text("x", "y", text="name", source=named, y_offset=-6, **aside, **TEXT))
 
 
 def _tagged(layer: str, renderer: Any) -> Any:

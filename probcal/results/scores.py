@@ -105,5 +105,5 @@ def add_scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> 
         places = _true(str(node.attrs["target"]), track, truth)
         columns = np.full(track["mean"].shape, np.nan)
         columns[:, np.isin(track["component"].values, _axes(track))] = places if frame is None else frame.back(places)
-        node["true"] = (("time", "component"), columns)
+        node["true"] = xr.DataArray(columns, dims=("time", "component"))
     return tree

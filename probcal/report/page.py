@@ -1,0 +1,144 @@
+"""The page: what is shown in which order, written whole or not at all."""
+
+import base64
+import io
+import json
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import matplotlib
+import xarray as xr
+from matplotlib.axes import Axes
+
+from probcal import plots
+from probcal.files import write_whole
+from probcal.report import tables, words
+from probcal.results.drifts import drift_table
+from probcal.results.schema import EVIDENCES, evidence_in
+from probcal.status import INVALID, Status
+
+COLOURS = {str(s): "good" if s.settled else "warn" if s.valid else "bad" for s in Status}
+HERE = Path(__file__).parent
+
+
+def write_report(tree: xr.DataTree, path: str | PathLike[str], *, static: bool = False) -> Path:
+    """Write the report of a fit as one HTML file that needs nothing else; a file of that name is whole or absent.
+
+    `static` leaves the interactive map, and with it every script, out. Raises `InputError` if the file cannot be
+    written.
+
+    >>> write_report(tree, folder / "report.html", static=True).name
+    'report.html'
+    """
+    return write_whole(path, _render(tree, static))
+
+
+def _render(tree: xr.DataTree, static: bool) -> str:
+    """The page as text."""
+    names = ("method", "prior", "message", "intervals")
+    attrs: dict[str, Any] = dict.fromkeys(names, "") | {"status": "unknown", "seed": words.NONE}
+    attrs |= {str(name): value for name, value in tree.attrs.items()}
+    model, data = (str(attrs.get(name, "")) for name in ("model", "data"))
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(HERE), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters["breakable"] = words.breakable
+    chart = None
+    if not static and "track" in tree.children and "constant_data" in tree.children:
+        from probcal.report.chart import chart as made  # a static page does without Bokeh
+
+        chart = made(tree)
+    columns, rows = tables.biases(tree)
+    shown, more = words.that_matter(tree)
+    pictures = _pictures(tree)
+    drawn = pictures.pop(0) if pictures and pictures[0]["title"] == "Map" else None
+    return environment.get_template("page.html").render(
+        attrs=attrs,
+        title=model or data or "probcal fit",
+        source=data if model else "",
+        evidence=f"{EVIDENCES[name]} {words.number(attrs[name], 7)}" if (name := evidence_in(attrs)) else "",
+        colour=_colour(tree),
+        invalid=attrs["status"] in INVALID,
+        headline=words.headline(tree),
+        errors=words.position_errors(attrs),
+        probability=f"{float(attrs.get('interval_probability', plots.INTERVAL)):.0%}",
+        chart=chart,
+        map=drawn,
+        shown=shown,
+        more=more,
+        known=any(row.true for row in shown),
+        notes=[*words.sentences(str(attrs["message"])), *tables.findings(tree)],
+        directions=tables.directions(tree),
+        columns=columns,
+        rows=rows,
+        tables=tables.tables(tree),
+        pictures=pictures,
+        versions=_versions(attrs),
+        style=(HERE / "style.css").read_text(encoding="utf-8"),
+        script=(HERE / "map.js").read_text(encoding="utf-8"),
+    )
+
+
+def _colour(tree: xr.DataTree) -> str:
+    """Colour of the verdict: that of the status, a warning where the fit ended well but biases are in conflict."""
+    found = COLOURS.get(str(tree.attrs.get("status")), "plain")
+    return "warn" if found == "good" and words.in_conflict(tree) else found
+
+
+def _versions(attrs: dict[str, Any]) -> str:
+    try:
+        found = json.loads(attrs.get("versions", "{}"))
+    except ValueError:
+        return str(attrs["versions"])
+    return ", ".join(f"{name} {number}" for name, number in found.items())
+
+
+# Pictures
+
+
+def _pictures(tree: xr.DataTree) -> list[dict[str, str]]:
+    """Pictures of what the tree holds, as data addresses."""
+    found: list[tuple[str, str, set[str], Callable[[], Axes]]] = [
+        ("Map", "Nodes and tracks before and after calibration", {"constant_data", "track"},
+         lambda: plots.plot_map(tree)),
+        ("Estimates", "Mean and interval of every bias in units of its scale", {"calibration"},
+         lambda: plots.plot_biases(tree)),
+        ("Residuals", "Histograms of the residuals before and after calibration", {"residual"},
+         lambda: plots.plot_residuals(tree)[0]),
+        ("Objective", "Objective over the iterations", {"optimisation"},
+         lambda: plots.plot_objective(tree)),
+    ]  # fmt: skip
+    if tables.weighted(tree):
+        text = "Residuals over time, those that count less than half marked"
+        found.insert(3, ("Residuals over time", text, {"residual"}, lambda: plots.plot_outliers(tree)))
+    if len(drift_table(tree)):
+        text = "Values of the drifting biases over time with their intervals"
+        found.insert(2, ("Drift", text, {"posterior"}, lambda: plots.plot_drift(tree)))
+    found += [
+        ("Verdicts", "Gamma of every bias against how much the data narrow it, coloured by verdict", {"verdict"},
+         lambda: plots.plot_shrinkage(tree)),
+        ("Innovations", "NIS of every epoch with its limits", {"epoch_check"},
+         lambda: plots.plot_nis(tree)),
+        ("Sensors left out", "Gain by calibration of each sensor, judged by the rest", {"sensor_check"},
+         lambda: plots.plot_left_out(tree)),
+        ("Halves", "Change of every bias from the first half to the second", {"halves"},
+         lambda: plots.plot_halves(tree)),
+    ]  # fmt: skip
+    present = set(tree.children)
+    return [
+        {"title": title, "alt": alt, "source": _embed(draw())} for title, alt, needs, draw in found if needs <= present
+    ]
+
+
+def _embed(ax: Axes) -> str:
+    """The figure of these axes as SVG in a data address, the same for the same tree."""
+    sheet = io.BytesIO()
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    with matplotlib.rc_context({"svg.hashsalt": "probcal"}):
+        figure.savefig(sheet, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(sheet.getvalue()).decode("ascii")
