@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         assess,
         bound_map,
         bounds,
+        changes,
         compare,
         interchangeable,
         next_anchors,
@@ -71,7 +72,7 @@ __all__ = lazy(
     __name__,
     {
         "probcal.analysis": (
-            "assess bound_map bounds compare interchangeable next_anchors next_passes next_sensors "
+            "assess bound_map bounds changes compare interchangeable next_anchors next_passes next_sensors "
             "observability sensitivity"
         ),
         "probcal.results.drifts": "drift_table",

@@ -23,7 +23,7 @@ def sonar(target, pose, *, range_offset=Bias("m", 5.0)):
 
 
 @pytest.fixture(scope="module")
-def names():
+def names(tmp_path_factory):
     """What the README has declared, simulated and fitted."""
     turned = {"heading": np.deg2rad(5)}
     nodes = [
@@ -37,7 +37,9 @@ def names():
     run = simulate(network, motion, np.arange(60.0), key=0, biases=biases, tracks={"target": path})
     problem = Problem(network, motion, run.table)
     found = {"network": network, "motion": motion, "run": run, "problem": problem, "tree": fit(problem, EA())}
-    return found | {"np": np, "Problem": Problem, "load": load}
+    return found | {
+        "np": np, "Problem": Problem, "load": load, "probcal": probcal, "folder": tmp_path_factory.mktemp("examples"),
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("path", SHOWN, ids=lambda path: path.stem)

@@ -40,7 +40,7 @@ from probcal.inference.fit import calibrate
 from probcal.inference.run import Context, first_state, given_of
 from probcal.noise import Bernoulli
 from probcal.priors import Precision
-from probcal.report import COLOURS
+from probcal.report.page import COLOURS
 from probcal.sensors import doa
 from probcal.smoothing.information import mean_square, squares_of
 from probcal.smoothing.linearised import laplace

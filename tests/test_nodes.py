@@ -13,12 +13,15 @@ from hypothesis import strategies as st
 
 from probcal import (
     Bias,
+    InputError,
     LocalFrame,
+    Network,
     Node,
     Path,
     read_nodes,
     write_nodes,
 )
+from probcal.sensors import radar
 from probcal.types import PoseView
 
 A, F = 6378137.0, 1 / 298.257223563
@@ -226,3 +229,10 @@ def test_the_nodes_of_a_fit_are_written_with_bias_and_sd(tmp_path):
     tree["constant_data"] = xr.DataTree(held.assign_coords(fixed_label=["a.heading"]))
     cells = pd.read_csv(write_nodes(tmp_path / "held.csv", tree)).set_index("node")
     assert cells.loc["a", "heading [deg]"] == pytest.approx(np.rad2deg(0.25))
+
+
+def test_the_frame_of_a_network_is_a_local_frame():
+    placed = radar.on(Node("mast", (0.0, 40.0)))
+    assert Network([placed], frame=LocalFrame(48.0, 11.0)).frame == LocalFrame(48.0, 11.0)
+    with pytest.raises(InputError, match=r"give a LocalFrame\(latitude, longitude"):
+        Network([placed], frame=(48.0, 11.0))

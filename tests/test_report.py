@@ -2,6 +2,7 @@
 
 import base64
 import html
+import json
 import os
 import re
 
@@ -11,12 +12,17 @@ import xarray as xr
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
+pytest.importorskip("bokeh")
 
+from bokeh.models import ColumnDataSource
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from probcal import InputError, plots, report
-from probcal.plots import base
+from probcal import InputError, LocalFrame, plots
+from probcal.plots import base, interactive, scene
+from probcal.report import page as sheet
+from probcal.report import words as said
+from probcal.report import write_report
 from probcal.status import INVALID
 
 AXES = ("x", "y", "z")
@@ -133,13 +139,13 @@ def pictures(page):
 
 
 def words(page):
-    """What a reader sees, without pictures and style."""
-    page = re.sub(r"<style>.*?</style>", " ", page, flags=re.DOTALL)
+    """What a reader sees, without pictures, style and scripts."""
+    page = re.sub(r"<(style|script).*?</\1>", " ", page.replace("<wbr>", ""), flags=re.DOTALL)
     return html.unescape(re.sub(r"<[^>]*>", " ", page))
 
 
-def page_of(tree, folder):
-    return report.write_report(tree, folder / "report.html").read_text(encoding="utf-8")
+def page_of(tree, folder, static=True):
+    return write_report(tree, folder / "report.html", static=static).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -151,7 +157,7 @@ def test_report_is_complete_and_self_contained(tmp_path, dimension, recursions, 
     page = page_of(tree, tmp_path)
     text = words(page)
     for label in tree["calibration"]["bias_label"].values:
-        assert f">{label}<" in page
+        assert f">{label}<" in page.replace("<wbr>", "")
     assert "What the fit has to say." in text
     assert "EA" in text and "ARD" in text and "rows.csv" in text and "plug-in" in text  # noqa: PT018
     assert "Seed 7. Versions: probcal 0.1.0." in text
@@ -164,8 +170,92 @@ def test_report_is_complete_and_self_contained(tmp_path, dimension, recursions, 
         assert not re.search(r"@import|url\(\s*['\"]?(https?:|//)", part)
 
 
-def test_the_same_tree_gives_the_same_page(tmp_path):
-    assert page_of(make(), tmp_path) == page_of(make(), tmp_path)
+@pytest.mark.parametrize("static", [True, False])
+def test_the_same_tree_gives_the_same_page(tmp_path, static):
+    assert page_of(make(), tmp_path, static) == page_of(make(), tmp_path, static)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_interactive_page_loads_nothing_and_stays_small(tmp_path, dimension):
+    tree = make(dimension, recursions=2)
+    page = page_of(tree, tmp_path, static=False)
+    assert len(page) < 3_000_000
+    assert not re.search(r"""<(script|link|img|iframe)[^>]*(src|href)\s*=\s*["']?\s*(https?:|//|file:)""", page)
+    data = json.loads(re.search(r'id="map-data">(.*?)</script>', page, re.DOTALL)[1])
+    assert data["root_id"] == "m1"
+    layers = json.loads(re.search(r'id="map-layers">(.*?)</script>', page, re.DOTALL)[1])
+    assert [tag for tag, _ in layers] == ["before", "after", "ellipses", "names"]
+    assert page.index("<noscript>") < page.index("The biases that matter") < page.index("<details")
+
+
+def test_the_verdict_is_one_sentence_and_what_matters_comes_first():
+    tree = make()
+    group = tree["calibration"].to_dataset()
+    verdicts = ["determined"] * 8
+    verdicts[3], verdicts[4], verdicts[5] = "conflicting", "weak", "prior only"
+    group = group.assign(mean=("bias_label", [0.0] * 7 + [9.0])).assign(
+        lower=("bias_label", [-1.0] * 7 + [8.0]), upper=("bias_label", [1.0] * 7 + [10.0])
+    )
+    tree["calibration"] = xr.DataTree(group)
+    tree["verdict"] = xr.DataTree(
+        xr.Dataset(dict.fromkeys(("verdict", "reason"), ("bias_label", verdicts))).assign_coords(
+            bias_label=group["bias_label"]
+        )
+    )
+    line = said.headline(tree)
+    assert line.startswith(
+        "The fit converged: 1 of 8 biases differs from zero, most clearly south.range_offset at 9.0 ±"
+    )
+    assert line.endswith("; 5 determined, 1 conflicting, 1 weak, 1 prior only.")
+    rows, left = said.that_matter(tree)
+    assert [row.label for row in rows] == ["north.range_offset", "south.range_offset", "south.position_x"]
+    assert left == 0
+    assert said.in_conflict(tree)
+
+
+@pytest.mark.parametrize(
+    ("status", "text"),
+    [
+        ("not converged", "The fit did not converge: its numbers are no answer."),
+        ("at bound", "The fit ended at bound: its numbers are no estimate."),
+    ],
+)
+def test_the_verdict_on_no_answer(status, text):
+    assert said.headline(make(status=status)) == text
+
+
+def test_labels_go_on_behind_a_point_or_underscore_only():
+    assert str(said.breakable("mast_12.range_offset")) == "mast_<wbr>12.<wbr>range_<wbr>offset"
+    assert str(said.breakable("<b>.x")) == "&lt;b&gt;.<wbr>x"
+
+
+def test_meridians_lie_where_the_frame_puts_them():
+    frame = LocalFrame(48.0, 11.0, 500.0)
+    for dimension in (2, 3):
+        lines = dict(interactive.graticule(frame, np.array([-3e3, -2e3]), np.array([3e3, 2e3]), dimension))
+        assert {"48° N", "11° E"} <= set(lines)
+        assert 6 < len(lines) < 40
+        np.testing.assert_allclose(lines["11° E"][:, 0], 0.0, atol=1e-6)
+        nearest = np.abs(lines["48° N"]).min(0)
+        assert nearest[1] < 1.0
+        for text, line in lines.items():
+            latitude, longitude = frame.to_geodetic(line if dimension == 2 else np.c_[line, np.zeros(len(line))])[:2]
+            stated, side = text.split("° ")
+            found = latitude if side in "NS" else longitude
+            np.testing.assert_allclose(found, float(stated), atol=1e-4)
+
+
+def test_the_truth_and_the_frame_are_on_the_map():
+    tree = make()
+    tree["track/car"]["true"] = tree["track/car"]["mean"] + 1.0
+    tree["constant_data"].attrs.update(latitude=48.0, longitude=11.0, height=0.0)
+    shown = scene.scene(tree)
+    assert shown.frame == LocalFrame(48.0, 11.0)
+    assert interactive.layers(shown)["truth"] == "truth"
+    ax = plots.plot_map(tree)
+    assert "truth" in [text.get_text() for text in ax.get_legend().get_texts()]
+    drawn = plots.interactive_map(tree)
+    assert any("° N" in str(source.data.get("text", "")) for source in drawn.select({"type": ColumnDataSource}))
 
 
 def test_extras_are_shown_where_the_tree_has_them(tmp_path):
@@ -190,8 +280,7 @@ def test_extras_are_shown_where_the_tree_has_them(tmp_path):
 @pytest.mark.parametrize("status", INVALID)
 def test_a_fit_that_is_no_answer_is_marked_invalid(tmp_path, status):
     page = page_of(make(status=status), tmp_path)
-    assert '<table class="biases invalid">' in page
-    assert "estimate invalid" in words(page)
+    assert '<table class="cards biases invalid">' in page
     assert "Estimate invalid" in words(page)
     assert page.count('<tr class="bad">') == 1
 
@@ -208,7 +297,10 @@ def test_labels_and_attributes_are_escaped(tmp_path):
     page = page_of(tree, tmp_path)
     assert "<script" not in page
     assert "<b>" not in page
-    assert "&lt;b&gt;north&lt;/b&gt;.position_x" in page
+    assert "&lt;b&gt;north&lt;/b&gt;.position_x" in page.replace("<wbr>", "")
+    whole = page_of(tree, tmp_path, static=False)
+    assert "<b>north" not in whole
+    assert whole.count("<script") == 4  # Bokeh, two data, one of the page
     for label in tree["calibration"]["bias_label"].values:
         assert label in words(page)
 
@@ -223,7 +315,7 @@ def test_numbers_that_do_not_exist_are_dashes(tmp_path):
         node["before"][:] = np.nan
     tree["residual"]["before"][:] = np.nan
     text = words(page_of(tree, tmp_path))
-    assert report.NONE in text
+    assert said.NONE in text
     assert not re.search(r"\bnan\b", text, re.IGNORECASE)
 
 
@@ -242,11 +334,11 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, b
         raise OSError("no")
 
     if broken == "render":
-        monkeypatch.setattr(report.plots, "plot_residuals", fail)
+        monkeypatch.setattr(sheet.plots, "plot_residuals", fail)
     else:
         monkeypatch.setattr(os, "replace", fail)
     with pytest.raises((OSError, InputError), match="no"):
-        report.write_report(make(), path)
+        write_report(make(), path)
     assert path.read_text() == "old"
     assert os.listdir(tmp_path) == ["report.html"]
 
@@ -265,7 +357,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, b
     ],
 )
 def test_numbers_are_rounded_to_their_sd(value, sd, text):
-    assert report._rounded(value, sd) == text
+    assert said.rounded(value, sd) == text
 
 
 def test_map_thins_tracks_and_names_nodes():

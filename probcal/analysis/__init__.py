@@ -7,6 +7,7 @@ from probcal.lazy import lazy
 if TYPE_CHECKING:
     from probcal.analysis.assess import assess
     from probcal.analysis.bounds import bounds
+    from probcal.analysis.changes import changes
     from probcal.analysis.compare import compare, interchangeable
     from probcal.analysis.maps import bound_map
     from probcal.analysis.observability import observability
@@ -18,6 +19,7 @@ __all__ = lazy(
     {
         "probcal.analysis.assess": "assess",
         "probcal.analysis.bounds": "bounds",
+        "probcal.analysis.changes": "changes",
         "probcal.analysis.compare": "compare interchangeable",
         "probcal.analysis.maps": "bound_map",
         "probcal.analysis.observability": "observability",

@@ -68,6 +68,10 @@ def fit_command(
     assessed: Annotated[
         bool, typer.Option("--assess/--no-assess", help="a verdict per bias, and what the residuals say")
     ] = True,
+    epoch: Annotated[float | None, typer.Option(help="bring rows to common epochs of so many s")] = None,
+    align: Annotated[
+        str | None, typer.Option(help="rigid | similarity: how the answer is laid on a truth in another frame")
+    ] = None,
 ) -> None:
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
     if method not in METHODS:
@@ -81,6 +85,7 @@ def fit_command(
     options.check_resumed(method, resume)
     kept = options.saved_names(save)
     arguments = options.given(given or ())
+    options.check_alignment(align)
     options.check_files(model, data)
     with outputs.results_of_a_run(out, outputs.FIT, "draws", resume=resume, overwrite=overwrite) as results:
         from probcal.cli import fit
@@ -89,7 +94,7 @@ def fit_command(
             fit.run(
                 model, data, method=method, prior=prior, fix=fix or (), given=arguments, starts=starts,
                 seed=seed, outputs=results, sizes=sizes, resume=resume, overwrite=overwrite, kept=kept,
-                assessed=assessed,
+                assessed=assessed, epoch=epoch, align=align,
             )
         )  # fmt: skip
 
@@ -203,18 +208,35 @@ def compare_command(
     raise typer.Exit(compare.run(folders, name, pairs, results))
 
 
+@app.command(name="changes")
+def changes_command(
+    first: Annotated[Path, typer.Argument(help="folder (or fit.nc) of the fit to the first recording")],
+    second: Annotated[Path, typer.Argument(help="folder (or fit.nc) of the fit to the second recording")],
+    name: Annotated[list[str] | None, typer.Option(help="name of each recording in turn (repeat)")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for changes.nc, changes.csv, changes.png")] = None,
+) -> None:
+    """Changes: what moved between two recordings of one network, second less first, with intervals."""
+    for path in (first, second):
+        options.check_fit(path)
+    results = None if out is None else outputs.replaceable(out, outputs.CHANGES)
+    from probcal.cli import changes
+
+    raise typer.Exit(changes.run(first, second, name, results))
+
+
 @app.command(name="report")
 def report_command(
     folder: Annotated[Path, typer.Argument(help="folder of a fit", show_default=False)],
+    static: Annotated[bool, typer.Option("--static", help="without scripts: a picture in place of the map")] = False,
 ) -> None:
-    """Write report.html of a saved fit: map, forest of biases, residuals, trace."""
+    """Write report.html of a saved fit: verdict, map, the biases that matter, and the rest folded away."""
     if not files.can_plot():
         raise InputError('the report needs plot packages: pip install "probcal[plot]"')
     options.check_fit(folder)
     results = outputs.replaceable(folder if folder.is_dir() else folder.parent, ("report.html",))
     from probcal.cli import report
 
-    raise typer.Exit(report.run(folder, results))
+    raise typer.Exit(report.run(folder, results, static=static))
 
 
 @app.command(name="sbc")

@@ -19,14 +19,14 @@ def write_csv(frame: "pd.DataFrame", path: Path) -> None:
 
 def can_plot() -> bool:
     """Whether the plot packages, an extra, are there."""
-    return all(importlib.util.find_spec(name) is not None for name in ("matplotlib", "jinja2"))
+    return all(importlib.util.find_spec(name) is not None for name in ("bokeh", "jinja2", "matplotlib"))
 
 
-def report_of(tree: "xr.DataTree", out: Path) -> Path:
+def report_of(tree: "xr.DataTree", out: Path, *, static: bool = False) -> Path:
     """Write the report.html of a fit."""
     from probcal.report import write_report  # the plot packages are an extra
 
-    return write_report(tree, out / "report.html")
+    return write_report(tree, out / "report.html", static=static)
 
 
 def say_written(files: Sequence[Path]) -> None:

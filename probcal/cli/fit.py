@@ -17,6 +17,7 @@ from probcal.cli.progress import line
 from probcal.files import Outputs
 from probcal.inference import METHODS, calibrate
 from probcal.inference.manifest import remove_run
+from probcal.results.alignment import KINDS
 from probcal.results.io import save
 from probcal.results.read import outliers, summary
 from probcal.results.schema import evidence_in
@@ -29,16 +30,17 @@ LONG = 60.0  # s of a fit that is written before it is assessed
 def run(
     model: Path, data: Path | None, *, method: str, prior: str | None, fix: Sequence[str], given: Mapping[str, Any],
     starts: int, seed: int, outputs: Outputs | None, sizes: Mapping[str, int], resume: bool, overwrite: bool,
-    kept: Sequence[str], assessed: bool,
+    kept: Sequence[str], assessed: bool, epoch: float | None = None, align: str | None = None,
 ) -> int:  # fmt: skip
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
     keep_kernels()
-    load_ahead(["scipy.stats", *(["probcal.report"] if outputs is not None and can_plot() else [])] if assessed else [])
+    drawn = ["probcal.report.page", "probcal.report.chart"] if outputs is not None and can_plot() else []
+    load_ahead(["scipy.stats", *drawn] if assessed else [])
     known, implied = METHODS[method]
     value: Any = known
     value = replace(value, **sizes) if sizes else value
     began = time.perf_counter()
-    module, problem = load_problem(model, data, fix, given)
+    module, problem = load_problem(model, data, fix, given, epoch)
     chosen = prior_named(module, value, implied, prior)
     truth = load_truth(module, model, data, problem, given)
     store = None if outputs is None else outputs.folder / "draws"
@@ -60,7 +62,7 @@ def run(
     if truth is not None:
         from probcal.results.scores import add_scores
 
-        add_scores(tree, truth)
+        add_scores(tree, truth, align=align)
     print(table_text(tree))
     _print_verdict(tree, time.perf_counter() - began)
     if outputs is not None and store is not None:
@@ -127,8 +129,10 @@ def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
         score = optima[evidence_in(optima) or "objective"]
         pairs = zip(optima["start"].values, optima["status"].values, score.values, strict=True)
         print(f"{score.name} by start: " + ", ".join(f"{k}: {value:.2f} ({status})" for k, status, value in pairs))
-    if "position_rmse_after" in attrs:
-        print(f"position RMSE before {attrs['position_rmse_before']:.3f} m, after {attrs['position_rmse_after']:.3f} m")
+    for suffix, how in (("", ""), *((f"_{kind}", f", {kind} alignment") for kind in KINDS)):
+        if f"position_rmse_after{suffix}" in attrs:
+            before, after = (attrs[f"position_rmse_{when}{suffix}"] for when in ("before", "after"))
+            print(f"position RMSE before {before:.3f} m, after {after:.3f} m{how}")
     _print_findings(tree)
     if attrs["message"]:
         print(attrs["message"], file=sys.stdout if Status(attrs["status"]).settled else sys.stderr)

@@ -66,9 +66,13 @@ def call(module: ModuleType, path: Path, name: str, /, *arguments: Any, **option
 
 
 def load_problem(
-    model: Path, data: Path | None, fix: Sequence[str] | None = (), given: Mapping[str, Any] | None = None
+    model: Path,
+    data: Path | None,
+    fix: Sequence[str] | None = (),
+    given: Mapping[str, Any] | None = None,
+    epoch: float | None = None,
 ) -> "tuple[ModuleType, Problem]":
-    """A model file and its problem with the given data and further arguments, some biases held at 0."""
+    """A model file and its problem with given data and arguments, some biases held at 0, rows at common epochs."""
     check_files(model, data)
     module, given = load_model(model), given or {}
     taken = arguments(module, "problem")
@@ -85,6 +89,8 @@ def load_problem(
         )
     if fix:
         problem = problem.rebuild(fix=problem.fixed | dict.fromkeys(fix, 0.0))
+    if epoch is not None:
+        problem = problem.rebuild(epoch=epoch)
     return module, problem
 
 

@@ -126,3 +126,9 @@ def _number(text: str) -> Any:
         except ValueError:
             continue
     return text
+
+
+def check_alignment(name: str | None) -> None:
+    """Raise `InputError` for an alignment of truth and answer that there is not."""
+    if name not in (None, "rigid", "similarity"):
+        raise InputError(f'--align "{name}": give rigid or similarity')

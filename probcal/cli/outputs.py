@@ -13,6 +13,7 @@ SBC = ("sbc.nc", "sbc.csv", "sbc.png")
 STUDY = ("study.nc", "study.csv", "study.png")
 CHECK = ("check.nc", "check.csv", "check.png")
 COMPARE = ("compare.nc", "compare.csv", "compare.png")
+CHANGES = ("changes.nc", "changes.csv", "changes.png")
 
 
 @contextmanager

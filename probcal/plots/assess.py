@@ -92,24 +92,44 @@ def plot_halves(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw the change of each bias from the first half to the second in units of its scale, with its limits."""
     group = tree["halves"].to_dataset()
     scale = tree["calibration"].to_dataset()["scale"].sel(bias_label=group["bias_label"]).values
-    ratio = np.abs(group["t"].values)
-    order = np.sort(np.argsort(-ratio, kind="stable")[:ROWS])
-    change, sd, limit = group["change"].values / scale, group["sd"].values / scale, float(group.attrs["limit"])
+    limit = float(group.attrs["limit"])
+    ax = _draw_changes(group, scale, np.abs(group["t"].values) > limit, ax)
+    ax.set_xlabel(f"second half less first, in scales; intervals of {limit:.1f} sd")
+    ax.set_title(f"Change between halves (at {group.attrs['time']:.4g} s)", loc="left")
+    return ax
+
+
+def plot_changes(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
+    """Draw what `changes` found between two recordings, in units of the scales, those that moved in colour."""
+    group = tree["change"].to_dataset()
+    group = group.isel(bias_label=np.isfinite(group["sd"].values))
+    ax = _draw_changes(group, group["scale"].values, group["verdict"].values == "moved", ax)
+    limit = tree["change"].attrs["limit"]
+    ax.set_xlabel(f"{plain_text(tree.attrs['second'])} less {plain_text(tree.attrs['first'])}, in scales;"
+                  f" intervals of {limit:.1f} sd")  # fmt: skip
+    moved = int((group["verdict"].values == "moved").sum())
+    ax.set_title(f"{moved} of {tree['change'].sizes['bias_label']} biases moved", loc="left")
+    return ax
+
+
+def _draw_changes(group: xr.Dataset, scale: np.ndarray, marked: np.ndarray, ax: Axes | None) -> Axes:
+    """Changes with intervals of the limit, those of largest |t| where there are many, `marked` ones in colour."""
+    order = np.sort(np.argsort(-np.abs(group["t"].values), kind="stable")[:ROWS])
+    limit = float(group.attrs["limit"])
+    change, sd = group["change"].values / scale, group["sd"].values / scale
     ax = new_axes(ax, 9.0, min(1.5 + 0.24 * len(order), 24.0))
     rows = np.arange(len(order))
-    tint = [COLOURS[1] if ratio[k] > limit else "0.45" for k in order]
+    tint = [COLOURS[1] if marked[k] else "0.45" for k in order]
     ax.axvline(0.0, color="0.3", linewidth=0.8)
     ax.hlines(rows, (change - limit * sd)[order], (change + limit * sd)[order], color=tint, linewidth=2.0)
     ax.scatter(change[order], rows, color=tint, s=22, zorder=3)
     _named(ax, rows, group["bias_label"].values[order])
-    if np.abs(change[order]).max() + limit * sd[order].max() > 5.0:
+    if len(order) and np.abs(change[order]).max() + limit * sd[order].max() > 5.0:
         ax.set_xscale("asinh", linear_width=1.0)
         ticks = [sign * 10.0**e for sign in (-1, 1) for e in range(9)]
         ticks = [0.0, *(tick for tick in ticks if ax.get_xlim()[0] < tick < ax.get_xlim()[1])]
         ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         ax.minorticks_off()
-    ax.set_xlabel(f"second half less first, in scales; intervals of {limit:.1f} sd")
-    ax.set_title(f"Change between halves (at {group.attrs['time']:.4g} s)", loc="left")
     return ax
 
 

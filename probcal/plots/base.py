@@ -38,6 +38,13 @@ def write_figure(figure: Figure, path: str | PathLike[str], dpi: float) -> None:
     write_whole(path, sheet.getvalue())
 
 
+def figure_of(ax: Axes) -> Figure:
+    """The whole figure that some axes belong to."""
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    return figure
+
+
 def colour(k: int) -> str:
     """Colour number k, in turn."""
     return COLOURS[k % len(COLOURS)]

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 
 from probcal import plots
 from probcal.files import write_whole
+from probcal.plots.base import figure_of
 from probcal.report import tables, words
 from probcal.results.drifts import drift_table
 from probcal.results.schema import EVIDENCES, evidence_in
@@ -71,7 +72,7 @@ def _render(tree: xr.DataTree, static: bool) -> str:
         shown=shown,
         more=more,
         known=any(row.true for row in shown),
-        notes=[*words.sentences(str(attrs["message"])), *tables.findings(tree)],
+        notes=[*words.sentences(str(attrs["message"])), *tables.noted(tree)],
         directions=tables.directions(tree),
         columns=columns,
         rows=rows,
@@ -137,8 +138,7 @@ def _pictures(tree: xr.DataTree) -> list[dict[str, str]]:
 def _embed(ax: Axes) -> str:
     """The figure of these axes as SVG in a data address, the same for the same tree."""
     sheet = io.BytesIO()
-    figure = ax.get_figure(root=True)
-    assert figure is not None
+    figure = figure_of(ax)
     with matplotlib.rc_context({"svg.hashsalt": "probcal"}):
         figure.savefig(sheet, format="svg", metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(sheet.getvalue()).decode("ascii")

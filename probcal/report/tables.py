@@ -158,7 +158,7 @@ def _checked(tree: xr.DataTree, name: str) -> dict[str, Any] | None:
     return {"title": title + (f", the first {CHECKED}" if left else ""), "columns": [keys[-1], *columns], "rows": rows}
 
 
-def findings(tree: xr.DataTree) -> list[str]:
+def noted(tree: xr.DataTree) -> list[str]:
     """Sentences of an assessment."""
     return tree["finding"].to_dataset()["sentence"].values.tolist() if "finding" in tree.children else []
 

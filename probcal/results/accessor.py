@@ -6,6 +6,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from probcal.lazy import Later
+from probcal.results.display import install
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,14 +47,15 @@ class Accessor:
 
         return drift_table(self._tree)
 
-    def scores(self, truth: Truth) -> dict[str, float]:
+    def scores(self, truth: Truth, *, align: str | None = None) -> dict[str, float]:
         """What a truth says of the tree, as `probcal.scores`."""
         from probcal.results.scores import scores
 
-        return scores(self._tree, truth)
+        return scores(self._tree, truth, align=align)
 
 
 @cache
 def register() -> None:
     """Let every `xarray.DataTree` have `.probcal`; called where results are made or read, since it loads xarray."""
     xr.register_datatree_accessor("probcal")(Accessor)
+    install()

@@ -110,7 +110,7 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
     columns = {
         "mean": found.mean * scales, "sd": found.sd * scales, "lower": found.lower * scales,
         "upper": found.upper * scales, "gamma": found.gamma, "precision": found.precision, "scale": scales,
-        "status": np.array(answer.bias_status, str),
+        "status": np.array(answer.bias_status, str), "pull": _pull(answer),
         "kind": np.array([b.kind for b in problem.biases], str), **found.columns,
     }  # fmt: skip
     matrices = {"covariance": found.covariance * np.outer(scales, scales), "information": found.information}
@@ -119,6 +119,12 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
     values: dict[str, Any] = {name: ("bias_label", column) for name, column in columns.items()}
     values |= {name: (("bias_label", "bias_label_other"), matrix) for name, matrix in matrices.items()}
     return xr.Dataset(values, coords={**bias_coords(problem), "bias_label_other": labels})
+
+
+def _pull(answer: Answer) -> np.ndarray:
+    """Linear term (M,) of the log-likelihood of z about zero; `information` is its quadratic one."""
+    at = answer.posterior.linearised
+    return np.asarray(at.solved.information @ at.point.z + at.solved.score)
 
 
 def _data_groups(answer: Answer, draws: Draws, before: Point) -> dict[str, xr.Dataset]:
