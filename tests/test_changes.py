@@ -147,7 +147,7 @@ def test_what_cannot_be_compared_is_said(pair):
         (first, "both fits are of the same data"),
         (broken(second, status="diverged"), 'the fit "second" ended "diverged" and is no answer'),
         (scaled, "the scale of n0.shift is 1 m in"),
-        (other, "have no bias in common; give two recordings"),
+        (other, "have no bias in common"),
         (old, "does not keep what its data say of the biases"),
         (xr.DataTree(), '"second" is no result of fit'),
     ):

@@ -47,6 +47,7 @@ def test_a_notebook_shows_it():
     """In IPython a result is displayed by its table, in HTML and as text."""
     testing = pytest.importorskip("IPython.testing.globalipapp")
     shell = testing.start_ipython()
+    shell.display_formatter.active_types = ["text/plain", "text/html"]
     display.install()
     data, _ = shell.display_formatter.format(committed.tree("ea"))
     assert data["text/plain"].startswith("EA (")

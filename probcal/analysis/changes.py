@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.analysis import pieces
+from probcal.analysis.compare import common_labels
 from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.errors import InputError
@@ -68,7 +69,7 @@ def changes(first: xr.DataTree, second: xr.DataTree, *, names: Sequence[str] = (
     pair = dict(zip(map(str, names), (first, second), strict=True))
     for name, tree in pair.items():
         _check(name, tree)
-    labels = _common(pair)
+    labels = common_labels(pair, "changes")
     if _same_data(first, second):
         raise InputError("changes: both fits are of the same data; compare() puts methods side by side")
     said = [_likelihood(name, tree).about(labels) for name, tree in pair.items()]
@@ -97,23 +98,6 @@ def _check(name: str, tree: xr.DataTree) -> None:
         raise InputError(f'changes: the fit "{name}" ended "{tree.attrs["status"]}" and is no answer; mend it first')
     if "pull" not in tree["calibration"].data_vars:
         raise InputError(f'changes: "{name}" does not keep what its data say of the biases; fit it again')
-
-
-def _common(pair: dict[str, xr.DataTree]) -> list[str]:
-    """Labels that both fits have, checked to mean the same."""
-    (one, first), (two, second) = ((name, tree["calibration"].to_dataset()) for name, tree in pair.items())
-    labels = [str(label) for label in first["bias_label"].values if label in second["bias_label"].values]
-    if not labels:
-        raise InputError(f'changes: "{one}" and "{two}" have no bias in common; give two recordings of one network')
-    for label in labels:
-        a, b = (
-            (float(group["scale"].sel(bias_label=label)), str(group["unit"].sel(bias_label=label).item()))
-            for group in (first, second)
-        )
-        if a[1] != b[1] or not np.isclose(a[0], b[0]):
-            sizes = f'{a[0]:g} {a[1]} in "{one}" and {b[0]:g} {b[1]} in "{two}"'
-            raise InputError(f"changes: the scale of {label} is {sizes}; declare one")
-    return labels
 
 
 def _same_data(first: xr.DataTree, second: xr.DataTree) -> bool:

@@ -49,7 +49,7 @@ def compare(fits: Fits, *, names: Sequence[str] | None = None) -> xr.DataTree:
     'all'
     """
     known = fits_by_name(fits, names)
-    labels = _common(known)
+    labels = common_labels(known)
     order = loo.same_data(known)
     groups: dict[str, xr.Dataset] = {"estimate": _estimates(known, labels), "pair": _pairs(known, labels)}
     truth = _truth(known, labels)
@@ -131,7 +131,7 @@ def interchangeable(
 
 def chosen_pair(fits: Mapping[str, xr.DataTree], labels: Sequence[str]) -> tuple[str, str]:
     """A pair of labels that all fits have; raises `InputError` for any other."""
-    common = _common(fits)
+    common = common_labels(fits)
     pair = split_pair(labels)
     for label in pair:
         if label not in common:
@@ -143,14 +143,14 @@ def _sound(tree: xr.DataTree) -> bool:
     return tree.attrs["status"] not in INVALID
 
 
-def _common(fits: Mapping[str, xr.DataTree]) -> list[str]:
-    """Labels that all fits have, in the order of the first, checked to mean the same."""
+def common_labels(fits: Mapping[str, xr.DataTree], verb: str = "compare") -> list[str]:
+    """Labels that all fits have, in the order of the first, checked to mean the same; errors begin with the verb."""
     groups = {name: tree["calibration"].to_dataset() for name, tree in fits.items()}
     (first, group), *others = groups.items()
     labels = [str(label) for label in group["bias_label"].values]
     labels = [label for label in labels if all(label in other["bias_label"] for _, other in others)]
     if not labels:
-        raise InputError(f'compare: "{first}" and the others have no bias in common; compare fits of one network')
+        raise InputError(f'{verb}: "{first}" and the others have no bias in common; compare fits of one network')
     group, level = group.sel(bias_label=labels), fits[first].attrs["interval_probability"]
     for name, other in others:
         other = other.sel(bias_label=labels)
@@ -159,10 +159,10 @@ def _common(fits: Mapping[str, xr.DataTree]) -> list[str]:
             sizes = [f"{float(g['scale'].sel(bias_label=label)):g} {g['unit'].sel(bias_label=label).item()}"
                      for g in (group, other)]  # fmt: skip
             raise InputError(
-                f'compare: the scale of {label} is {sizes[0]} in "{first}" and {sizes[1]} in "{name}"; declare one'
+                f'{verb}: the scale of {label} is {sizes[0]} in "{first}" and {sizes[1]} in "{name}"; declare one'
             )
         if fits[name].attrs["interval_probability"] != level:
-            raise InputError(f'compare: the intervals of "{first}" and "{name}" have different probabilities')
+            raise InputError(f'{verb}: the intervals of "{first}" and "{name}" have different probabilities')
     return labels
 
 

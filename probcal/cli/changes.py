@@ -17,7 +17,7 @@ COLUMNS = ("unit", "scale", "first", "second", "change", "sd", "lower", "upper",
 def run(first: Path, second: Path, names: Sequence[str] | None, outputs: Outputs | None) -> int:
     """What moved between two recordings: one row a bias, second less first with its interval, and findings."""
     found = changes(load(first), load(second), names=names or ("first", "second"))
-    frame = table(found)
+    frame = frame_of(found)
     print(frame.to_string(index=False, justify="right", float_format=lambda value: f"{value:.4g}"))
     for sentence in found["finding"].to_dataset()["sentence"].values:
         print(f"- {sentence}")
@@ -27,7 +27,7 @@ def run(first: Path, second: Path, names: Sequence[str] | None, outputs: Outputs
     return 0
 
 
-def table(found: xr.DataTree) -> pd.DataFrame:
+def frame_of(found: xr.DataTree) -> pd.DataFrame:
     """One row a bias."""
     frame = found["change"].to_dataset().to_dataframe().reset_index()
     return frame.rename(columns={"bias_label": "bias"})[["bias", *COLUMNS]]

@@ -24,9 +24,7 @@ turned = attitude(masts["rotations"])["heading"]
 given = zip(masts["places"], turned, strict=True)
 nodes = [Node(f"mast_{k}", place, heading, scale={"heading": 0.1}) for k, (place, heading) in enumerate(given)]
 problem = Problem(Network([scanner.on(n) for n in nodes]), ConstantVelocity(0.5), folder / "rows.csv", epoch=0.5)
-print(
-    probcal.observability(problem)["direction"].sizes if "direction" in probcal.observability(problem) else "all told"
-)
+print(probcal.observability(problem).attrs["status"])
 
 tree = probcal.assess(problem, probcal.fit(problem, EA()))
 times = problem.measurements.time
