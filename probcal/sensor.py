@@ -347,6 +347,9 @@ def sensor(
             wrong = next((n for n in found if n not in channels), None) if isinstance(returned, Mapping) else None
             hint = nearest(wrong, channels) if wrong else ""
             raise InputError(f"sensor {label}: returns {found}, but the declared channels are {sorted(channels)}{hint}")
+        for name, value in returned.items():
+            if jnp.issubdtype(value.dtype, jnp.complexfloating):
+                raise InputError(f'sensor {label}: channel "{name}" is complex; return its real part')
         return SensorType(
             name=label,
             function=function,

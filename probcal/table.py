@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Number
 from os import PathLike
@@ -88,6 +89,7 @@ def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
     form: dict[str, Any] = dict(index_col=False, skip_blank_lines=False, encoding="utf-8-sig", low_memory=False)
     try:
         first = pd.read_csv(path, header=None, nrows=1, dtype=str, keep_default_na=False, **form)
+        _check_separator(path, first.iloc[0].tolist())
         columns = _once(path, first.iloc[0].tolist())
         text = [column for column in columns if split_header(column)[0] in NAMES]
         form |= {"na_values": dict.fromkeys(columns, BLANK) | dict.fromkeys(text, ("",)), "keep_default_na": False}
@@ -107,6 +109,16 @@ def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
     lines = np.arange(2, len(frame) + 2)
     filled = frame.notna().any(axis=1).to_numpy()
     return Table(frame[filled].reset_index(drop=True), path.name, lines[filled])
+
+
+def _check_separator(path: Path, header: Sequence[str]) -> None:
+    """Raise `InputError` where the cells of a header hold a separator other than the comma."""
+    for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+        if any(mark in cell for cell in header):
+            raise InputError(
+                f"{path.name}: its columns are parted by {name}; write commas, with decimal points in the numbers, or "
+                f"give the DataFrame of pandas.read_csv(path, sep={mark!r}), with decimal=',' where commas are decimal"
+            )
 
 
 def _once(path: Path, columns: list[str]) -> list[str]:
@@ -234,6 +246,8 @@ def _seconds(column: pd.Series) -> np.ndarray:
     """A column of durations in seconds, or of dates in seconds since the first one; NaN where it is neither."""
     if column.dtype.kind == "m":
         return column.dt.total_seconds().to_numpy(float)
+    if isinstance(column.dtype, pd.CategoricalDtype):
+        column = column.astype(object)
     if column.dtype == object:  # a number among dates is none
         column = column.map(lambda cell: None if isinstance(cell, Number) else cell)
     try:

@@ -182,6 +182,13 @@ def test_fixing_a_bias_takes_it_out_of_the_problem():
     assert problem.fixed["b.position_x"] == 0.0
 
 
+def test_a_prior_that_is_none_is_refused(model, rows):
+    model.write_text(model.read_text() + '\nPRIOR = "ard"\n')
+    code, _, err = call("fit", model, rows)
+    assert code == 2
+    assert "PRIOR is 'ard'; give a prior of probcal, such as Horseshoe()" in err
+
+
 def test_a_model_may_bring_its_prior(model):
     model.write_text(model.read_text() + '\nfrom probcal import ARD\nPRIOR = ARD(by="node")\n')
     module = load_model(model)

@@ -197,6 +197,7 @@ CASES = [
     (declare(lambda target, *poses: {}), 'argument "*poses" is not allowed'),
     (declare(lambda target, pose: dict(rnge=1.0)), "returns ['rnge'], but the declared channels are ['range']"),
     (declare(fails), "sensor fails: the function failed on a trial call: no distance"),
+    (declare(lambda target, pose: dict(range=1j * target.position[0])), 'channel "range" is complex; return its real'),
     (lambda _: TargetView("the target", {"position": 0.0}).power, 'the target has no component "power"; known: position'),
     # noise, priors, motion
     (lambda _: Unknown(-1.0), "Unknown(guess=-1.0): the guess must be positive"),

@@ -375,6 +375,10 @@ def test_wrong_settings_are_refused():
         Collapsed(patience=0)
     with pytest.raises(InputError, match="it must be at least"):
         Collapsed(draws=0)
+    with pytest.raises(InputError, match="chains are the most"):
+        Collapsed(chains=10**6)
+    with pytest.raises(InputError, match="with warm-up; 10,000,000 in all are the most"):
+        NUTS(draws=10**12)
     with pytest.raises(InputError, match="it must lie between 0 and 1, or be None"):
         BernoulliGaussian(share=1.5)
     with pytest.raises(InputError, match="give a positive number"):

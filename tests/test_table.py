@@ -229,3 +229,19 @@ def test_rows_are_brought_to_common_epochs(tmp_path):
     for bad in (0.0, -1.0, np.nan, "0.1"):
         with pytest.raises(InputError, match=r"Problem\(epoch=.*give seconds, a positive number"):
             Problem(network, ConstantVelocity(1.0), table, epoch=bad)
+
+
+@pytest.mark.parametrize(("mark", "name"), [(";", "semicolons"), ("\t", "tabs"), ("|", "bars")])
+def test_another_separator_is_named(mark, name, tmp_path):
+    path = tmp_path / "rows.csv"
+    path.write_text(f"time{mark}sensor{mark}range\n0,5{mark}a{mark}1,25\n")
+    with pytest.raises(InputError, match=f"rows.csv: its columns are parted by {name}; write commas"):
+        read_table(path)
+
+
+def test_a_category_of_numbers_is_no_date():
+    """It came as a warning of pandas out of `read_table`."""
+    cells = pd.Series([None, None, None, 10**400], dtype=object).astype("category")
+    frame = pd.DataFrame({"time": cells, "sensor": list("abcd"), "range": 5.0})
+    with pytest.raises(InputError, match="time"):
+        measure(read_table(frame), network())

@@ -130,8 +130,10 @@ def load_truth(
 
 def prior_named(module: ModuleType, method: "Method", implied: "Prior | None", name: str | None) -> "Prior | None":
     """The prior that is named, else that of the method's name, else the model's own `PRIOR` if the method takes it."""
-    from probcal.priors import PRIORS
+    from probcal.priors import PRIORS, Prior
 
     chosen = PRIORS[name] if name is not None else implied
     own = getattr(module, "PRIOR", None)
+    if not isinstance(own, Prior | None):
+        raise InputError(f"{module.__name__}.py: PRIOR is {own!r}; give a prior of probcal, such as Horseshoe()")
     return own if chosen is None and own is not None and method.takes(own) else chosen

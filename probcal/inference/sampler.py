@@ -21,6 +21,16 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.mode import Point
 
+CHAINS, DRAWS = 4_096, 10_000_000  # the most; draws with warm-up, of all chains
+
+
+def check_size(name: str, chains: int, draws: int) -> None:
+    """Raise `InputError` for more chains or draws than any result can keep."""
+    if chains > CHAINS:
+        raise InputError(f"{name}(chains={chains}): {CHAINS:,} chains are the most")
+    if chains * draws > DRAWS:
+        raise InputError(f"{name}: {chains} chains of {draws} draws, with warm-up; {DRAWS:,} in all are the most")
+
 
 class Sampler(Method, ABC):
     """A method whose answer is draws: a frozen dataclass with `chains`, `warmup`, `draws` and a pure `step`."""
@@ -41,6 +51,7 @@ class Sampler(Method, ABC):
         for field, least in (("chains", 1), ("warmup", 0), ("draws", 1)):
             if getattr(self, field) < least:
                 raise InputError(f"{self.name}({field}={getattr(self, field)}): it must be at least {least}")
+        check_size(self.name, self.chains, self.warmup + self.draws)
 
     def takes(self, prior: Prior) -> bool:
         """Whether there is a posterior to draw from, and the method can: a flat hyper-prior of ARD leaves none."""

@@ -36,7 +36,7 @@ def as_html(tree: xr.DataTree) -> str:
     body = table.to_html(index=False, float_format=_number, escape=True, border=0)
     return (
         f"<div><p><strong>{html.escape(head)}</strong></p>{said}{body}{more}"
-        f"<details><summary>The whole tree</summary>{tree._repr_html_()}</details></div>"
+        f"<details><summary>The whole tree</summary><pre>{html.escape(repr(tree))}</pre></details></div>"
     )
 
 
