@@ -297,6 +297,15 @@ def test_collapsed_is_uniform():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("prior", [HORSESHOE, SPIKE], ids=["horseshoe", "spike"])
+def test_collapsed_is_uniform_from_the_automatic_start(prior):
+    """100 simulations of four radars, no start given; a right sampler fails with probability 1 %."""
+    method = Collapsed(chains=2, warmup=50, draws=150)
+    tree = sbc(radars(4, 15), method, prior=prior, runs=100, fallback=False, threads=2)
+    assert tree.attrs["status"] == "uniform", tree.attrs["verdict"]
+
+
+@pytest.mark.slow
 def test_collapsed_with_a_spike_is_uniform():
     """40 simulations of three radars; a right sampler fails with probability 1 %."""
     tree = quick(Collapsed(chains=2, warmup=50, draws=150), SPIKE)
