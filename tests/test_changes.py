@@ -83,6 +83,7 @@ def test_sentences_name_what_moved(pair):
     ]
 
 
+@pytest.mark.ci
 def test_methods_agree_on_what_their_data_say(pair):
     """The likelihood does not depend on the prior, nor on how it was explored: the linear world has one."""
     mode, sampled = pair[0], answer(1, shifts([0.3, -0.5, 0.0, 1.0, 0.2]), EA())
@@ -104,6 +105,7 @@ def test_nothing_is_told_of_what_one_recording_does_not_see(pair):
     assert plot_changes(changes(pair[0], unseen)).get_title(loc="left").startswith("1 of 5 biases moved")
 
 
+@pytest.mark.ci
 def test_a_bias_that_one_fit_lacks_is_integrated(pair):
     held = fit(recording(2, shifts([0.3, -0.5, 4.0, 1.0, 0.0]), fix=["n4.shift"]), MAP(), prior=Gaussian())
     found = changes(pair[0], held)["change"].to_dataset()
