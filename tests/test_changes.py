@@ -1,5 +1,6 @@
 """What moved between two recordings: exact on a linear world, at its rate of false alarms, whatever the method."""
 
+import committed
 import numpy as np
 import pytest
 import xarray as xr
@@ -91,6 +92,14 @@ def test_methods_agree_on_what_their_data_say(pair):
         np.testing.assert_allclose(
             sampled["calibration"][name].values, mode["calibration"][name].values, rtol=1e-5, atol=1e-7
         )
+
+
+def test_the_likelihood_ends_where_the_fit_did():
+    """Radars, not linear: the kept likelihood times a standard normal prior has its mode where that fit ended."""
+    group = committed.tree("map")["calibration"].to_dataset()
+    G, h = group["information"].values, group["pull"].values
+    mode = np.linalg.solve(G + np.eye(len(h)), h)
+    np.testing.assert_allclose(mode, (group["mean"] / group["scale"]).values, atol=3e-3)
 
 
 def test_nothing_is_told_of_what_one_recording_does_not_see(pair):

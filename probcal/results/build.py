@@ -26,6 +26,7 @@ from probcal.results.groups import (
 )
 from probcal.results.schema import BOUND, EVIDENCE, INTERVAL, RESULTS_VERSION
 from probcal.smoothing.draws import residuals
+from probcal.smoothing.marginal import volume_slope
 from probcal.smoothing.mirrors import SAME
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import track_mode
@@ -122,9 +123,13 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
 
 
 def _pull(answer: Answer) -> np.ndarray:
-    """Linear term (M,) of the log-likelihood of z about zero; `information` is its quadratic one."""
-    at = answer.posterior.linearised
-    return np.asarray(at.solved.information @ at.point.z + at.solved.score)
+    """Linear term (M,) of the log-likelihood of z about zero, trajectories integrated; `information` is its quadratic.
+
+    Its slope at the point is that of the marginal likelihood, the volume of the trajectories with it.
+    """
+    at, information = answer.posterior.linearised, answer.posterior.summary.information
+    volume, _ = volume_slope(at.model, at.point, at.solved)
+    return information @ np.asarray(at.point.z) + np.asarray(at.solved.score - 0.5 * volume)
 
 
 def _data_groups(answer: Answer, draws: Draws, before: Point) -> dict[str, xr.Dataset]:
