@@ -32,7 +32,7 @@ def test_plaza_is_calibrated_from_the_command_line(tmp_path):
         assert abs(row["mean"] - scale) < 0.008
         assert row["gamma"] > 0.98
     assert np.isfinite(summary.select_dtypes("number").to_numpy()).all()
-    html = (tmp_path / "fit" / "report.html").read_text()
+    html = (tmp_path / "fit" / "report.html").read_text().replace("<wbr>", "")
     assert "beacon_5.range_scale" in html
     again = run("report", tmp_path / "fit")
     assert again.returncode == 0, again.stderr

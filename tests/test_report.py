@@ -178,13 +178,19 @@ def test_the_same_tree_gives_the_same_page(tmp_path, static):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_interactive_page_loads_nothing_and_stays_small(tmp_path, dimension):
     tree = make(dimension, recursions=2)
+    paths = np.random.default_rng(0).normal(size=(40_000, 2)).cumsum(0)  # more than is drawn
+    for name in ("car", "lorry"):
+        values = dict.fromkeys(("mean", "sd", "before", "true"), (("time", "component"), paths))
+        coords = {"component": ["position_x", "position_y"], "time": np.arange(40_000.0)}
+        if dimension == 2:
+            tree[f"track/{name}"] = xr.DataTree(xr.Dataset(values, coords, attrs={"target": name}))
     page = page_of(tree, tmp_path, static=False)
     assert len(page) < 3_000_000
     assert not re.search(r"""<(script|link|img|iframe)[^>]*(src|href)\s*=\s*["']?\s*(https?:|//|file:)""", page)
     data = json.loads(re.search(r'id="map-data">(.*?)</script>', page, re.DOTALL)[1])
     assert data["root_id"] == "m1"
     layers = json.loads(re.search(r'id="map-layers">(.*?)</script>', page, re.DOTALL)[1])
-    assert [tag for tag, _ in layers] == ["before", "after", "ellipses", "names"]
+    assert [tag for tag, _ in layers if tag != "truth"] == ["before", "after", "ellipses", "names"]
     assert page.index("<noscript>") < page.index("The biases that matter") < page.index("<details")
 
 

@@ -24,7 +24,7 @@ from probcal.plots.scene import Scene, Track, ellipse, scene
 
 POINTS = 8_000  # epochs of all tracks together
 CORNERS = 32  # of an ellipse
-ENCIRCLED = 2_000  # nodes above which there are no ellipses
+ENCIRCLED = 500  # nodes above which there are no ellipses
 LISTED = 12  # targets in the legend, and biases in the words of a node
 LINES = 6  # meridians, and parallels, across the map
 MIDDLE = "#767676"  # readable on white and on black

@@ -55,7 +55,7 @@ def _render(tree: xr.DataTree, static: bool) -> str:
         chart = made(tree)
     columns, rows = tables.biases(tree)
     shown, more = words.that_matter(tree)
-    pictures = _pictures(tree)
+    pictures = _pictures(tree, light=() if chart is None else ("Map",))
     drawn = pictures.pop(0) if pictures and pictures[0]["title"] == "Map" else None
     return environment.get_template("page.html").render(
         attrs=attrs,
@@ -101,8 +101,8 @@ def _versions(attrs: dict[str, Any]) -> str:
 # Pictures
 
 
-def _pictures(tree: xr.DataTree) -> list[dict[str, str]]:
-    """Pictures of what the tree holds, as data addresses."""
+def _pictures(tree: xr.DataTree, light: tuple[str, ...]) -> list[dict[str, str]]:
+    """Pictures of what the tree holds, as data addresses; those that are to be light by pixels."""
     found: list[tuple[str, str, set[str], Callable[[], Axes]]] = [
         ("Map", "Nodes and tracks before and after calibration", {"constant_data", "track"},
          lambda: plots.plot_map(tree)),
@@ -131,14 +131,17 @@ def _pictures(tree: xr.DataTree) -> list[dict[str, str]]:
     ]  # fmt: skip
     present = set(tree.children)
     return [
-        {"title": title, "alt": alt, "source": _embed(draw())} for title, alt, needs, draw in found if needs <= present
+        {"title": title, "alt": alt, "source": _embed(draw(), "png" if title in light else "svg")}
+        for title, alt, needs, draw in found
+        if needs <= present
     ]
 
 
-def _embed(ax: Axes) -> str:
-    """The figure of these axes as SVG in a data address, the same for the same tree."""
+def _embed(ax: Axes, kind: str) -> str:
+    """The figure of these axes in a data address, the same for the same tree."""
     sheet = io.BytesIO()
-    figure = figure_of(ax)
     with matplotlib.rc_context({"svg.hashsalt": "probcal"}):
-        figure.savefig(sheet, format="svg", metadata={"Date": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(sheet.getvalue()).decode("ascii")
+        metadata = {"Date": None} if kind == "svg" else {"Software": None}
+        figure_of(ax).savefig(sheet, format=kind, dpi=80, metadata=metadata)
+    mime = "image/svg+xml" if kind == "svg" else "image/png"
+    return f"data:{mime};base64," + base64.b64encode(sheet.getvalue()).decode("ascii")
