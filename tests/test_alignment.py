@@ -1,12 +1,13 @@
 """Answers laid on a truth in another frame: the inverse of what moved it, never a mirror image, named in the score."""
 
+import committed
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-from probcal import InputError, Truth
+from probcal import InputError, Truth, add_scores
 from probcal.results.alignment import KINDS, align
 from probcal.results.scores import scores
 
@@ -75,3 +76,13 @@ def test_too_few_places_are_refused():
         align(np.zeros((5, 3)), np.zeros((5, 3)), "rigid")
     with pytest.raises(InputError, match="align: places and truth have shape"):
         align(np.zeros((5, 3)), np.zeros((4, 3)), "rigid")
+
+
+def test_scores_of_another_alignment_are_forgotten():
+    tree, truth = committed.tree("ea"), Truth(committed.DATA / "small.tracks.csv")
+    add_scores(tree, truth)
+    add_scores(tree, truth, align="rigid")
+    assert "position_rmse_after" not in tree.attrs
+    assert "position_rmse_after_rigid" in tree.attrs
+    assert "truth" not in tree.children  # this truth has no biases
+    assert all("true" in node.data_vars for node in tree["track"].children.values())

@@ -287,6 +287,7 @@ def test_other_bad_arguments(model, rows, tmp_path):
         (("fit", model, rows, "--method", "eaa"), 'did you mean "ea"?'),
         (("fit", model, rows, "--prior", "gausian"), 'did you mean "gaussian"?'),
         (("fit", model, rows, "--align", "scale"), '--align "scale": give rigid or similarity'),
+        (("fit", model, rows, "--align", "rigid"), "there is no truth to lay the answer on; put one beside"),
         (("fit", model, rows, "--epoch", "-1"), "Problem(epoch=-1.0): give seconds"),
         (("fit", model, rows, "--prior", "gaussian"), "EA does not take the prior Gaussian; it takes: laplace"),
         (("fit", model, rows, "--fix", "gauge_9.*"), 'no bias is called "gauge_9.*"'),

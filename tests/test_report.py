@@ -21,8 +21,8 @@ from matplotlib.patches import Ellipse
 from probcal import InputError, LocalFrame, plots
 from probcal.plots import base, interactive, scene
 from probcal.report import page as sheet
+from probcal.report import tables, write_report
 from probcal.report import words as said
-from probcal.report import write_report
 from probcal.status import INVALID
 
 AXES = ("x", "y", "z")
@@ -455,3 +455,35 @@ def test_pictures_draw_into_given_axes():
     for draw in (plots.plot_map, plots.plot_biases, plots.plot_objective, plots.plot_gamma):
         ax = Figure().subplots()
         assert draw(make(), ax) is ax
+
+
+def test_what_is_no_fit_is_refused(tmp_path):
+    tracks = make()
+    del tracks["calibration"]
+    with pytest.raises(InputError, match="write_report: the tree has no group calibration; give a result of fit"):
+        write_report(tracks, tmp_path / "report.html")
+    with pytest.raises(InputError, match="the map needs a result of fit"):
+        plots.plot_map(tracks)
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_found_is_no_praise(tmp_path):
+    tree = make()
+    group = tree["calibration"].to_dataset()
+    wide = {"lower": group["lower"] - 99.0, "upper": group["upper"] + 99.0}
+    tree["calibration"] = xr.DataTree(group.assign(wide))
+    assert "None differs from zero; the fit was not assessed." in words(page_of(tree, tmp_path))
+
+
+def test_a_long_table_is_cut_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "BIASES", 3)
+    assert "3 of 8 biases, those furthest from zero" in words(page_of(make(), tmp_path))
+
+
+def test_targets_of_one_epoch_are_marks_on_the_map():
+    tree = make(recursions=2)
+    for name in ("car", "lorry"):
+        del tree[f"track/{name}"]
+    drawn = plots.interactive_map(tree)
+    marks = [r for r in drawn.renderers if "before" in r.tags and type(r.glyph).__name__ == "Scatter"]
+    assert len(marks) == 1

@@ -17,11 +17,13 @@ from probcal.analysis.compare import common_labels
 from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.errors import InputError
+from probcal.labels import step_of
 from probcal.results.answer import HALF
 from probcal.results.schema import INTERVAL
-from probcal.status import INVALID
+from probcal.status import Status
 
 PATTERN = np.array([[0.0], [1.0]])  # what the second recording has beyond the first
+ALIKE = 6.0  # chi-square (3 nats) within which another change explains the data as well
 TOLD = 1.0  # information about a change, in declared scales, below which the data do not tell it
 
 
@@ -54,10 +56,12 @@ def changes(first: xr.DataTree, second: xr.DataTree, *, names: Sequence[str] = (
       declared scale);
     - `finding`: kind, subject and a sentence each.
 
-    A bias counts as moved where its change, with all others held common but for those that moved more, passes the
-    limit of a false-alarm rate of 1 % over all biases (attributes `limit`, `rate`). Biases that one fit lacks are
-    integrated out. Raises `InputError` for a tree that is no fit or no answer, for other scales or units, for the same
-    data twice, and where no bias is common.
+    A bias counts as moved where its change, with all others held common but for those that moved too, passes the
+    limit of a false-alarm rate of 1 % over all biases (attributes `limit`, `rate`); a sentence names the biases whose
+    change would explain the data as well. Biases that one fit lacks are integrated out, and so are the steps of a
+    drifting one: it is compared at its first piece. Both networks have the same sensor models and count biases from
+    the same stated values. Raises `InputError` for a tree that is no fit or no answer, for other scales or units, other
+    stated values or fixed biases, for the same data twice, and where no bias is common.
 
     >>> later = probcal.simulate(network, motion, np.arange(60.0), key=1, biases={"sonar_0.heading": 0.1})
     >>> moved = changes(tree, probcal.fit(Problem(network, motion, later.table), probcal.EA()))["change"].to_dataset()
@@ -69,10 +73,11 @@ def changes(first: xr.DataTree, second: xr.DataTree, *, names: Sequence[str] = (
     pair = dict(zip(map(str, names), (first, second), strict=True))
     for name, tree in pair.items():
         _check(name, tree)
-    labels = common_labels(pair, "changes")
+    _check_zero(pair)
+    labels = [label for label in common_labels(pair, "changes") if _still(first, label)]  # the first piece stays
     if _same_data(first, second):
         raise InputError("changes: both fits are of the same data; compare() puts methods side by side")
-    said = [_likelihood(name, tree).about(labels) for name, tree in pair.items()]
+    said = [_likelihood(tree).about(labels) for tree in pair.values()]
     group = first["calibration"].to_dataset().sel(bias_label=labels)
     change = _changes(said, group["scale"].values)
     means = [tree["calibration"].to_dataset().sel(bias_label=labels)["mean"].values for tree in pair.values()]
@@ -92,12 +97,55 @@ def changes(first: xr.DataTree, second: xr.DataTree, *, names: Sequence[str] = (
 
 
 def _check(name: str, tree: xr.DataTree) -> None:
-    if not isinstance(tree, xr.DataTree) or not {"calibration", "observed_data"} <= set(tree.children):
+    """Raise `InputError` for a tree that is no answer, or does not say what its data tell."""
+    if not isinstance(tree, xr.DataTree) or not {"calibration", "observed_data", "constant_data"} <= set(tree.children):
         raise InputError(f'changes: "{name}" is no result of fit(); give trees of fit() or load()')
-    if tree.attrs["status"] in INVALID:
-        raise InputError(f'changes: the fit "{name}" ended "{tree.attrs["status"]}" and is no answer; mend it first')
-    if "pull" not in tree["calibration"].data_vars:
+    status = str(tree.attrs.get("status", "unknown"))
+    if status not in set(Status) or not Status(status).settled:
+        raise InputError(f'changes: the fit "{name}" ended "{status}" and is no answer; mend it first')
+    group = tree["calibration"].to_dataset()
+    if "pull" not in group:
         raise InputError(f'changes: "{name}" does not keep what its data say of the biases; fit it again')
+    wide = _inflation(tree)
+    if not all(np.isfinite(values).all() for values in (group["pull"], group["information"], wide)):
+        raise InputError(f'changes: what the data of "{name}" say of the biases is not finite; fit it again')
+
+
+def _check_zero(pair: dict[str, xr.DataTree]) -> None:
+    """Raise `InputError` where the fits count a bias from other stated values, or hold one that the other does not."""
+    (one, first), (two, second) = ((name, tree["constant_data"].to_dataset()) for name, tree in pair.items())
+    stated = [_stated(first), _stated(second)]
+    for what in stated[0].keys() & stated[1].keys():
+        a, b = (own[what] for own in stated)
+        if not np.isclose(a, b, rtol=1e-9, atol=1e-12):
+            values = f'{a:.10g} in "{one}" and {b:.10g} in "{two}"'
+            raise InputError(f"changes: {what} is stated as {values}; state the same values in both")
+    held = [
+        {str(label): float(value) for label, value in own["fixed"].to_series().items()} if "fixed" in own else {}
+        for own in (first, second)
+    ]
+    free = [set(tree["calibration"].to_dataset()["bias_label"].values.tolist()) for tree in pair.values()]
+    for k, name in enumerate(pair):
+        for label, value in held[k].items():
+            if label in free[1 - k] or not np.isclose(held[1 - k].get(label, value), value):
+                raise InputError(f'changes: {label} is fixed at {value:g} in "{name}" only; fix the same in both')
+
+
+def _stated(group: xr.Dataset) -> dict[str, float]:
+    """Stated values of the nodes that rest, by node and component."""
+    moving = dict(zip(group["node"].values.tolist(), group["moving"].values.tolist(), strict=True))
+    names = zip(group["stated_node"].values.tolist(), group["stated_component"].values.tolist(), strict=True)
+    found = {f"{n}.{c}": float(v) for (n, c), v in zip(names, group["stated"].values, strict=True) if not moving[n]}
+    for name, place in zip(group["node"].values.tolist(), group["node_position"].values, strict=True):
+        if not moving[name]:
+            axes = zip(group["axis"].values.tolist(), place.tolist(), strict=True)
+            found |= {f"{name}.position_{axis}": value for axis, value in axes}
+    return found
+
+
+def _still(tree: xr.DataTree, label: str) -> bool:
+    """Whether a bias is no step of a drifting one."""
+    return step_of(label, set(tree["calibration"].to_dataset()["bias_label"].values.tolist())) is None
 
 
 def _same_data(first: xr.DataTree, second: xr.DataTree) -> bool:
@@ -105,12 +153,16 @@ def _same_data(first: xr.DataTree, second: xr.DataTree) -> bool:
     return all(np.array_equal(one[name].values, two[name].values) for name in ("y", "time", "sensor"))
 
 
-def _likelihood(name: str, tree: xr.DataTree) -> Likelihood:
+def _likelihood(tree: xr.DataTree) -> Likelihood:
     group = tree["calibration"].to_dataset()
-    M = group.sizes["bias_label"]
-    wide = tree["verdict"].to_dataset()["inflation"].values if "verdict" in tree.children else np.ones(M)
     labels = [str(label) for label in group["bias_label"].values]
-    return Likelihood(labels, group["information"].values, group["pull"].values, np.maximum(wide, 1.0))
+    return Likelihood(labels, group["information"].values, group["pull"].values, np.maximum(_inflation(tree), 1.0))
+
+
+def _inflation(tree: xr.DataTree) -> np.ndarray:
+    """How much wider (M,) the variances are than the model says, 1 where nobody looked."""
+    count = tree["calibration"].sizes["bias_label"]
+    return tree["verdict"].to_dataset()["inflation"].values if "verdict" in tree.children else np.ones(count)
 
 
 def _changes(said: Sequence[Likelihood], scale: np.ndarray) -> dict[str, np.ndarray]:
@@ -124,9 +176,7 @@ def _changes(said: Sequence[Likelihood], scale: np.ndarray) -> dict[str, np.ndar
     moved = pieces.changing(
         both, {"second": PATTERN}, {"second": inflation}, lambda freedom: limit_of(M, freedom), most=M
     )
-    free = {one.bias: one.contrast for one in moved}
-    for m in free:  # each beside all the others
-        free[m] = pieces.contrasts(both, PATTERN, [(k, PATTERN) for k in free if k != m]).get(m, free[m])
+    free = _beside_each_other(both, [one.bias for one in moved], inflation)
     beside = pieces.contrasts(both, PATTERN, [(k, PATTERN) for k in free]) | free
     value, sd = np.zeros(M), np.full(M, np.inf)  # of what neither recording sees
     for m, contrast in beside.items():
@@ -134,30 +184,66 @@ def _changes(said: Sequence[Likelihood], scale: np.ndarray) -> dict[str, np.ndar
     t = value / sd
     told = ["moved" if m in free else "no change seen" if sd[m] ** -2 >= TOLD else "not told" for m in range(M)]
     ends = {"lower": value - HALF * sd, "upper": value + HALF * sd}
+    alike = [", ".join(said[0].labels[k] for k in _alike(both, m, free, inflation)) for m in range(M)]
     return {
         "change": value * scale, "sd": sd * scale, **{name: end * scale for name, end in ends.items()}, "t": t,
-        "verdict": np.array(told),
+        "verdict": np.array(told), "alike": np.array(alike),
     }  # fmt: skip
+
+
+def _beside_each_other(both: pieces.Pieces, moved: list[int], inflation: np.ndarray) -> dict[int, pieces.Contrast]:
+    """How each bias that moved changed beside the others; what these explain away is common again, the least first."""
+    limit = limit_of(len(inflation))
+    while moved:
+        found = {m: pieces.contrasts(both, PATTERN, [(k, PATTERN) for k in moved if k != m]).get(m) for m in moved}
+        square = {m: one.square / inflation[m] if one is not None else 0.0 for m, one in found.items()}
+        least = min(moved, key=square.__getitem__)
+        if square[least] > limit:
+            return {m: one for m, one in found.items() if one is not None}
+        moved = [m for m in moved if m != least]
+    return {}
+
+
+def _alike(both: pieces.Pieces, moved: int, free: dict[int, pieces.Contrast], inflation: np.ndarray) -> list[int]:
+    """Other biases whose change in the place of one that moved would explain the data about as well."""
+    if moved not in free:
+        return []
+    found = pieces.contrasts(both, PATTERN, [(k, PATTERN) for k in free if k != moved])
+    least = free[moved].square / inflation[moved] - ALIKE
+    return [k for k, one in found.items() if k not in free and one.square / inflation[k] > least]
 
 
 def _findings(found: xr.Dataset, pair: dict[str, xr.DataTree]) -> list[Finding]:
     """A sentence for each bias that moved, one for those that are not told, one for what stays common otherwise."""
     said = []
-    verdicts = found["verdict"].values
-    for k in sorted(np.flatnonzero(verdicts == "moved").tolist(), key=lambda k: -abs(float(found["t"].values[k]))):
-        label, unit = str(found["bias_label"].values[k]), str(found["unit"].values[k])
-        change, sd, t = (float(found[name].values[k]) for name in ("change", "sd", "t"))
-        size = f"{change:.3g} ± {sd:.2g}{'' if unit == '1' else f' {unit}'}"
+    verdicts, far = found["verdict"].values, np.abs(found["t"].values)
+    labels = found["bias_label"].values.astype(str)
+    for k in sorted(np.flatnonzero(verdicts == "moved").tolist(), key=lambda k: -far[k]):
+        other = str(found["alike"].values[k])
+        more = f"; or {other} did: the data cannot tell them apart" if other else ""
+        said.append(Finding("moved", labels[k], f"{labels[k]} moved by {_size(found, k)}{more}"))
+    seen = np.flatnonzero(verdicts == "no change seen")
+    if len(seen):
+        k = int(seen[np.argmax(far[seen])])
+        what = "one bias" if len(seen) == 1 else f"{len(seen)} biases"
         said.append(
-            Finding("moved", label, f"{label} moved by {size} ({abs(t):.1f} sd, limit {found.attrs['limit']:.1f})")
+            Finding("held", labels[k], f"no change seen in {what}; the largest, {labels[k]}, {_size(found, k)}")
         )
-    if not said:
-        count = int((verdicts == "no change seen").sum())
-        said.append(Finding("moved", "", f"nothing moved: none of {count} biases that the data tell of has changed"))
-    silent = int((verdicts == "not told").sum())
+    silent = labels[verdicts == "not told"].tolist()
     if silent:
-        said.append(Finding("not told", "", f"of {silent} biases the data say too little to see a change of one scale"))
+        listed = ", ".join(silent[:4]) + (f" and {len(silent) - 4} more" if len(silent) > 4 else "")
+        said.append(Finding("not told", "", f"the data say too little to tell a change of {listed}"))
     for name, tree in pair.items():
         if "verdict" not in tree.children:
             said.append(Finding("assess", name, f'"{name}" was not assessed: the declared noise is taken as right'))
+        if "mirror" in tree.children:
+            said.append(Finding("mirror", name, f'"{name}" has another answer on the other side of a mirror'))
     return said
+
+
+def _size(found: xr.Dataset, k: int) -> str:
+    """A change with its sd, unit and how far it is from none."""
+    change, sd, t = (float(found[name].values[k]) for name in ("change", "sd", "t"))
+    unit = str(found["unit"].values[k])
+    far = f"{abs(t):.1f} sd, limit {found.attrs['limit']:.1f}"
+    return f"{change:.3g} ± {sd:.2g}{'' if unit == '1' else f' {unit}'} ({far})"

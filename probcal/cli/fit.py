@@ -14,6 +14,7 @@ from probcal.cli.files import can_plot, report_of, say_written, write_csv
 from probcal.cli.kernels import keep_kernels, load_ahead
 from probcal.cli.models import load_problem, load_truth, prior_named
 from probcal.cli.progress import line
+from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.inference import METHODS, calibrate
 from probcal.inference.manifest import remove_run
@@ -43,6 +44,8 @@ def run(
     module, problem = load_problem(model, data, fix, given, epoch)
     chosen = prior_named(module, value, implied, prior)
     truth = load_truth(module, model, data, problem, given)
+    if align is not None and truth is None:
+        raise InputError(f"--align {align}: there is no truth to lay the answer on; put one beside the data")
     store = None if outputs is None else outputs.folder / "draws"
     if outputs is not None and overwrite:
         outputs.begin()
@@ -55,14 +58,16 @@ def run(
             from probcal.analysis import assess
 
             with _safe(tree, outputs, time.perf_counter() - began > LONG):
-                tree = assess(problem, tree, truth=truth, key=seed, answer=answer)
+                near = truth if align is None else None  # of a truth in another frame no NEES
+                tree = assess(problem, tree, truth=near, key=seed, answer=answer)
     tree.attrs["model"] = model.stem
     if given:
         tree.attrs["set"] = ", ".join(f"{name}={value}" for name, value in given.items())
     if truth is not None:
         from probcal.results.scores import add_scores
 
-        add_scores(tree, truth, align=align)
+        with _safe(tree, outputs, False):
+            add_scores(tree, truth, align=align)
     print(table_text(tree))
     _print_verdict(tree, time.perf_counter() - began)
     if outputs is not None and store is not None:

@@ -22,7 +22,7 @@ from probcal.labels import AXES
 from probcal.plots.base import BEFORE, NAMED, colour, probability
 from probcal.plots.scene import Scene, Track, ellipse, scene
 
-POINTS = 8_000  # epochs of all tracks together
+POINTS = 5_000  # epochs of all tracks together
 CORNERS = 32  # of an ellipse
 ENCIRCLED = 500  # nodes above which there are no ellipses
 LISTED = 12  # targets in the legend, and biases in the words of a node
@@ -157,6 +157,11 @@ def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: l
 
     if not tracks:
         return
+    alone = [track for track in tracks if len(track.time) == 1]  # a line of one point is none
+    for tag, part, marker in (("before", "before", "circle"), ("truth", "true", "x")) if alone else ():
+        u, v = np.array([getattr(track, part)[0, plane] for track in alone]).T
+        tint = BEFORE if tag == "before" else MIDDLE
+        _tagged(tag, sheet.scatter(u, v, marker=marker, size=6, fill_color=tint, line_color=tint))
     lines("before", tracks, "before", line_color=BEFORE, line_width=1)
     after = lines("after", tracks, "after", line_width=1.5)
     if any(np.isfinite(track.true).any() for track in tracks):
@@ -164,7 +169,8 @@ def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: l
     if shown.mirrored:
         lines("mirror", [track.thin(most) for track in shown.mirrored], "after", line_dash="dashed", line_width=1.5)
     x, y = (AXES[axis] for axis in plane)
-    dots = _tagged("after", sheet.scatter(x, y, source=epochs, size=3, fill_color="colour", line_color=None))
+    size = 6 if len(alone) == len(tracks) else 3
+    dots = _tagged("after", sheet.scatter(x, y, source=epochs, size=size, fill_color="colour", line_color=None))
     axes = AXES[: shown.dimension]
     where = "".join(f"<div>{axis} @{axis}{{0.000}} ± @sd_{axis}{{0.000}} m</div>" for axis in axes)
     said = f"<b>@target</b><div>time @time{{0.000}} s</div>{where}"

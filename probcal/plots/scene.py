@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from probcal.errors import InputError
 from probcal.geodesy import GEODETIC, LocalFrame
 from probcal.labels import AXES
 from probcal.results.read import each_track
@@ -62,7 +63,9 @@ class Scene:
 
 
 def scene(tree: xr.DataTree) -> Scene:
-    """Read the map of a fit."""
+    """Read the map of a fit; raises `InputError` for a tree that is none."""
+    if not {"calibration", "constant_data"} <= set(tree.children):
+        raise InputError("the map needs a result of fit(), with its groups calibration and constant_data")
     nodes, tracks, mirrored = _places(tree), list(_tracks(tree)), list(_mirrored(tree))
     attrs = tree["constant_data"].attrs
     frame = LocalFrame(*(float(attrs[name]) for name in GEODETIC)) if GEODETIC[0] in attrs else None

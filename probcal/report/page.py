@@ -14,6 +14,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from probcal import plots
+from probcal.errors import InputError
 from probcal.files import write_whole
 from probcal.plots.base import figure_of
 from probcal.report import tables, words
@@ -39,6 +40,8 @@ def write_report(tree: xr.DataTree, path: str | PathLike[str], *, static: bool =
 
 def _render(tree: xr.DataTree, static: bool) -> str:
     """The page as text."""
+    if "calibration" not in tree.children:
+        raise InputError("write_report: the tree has no group calibration; give a result of fit() or load()")
     names = ("method", "prior", "message", "intervals")
     attrs: dict[str, Any] = dict.fromkeys(names, "") | {"status": "unknown", "seed": words.NONE}
     attrs |= {str(name): value for name, value in tree.attrs.items()}
@@ -71,6 +74,8 @@ def _render(tree: xr.DataTree, static: bool) -> str:
         map=drawn,
         shown=shown,
         more=more,
+        nothing=words.nothing_found(tree),
+        total=tree["calibration"].sizes["bias_label"],
         known=any(row.true for row in shown),
         notes=[*words.sentences(str(attrs["message"])), *tables.noted(tree)],
         directions=tables.directions(tree),
@@ -94,6 +99,8 @@ def _versions(attrs: dict[str, Any]) -> str:
     try:
         found = json.loads(attrs.get("versions", "{}"))
     except ValueError:
+        found = None
+    if not isinstance(found, dict):
         return str(attrs["versions"])
     return ", ".join(f"{name} {number}" for name, number in found.items())
 

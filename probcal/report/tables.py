@@ -10,6 +10,7 @@ from probcal.results.read import outliers
 from probcal.results.schema import EVIDENCES, evidence_in
 from probcal.status import INVALID
 
+BIASES = 400  # of the table of all: the others are in summary.csv
 EXTRA = {"r_hat": "r_hat", "ess_bulk": "ess bulk", "ess_tail": "ess tail", "ess": "ess"}  # of samplers
 LISTED = 20  # outlying data in the table
 CHECKED = 60  # rows of a table of checks
@@ -39,6 +40,9 @@ CHECKS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
 def biases(tree: xr.DataTree) -> tuple[list[str], list[dict[str, Any]]]:
     """Column names and one row a bias, cells with a mark for text."""
     group = tree["calibration"].to_dataset()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        far = np.nan_to_num(np.abs(group["mean"].values / group["sd"].values), nan=np.inf)
+    shown = np.sort(np.argsort(-far, kind="stable")[:BIASES])
     extra = [name for name in EXTRA if name in group]
     known = true_values(tree)
     columns = ["bias", "unit", "scale", "mean", "sd", "interval", "gamma", "status"]
@@ -47,7 +51,9 @@ def biases(tree: xr.DataTree) -> tuple[list[str], list[dict[str, Any]]]:
     columns += [EXTRA[name] for name in extra] + (["true value"] if known else [])
     table = {str(name): group[name].values for name in (*group.data_vars, "unit") if group[name].ndim == 1}
     rows = []
-    for k, label in enumerate(group["bias_label"].values.tolist()):
+    labels = group["bias_label"].values.tolist()
+    for k in shown.tolist():
+        label = labels[k]
         one = {name: values[k] for name, values in table.items()}
         sd, status = float(one["sd"]), str(one["status"])
         mean, lower, upper, spread = (rounded(float(one[n]), sd) for n in ("mean", "lower", "upper", "sd"))

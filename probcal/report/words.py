@@ -84,6 +84,15 @@ def _judged(tree: xr.DataTree) -> str:
     return "; " + ", ".join(f"{count} {name}" for name, count in counts.items() if count)
 
 
+def nothing_found(tree: xr.DataTree) -> str:
+    """What it means that no bias is shown: how many the data tell of, or that nobody asked."""
+    if "verdict" not in tree.children:
+        return "; the fit was not assessed"
+    verdicts = tree["verdict"].to_dataset()["verdict"].values
+    told = int((verdicts == "determined").sum())
+    return f"; the data determine {told} of {len(verdicts)}"
+
+
 def in_conflict(tree: xr.DataTree) -> bool:
     """Whether some bias conflicts with the model or drifts."""
     return "verdict" in tree.children and bool(np.isin(tree["verdict"].to_dataset()["verdict"].values, ASIDE).any())

@@ -6,6 +6,8 @@ import html
 import sys
 from typing import TYPE_CHECKING, Any
 
+from probcal.status import INVALID
+
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -33,7 +35,7 @@ def as_html(tree: xr.DataTree) -> str:
     head, message, table = _parts(tree)
     said = f"<p>{html.escape(message)}</p>" if message else ""
     more = f"<p>{_more(tree)}</p>" if _more(tree) else ""
-    body = table.to_html(index=False, float_format=_number, escape=True, border=0)
+    body = table.to_html(index=False, float_format=_number, na_rep="–", escape=True, border=0)
     return (
         f"<div><p><strong>{html.escape(head)}</strong></p>{said}{body}{more}"
         f"<details><summary>The whole tree</summary><pre>{html.escape(repr(tree))}</pre></details></div>"
@@ -45,7 +47,7 @@ def as_text(tree: xr.DataTree) -> str:
     if not _is_result(tree):
         return repr(tree)
     head, message, table = _parts(tree)
-    body = table.to_string(index=False, float_format=_number)
+    body = table.to_string(index=False, float_format=_number, na_rep="–")
     groups = ", ".join(str(name) for name in tree.children)
     return "\n".join(part for part in (head, message, body, _more(tree), f"groups: {groups}") if part)
 
@@ -60,6 +62,7 @@ def _parts(tree: xr.DataTree) -> tuple[str, str, Any]:
     frame = summary(tree)
     attrs = tree.attrs
     head = f"{attrs['method']} ({attrs['prior']}): {attrs['status']}"
+    head += ", estimate invalid: do not use these numbers" if attrs["status"] in INVALID else ""
     return head, str(attrs.get("message", "")), frame[[name for name in SHOWN if name in frame]].head(ROWS)
 
 

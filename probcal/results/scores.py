@@ -89,7 +89,9 @@ def add_scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> 
     >>> add_scores(tree, run.truth)["truth/bias"].sel(bias_label="sonar_1.range_offset").item()
     8.0
     """
-    tree.attrs.update(scores(tree, truth, align=align))
+    found = scores(tree, truth, align=align)
+    _forget(tree)
+    tree.attrs.update(found)
     labels = tree["calibration"].to_dataset()["bias_label"].values.tolist() if "calibration" in tree.children else []
     known = {label: float(value) for label, value in truth.biases.items() if label in labels}
     if known:
@@ -107,3 +109,16 @@ def add_scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> 
         columns[:, np.isin(track["component"].values, _axes(track))] = places if frame is None else frame.back(places)
         node["true"] = xr.DataArray(columns, dims=("time", "component"))
     return tree
+
+
+def _forget(tree: xr.DataTree) -> None:
+    """Take out what another truth said, or this one otherwise aligned."""
+    for name in [str(name) for name in tree.attrs if str(name).startswith("position_rmse_")]:
+        del tree.attrs[name]
+    for name in ("bias_rmse", "coverage"):
+        tree.attrs.pop(name, None)
+    if "truth" in tree.children:
+        del tree["truth"]
+    for node in tree["track"].children.values() if "track" in tree.children else ():
+        if "true" in node.data_vars:
+            node.dataset = node.to_dataset(inherit=False).drop_vars("true")
