@@ -482,8 +482,7 @@ def test_a_long_table_is_cut_and_says_so(tmp_path, monkeypatch):
 
 def test_targets_of_one_epoch_are_marks_on_the_map():
     tree = make(recursions=2)
-    for name in ("car", "lorry"):
-        del tree[f"track/{name}"]
+    tree["track"] = tree["track"].drop_nodes(["car", "lorry"])
     drawn = plots.interactive_map(tree)
     marks = [r for r in drawn.renderers if "before" in r.tags and type(r.glyph).__name__ == "Scatter"]
     assert len(marks) == 1
