@@ -254,6 +254,12 @@ class Problem:
         other.model = self.model.with_mixing(weights)
         return other
 
+    def seen(self) -> Problem:
+        """The same problem where states are what rows see of them, (E, n) whatever the motion."""
+        other = copy(self)
+        other.model = self.model.seen()
+        return other
+
     def later(self, data: Any, sizes: tuple[int, ...] | None = None) -> Epoch:
         """The epochs of rows that came after those of this problem, stacked in time order (K leading).
 

@@ -7,9 +7,13 @@ import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
-from probcal.inference.run import Given, Maximiser, State, learn, reweighted, valued
+from probcal.inference.particle_em import climb_by_particles
+from probcal.inference.run import Context, Given, Maximiser, State, learn, reweighted, valued
 from probcal.model.model import Model
+from probcal.particle.settings import Particles
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
+from probcal.problem import Problem
+from probcal.results.answer import Answer
 from probcal.smoothing.esteps import EStep, Extended, shorten
 from probcal.smoothing.information import update_levels
 from probcal.smoothing.linearised import laplace
@@ -67,9 +71,12 @@ class EM(Maximiser):
     `e_step` is a value: `Extended()` or, by sigma points, `Unscented()` or `Cubature()`. It stops when the joint log
     density changes by less than `tolerance`; 0 runs all `iterations`, as the papers do. Raises `InputError` for an
     E-step that is none.
+
+    `Particles(500)` as E-step is Paper A's algorithm: any motion, roads too; the intervals are by Louis' identity, and
+    it stops where the biases only scatter about a place.
     """
 
-    e_step: EStep = EXTENDED
+    e_step: EStep | Particles = EXTENDED
     iterations: int = 500
     tolerance: float = 1e-5
     inner: int = 1
@@ -79,17 +86,32 @@ class EM(Maximiser):
     intervals: ClassVar[str] = "Laplace: exact for a Gaussian or flat prior where the problem is linear and Gaussian"
 
     def __post_init__(self):
-        if not isinstance(self.e_step, EStep):
-            raise InputError(f"{self.name}(e_step={self.e_step!r}): give an E-step such as Extended() or Cubature()")
+        if not isinstance(self.e_step, EStep | Particles):
+            raise InputError(
+                f"{self.name}(e_step={self.e_step!r}): give an E-step such as Extended(), Cubature() or Particles(500)"
+            )
         if self.inner < 1:
             raise InputError(f"{self.name}(inner={self.inner}): at least one inner iteration is needed")
 
+    @property
+    def by_particles(self) -> bool:
+        """Whether trajectories are particles."""
+        return isinstance(self.e_step, Particles)
+
+    def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
+        """Climb from a start until it is done or its iterations are spent."""
+        if isinstance(self.e_step, Particles):
+            return climb_by_particles(problem, self, self.e_step, prior, start.z, context)
+        return super().answer(problem, prior, start, context)
+
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Inner EM steps, then new precisions."""
+        assert isinstance(self.e_step, EStep)
         return _iterate(model, prior, given, state, self.inner, self.e_step)
 
     def begin(self, model: Model, start: Point) -> Any:
         """What the E-step carries to its first step."""
+        assert isinstance(self.e_step, EStep)
         return self.e_step.begin(model, start)
 
     def close(self, model: Model, prior: Prior, given: Given, state: State) -> State:

@@ -95,7 +95,7 @@ def calibrate(
     if not isinstance(method, Method):
         raise InputError(f"method must be a value such as EA() or MAP(), got {method!r}")
     prior = choose_prior(method, prior)
-    check_problem(problem)
+    check_problem(problem, linear=not method.by_particles)
     keep = _kept(save)
     if starts < 1:
         raise InputError(f"starts={starts}: at least one start is needed")
@@ -130,9 +130,16 @@ def calibrate(
 def _directions(answer: Answer) -> tuple[Direction, ...]:
     """What the data leave open where the answer stands."""
     information = answer.posterior.summary.information
-    if not np.isfinite(information).all():
+    if not linear_form(answer) or not np.isfinite(information).all():
         return ()
     return weak_directions(answer.problem, information, answer.posterior.point)
+
+
+def linear_form(answer: Answer) -> bool:
+    """Whether the states of an answer are those of linear motions, as what follows gauges needs them."""
+    return all(
+        x.shape == u.shape for x, u in zip(answer.posterior.point.states, answer.posterior.point.noises, strict=True)
+    )
 
 
 def _advised(answer: Answer, directions: Sequence[Direction]) -> str:
@@ -147,7 +154,7 @@ def _advised(answer: Answer, directions: Sequence[Direction]) -> str:
 def _watched(answer: Answer) -> Answer:
     """The answer with what it ran along: no estimate where no row fixes that, else a sentence."""
     problem, point = answer.problem, answer.posterior.point
-    if not answer.status.valid or not np.isfinite(np.asarray(point.z)).all():
+    if not linear_form(answer) or not answer.status.valid or not np.isfinite(np.asarray(point.z)).all():
         return answer
     found, status = [answer.message] if answer.message else [], answer.status
     for run in runs(problem, point):

@@ -15,6 +15,7 @@ from probcal.inference.nuts import NUTS
 from probcal.inference.run import Method
 from probcal.inference.svi import SVI
 from probcal.lazy import Later
+from probcal.particle.settings import Particles
 from probcal.priors import PRIORS, BernoulliGaussian, Flat, Laplace, Prior
 from probcal.problem import Problem, check_linear
 
@@ -37,6 +38,8 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
     "map-l1": (MAP(), Laplace()),
     "ml": (MAP(), Flat()),
     "nls": (LeastSquares(), None),
+    "em-particles": (EM(Particles(500), iterations=200), None),
+    "em-ea-particles": (EMEA(Particles(500)), None),
     "collapsed": (Collapsed(), None),
     "collapsed-spike": (Collapsed(), BernoulliGaussian()),
     "nuts": (NUTS(), None),
@@ -56,9 +59,10 @@ def choose_prior(method: Method, prior: Prior | None) -> Prior:
     return prior
 
 
-def check_problem(problem: Problem) -> None:
-    """Raise `InputError` for a single row, a motion that is not linear, no free biases or sensors without rows."""
-    check_linear(problem)
+def check_problem(problem: Problem, *, linear: bool = True) -> None:
+    """Raise `InputError` for a single row, a motion that is not `linear`, no free biases or sensors without rows."""
+    if linear:
+        check_linear(problem)
     source = problem.measurements.table.source
     if problem.measurements.measured.any(1).sum() < 2:
         raise InputError(f"{source} has one measured row only; a fit needs at least two")

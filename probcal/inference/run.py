@@ -75,6 +75,11 @@ class Method(ABC):
     intervals: ClassVar[str]  # what the intervals are worth
     climbs: ClassVar[bool] = True  # to a mode; others start at the joint mode where noise levels are unknown
 
+    @property
+    def by_particles(self) -> bool:
+        """Whether trajectories are particles, so that any motion will do and no start is needed."""
+        return False
+
     @abstractmethod
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Solve a problem from a start."""

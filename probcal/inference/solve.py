@@ -23,6 +23,8 @@ def solve(
     A sampler starts at the best joint mode under the declared scales where there are several starts, or noise levels
     that are unknown. The context's key seeds draws and further starts.
     """
+    if method.by_particles:
+        return _by_particles(problem, method, prior, context, start, starts)
     given, problem = problem, method.prepare(problem)
     used = problem is given
     first = automatic_start(problem) if start is None else _suited(given, problem, start)
@@ -39,6 +41,29 @@ def solve(
     motion = "used" if used else "left out"
     found = replace(found, motion=motion, optima=tuple(optima) if starts > 1 else (), best=best)
     return _beside_mirrors(found, method, context) if method.climbs and used else found
+
+
+def _by_particles(
+    problem: Problem, method: Method, prior: Prior, context: Context, start: Point | None, starts: int
+) -> Answer:
+    """The answer of a method whose trajectories are particles: it begins at biases, whatever the states of a start.
+
+    Where none is given it is the joint mode, mirrors seen to, if the motions have one, else zero. Further starts are
+    draws of the biases within their scales; the one of the greatest evidence is the answer.
+    """
+    if start is None and all(form is None for form in problem.model.sampled):
+        first = solve(problem, MAP(trajectory="joint"), Gaussian(), context._replace(progress=None))
+        start = first.posterior.point if first.status.valid and first.posterior.sound else None
+    drawn = np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(context.key, 1))))
+    begin = np.zeros(problem.model.biases) if start is None else np.asarray(start.z)
+    places = [begin, *drawn.standard_normal((starts - 1, len(begin)))]
+    answers = []
+    for k, z in enumerate(places):
+        key = context.key if k == 0 else jax.random.fold_in(context.key, 1 + k)
+        point = Point((), (), z, np.zeros(len(problem.levels)))
+        answers.append(method.answer(problem, prior, point, context._replace(key=key)))
+    best = max(range(starts), key=lambda k: _rank(answers[k]))
+    return replace(answers[best], optima=tuple(answers) if starts > 1 else (), best=best)
 
 
 def _beside_mirrors(answer: Answer, method: Method, context: Context) -> Answer:

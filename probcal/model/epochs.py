@@ -111,12 +111,7 @@ class Stepwise:
         Raises `InputError` for a motion whose noise leaves out a direction, which has no density, and for one that
         states none.
         """
-        if not self.full_rank:
-            raise InputError(
-                "the motion has no density: its noise does not reach every component of the state (singular=True, or"
-                " Static()); take a motion with noise in all of them"
-            )
-
+        self._check_rank()
         check_densities(self.sampled)
 
         def of(r: int) -> jax.Array:
@@ -138,6 +133,33 @@ class Stepwise:
             return total
 
         return jax.lax.switch(epoch.recursion, [lambda r=r: of(r) for r in range(len(self.recursions))])
+
+    def log_steps(self, x: State, after: State, epoch: Epoch, levels: jax.Array) -> jax.Array:
+        """Log densities (I, J) of the J states after an epoch given each of the I before it, of a model of one target.
+
+        What is linear and Gaussian is whitened once, so that a pair costs a product; the rest is `log_step`, pair by
+        pair. Raises `InputError` as `log_step`.
+        """
+        (part,), (form,), move = self.recursions, self.sampled, epoch.move[0]
+        if form is not None or part.tails:
+            return jax.vmap(lambda a: jax.vmap(lambda b: self.log_step(a, b, epoch, levels))(after))(x)
+        self._check_rank()
+        lower, inverse = linalg.factor_and_inverse(_root(move, levels) @ _root(move, levels).T)
+        (old,), (new,) = x, after
+        middle = jnp.mean(new[:, 0], 0)  # about which nothing cancels
+        ahead = (old[:, 0] @ move.F.T + move.drift - middle) @ inverse.T
+        there = (new[:, 0] - middle) @ inverse.T
+        square = jnp.sum(ahead**2, 1)[:, None] + jnp.sum(there**2, 1)[None, :] - 2.0 * ahead @ there.T
+        n = inverse.shape[0]
+        volume = jnp.sum(jnp.log(jnp.diagonal(lower))) + 0.5 * n * float(np.log(2 * np.pi))
+        return -0.5 * jnp.maximum(square, 0.0) - volume
+
+    def _check_rank(self) -> None:
+        if not self.full_rank:
+            raise InputError(
+                "the motion has no density: its noise does not reach every component of the state (singular=True, or"
+                " Static()); take a motion with noise in all of them"
+            )
 
     def predict_at(self, epoch: Epoch, x: State, z: jax.Array) -> tuple[jax.Array, ...]:
         """Predicted value (P, C) of every row of an epoch, for each block."""

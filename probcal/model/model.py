@@ -179,6 +179,13 @@ class Model(Stepwise):
             for block, data, r in self._blocks()
         )
 
+    def linearise_biases(self, at: Where, *, expected: bool) -> tuple[Linearised, ...]:
+        """Every block linearised by the biases alone, whatever the motion: `of_biases` reads it."""
+        return tuple(
+            waist.linearise_biases(block, data, self.vectors(r, at.states[r]), at.z, at.levels, expected=expected)
+            for block, data, r in self._blocks()
+        )
+
     # rows linearised at a point
 
     def of_states(self, lins: Sequence[Linearised]) -> list[tuple[jax.Array, jax.Array]]:
@@ -382,6 +389,10 @@ class Model(Stepwise):
         return most_rows(self)
 
     # other models of the same form
+
+    def seen(self) -> "Model":
+        """The model whose states are what rows see of them, (E, n) arrays whatever the motion: for what reads rows."""
+        return replace(self, sampled=(None,) * len(self.sampled)) if any(self.sampled) else self
 
     def with_values(self, y: Sequence[Any]) -> "Model":
         """The same rows with other measured values y (N, C), read where a value is measured."""

@@ -249,6 +249,23 @@ def linearise(
     return Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])
 
 
+def linearise_biases(
+    block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: bool
+) -> Linearised:
+    """Score, weight and the Jacobian by the biases alone: what needs no derivative by the states."""
+    local, reached = _local(block, rows, z), states[rows.epoch]
+
+    def one(state: jax.Array, pose: jax.Array, b: jax.Array) -> jax.Array:
+        return _one(block, state, pose, b)
+
+    jacobian = jax.jacrev if len(block.channels) < local.shape[1] else jax.jacfwd
+    by_bias = jax.vmap(jacobian(one, argnums=2))(reached, rows.pose, local)
+    predicted = jax.vmap(one)(reached, rows.pose, local)
+    score, weight = weigh(block, rows, predicted, noise_std(rows, levels), expected=expected)
+    none = jnp.zeros((*score.shape, 0))
+    return Linearised(score, weight, none, by_bias * rows.scale[rows.sensor][:, None, :])
+
+
 def standardised(score: jax.Array, information: jax.Array) -> jax.Array:
     """Scores over the root of their information, of mean 0 and variance 1 under the model; zero where missing."""
     there = information > 0

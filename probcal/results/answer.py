@@ -20,8 +20,10 @@ from probcal.priors import Prior
 from probcal.results.schema import INTERVAL
 from probcal.smoothing.draws import draw, draw_biases, draws_a_chain
 from probcal.smoothing.linearised import LaplaceApproximation, Linearisation, linearise
+from probcal.smoothing.marginal import volume_slope
 from probcal.smoothing.mirrors import Mirrored
 from probcal.smoothing.mode import Point
+from probcal.smoothing.start import track_mode
 from probcal.status import Status
 
 if TYPE_CHECKING:
@@ -124,6 +126,21 @@ class Posterior(ABC):
     def worth(self) -> float | None:
         """What optima of several starts are ranked by: the evidence."""
         return self.summary.evidence
+
+    @cached_property
+    def before(self) -> Point:
+        """The point with all biases zero, each trajectory at its mode."""
+        return track_mode(self.problem, uncalibrated(self.point))
+
+    @property
+    def pull(self) -> np.ndarray:
+        """Linear term (M,) of the log-likelihood of z about zero, trajectories integrated; `information` is its square.
+
+        Its slope at the point is that of the marginal likelihood, the volume of the trajectories with it.
+        """
+        at, information = self.linearised, self.summary.information
+        volume, _ = volume_slope(at.model, at.point, at.solved)
+        return information @ np.asarray(at.point.z) + np.asarray(at.solved.score - 0.5 * volume)
 
     @property
     def variables(self) -> Mapping[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 from probcal.labels import AXES
 from probcal.lazy import Later
 from probcal.results.accessor import register
-from probcal.results.answer import Answer, Draws, Summary, Tracks, uncalibrated
+from probcal.results.answer import Answer, Draws, Summary, Tracks
 from probcal.results.groups import (
     Band,
     bias_coords,
@@ -26,10 +26,8 @@ from probcal.results.groups import (
 )
 from probcal.results.schema import BOUND, EVIDENCE, INTERVAL, RESULTS_VERSION
 from probcal.smoothing.draws import residuals
-from probcal.smoothing.marginal import volume_slope
 from probcal.smoothing.mirrors import SAME
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import track_mode
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -51,7 +49,7 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
     """
     problem, posterior = answer.problem, answer.posterior
     draws = posterior.draws(key, keep)
-    before = track_mode(problem, uncalibrated(posterior.point))
+    before = posterior.before
     tracks = bands(posterior.tracks(), before)
     groups = {
         "posterior": _posterior_group(answer, draws),
@@ -111,7 +109,7 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
     columns = {
         "mean": found.mean * scales, "sd": found.sd * scales, "lower": found.lower * scales,
         "upper": found.upper * scales, "gamma": found.gamma, "precision": found.precision, "scale": scales,
-        "status": np.array(answer.bias_status, str), "pull": _pull(answer),
+        "status": np.array(answer.bias_status, str), "pull": answer.posterior.pull,
         "kind": np.array([b.kind for b in problem.biases], str), **found.columns,
     }  # fmt: skip
     matrices = {"covariance": found.covariance * np.outer(scales, scales), "information": found.information}
@@ -120,16 +118,6 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
     values: dict[str, Any] = {name: ("bias_label", column) for name, column in columns.items()}
     values |= {name: (("bias_label", "bias_label_other"), matrix) for name, matrix in matrices.items()}
     return xr.Dataset(values, coords={**bias_coords(problem), "bias_label_other": labels})
-
-
-def _pull(answer: Answer) -> np.ndarray:
-    """Linear term (M,) of the log-likelihood of z about zero, trajectories integrated; `information` is its quadratic.
-
-    Its slope at the point is that of the marginal likelihood, the volume of the trajectories with it.
-    """
-    at, information = answer.posterior.linearised, answer.posterior.summary.information
-    volume, _ = volume_slope(at.model, at.point, at.solved)
-    return information @ np.asarray(at.point.z) + np.asarray(at.solved.score - 0.5 * volume)
 
 
 def _data_groups(answer: Answer, draws: Draws, before: Point) -> dict[str, xr.Dataset]:

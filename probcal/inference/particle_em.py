@@ -1,0 +1,212 @@
+"""Expectation maximisation whose E-step is a particle smoother (Paper A, Algorithms 1-4): the loop behind `EM`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.errors import FitError
+from probcal.inference.progress import Progress
+from probcal.inference.run import Context, Given, Maximiser, bare, check_method, given_of, learn
+from probcal.inference.weighted import Ended, Place, conclude_particles, places, prepared
+from probcal.model.model import At, Model
+from probcal.particle.ensemble import (
+    Ensemble,
+    Expectation,
+    at_states,
+    ensemble,
+    log_likelihood_over,
+    moved_levels,
+    nearest_states,
+    over_paths,
+)
+from probcal.particle.settings import Particles
+from probcal.particle.targets import Targets, weighted
+from probcal.priors import Precision, Prior
+from probcal.problem import Problem
+from probcal.results.answer import Answer
+
+CHUNK = 5  # iterations between two reports of progress
+SETTLING = 10  # iterations of stochastic approximation before it averages
+POWER = 0.7  # by which the weights of later passes fall
+HALVINGS = 5
+COOL = 0.02  # by which the log-likelihood counts at first, where it is tempered
+RIDGE = 1e-12  # of the information, where a flat prior meets a bias that no row reads
+WINDOW = 20  # iterations that are compared with as many before them
+DRIFT = 4.0  # standard errors by which these may differ, beside
+NEAR = 0.1  # so many sd of a bias
+
+
+class Climb(NamedTuple):
+    """Where the loop stands."""
+
+    z: jax.Array  # (M,)
+    levels: jax.Array  # (H,)
+    alpha: jax.Array  # (M,)
+    information: jax.Array  # (M, M) averaged, of the biases at given states
+    pull: jax.Array  # (M,) averaged, of its linear term about zero
+    k: jax.Array  # () passes done
+    key: jax.Array
+
+
+class Trace(NamedTuple):
+    """Of every iteration."""
+
+    z: jax.Array  # (I, M)
+    variance: jax.Array  # (I, M) of each bias at given states
+    log_likelihood: jax.Array  # (I,) estimated, at the biases before the step
+
+
+@partial(jax.jit, static_argnames=("prior", "how", "place"))
+def chunk(
+    model: Model, targets: tuple[Targets, ...], prior: Prior, given: Given, state: Climb, last: jax.Array,
+    how: Particles, place: Place,
+) -> tuple[Climb, Trace]:  # fmt: skip
+    """A few iterations, none after the `last`."""
+
+    def one(state: Climb, _: None) -> tuple[Climb, Trace]:
+        blank = Trace(state.z, jnp.zeros_like(state.z), jnp.zeros(()))
+        return jax.lax.cond(
+            state.k < last,
+            lambda: iterate(model, targets, prior, given, state, how, place),
+            lambda: (state, blank),
+        )
+
+    return jax.lax.scan(one, state, None, length=CHUNK)
+
+
+def iterate(
+    model: Model, targets: tuple[Targets, ...], prior: Prior, given: Given, state: Climb, how: Particles, place: Place
+) -> tuple[Climb, Trace]:
+    """One E-step and one M-step, with the prior of the biases (Paper A 20-21), then precisions and levels."""
+    keys, now = jax.random.split(state.key), given.prior._replace(alpha=state.alpha)
+    share = COOL ** jnp.maximum(1.0 - state.k / max(how.tempered, 1), 0.0) if how.tempered else jnp.ones(())
+    model = model.weighted([jnp.full_like(there, share) for there in model.measured])
+    targets = tuple(weighted(own, share) for own in targets)
+    found = ensemble(model, targets, state.z, state.levels, keys[0], how)
+    states = nearest_states(model, found, place) if how.m_step == "mean" else None
+    expected = over_paths(model, found, state.z, state.levels) if states is None else at_states(
+        model, states, state.z, state.levels
+    )  # fmt: skip
+    state = _averaged(state, expected, how)
+    matrix = state.information + now.matrix() + RIDGE * jnp.eye(model.biases)
+    step = linalg.solve_positive(matrix, state.pull - matrix @ state.z + RIDGE * state.z)
+    step = jnp.where(jnp.all(jnp.isfinite(step)), step, jnp.zeros_like(step))
+    if how.m_step != "averaged":
+        step = _shortened(model, found, states, state, now, step)
+    z = state.z + step
+    variance = jnp.diagonal(linalg.inverse_and_logdet(matrix)[0])
+    alpha = learn(prior, given, state.alpha, jnp.zeros_like(z), variance, z, "em")
+    levels = state.levels
+    if model.level_spread.shape[0]:
+        levels = moved_levels(model, targets, found, z, levels)
+    after = state._replace(z=z, levels=levels, alpha=alpha, k=state.k + 1, key=keys[1])
+    return after, Trace(z, variance, found.log_evidence)
+
+
+def _averaged(state: Climb, expected: Expectation, how: Particles) -> Climb:
+    """The state with what this pass says of the biases, averaged with earlier ones if that is asked for."""
+    share = 1.0
+    if how.m_step == "averaged":
+        passed = state.k - how.tempered - SETTLING
+        share = jnp.where(passed < 0, 1.0, (1.0 + jnp.maximum(passed, 0)) ** -POWER)
+    pull = expected.score + expected.information @ state.z
+    information = state.information + share * (expected.information - state.information)
+    return state._replace(information=information, pull=state.pull + share * (pull - state.pull))
+
+
+def _shortened(model: Model, found: Ensemble, states: Any, state: Climb, now: Precision, step: jax.Array) -> jax.Array:
+    """The longest of the halved steps that does not lower the expectation."""
+
+    def value(z: jax.Array) -> jax.Array:
+        if states is None:
+            told = log_likelihood_over(model, found, z, state.levels)
+        else:
+            told = sum(jnp.sum(part) for part in model.log_likelihood(At(states, z, state.levels)))
+        return told - 0.5 * now.square(z)
+
+    least = value(state.z)
+
+    def worse(carry: tuple[jax.Array, jax.Array]) -> jax.Array:
+        t, tries = carry
+        return ~(value(state.z + t * step) >= least) & (tries < HALVINGS)
+
+    t, tries = jax.lax.while_loop(worse, lambda c: (0.5 * c[0], c[1] + 1), (jnp.ones(()), jnp.zeros((), int)))
+    return jnp.where(tries < HALVINGS, t, 0.0) * step
+
+
+@dataclass(frozen=True)
+class Wandering:
+    """How the last iterations compare with as many before them."""
+
+    still: bool
+    worst: int  # the bias that moved most
+    moved: float  # by so many of its sd
+
+
+def wandering(trace: np.ndarray, sd: np.ndarray) -> Wandering:
+    """Whether the biases of the last iterations (I, M) scatter about a place, or still move."""
+    size = min(WINDOW, len(trace) // 2)
+    if size < 5:
+        return Wandering(False, 0, np.inf)
+    late, before = trace[-size:], trace[-2 * size : -size]
+    away = np.abs(late.mean(0) - before.mean(0))
+    error = np.sqrt((late.var(0) + before.var(0)) * _correlation(trace[-2 * size :]) / size)
+    over = (away - DRIFT * error) / np.maximum(sd, 1e-12)
+    worst = int(np.argmax(over))
+    return Wandering(bool((over < NEAR).all()), worst, float(away[worst] / max(sd[worst], 1e-12)))
+
+
+def _correlation(trace: np.ndarray) -> np.ndarray:
+    """By how much the variance of a mean (M,) grows with the correlation of neighbours, one order of it."""
+    around = trace - trace.mean(0)
+    r = np.clip((around[1:] * around[:-1]).mean(0) / np.maximum(around.var(0), 1e-300), 0.0, 0.9)
+    return (1 + r) / (1 - r)
+
+
+def climb_by_particles(
+    problem: Problem, method: Maximiser, how: Particles, prior: Prior, z: Any, context: Context
+) -> Answer:
+    """Run the loop from biases z (M,) and conclude: a Gaussian about them, its information by Louis' identity."""
+    check_method(method)
+    targets = prepared(problem, how)
+    how = replace(how, tempered=0) if np.any(np.asarray(z)) else how  # a start that is known is not left again
+    model, given, place = problem.model, given_of(method, problem, prior), places(problem)
+    M, keys = model.biases, jax.random.split(context.key)
+    state = Climb(
+        jnp.asarray(z), jnp.zeros(model.level_spread.shape), given.prior.alpha, jnp.zeros((M, M)), jnp.zeros(M),
+        jnp.zeros((), int), keys[0],
+    )  # fmt: skip
+    parts: list[Trace] = []
+    count, known, still = 0, bare(prior), Wandering(False, 0, np.inf)
+    while count < method.iterations:
+        state, part = chunk(model, targets, known, given, state, jnp.asarray(method.iterations), how, place)
+        part = jax.tree.map(lambda leaf: np.asarray(leaf)[: method.iterations - count], part)
+        parts.append(part)
+        count += len(part.log_likelihood)
+        if not np.isfinite(part.z).all():
+            raise FitError(f"{method.name}: the biases ran away; give them a prior, or fix some")
+        if context.progress is not None:
+            context.progress(Progress(method.name, count, method.iterations, float(part.log_likelihood[-1])))
+        traced = np.concatenate([own.z for own in parts])
+        still = wandering(traced, np.sqrt(part.variance[-1]))
+        if method.tolerance > 0 and count >= 2 * WINDOW and still.still:
+            break
+    trace = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    if still.still and how.m_step != "averaged":  # what is left is the noise of the particles
+        state = state._replace(z=jnp.asarray(trace.z[-min(WINDOW, len(trace.z) // 2) :].mean(0)))
+    ended = Ended(state.z, state.levels, state.alpha, trace.log_likelihood, still.still, _moved(problem, still))
+    return conclude_particles(problem, method, how, prior, given, targets, ended, keys[1])
+
+
+def _moved(problem: Problem, still: Wandering) -> str:
+    """What still moves, in words."""
+    if not np.isfinite(still.moved):
+        return "too few iterations to tell whether they settled"
+    return f"{problem.labels[still.worst]} still moves by {still.moved:.2g} sd in {WINDOW} iterations"

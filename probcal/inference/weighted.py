@@ -1,0 +1,292 @@
+"""Answers of methods whose trajectories are particles: a Gaussian of the biases, and paths drawn given them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.inference.ending import ABSURD, FAR, low_and_far
+from probcal.inference.run import Given, Maximiser
+from probcal.particle.ensemble import Ensemble, ensemble, moments, nearest_states, over_paths
+from probcal.particle.proposals import check_proposal
+from probcal.particle.settings import Particles, check_installed
+from probcal.particle.targets import Targets, targets_of
+from probcal.priors import Prior
+from probcal.problem import Problem
+from probcal.results.answer import CHAINS, HALF, Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
+from probcal.smoothing.draws import draw_biases, draws_a_chain, predictive
+from probcal.smoothing.mode import Point
+from probcal.smoothing.start import follow_states, track_mode
+from probcal.status import Status
+
+Place = tuple[tuple[int, int], ...]  # first and last (excluded) entry of the position, of each recursion
+LAST = 1000  # least particles of the last pass, whose scores give the information
+FILTERS = 8  # whose mean likelihood is the evidence
+SPREAD = 32  # draws of the biases behind the sd of a track, and behind values by datum
+
+
+def prepared(problem: Problem, how: Particles) -> tuple[Targets, ...]:
+    """The targets of a problem; raises `InputError` for particles that it cannot have."""
+    check_installed()
+    check_proposal(problem.model, how)
+    return targets_of(problem.model)
+
+
+def places(problem: Problem) -> Place:
+    """Where the position stands in what rows see of the states."""
+    return tuple(epochs.position for epochs in problem.epochs)
+
+
+class Ended(NamedTuple):
+    """Where a climb by particles ended."""
+
+    z: jax.Array  # (M,)
+    levels: jax.Array  # (H,)
+    alpha: jax.Array  # (M,)
+    trace: np.ndarray  # (I,) log-likelihood of every iteration, estimated
+    still: bool
+    said: str  # what still moves
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Particles of the targets of a problem, run at any biases and levels."""
+
+    problem: Problem  # with its own motions
+    how: Particles
+    targets: tuple[Targets, ...]
+
+    def at(self, z: Any, levels: Any, key: jax.Array) -> Ensemble:
+        """Smoothed particles at biases z (M,) and log levels (H,)."""
+        return ensemble(self.problem.model, self.targets, jnp.asarray(z), jnp.asarray(levels), key, self.how)
+
+    def seen(self, found: Ensemble) -> list[jax.Array]:
+        """What rows see of the states, (E, N, n) of each recursion."""
+        return [jax.vmap(lambda x, r=r: self.problem.model.vectors(r, x))(x) for r, x in enumerate(found.states)]
+
+    def drawn(self, z: np.ndarray, levels: np.ndarray, key: jax.Array) -> list[np.ndarray]:
+        """A path for each draw of the biases z (D, M), as rows see it: (D, E, n) of each recursion."""
+        parts = []
+        for k, own in enumerate(z):
+            found = self.at(own, levels, jax.random.fold_in(key, k))
+            parts.append([np.asarray(x[:, 0]) for x in self.seen(found)])  # paths come in no order
+        return [np.stack(column) for column in zip(*parts, strict=True)]
+
+    def tracks(self, z: np.ndarray, levels: np.ndarray, key: jax.Array) -> list[Tracks]:
+        """Mean and sd of all states over draws of the biases z (D, M)."""
+        each = []
+        for k, own in enumerate(z):
+            found = moments(self.problem.model, self.at(own, levels, jax.random.fold_in(key, k)))
+            each.append([(np.asarray(m.mean), np.asarray(m.variance)) for m in found])
+        tracks = []
+        for column in zip(*each, strict=True):
+            mean, variance = (np.stack(part) for part in zip(*column, strict=True))
+            tracks.append(Tracks(mean.mean(0), np.sqrt(variance.mean(0) + mean.var(0))))
+        return tracks
+
+    def point(self, found: Ensemble, z: Any, levels: Any) -> Point:
+        """The states that stand for the particles: on the road where there is one (Paper A 43)."""
+        states = nearest_states(self.problem.model, found, places(self.problem))
+        vectors = tuple(self.problem.model.vectors(r, x) for r, x in enumerate(states))
+        noises = tuple(jnp.zeros((x.shape[0], 0)) for x in vectors)
+        return Point(vectors, noises, jnp.asarray(z), jnp.asarray(levels))
+
+
+@dataclass(frozen=True, eq=False)
+class EnsemblePosterior(Posterior):
+    """A Gaussian of the biases, and the paths that particles draw given them."""
+
+    paths: Paths
+    term: np.ndarray  # (M,)
+    without: Point
+    own: Sequence[Tracks]
+    key: jax.Array
+    numbers: Mapping[str, float]
+
+    chained: ClassVar[bool] = False
+    held: ClassVar[bool] = True
+
+    @property
+    def states(self) -> Sequence[np.ndarray]:
+        """Mean states (E, n) of each recursion."""
+        return [own.mean for own in self.own]
+
+    def tracks(self) -> Sequence[Tracks]:
+        """Mean and sd of all states, the biases uncertain."""
+        return self.own
+
+    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
+        """Independent draws of the biases; of some of them, or of all where states are kept, a path and its values."""
+        M, model = self.problem.model.biases, self.problem.model
+        shape, keys = (CHAINS, draws_a_chain(model.size, CHAINS)), jax.random.split(key, 3)
+        covariance = jnp.asarray(self.summary.covariance)
+        z = np.asarray(draw_biases(self.point._replace(z=jnp.asarray(self.summary.mean)), covariance, keys[0],
+                                   shape[0] * shape[1])).reshape(*shape, M)  # fmt: skip
+        count = shape[1] if "states" in keep else min(shape[1], SPREAD // CHAINS)
+        kept = np.unique(np.linspace(0, shape[1] - 1, count).round().astype(int))
+        levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
+        if not keep:
+            return Draws(z, levels, [], kept, [], [])
+        flat = z[:, kept].reshape(-1, M)
+        states = self.paths.drawn(flat, self.summary.levels, keys[1])
+        found = predictive(
+            model, jnp.asarray(levels[:, kept].reshape(len(flat), -1)), jnp.asarray(flat),
+            tuple(jnp.asarray(x) for x in states), keys[2], keep,
+        )  # fmt: skip
+
+        def split(a: Any) -> np.ndarray:
+            return np.asarray(a).reshape(CHAINS, len(kept), *np.shape(a)[1:])
+
+        likelihood, replicas = ([split(a) for a in part] for part in found)
+        return Draws(z, levels, [split(x) for x in states] if "states" in keep else [], kept, likelihood, replicas)
+
+    def log_prior(self, draws: Draws) -> np.ndarray | None:
+        """Log density (chain, draw, M) of each bias given its precision; None for flat or correlated ones."""
+        independent = self.prior.proper and not self.prior.correlation
+        return log_prior_normal(draws.z, self.summary.precision) if independent else None
+
+    @property
+    def pull(self) -> np.ndarray:
+        """Linear term (M,) of the log-likelihood of z about zero."""
+        return self.term
+
+    @property
+    def before(self) -> Point:
+        """The point with all biases zero: mean states by particles."""
+        return self.without
+
+    @property
+    def attrs(self) -> Mapping[str, float]:
+        """Numbers of the last pass."""
+        return self.numbers
+
+
+def marginal_information(paths: Paths, z: Any, levels: Any, key: jax.Array) -> tuple[np.ndarray, np.ndarray, Ensemble]:
+    """Information (M, M) of the data about the biases, trajectories integrated, their score, and the particles.
+
+    By Louis' identity (1982): the expected information at given states less the covariance of the score over paths.
+    """
+    how = paths.how
+    smoother = "backward" if how.smoother == "marginal" else how.smoother
+    more = replace(paths, how=replace(how, smoother=smoother, count=max(how.count, LAST)))
+    found = more.at(z, levels, key)
+    expected = jax.jit(over_paths)(paths.problem.model, found, jnp.asarray(z), jnp.asarray(levels))
+    return positive(np.asarray(expected.information - expected.spread)), np.asarray(expected.score), found
+
+
+def positive(matrix: np.ndarray) -> np.ndarray:
+    """The nearest matrix without negative eigenvalues: an estimated information may have some."""
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T
+
+
+def log_likelihood_at(paths: Paths, z: Any, levels: Any, key: jax.Array) -> tuple[float, float]:
+    """Log of the mean likelihood over some filters, and the standard error of that log."""
+    logs = np.array([float(paths.at(z, levels, jax.random.fold_in(key, k)).log_evidence) for k in range(FILTERS)])
+    weights = np.exp(logs - logs.max())
+    mean = weights.mean()
+    return float(logs.max() + np.log(mean)), float(weights.std(ddof=1) / mean / np.sqrt(FILTERS))
+
+
+def conclude_particles(
+    problem: Problem, method: Maximiser, how: Particles, prior: Prior, given: Given, targets: tuple[Targets, ...],
+    ended: Ended, key: jax.Array,
+) -> Answer:  # fmt: skip
+    """The answer of a climb by particles."""
+    paths, keys = Paths(problem, how, targets), jax.random.split(key, 6)
+    z, levels, M = np.asarray(ended.z), np.asarray(ended.levels), problem.model.biases
+    information, score, found = marginal_information(paths, z, levels, keys[0])
+    now = given.prior._replace(alpha=ended.alpha)
+    matrix = jnp.asarray(information) + now.matrix()
+    covariance, volume = (np.asarray(a) for a in linalg.inverse_and_logdet(matrix))
+    likelihood, error = log_likelihood_at(paths, z, levels, keys[1])
+    evidence = likelihood + 0.5 * float(now.log_determinant() - now.square(ended.z)) - 0.5 * float(volume)
+    alpha = np.asarray(ended.alpha)
+    with np.errstate(invalid="ignore"):  # a singular problem has no sd
+        half = HALF * np.sqrt(np.diag(covariance))
+    gamma = np.clip(1.0 - alpha * np.diag(covariance), 0.0, 1.0)
+    summary = Summary(
+        "Laplace", "maximised" if prior.learns else "given", z, covariance, z - half, z + half, gamma, alpha,
+        information, levels, evidence if prior.proper else None,
+    )  # fmt: skip
+    numbers = {"log_likelihood": likelihood, "log_likelihood_se": error, "particles": float(how.count)}
+    posterior = posterior_of(paths, prior, summary, score, found, keys[2], numbers)
+    low, far = low_and_far(prior, summary, problem.surveyed)
+    status, message = _judged(posterior, method, ended, bool(low.any()), bool(far.any()))
+    words = np.select(
+        [problem.surveyed, low, far], ["survey", "at bound", "diverged"], "estimated"
+    ).tolist() if M else []  # fmt: skip
+    return Answer(
+        posterior.problem, method, method, prior, posterior, status, message, tuple(words), len(ended.trace),
+        ended.trace,
+    )  # fmt: skip
+
+
+def posterior_of(
+    paths: Paths, prior: Prior, summary: Summary, score: np.ndarray, found: Ensemble, key: jax.Array,
+    numbers: Mapping[str, float],
+) -> EnsemblePosterior:  # fmt: skip
+    """The posterior around a Gaussian of the biases, with tracks made by particles."""
+    problem, keys = paths.problem, jax.random.split(key, 3)
+    z, levels = jnp.asarray(summary.mean), summary.levels
+    point = paths.point(found, z, levels)
+    zero = paths.at(jnp.zeros_like(z), levels, keys[0])
+    before = paths.point(zero, jnp.zeros_like(z), levels)
+    before = before._replace(states=tuple(m.mean for m in moments(problem.model, zero)))
+    drawn = np.asarray(draw_biases(point, jnp.asarray(summary.covariance), keys[1], SPREAD))
+    sound = np.isfinite(drawn).all()
+    tracks = paths.tracks(drawn if sound else np.asarray(z)[None], levels, keys[2])
+    seen = problem
+    if any(form is not None for form in problem.model.sampled):
+        seen = problem.seen()
+    else:
+        near = follow_states(problem, [np.asarray(x) for x in point.states])
+        point = track_mode(problem, near._replace(z=z, levels=jnp.asarray(levels)))
+    pull = summary.information @ np.asarray(z) + score
+    return EnsemblePosterior(seen, prior, point, summary, paths, pull, before, tracks, keys[0], numbers)
+
+
+def unexplained(posterior: EnsemblePosterior) -> list[str]:
+    """Targets whose rows no path explains, worst first."""
+    problem = posterior.problem
+    model, point = problem.model, posterior.point
+    squares, there = model.by_epoch(model.square(point)), model.by_epoch(model.measured)
+    found = []
+    for epochs, square, count in zip(problem.epochs, squares, there, strict=True):
+        for name in dict.fromkeys(epochs.target):
+            mine = epochs.target == name
+            mean = float(np.asarray(square)[mine].sum() / max(np.asarray(count)[mine].sum(), 1))
+            if not mean <= ABSURD:
+                found.append((mean, str(name)))
+    return [name for _, name in sorted(found, reverse=True)]
+
+
+def misfit(names: Sequence[str]) -> str:
+    """What is said of targets that no path explains."""
+    listed = ", ".join(f'"{name}"' for name in names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    return (
+        f"No path of target {listed} explains its rows: check its roads or let it leave them, its start, units and"
+        " the noise std; or take more particles."
+    )
+
+
+def _judged(posterior: EnsemblePosterior, method: Maximiser, ended: Ended, low: bool, far: bool) -> tuple[Status, str]:
+    """Status of a climb by particles, and a sentence."""
+    if names := unexplained(posterior):
+        return Status.MISFIT, misfit(names)
+    if far or not posterior.sound:
+        where = f"some biases lie more than {FAR:g} scales away" if far else "the information is singular"
+        return Status.DIVERGED, f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases."
+    if low:
+        return Status.AT_BOUND, "A precision stands at its lower bound: the estimate is invalid."
+    if ended.still:
+        return Status.CONVERGED, ""
+    if method.tolerance == 0:
+        return Status.SPENT, f"All {len(ended.trace)} iterations were run, as asked; {ended.said}."
+    return Status.NOT_CONVERGED, f"The fit did not settle in {len(ended.trace)} iterations: {ended.said}; allow more."

@@ -1,0 +1,62 @@
+"""Sums over the epochs of a target, smoothed while it is filtered: PaRIS (Olsson, Westerborn 2017)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from probcal.model.epochs import Epoch, State
+from probcal.model.model import Model
+from probcal.particle.backward import sampler_of
+from probcal.particle.filtering import built
+from probcal.particle.settings import Particles
+
+Functional = Callable[[State, State, Epoch], Any]  # the state before, that at an epoch, and the epoch: a pytree
+
+
+def smoothed_sum(
+    model: Model, epochs: Epoch, there: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array, how: Particles,
+    functional: Functional, draws: int = 2,
+) -> tuple[Any, jax.Array]:  # fmt: skip
+    """Smoothed expectation of a sum of `functional` over a target's epochs, and the log evidence.
+
+    Particles carry the sum along; each goes on from the mean over `draws` of what the particles before it carry, drawn
+    backward. Nothing is kept of earlier epochs, so that a stream can be smoothed so; two draws are enough for the
+    variance to grow no faster than the number of epochs.
+    """
+    filter_, sampler, keys = built(model, how, z, levels), sampler_of(how), jax.random.split(key)
+    first = filter_.init_prepare(key=keys[0])
+    blank = jax.eval_shape(lambda e: functional(model.initial(), model.initial(), e), _row(epochs, 0))
+    sums = jax.tree.map(lambda leaf: jnp.zeros((how.count, *leaf.shape), leaf.dtype), blank)
+
+    def one(carry: Any, inputs: Any) -> tuple[Any, None]:
+        state, sums = carry
+        epoch, really, own = inputs
+        seeds = jax.random.split(own, draws + 1)
+        state = state._replace(model_inputs=(epoch, really))
+        after = filter_.filter_combine(state, filter_.filter_prepare((epoch, really), key=seeds[0]))
+        before, there = state.particles[0], after.particles[0]
+        parts = []
+        for seed in seeds[1:]:
+            _, chosen = sampler(
+                seed, before, there, state.log_weights, lambda a, b: model.log_step(a, b, epoch, levels),
+                after.ancestor_indices,
+            )  # fmt: skip
+            chosen = jnp.where(really & ~epoch.first, chosen, after.ancestor_indices)
+            x0, carried = jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], (before, sums))
+            added = jax.vmap(lambda a, b: functional(a, b, epoch))(x0, there)
+            parts.append(jax.tree.map(lambda s, h: s + jnp.where(really, h, 0.0), carried, added))
+        sums = jax.tree.map(lambda *leaves: sum(leaves) / draws, *parts)
+        return (after, sums), None
+
+    first = first._replace(model_inputs=(_row(epochs, 0), there[0]))
+    (last, sums), _ = jax.lax.scan(one, (first, sums), (epochs, there, jax.random.split(keys[1], len(there))))
+    weights = jax.nn.softmax(last.log_weights)
+    return jax.tree.map(lambda leaf: jnp.tensordot(weights, leaf, 1), sums), last.log_normalizing_constant
+
+
+def _row(tree: Any, k: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[k], tree)

@@ -1,0 +1,189 @@
+"""Smoothed particles of all targets at the epochs of a model, and what they say of states, biases and levels."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from probcal.model.model import At, Model, scaled
+from probcal.particle.backward import smooth
+from probcal.particle.filtering import run_filter
+from probcal.particle.settings import Particles
+from probcal.particle.targets import Targets, by_target, place_by_epoch
+
+AT_ONCE = 25  # paths whose rows are linearised together
+
+
+class Ensemble(NamedTuple):
+    """Smoothed particles of every recursion: N at each of E epochs, in the order of the recursion."""
+
+    states: tuple[Any, ...]  # (E, N) leading
+    weights: tuple[jax.Array, ...]  # (E, N)
+    log_evidence: jax.Array  # () of all targets
+    lost: tuple[jax.Array, ...]  # (E,) whether no particle could have given the rows of an epoch
+
+
+class Moments(NamedTuple):
+    """What rows see of the states of one recursion."""
+
+    mean: jax.Array  # (E, n)
+    variance: jax.Array  # (E, n)
+
+
+class Expectation(NamedTuple):
+    """Of the log-likelihood by biases z and log levels, smoothed particles in the place of the states."""
+
+    score: jax.Array  # (M,)
+    information: jax.Array  # (M, M) at given states, expected over them
+    spread: jax.Array  # (M, M) covariance of the score over the paths: what the states take away (Louis 1982)
+
+
+@partial(jax.jit, static_argnames="how")
+def ensemble(
+    model: Model, targets: tuple[Targets, ...], z: jax.Array, levels: jax.Array, key: jax.Array, how: Particles
+) -> Ensemble:
+    """Filter and smooth every target of a model."""
+    found: list[Any] = []
+    for r, own in enumerate(targets):
+
+        def one(epochs: Any, there: jax.Array, key: jax.Array, own: Targets = own) -> Any:
+            keys = jax.random.split(key)
+            filtered = run_filter(own.model, epochs, there, z, levels, keys[0], how)
+            return smooth(own.model, filtered, epochs, there, levels, keys[1], how)
+
+        seeds, E = jax.random.split(jax.random.fold_in(key, r), len(own.there)), model.recursions[r].time.shape[0]
+        smoothed = jax.vmap(one)(own.epochs, own.there, seeds)
+        put = partial(place_by_epoch, own.index, E=E)
+        states = jax.tree.map(lambda leaf, put=put: put(leaf[:, :, :, 0]), smoothed.states[0])
+        found.append((states, put(smoothed.weights), jnp.sum(smoothed.log_evidence), put(smoothed.lost)))
+    states, weights, evidence, lost = zip(*found, strict=True)
+    return Ensemble(states, weights, sum(evidence), lost)
+
+
+@jax.jit
+def moments(model: Model, found: Ensemble) -> tuple[Moments, ...]:
+    """Mean and variance of what rows see of the states of each recursion."""
+    parts = []
+    for r, (states, weights) in enumerate(zip(found.states, found.weights, strict=True)):
+        seen = jax.vmap(partial(model.vectors, r))(states)  # (E, N, n)
+        mean = jnp.einsum("en,enu->eu", weights, seen)
+        parts.append(Moments(mean, jnp.einsum("en,enu->eu", weights, (seen - mean[:, None]) ** 2)))
+    return tuple(parts)
+
+
+@partial(jax.jit, static_argnames="place")
+def nearest_states(model: Model, found: Ensemble, place: tuple[slice, ...]) -> tuple[Any, ...]:
+    """States (E leading) that stand for the particles: their mean, or, of a motion without linear form, the particle
+    whose position is nearest to the mean position, so that it is on the road (Paper A 43).
+
+    `place` says which entries of what rows see are the position, of each recursion.
+    """
+    chosen = []
+    for r, (states, weights) in enumerate(zip(found.states, found.weights, strict=True)):
+        if model.sampled[r] is None:
+            chosen.append(jnp.einsum("en,enu->eu", weights, states))
+            continue
+        where = jax.vmap(partial(model.vectors, r))(states)[:, :, place[r]]
+        middle = jnp.einsum("en,enu->eu", weights, where)
+        away = jnp.sum((where - middle[:, None]) ** 2, 2)
+        best = jnp.argmin(jnp.where(weights > 0, away, jnp.inf), 1)
+        chosen.append(jax.tree.map(lambda leaf, k=best: jax.vmap(lambda own, j: own[j])(leaf, k), states))
+    return tuple(chosen)
+
+
+def at_states(model: Model, states: tuple[Any, ...], z: jax.Array, levels: jax.Array) -> Expectation:
+    """Score and information of the biases at single states, of no spread (Paper A 16-20)."""
+    information, score = model.of_biases(model.linearise_biases(At(states, z, levels), expected=True))
+    return Expectation(score, information, jnp.zeros_like(information))
+
+
+def over_paths(model: Model, found: Ensemble, z: jax.Array, levels: jax.Array) -> Expectation:
+    """Score, information and spread of the score of the biases over smoothed particles.
+
+    The spread has a meaning where the particles form paths, all of one weight.
+    """
+    N, M = found.weights[0].shape[1], model.biases
+    count = -(-N // AT_ONCE)
+
+    def one(n: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        there = n < N
+        k = jnp.minimum(n, N - 1)
+        states = tuple(jax.tree.map(lambda leaf: leaf[:, k], own) for own in found.states)
+        lins = model.linearise_biases(At(states, z, levels), expected=True)
+        shares = [
+            jnp.where(there, found.weights[r][data.epoch, k], 0.0)[:, None]
+            for data, r in zip(model.rows, model.recursion, strict=True)
+        ]
+        information, score = model.of_biases(scaled(lins, shares))
+        return information, score, jnp.where(there, score * N, 0.0)
+
+    def some(carry: tuple[jax.Array, ...], k: jax.Array) -> tuple[tuple[jax.Array, ...], None]:
+        information, score, each = jax.vmap(one)(k * AT_ONCE + jnp.arange(AT_ONCE))
+        added = (jnp.sum(information, 0), jnp.sum(score, 0), each.T @ each / N)
+        return tuple(a + b for a, b in zip(carry, added, strict=True)), None
+
+    blank = (jnp.zeros((M, M)), jnp.zeros(M), jnp.zeros((M, M)))
+    (information, score, square), _ = jax.lax.scan(some, blank, jnp.arange(count))
+    return Expectation(score, information, square - score[:, None] * score[None, :])
+
+
+def log_likelihood_over(model: Model, found: Ensemble, z: jax.Array, levels: jax.Array) -> jax.Array:
+    """Log-likelihood () of all rows expected over smoothed particles."""
+    N = found.weights[0].shape[1]
+
+    def one(n: jax.Array) -> jax.Array:
+        k, there = jnp.minimum(n, N - 1), n < N
+        states = tuple(jax.tree.map(lambda leaf: leaf[:, k], own) for own in found.states)
+        parts = zip(model.rows, model.recursion, model.log_likelihood(At(states, z, levels)), strict=True)
+        return sum(
+            (
+                jnp.sum(jnp.where(there, found.weights[r][data.epoch, k], 0.0)[:, None] * part)
+                for data, r, part in parts
+            ),
+            jnp.zeros(()),
+        )
+
+    def some(total: jax.Array, k: jax.Array) -> tuple[jax.Array, None]:
+        return total + jnp.sum(jax.vmap(one)(k * AT_ONCE + jnp.arange(AT_ONCE))), None
+
+    return jax.lax.scan(some, jnp.zeros(()), jnp.arange(-(-N // AT_ONCE)))[0]
+
+
+def log_motion_over(targets: tuple[Targets, ...], found: Ensemble, levels: jax.Array) -> jax.Array:
+    """Log density () of the steps of all targets expected over paths: by it the levels of process noise are learnt."""
+    total = jnp.zeros(())
+    for own, states, weights in zip(targets, found.states, found.weights, strict=True):
+        paths = jax.tree.map(lambda leaf, own=own: by_target(own.index, leaf), (states, weights))
+
+        def step(before: Any, after: Any, epoch: Any, own: Targets = own) -> jax.Array:
+            x, y = (jax.tree.map(lambda leaf: leaf[None], part) for part in (before, after))
+            return own.model.log_step((x,), (y,), epoch, levels)
+
+        def along(path: Any, epochs: Any, there: jax.Array, step: Any = step) -> jax.Array:
+            states, weights = path
+            old, new = (jax.tree.map(lambda leaf, c=c: leaf[c], states) for c in (slice(None, -1), slice(1, None)))
+            later = jax.tree.map(lambda leaf: leaf[1:], epochs)
+            each = jax.vmap(jax.vmap(step, (0, 0, None)))(old, new, later)
+            return jnp.sum(jnp.where(there[1:, None], each, 0.0) * weights[1:])
+
+        if own.there.shape[1] > 1:
+            total = total + jnp.sum(jax.vmap(along)(paths, own.epochs, own.there))
+    return total
+
+
+def moved_levels(
+    model: Model, targets: tuple[Targets, ...], found: Ensemble, z: jax.Array, levels: jax.Array
+) -> jax.Array:
+    """One Newton step of the log levels up their expectation over paths, with their log-normal prior."""
+
+    def value(levels: jax.Array) -> jax.Array:
+        prior = -0.5 * jnp.sum((levels / model.level_spread) ** 2)
+        motion = log_motion_over(targets, found, levels) if model.driven else 0.0
+        return log_likelihood_over(model, found, z, levels) + motion + prior
+
+    slope, curvature = jax.grad(value)(levels), jnp.diagonal(jax.jacfwd(jax.jacfwd(value))(levels))
+    step = slope / jnp.maximum(-curvature, 1.0 / model.level_spread**2)
+    return levels + jnp.clip(jnp.where(jnp.isfinite(step), step, 0.0), -1.0, 1.0)

@@ -1,0 +1,122 @@
+"""Road networks from files: GeoJSON and GraphML."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from probcal.errors import InputError
+from probcal.geodesy import LocalFrame
+from probcal.roads.checks import as_points
+from probcal.roads.coordinates import WGS84, projection
+from probcal.roads.extra import networkx
+from probcal.roads.graphs import direction, name_of, unique
+from probcal.roads.network import RoadNetwork, joined
+
+
+def read_roads(
+    path: str | PathLike[str],
+    *,
+    frame: LocalFrame | None = None,
+    crs: Any = None,
+    dimension: int | None = None,
+    snap: float = 0.01,
+    connected: bool = True,
+    bridges: Collection[str] = (),
+) -> RoadNetwork:
+    """Read a road network from GeoJSON (.geojson, .json) or GraphML (.graphml), as osmnx and GIS programs write them.
+
+    Coordinates are in `crs`, by default what the file states; GeoJSON that states none is longitude and latitude
+    (RFC 7946). Those need a `frame` that takes them to metres; projected ones are metres without one, and
+    `crs="local"` says that the coordinates are metres already. Heights count where every point has one, but with
+    `dimension=2`. Lines are named by name, id or osmid, one-way by oneway (yes, no, -1); what is no line is skipped.
+    The other arguments are those of `RoadNetwork.from_lines`. Raises `InputError` naming file and edge.
+    """
+    path = Path(path)
+    try:
+        if path.suffix.lower() == ".graphml":
+            return _graphml(path, frame, crs, dimension, snap, connected, bridges)
+        if path.suffix.lower() in (".geojson", ".json"):
+            return _geojson(path, frame, crs, dimension, snap, connected, bridges)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from None
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from None
+    raise InputError(f"{path.name}: roads are read from .geojson, .json or .graphml")
+
+
+def _graphml(path: Path, frame: Any, crs: Any, dimension: Any, snap: float, connected: bool, bridges: Any) -> Any:
+    """The network of a GraphML file."""
+    import xml.etree.ElementTree as xml
+
+    if not path.read_text().strip():
+        raise InputError("the file is empty")
+    try:
+        graph = networkx.read_graphml(path)
+    except (xml.ParseError, networkx.NetworkXError, ValueError, KeyError) as error:
+        raise InputError(f"the file is no GraphML: {error}") from None
+    for _, data in graph.nodes(data=True):
+        if isinstance(data.get("pos"), str):
+            data["pos"] = data["pos"].strip("()[] ").replace(",", " ").split()
+    return RoadNetwork.from_graph(
+        graph, frame=frame, crs=crs, dimension=dimension, snap=snap, connected=connected, bridges=bridges
+    )
+
+
+def _geojson(path: Path, frame: Any, crs: Any, dimension: Any, snap: float, connected: bool, bridges: Any) -> Any:
+    """The network of a GeoJSON file."""
+    text = path.read_text(encoding="utf-8")
+    if not text.strip():
+        raise InputError("the file is empty")
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"the file is no JSON: {error}") from None
+    names, lines, ways, over = _features(content)
+    d = dimension or min(line.shape[1] for line in lines)
+    if min(line.shape[1] for line in lines) < d:
+        raise InputError("some points have no height; give every point one, or dimension=2")
+    stated = content.get("crs") if crs is None else crs
+    if isinstance(stated, dict):
+        stated = (stated.get("properties") or {}).get("name")
+    to_metres = projection(WGS84 if stated is None else stated, frame)
+    points = to_metres(np.concatenate([line[:, :d] for line in lines]))
+    lines = np.split(points, np.cumsum([len(line) for line in lines])[:-1])
+    lines = [line[::-1] if way < 0 else line for line, way in zip(lines, ways, strict=True)]
+    names = unique(names)
+    bridged = [name for name, high in zip(names, over, strict=True) if high]
+    pieces = joined(names, lines, [way != 0 for way in ways], snap, bridged)
+    return RoadNetwork.from_pieces(pieces, snap, connected, bridges)
+
+
+def _features(content: Any) -> tuple[list[str], list[np.ndarray], list[int], list[bool]]:
+    """Names, lines, ways (1, -1 or 0) and whether it is a bridge, of every line of a GeoJSON object."""
+    if not isinstance(content, dict):
+        raise InputError("the file is no GeoJSON object; give a FeatureCollection of LineString features")
+    features = content.get("features", [content] if content.get("type") == "Feature" else [])
+    names: list[str] = []
+    lines: list[np.ndarray] = []
+    ways: list[int] = []
+    over: list[bool] = []
+    for k, feature in enumerate(features if isinstance(features, list) else []):
+        feature = feature if isinstance(feature, dict) else {}
+        geometry, own = feature.get("geometry") or {}, feature.get("properties") or {}
+        kind, parts = geometry.get("type"), geometry.get("coordinates") or []
+        if kind not in ("LineString", "MultiLineString"):
+            continue
+        name = name_of({**own, "feature": feature.get("id")}, ("name", "id", "osmid", "feature"), str(k))
+        for part in [parts] if kind == "LineString" else parts:
+            names.append(name)
+            lines.append(as_points(name, part))
+            ways.append(direction(name, own.get("oneway")))
+            over.append(any(name_of(own, (key,), "no") != "no" for key in ("bridge", "tunnel")))
+    if not lines:
+        raise InputError("the file has no LineString or MultiLineString feature; a network needs at least one")
+    return names, lines, ways, over
