@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         Cubature,
         Extended,
         LeastSquares,
+        ParticleGibbs,
         Unscented,
         coverage_table,
         fit,
@@ -60,10 +61,12 @@ if TYPE_CHECKING:
     from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
     from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
     from probcal.problem import Problem
+    from probcal.particle.settings import Particles
     from probcal.results.drifts import drift_table
     from probcal.results.io import load, save
     from probcal.results.read import outliers, summary, tracks
     from probcal.results.scores import add_scores, scores
+    from probcal.roads import LeavingRoad, Road, RoadNetwork, match_track, read_roads
     from probcal.sensor import Bias, Channel, Drift, Sensor, SensorType, sensor
     from probcal.simulate import Simulation, Truth, simulate
     from probcal.table import read_table
@@ -80,7 +83,7 @@ __all__ = lazy(
         "probcal.errors": "FitError InputError",
         "probcal.geodesy": "LocalFrame",
         "probcal.inference": (
-            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares Unscented coverage_table fit "
+            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares ParticleGibbs Unscented coverage_table fit "
             "log_evidence numpyro_model sbc study track"
         ),
         "probcal.motion": (
@@ -89,8 +92,10 @@ __all__ = lazy(
         "probcal.network": "Network Node Path",
         "probcal.nodes": "read_nodes write_nodes",
         "probcal.noise": "Bernoulli Mixture StudentT Unknown",
+        "probcal.particle.settings": "Particles",
         "probcal.priors": "ARD BernoulliGaussian Flat Gaussian Horseshoe Laplace",
         "probcal.problem": "Problem",
+        "probcal.roads": "LeavingRoad Road RoadNetwork match_track read_roads",
         "probcal.sensor": "Bias Channel Drift Sensor SensorType sensor",
         "probcal.simulate": "Simulation Truth simulate",
         "probcal.table": "read_table",

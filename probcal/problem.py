@@ -254,6 +254,17 @@ class Problem:
         other.model = self.model.with_mixing(weights)
         return other
 
+    def loosened(self) -> Problem | None:
+        """The same problem with motions of a linear form that hold its own loosely; None where one has none."""
+        motions = {}
+        for name in self.measurements.target_names:
+            target = self.target(name)
+            found = as_motion(target.motion).within(self.longest).loose() if as_motion(target.motion).split[1] else ()
+            if found is None:
+                return None
+            motions[name] = Target(found[0], {**found[1], **target.start}) if found else target
+        return Problem(self.network, motions, self.measurements.table, fix=self.fixed, epoch=self.epoch)
+
     def seen(self) -> Problem:
         """The same problem where states are what rows see of them, (E, n) whatever the motion."""
         other = copy(self)
@@ -297,6 +308,7 @@ class Problem:
     def _compile(self, begun: Mapping[str, float] = MappingProxyType({})) -> None:
         """Arrays of the rows; the targets in `begun` go on from an earlier epoch at that time."""
         levels = Levels(self.levels if begun else ())
+        self.longest = self._longest(begun)
         forms = self._forms(levels)
         chained = [self._chained(layout, names, levels, begun) for (layout, _), names in forms.items()]
         self.epochs = [own.epochs for own in chained]
@@ -329,11 +341,28 @@ class Problem:
             may_alias=False,
         )
 
+    def _longest(self, begun: Mapping[str, float]) -> float:
+        """The longest time in s between two epochs of a target; of rows that come later, what it was before them."""
+        data, longest = self.measurements, 0.0
+        for n, name in enumerate(data.target_names):
+            times = np.unique(data.time[data.target == n])
+            longest = max(longest, float(np.diff(times, prepend=begun.get(name, times[0])).max()))
+        if not begun:
+            return longest or 1.0
+        beyond = any(as_motion(self.target(name).motion).split[1] for name in data.target_names)
+        if beyond and longest > self.longest * (1 + 1e-9):
+            raise InputError(
+                f"later: {longest:g} s pass between two epochs, more than the {self.longest:g} s for which the motion"
+                " was made ready; build a new Problem from all rows"
+            )
+        return self.longest
+
     def _forms(self, levels: Levels) -> dict[tuple[Layout, SampledMotion | None], list[str]]:
         """The targets whose states are alike, by layout and motion without linear form: one recursion each."""
         forms: dict[tuple[Layout, SampledMotion | None], list[str]] = {}
         for name in self.measurements.target_names:
-            layout, sampled = form_of(name, as_motion(self.target(name).motion), levels, self.network.dimension)
+            motion = as_motion(self.target(name).motion).within(self.longest)
+            layout, sampled = form_of(name, motion, levels, self.network.dimension)
             if "position" not in {component for component, *_ in layout}:
                 raise InputError(f'target "{name}": the motion has no position; add ConstantVelocity(std) or Static()')
             forms.setdefault((layout, sampled), []).append(name)

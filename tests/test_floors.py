@@ -15,21 +15,23 @@ FLOORS = {
     0: ("linalg", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files", "status"),
     1: ("sensor", "motion", "priors", "noise"),
     2: ("sensors",),
-    3: ("geodesy", "network", "table", "nodes", "plausible"),
+    3: ("geodesy", "network", "table", "nodes", "plausible", "roads"),
     4: ("model", "problem", "simulate"),
-    5: ("smoothing",),
+    5: ("smoothing", "particle"),
     6: ("identifiability", "results"),
     7: ("inference",),
     8: ("analysis",),
     9: ("cli", "report", "plots", "diagnostics"),
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
-METHODS = tuple(f"inference.{name}" for name in ("ea", "em", "collapsed", "nuts", "svi"))  # algorithms
+METHODS = tuple(
+    f"inference.{name}" for name in ("ea", "em", "collapsed", "nuts", "particle_gibbs", "svi")
+)  # algorithms
 SHARED = tuple(
     f"inference.{name}"
     for name in (
         "run", "ending", "sampler", "sampling", "chains", "posterior", "hierarchy", "posed", "pose", "gibbs",
-        "coordinates", "guides", "psis", "leaps", "sides", "mixed",
+        "coordinates", "guides", "psis", "leaps", "sides", "mixed", "particle_em", "weighted",
     )
 )  # fmt: skip  # what they share: it knows none of them
 LOW = {"jax", "numpy", "filelock"}  # third parties of floor 0, besides the standard library

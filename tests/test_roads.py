@@ -23,6 +23,7 @@ from probcal.motion.base import Joint
 from probcal.roads import LeavingRoad, Road, RoadNetwork, match_track, read_roads
 from probcal.roads.extra import Extra
 from probcal.roads.paths import path_table
+from probcal.roads.place import draw_place, log_masses
 
 ALARM = 1e-4  # false-alarm rate of a chi-square test
 LEGENDRE = np.polynomial.legendre.leggauss(12)
@@ -136,6 +137,48 @@ def test_the_start_sums_to_one_and_agrees_with_draws(position):
     assert not network.oneway.all()
     turned = expected.sum(1)[network.oneway]
     assert (turned[:, 0] < 0.7 * turned[:, 1]).all()  # forward but for the sd of the speed
+
+
+def test_draws_on_one_piece_are_truncated_normal():
+    """By Kolmogorov and Smirnov, false alarm 1e-4: beside either half, four sd and forty beyond an end."""
+    network = RoadNetwork.from_lines({"a": [(0, 0), (100, 0)]})
+
+    @jax.jit
+    def draw(mean, std):
+        masses = log_masses(network, mean, std)
+        keys = jax.random.split(jax.random.key(0), 2000)
+        return masses, jax.vmap(lambda key: draw_place(key, network, mean, std, masses)[1])(keys)
+
+    for x, y, std in ((20.0, 3.0, 25.0), (85.0, 3.0, 25.0), (-8.0, 0.0, 2.0), (180.0, 0.0, 2.0), (-80.0, 0.0, 2.0)):
+        with jax.enable_x64(True):
+            masses, along = (np.asarray(part) for part in draw(np.array([x, y]), std))
+        exact = stats.truncnorm(-x / std, (100 - x) / std, x, std)
+        assert stats.kstest(along, exact.cdf).pvalue > ALARM
+        sides = stats.norm.logsf(
+            np.abs([x, 100 - x]) / std
+        )  # the tails beyond both ends, or the nearer less the farther
+        inside = (
+            np.log1p(-np.exp(sides).sum())
+            if 0 < x < 100
+            else sides.max() + np.log1p(-np.exp(sides.min() - sides.max()))
+        )
+        assert masses == pytest.approx([inside + stats.norm(0, std).logpdf(y)], rel=1e-9)
+
+
+def test_a_one_way_edge_is_never_entered_at_its_end():
+    """Neither by draws nor by the density, though one already on it may go back."""
+    network = RoadNetwork.from_lines(T_SHAPE | {"east": T_SHAPE["east"][::-1]}, oneway="east")
+    road = Road(network, 2.0, (0.0, 1.0), reach=90.0)
+    before = {"edge": 0, "along": 50.0, "speed": 3.0}
+    with jax.enable_x64(True):
+        draw = jax.jit(jax.vmap(lambda key, x: road.sample(key, x, 3.0, {}), (0, None)))
+        density = jax.jit(lambda x, y: road.log_density(x, y, 3.0, {}))
+        keys = jax.random.split(jax.random.key(0), 500)
+        assert set(np.asarray(draw(keys, before)["edge"])) == {0, 2}
+        assert density(before, {"edge": 1, "along": 49.0, "speed": -3.0}) == -np.inf
+        assert 1 in np.asarray(draw(keys, {"edge": 1, "along": 20.0, "speed": -1.0})["edge"])
+        assert density({"edge": 1, "along": 20.0, "speed": -1.0}, {"edge": 1, "along": 17.0, "speed": -1.0}) > -20
+        assert density(before, {"edge": 0, "along": 60.1, "speed": 3.0}) == -np.inf  # beyond its end
 
 
 def test_one_long_road_is_constant_velocity_in_one_dimension():
@@ -394,6 +437,13 @@ def test_the_probability_of_joining_is_that_of_a_road_underfoot():
             cv = stats.multivariate_normal(np.zeros(2), 4.0 * np.array([[8 / 3, 2.0], [2.0, 2.0]])).logpdf
             join = (1 - np.exp(-0.6)) * np.exp(-(h**2) / (2 * s**2))
             assert away == pytest.approx(np.log1p(-join) + 2 * cv([0.0, 0.0]), rel=1e-9)
+        lines = {f"{k}": [(0, 0), end] for k, end in enumerate([(5e3, 0), (-5e3, 0), (0, 5e3), (0, -5e3)])}
+        cross = Road(RoadNetwork.from_lines(lines), 1.0, (1.0, 1.0), reach=50.0)
+        for join in (0.3, 50.0):  # where roads cross there is twice as much road: no more than all, and never all
+            motion = LeavingRoad(cross, 2.0, leave=0.1, join=join)
+            x = {**STATES["near"], "position": np.zeros(2), "velocity": np.zeros(2)}
+            away = float(jax.jit(lambda x, motion=motion: motion.log_density(x, x, 2.0, {}))(x))
+            assert away == pytest.approx(max(-2 * join, np.log(1e-12)) + 2 * cv([0.0, 0.0]), rel=1e-4)
 
 
 def test_leaving_roads_starts_on_or_off_and_has_finite_gradients():
@@ -655,6 +705,11 @@ def test_graphs_as_osmnx_makes_them_and_back(tmp_path):
     lone = nx.DiGraph([("a", "b")])
     nx.set_node_attributes(lone, {"a": (0.0, 0.0), "b": (30.0, 40.0)}, "pos")
     assert RoadNetwork.from_graph(lone).oneway.all()
+    lone.edges["a", "b"]["geometry"] = [(30, 40), (20, 10), (0, 0)]  # from its end to its start
+    np.testing.assert_array_equal(RoadNetwork.from_graph(lone).lines[0], [(0, 0), (20, 10), (30, 40)])
+    del lone.edges["a", "b"]["geometry"]
+    lone.add_edge("b", "a")
+    assert RoadNetwork.from_graph(lone).oneway.tolist() == [False]
 
 
 def graph_of(change):
@@ -731,6 +786,19 @@ def test_a_noisy_drive_is_matched_to_its_road():
     assert plane["along"].isna().all()
     assert list(ghost["status"]) == ["matched"] * 3 + ["unreachable", "matched after a gap", "matched"]
     assert list(found.columns) == ["time", "target", "edge", "along", "position_x", "position_y", "distance", "status"]
+
+
+def test_matching_drives_as_the_roads_allow():
+    """Back along a two-way road and round by another; never back along a one-way road."""
+    network, *_ = drive()
+    north = [(x, 12.0) for x in range(140, 0, -20)]
+    places = {"bus": north + [(x, 0.0) for x in range(20, 160, 20)], "wrong": [(490, -81), (460, -54), (430, -27)]}
+    rows = [(float(k), name, *place) for name, own in places.items() for k, place in enumerate(own)]
+    frame = pd.DataFrame(rows, columns=["time", "target", "position_x", "position_y"])
+    found = match_track(frame, network, std=5.0)
+    assert list(found["edge"][:14]) == ["north"] * 7 + ["south"] * 7
+    np.testing.assert_allclose(found["distance"][:14], 0, atol=1e-9)
+    assert list(found["status"][14:]) == ["unreachable"] * 3
 
 
 def test_a_track_is_taken_from_a_tree_and_checked():

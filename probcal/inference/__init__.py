@@ -8,7 +8,18 @@ if TYPE_CHECKING:
     from probcal.inference.coverage import coverage_table
     from probcal.inference.evidence import Evidence, log_evidence
     from probcal.inference.fit import calibrate, fit, track
-    from probcal.inference.methods import EA, EM, EMEA, MAP, METHODS, NUTS, Collapsed, LeastSquares, table
+    from probcal.inference.methods import (
+        EA,
+        EM,
+        EMEA,
+        MAP,
+        METHODS,
+        NUTS,
+        Collapsed,
+        LeastSquares,
+        ParticleGibbs,
+        table,
+    )
     from probcal.inference.model import numpyro_model
     from probcal.inference.run import Method
     from probcal.inference.sbc import sbc
@@ -22,7 +33,7 @@ __all__ = lazy(
         "probcal.inference.coverage": "coverage_table",
         "probcal.inference.evidence": "Evidence log_evidence",
         "probcal.inference.fit": "calibrate fit track",
-        "probcal.inference.methods": "EA EM EMEA MAP METHODS NUTS Collapsed LeastSquares table",
+        "probcal.inference.methods": "EA EM EMEA MAP METHODS NUTS Collapsed LeastSquares ParticleGibbs table",
         "probcal.inference.model": "numpyro_model",
         "probcal.inference.run": "Method",
         "probcal.inference.sbc": "sbc",

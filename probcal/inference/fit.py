@@ -22,8 +22,10 @@ from probcal.inference.progress import OnProgress
 from probcal.inference.run import Context, Method
 from probcal.inference.solve import solve
 from probcal.inference.storage import Storage
+from probcal.inference.weighted import track_by_particles
+from probcal.particle.settings import Particles
 from probcal.priors import Prior
-from probcal.problem import Problem
+from probcal.problem import Problem, check_linear
 from probcal.results.answer import Answer, tracks_of, uncalibrated
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
 from probcal.results.read import apply
@@ -220,11 +222,16 @@ def _kept(save: Collection[str]) -> tuple[str, ...]:
 
 
 @float64
-def track(problem: Problem, calibration: xr.DataTree) -> xr.DataTree:
+def track(
+    problem: Problem, calibration: xr.DataTree, *, smoother: Particles | None = None, key: Key = 0
+) -> xr.DataTree:
     """Tracks of other data with a calibration applied: a tree with group `track` (mean, sd, before).
 
-    The biases are held at the calibrated means; the sd carries their covariance. Biases are matched by label;
-    raises `InputError` if the calibration lacks one.
+    The biases are held at the calibrated means; the sd carries their covariance. Biases are matched by label. Without
+    a `smoother` each track is its mode and the Gaussian about it; `Particles(2000)` filters and smooths any motion, a
+    road too, by draws that `key` seeds, and says in the attributes `status` and `message` whether some target's rows
+    are explained by no path. Raises `InputError` if the calibration lacks a bias, and where a motion has no linear
+    form and there is no smoother.
 
     >>> later = track(Problem(network, motion, run.table), tree)
     >>> later["track/target"]["mean"].dims
@@ -232,6 +239,11 @@ def track(problem: Problem, calibration: xr.DataTree) -> xr.DataTree:
     """
     found = apply(problem, calibration)
     problem, covariance = found.problem, jnp.asarray(found.covariance)
+    if smoother is not None:
+        if not isinstance(smoother, Particles):
+            raise InputError(f"track(smoother={smoother!r}): give Particles(2000), or None for the Gaussian smoother")
+        return track_by_particles(problem, smoother, found.z, found.covariance, found.levels, as_key(key))
+    check_linear(problem)
     start = at_levels(problem.model, automatic_start(problem), jnp.asarray(found.levels))
     before = track_mode(problem, uncalibrated(start))
     after = track_mode(problem, start._replace(z=jnp.asarray(found.z)))

@@ -12,6 +12,7 @@ from probcal.inference.collapsed import Collapsed
 from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
 from probcal.inference.nuts import NUTS
+from probcal.inference.particle_gibbs import ParticleGibbs
 from probcal.inference.run import Method
 from probcal.inference.svi import SVI
 from probcal.lazy import Later
@@ -43,6 +44,7 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
     "collapsed": (Collapsed(), None),
     "collapsed-spike": (Collapsed(), BernoulliGaussian()),
     "nuts": (NUTS(), None),
+    "particle-gibbs": (ParticleGibbs(), None),
     "svi": (SVI(), None),
     "svi-mean-field": (SVI(guide="mean-field"), None),
     "svi-low-rank": (SVI(guide="low-rank"), None),

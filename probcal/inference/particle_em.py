@@ -112,7 +112,7 @@ def iterate(
 
 def _averaged(state: Climb, expected: Expectation, how: Particles) -> Climb:
     """The state with what this pass says of the biases, averaged with earlier ones if that is asked for."""
-    share = 1.0
+    share = jnp.ones(())
     if how.m_step == "averaged":
         passed = state.k - how.tempered - SETTLING
         share = jnp.where(passed < 0, 1.0, (1.0 + jnp.maximum(passed, 0)) ** -POWER)
@@ -170,6 +170,29 @@ def _correlation(trace: np.ndarray) -> np.ndarray:
     return (1 + r) / (1 - r)
 
 
+def climb(problem: Problem, how: Particles, prior: Prior, z: Any, iterations: int, key: jax.Array) -> Climb:
+    """Where the loop stands after some iterations from biases z (M,) under a prior: a start for a sampler."""
+    given = Given(
+        prior.precision(problem.labels, problem.surveyed), jnp.asarray(problem.surveyed),
+        jnp.arange(problem.model.biases), jnp.zeros(()),
+    )  # fmt: skip
+    state, targets = _begun(problem, given, z, key), prepared(problem, how)
+    while int(state.k) < iterations:
+        state, _ = chunk(
+            problem.model, targets, bare(prior), given, state, jnp.asarray(iterations), how, places(problem)
+        )
+    return state
+
+
+def _begun(problem: Problem, given: Given, z: Any, key: jax.Array) -> Climb:
+    """The state before the first iteration."""
+    M = problem.model.biases
+    return Climb(
+        jnp.asarray(z, float), jnp.zeros(problem.model.level_spread.shape), given.prior.alpha, jnp.zeros((M, M)),
+        jnp.zeros(M), jnp.zeros((), int), key,
+    )  # fmt: skip
+
+
 def climb_by_particles(
     problem: Problem, method: Maximiser, how: Particles, prior: Prior, z: Any, context: Context
 ) -> Answer:
@@ -178,16 +201,13 @@ def climb_by_particles(
     targets = prepared(problem, how)
     how = replace(how, tempered=0) if np.any(np.asarray(z)) else how  # a start that is known is not left again
     model, given, place = problem.model, given_of(method, problem, prior), places(problem)
-    M, keys = model.biases, jax.random.split(context.key)
-    state = Climb(
-        jnp.asarray(z), jnp.zeros(model.level_spread.shape), given.prior.alpha, jnp.zeros((M, M)), jnp.zeros(M),
-        jnp.zeros((), int), keys[0],
-    )  # fmt: skip
+    keys = jax.random.split(context.key)
+    state = _begun(problem, given, z, keys[0])
     parts: list[Trace] = []
     count, known, still = 0, bare(prior), Wandering(False, 0, np.inf)
     while count < method.iterations:
         state, part = chunk(model, targets, known, given, state, jnp.asarray(method.iterations), how, place)
-        part = jax.tree.map(lambda leaf: np.asarray(leaf)[: method.iterations - count], part)
+        part = Trace(*(np.asarray(leaf)[: method.iterations - count] for leaf in part))
         parts.append(part)
         count += len(part.log_likelihood)
         if not np.isfinite(part.z).all():

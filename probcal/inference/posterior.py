@@ -14,6 +14,7 @@ from probcal.inference.ending import ABSURD, FAR, misfit_sentence
 from probcal.inference.hierarchy import LEAST, MOST, SpikeAndSlab
 from probcal.inference.mixed import ESS, R_HAT, UNSURE, mixing, weights_of_sides, within_sides
 from probcal.inference.pose import pareto_khat
+from probcal.inference.posed import Posed
 from probcal.inference.sampling import SamplerRun
 from probcal.priors import PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
@@ -52,10 +53,15 @@ class Chains(Posterior):
         precision = np.where(problem.surveyed | isinstance(prior, Flat), np.asarray(run.posed.first.alpha), precision)
         summary = Summary(
             "exact" if run.method.exact else "variational", "sampled", z.mean((0, 1)), covariance, lower, upper, gamma,
-            precision, np.asarray(run.posed.frame.information)[:M, :M], run.levels.mean((0, 1)), None,
+            precision, np.asarray(run.posed.information)[:M, :M], run.levels.mean((0, 1)), None,
             _columns(run, mixed, M),
         )  # fmt: skip
-        return cls(problem, prior, mean_point(problem, run), summary, run)
+        return cls(problem, prior, cls.point_of(problem, run), summary, run)
+
+    @classmethod
+    def point_of(cls, problem: Problem, run: SamplerRun) -> Point:
+        """Posterior means of biases and levels, and the trajectories there."""
+        return mean_point(problem, run)
 
     @property
     def here(self) -> tuple[np.ndarray, np.ndarray]:
@@ -104,18 +110,19 @@ class Chains(Posterior):
     def attrs(self) -> Mapping[str, float]:
         """Seconds, the frame's worth, and the limits used."""
         run = self.run
-        found = {"seconds": run.seconds, "rope": ROPE, "frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
-        found |= {"frame_acceptance": run.worth.acceptance}
-        found |= {"thin": run.thin}
+        found: dict[str, Any] = {"seconds": run.seconds, "rope": ROPE, "thin": run.thin}
+        if run.worth is not None:
+            found |= {"frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
+            found |= {"frame_acceptance": run.worth.acceptance}
         if not run.method.exact:
             found["khat"] = pareto_khat(_stats(run)["log_weight"].ravel())
         return {name: float(value) for name, value in found.items()}
 
 
-def conclude_draws(problem: Problem, prior: Prior, run: SamplerRun) -> Answer:
+def conclude_draws(problem: Problem, prior: Prior, run: SamplerRun, kind: type[Chains] = Chains) -> Answer:
     """The answer of a sampler's run."""
     mixed = mixing(within_sides(np.asarray(run.draws.theta), run.side))
-    posterior = Chains.of(problem, prior, run, mixed)
+    posterior = kind.of(problem, prior, run, mixed)
     status, message = judge_chains(problem, prior, run, mixed, posterior.point)
     ended = _bias_status(problem, mixed, run.form.biases)
     return Answer(
@@ -138,15 +145,21 @@ def _mirrors(run: SamplerRun) -> tuple[Mirrored, ...]:
         if k != first:
             other = run.sides[int(k or first) - 1]  # of the first side, what was reflected to leave it
             shift = run.z[run.side == k].mean(0) - middle
-            point = other.point if k else run.posed.frame.point
+            point = other.point if k else _framed(run)
             found.append(Mirrored(other.name, float(np.log(share[k] / share[first])), point, shift))
     return tuple(found)
+
+
+def _framed(run: SamplerRun) -> Point:
+    """Where the frame of a run stands."""
+    assert isinstance(run.posed, Posed)
+    return run.posed.frame.point
 
 
 def mean_point(problem: Problem, run: SamplerRun) -> Point:
     """Posterior means of biases and levels on the heaviest side, trajectories at their mode there."""
     side = heaviest(run)
-    start = run.posed.frame.point if side == 0 else run.sides[side - 1].point
+    start = _framed(run) if side == 0 else run.sides[side - 1].point
     mine = run.side == side
     start = at_levels(problem.model, start, jnp.asarray(run.levels[mine].mean(0)))
     return track_mode(problem, start._replace(z=jnp.asarray(run.z[mine].mean(0))))

@@ -217,5 +217,6 @@ def ranked(trial: Trial, found: Pool, most: int, rng: np.random.Generator) -> di
     if found.points.states:
         arrays["position_rmse"] = np.array(_position_rmse(trial.problem, trial.point, found.points))
     if found.run is not None:
-        arrays |= {"r_hat": np.array(worst), "khat": np.array(found.run.worth.khat)}
+        worth = found.run.worth
+        arrays |= {"r_hat": np.array(worst)} | ({} if worth is None else {"khat": np.array(worth.khat)})
     return arrays

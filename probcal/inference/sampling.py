@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from probcal.inference.hierarchy import SpikeAndSlab
 from probcal.inference.mixed import settled
 from probcal.inference.orbits import orbits_of
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
-from probcal.inference.posed import Form, Posed
+from probcal.inference.posed import Form, Natural, Posed
 from probcal.inference.progress import OnProgress, Progress
 from probcal.inference.sides import Sided, distances, side_by_side
 from probcal.inference.storage import Chunks, Storage
@@ -42,8 +42,8 @@ class SamplerRun:
     method: Sampler
     asked: Sampler  # the method that was asked for, where another took over
     form: Form
-    posed: Posed
-    worth: Worth
+    posed: Posed | Natural
+    worth: Worth | None  # of the frame, where there is one
     draws: Draw  # leading dims (chain, draw) of every array
     seconds: float
     interrupted: bool
@@ -146,7 +146,6 @@ def sample(
     fit and has its prior. Raises `FitError` where no draw is finite, `InputError` where a stored chunk is damaged.
     """
     began = time.perf_counter()
-    box = Chunks(Storage(None, "draws", {}) if storage is None else storage)
     keys = jax.random.split(key)
     around = other_sides(problem, start) if np.isfinite(np.asarray(start.z)).all() else None
     start = start if around is None else around.point
@@ -173,6 +172,33 @@ def sample(
         orbits = orbits_of(problem, posed, covariance)
         poses = [(one._replace(orbits=orbits), drawn) for one, drawn in poses]
     runs = _Run(method, form, [one for one, _ in poses], [draws for _, draws in poses], keys[1])
+    drawn, thin, interrupted = drawn_by(method, runs, len(poses), progress, storage, threads)
+    seconds = time.perf_counter() - began
+    return SamplerRun(method, asked, form, posed, worth, drawn, seconds, interrupted, note, tuple(sides), thin)
+
+
+class Runnable(Protocol):
+    """The chains of a sampler, whatever their state is."""
+
+    def first(self) -> Any:
+        """State of all chains, leading dim (chains,)."""
+
+    def restored(self, leaves: list[np.ndarray]) -> Any:
+        """The state of saved leaves."""
+
+    def advance(self, state: Any, thin: int, pool: ThreadPoolExecutor) -> tuple[Any, Draw]:
+        """All chains one chunk further, every `thin`-th step kept."""
+
+
+def drawn_by(
+    method: Sampler, runs: Runnable, sides: int, progress: OnProgress | None, storage: Storage | None,
+    threads: int | None,
+) -> tuple[Draw, int, bool]:  # fmt: skip
+    """Draws of all chains, chunk by chunk, steps from one to the next, and whether they were interrupted.
+
+    What a storage holds is gone on with. Raises `FitError` where no draw is finite.
+    """
+    box = Chunks(Storage(None, "draws", {}) if storage is None else storage)
     state = runs.restored(box.state) if box.state is not None else runs.first()
     plan, interrupted = Plan(method), False
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
@@ -188,7 +214,7 @@ def sample(
                         density = float(np.mean(draws.density))
                         progress(Progress(method.name, plan.steps(box.count), plan.steps(plan.end), density))
                 drawn = plan.drawn(box)
-                if plan.last or settled(np.asarray(drawn.theta), _side(drawn), len(poses)):
+                if plan.last or settled(np.asarray(drawn.theta), _side(drawn), sides):
                     break
                 plan = plan.longer()
         except KeyboardInterrupt:
@@ -202,8 +228,16 @@ def sample(
         raise FitError(
             f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them"
         )
-    seconds = time.perf_counter() - began
-    return SamplerRun(method, asked, form, posed, worth, drawn, seconds, interrupted, note, tuple(sides), plan.thin)
+    return drawn, plan.thin, interrupted
+
+
+def restored_as(form: Any, leaves: list[np.ndarray]) -> Any:
+    """The state of saved leaves; raises `InputError` where they are those of another."""
+    if [leaf.shape for leaf in jax.tree.leaves(form)] != [leaf.shape for leaf in leaves]:
+        raise InputError(
+            "the state of the stored run has another form than this run's: begin anew with --overwrite (overwrite=True)"
+        )
+    return jax.tree.unflatten(jax.tree.structure(form), [jnp.asarray(leaf) for leaf in leaves])
 
 
 def flat_arrays(draws: Draw) -> dict[str, np.ndarray]:
@@ -254,13 +288,7 @@ class _Run:
 
     def restored(self, leaves: list[np.ndarray]) -> Any:
         """The state of saved leaves; raises `InputError` where they are those of another."""
-        form = jax.eval_shape(self.first)
-        if [leaf.shape for leaf in jax.tree.leaves(form)] != [leaf.shape for leaf in leaves]:
-            raise InputError(
-                "the state of the stored run has another form than this run's: begin anew with --overwrite"
-                " (overwrite=True)"
-            )
-        return jax.tree.unflatten(jax.tree.structure(form), [jnp.asarray(leaf) for leaf in leaves])
+        return restored_as(jax.eval_shape(self.first), leaves)
 
     def advance(self, state: Any, thin: int, pool: ThreadPoolExecutor) -> tuple[Any, Draw]:
         """All chains one chunk further, every `thin`-th step kept."""

@@ -48,11 +48,14 @@ def _by_particles(
 ) -> Answer:
     """The answer of a method whose trajectories are particles: it begins at biases, whatever the states of a start.
 
-    Where none is given it is the joint mode, mirrors seen to, if the motions have one, else zero. Further starts are
-    draws of the biases within their scales; the one of the greatest evidence is the answer.
+    Where none is given it is the joint mode, mirrors seen to, with motions of a linear form in the place of others
+    (`Motion.loose`), and zero where there is none. Further starts are draws of the biases within their scales; the one
+    of the greatest evidence is the answer.
     """
-    if start is None and all(form is None for form in problem.model.sampled):
-        first = solve(problem, MAP(trajectory="joint"), Gaussian(), context._replace(progress=None))
+    linear = all(form is None for form in problem.model.sampled)
+    near = problem if linear else problem.loosened()
+    if start is None and near is not None:
+        first = solve(near, MAP(trajectory="joint"), Gaussian(), context._replace(progress=None))
         start = first.posterior.point if first.status.valid and first.posterior.sound else None
     drawn = np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(context.key, 1))))
     begin = np.zeros(problem.model.biases) if start is None else np.asarray(start.z)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,17 +13,22 @@ import numpy as np
 from probcal import linalg
 from probcal.inference.ending import ABSURD, FAR, low_and_far
 from probcal.inference.run import Given, Maximiser
-from probcal.particle.ensemble import Ensemble, ensemble, moments, nearest_states, over_paths
+from probcal.particle.ensemble import Ensemble, ensemble, moments, nearest_states, observed_over_paths
 from probcal.particle.proposals import check_proposal
 from probcal.particle.settings import Particles, check_installed
 from probcal.particle.targets import Targets, targets_of
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.results.answer import CHAINS, HALF, Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
+from probcal.results.build import build_tracks
+from probcal.results.groups import Band
 from probcal.smoothing.draws import draw_biases, draws_a_chain, predictive
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import follow_states, track_mode
 from probcal.status import Status
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Place = tuple[tuple[int, int], ...]  # first and last (excluded) entry of the position, of each recursion
 LAST = 1000  # least particles of the last pass, whose scores give the information
@@ -170,13 +175,13 @@ class EnsemblePosterior(Posterior):
 def marginal_information(paths: Paths, z: Any, levels: Any, key: jax.Array) -> tuple[np.ndarray, np.ndarray, Ensemble]:
     """Information (M, M) of the data about the biases, trajectories integrated, their score, and the particles.
 
-    By Louis' identity (1982): the expected information at given states less the covariance of the score over paths.
+    By Louis' identity (1982): the curvature at given states, less the covariance of the score over paths.
     """
     how = paths.how
     smoother = "backward" if how.smoother == "marginal" else how.smoother
     more = replace(paths, how=replace(how, smoother=smoother, count=max(how.count, LAST)))
     found = more.at(z, levels, key)
-    expected = jax.jit(over_paths)(paths.problem.model, found, jnp.asarray(z), jnp.asarray(levels))
+    expected = observed_over_paths(paths.problem.model, found, jnp.asarray(z), jnp.asarray(levels))
     return positive(np.asarray(expected.information - expected.spread)), np.asarray(expected.score), found
 
 
@@ -252,10 +257,28 @@ def posterior_of(
     return EnsemblePosterior(seen, prior, point, summary, paths, pull, before, tracks, keys[0], numbers)
 
 
-def unexplained(posterior: EnsemblePosterior) -> list[str]:
+def track_by_particles(
+    problem: Problem, how: Particles, z: np.ndarray, covariance: np.ndarray, levels: np.ndarray, key: jax.Array
+) -> xr.DataTree:
+    """Tracks by particles at biases z (M,) of a covariance (M, M), and what they are worth."""
+    paths, keys = Paths(problem, how, prepared(problem, how)), jax.random.split(key, 4)
+    found = paths.at(z, levels, keys[0])
+    point = paths.point(found, z, levels)
+    zero = moments(problem.model, paths.at(np.zeros_like(z), levels, keys[1]))
+    drawn = np.asarray(draw_biases(point, jnp.asarray(covariance), keys[2], SPREAD)) if len(z) else np.zeros((1, 0))
+    tracks = paths.tracks(drawn, levels, keys[3])
+    seen = problem.seen()
+    tree = build_tracks(seen, [Band(t.mean, t.sd, np.asarray(m.mean)) for t, m in zip(tracks, zero, strict=True)])
+    names = unexplained(seen, point)
+    tree.attrs["status"] = str(Status.MISFIT if names else Status.CONVERGED)
+    tree.attrs["message"] = misfit(names) if names else ""
+    tree.attrs["smoother"] = repr(how)
+    return tree
+
+
+def unexplained(problem: Problem, point: Point) -> list[str]:
     """Targets whose rows no path explains, worst first."""
-    problem = posterior.problem
-    model, point = problem.model, posterior.point
+    model = problem.model
     squares, there = model.by_epoch(model.square(point)), model.by_epoch(model.measured)
     found = []
     for epochs, square, count in zip(problem.epochs, squares, there, strict=True):
@@ -278,7 +301,7 @@ def misfit(names: Sequence[str]) -> str:
 
 def _judged(posterior: EnsemblePosterior, method: Maximiser, ended: Ended, low: bool, far: bool) -> tuple[Status, str]:
     """Status of a climb by particles, and a sentence."""
-    if names := unexplained(posterior):
+    if names := unexplained(posterior.problem, posterior.point):
         return Status.MISFIT, misfit(names)
     if far or not posterior.sound:
         where = f"some biases lie more than {FAR:g} scales away" if far else "the information is singular"

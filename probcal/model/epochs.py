@@ -111,8 +111,7 @@ class Stepwise:
         Raises `InputError` for a motion whose noise leaves out a direction, which has no density, and for one that
         states none.
         """
-        self._check_rank()
-        check_densities(self.sampled)
+        self.check_density()
 
         def of(r: int) -> jax.Array:
             move, target, form = epoch.move[r], epoch.target[r], self.sampled[r]
@@ -143,7 +142,7 @@ class Stepwise:
         (part,), (form,), move = self.recursions, self.sampled, epoch.move[0]
         if form is not None or part.tails:
             return jax.vmap(lambda a: jax.vmap(lambda b: self.log_step(a, b, epoch, levels))(after))(x)
-        self._check_rank()
+        self.check_density()
         lower, inverse = linalg.factor_and_inverse(_root(move, levels) @ _root(move, levels).T)
         (old,), (new,) = x, after
         middle = jnp.mean(new[:, 0], 0)  # about which nothing cancels
@@ -154,7 +153,9 @@ class Stepwise:
         volume = jnp.sum(jnp.log(jnp.diagonal(lower))) + 0.5 * n * float(np.log(2 * np.pi))
         return -0.5 * jnp.maximum(square, 0.0) - volume
 
-    def _check_rank(self) -> None:
+    def check_density(self) -> None:
+        """Raise `InputError` where steps have no density."""
+        check_densities(self.sampled)
         if not self.full_rank:
             raise InputError(
                 "the motion has no density: its noise does not reach every component of the state (singular=True, or"

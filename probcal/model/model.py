@@ -212,6 +212,16 @@ class Model(Stepwise):
             g = g.at[data.bias].add(pull)
         return G[:M, :M], g[:M]
 
+    def curvature_by_biases(self, at: Where, weights: Sequence[jax.Array]) -> jax.Array:
+        """Minus the second derivative (M, M) of the log-likelihood by the biases at given states, rows weighed (N,)."""
+        M = self.biases
+        G = jnp.zeros((M + 1, M + 1))
+        for (block, data, r), w in zip(self._blocks(), weights, strict=True):
+            rows = waist.curvature(block, data, self.vectors(r, at.states[r]), at.z, at.levels)
+            own = jax.ops.segment_sum(rows * w[:, None, None], data.sensor, data.bias.shape[0])
+            G = G.at[data.bias[:, :, None], data.bias[:, None, :]].add(own)
+        return G[:M, :M]
+
     def of_both(self, lins: Sequence[Linearised]) -> list[jax.Array]:
         """Cross information of states and biases, (E, n, M) of each recursion."""
         M = self.biases

@@ -266,6 +266,19 @@ def linearise_biases(
     return Linearised(score, weight, none, by_bias * rows.scale[rows.sensor][:, None, :])
 
 
+def curvature(block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array) -> jax.Array:
+    """Minus the second derivative (N, p, p) of each row's log density by the biases z that it reads."""
+    std, local, scale = noise_std(rows, levels), _local(block, rows, z), rows.scale[rows.sensor]
+
+    def density(b: jax.Array, state: jax.Array, pose: jax.Array, y: jax.Array, mask: jax.Array, s: jax.Array) -> Any:
+        predicted = _one(block, state, pose, b)
+        columns = _by_channel(block, "log_likelihood", y[None], predicted[None], s[None])
+        return jnp.sum(mask * columns[0])
+
+    second = jax.vmap(jax.jacfwd(jax.grad(density)))(local, states[rows.epoch], rows.pose, rows.y, rows.mask, std)
+    return -second * scale[:, :, None] * scale[:, None, :]
+
+
 def standardised(score: jax.Array, information: jax.Array) -> jax.Array:
     """Scores over the root of their information, of mean 0 and variance 1 under the model; zero where missing."""
     there = information > 0

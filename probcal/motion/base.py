@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, cast
@@ -75,6 +75,17 @@ class Motion(ABC):
     def linear(self, dt: Any, dimension: int) -> Linear:
         """Transition and noise factor over each of dt (E,) seconds."""
         raise InputError(f"{_name(self)} has no linear form; one that has is composed of motion.Component")
+
+    def within(self, longest: float) -> Motion:
+        """The motion with what it precomputes for steps of up to `longest` s; a problem asks once."""
+        return self
+
+    def loose(self) -> tuple[Any, Start] | None:
+        """A motion with a linear form that holds this one loosely, and its start: from it a search begins.
+
+        None where none is known.
+        """
+        return None
 
     def __add__(self, other: Any) -> Motion:
         return _joined(self, as_motion(other))
@@ -300,6 +311,20 @@ class Joint(Motion):
     def levels(self) -> dict[str, Level]:
         """Noise levels of all parts."""
         return {name: level for part in self.parts for name, level in part.levels.items()}
+
+    def loose(self) -> tuple[Any, Start] | None:
+        """The loose motions of all parts, side by side."""
+        found = [part.loose() for part in self.others]
+        known = [pair for pair in found if pair is not None]
+        if len(known) < len(found):
+            return None
+        motions = [as_motion(motion) for motion, _ in known]
+        start = {name: pair for _, own in known for name, pair in own.items()}
+        return _joined(*([] if self.vector is None else [self.vector]), *motions), start
+
+    def within(self, longest: float) -> Motion:
+        """The motion with what its parts precompute for steps of up to `longest` s."""
+        return replace(self, others=tuple(part.within(longest) for part in self.others))
 
     def view(self, state: Any) -> dict[str, Any]:
         """Components of all parts by name."""

@@ -35,7 +35,7 @@ def conditional_path(
         parent = jax.random.categorical(seeds[1], jnp.where(jnp.isfinite(jnp.max(reach)), reach, weights))
         chosen = jnp.where(really, chosen.at[-1].set(jnp.where(epoch.first, M - 1, parent)), jnp.arange(M))
         before = jax.tree.map(lambda leaf: leaf[chosen], states)
-        after, gain = jax.vmap(lambda k, x: moved(model, how, k, x, epoch, z, levels))(
+        after, gain = jax.vmap(lambda k, x: moved(model, how, k, x, epoch, z, levels, conditional=True))(
             jax.random.split(seeds[2], M), before
         )
         last = jax.tree.map(lambda leaf: leaf[-1], before)

@@ -100,10 +100,14 @@ def at_states(model: Model, states: tuple[Any, ...], z: jax.Array, levels: jax.A
     return Expectation(score, information, jnp.zeros_like(information))
 
 
-def over_paths(model: Model, found: Ensemble, z: jax.Array, levels: jax.Array) -> Expectation:
+def over_paths(
+    model: Model, found: Ensemble, z: jax.Array, levels: jax.Array, *, observed: bool = False
+) -> Expectation:
     """Score, information and spread of the score of the biases over smoothed particles.
 
-    The spread has a meaning where the particles form paths, all of one weight.
+    The information is that of the model, or with `observed` the curvature that the data have: less the spread, it is
+    then the curvature of the marginal likelihood (Louis 1982). The spread has a meaning where the particles form
+    paths, all of one weight.
     """
     N, M = found.weights[0].shape[1], model.biases
     count = -(-N // AT_ONCE)
@@ -111,23 +115,28 @@ def over_paths(model: Model, found: Ensemble, z: jax.Array, levels: jax.Array) -
     def one(n: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         there = n < N
         k = jnp.minimum(n, N - 1)
-        states = tuple(jax.tree.map(lambda leaf: leaf[:, k], own) for own in found.states)
-        lins = model.linearise_biases(At(states, z, levels), expected=True)
+        at = At(tuple(jax.tree.map(lambda leaf: leaf[:, k], own) for own in found.states), z, levels)
         shares = [
-            jnp.where(there, found.weights[r][data.epoch, k], 0.0)[:, None]
+            jnp.where(there, found.weights[r][data.epoch, k], 0.0)
             for data, r in zip(model.rows, model.recursion, strict=True)
         ]
-        information, score = model.of_biases(scaled(lins, shares))
+        lins = model.linearise_biases(at, expected=True)
+        information, score = model.of_biases(scaled(lins, [share[:, None] for share in shares]))
+        if observed:
+            information = model.curvature_by_biases(at, shares)
         return information, score, jnp.where(there, score * N, 0.0)
 
-    def some(carry: tuple[jax.Array, ...], k: jax.Array) -> tuple[tuple[jax.Array, ...], None]:
+    def some(carry: Any, k: jax.Array) -> tuple[Any, None]:
         information, score, each = jax.vmap(one)(k * AT_ONCE + jnp.arange(AT_ONCE))
         added = (jnp.sum(information, 0), jnp.sum(score, 0), each.T @ each / N)
-        return tuple(a + b for a, b in zip(carry, added, strict=True)), None
+        return jax.tree.map(jnp.add, carry, added), None
 
     blank = (jnp.zeros((M, M)), jnp.zeros(M), jnp.zeros((M, M)))
     (information, score, square), _ = jax.lax.scan(some, blank, jnp.arange(count))
     return Expectation(score, information, square - score[:, None] * score[None, :])
+
+
+observed_over_paths = jax.jit(partial(over_paths, observed=True))
 
 
 def log_likelihood_over(model: Model, found: Ensemble, z: jax.Array, levels: jax.Array) -> jax.Array:
@@ -154,23 +163,29 @@ def log_likelihood_over(model: Model, found: Ensemble, z: jax.Array, levels: jax
 
 def log_motion_over(targets: tuple[Targets, ...], found: Ensemble, levels: jax.Array) -> jax.Array:
     """Log density () of the steps of all targets expected over paths: by it the levels of process noise are learnt."""
+    parts = zip(targets, found.states, strict=True)
+    paths = tuple(jax.tree.map(lambda leaf, own=own: by_target(own.index, leaf), states) for own, states in parts)
+
+    def one(n: jax.Array) -> jax.Array:
+        alone = jax.tree.map(lambda leaf: leaf[:, :, n][:, :, None], paths)
+        return log_motion_of(targets, alone, levels)
+
+    return jnp.mean(jax.vmap(one)(jnp.arange(found.weights[0].shape[1])))
+
+
+def log_motion_of(targets: tuple[Targets, ...], paths: tuple[Any, ...], levels: jax.Array) -> jax.Array:
+    """Log density () of the steps of all targets along paths (T, K, 1, ...), their starts left out."""
     total = jnp.zeros(())
-    for own, states, weights in zip(targets, found.states, found.weights, strict=True):
-        paths = jax.tree.map(lambda leaf, own=own: by_target(own.index, leaf), (states, weights))
+    for own, states in zip(targets, paths, strict=True):
 
-        def step(before: Any, after: Any, epoch: Any, own: Targets = own) -> jax.Array:
-            x, y = (jax.tree.map(lambda leaf: leaf[None], part) for part in (before, after))
-            return own.model.log_step((x,), (y,), epoch, levels)
-
-        def along(path: Any, epochs: Any, there: jax.Array, step: Any = step) -> jax.Array:
-            states, weights = path
-            old, new = (jax.tree.map(lambda leaf, c=c: leaf[c], states) for c in (slice(None, -1), slice(1, None)))
+        def along(path: Any, epochs: Any, there: jax.Array, own: Targets = own) -> jax.Array:
+            old, new = (jax.tree.map(lambda leaf, c=c: leaf[c], path) for c in (slice(None, -1), slice(1, None)))
             later = jax.tree.map(lambda leaf: leaf[1:], epochs)
-            each = jax.vmap(jax.vmap(step, (0, 0, None)))(old, new, later)
-            return jnp.sum(jnp.where(there[1:, None], each, 0.0) * weights[1:])
+            each = jax.vmap(lambda a, b, epoch: own.model.log_step((a,), (b,), epoch, levels))(old, new, later)
+            return jnp.sum(jnp.where(there[1:], each, 0.0))
 
         if own.there.shape[1] > 1:
-            total = total + jnp.sum(jax.vmap(along)(paths, own.epochs, own.there))
+            total = total + jnp.sum(jax.vmap(along)(states, own.epochs, own.there))
     return total
 
 

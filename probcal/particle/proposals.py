@@ -14,7 +14,7 @@ from probcal.model.model import Model
 from probcal.particle.settings import Particles
 
 LOST = -1e12  # log weight of a particle that cannot be: were all lost, they would count alike
-STEPS = {"extended": 1, "laplace": 5}  # of Gauss-Newton
+STEPS = {"bootstrap": 0, "extended": 1, "laplace": 5}  # of Gauss-Newton
 
 
 def log_rows(model: Model, epoch: Epoch, x: State, z: jax.Array, levels: jax.Array) -> jax.Array:
@@ -23,23 +23,37 @@ def log_rows(model: Model, epoch: Epoch, x: State, z: jax.Array, levels: jax.Arr
     return jnp.where(jnp.isnan(total), LOST, jnp.clip(total, LOST, -LOST))
 
 
+def steps_of(model: Model, how: Particles, conditional: bool) -> int:
+    """Gauss-Newton steps of the proposal for the targets of one recursion, 0 where it is the motion itself.
+
+    A heavy tail draws its precisions first, so that a given state has no weight: it is then proposed by the motion.
+    """
+    if how.proposal != "auto":
+        return STEPS[how.proposal]
+    linear = model.sampled[0] is None and not (conditional and model.tailed)
+    return STEPS["extended"] if linear else 0
+
+
 def moved(
-    model: Model, how: Particles, key: jax.Array, x: State, epoch: Epoch, z: jax.Array, levels: jax.Array
-) -> tuple[State, jax.Array]:
+    model: Model, how: Particles, key: jax.Array, x: State, epoch: Epoch, z: jax.Array, levels: jax.Array,
+    conditional: bool = False,
+) -> tuple[State, jax.Array]:  # fmt: skip
     """A state drawn for an epoch from that before it, and the log weight gained."""
-    if how.proposal == "bootstrap":
+    steps = steps_of(model, how, conditional)
+    if not steps:
         after = model.step(key, x, epoch, levels)
         return after, log_rows(model, epoch, after, z, levels)
-    return guided(model, STEPS[how.proposal], key, x, epoch, z, levels, None)
+    return guided(model, steps, key, x, epoch, z, levels, None)
 
 
 def gained(
     model: Model, how: Particles, before: State, after: State, epoch: Epoch, z: jax.Array, levels: jax.Array
 ) -> jax.Array:
     """The log weight that a given state gains."""
-    if how.proposal == "bootstrap":
+    steps = steps_of(model, how, True)
+    if not steps:
         return log_rows(model, epoch, after, z, levels)
-    return guided(model, STEPS[how.proposal], jax.random.key(0), before, epoch, z, levels, after)[1]
+    return guided(model, steps, jax.random.key(0), before, epoch, z, levels, after)[1]
 
 
 def guided(
@@ -91,7 +105,7 @@ def guided(
 
 def check_proposal(model: Model, how: Particles, *, conditional: bool = False) -> None:
     """Raise `InputError` where a proposal asks for what a motion does not have."""
-    if how.proposal == "bootstrap":
+    if how.proposal in ("auto", "bootstrap"):
         return
     try:
         model.check_linear()

@@ -9,7 +9,7 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 
-PROPOSALS = ("bootstrap", "extended", "laplace")
+PROPOSALS = ("auto", "bootstrap", "extended", "laplace")
 SMOOTHERS = ("backward", "exact", "marginal", "genealogy")
 M_STEPS = ("mean", "paths", "averaged")
 
@@ -19,7 +19,8 @@ class Particles:
     """A particle filter of `count` particles and a smoother behind it, for `track`, and for `EM` as its E-step.
 
     `proposal`: "bootstrap" draws from the motion; "extended" and "laplace" from a Gaussian that has seen the rows of
-    the epoch (one Gauss-Newton step, or several), for motions with a linear form. Resampled, systematically, where the
+    the epoch (one Gauss-Newton step, or several), for motions with a linear form; "auto" is extended for these,
+    bootstrap for others. Resampled, systematically, where the
     effective number falls below `threshold` of them.
 
     `smoother`: "backward" draws paths backward in time at a cost linear in `count`, by `moves` independent Metropolis
@@ -40,7 +41,7 @@ class Particles:
     """
 
     count: int = 1000
-    proposal: str = "bootstrap"
+    proposal: str = "auto"
     smoother: str = "backward"
     m_step: str = "paths"
     threshold: float = 0.5

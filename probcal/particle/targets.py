@@ -1,4 +1,4 @@
-"""The epochs of each target by itself: given the biases targets know nothing of each other, so each is filtered alone."""
+"""The epochs of each target by itself: given the biases no target knows of another, so that each is filtered alone."""
 
 from __future__ import annotations
 
@@ -49,12 +49,13 @@ def _of(model: Model, epochs: Epoch, r: int) -> Targets:
 
     rows = tuple(jax.tree.map(taken, epochs.rows[b]) for b in blocks)
     rows = tuple(seen._replace(mask=seen.mask * there[:, :, None, None]) for seen in rows)
-    found = epochs._replace(
+    picked: Any = dict(
         time=taken(epochs.time), dt=taken(epochs.dt) * there, first=taken(epochs.first) & there,
         recursion=np.zeros_like(index), target=(np.zeros_like(index),),
         move=(jax.tree.map(taken, epochs.move[r]),), rows=rows,
     )  # fmt: skip
-    return jax.device_put(Targets(_alone(model, r, blocks), found, there, index))
+    found: Any = (_alone(model, r, blocks), epochs._replace(**picked), there, index)
+    return jax.device_put(Targets(*found))
 
 
 def _alone(model: Model, r: int, blocks: list[int]) -> Model:

@@ -21,7 +21,7 @@ YES, BACKWARD, NO = ("yes", "true", "1"), ("-1", "reverse", "reversed"), ("no", 
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class EdgeList:
     """Edges as read: names, polylines, numbers of the end nodes, node places, one-way flags and bridges."""
 
     names: list[str]
@@ -65,7 +65,7 @@ def name_of(data: Any, keys: Sequence[str], default: str) -> str:
     return default
 
 
-def pieces_of(graph: Any, to_metres: Projection, dimension: int | None) -> Pieces:
+def pieces_of(graph: Any, to_metres: Projection, dimension: int | None) -> EdgeList:
     """Edges of a Graph, DiGraph, MultiGraph or MultiDiGraph; two directed edges back and forth are one."""
     if not (hasattr(graph, "edges") and hasattr(graph, "is_directed")):
         raise InputError(f"from_graph takes a networkx graph, not {type(graph).__name__}")
@@ -114,7 +114,7 @@ def pieces_of(graph: Any, to_metres: Projection, dimension: int | None) -> Piece
     used, ends_used = np.unique(ends, return_inverse=True)
     labels = unique(labels)
     bridges = [name for name, high in zip(labels, over, strict=True) if high]
-    return Pieces(labels, lines, ends_used.reshape(-1, 2), nodes[used], oneway, bridges)
+    return EdgeList(labels, lines, ends_used.reshape(-1, 2), nodes[used], oneway, bridges)
 
 
 def as_graph(network: RoadNetwork) -> Any:

@@ -14,6 +14,7 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.motion.base import Motion
+from probcal.motion.components import ConstantVelocity
 from probcal.motion.target import check_pair
 from probcal.noise import Level, Unknown, check_level, guess_of
 from probcal.roads.network import RoadNetwork
@@ -87,6 +88,16 @@ class Road(Motion):
     def within(self, longest: float) -> Road:
         """The motion with paths that reach as far as steps of up to `longest` s need, unless `reach` is stated."""
         return self if self.longest == longest else replace(self, longest=float(longest))
+
+    def loose(self) -> tuple[Any, Mapping[str, tuple[Any, float]]]:
+        """Constant velocity in the plane that can turn within the longest step, from the same start."""
+        quick = abs(self.speed[0]) + QUICK * self.speed[1]
+        corners = np.concatenate([np.asarray(line) for line in self.network.lines])
+        middle = (corners.mean(0), float(np.ptp(corners, axis=0).max()))
+        position = self.position if self.position is not None else middle
+        velocity = (np.zeros(self.network.dimension), abs(self.speed[0]) + self.speed[1])
+        motion = ConstantVelocity(quick / math.sqrt(self.longest or 1.0))
+        return motion, {"position": position, "velocity": velocity}
 
     @property
     def limit(self) -> float | None:

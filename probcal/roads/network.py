@@ -14,7 +14,7 @@ from probcal.geodesy import LocalFrame
 from probcal.roads.checks import as_points, check_connected, check_crossings, check_ends, check_lines, edge_names
 from probcal.roads.coordinates import projection
 from probcal.roads.extra import shapely
-from probcal.roads.graphs import Pieces, as_graph, pieces_of
+from probcal.roads.graphs import EdgeList, as_graph, pieces_of
 
 CHUNK = 1_000_000  # pairs of points and segments that are compared at once
 
@@ -93,7 +93,7 @@ class RoadNetwork:
         return cls.from_pieces(found, snap, connected, bridges)
 
     @classmethod
-    def from_pieces(cls, pieces: Pieces, snap: float, connected: bool, bridges: Collection[str]) -> RoadNetwork:
+    def from_pieces(cls, pieces: EdgeList, snap: float, connected: bool, bridges: Collection[str]) -> RoadNetwork:
         """The network of pieces; raises `InputError` where they are no network."""
         over = edge_names(bridges, pieces.names, "bridges") | frozenset(pieces.bridges)
         check_lines(pieces.names, pieces.lines, snap)
@@ -188,7 +188,7 @@ class RoadNetwork:
 
 def joined(
     names: list[str], lines: list[np.ndarray], oneway: list[bool], snap: float, bridges: Collection[str] = ()
-) -> Pieces:
+) -> EdgeList:
     """Polylines with their ends joined: those within `snap` m of each other become one node at their mean."""
     check_lines(names, lines, snap)
     from scipy.sparse import coo_array
@@ -204,7 +204,7 @@ def joined(
     moved = [
         np.concatenate([nodes[a][None], line[1:-1], nodes[b][None]]) for (a, b), line in zip(ends, lines, strict=True)
     ]
-    return Pieces(names, moved, ends, nodes, oneway, list(bridges))
+    return EdgeList(names, moved, ends, nodes, oneway, list(bridges))
 
 
 def _without_repeats(line: np.ndarray) -> np.ndarray:

@@ -69,6 +69,10 @@ class LeavingRoad(Motion):
         """Noise levels on the road and off it, m s^-3/2."""
         return {**self.road.levels, "velocity_std": self.std}
 
+    def loose(self) -> tuple[Any, Mapping[str, tuple[Any, float]]]:
+        """That of the road."""
+        return self.road.loose()
+
     def within(self, longest: float) -> LeavingRoad:
         """The motion with the paths that steps of up to `longest` s need."""
         road = self.road.within(longest)

@@ -13,6 +13,7 @@ from jax.scipy.special import log_ndtr, ndtr, ndtri
 from probcal.roads.network import RoadNetwork
 
 LOST = -1e30  # log mass of a piece without any
+DEEP = -30.0  # sd beyond which the normal integral is lost
 
 
 def segments_of(network: RoadNetwork) -> tuple[jax.Array, ...]:
@@ -62,7 +63,9 @@ def draw_place(key: jax.Array, network: RoadNetwork, mean: Any, std: Any, masses
     own = jnp.minimum(jnp.searchsorted(total, pick * total[-1], side="right"), len(masses) - 1)
     foot = jnp.sum((mean - origin[own]) * tangent[own])
     low, high, turned = _turned(foot, length[own], std)
-    unit = ndtri(ndtr(low) + where * (ndtr(high) - ndtr(low)))
+    inside = ndtri(ndtr(low) + where * (ndtr(high) - ndtr(low)))
+    tail = -jnp.sqrt(high**2 - 2 * jnp.log1p(-where))  # of the Gaussian tail, to 1 / high^2
+    unit = jnp.maximum(jnp.where(high < DEEP, tail, inside), low)
     gone = jnp.clip(foot + std * jnp.where(turned, -unit, unit), 0.0, length[own])
     return edge[own], begin[own] + gone
 

@@ -1,0 +1,390 @@
+"""Particle Gibbs: trajectories by a conditional particle filter with ancestor sampling, biases given trajectories.
+
+The exact answer where no Gaussian stands for the trajectories: yes-or-no sensors, mirrored bearings, roads. One sweep
+draws the path of every target given the biases (Lindsten, Jordan, Schon 2014), then biases, levels and
+hyper-parameters given the paths.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.errors import InputError
+from probcal.inference.chains import Draw, Sample
+from probcal.inference.draws import slice_step
+from probcal.inference.hierarchy import Phi, hierarchy_of
+from probcal.inference.particle_em import climb
+from probcal.inference.posed import Form, Natural, Posed, conditional, log_prior, prior_precision
+from probcal.inference.posterior import Chains, conclude_draws
+from probcal.inference.run import Context
+from probcal.inference.sampler import Sampler
+from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
+from probcal.inference.weighted import Paths, marginal_information, misfit, prepared, unexplained
+from probcal.model.model import At, Model
+from probcal.particle.conditional import conditional_path
+from probcal.particle.ensemble import log_motion_of, moments, over_paths
+from probcal.particle.proposals import check_proposal
+from probcal.particle.settings import Particles
+from probcal.particle.targets import Targets, by_target, place_by_epoch
+from probcal.priors import Gaussian, Horseshoe, Prior
+from probcal.problem import Problem
+from probcal.results.answer import Answer
+from probcal.smoothing.mode import Point
+from probcal.smoothing.start import follow_states, track_mode
+from probcal.status import Status
+
+SPREAD = 1.5  # by how much chains start further out than the data leave the biases
+SEARCH = 40  # iterations of the search for a start, where there is none
+LENGTHS = (1.0, 0.3)  # of steps of all biases; 1 is an independent draw from the Gaussian at given paths
+NEAR, FAR = 0.2, 20.0  # shortest and longest steps of a sensor by itself, in sd at given paths
+CROWD = 500  # least particles of passes that are no sweeps
+CONDITIONAL = Particles(100)
+
+
+class GibbsState(NamedTuple):
+    """Where a chain stands."""
+
+    theta: jax.Array  # (Q,) biases, log levels
+    phi: Phi
+    paths: tuple[Any, ...]  # (T, K, 1, ...) of each recursion
+    key: jax.Array
+
+
+class Held(NamedTuple):
+    """What stays the same in all sweeps."""
+
+    model: Model
+    targets: tuple[Targets, ...]
+    natural: Natural  # the data about the biases as a Gaussian: only gamma is read off it
+    group: jax.Array  # (M,) biases of one group share a row, or the prior ties them
+    reference: jax.Array  # (M, M) information about the biases at given paths, by which steps of a sensor are scaled
+    of_sensor: tuple[jax.Array, ...]  # (S,) group of each sensor of each block, one more than there are for none
+
+
+@dataclass(frozen=True)
+class ParticleGibbs(Sampler):
+    """Exact posterior of biases, hyper-parameters and trajectories for any motion, by particle Gibbs.
+
+    A sweep draws every path anew by a conditional filter of `particles` with ancestor sampling, then takes `steps` of
+    the biases at given paths: of all together, by Gauss-Newton proposals, and of each sensor by itself, near and far,
+    which given the paths knows nothing of the others. The motion needs a density. Draws that
+    have not mixed are made anew with 4 times as many sweeps from one to the next, up to `patience`. Raises
+    `InputError` for settings outside their ranges.
+    """
+
+    chains: int = 4
+    warmup: int = 200
+    draws: int = 500
+    particles: Particles = CONDITIONAL
+    steps: int = 40
+    patience: int = 16
+
+    name: ClassVar[str] = "ParticleGibbs"
+    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
+    chunk: ClassVar[int] = 25
+
+    def __post_init__(self):
+        super().__post_init__()
+        for name, value in (("steps", self.steps), ("patience", self.patience)):
+            if value < 1:
+                raise InputError(f"ParticleGibbs({name}={value}): it must be at least 1")
+
+    @property
+    def by_particles(self) -> bool:
+        """Trajectories are particles."""
+        return True
+
+    def kernel(self) -> ParticleGibbs:
+        """The method whatever the number of its chains and draws."""
+        return replace(self, chains=1, warmup=0, draws=1, patience=1)
+
+    def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
+        """Draws of the posterior from biases of a start, zero for a search, and what they say."""
+        began = time.perf_counter()
+        targets = prepared(problem, self.particles)
+        check_proposal(problem.model, self.particles, conditional=True)
+        for own in targets:
+            own.model.check_density()
+        keys = jax.random.split(context.key, 4)
+        crowd = replace(self.particles, count=max(self.particles.count, CROWD), smoother="backward")
+        z, levels = np.asarray(start.z), np.zeros(len(problem.levels))
+        if not z.any():  # a sweep goes where the last path was: chains are begun where the data may be explained
+            begun = climb(problem, crowd, Gaussian(), z, SEARCH, keys[3])
+            z, levels = np.asarray(begun.z), np.asarray(begun.levels)
+        paths = Paths(problem, crowd, targets)
+        information, score, found = marginal_information(paths, z, levels, keys[0])
+        reference = over_paths(problem.model, found, jnp.asarray(z), jnp.asarray(levels)).information
+        H = len(levels)
+        natural = Natural(
+            jnp.asarray(np.pad(information, (0, H))), jnp.asarray(np.pad(information @ z + score, (0, H))),
+            problem.model.level_spread, prior.precision(problem.labels, problem.surveyed),
+        )  # fmt: skip
+        form = Form(problem.model.biases, hierarchy_of(prior, problem))
+        group, of_sensor = groups_of(problem.model, np.asarray(natural.first.coupling))
+        held = Held(problem.model, targets, natural, group, reference, of_sensor)
+        runs = _Gibbs(self, form, held, paths, z, levels, keys[1])
+        drawn, thin, interrupted = drawn_by(self, runs, 1, context.progress, context.storage, context.threads)
+        run = ParticleRun(
+            self, self, form, natural, None, drawn, time.perf_counter() - began, interrupted, "", (), thin, paths,
+            score, z,
+        )  # fmt: skip
+        linear = all(part is None for part in problem.model.sampled)
+        answer = conclude_draws(problem if linear else problem.seen(), prior, run, ParticleChains)
+        if names := unexplained(answer.posterior.problem, answer.posterior.point):
+            return replace(answer, status=Status.MISFIT, message=misfit(names))
+        return answer
+
+    def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
+        """Not asked: chains begin by paths."""
+        raise AssertionError("particle Gibbs begins by paths")
+
+    def step(self, form: Form, posed: Any, chain: GibbsState) -> tuple[GibbsState, Sample]:
+        """One sweep; `posed` is what is `Held`."""
+        held: Held = posed
+        model, M = held.model, form.biases
+        key, *keys = jax.random.split(chain.key, 5)
+        z, levels = chain.theta[:M], chain.theta[M:]
+        paths, renewed = [], []
+        for r, (own, old) in enumerate(zip(held.targets, chain.paths, strict=True)):
+            seeds = jax.random.split(jax.random.fold_in(keys[0], r), len(own.there))
+
+            def one(epochs: Any, there: Any, path: Any, k: Any, own: Targets = own) -> Any:
+                return conditional_path(own.model, epochs, there, (path,), z, levels, k, self.particles)
+
+            (new,), moved = jax.vmap(one)(own.epochs, own.there, old, seeds)
+            paths.append(new)
+            renewed.append(jnp.sum(moved & own.there) / jnp.sum(own.there))
+        at = states_of(held, tuple(paths))
+        theta, rate = self._moved(form, held, at, chain.theta, chain.phi, keys[1])
+        theta = self._levels(form, held, at, tuple(paths), theta, keys[2])
+        phi, learnt = chain.phi, jnp.asarray(form.hierarchy.learnt, int)
+        for k, update in enumerate(form.hierarchy.updates()):
+            phi = update(phi, theta[learnt], jax.random.fold_in(keys[3], k))
+        told = sum(jnp.sum(part) for part in model.log_likelihood(At(at, theta[:M], theta[M:])))
+        joint = told + log_motion_of(held.targets, tuple(paths), theta[M:])
+        stats = {"acceptance_rate": rate, "renewed": jnp.mean(jnp.stack(renewed))}
+        return GibbsState(theta, phi, tuple(paths), key), Sample(theta, (), phi, joint, stats)
+
+    def _moved(
+        self, form: Form, held: Held, at: Any, theta: jax.Array, phi: Phi, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Steps of the biases at given paths, and the share of them taken.
+
+        A proposal is a shorter or longer part of a draw from the Gaussian of a Gauss-Newton step: for a linear sensor
+        it is always taken.
+        """
+        M, levels = form.biases, theta[form.biases :]
+        alpha, coupling = prior_precision(form, held.natural, phi)
+        prior = (jnp.diag(alpha) + coupling)[:M, :M]
+
+        def place(z: jax.Array) -> tuple[jax.Array, ...]:
+            point = At(at, z, levels)
+            told = sum(jnp.sum(part) for part in held.model.log_likelihood(point))
+            information, score = held.model.of_biases(held.model.linearise_biases(point, expected=True))
+            lower, inverse = linalg.factor_and_inverse(information + prior)
+            slope = score - prior @ z
+            return told - 0.5 * z @ prior @ z, inverse.T @ (inverse @ slope), lower, inverse
+
+        def log_proposal(here: tuple[jax.Array, ...], z: jax.Array, other: jax.Array, length: Any) -> jax.Array:
+            white = here[2].T @ (other - z - (1 - jnp.sqrt(1 - length**2)) * here[1]) / length
+            return jnp.sum(jnp.log(jnp.diagonal(here[2]))) - 0.5 * jnp.sum(white**2)
+
+        def together(carry: Any, inputs: Any) -> tuple[Any, jax.Array]:
+            z, here = carry
+            own, length = inputs
+            seeds = jax.random.split(own)
+            noise = here[3].T @ jax.random.normal(seeds[0], z.shape)
+            other = z + (1 - jnp.sqrt(1 - length**2)) * here[1] + length * noise
+            there = place(other)
+            gain = there[0] - here[0] + log_proposal(there, other, z, length) - log_proposal(here, z, other, length)
+            taken = jnp.log(jax.random.uniform(seeds[1])) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
+            return jax.tree.map(lambda new, old: jnp.where(taken, new, old), (other, there), (z, here)), taken
+
+        groups = form.biases + 1  # at most, and one for the rows of sensors without bias
+
+        def values(z: jax.Array) -> jax.Array:
+            """Log density of each group."""
+            total = jnp.zeros(groups).at[held.group].add(-0.5 * z * (prior @ z))
+            told = held.model.log_likelihood(At(at, z, levels))
+            for data, part, own in zip(held.model.rows, told, held.of_sensor, strict=True):
+                total = total.at[own[data.sensor]].add(jnp.sum(part, 1))
+            return total
+
+        def apart(carry: Any, own: jax.Array) -> tuple[Any, jax.Array]:
+            z, here = carry
+            seeds = jax.random.split(own, 3)
+            span = jnp.log(NEAR) + (jnp.log(FAR) - jnp.log(NEAR)) * jax.random.uniform(seeds[0], (groups,))
+            other = z + jnp.exp(span)[held.group] * (spread.T @ jax.random.normal(seeds[1], z.shape))
+            there = values(other)
+            gain = jnp.where(jnp.isfinite(there), there - here, -jnp.inf)
+            taken = jnp.log(jax.random.uniform(seeds[2], (groups,))) < gain
+            found = (jnp.where(taken[held.group], other, z), jnp.where(taken, there, here))
+            return found, jnp.mean(taken[held.group])
+
+        seeds, z = jax.random.split(key, 3), theta[:M]
+        lengths = jnp.asarray(LENGTHS)
+        (z, _), taken = jax.lax.scan(together, (z, place(z)), (jax.random.split(seeds[0], len(LENGTHS)), lengths))
+        # by a factor that no draw of the biases moves, so that a step is as likely as its way back
+        spread = linalg.factor_and_inverse(held.reference + prior)[1]
+        (z, _), _ = jax.lax.scan(apart, (z, values(z)), jax.random.split(seeds[1], self.steps))
+        return theta.at[:M].set(z), jnp.mean(taken)
+
+    def _levels(
+        self, form: Form, held: Held, at: Any, paths: tuple[Any, ...], theta: jax.Array, key: jax.Array
+    ) -> jax.Array:
+        """Unknown noise levels at given paths and biases, one after the other."""
+        M, model = form.biases, held.model
+
+        def density(h: int, value: jax.Array, theta: jax.Array) -> jax.Array:
+            levels = theta[M:].at[h].set(value)
+            told = sum(jnp.sum(part) for part in model.log_likelihood(At(at, theta[:M], levels)))
+            motion = log_motion_of(held.targets, paths, levels) if model.driven else 0.0
+            return told + motion - 0.5 * (value / model.level_spread[h]) ** 2
+
+        for h in range(model.level_spread.shape[0]):
+            now = theta
+            value = slice_step(jax.random.fold_in(key, h), theta[M + h], lambda v, h=h, now=now: density(h, v, now))
+            theta = theta.at[M + h].set(value)
+        return theta
+
+
+def groups_of(model: Model, coupling: np.ndarray) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    """Groups (M,) of biases that share a sensor or that the prior ties, and the group of each sensor of each block."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    M, pairs = model.biases, [np.argwhere(coupling != 0)]
+    read = [np.asarray(data.bias) for data in model.rows]
+    for bias in read:
+        for own in bias:
+            free = own[own < M]
+            pairs.append(np.stack([np.repeat(free[:1], len(free)), free], 1))
+    a, b = np.concatenate(pairs).T if pairs else np.zeros((2, 0), int)
+    _, group = connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(M, M)), directed=False)
+    padded = np.append(group, M)
+    first = [np.where(bias < M, bias, M).min(1, initial=M) for bias in read]
+    return jnp.asarray(group), tuple(jnp.asarray(padded[own]) for own in first)
+
+
+def states_of(held: Held, paths: tuple[Any, ...]) -> tuple[Any, ...]:
+    """States (E leading) of each recursion along paths (T, K, 1, ...)."""
+    found = []
+    for own, part, recursion in zip(held.targets, paths, held.model.recursions, strict=True):
+        E = recursion.time.shape[0]
+        found.append(jax.tree.map(lambda leaf, own=own, E=E: place_by_epoch(own.index, leaf[:, :, 0], E), part))
+    return tuple(found)
+
+
+@partial(jax.jit, static_argnames=("method", "form"))
+def run_sweeps(method: ParticleGibbs, form: Form, held: Held, chain: GibbsState, thin: jax.Array) -> Any:
+    """`method.chunk` draws of one chain, `thin` sweeps apart."""
+    blank = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(partial(method.step, form, held), chain)[1]
+    )
+
+    def one(chain: GibbsState, _: None) -> tuple[GibbsState, Draw]:
+        chain, sample = jax.lax.fori_loop(0, thin, lambda _, both: method.step(form, held, both[0]), (chain, blank))
+        M = form.biases
+        given = conditional(form, held.natural, sample.phi)
+        variance = given.variance[:M]
+        gamma = jnp.clip(1.0 - given.alpha[:M] * variance, 0.0, 1.0)
+        vectors = tuple(held.model.vectors(r, x) for r, x in enumerate(states_of(held, chain.paths)))
+        density = sample.joint + log_prior(form, held.natural, sample.theta, sample.phi)
+        return chain, Draw(sample.theta, sample.phi, gamma, variance, vectors, density, sample.stats)
+
+    return jax.lax.scan(one, chain, None, length=method.chunk)
+
+
+class _Gibbs:
+    """Chains of particle Gibbs: a thread each on a CPU, one after the other on an accelerator."""
+
+    def __init__(
+        self, method: ParticleGibbs, form: Form, held: Held, paths: Paths, z: np.ndarray, levels: np.ndarray,
+        key: jax.Array,
+    ):  # fmt: skip
+        self.method, self.form, self.held, self.paths = method, form, held, paths
+        self.z, self.levels, self.keys = z, levels, jax.random.split(key, method.chains)
+
+    def first(self) -> GibbsState:
+        """Chains about the start, further out than the data leave the biases, on paths drawn there."""
+        natural, states = self.held.natural, []
+        for own in self.keys:
+            keys = jax.random.split(own, 4)
+            phi = self.form.hierarchy.draw(keys[0])
+            narrow = conditional(self.form, natural, phi).deviation(keys[1])
+            theta = jnp.asarray(np.concatenate([self.z, self.levels])) + SPREAD * narrow
+            found = self.paths.at(theta[: len(self.z)], theta[len(self.z) :], keys[2])
+            chosen = [jax.tree.map(lambda leaf: leaf[:, 0], part) for part in found.states]
+            paths = tuple(
+                jax.tree.map(lambda leaf, t=t: by_target(t.index, leaf)[:, :, None], x)
+                for t, x in zip(self.held.targets, chosen, strict=True)
+            )
+            states.append(GibbsState(theta, phi, paths, jax.random.key_data(keys[3])))
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+
+    def restored(self, leaves: list[np.ndarray]) -> Any:
+        """The state of saved leaves."""
+        return restored_as(jax.eval_shape(self.first), leaves)
+
+    def advance(self, state: Any, thin: int, pool: ThreadPoolExecutor) -> tuple[Any, Draw]:
+        """All chains one chunk further, every `thin`-th sweep kept."""
+
+        def one(k: int) -> tuple[Any, Draw]:
+            with jax.enable_x64(True):
+                own = jax.tree.map(lambda leaf: leaf[k], state)
+                return jax.block_until_ready(
+                    run_sweeps(self.method.kernel(), self.form, self.held, own, jnp.asarray(thin))
+                )
+
+        found = list(pool.map(one, range(self.method.chains)))
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleRun(SamplerRun):
+    """What particle Gibbs leaves: its draws, and the particles that it was begun with."""
+
+    paths: Any = None  # a `Paths`
+    score: Any = None  # (M,) of the data where chains were begun
+    begun: Any = None  # (M,) biases there
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleChains(Chains):
+    """The draws of particle Gibbs."""
+
+    @classmethod
+    def point_of(cls, problem: Problem, run: SamplerRun) -> Point:
+        """Posterior means of biases and levels, and states that stand for the particles there (Paper A 43)."""
+        assert isinstance(run, ParticleRun)
+        paths, z, levels = run.paths, run.z.mean((0, 1)), run.levels.mean((0, 1))
+        found = paths.at(z, levels, jax.random.key(0))
+        point = paths.point(found, z, levels)
+        if any(form is not None for form in paths.problem.model.sampled):
+            return point
+        near = follow_states(problem, [np.asarray(x) for x in point.states])
+        return track_mode(problem, near._replace(z=jnp.asarray(z), levels=jnp.asarray(levels)))
+
+    @cached_property
+    def before(self) -> Point:
+        """The point with all biases zero: mean states by particles."""
+        assert isinstance(self.run, ParticleRun)
+        zero, levels = np.zeros_like(self.summary.mean), self.summary.levels
+        found = self.run.paths.at(zero, levels, jax.random.key(1))
+        point = self.run.paths.point(found, zero, levels)
+        return point._replace(states=tuple(m.mean for m in moments(self.run.paths.problem.model, found)))
+
+    @property
+    def pull(self) -> np.ndarray:
+        """Linear term (M,) of the log-likelihood of z about zero."""
+        assert isinstance(self.run, ParticleRun)
+        return self.summary.information @ np.asarray(self.run.begun) + np.asarray(self.run.score)
