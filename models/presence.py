@@ -10,7 +10,6 @@ no number, so that no Gaussian stands for the walker or for the sensor: particle
 
 from functools import cache
 
-import jax.numpy as jnp
 import numpy as np
 
 from probcal import Channel, ConstantVelocity, Network, Node, Problem, Target, Truth, sensor, simulate

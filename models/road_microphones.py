@@ -4,7 +4,7 @@ Log powers (Paper A 6, its natural logarithm) of one vehicle, 30 of them a secon
 those of its Table 1; the stated ones of microphones 3 and 4 are swapped, and of 7 and 8, so that the biases of
 microphone 3 are about (-16.6, -6.3) m (its Table 2 has survey minus truth). Biases: x and y (5 m) and gain (0.1) of
 each; process noise of the paper in its form of full rank. What the paper leaves open: the roads (a main road with a
-bend, two junctions and two side roads), the start (10 m, 1 m/s), and 3 m/s along the main road.
+bend, two junctions and two side roads), the start (2 m, 0.3 m/s), and 3 m/s along the main road.
 
 The vehicle moves freely, or on the road (`--set motion=road`):
 
@@ -28,6 +28,7 @@ PLACES = {
 SWAPPED = {3: 4, 4: 3, 7: 8, 8: 7}
 TIME = np.arange(30.0)  # s
 SPEED = 3.0  # m/s
+START, PACE = 2.0, 0.3  # m, m/s: how well the start is known
 ROADS = {
     "main west": [(0.0, 22.0), (18.0, 25.0), (36.0, 30.0)],
     "main middle": [(36.0, 30.0), (52.0, 28.0), (66.0, 25.0)],
@@ -73,11 +74,11 @@ def motion(kind: Literal["free", "road"] = "free"):
     """Constant velocity in the plane, or along the road, with a power that wanders."""
     first = path()[0]
     if kind == "free":
-        start = {"position": (first[:2], 10.0), "velocity": (first[2:], 1.0)}
+        start = {"position": (first[:2], START), "velocity": (first[2:], PACE)}
         return Target(ConstantVelocity(5.0) + POWER, start)
     from probcal.roads import Road
 
-    return Target(Road(roads(), std=0.1, speed=(SPEED, 1.0), position=(tuple(first[:2]), 10.0)) + POWER)
+    return Target(Road(roads(), std=0.1, speed=(SPEED, PACE), position=(tuple(first[:2]), START)) + POWER)
 
 
 def biases():

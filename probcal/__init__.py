@@ -59,9 +59,9 @@ if TYPE_CHECKING:
     from probcal.network import Network, Node, Path
     from probcal.nodes import read_nodes, write_nodes
     from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
+    from probcal.particle.settings import Particles
     from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
     from probcal.problem import Problem
-    from probcal.particle.settings import Particles
     from probcal.results.drifts import drift_table
     from probcal.results.io import load, save
     from probcal.results.read import outliers, summary, tracks
@@ -83,8 +83,8 @@ __all__ = lazy(
         "probcal.errors": "FitError InputError",
         "probcal.geodesy": "LocalFrame",
         "probcal.inference": (
-            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares ParticleGibbs Unscented coverage_table fit "
-            "log_evidence numpyro_model sbc study track"
+            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares ParticleGibbs Unscented coverage_table "
+            "fit log_evidence numpyro_model sbc study track"
         ),
         "probcal.motion": (
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"

@@ -24,6 +24,7 @@ Given = Annotated[
     list[str] | None, typer.Option("--set", help="an argument of problem(): swap=3,4 (repeat)", show_default=False)
 ]
 LARGEST_SEED = 2**62
+SMOOTHERS = ("gaussian", "particles")
 Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="seed of everything random")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace the run in --out: the files that probcal wrote")]
 
@@ -138,18 +139,25 @@ def track_command(
     data: Data = None,
     calibration: Annotated[Path | None, typer.Option(help="folder (or fit.nc) of a fit", show_default=False)] = None,
     given: Given = None,
+    smoother: Annotated[str, typer.Option(help="gaussian, or particles: for any motion, roads too")] = "gaussian",
+    particles: Annotated[int, typer.Option(min=2, help="particles of each target")] = 1000,
+    seed: Seed = 0,
     out: Annotated[Path, typer.Option(help="table of tracks to write")] = Path("tracks.csv"),
 ) -> None:
     """Tracks of other data with a calibration applied: time, target, each state component with its sd."""
     if calibration is None:
         raise InputError("track needs --calibration DIR, the folder of a fit")
+    if smoother not in SMOOTHERS:
+        raise InputError(f'--smoother "{smoother}" is not known{nearest(smoother, SMOOTHERS)}')
     options.check_fit(calibration)
     options.check_files(model, data)
     arguments = options.given(given or ())
     results = outputs.replaceable(out.parent, (out.name,))
     from probcal.cli import track
 
-    raise typer.Exit(track.run(model, data, arguments, calibration, results))
+    raise typer.Exit(track.run(
+        model, data, arguments, calibration, results, smoother=smoother, particles=particles, seed=seed
+    ))  # fmt: skip
 
 
 @app.command(name="study")

@@ -17,6 +17,7 @@ from probcal.cli.progress import line
 from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.inference import METHODS, calibrate
+from probcal.inference.fit import linear_form
 from probcal.inference.manifest import remove_run
 from probcal.results.alignment import KINDS
 from probcal.results.io import save
@@ -54,7 +55,7 @@ def run(
             problem, value, prior=chosen, key=seed, starts=starts, progress=progress, save=kept, store=store,
             resume=resume, overwrite=overwrite,
         )  # fmt: skip
-        if assessed:
+        if assessed and linear_form(answer):
             from probcal.analysis import assess
 
             with _safe(tree, outputs, time.perf_counter() - began > LONG):

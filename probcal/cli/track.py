@@ -1,5 +1,6 @@
 """`track`: tracks of other data with a calibration applied."""
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,16 @@ from probcal.cli.models import load_problem, load_truth
 from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.inference import track
+from probcal.particle.settings import Particles
 from probcal.results.io import load
 from probcal.results.read import tracks
 from probcal.results.scores import scores
 from probcal.status import INVALID
 
 
-def run(model: Path, data: Path | None, given: Mapping[str, Any], calibration: Path, outputs: Outputs) -> int:
+def run(model: Path, data: Path | None, given: Mapping[str, Any], calibration: Path, outputs: Outputs, *,
+    smoother: str, particles: int, seed: int,
+) -> int:  # fmt: skip
     """Tracks of other data with a calibration applied: time, target, each state component with its sd."""
     known = load(calibration)
     if known.attrs.get("status") in INVALID:
@@ -26,7 +30,7 @@ def run(model: Path, data: Path | None, given: Mapping[str, Any], calibration: P
     keep_kernels()
     module, problem = load_problem(model, data, (), given)
     truth = load_truth(module, model, data, problem, given)
-    tree = track(problem, known)
+    tree = track(problem, known, smoother=Particles(particles) if smoother == "particles" else None, key=seed)
     frame = tracks(tree)
     out = outputs.folder / outputs.names[0]
     with outputs.writing():
@@ -35,4 +39,6 @@ def run(model: Path, data: Path | None, given: Mapping[str, Any], calibration: P
     if "position_rmse_after" in found:
         print(f"position RMSE before {found['position_rmse_before']:.3f} m, after {found['position_rmse_after']:.3f} m")
     print(f"written: {out} ({len(frame)} epochs)")
-    return 0
+    if tree.attrs.get("message"):
+        print(tree.attrs["message"], file=sys.stderr)
+    return 1 if tree.attrs.get("status") in INVALID else 0

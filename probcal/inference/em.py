@@ -21,6 +21,7 @@ from probcal.smoothing.mode import Point, cost, mixing_gain
 from probcal.smoothing.solves import Dense
 
 EXTENDED = Extended()
+BY_PATHS = "Gaussian of the curvature of the marginal likelihood, by Louis' identity over the paths of the particles"
 RIDGE = 1e-12  # of the information, where a flat prior meets a bias that no row reads
 
 
@@ -97,6 +98,10 @@ class EM(Maximiser):
     def by_particles(self) -> bool:
         """Whether trajectories are particles."""
         return isinstance(self.e_step, Particles)
+
+    def note(self, prior: Prior) -> str:
+        """What the intervals are worth."""
+        return BY_PATHS if self.by_particles and not prior.learns else super().note(prior)
 
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Climb from a start until it is done or its iterations are spent."""

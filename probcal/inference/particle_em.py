@@ -20,7 +20,9 @@ from probcal.particle.ensemble import (
     Ensemble,
     Expectation,
     at_states,
+    conditional_ensemble,
     ensemble,
+    first_paths,
     log_likelihood_over,
     moved_levels,
     nearest_states,
@@ -41,6 +43,7 @@ RIDGE = 1e-12  # of the information, where a flat prior meets a bias that no row
 WINDOW = 20  # iterations that are compared with as many before them
 DRIFT = 4.0  # standard errors by which these may differ, beside
 NEAR = 0.1  # so many sd of a bias
+CROWD = 500  # least particles of the pass that a conditional filter begins with
 
 
 class Climb(NamedTuple):
@@ -53,6 +56,9 @@ class Climb(NamedTuple):
     pull: jax.Array  # (M,) averaged, of its linear term about zero
     k: jax.Array  # () passes done
     key: jax.Array
+    paths: tuple[
+        Any, ...
+    ]  # of each recursion the path that the next conditional filter holds; none where it is not one
 
 
 class Trace(NamedTuple):
@@ -89,7 +95,11 @@ def iterate(
     share = COOL ** jnp.maximum(1.0 - state.k / max(how.tempered, 1), 0.0) if how.tempered else jnp.ones(())
     model = model.weighted([jnp.full_like(there, share) for there in model.measured])
     targets = tuple(weighted(own, share) for own in targets)
-    found = ensemble(model, targets, state.z, state.levels, keys[0], how)
+    if how.m_step == "averaged":
+        found, paths = conditional_ensemble(model, targets, state.paths, state.z, state.levels, keys[0], how)
+        state = state._replace(paths=paths)
+    else:
+        found = ensemble(model, targets, state.z, state.levels, keys[0], how)
     states = nearest_states(model, found, place) if how.m_step == "mean" else None
     expected = over_paths(model, found, state.z, state.levels) if states is None else at_states(
         model, states, state.z, state.levels
@@ -128,7 +138,7 @@ def _shortened(model: Model, found: Ensemble, states: Any, state: Climb, now: Pr
         if states is None:
             told = log_likelihood_over(model, found, z, state.levels)
         else:
-            told = sum(jnp.sum(part) for part in model.log_likelihood(At(states, z, state.levels)))
+            told = sum((jnp.sum(part) for part in model.log_likelihood(At(states, z, state.levels))), jnp.zeros(()))
         return told - 0.5 * now.square(z)
 
     least = value(state.z)
@@ -176,7 +186,8 @@ def climb(problem: Problem, how: Particles, prior: Prior, z: Any, iterations: in
         prior.precision(problem.labels, problem.surveyed), jnp.asarray(problem.surveyed),
         jnp.arange(problem.model.biases), jnp.zeros(()),
     )  # fmt: skip
-    state, targets = _begun(problem, given, z, key), prepared(problem, how)
+    targets = prepared(problem, how)
+    state = _begun(problem, targets, how, given, z, key)
     while int(state.k) < iterations:
         state, _ = chunk(
             problem.model, targets, bare(prior), given, state, jnp.asarray(iterations), how, places(problem)
@@ -184,12 +195,20 @@ def climb(problem: Problem, how: Particles, prior: Prior, z: Any, iterations: in
     return state
 
 
-def _begun(problem: Problem, given: Given, z: Any, key: jax.Array) -> Climb:
+def _begun(
+    problem: Problem, targets: tuple[Targets, ...], how: Particles, given: Given, z: Any, key: jax.Array
+) -> Climb:
     """The state before the first iteration."""
-    M = problem.model.biases
+    M, z, keys = problem.model.biases, jnp.asarray(z, float), jax.random.split(key)
+    levels, paths = jnp.zeros(problem.model.level_spread.shape), tuple[Any, ...]()
+    if how.m_step == "averaged":
+        for own in targets:
+            own.model.check_density()
+        crowd = replace(how, count=max(how.count, CROWD))
+        cool = tuple(weighted(own, jnp.asarray(COOL if how.tempered else 1.0)) for own in targets)
+        paths = first_paths(targets, ensemble(problem.model, cool, z, levels, keys[1], crowd))
     return Climb(
-        jnp.asarray(z, float), jnp.zeros(problem.model.level_spread.shape), given.prior.alpha, jnp.zeros((M, M)),
-        jnp.zeros(M), jnp.zeros((), int), key,
+        z, levels, given.prior.alpha, jnp.zeros((M, M)), jnp.zeros(M), jnp.zeros((), int), keys[0], paths
     )  # fmt: skip
 
 
@@ -202,12 +221,12 @@ def climb_by_particles(
     how = replace(how, tempered=0) if np.any(np.asarray(z)) else how  # a start that is known is not left again
     model, given, place = problem.model, given_of(method, problem, prior), places(problem)
     keys = jax.random.split(context.key)
-    state = _begun(problem, given, z, keys[0])
+    state = _begun(problem, targets, how, given, z, keys[0])
     parts: list[Trace] = []
     count, known, still = 0, bare(prior), Wandering(False, 0, np.inf)
     while count < method.iterations:
         state, part = chunk(model, targets, known, given, state, jnp.asarray(method.iterations), how, place)
-        part = Trace(*(np.asarray(leaf)[: method.iterations - count] for leaf in part))
+        part = jax.tree.map(lambda leaf, left=method.iterations - count: np.asarray(leaf)[:left], part)
         parts.append(part)
         count += len(part.log_likelihood)
         if not np.isfinite(part.z).all():

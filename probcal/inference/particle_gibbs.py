@@ -244,15 +244,14 @@ class ParticleGibbs(Sampler):
         """Unknown noise levels at given paths and biases, one after the other."""
         M, model = form.biases, held.model
 
-        def density(h: int, value: jax.Array, theta: jax.Array) -> jax.Array:
+        def density(h: int, theta: jax.Array, value: jax.Array) -> jax.Array:
             levels = theta[M:].at[h].set(value)
             told = sum(jnp.sum(part) for part in model.log_likelihood(At(at, theta[:M], levels)))
             motion = log_motion_of(held.targets, paths, levels) if model.driven else 0.0
             return told + motion - 0.5 * (value / model.level_spread[h]) ** 2
 
         for h in range(model.level_spread.shape[0]):
-            now = theta
-            value = slice_step(jax.random.fold_in(key, h), theta[M + h], lambda v, h=h, now=now: density(h, v, now))
+            value = slice_step(jax.random.fold_in(key, h), theta[M + h], partial(density, h, theta))
             theta = theta.at[M + h].set(value)
         return theta
 
@@ -280,7 +279,7 @@ def states_of(held: Held, paths: tuple[Any, ...]) -> tuple[Any, ...]:
     found = []
     for own, part, recursion in zip(held.targets, paths, held.model.recursions, strict=True):
         E = recursion.time.shape[0]
-        found.append(jax.tree.map(lambda leaf, own=own, E=E: place_by_epoch(own.index, leaf[:, :, 0], E), part))
+        found.append(jax.tree.map(lambda leaf, own=own, E=E: place_by_epoch(own.place, leaf[:, :, 0], E), part))
     return tuple(found)
 
 
@@ -325,7 +324,7 @@ class _Gibbs:
             found = self.paths.at(theta[: len(self.z)], theta[len(self.z) :], keys[2])
             chosen = [jax.tree.map(lambda leaf: leaf[:, 0], part) for part in found.states]
             paths = tuple(
-                jax.tree.map(lambda leaf, t=t: by_target(t.index, leaf)[:, :, None], x)
+                jax.tree.map(lambda leaf, t=t: by_target(t.place, leaf)[:, :, None], x)
                 for t, x in zip(self.held.targets, chosen, strict=True)
             )
             states.append(GibbsState(theta, phi, paths, jax.random.key_data(keys[3])))

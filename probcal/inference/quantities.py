@@ -155,7 +155,7 @@ def _quantities(trial: Trial, found: Pool) -> dict[str, _Quantity]:
         draws = np.asarray(_likelihoods(problem.model, *args))
         truth = float(_likelihoods(problem.model, *true)[0])
         all_["log likelihood"] = _Quantity("density", truth, draws)
-    if sampled is not None and trial.joint:
+    if sampled is not None and trial.joint and isinstance(sampled.posed, Posed):
         phi = {name: jnp.asarray(value) for name, value in trial.phi.items()}
         truth = float(_joint(sampled.form, sampled.posed, point, phi))
         all_["log joint"] = _Quantity("density", truth, np.asarray(sampled.draws.density).reshape(-1))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from probcal.inference.methods import MAP
@@ -63,7 +64,7 @@ def _by_particles(
     answers = []
     for k, z in enumerate(places):
         key = context.key if k == 0 else jax.random.fold_in(context.key, 1 + k)
-        point = Point((), (), z, np.zeros(len(problem.levels)))
+        point = Point((), (), jnp.asarray(z), jnp.zeros(len(problem.levels)))
         answers.append(method.answer(problem, prior, point, context._replace(key=key)))
     best = max(range(starts), key=lambda k: _rank(answers[k]))
     return replace(answers[best], optima=tuple(answers) if starts > 1 else (), best=best)

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 Place = tuple[tuple[int, int], ...]  # first and last (excluded) entry of the position, of each recursion
 LAST = 1000  # least particles of the last pass, whose scores give the information
 FILTERS = 8  # whose mean likelihood is the evidence
+SCATTER = 3.0  # mean square of what is left, 1 expected, from which another optimum is looked for
 SPREAD = 32  # draws of the biases behind the sd of a track, and behind values by datum
 
 
@@ -290,6 +291,13 @@ def unexplained(problem: Problem, point: Point) -> list[str]:
     return [name for _, name in sorted(found, reverse=True)]
 
 
+def scatter(problem: Problem, point: Point) -> float:
+    """Mean square of what a point leaves of all rows, about 1 or less where the model is right."""
+    model = problem.model
+    total, count = (sum(float(jnp.sum(part)) for part in parts) for parts in (model.square(point), model.measured))
+    return total / max(count, 1.0)
+
+
 def misfit(names: Sequence[str]) -> str:
     """What is said of targets that no path explains."""
     listed = ", ".join(f'"{name}"' for name in names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
@@ -308,6 +316,12 @@ def _judged(posterior: EnsemblePosterior, method: Maximiser, ended: Ended, low: 
         return Status.DIVERGED, f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases."
     if low:
         return Status.AT_BOUND, "A precision stands at its lower bound: the estimate is invalid."
+    square = scatter(posterior.problem, posterior.point)
+    if square > SCATTER:
+        return Status.NOT_CONVERGED, (
+            f"What is left of the rows has a mean square of {square:.1f} where 1 is expected: another optimum may"
+            ' explain them, or the noise std is too small. Take m_step="averaged", more particles, or further starts.'
+        )
     if ended.still:
         return Status.CONVERGED, ""
     if method.tolerance == 0:

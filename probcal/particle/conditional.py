@@ -23,6 +23,15 @@ def conditional_path(
     Particle Gibbs with ancestor sampling (Lindsten, Jordan, Schon 2014): the last of the particles is the given path;
     its ancestor is drawn anew at every epoch. Resampled at every epoch, multinomially.
     """
+    paths, new = conditional_paths(model, epochs, there, path, z, levels, key, how, 1)
+    return jax.tree.map(lambda leaf: leaf[:, 0], paths), new[:, 0]
+
+
+def conditional_paths(
+    model: Model, epochs: Epoch, there: jax.Array, path: State, z: jax.Array, levels: jax.Array, key: jax.Array,
+    how: Particles, draws: int,
+) -> tuple[State, jax.Array]:  # fmt: skip
+    """Several paths (K, draws leading) of one conditional filter, each by itself a draw of the kernel."""
     M, keys = how.count, jax.random.split(key)
 
     def one(carry: Any, inputs: Any) -> tuple[Any, Any]:
@@ -48,7 +57,7 @@ def conditional_path(
     start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (M, *leaf.shape)), model.initial())
     inputs = (epochs, there, path, jax.random.split(keys[0], len(there)))
     (_, weights), (states, ancestors) = jax.lax.scan(one, (start, jnp.zeros(M)), inputs)
-    last = jax.random.categorical(keys[1], weights)
+    last = jax.random.categorical(keys[1], weights, shape=(draws,))
 
     def back(chosen: jax.Array, inputs: Any) -> tuple[jax.Array, Any]:
         own, parents = inputs

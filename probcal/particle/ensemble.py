@@ -10,10 +10,12 @@ import jax.numpy as jnp
 
 from probcal.model.model import At, Model, scaled
 from probcal.particle.backward import smooth
+from probcal.particle.conditional import conditional_paths
 from probcal.particle.filtering import run_filter
 from probcal.particle.settings import Particles
 from probcal.particle.targets import Targets, by_target, place_by_epoch
 
+DRAWS = 20  # paths that are read off one conditional filter
 AT_ONCE = 25  # paths whose rows are linearised together
 
 
@@ -56,11 +58,46 @@ def ensemble(
 
         seeds, E = jax.random.split(jax.random.fold_in(key, r), len(own.there)), model.recursions[r].time.shape[0]
         smoothed = jax.vmap(one)(own.epochs, own.there, seeds)
-        put = partial(place_by_epoch, own.index, E=E)
+        put = partial(place_by_epoch, own.place, E=E)
         states = jax.tree.map(lambda leaf, put=put: put(leaf[:, :, :, 0]), smoothed.states[0])
         found.append((states, put(smoothed.weights), jnp.sum(smoothed.log_evidence), put(smoothed.lost)))
     states, weights, evidence, lost = zip(*found, strict=True)
     return Ensemble(states, weights, sum(evidence), lost)
+
+
+def conditional_ensemble(
+    model: Model, targets: tuple[Targets, ...], paths: tuple[Any, ...], z: jax.Array, levels: jax.Array,
+    key: jax.Array, how: Particles,
+) -> tuple[Ensemble, tuple[Any, ...]]:  # fmt: skip
+    """Paths of every target drawn given one (T, K, 1, ...) of each recursion, and the next one to be given."""
+    found: list[Any] = []
+    for r, (own, path) in enumerate(zip(targets, paths, strict=True)):
+
+        def one(epochs: Any, there: jax.Array, given: Any, key: jax.Array, own: Targets = own) -> Any:
+            return conditional_paths(own.model, epochs, there, (given,), z, levels, key, how, DRAWS)[0][0]
+
+        seeds, E = jax.random.split(jax.random.fold_in(key, r), len(own.there)), model.recursions[r].time.shape[0]
+        drawn = jax.vmap(one)(own.epochs, own.there, path, seeds)  # (T, K, draws, 1, ...)
+        seen = jax.tree.map(lambda leaf, own=own, E=E: place_by_epoch(own.place, leaf[:, :, :, 0], E), drawn)
+        found.append(
+            (
+                seen,
+                jnp.full((E, DRAWS), 1.0 / DRAWS),
+                jnp.zeros(E, bool),
+                jax.tree.map(lambda leaf: leaf[:, :, 0], drawn),
+            )
+        )
+    states, weights, lost, after = zip(*found, strict=True)
+    return Ensemble(states, weights, jnp.zeros(()), lost), after
+
+
+def first_paths(targets: tuple[Targets, ...], found: Ensemble) -> tuple[Any, ...]:
+    """One path (T, K, 1, ...) of each recursion out of many."""
+    pairs = zip(targets, found.states, strict=True)
+    return tuple(
+        jax.tree.map(lambda leaf, own=own: by_target(own.place, leaf[:, 0])[:, :, None], states)
+        for own, states in pairs
+    )
 
 
 @jax.jit
@@ -164,7 +201,7 @@ def log_likelihood_over(model: Model, found: Ensemble, z: jax.Array, levels: jax
 def log_motion_over(targets: tuple[Targets, ...], found: Ensemble, levels: jax.Array) -> jax.Array:
     """Log density () of the steps of all targets expected over paths: by it the levels of process noise are learnt."""
     parts = zip(targets, found.states, strict=True)
-    paths = tuple(jax.tree.map(lambda leaf, own=own: by_target(own.index, leaf), states) for own, states in parts)
+    paths = tuple(jax.tree.map(lambda leaf, own=own: by_target(own.place, leaf), states) for own, states in parts)
 
     def one(n: jax.Array) -> jax.Array:
         alone = jax.tree.map(lambda leaf: leaf[:, :, n][:, :, None], paths)

@@ -11,7 +11,7 @@ from probcal.errors import InputError, nearest
 
 PROPOSALS = ("auto", "bootstrap", "extended", "laplace")
 SMOOTHERS = ("backward", "exact", "marginal", "genealogy")
-M_STEPS = ("mean", "paths", "averaged")
+M_STEPS = ("averaged", "mean", "paths")
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,12 @@ class Particles:
     "marginal" weighs these (Paper A 38-39), both at a quadratic cost; "genealogy" keeps the ancestors: all that is
     left for a motion without density.
 
-    `m_step`, where it is an E-step: "mean" linearises at the smoothed mean, or on the road that is nearest to it (Paper
-    A 20-21, 43); "paths" takes a Gauss-Newton step of the expectation over all smoothed particles; "averaged" is
-    stochastic approximation, one pass a step, averaged over the passes (Delyon, Lavielle, Moulines 1999). Over the
-    first `tempered` iterations from biases of zero the log-likelihood counts less, at first by 1/50, so that particles
-    that do not know the biases yet are not thrown off by rows that contradict each other (Ueda, Nakano 1998).
+    `m_step`, where it is an E-step: "averaged" is stochastic approximation, each step one pass of a filter that holds
+    the last path, so that few particles will do and none is lost, averaged over the passes (Lindsten 2013; Delyon,
+    Lavielle, Moulines 1999); "mean" linearises at the smoothed mean, or on the road that is nearest to it (Paper A
+    20-21, 43); "paths" takes a Gauss-Newton step of the expectation over all smoothed particles. Over its first
+    `tempered` iterations from biases of zero the log-likelihood counts less, at first by 1/50, so that particles that
+    do not know the biases yet are not thrown off by rows that contradict each other (Ueda, Nakano 1998).
 
     Raises `InputError` for settings outside their ranges; what runs it, where cuthbert is not installed.
 
@@ -43,7 +44,7 @@ class Particles:
     count: int = 1000
     proposal: str = "auto"
     smoother: str = "backward"
-    m_step: str = "paths"
+    m_step: str = "averaged"
     threshold: float = 0.5
     moves: int = 2
     tempered: int = 10

@@ -24,7 +24,7 @@ class Targets(NamedTuple):
     model: Model
     epochs: Epoch  # (T, K) leading
     there: jax.Array  # (T, K) whether a target has so many epochs
-    index: jax.Array  # (T, K) which epoch of the recursion it is; the number of them where there is none
+    place: jax.Array  # (T, K) which epoch of the recursion it is; the number of them where there is none
 
 
 def targets_of(model: Model) -> tuple[Targets, ...]:
@@ -44,7 +44,7 @@ def _of(model: Model, epochs: Epoch, r: int) -> Targets:
     index = np.stack([np.concatenate([one, np.full(K - len(one), len(owner))]) for one in order])
     blocks = [b for b, own in enumerate(model.recursion) if own == r]
 
-    def taken(leaf: np.ndarray) -> np.ndarray:
+    def taken(leaf: Any) -> Any:
         return leaf[pick]
 
     rows = tuple(jax.tree.map(taken, epochs.rows[b]) for b in blocks)
