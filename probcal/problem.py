@@ -271,6 +271,7 @@ class Problem:
         other.model = self.model.seen()
         return other
 
+    @float64
     def later(self, data: Any, sizes: tuple[int, ...] | None = None) -> Epoch:
         """The epochs of rows that came after those of this problem, stacked in time order (K leading).
 

@@ -111,7 +111,7 @@ MUTATIONS = [
     Mutation("model/sigma.py", " - jnp.sum(slope**2, -1)", "", "test_methods.py"),
     # model/rows.py
     Mutation("model/rows.py", "rows.base + rows.scale * padded", "rows.base - rows.scale * padded", "test_exact.py"),
-    Mutation("model/rows.py", "by_bias * rows.scale[rows.sensor][:, None, :]", "by_bias", "test_exact.py"),
+    Mutation("model/rows.py", "Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])", "Linearised(score, weight, by_state, by_bias)", "test_exact.py"),
     Mutation("model/rows.py", "return rows.std * factors[rows.level]", "return rows.std", "test_formulas.py"),
     Mutation("model/rows.py", "score / jnp.sqrt(jnp.where(there, information, 1.0))", "score / jnp.where(there, information, 1.0)", "test_assess.py"),
     Mutation("model/rows.py", "jnp.mod(value + channel.period / 2, channel.period)", "jnp.mod(value, channel.period)", "test_formulas.py"),

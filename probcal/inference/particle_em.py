@@ -29,7 +29,7 @@ from probcal.particle.ensemble import (
     over_paths,
 )
 from probcal.particle.settings import Particles
-from probcal.particle.targets import Targets, weighted
+from probcal.particle.targets import Targets, weigh_rows
 from probcal.priors import Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -70,7 +70,7 @@ class Trace(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("prior", "how", "place"))
-def chunk(
+def em_chunk(
     model: Model, targets: tuple[Targets, ...], prior: Prior, given: Given, state: Climb, last: jax.Array,
     how: Particles, place: Place,
 ) -> tuple[Climb, Trace]:  # fmt: skip
@@ -94,7 +94,7 @@ def iterate(
     keys, now = jax.random.split(state.key), given.prior._replace(alpha=state.alpha)
     share = COOL ** jnp.maximum(1.0 - state.k / max(how.tempered, 1), 0.0) if how.tempered else jnp.ones(())
     model = model.weighted([jnp.full_like(there, share) for there in model.measured])
-    targets = tuple(weighted(own, share) for own in targets)
+    targets = tuple(weigh_rows(own, share) for own in targets)
     if how.m_step == "averaged":
         found, paths = conditional_ensemble(model, targets, state.paths, state.z, state.levels, keys[0], how)
         state = state._replace(paths=paths)
@@ -189,7 +189,7 @@ def climb(problem: Problem, how: Particles, prior: Prior, z: Any, iterations: in
     targets = prepared(problem, how)
     state = _begun(problem, targets, how, given, z, key)
     while int(state.k) < iterations:
-        state, _ = chunk(
+        state, _ = em_chunk(
             problem.model, targets, bare(prior), given, state, jnp.asarray(iterations), how, places(problem)
         )
     return state
@@ -199,17 +199,23 @@ def _begun(
     problem: Problem, targets: tuple[Targets, ...], how: Particles, given: Given, z: Any, key: jax.Array
 ) -> Climb:
     """The state before the first iteration."""
-    M, z, keys = problem.model.biases, jnp.asarray(z, float), jax.random.split(key)
-    levels, paths = jnp.zeros(problem.model.level_spread.shape), tuple[Any, ...]()
     if how.m_step == "averaged":
         for own in targets:
             own.model.check_density()
+    return _beginning(problem.model, targets, given.prior.alpha, np.asarray(z, float), key, how)
+
+
+@partial(jax.jit, static_argnames="how")
+def _beginning(
+    model: Model, targets: tuple[Targets, ...], alpha: jax.Array, z: Any, key: jax.Array, how: Particles
+) -> Climb:
+    M, keys, paths = model.biases, jax.random.split(key), tuple[Any, ...]()
+    levels = jnp.zeros(model.level_spread.shape)
+    if how.m_step == "averaged":
         crowd = replace(how, count=max(how.count, CROWD))
-        cool = tuple(weighted(own, jnp.asarray(COOL if how.tempered else 1.0)) for own in targets)
-        paths = first_paths(targets, ensemble(problem.model, cool, z, levels, keys[1], crowd))
-    return Climb(
-        z, levels, given.prior.alpha, jnp.zeros((M, M)), jnp.zeros(M), jnp.zeros((), int), keys[0], paths
-    )  # fmt: skip
+        cool = tuple(weigh_rows(own, jnp.asarray(COOL if how.tempered else 1.0)) for own in targets)
+        paths = first_paths(targets, ensemble(model, cool, z, levels, keys[1], crowd))
+    return Climb(z, levels, alpha, jnp.zeros((M, M)), jnp.zeros(M), jnp.zeros((), int), keys[0], paths)
 
 
 def climb_by_particles(
@@ -225,7 +231,7 @@ def climb_by_particles(
     parts: list[Trace] = []
     count, known, still = 0, bare(prior), Wandering(False, 0, np.inf)
     while count < method.iterations:
-        state, part = chunk(model, targets, known, given, state, jnp.asarray(method.iterations), how, place)
+        state, part = em_chunk(model, targets, known, given, state, jnp.asarray(method.iterations), how, place)
         part = jax.tree.map(lambda leaf, left=method.iterations - count: np.asarray(leaf)[:left], part)
         parts.append(part)
         count += len(part.log_likelihood)

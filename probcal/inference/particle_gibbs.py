@@ -28,13 +28,13 @@ from probcal.inference.posterior import Chains, conclude_draws
 from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
-from probcal.inference.weighted import Paths, marginal_information, misfit, prepared, unexplained
+from probcal.inference.weighted import Paths, louis_information, misfit, prepared, unexplained
 from probcal.model.model import At, Model
 from probcal.particle.conditional import conditional_path
-from probcal.particle.ensemble import log_motion_of, moments, over_paths
+from probcal.particle.ensemble import ensemble, expected_over_paths, first_paths, log_motion_of, state_moments
 from probcal.particle.proposals import check_proposal
 from probcal.particle.settings import Particles
-from probcal.particle.targets import Targets, by_target, place_by_epoch
+from probcal.particle.targets import Targets, place_by_epoch
 from probcal.priors import Gaussian, Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -121,8 +121,8 @@ class ParticleGibbs(Sampler):
             begun = climb(problem, crowd, Gaussian(), z, SEARCH, keys[3])
             z, levels = np.asarray(begun.z), np.asarray(begun.levels)
         paths = Paths(problem, crowd, targets)
-        information, score, found = marginal_information(paths, z, levels, keys[0])
-        reference = over_paths(problem.model, found, jnp.asarray(z), jnp.asarray(levels)).information
+        information, score, found = louis_information(paths, z, levels, keys[0])
+        reference = expected_over_paths(problem.model, found, jnp.asarray(z), jnp.asarray(levels)).information
         H = len(levels)
         natural = Natural(
             jnp.asarray(np.pad(information, (0, H))), jnp.asarray(np.pad(information @ z + score, (0, H))),
@@ -284,7 +284,7 @@ def states_of(held: Held, paths: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 @partial(jax.jit, static_argnames=("method", "form"))
-def run_sweeps(method: ParticleGibbs, form: Form, held: Held, chain: GibbsState, thin: jax.Array) -> Any:
+def run_particle_sweeps(method: ParticleGibbs, form: Form, held: Held, chain: GibbsState, thin: jax.Array) -> Any:
     """`method.chunk` draws of one chain, `thin` sweeps apart."""
     blank = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(partial(method.step, form, held), chain)[1]
@@ -303,6 +303,21 @@ def run_sweeps(method: ParticleGibbs, form: Form, held: Held, chain: GibbsState,
     return jax.lax.scan(one, chain, None, length=method.chunk)
 
 
+@partial(jax.jit, static_argnames=("form", "how"))
+def begin_chains(form: Form, how: Particles, held: Held, theta: Any, keys: jax.Array) -> GibbsState:
+    """States of chains (chains leading) about theta (Q,), on paths that particles draw there."""
+    M = form.biases
+
+    def one(key: jax.Array) -> GibbsState:
+        seeds = jax.random.split(key, 4)
+        phi = form.hierarchy.draw(seeds[0])
+        place = theta + SPREAD * conditional(form, held.natural, phi).deviation(seeds[1])
+        found = ensemble(held.model, held.targets, place[:M], place[M:], seeds[2], how)
+        return GibbsState(place, phi, first_paths(held.targets, found), jax.random.key_data(seeds[3]))
+
+    return jax.lax.map(one, keys)
+
+
 class _Gibbs:
     """Chains of particle Gibbs: a thread each on a CPU, one after the other on an accelerator."""
 
@@ -315,20 +330,8 @@ class _Gibbs:
 
     def first(self) -> GibbsState:
         """Chains about the start, further out than the data leave the biases, on paths drawn there."""
-        natural, states = self.held.natural, []
-        for own in self.keys:
-            keys = jax.random.split(own, 4)
-            phi = self.form.hierarchy.draw(keys[0])
-            narrow = conditional(self.form, natural, phi).deviation(keys[1])
-            theta = jnp.asarray(np.concatenate([self.z, self.levels])) + SPREAD * narrow
-            found = self.paths.at(theta[: len(self.z)], theta[len(self.z) :], keys[2])
-            chosen = [jax.tree.map(lambda leaf: leaf[:, 0], part) for part in found.states]
-            paths = tuple(
-                jax.tree.map(lambda leaf, t=t: by_target(t.place, leaf)[:, :, None], x)
-                for t, x in zip(self.held.targets, chosen, strict=True)
-            )
-            states.append(GibbsState(theta, phi, paths, jax.random.key_data(keys[3])))
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        theta = np.concatenate([self.z, self.levels])
+        return begin_chains(self.form, self.paths.how, self.held, theta, self.keys)
 
     def restored(self, leaves: list[np.ndarray]) -> Any:
         """The state of saved leaves."""
@@ -341,7 +344,7 @@ class _Gibbs:
             with jax.enable_x64(True):
                 own = jax.tree.map(lambda leaf: leaf[k], state)
                 return jax.block_until_ready(
-                    run_sweeps(self.method.kernel(), self.form, self.held, own, jnp.asarray(thin))
+                    run_particle_sweeps(self.method.kernel(), self.form, self.held, own, jnp.asarray(thin))
                 )
 
         found = list(pool.map(one, range(self.method.chains)))
@@ -380,7 +383,7 @@ class ParticleChains(Chains):
         zero, levels = np.zeros_like(self.summary.mean), self.summary.levels
         found = self.run.paths.at(zero, levels, jax.random.key(1))
         point = self.run.paths.point(found, zero, levels)
-        return point._replace(states=tuple(m.mean for m in moments(self.run.paths.problem.model, found)))
+        return point._replace(states=tuple(m.mean for m in state_moments(self.run.paths.problem.model, found)))
 
     @property
     def pull(self) -> np.ndarray:

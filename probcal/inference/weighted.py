@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
@@ -13,7 +14,8 @@ import numpy as np
 from probcal import linalg
 from probcal.inference.ending import ABSURD, FAR, low_and_far
 from probcal.inference.run import Given, Maximiser
-from probcal.particle.ensemble import Ensemble, ensemble, moments, nearest_states, observed_over_paths
+from probcal.model.model import Model
+from probcal.particle.ensemble import Ensemble, ensemble, nearest_states, observed_over_paths, state_moments
 from probcal.particle.proposals import check_proposal
 from probcal.particle.settings import Particles, check_installed
 from probcal.particle.targets import Targets, targets_of
@@ -69,26 +71,26 @@ class Paths:
     targets: tuple[Targets, ...]
 
     def at(self, z: Any, levels: Any, key: jax.Array) -> Ensemble:
-        """Smoothed particles at biases z (M,) and log levels (H,)."""
+        """SmoothedParticles particles at biases z (M,) and log levels (H,)."""
         return ensemble(self.problem.model, self.targets, jnp.asarray(z), jnp.asarray(levels), key, self.how)
 
     def seen(self, found: Ensemble) -> list[jax.Array]:
         """What rows see of the states, (E, N, n) of each recursion."""
-        return [jax.vmap(lambda x, r=r: self.problem.model.vectors(r, x))(x) for r, x in enumerate(found.states)]
+        return list(vectors_of(self.problem.model, found.states))
 
     def drawn(self, z: np.ndarray, levels: np.ndarray, key: jax.Array) -> list[np.ndarray]:
         """A path for each draw of the biases z (D, M), as rows see it: (D, E, n) of each recursion."""
         parts = []
         for k, own in enumerate(z):
             found = self.at(own, levels, jax.random.fold_in(key, k))
-            parts.append([np.asarray(x[:, 0]) for x in self.seen(found)])  # paths come in no order
+            parts.append([np.asarray(x)[:, 0] for x in self.seen(found)])  # paths come in no order
         return [np.stack(column) for column in zip(*parts, strict=True)]
 
     def tracks(self, z: np.ndarray, levels: np.ndarray, key: jax.Array) -> list[Tracks]:
         """Mean and sd of all states over draws of the biases z (D, M)."""
         each = []
         for k, own in enumerate(z):
-            found = moments(self.problem.model, self.at(own, levels, jax.random.fold_in(key, k)))
+            found = state_moments(self.problem.model, self.at(own, levels, jax.random.fold_in(key, k)))
             each.append([(np.asarray(m.mean), np.asarray(m.variance)) for m in found])
         tracks = []
         for column in zip(*each, strict=True):
@@ -99,8 +101,8 @@ class Paths:
     def point(self, found: Ensemble, z: Any, levels: Any) -> Point:
         """The states that stand for the particles: on the road where there is one (Paper A 43)."""
         states = nearest_states(self.problem.model, found, places(self.problem))
-        vectors = tuple(self.problem.model.vectors(r, x) for r, x in enumerate(states))
-        noises = tuple(jnp.zeros((x.shape[0], 0)) for x in vectors)
+        vectors = single_vectors(self.problem.model, states)
+        noises = tuple(jax.device_put(np.zeros((x.shape[0], 0))) for x in vectors)
         return Point(vectors, noises, jnp.asarray(z), jnp.asarray(levels))
 
 
@@ -173,7 +175,7 @@ class EnsemblePosterior(Posterior):
         return self.numbers
 
 
-def marginal_information(paths: Paths, z: Any, levels: Any, key: jax.Array) -> tuple[np.ndarray, np.ndarray, Ensemble]:
+def louis_information(paths: Paths, z: Any, levels: Any, key: jax.Array) -> tuple[np.ndarray, np.ndarray, Ensemble]:
     """Information (M, M) of the data about the biases, trajectories integrated, their score, and the particles.
 
     By Louis' identity (1982): the curvature at given states, less the covariance of the score over paths.
@@ -184,6 +186,24 @@ def marginal_information(paths: Paths, z: Any, levels: Any, key: jax.Array) -> t
     found = more.at(z, levels, key)
     expected = observed_over_paths(paths.problem.model, found, jnp.asarray(z), jnp.asarray(levels))
     return positive(np.asarray(expected.information - expected.spread)), np.asarray(expected.score), found
+
+
+@jax.jit
+def vectors_of(model: Model, states: tuple[Any, ...]) -> tuple[jax.Array, ...]:
+    """What rows see of particles (E, N leading) of each recursion."""
+    return tuple(jax.vmap(partial(model.vectors, r))(x) for r, x in enumerate(states))
+
+
+@jax.jit
+def single_vectors(model: Model, states: tuple[Any, ...]) -> tuple[jax.Array, ...]:
+    """What rows see of states (E leading) of each recursion."""
+    return tuple(model.vectors(r, x) for r, x in enumerate(states))
+
+
+@jax.jit
+def squares_by_epoch(model: Model, point: Point) -> tuple[list[jax.Array], list[jax.Array]]:
+    """Sums (E,) of squares and of data over the rows of each epoch, for each recursion."""
+    return model.by_epoch(model.square(point)), model.by_epoch(model.measured)
 
 
 def positive(matrix: np.ndarray) -> np.ndarray:
@@ -207,7 +227,7 @@ def conclude_particles(
     """The answer of a climb by particles."""
     paths, keys = Paths(problem, how, targets), jax.random.split(key, 6)
     z, levels, M = np.asarray(ended.z), np.asarray(ended.levels), problem.model.biases
-    information, score, found = marginal_information(paths, z, levels, keys[0])
+    information, score, found = louis_information(paths, z, levels, keys[0])
     now = given.prior._replace(alpha=ended.alpha)
     matrix = jnp.asarray(information) + now.matrix()
     covariance, volume = (np.asarray(a) for a in linalg.inverse_and_logdet(matrix))
@@ -244,7 +264,7 @@ def posterior_of(
     point = paths.point(found, z, levels)
     zero = paths.at(jnp.zeros_like(z), levels, keys[0])
     before = paths.point(zero, jnp.zeros_like(z), levels)
-    before = before._replace(states=tuple(m.mean for m in moments(problem.model, zero)))
+    before = before._replace(states=tuple(m.mean for m in state_moments(problem.model, zero)))
     drawn = np.asarray(draw_biases(point, jnp.asarray(summary.covariance), keys[1], SPREAD))
     sound = np.isfinite(drawn).all()
     tracks = paths.tracks(drawn if sound else np.asarray(z)[None], levels, keys[2])
@@ -265,7 +285,7 @@ def track_by_particles(
     paths, keys = Paths(problem, how, prepared(problem, how)), jax.random.split(key, 4)
     found = paths.at(z, levels, keys[0])
     point = paths.point(found, z, levels)
-    zero = moments(problem.model, paths.at(np.zeros_like(z), levels, keys[1]))
+    zero = state_moments(problem.model, paths.at(np.zeros_like(z), levels, keys[1]))
     drawn = np.asarray(draw_biases(point, jnp.asarray(covariance), keys[2], SPREAD)) if len(z) else np.zeros((1, 0))
     tracks = paths.tracks(drawn, levels, keys[3])
     seen = problem.seen()
@@ -279,8 +299,7 @@ def track_by_particles(
 
 def unexplained(problem: Problem, point: Point) -> list[str]:
     """Targets whose rows no path explains, worst first."""
-    model = problem.model
-    squares, there = model.by_epoch(model.square(point)), model.by_epoch(model.measured)
+    squares, there = squares_by_epoch(problem.model, point)
     found = []
     for epochs, square, count in zip(problem.epochs, squares, there, strict=True):
         for name in dict.fromkeys(epochs.target):
@@ -293,8 +312,9 @@ def unexplained(problem: Problem, point: Point) -> list[str]:
 
 def scatter(problem: Problem, point: Point) -> float:
     """Mean square of what a point leaves of all rows, about 1 or less where the model is right."""
-    model = problem.model
-    total, count = (sum(float(jnp.sum(part)) for part in parts) for parts in (model.square(point), model.measured))
+    total, count = (
+        sum(float(np.sum(part)) for part in parts) for parts in squares_by_epoch(problem.model, point)
+    )  # fmt: skip
     return total / max(count, 1.0)
 
 

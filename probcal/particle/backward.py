@@ -11,14 +11,14 @@ import jax.numpy as jnp
 
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
-from probcal.particle.filtering import Filtered
+from probcal.particle.filtering import FilteredParticles
 from probcal.particle.resampling import multinomial, systematic
 from probcal.particle.settings import Particles
 
 Sampler = Callable[..., tuple[Any, jax.Array]]  # `cuthbertlib.smc.smoothing.protocols.BackwardSampling`
 
 
-class Smoothed(NamedTuple):
+class SmoothedParticles(NamedTuple):
     """Smoothed particles of one target at K epochs, N each."""
 
     states: State  # (K, N) leading
@@ -68,7 +68,13 @@ def sampler_of(how: Particles) -> Sampler:
 
 
 def draw_paths(
-    model: Model, found: Filtered, epochs: Epoch, there: jax.Array, levels: jax.Array, key: jax.Array, how: Particles
+    model: Model,
+    found: FilteredParticles,
+    epochs: Epoch,
+    there: jax.Array,
+    levels: jax.Array,
+    key: jax.Array,
+    how: Particles,
 ) -> State:
     """As many paths as particles, (K, M) leading, drawn from a target's smoothing distribution."""
     sampler, keys = sampler_of(how), jax.random.split(key)
@@ -95,7 +101,9 @@ def draw_paths(
     return jax.tree.map(lambda leaf: jax.vmap(lambda own, k: own[k])(leaf, chosen), found.states)
 
 
-def marginal_weights(model: Model, found: Filtered, epochs: Epoch, there: jax.Array, levels: jax.Array) -> jax.Array:
+def marginal_weights(
+    model: Model, found: FilteredParticles, epochs: Epoch, there: jax.Array, levels: jax.Array
+) -> jax.Array:
     """Smoothed weights (K, M) of the filter's particles, in O(M^2) an epoch (Paper A, Algorithm 4, 38-39)."""
 
     def back(weights: jax.Array, inputs: Any) -> tuple[jax.Array, jax.Array]:
@@ -123,12 +131,18 @@ def marginal_weights(model: Model, found: Filtered, epochs: Epoch, there: jax.Ar
     return jnp.concatenate([weights, last[None]])
 
 
-def smooth(
-    model: Model, found: Filtered, epochs: Epoch, there: jax.Array, levels: jax.Array, key: jax.Array, how: Particles
-) -> Smoothed:
+def smooth_particles(
+    model: Model,
+    found: FilteredParticles,
+    epochs: Epoch,
+    there: jax.Array,
+    levels: jax.Array,
+    key: jax.Array,
+    how: Particles,
+) -> SmoothedParticles:
     """The smoother of `how` behind a filter."""
     if how.smoother == "marginal":
         weights = marginal_weights(model, found, epochs, there, levels)
-        return Smoothed(found.states, weights, found.log_evidence, found.lost)
+        return SmoothedParticles(found.states, weights, found.log_evidence, found.lost)
     states = draw_paths(model, found, epochs, there, levels, key, how)
-    return Smoothed(states, jnp.full(found.log_weights.shape, 1.0 / how.count), found.log_evidence, found.lost)
+    return SmoothedParticles(states, jnp.full(found.log_weights.shape, 1.0 / how.count), found.log_evidence, found.lost)

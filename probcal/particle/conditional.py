@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
-from probcal.particle.proposals import gained, moved
+from probcal.particle.proposals import gained, propagated
 from probcal.particle.resampling import multinomial
 from probcal.particle.settings import Particles
 
@@ -44,7 +44,7 @@ def conditional_paths(
         parent = jax.random.categorical(seeds[1], jnp.where(jnp.isfinite(jnp.max(reach)), reach, weights))
         chosen = jnp.where(really, chosen.at[-1].set(jnp.where(epoch.first, M - 1, parent)), jnp.arange(M))
         before = jax.tree.map(lambda leaf: leaf[chosen], states)
-        after, gain = jax.vmap(lambda k, x: moved(model, how, k, x, epoch, z, levels, conditional=True))(
+        after, gain = jax.vmap(lambda k, x: propagated(model, how, k, x, epoch, z, levels, conditional=True))(
             jax.random.split(seeds[2], M), before
         )
         last = jax.tree.map(lambda leaf: leaf[-1], before)

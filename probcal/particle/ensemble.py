@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from probcal.model.model import At, Model, scaled
-from probcal.particle.backward import smooth
+from probcal.particle.backward import smooth_particles
 from probcal.particle.conditional import conditional_paths
 from probcal.particle.filtering import run_filter
 from probcal.particle.settings import Particles
-from probcal.particle.targets import Targets, by_target, place_by_epoch
+from probcal.particle.targets import Targets, along_targets, place_by_epoch
 
 DRAWS = 20  # paths that are read off one conditional filter
 AT_ONCE = 25  # paths whose rows are linearised together
@@ -28,7 +28,7 @@ class Ensemble(NamedTuple):
     lost: tuple[jax.Array, ...]  # (E,) whether no particle could have given the rows of an epoch
 
 
-class Moments(NamedTuple):
+class StateMoments(NamedTuple):
     """What rows see of the states of one recursion."""
 
     mean: jax.Array  # (E, n)
@@ -54,7 +54,7 @@ def ensemble(
         def one(epochs: Any, there: jax.Array, key: jax.Array, own: Targets = own) -> Any:
             keys = jax.random.split(key)
             filtered = run_filter(own.model, epochs, there, z, levels, keys[0], how)
-            return smooth(own.model, filtered, epochs, there, levels, keys[1], how)
+            return smooth_particles(own.model, filtered, epochs, there, levels, keys[1], how)
 
         seeds, E = jax.random.split(jax.random.fold_in(key, r), len(own.there)), model.recursions[r].time.shape[0]
         smoothed = jax.vmap(one)(own.epochs, own.there, seeds)
@@ -95,19 +95,19 @@ def first_paths(targets: tuple[Targets, ...], found: Ensemble) -> tuple[Any, ...
     """One path (T, K, 1, ...) of each recursion out of many."""
     pairs = zip(targets, found.states, strict=True)
     return tuple(
-        jax.tree.map(lambda leaf, own=own: by_target(own.place, leaf[:, 0])[:, :, None], states)
+        jax.tree.map(lambda leaf, own=own: along_targets(own.place, leaf[:, 0])[:, :, None], states)
         for own, states in pairs
     )
 
 
 @jax.jit
-def moments(model: Model, found: Ensemble) -> tuple[Moments, ...]:
+def state_moments(model: Model, found: Ensemble) -> tuple[StateMoments, ...]:
     """Mean and variance of what rows see of the states of each recursion."""
     parts = []
     for r, (states, weights) in enumerate(zip(found.states, found.weights, strict=True)):
         seen = jax.vmap(partial(model.vectors, r))(states)  # (E, N, n)
         mean = jnp.einsum("en,enu->eu", weights, seen)
-        parts.append(Moments(mean, jnp.einsum("en,enu->eu", weights, (seen - mean[:, None]) ** 2)))
+        parts.append(StateMoments(mean, jnp.einsum("en,enu->eu", weights, (seen - mean[:, None]) ** 2)))
     return tuple(parts)
 
 
@@ -173,6 +173,7 @@ def over_paths(
     return Expectation(score, information, square - score[:, None] * score[None, :])
 
 
+expected_over_paths = jax.jit(over_paths)
 observed_over_paths = jax.jit(partial(over_paths, observed=True))
 
 
@@ -201,7 +202,7 @@ def log_likelihood_over(model: Model, found: Ensemble, z: jax.Array, levels: jax
 def log_motion_over(targets: tuple[Targets, ...], found: Ensemble, levels: jax.Array) -> jax.Array:
     """Log density () of the steps of all targets expected over paths: by it the levels of process noise are learnt."""
     parts = zip(targets, found.states, strict=True)
-    paths = tuple(jax.tree.map(lambda leaf, own=own: by_target(own.place, leaf), states) for own, states in parts)
+    paths = tuple(jax.tree.map(lambda leaf, own=own: along_targets(own.place, leaf), states) for own, states in parts)
 
     def one(n: jax.Array) -> jax.Array:
         alone = jax.tree.map(lambda leaf: leaf[:, :, n][:, :, None], paths)

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
-from probcal.particle.proposals import lost, moved
+from probcal.particle.proposals import lost, propagated
 from probcal.particle.resampling import systematic
 from probcal.particle.settings import Particles
 
 
-class Filtered(NamedTuple):
+class FilteredParticles(NamedTuple):
     """What a filter leaves of each of K epochs: M particles as they were drawn, before they are resampled."""
 
     states: State  # (K, M) leading
@@ -31,7 +31,7 @@ def built(model: Model, how: Particles, z: jax.Array, levels: jax.Array) -> Any:
 
     def propagate(key: jax.Array, particle: tuple[State, jax.Array], inputs: tuple[Epoch, jax.Array]) -> Any:
         epoch, there = inputs
-        after, gain = moved(model, how, key, particle[0], epoch, z, levels)
+        after, gain = propagated(model, how, key, particle[0], epoch, z, levels)
         held = jax.tree.map(lambda new, old: jnp.where(there, new, old), after, particle[0])
         return held, jnp.where(there, gain, 0.0)
 
@@ -46,14 +46,14 @@ def built(model: Model, how: Particles, z: jax.Array, levels: jax.Array) -> Any:
 
 def run_filter(
     model: Model, epochs: Epoch, there: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array, how: Particles
-) -> Filtered:
+) -> FilteredParticles:
     """Particles of one target over its epochs (K leading)."""
     import cuthbert
 
     filter_, keys = built(model, how, z, levels), jax.random.split(key)
     found = cuthbert.filter(filter_, (epochs, there), filter_.init_prepare(key=keys[0]), key=keys[1])
     states, gains = jax.tree.map(lambda leaf: leaf[1:], found.particles)
-    return Filtered(
+    return FilteredParticles(
         states,
         jax.nn.log_softmax(found.log_weights[1:], -1),
         found.ancestor_indices[1:],

@@ -34,7 +34,7 @@ def steps_of(model: Model, how: Particles, conditional: bool) -> int:
     return STEPS["extended"] if linear else 0
 
 
-def moved(
+def propagated(
     model: Model, how: Particles, key: jax.Array, x: State, epoch: Epoch, z: jax.Array, levels: jax.Array,
     conditional: bool = False,
 ) -> tuple[State, jax.Array]:  # fmt: skip

@@ -71,7 +71,7 @@ def _alone(model: Model, r: int, blocks: list[int]) -> Model:
     )  # fmt: skip
 
 
-def weighted(targets: Targets, weight: jax.Array) -> Targets:
+def weigh_rows(targets: Targets, weight: jax.Array) -> Targets:
     """The targets with every datum counted by a weight ()."""
     rows = tuple(seen._replace(mask=seen.mask * weight) for seen in targets.epochs.rows)
     return targets._replace(epochs=targets.epochs._replace(rows=rows))
@@ -83,7 +83,7 @@ def place_by_epoch(index: jax.Array, leaf: jax.Array, E: int) -> jax.Array:
     return jnp.zeros((E, *flat.shape[1:]), leaf.dtype).at[index.reshape(-1)].set(flat, mode="drop")
 
 
-def by_target(index: jax.Array, leaf: jax.Array) -> jax.Array:
+def along_targets(index: jax.Array, leaf: jax.Array) -> jax.Array:
     """(E, ...) of a recursion as (T, K, ...), what is behind a target's last epoch that epoch's again."""
     last = jnp.max(jnp.where(index < leaf.shape[0], index, -1), 1, keepdims=True)
     return leaf[jnp.where(index < leaf.shape[0], index, last)]

@@ -1,0 +1,304 @@
+"""Methods whose trajectories are particles: EM, particle Gibbs and tracks, against exact answers and on roads."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import probcal
+from probcal import (
+    EM,
+    EMEA,
+    NUTS,
+    Channel,
+    ConstantVelocity,
+    Gaussian,
+    InputError,
+    LeavingRoad,
+    Network,
+    Node,
+    ParticleGibbs,
+    Particles,
+    Problem,
+    RandomWalk,
+    Road,
+    RoadNetwork,
+    Target,
+    Unknown,
+    fit,
+    sensor,
+    simulate,
+    track,
+)
+
+pytest.importorskip("cuthbert", reason="cuthbert is not installed: uv sync --extra particles")
+pytest.importorskip("shapely", reason="shapely is not installed: uv sync --extra roads")
+ROOT = Path(__file__).parents[1]
+TIME = np.arange(12.0)
+START = {"position": ((0.0, 0.0), 2.0), "velocity": ((2.0, 1.0), 0.5)}
+MOTION = Target(ConstantVelocity(0.5), START)
+STREET = RoadNetwork.from_lines({"street": [(-200.0, 0.0), (300.0, 0.0)]}, oneway=("street",))
+
+
+@sensor(place=Channel("m", std=0.5, per_axis=True))
+def relative(target, pose):
+    """Where a target is, seen from a node: linear in both."""
+    return {"place": target.position - pose.position}
+
+
+def offsets():
+    """A network whose posterior is Gaussian: two nodes at unknown places, one known."""
+    nodes = [Node("known", (0.0, 0.0)), *(Node(name, (0.0, 0.0), scale=3.0) for name in "ab")]
+    return Network([relative.on(node) for node in nodes])
+
+
+@pytest.fixture(scope="module")
+def linear():
+    """A linear problem of one target, and the exact answer."""
+    network = offsets()
+    run = simulate(network, MOTION, TIME, key=3)
+    problem = Problem(network, MOTION, run.table)
+    return problem, fit(problem, probcal.MAP(), prior=Gaussian())
+
+
+def same(found, exact, *, shift, ratio):
+    """Means within `shift` sd of the exact ones, sds within a `ratio`."""
+    mine, theirs = found["calibration"].to_dataset(), exact["calibration"].to_dataset()
+    assert (np.abs(mine["mean"] - theirs["mean"]) < shift * theirs["sd"]).all()
+    assert (np.abs(np.log(mine["sd"] / theirs["sd"])) < np.log(ratio)).all()
+
+
+@pytest.mark.parametrize("m_step", ["averaged", "mean", "paths"])
+def test_em_by_particles_ends_where_the_exact_answer_is(linear, m_step):
+    """One run of 60 iterations each; the noise of 400 particles is below 0.1 sd, the limit three times that."""
+    problem, exact = linear
+    found = fit(problem, EM(Particles(400, m_step=m_step), iterations=60, tolerance=0.0), prior=Gaussian())
+    assert found.attrs["status"] in ("converged", "iterations spent")
+    same(found, exact, shift=0.3, ratio=1.2)
+    assert abs(found.attrs["log_evidence"] - exact.attrs["log_evidence"]) < 0.5
+    mine, theirs = (tree["track/target"].to_dataset() for tree in (found, exact))
+    assert (np.abs(mine["mean"] - theirs["mean"]) < 0.4 * theirs["sd"]).all()
+    assert (np.abs(np.log(mine["sd"] / theirs["sd"])) < np.log(1.4)).all()
+    assert np.isfinite(found["log_likelihood"]["y"].values).all()
+
+
+def test_particle_gibbs_draws_the_exact_posterior(linear):
+    problem, exact = linear
+    found = fit(problem, ParticleGibbs(chains=2, warmup=100, draws=500, particles=Particles(60)), prior=Gaussian())
+    assert found.attrs["status"] == "converged"
+    same(found, exact, shift=0.3, ratio=1.25)
+    stats = found["sample_stats"].to_dataset()
+    assert float(stats["renewed"].mean()) > 0.8
+    assert float(stats["acceptance_rate"].mean()) > 0.2
+
+
+def test_a_run_of_particle_gibbs_goes_on_where_it_was_stopped(linear, tmp_path):
+    """The draws of a run in two pieces are those of one run."""
+    problem, _ = linear
+    method = ParticleGibbs(chains=1, warmup=25, draws=75, particles=Particles(20), patience=1)
+    whole = fit(problem, method, prior=Gaussian(), key=5)
+
+    class Stopped(Exception):
+        pass
+
+    def stop(step):
+        if step.done >= 50:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        fit(problem, method, prior=Gaussian(), key=5, store=tmp_path / "draws", progress=stop)
+    again = fit(problem, method, prior=Gaussian(), key=5, store=tmp_path / "draws", resume=True)
+    np.testing.assert_array_equal(whole["posterior"]["bias"], again["posterior"]["bias"])
+
+
+def test_em_ea_by_particles_prunes_what_is_zero(linear):
+    problem, _ = linear
+    found = fit(problem, EMEA(Particles(100), iterations=20))
+    assert found.attrs["precisions"] == "maximised"
+    assert ((found["calibration"]["gamma"] >= 0) & (found["calibration"]["gamma"] <= 1)).all()
+
+
+@pytest.mark.ci
+def test_an_unknown_noise_level_is_found_by_particles():
+    """sd of a level from 24 data of two axes and three sensors is 9 %; limits four of them, false alarms below 1e-3."""
+    network, motion = offsets(), Target(ConstantVelocity(Unknown(0.2, 5.0)), START)
+    run = simulate(network, MOTION, np.arange(40.0), key=1)
+    problem = Problem(network, motion, run.table)
+    methods = (EM(Particles(200), iterations=80, tolerance=0.0), EM())
+    by_particles, exact = (float(fit(problem, m, prior=Gaussian())["level"]["std"][0]) for m in methods)
+    assert 0.3 < by_particles < 0.8, "0.5 is true, 0.2 was guessed"
+    assert abs(np.log(by_particles / exact)) < 0.3
+
+
+def calibrated(problem):
+    """What `track` reads of a fit: biases of zero, known."""
+    labels, M = list(problem.labels), len(problem.labels)
+    values = {
+        "mean": ("bias_label", np.zeros(M)),
+        "covariance": (("bias_label", "bias_label_other"), np.zeros((M, M))),
+    }
+    group = xr.Dataset(values, {"bias_label": labels, "bias_label_other": labels})
+    return xr.DataTree.from_dict({"calibration": group, "constant_data": xr.Dataset()})
+
+
+def smoothed_along(measured, std, noise, place, pace):
+    """Mean and sd of place and speed along a line by the information matrix of all epochs, one second apart."""
+    K, Q = len(measured), noise**2 * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
+    F, J, b = np.array([[1.0, 1.0], [0.0, 1.0]]), np.zeros((2 * K, 2 * K)), np.zeros(2 * K)
+    J[:2, :2] += np.diag([1 / place[1] ** 2, 1 / pace[1] ** 2])
+    b[:2] += [place[0] / place[1] ** 2, pace[0] / pace[1] ** 2]
+    for k in range(K - 1):
+        step = np.hstack([-F, np.eye(2)])
+        J[2 * k : 2 * k + 4, 2 * k : 2 * k + 4] += step.T @ np.linalg.inv(Q) @ step
+    J[::2, ::2] += np.eye(K) / std**2
+    b[::2] += measured / std**2
+    P = np.linalg.inv(J)
+    return (P @ b).reshape(K, 2), np.sqrt(np.diag(P)).reshape(K, 2)
+
+
+def test_a_road_of_one_long_edge_is_smoothed_as_a_line():
+    """Mean and sd of place and speed against the Gaussian of all epochs; 4,000 particles, limits 0.15 sd and 12 %."""
+    motion = Road(STREET, std=0.4, speed=(3.0, 0.5), position=((0.0, 0.0), 2.0))
+    network = Network([relative.on(Node("known", (0.0, 0.0)))])
+    run = simulate(network, motion, TIME, key=2)
+    problem = Problem(network, motion, run.table)
+    tree = track(problem, calibrated(problem), smoother=Particles(4000))
+    assert tree.attrs["status"] == "converged"
+    found = tree["track/target"].to_dataset()
+    x = run.table.sort_values("time")["place_x"].to_numpy(float)
+    mean, sd = smoothed_along(x, relative.channels["place"].std, 0.4, (0.0, 2.0), (3.0, 0.5))
+    for j, component in enumerate(("position_x", "velocity_x")):
+        mine = found.sel(component=component)
+        assert (np.abs(mine["mean"] - mean[:, j]) < 0.15 * sd[:, j]).all()
+        assert (np.abs(np.log(mine["sd"] / sd[:, j])) < np.log(1.12)).all()
+    np.testing.assert_allclose(found["mean"].sel(component="position_y"), 0.0, atol=1e-9)
+
+
+CROSS = RoadNetwork.from_lines({
+    "west": [(-60.0, 0.0), (0.0, 0.0)], "east": [(0.0, 0.0), (60.0, 5.0)], "north": [(0.0, 0.0), (5.0, 60.0)],
+    "south": [(0.0, -60.0), (0.0, 0.0)],
+})  # fmt: skip
+
+
+def crossing(kind):
+    """A target that comes from the west, with a power beside it, on the road or free to leave it."""
+    road = Road(CROSS, std=0.3, speed=(4.0, 0.5), position=((-40.0, 0.0), 2.0))
+    return (road if kind == "road" else LeavingRoad(road, 0.5, 0.05, 0.05)) + RandomWalk("power", "dB", 0.5, (4.0, 2.0))
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("kind", ["road", "leaving"])
+def test_a_network_is_calibrated_from_targets_on_roads(kind):
+    """Two targets at times of their own; the places of two sensors, 3 sd about the truth (NEES below 3 in 1e-4)."""
+    network = offsets()
+    schedule = pd.DataFrame(
+        [(t + 0.3 * k, name, s.name) for k, name in enumerate(("one", "two")) for t in np.arange(18.0 + k)
+         for s in network.sensors], columns=["time", "target", "sensor"],
+    )  # fmt: skip
+    biases = {"a.position_x": 3.0, "a.position_y": -2.0, "b.position_x": 0.0, "b.position_y": 4.0}
+    motions = {name: crossing(kind) for name in ("one", "two")}
+    run = simulate(network, motions, [0.0], key=1, biases=biases, schedule=schedule)
+    problem = Problem(network, motions, run.table)
+    found = fit(problem, EM(Particles(200), iterations=60), prior=Gaussian())
+    assert found.attrs["status"] == "converged", found.attrs["message"]
+    group = found["calibration"].to_dataset()
+    error = group["mean"].values - np.array([run.truth.biases[label] for label in problem.labels])
+    assert error @ np.linalg.solve(group["covariance"].values, error) / len(error) < 6.0
+    assert (group["sd"] < 1.0).all(), "the rows say where they are"
+    tracks = probcal.tracks(found)
+    assert list(tracks.columns[:4]) == ["time", "target", "power", "power_sd"]
+    if kind == "road":
+        _, _, away = CROSS.nearest(run.truth.tracks[["position_x", "position_y"]].to_numpy(float))
+        assert away.max() < 1e-6
+
+
+def test_a_target_that_no_road_explains_has_a_status():
+    network, far = Network([relative.on(Node("known", (0.0, 0.0)))]), np.arange(8.0)
+    table = pd.DataFrame({"time": far, "sensor": "known", "place_x": 4.0 * far, "place_y": 300.0 + far})
+    problem = Problem(network, Road(CROSS, std=0.3, speed=(4.0, 0.5)), table)
+    tree = track(problem, calibrated(problem), smoother=Particles(200))
+    assert tree.attrs["status"] == "misfit"
+    assert 'No path of target "target" explains its rows' in tree.attrs["message"]
+    assert np.isfinite(tree["track/target"]["mean"].values).all()
+
+
+@pytest.mark.ci
+def test_em_by_particles_says_where_nothing_explains_the_rows():
+    network, far = offsets(), np.arange(8.0)
+    rows = [(t, s, 4.0 * t, 300.0 + t) for t in far for s in ("known", "a", "b")]
+    table = pd.DataFrame(rows, columns=["time", "sensor", "place_x", "place_y"])
+    problem = Problem(network, Road(CROSS, std=0.3, speed=(4.0, 0.5)), table)
+    tree = fit(problem, EM(Particles(100), iterations=10), prior=Gaussian())
+    assert tree.attrs["status"] == "misfit"
+    tree = fit(problem, ParticleGibbs(chains=1, warmup=0, draws=25, particles=Particles(20)), prior=Gaussian())
+    assert tree.attrs["status"] == "misfit"
+
+
+def test_later_rows_of_a_road_may_not_lie_further_apart():
+    network = Network([relative.on(Node("known", (0.0, 0.0)))])
+    run = simulate(network, crossing("road"), TIME, key=1)
+    problem = Problem(network, crossing("road"), run.table[run.table["time"] < 6])
+    assert problem.later(run.table[run.table["time"] == 6]).time.shape == (1,)
+    with pytest.raises(InputError, match="later: 3 s pass between two epochs, more than the 1 s"):
+        problem.later(run.table[run.table["time"] == 8])
+
+
+ERRORS = [
+    (lambda p: track(p, calibrated(p), smoother="particles"), "give Particles\\(2000\\), or None for the Gaussian smo"),
+    (lambda p: EM("particles"), "Cubature\\(\\) or Particles\\(500\\)"),
+    (lambda p: ParticleGibbs(steps=0), "ParticleGibbs\\(steps=0\\): it must be at least 1"),
+    (lambda p: fit(Problem(p.network, Target(ConstantVelocity(0.5, singular=True), START), p.measurements.table.frame),
+                   ParticleGibbs()), "the motion has no density: its noise"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "text"), ERRORS, ids=[text[:30] for _, text in ERRORS])
+def test_what_particles_cannot_is_said(linear, call, text):
+    with pytest.raises(InputError, match=text):
+        call(linear[0])
+
+
+@pytest.mark.ci
+def test_particle_gibbs_and_nuts_agree_on_yes_and_no():
+    """Presence sensors beside a way: means within 0.35 sd, sds within 20 %, of some hundred effective draws each."""
+    sys.path.insert(0, str(ROOT / "models"))
+    import presence
+
+    nodes = [Node(f"p{k}", (4.0 * k, 2.0 * (-1) ** k), scale=2.0) for k in (1, 2, 3)]
+    gates = [Node("g", (0.0, 10.0)), Node("h", (16.0, -10.0))]
+    network = Network([*(presence.presence.on(n) for n in nodes), *(presence.gate.on(n) for n in gates)])
+    motions = {name: Target(ConstantVelocity(0.3), {"position": ((0.0, 0.0), 1.0), "velocity": ((1.4, 0.0), 0.2)})
+               for name in ("one", "two")}  # fmt: skip
+    problem = Problem(network, motions, simulate(network, motions, TIME, key=0).table)
+    gibbs = fit(problem, ParticleGibbs(chains=2, warmup=200, draws=1500, particles=Particles(50)), prior=Gaussian())
+    nuts = fit(problem, NUTS(chains=2, draws=500), prior=Gaussian())
+    same(gibbs, nuts, shift=0.35, ratio=1.2)
+
+
+@pytest.mark.ci
+def test_the_command_line_fits_and_tracks_by_particles(tmp_path):
+    model = str(ROOT / "models" / "road_microphones.py")
+    base = [sys.executable, "-m", "probcal.cli"]
+    done = subprocess.run(
+        [*base, "fit", model, "--set", "motion=road", "--method", "em-particles", "--out", str(tmp_path / "fit")],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "EM (Gaussian): converged" in done.stdout
+    out = tmp_path / "tracks.csv"
+    done = subprocess.run(
+        [*base, "track", model, "--set", "motion=road", "--calibration", str(tmp_path / "fit"), "--smoother",
+         "particles", "--out", str(out)], capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert len(pd.read_csv(out)) == 30
+    done = subprocess.run(
+        [*base, "track", model, "--calibration", str(tmp_path / "fit"), "--smoother", "particle"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert '--smoother "particle" is not known' in done.stderr
