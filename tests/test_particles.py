@@ -37,10 +37,10 @@ from probcal.particle.ensemble import (
     ensemble,
     log_likelihood_over,
     log_motion_over,
-    state_moments,
     moved_levels,
     nearest_states,
     over_paths,
+    state_moments,
 )
 from probcal.particle.filtering import run_filter
 from probcal.particle.proposals import check_proposal
@@ -77,7 +77,7 @@ def table_of(powered):
 
 
 @cache
-def world(name):
+def world(name, level=LEVEL):
     """A problem of two targets with an unknown process noise, and the dense Gaussian of the same data."""
     powered, unknown = name == "joint", Unknown(0.8)
     linear, glider = ConstantVelocity(unknown), Glider(unknown)
@@ -97,7 +97,7 @@ def world(name):
     def evidence(z, level):
         return reference.dense(naive_at(level), None, hold=z).evidence
 
-    naive = naive_at(LEVEL)
+    naive = naive_at(level)
     z = 0.2 * np.linspace(-1.0, 1.0, problem.model.biases)
     held = reference.dense(naive, None, hold=z)
     starts = np.cumsum([0, *(len(chain.names) * len(chain.times) for chain in naive.chains)])
@@ -113,7 +113,7 @@ def world(name):
     with jax.enable_x64(True):
         targets = targets_of(problem.model)
     return SimpleNamespace(
-        problem=problem, model=problem.model, targets=targets, z=z, levels=np.array([LEVEL]), evidence=evidence,
+        problem=problem, model=problem.model, targets=targets, z=z, levels=np.array([level]), evidence=evidence,
         exact=held.evidence, index=index, mean=[mean[k] for k in index], sd=[sd[k] for k in index],
         whole=mean, covariance=held.covariance[held.biases :, held.biases :],
     )  # fmt: skip
@@ -143,6 +143,13 @@ def wild():
     plan = plan_of(PLANE, {"one": [0.0, 0.5, 1.5, 2.0, 4.0]})
     run = simulate(PLANE, Target(CV, START), [0.0], key=5, schedule=plan, biases={})
     return Problem(PLANE, Target(ConstantVelocity(0.8, noise=WILD), START), run.table)
+
+
+@cache
+def restless():
+    """The same with noise so wide that ancestors are many, and tails as heavy as those of a Cauchy."""
+    table = wild().measurements.table.frame
+    return Problem(PLANE, Target(ConstantVelocity(3.0, noise=StudentT(1.0)), START), table)
 
 
 @cache
@@ -382,15 +389,15 @@ def test_a_sum_smoothed_on_the_way_is_exact(smoother, draws):
 
 @pytest.mark.parametrize(("name", "proposal"), [("linear", "extended"), ("linear", "bootstrap")])
 def test_a_kernel_leaves_exact_paths_exact(name, proposal):
-    """8,000 paths of the exact posterior, three steps of 5 particles each: means, variances, products of neighbours.
+    """20,000 paths of the exact posterior, four steps of 4 particles each: means, variances, products of neighbours.
 
-    All 100 lie within 5 standard errors: false alarms 6e-5, sees 6 % of an sd, 8 % of a variance. Of the paths of five
-    epochs most begin anew, which no filter of 5 particles does that keeps the ancestors of its path.
+    All 100 lie within 5 standard errors: false alarms 6e-5; sees 4 % of an sd, 5 % of a variance. A fifth of the paths
+    begins anew at every step, where a filter that keeps the ancestors of its path renews a thirtieth.
     """
-    w, runs = world(name), 8000
+    w, runs = world(name, 1.8), 20_000  # so restless that ancestors are many
     (targets,) = w.targets
     draws = np.random.default_rng(1).multivariate_normal(w.whole, w.covariance, runs)[:, w.index[0]]
-    how, E = Particles(8, proposal=proposal), len(w.index[0])
+    how, E = Particles(4, proposal=proposal), len(w.index[0])
 
     def one(states, key):
         paths = along_targets(targets.place, states)[:, :, None]
@@ -402,7 +409,7 @@ def test_a_kernel_leaves_exact_paths_exact(name, proposal):
             )(targets.epochs, targets.there, paths, keys)
             return after[:, :, 1], new[:, :, 1]
 
-        paths, new = jax.lax.scan(sweep, paths, jax.random.split(key, 3))
+        paths, new = jax.lax.scan(sweep, paths, jax.random.split(key, 4))
         return place_by_epoch(targets.place, paths[:, :, 0], E), place_by_epoch(targets.place, new[0], E)
 
     with jax.enable_x64(True):
@@ -417,8 +424,7 @@ def test_a_kernel_leaves_exact_paths_exact(name, proposal):
     assert near(away**2, 1.0)
     assert near(away[:, 1:] * away[:, :-1], correlation)
     share = new.mean(0)
-    print("renewed", share)
-    assert (share[[0, 5]] > 0.12).all()
+    assert (share[[0, 5]] > 0.2).all()
     assert (share < 1.0).all()
     moved = (np.abs(after - draws) > 0).any(2).mean(0)
     assert (moved >= share - 0.02).all(), "what is said to be new has moved"
@@ -460,7 +466,8 @@ def renewed(targets, key, how, runs):
 
 
 @pytest.mark.parametrize(
-    ("made", "proposal"), [(wild, "auto"), (ranging, "laplace"), pytest.param(ranging, "auto", marks=pytest.mark.ci)]
+    ("made", "proposal"),
+    [(restless, "auto"), (ranging, "laplace"), pytest.param(ranging, "auto", marks=pytest.mark.ci)],
 )
 def test_a_kernel_leaves_paths_from_the_prior_to_the_prior(made, proposal):
     """8,000 paths and data drawn together, then three steps of 5 particles given the data (Geweke 2004).
@@ -499,7 +506,7 @@ def expectations(model, targets, z, levels, key, how, runs):
     return jax.lax.map(one, jax.random.split(key, runs), batch_size=10)
 
 
-@pytest.mark.parametrize("name", ["linear", pytest.param("glider", marks=pytest.mark.ci)])
+@pytest.mark.parametrize("name", ["linear", "glider"])
 def test_score_information_and_slope_are_those_of_the_marginal_likelihood(name):
     """Fisher's and Louis' identities: 100 runs of 300 particles against the dense evidence, which is quadratic in z.
 
@@ -523,14 +530,14 @@ def test_score_information_and_slope_are_those_of_the_marginal_likelihood(name):
     assert np.asarray(found[2]).std() > 0
 
 
-@pytest.mark.parametrize("name", ["linear", pytest.param("glider", marks=pytest.mark.ci)])
-def test_levels_stay_at_the_top_of_the_evidence_and_climb_to_it(name):
-    """60 Newton steps of 300 particles from the exact mode and from both sides, targets of 5 and 4 epochs.
+@pytest.mark.ci
+def test_levels_stay_at_the_top_of_the_evidence_and_climb_to_it():
+    """300 Newton steps of 200 particles each from the exact mode and from both sides, targets of 5 and 4 epochs.
 
     At the mode their mean is zero within 5 standard errors and 0.01: false alarms below 1e-6. A step is that of EM,
-    some hundredths long: from 0.7 away all go back on average, by more than 5 standard errors.
+    some hundredths long: from 0.7 above and below they go back on average, by more than 5 standard errors.
     """
-    w = world(name)
+    w = world("linear")
     spread = float(np.asarray(w.model.level_spread)[0])
     grid = np.linspace(-2.5, 1.5, 41)
     top = np.polynomial.Polynomial.fit(
@@ -540,19 +547,19 @@ def test_levels_stay_at_the_top_of_the_evidence_and_climb_to_it(name):
     best = fine[np.argmax(top(fine))]
 
     def step(levels, key):
-        found = ensemble(w.model, w.targets, w.z, levels, key, Particles(300))
+        found = ensemble(w.model, w.targets, w.z, levels, key, Particles(200))
         return moved_levels(w.model, w.targets, found, w.z, levels) - levels
 
     with jax.enable_x64(True):
         run = jax.jit(lambda levels, keys: jax.lax.map(lambda k: step(levels, k), keys, batch_size=10))
         moved = {
-            away: np.asarray(run(np.array([best + away]), jax.random.split(jax.random.key(8), 60)))
+            away: np.asarray(run(np.array([best + away]), jax.random.split(jax.random.key(8), 300)))
             for away in (0.0, 0.7, -0.7)
         }
     assert near(moved[0.0], 0.0, 0.01)
     for away in (0.7, -0.7):
         steps = moved[away][:, 0] * -np.sign(away)
-        assert steps.mean() > 5 * steps.std(ddof=1) / np.sqrt(60) > 0
+        assert steps.mean() > 5 * steps.std(ddof=1) / np.sqrt(300) > 0
 
 
 # particles that are lost
@@ -663,8 +670,13 @@ def test_places_fall_on_particles_with_weight():
 
 
 def test_targets_hold_every_row_once_and_find_back_to_their_epochs():
-    for name in ("linear", "joint"):
-        w = world(name)
+    """Two worlds, and one whose second target has a single epoch."""
+    w = world("linear")
+    table = table_of(False)
+    few = Problem(PLANE, w.problem.motion, table[(table["target"] == "one") | (table["time"] == 0.2)])
+    with jax.enable_x64(True):
+        short = SimpleNamespace(problem=few, model=few.model, targets=targets_of(few.model))
+    for w in (world("linear"), world("joint"), short):
         for r, targets in enumerate(w.targets):
             there, place = np.asarray(targets.there), np.asarray(targets.place)
             E = len(w.problem.epochs[r].time)

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 Place = tuple[tuple[int, int], ...]  # first and last (excluded) entry of the position, of each recursion
 LAST = 1000  # least particles of the last pass, whose scores give the information
 FILTERS = 8  # whose mean likelihood is the evidence
-SCATTER = 3.0  # mean square of what is left, 1 expected, from which another optimum is looked for
+SCATTER = 1.5  # mean square of what is left, 1 expected, from which another optimum is looked for
+SURE = 6.0  # sd by which that mean square lies above 1 at least
 SPREAD = 32  # draws of the biases behind the sd of a track, and behind values by datum
 
 
@@ -310,12 +311,12 @@ def unexplained(problem: Problem, point: Point) -> list[str]:
     return [name for _, name in sorted(found, reverse=True)]
 
 
-def scatter(problem: Problem, point: Point) -> float:
-    """Mean square of what a point leaves of all rows, about 1 or less where the model is right."""
+def scatter(problem: Problem, point: Point) -> tuple[float, float]:
+    """Mean square of what a point leaves of all data, about 1 or less where the model is right, and their number."""
     total, count = (
         sum(float(np.sum(part)) for part in parts) for parts in squares_by_epoch(problem.model, point)
     )  # fmt: skip
-    return total / max(count, 1.0)
+    return total / max(count, 1.0), max(count, 1.0)
 
 
 def misfit(names: Sequence[str]) -> str:
@@ -336,8 +337,8 @@ def _judged(posterior: EnsemblePosterior, method: Maximiser, ended: Ended, low: 
         return Status.DIVERGED, f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases."
     if low:
         return Status.AT_BOUND, "A precision stands at its lower bound: the estimate is invalid."
-    square = scatter(posterior.problem, posterior.point)
-    if square > SCATTER:
+    square, count = scatter(posterior.problem, posterior.point)
+    if square > max(SCATTER, 1 + SURE * np.sqrt(2 / count)):
         return Status.NOT_CONVERGED, (
             f"What is left of the rows has a mean square of {square:.1f} where 1 is expected: another optimum may"
             ' explain them, or the noise std is too small. Take m_step="averaged", more particles, or further starts.'
