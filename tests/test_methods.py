@@ -502,7 +502,7 @@ ERRORS = [
     (lambda: Mixture(0.1, 1.0), "an echo must differ from an inlier"),
     (lambda: EA(update="newton"), 'EA\\(update="newton"\\): give one of mackay, em'),
     (lambda: EA(trajectory="none"), 'EA\\(trajectory="none"\\): give one of joint, marginal, smoothed'),
-    (lambda: EM("cubature"), r"EM\(e_step='cubature'\): give an E-step such as Extended\(\), Cubature\(\) or Particles"),
+    (lambda: EM("cubature"), r"EM\(e_step='cubature'\): give an E-step such as Extended\(\), Cubature"),
     (lambda: EMEA(inner=0), "EM-EA\\(inner=0\\): at least one inner iteration is needed"),
     (
         lambda: ARD(by="nod"),

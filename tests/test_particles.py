@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import reference
-from test_motion_protocol import CV, PLANE, POWER, POWERED, START, TIMES, Glider, plan_of
+from gliders import CV, PLANE, POWER, POWERED, START, TIMES, Glider, plan_of
 from worlds import fix
 
 from probcal import (

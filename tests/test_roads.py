@@ -820,3 +820,20 @@ def test_a_track_is_taken_from_a_tree_and_checked():
             match_track(bad, network, std=5.0)
     with pytest.raises(InputError, match=r"match_track: std is 0.0; give a positive number of metres"):
         match_track(frame, network, std=0.0)
+
+
+def test_points_that_cannot_be_placed_are_refused(tmp_path):
+    network = RoadNetwork.from_lines({"a": [(0.0, 0.0), (10.0, 0.0)]})
+    with pytest.raises(InputError, match=r"nearest takes finite points of shape \(n, 2\) in m"):
+        network.nearest([(0.0, np.nan)])
+    graph = nx.MultiDiGraph()
+    graph.add_node(1, x=0.0, y=0.0)
+    graph.add_node(2, x=9.0, y=0.0)
+    graph.add_edge(1, 2)
+    with pytest.raises(InputError, match="the graph has nodes without z; give every node one, or dimension=2"):
+        RoadNetwork.from_graph(graph, crs="local", dimension=3)
+    far = {"type": "LineString", "coordinates": [[1e30, 0.0], [2e30, 0.0]]}
+    path = tmp_path / "far.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": far}]}))
+    with pytest.raises(InputError, match="some points are outside the area of"):
+        read_roads(path, crs="EPSG:25832", frame=LocalFrame(47.8, 11.5))

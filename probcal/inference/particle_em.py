@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.errors import FitError
 from probcal.inference.progress import Progress
 from probcal.inference.run import Context, Given, Maximiser, bare, check_method, given_of, learn
 from probcal.inference.weighted import Ended, Place, conclude_particles, places, prepared
@@ -224,6 +223,8 @@ def climb_by_particles(
     """Run the loop from biases z (M,) and conclude: a Gaussian about them, its information by Louis' identity."""
     check_method(method)
     targets = prepared(problem, how)
+    if problem.model.driven and how.smoother == "marginal":
+        how = replace(how, smoother="exact")  # levels of process noise are learnt along paths
     how = replace(how, tempered=0) if np.any(np.asarray(z)) else how  # a start that is known is not left again
     model, given, place = problem.model, given_of(method, problem, prior), places(problem)
     keys = jax.random.split(context.key)
@@ -235,8 +236,6 @@ def climb_by_particles(
         part = jax.tree.map(lambda leaf, left=method.iterations - count: np.asarray(leaf)[:left], part)
         parts.append(part)
         count += len(part.log_likelihood)
-        if not np.isfinite(part.z).all():
-            raise FitError(f"{method.name}: the biases ran away; give them a prior, or fix some")
         if context.progress is not None:
             context.progress(Progress(method.name, count, method.iterations, float(part.log_likelihood[-1])))
         traced = np.concatenate([own.z for own in parts])

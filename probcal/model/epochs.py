@@ -88,7 +88,7 @@ class Stepwise:
                     noise = noise.at[slice(*tail.columns)].divide(jnp.sqrt(jnp.where(on, drawn, 1.0)))
                 vector = vector.at[target].set(_mean(vector, move, target) + _root(move, levels) @ noise)
             if form is not None:
-                moved = self._moved(form, jax.random.fold_in(own, 1), others, r, epoch, levels)
+                moved = self._moved(form, jax.random.fold_in(own, 1 + len(move.mixed)), others, r, epoch, levels)
                 vector = form.whole(vector, moved)
             found.append(vector)
         return tuple(found)
@@ -146,8 +146,8 @@ class Stepwise:
         lower, inverse = linalg.factor_and_inverse(_root(move, levels) @ _root(move, levels).T)
         (old,), (new,) = x, after
         middle = jnp.mean(new[:, 0], 0)  # about which nothing cancels
-        ahead = (old[:, 0] @ move.F.T + move.drift - middle) @ inverse.T
-        there = (new[:, 0] - middle) @ inverse.T
+        ahead = (old[:, 0] @ move.F.T + (move.drift - middle)[None, :]) @ inverse.T
+        there = (new[:, 0] - middle[None, :]) @ inverse.T
         square = jnp.sum(ahead**2, 1)[:, None] + jnp.sum(there**2, 1)[None, :] - 2.0 * ahead @ there.T
         n = inverse.shape[0]
         volume = jnp.sum(jnp.log(jnp.diagonal(lower))) + 0.5 * n * float(np.log(2 * np.pi))
@@ -168,10 +168,11 @@ class Stepwise:
 
     def log_likelihood_at(self, epoch: Epoch, x: State, z: jax.Array, levels: jax.Array) -> tuple[jax.Array, ...]:
         """Log density (P, C) of every row of an epoch, zero where nothing was measured, for each block."""
-        return tuple(
-            waist.log_likelihood(block, data, waist.predict(block, data, states, z), levels)
-            for block, data, states in self._seen(epoch, x)
-        )
+        found = []
+        for block, data, states in self._seen(epoch, x):
+            part = waist.log_likelihood(block, data, waist.predict(block, data, states, z), levels)
+            found.append(jnp.where(data.mask > 0, part, 0.0))  # a padded row may have no value
+        return tuple(found)
 
     def linearise_at(
         self, epoch: Epoch, x: State, z: jax.Array, levels: jax.Array, *, expected: bool = True
@@ -184,6 +185,8 @@ class Stepwise:
         found = []
         for block, data, states in self._seen(epoch, x):
             lin = waist.linearise(block, data, states, z, levels, expected=expected)
+            there = data.mask > 0  # a padded row may have no value
+            lin = jax.tree.map(lambda leaf, t=there: jnp.where(t if leaf.ndim == 2 else t[:, :, None], leaf, 0.0), lin)
             whole = jnp.zeros((*lin.state.shape[:2], states.shape[1]))
             found.append(lin._replace(state=whole.at[:, :, np.asarray(block.used, int)].set(lin.state)))
         return tuple(found)

@@ -39,7 +39,8 @@ def metropolis(
     density, count = jax.vmap(log_density), len(x1_ancestor_indices)
 
     def at(chosen: jax.Array) -> jax.Array:
-        return density(jax.tree.map(lambda leaf: leaf[chosen], x0_all), x1_all)
+        value = density(jax.tree.map(lambda leaf: leaf[chosen], x0_all), x1_all)
+        return jnp.where(jnp.isnan(value), -jnp.inf, value)
 
     def move(state: tuple[jax.Array, jax.Array], own: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
         chosen, value = state
@@ -110,7 +111,7 @@ def marginal_weights(
         before, filtered, after, ancestors, epoch, really = inputs
         density = filtered[:, None] + model.log_steps(before, after, epoch, levels)
         highest = jnp.max(density, 0)
-        shares = jnp.exp(density - jnp.where(jnp.isfinite(highest), highest, 0.0))
+        shares = jnp.exp(density - jnp.where(jnp.isfinite(highest), highest, 0.0)[None, :])
         total = jnp.sum(shares, 0)
         smoothed = shares @ jnp.where(total > 0, weights / jnp.where(total > 0, total, 1.0), 0.0)
         held = jnp.zeros_like(weights).at[ancestors].add(weights)

@@ -50,7 +50,7 @@ def _of(model: Model, epochs: Epoch, r: int) -> Targets:
     rows = tuple(jax.tree.map(taken, epochs.rows[b]) for b in blocks)
     rows = tuple(seen._replace(mask=seen.mask * there[:, :, None, None]) for seen in rows)
     picked: Any = dict(
-        time=taken(epochs.time), dt=taken(epochs.dt) * there, first=taken(epochs.first) & there,
+        time=taken(epochs.time), dt=np.where(there, taken(epochs.dt), 1.0), first=taken(epochs.first) & there,
         recursion=np.zeros_like(index), target=(np.zeros_like(index),),
         move=(jax.tree.map(taken, epochs.move[r]),), rows=rows,
     )  # fmt: skip
