@@ -41,6 +41,7 @@ if TYPE_CHECKING:
         fit,
         log_evidence,
         numpyro_model,
+        particle_filter,
         sbc,
         study,
         track,
@@ -84,7 +85,7 @@ __all__ = lazy(
         "probcal.geodesy": "LocalFrame",
         "probcal.inference": (
             "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares ParticleGibbs Unscented coverage_table "
-            "fit log_evidence numpyro_model sbc study track"
+            "fit log_evidence numpyro_model particle_filter sbc study track"
         ),
         "probcal.motion": (
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"

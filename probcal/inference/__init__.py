@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from probcal.lazy import lazy
 
 if TYPE_CHECKING:
+    from probcal.inference.clouds import particle_filter
     from probcal.inference.coverage import coverage_table
     from probcal.inference.evidence import Evidence, log_evidence
     from probcal.inference.fit import calibrate, fit, track
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 __all__ = lazy(
     __name__,
     {
+        "probcal.inference.clouds": "particle_filter",
         "probcal.inference.coverage": "coverage_table",
         "probcal.inference.evidence": "Evidence log_evidence",
         "probcal.inference.fit": "calibrate fit track",

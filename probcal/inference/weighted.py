@@ -213,12 +213,12 @@ def positive(matrix: np.ndarray) -> np.ndarray:
     return (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
-def log_likelihood_at(paths: Paths, z: Any, levels: Any, key: jax.Array) -> tuple[float, float]:
+def log_likelihood_at(paths: Paths, z: Any, levels: Any, key: jax.Array, filters: int = FILTERS) -> tuple[float, float]:
     """Log of the mean likelihood over some filters, and the standard error of that log."""
-    logs = np.array([float(paths.at(z, levels, jax.random.fold_in(key, k)).log_evidence) for k in range(FILTERS)])
+    logs = np.array([float(paths.at(z, levels, jax.random.fold_in(key, k)).log_evidence) for k in range(filters)])
     weights = np.exp(logs - logs.max())
     mean = weights.mean()
-    return float(logs.max() + np.log(mean)), float(weights.std(ddof=1) / mean / np.sqrt(FILTERS))
+    return float(logs.max() + np.log(mean)), float(weights.std(ddof=1) / mean / np.sqrt(filters))
 
 
 def conclude_particles(

@@ -62,7 +62,28 @@ def ensemble(
         states = jax.tree.map(lambda leaf, put=put: put(leaf[:, :, :, 0]), smoothed.states[0])
         found.append((states, put(smoothed.weights), jnp.sum(smoothed.log_evidence), put(smoothed.lost)))
     states, weights, evidence, lost = zip(*found, strict=True)
-    return Ensemble(states, weights, sum(evidence), lost)
+    return Ensemble(states, weights, jnp.sum(jnp.stack(evidence)), lost)
+
+
+@partial(jax.jit, static_argnames="how")
+def filter_ensemble(
+    model: Model, targets: tuple[Targets, ...], z: jax.Array, levels: jax.Array, key: jax.Array, how: Particles
+) -> Ensemble:
+    """Filter every target of a model: particles as they are weighed at each epoch, none smoothed."""
+    found: list[Any] = []
+    for r, own in enumerate(targets):
+
+        def one(epochs: Any, there: jax.Array, key: jax.Array, own: Targets = own) -> Any:
+            return run_filter(own.model, epochs, there, z, levels, key, how)
+
+        seeds, E = jax.random.split(jax.random.fold_in(key, r), len(own.there)), model.recursions[r].time.shape[0]
+        filtered = jax.vmap(one)(own.epochs, own.there, seeds)
+        put = partial(place_by_epoch, own.place, E=E)
+        drawn = jax.tree.map(lambda leaf, put=put: put(leaf[:, :, :, 0]), filtered.states[0])
+        told = jnp.sum(filtered.log_evidence)
+        found.append((drawn, put(jnp.exp(filtered.log_weights)), told, put(filtered.lost)))
+    states, weights, evidence, lost = zip(*found, strict=True)
+    return Ensemble(states, weights, jnp.sum(jnp.stack(evidence)), lost)
 
 
 def conditional_ensemble(

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from probcal.plots.interactive import interactive_map
     from probcal.plots.map import plot_map
     from probcal.plots.observability import draw_check, plot_directions, plot_passes, plot_spectrum
+    from probcal.plots.roads import plot_particles, plot_roads
     from probcal.plots.sbc import draw_sbc, plot_coverage, plot_ranks
     from probcal.plots.study import draw_study, plot_study
 
@@ -34,6 +35,7 @@ __all__ = lazy(
         "probcal.plots.interactive": "interactive_map",
         "probcal.plots.map": "plot_map",
         "probcal.plots.observability": "draw_check plot_directions plot_passes plot_spectrum",
+        "probcal.plots.roads": "plot_particles plot_roads",
         "probcal.plots.sbc": "draw_sbc plot_coverage plot_ranks",
         "probcal.plots.study": "draw_study plot_study",
     },
