@@ -65,7 +65,7 @@ class Trace(NamedTuple):
 
     z: jax.Array  # (I, M)
     variance: jax.Array  # (I, M) of each bias at given states
-    log_likelihood: jax.Array  # (I,) estimated, at the biases before the step
+    log_likelihood: jax.Array  # (I,) at the biases before the step, trajectories integrated, or given where averaged
 
 
 @partial(jax.jit, static_argnames=("prior", "how", "place"))
@@ -97,8 +97,10 @@ def iterate(
     if how.m_step == "averaged":
         found, paths = conditional_ensemble(model, targets, state.paths, state.z, state.levels, keys[0], how)
         state = state._replace(paths=paths)
+        told = log_likelihood_over(model, found, state.z, state.levels)
     else:
         found = ensemble(model, targets, state.z, state.levels, keys[0], how)
+        told = found.log_evidence
     states = nearest_states(model, found, place) if how.m_step == "mean" else None
     expected = over_paths(model, found, state.z, state.levels) if states is None else at_states(
         model, states, state.z, state.levels
@@ -116,7 +118,7 @@ def iterate(
     if model.level_spread.shape[0]:
         levels = moved_levels(model, targets, found, z, levels)
     after = state._replace(z=z, levels=levels, alpha=alpha, k=state.k + 1, key=keys[1])
-    return after, Trace(z, variance, found.log_evidence)
+    return after, Trace(z, variance, told)
 
 
 def _averaged(state: Climb, expected: Expectation, how: Particles) -> Climb:
@@ -245,7 +247,9 @@ def climb_by_particles(
     trace = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     if still.still and how.m_step != "averaged":  # what is left is the noise of the particles
         state = state._replace(z=jnp.asarray(trace.z[-min(WINDOW, len(trace.z) // 2) :].mean(0)))
-    ended = Ended(state.z, state.levels, state.alpha, trace.log_likelihood, still.still, _moved(problem, still))
+    ended = Ended(
+        state.z, state.levels, state.alpha, trace.log_likelihood, trace.z, still.still, _moved(problem, still)
+    )
     return conclude_particles(problem, method, how, prior, given, targets, ended, keys[1])
 
 

@@ -96,7 +96,7 @@ class _Run(NamedTuple):
 
     problem: Problem
     truth: Truth
-    start: Point
+    start: Point | None  # None where a motion has no linear form
     number: int
 
 
@@ -136,7 +136,9 @@ def _batch(
         whole = [_simulated(setting, point, run) for point, run in cases]
         found: list[dict[str, Any]] = []
         for name, (method, prior) in methods.items():
-            if isinstance(method, Sampler):
+            for run in whole:
+                check_problem(run.problem, linear=not method.by_particles)
+            if isinstance(method, Sampler) or method.by_particles:
                 found += [
                     {"case": case, "method": name} | _record(run, _drawn(run, method, prior))
                     for case, run in zip(cases, whole, strict=True)
@@ -174,7 +176,8 @@ def _batch(
 def _simulated(setting: Setting, point: dict[str, Any], number: int) -> _Run:
     """One problem with its start; raises `InputError` where a setting does not return what a study needs."""
     problem, truth = _made(setting, point, number)
-    return _Run(problem, truth, automatic_start(problem), number)
+    linear = all(form is None for form in problem.model.sampled)
+    return _Run(problem, truth, automatic_start(problem) if linear else None, number)
 
 
 def _made(setting: Setting, point: dict[str, Any], number: int) -> tuple[Problem, Truth]:
@@ -183,7 +186,7 @@ def _made(setting: Setting, point: dict[str, Any], number: int) -> tuple[Problem
     if not (isinstance(made, tuple) and len(made) == 2 and isinstance(made[0], Problem) and isinstance(made[1], Truth)):
         raise InputError("study: setting(run, ...) must return a pair, the Problem and its Truth")
     problem, truth = made
-    check_problem(problem)
+    check_problem(problem, linear=False)
     unknown = [label for label in problem.labels if label not in truth.biases]
     if unknown:
         raise InputError(f'study: the truth of setting(run, ...) does not name the bias "{unknown[0]}"; give its value')
@@ -211,9 +214,9 @@ def _record(run: _Run, answer: Answer) -> dict[str, Any]:
 
 
 def _drawn(run: _Run, method: Method, prior: Prior) -> Answer:
-    """The answer of a sampler, which takes its runs one by one."""
+    """The answer of a sampler, or of a method by particles, which take their runs one by one."""
     context = Context(jax.random.key(run.number), threads=1, fallback=NUTS())
-    return solve(run.problem, method, prior, context, start=run.start)
+    return solve(run.problem, method, prior, context, start=None if method.by_particles else run.start)
 
 
 def choose_methods(names: Sequence[str]) -> dict[str, tuple[Method, Prior]]:

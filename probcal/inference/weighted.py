@@ -59,6 +59,7 @@ class Ended(NamedTuple):
     levels: jax.Array  # (H,)
     alpha: jax.Array  # (M,)
     trace: np.ndarray  # (I,) log-likelihood of every iteration, estimated
+    steps: np.ndarray  # (I, M) biases after every iteration
     still: bool
     said: str  # what still moves
 
@@ -251,7 +252,7 @@ def conclude_particles(
     ).tolist() if M else []  # fmt: skip
     return Answer(
         posterior.problem, method, method, prior, posterior, status, message, tuple(words), len(ended.trace),
-        ended.trace,
+        ended.trace, ended.steps,
     )  # fmt: skip
 
 

@@ -246,6 +246,7 @@ class Answer:
     bias_status: tuple[str, ...]
     iterations: int  # of the outer loop, or draws a chain
     trace: np.ndarray | None = None  # objective of every outer iteration
+    steps: np.ndarray | None = None  # (I, M) biases after every outer iteration, where they are kept
     interrupted: bool = False
     motion: str = "used"  # or "left out", for least squares
     optima: tuple[Answer, ...] = ()  # those found from several starts

@@ -59,7 +59,9 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
         **_data_groups(answer, draws, before),
     }
     if answer.trace is not None:
-        groups["optimisation"] = xr.Dataset({"objective": ("iteration", answer.trace)})
+        steps = {} if answer.steps is None else {"bias": (("iteration", "bias_label"), answer.steps * problem.scales)}
+        coords = {"bias_label": list(problem.labels)} if steps else {}
+        groups["optimisation"] = xr.Dataset({"objective": ("iteration", answer.trace), **steps}, coords=coords)
     if posterior.stats:
         groups["sample_stats"] = xr.Dataset({k: (SAMPLE, v) for k, v in posterior.stats.items()}, coords=_sample(draws))
     if (log_prior := posterior.log_prior(draws)) is not None:
