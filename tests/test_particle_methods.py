@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import reference
 import xarray as xr
 
 import probcal
@@ -30,10 +31,13 @@ from probcal import (
     Target,
     Unknown,
     fit,
+    particle_filter,
     sensor,
     simulate,
     track,
 )
+from probcal.plots import plot_particles, plot_roads
+from probcal.plots.base import write_figure
 
 pytest.importorskip("cuthbert", reason="cuthbert is not installed: uv sync --extra particles")
 pytest.importorskip("shapely", reason="shapely is not installed: uv sync --extra roads")
@@ -132,6 +136,30 @@ def test_an_unknown_noise_level_is_found_by_particles():
     by_particles, exact = (float(fit(problem, m, prior=Gaussian())["level"]["std"][0]) for m in methods)
     assert 0.3 < by_particles < 0.8, "0.5 is true, 0.2 was guessed"
     assert abs(np.log(by_particles / exact)) < 0.3
+
+
+def test_filtered_and_smoothed_particles_are_a_tree(linear, tmp_path):
+    """Weights sum to one, means are those of the smoother, and the likelihood is exact within four of its errors."""
+    problem, exact = linear
+    tree = particle_filter(problem, Particles(2000, smoother="marginal"), calibration=exact, runs=16)
+    assert tree.attrs["status"] == "converged"
+    for kind in ("filtered", "smoothed"):
+        group = tree[f"{kind}/target"].to_dataset()
+        np.testing.assert_allclose(group["weight"].sum("particle"), 1.0)
+        assert group["state"].dims == ("particle", "time", "component")
+    mean = (group["state"] * group["weight"]).sum("particle").transpose("time", "component")
+    track_there = exact["track/target"].to_dataset()
+    assert (np.abs(mean - track_there["mean"]) < 0.3 * track_there["sd"]).all()
+    held = Problem(problem.network, problem.motion, problem.measurements.table.frame,
+                   fix=exact["calibration"]["mean"].to_series().to_dict())  # fmt: skip
+    naive = reference.Linear(held.network, {"target": MOTION}, held.measurements.table.frame, held.fixed)
+    evidence = reference.dense(naive, None, hold=np.zeros(len(naive.labels))).evidence
+    assert abs(tree.attrs["log_likelihood"] - evidence) < 4 * tree.attrs["log_likelihood_se"] + 1e-6
+    assert 0 < tree.attrs["log_likelihood_se"] < 0.3
+    axes = plot_particles(tree, times=[0.0, 5.0, 11.0], roads=CROSS, kind="filtered")
+    plot_roads(STREET, axes[0], names=True)
+    write_figure(axes[0].get_figure(), tmp_path / "particles.png", 60)
+    assert (tmp_path / "particles.png").stat().st_size > 5000
 
 
 def calibrated(problem):
@@ -249,6 +277,8 @@ def test_later_rows_of_a_road_may_not_lie_further_apart():
 
 ERRORS = [
     (lambda p: track(p, calibrated(p), smoother="particles"), "give Particles\\(2000\\), or None for the Gaussian smo"),
+    (lambda p: particle_filter(p, 100), "particle_filter\\(particles=100\\): give Particles"),
+    (lambda p: particle_filter(p, runs=1), "at least 2 filters give an error"),
     (lambda p: EM("particles"), "Cubature\\(\\) or Particles\\(500\\)"),
     (lambda p: ParticleGibbs(steps=0), "ParticleGibbs\\(steps=0\\): it must be at least 1"),
     (lambda p: fit(Problem(p.network, Target(ConstantVelocity(0.5, singular=True), START), p.measurements.table.frame),
@@ -302,3 +332,16 @@ def test_the_command_line_fits_and_tracks_by_particles(tmp_path):
     )  # fmt: skip
     assert done.returncode == 2
     assert '--smoother "particle" is not known' in done.stderr
+
+
+@pytest.mark.ci
+def test_a_study_takes_methods_by_particles_and_refuses_others_on_roads():
+    sys.path.insert(0, str(ROOT / "models"))
+    import road_microphones
+
+    method = EM(Particles(60), iterations=10, tolerance=0.0)
+    found = probcal.study(road_microphones.setting, {"motion": ["road"]}, {"em": (method, Gaussian())}, runs=2)
+    assert found.sizes["run"] == 2
+    assert np.isfinite(found["bias_rmse"]).all()
+    with pytest.raises(InputError, match="which has no linear form"):
+        probcal.study(road_microphones.setting, {"motion": ["road"]}, ("em",), runs=1)

@@ -16,7 +16,7 @@ LARGEST = 60.0  # points^2 of the heaviest particle
 def plot_roads(network: Any, ax: Axes | None = None, *, names: bool = False) -> Axes:
     """Draw the roads of a `RoadNetwork` in the plane, one-way ones with an arrow, and their `names` if asked for."""
     ax = new_axes(ax, 7.0, 5.0)
-    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_aspect("equal", adjustable="box")
     for name, line, oneway in zip(network.names, network.lines, network.oneway, strict=True):
         line = np.asarray(line)[:, :2]
         ax.plot(*line.T, color="0.8", linewidth=3.0, solid_capstyle="round", zorder=0.5)
@@ -56,5 +56,5 @@ def plot_particles(
             places[:, 0], places[:, 1], s=LARGEST * weight / weight.max(), color=colour(0), alpha=0.4, linewidths=0
         )
         ax.set_title(f"{float(here['time']):g} s", fontsize=9)
-        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_aspect("equal", adjustable="box")
     return list(axes)
