@@ -8,6 +8,7 @@ hyper-parameters given the paths.
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -28,7 +29,7 @@ from probcal.inference.posterior import Chains, conclude_draws
 from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
-from probcal.inference.weighted import Paths, louis_information, misfit, prepared, unexplained
+from probcal.inference.weighted import Paths, louis_information, misfit, positive, prepared, unexplained
 from probcal.model.model import At, Model
 from probcal.particle.conditional import conditional_path
 from probcal.particle.ensemble import ensemble, expected_over_paths, first_paths, log_motion_of, state_moments
@@ -47,6 +48,8 @@ SEARCH = 40  # iterations of the search for a start, where there is none
 LENGTHS = (1.0, 0.3)  # of steps of all biases; 1 is an independent draw from the Gaussian at given paths
 NEAR, FAR = 0.2, 20.0  # shortest and longest steps of a sensor by itself, in sd at given paths
 CROWD = 500  # least particles of passes that are no sweeps
+MANY = 20  # draws a bias from which their covariance is inverted
+STUCK = 0.2  # share of the paths that a sweep renews below which it is said
 CONDITIONAL = Particles(100)
 
 
@@ -134,13 +137,15 @@ class ParticleGibbs(Sampler):
         runs = _Gibbs(self, form, held, paths, z, levels, keys[1])
         drawn, thin, interrupted = drawn_by(self, runs, 1, context.progress, context.storage, context.threads)
         run = ParticleRun(
-            self, self, form, natural, None, drawn, time.perf_counter() - began, interrupted, "", (), thin, paths,
-            score, z,
+            self, self, form, natural, None, drawn, time.perf_counter() - began, interrupted, "", (), thin, paths
         )  # fmt: skip
         linear = all(part is None for part in problem.model.sampled)
         answer = conclude_draws(problem if linear else problem.seen(), prior, run, ParticleChains)
         if names := unexplained(answer.posterior.problem, answer.posterior.point):
             return replace(answer, status=Status.MISFIT, message=misfit(names))
+        if (share := float(np.mean(drawn.stats["renewed"]))) < STUCK:
+            more = f"A sweep renews {share:.0%} of the paths only: take more particles."
+            answer = replace(answer, message=f"{answer.message} {more}".strip())
         return answer
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
@@ -356,13 +361,20 @@ class ParticleRun(SamplerRun):
     """What particle Gibbs leaves: its draws, and the particles that it was begun with."""
 
     paths: Any = None  # a `Paths`
-    score: Any = None  # (M,) of the data where chains were begun
-    begun: Any = None  # (M,) biases there
 
 
 @dataclass(frozen=True, eq=False)
 class ParticleChains(Chains):
     """The draws of particle Gibbs."""
+
+    @classmethod
+    def of(cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> Chains:
+        """The posterior of a run; where the precisions are known, the draws say what the data tell of the biases."""
+        found = super().of(problem, prior, run, mixed)
+        if run.form.hierarchy.learnt or run.z.shape[0] * run.z.shape[1] < MANY * run.form.biases:
+            return found
+        told = np.linalg.inv(found.summary.covariance) - np.asarray(run.posed.first.matrix())
+        return replace(found, summary=replace(found.summary, information=positive(told)))
 
     @classmethod
     def point_of(cls, problem: Problem, run: SamplerRun) -> Point:
@@ -389,4 +401,7 @@ class ParticleChains(Chains):
     def pull(self) -> np.ndarray:
         """Linear term (M,) of the log-likelihood of z about zero."""
         assert isinstance(self.run, ParticleRun)
-        return self.summary.information @ np.asarray(self.run.begun) + np.asarray(self.run.score)
+        if self.run.form.hierarchy.learnt:
+            return np.asarray(self.run.posed.pull)[: self.run.form.biases]
+        mean = self.summary.mean  # of a Gaussian its slope vanishes there, the prior's included
+        return self.summary.information @ mean + np.asarray(self.run.posed.first.pull(jnp.asarray(mean)))
