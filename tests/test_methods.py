@@ -400,7 +400,8 @@ def check_pair(name, prior):
     _, problem, tree = solve(method, prior or own)
     check_tree(tree, problem)
     assert tree.attrs["prior"] == type(choose_prior(method, prior or own)).__name__
-    asked = getattr(method, "tolerance", 1.0) == 0.0  # so many iterations, as in the papers
+    # so many iterations, as in the papers; by particles they may have settled by then
+    asked = getattr(method, "tolerance", 1.0) == 0.0 and not method.by_particles
     assert tree.attrs["status"] == ("iterations spent" if asked else "converged") or name == "paper-b"
     assert tree.attrs["requested"] == tree.attrs["method"]
 
