@@ -133,11 +133,9 @@ def _batch(
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Records of all methods on some cases (grid point, run); one of them says what its problem was, if `stored`."""
     with jax.enable_x64(True):
-        whole = [_simulated(setting, point, run) for point, run in cases]
+        whole = [_simulated(setting, point, run, _needs_linear(methods)) for point, run in cases]
         found: list[dict[str, Any]] = []
         for name, (method, prior) in methods.items():
-            for run in whole:
-                check_problem(run.problem, linear=not method.by_particles)
             if isinstance(method, Sampler) or method.by_particles:
                 found += [
                     {"case": case, "method": name} | _record(run, _drawn(run, method, prior))
@@ -173,20 +171,24 @@ def _batch(
         return found
 
 
-def _simulated(setting: Setting, point: dict[str, Any], number: int) -> _Run:
+def _simulated(setting: Setting, point: dict[str, Any], number: int, linear: bool) -> _Run:
     """One problem with its start; raises `InputError` where a setting does not return what a study needs."""
-    problem, truth = _made(setting, point, number)
-    linear = all(form is None for form in problem.model.sampled)
+    problem, truth = _made(setting, point, number, linear)
     return _Run(problem, truth, automatic_start(problem) if linear else None, number)
 
 
-def _made(setting: Setting, point: dict[str, Any], number: int) -> tuple[Problem, Truth]:
-    """A problem and its truth, checked."""
+def _needs_linear(methods: Mapping[str, tuple[Method, Prior]]) -> bool:
+    """Whether some method asks for motions with a linear form."""
+    return not all(method.by_particles for method, _ in methods.values())
+
+
+def _made(setting: Setting, point: dict[str, Any], number: int, linear: bool) -> tuple[Problem, Truth]:
+    """A problem and its truth, checked; `linear` if some method asks for motions with a linear form."""
     made = setting(number, **point)
     if not (isinstance(made, tuple) and len(made) == 2 and isinstance(made[0], Problem) and isinstance(made[1], Truth)):
         raise InputError("study: setting(run, ...) must return a pair, the Problem and its Truth")
     problem, truth = made
-    check_problem(problem, linear=False)
+    check_problem(problem, linear=linear)
     unknown = [label for label in problem.labels if label not in truth.biases]
     if unknown:
         raise InputError(f'study: the truth of setting(run, ...) does not name the bias "{unknown[0]}"; give its value')
@@ -346,7 +348,7 @@ class _Kept:
         for record in marked[:: -(-len(marked) // CHECKED) or 1]:
             point, run = json.loads(str(record["case"]))
             with jax.enable_x64(True):
-                problem, truth = _made(setting, point, run)
+                problem, truth = _made(setting, point, run, False)
                 same = problem_digest(problem, truth.biases) == str(record["problem"])
             if not same:
                 raise InputError(
