@@ -64,7 +64,7 @@ def speed(peer):
         print(f"{how.count:6d} on road   {how.smoother:9} first {first:.2f} s, then {run:.4f} s")
     if peer:
         told = subprocess.run([*peer], capture_output=True, text=True, check=True).stdout
-        theirs = sum(float(value) for value in re.findall(r"([\d.]+(?:e-?\d+)?)(?=\s|$)", told)[-2:] if value)
+        theirs = sum(float(value) for value in re.findall(r"\d+\.\d+(?:e-?\d+)?", told)[-2:])
         print(told.strip())
         print(f"ratio of filter and O(M^2) smoother: {theirs / mine:.0f}")
 
