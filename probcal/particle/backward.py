@@ -90,12 +90,9 @@ def draw_paths(
         drawn = jnp.where(really, drawn, parents)  # behind a target's last epoch nothing moves
         return drawn, drawn
 
-    def cut(tree: Any, start: int | None, stop: int | None) -> Any:
-        return jax.tree.map(lambda leaf: leaf[start:stop], tree)
-
     pairs = (
-        cut(found.states, None, -1), found.log_weights[:-1], cut(found.states, 1, None), found.ancestors[1:],
-        cut(epochs, 1, None), there[1:], jax.random.split(keys[1], len(there) - 1),
+        _cut(found.states, None, -1), found.log_weights[:-1], _cut(found.states, 1, None), found.ancestors[1:],
+        _cut(epochs, 1, None), there[1:], jax.random.split(keys[1], len(there) - 1),
     )  # fmt: skip
     _, chosen = jax.lax.scan(back, last, pairs, reverse=True)
     chosen = jnp.concatenate([chosen, last[None]])
@@ -120,13 +117,10 @@ def marginal_weights(
         smoothed = smoothed / jnp.sum(smoothed)
         return smoothed, smoothed
 
-    def cut(tree: Any, start: int | None, stop: int | None) -> Any:
-        return jax.tree.map(lambda leaf: leaf[start:stop], tree)
-
     last = jnp.exp(found.log_weights[-1])
     pairs = (
-        cut(found.states, None, -1), found.log_weights[:-1], cut(found.states, 1, None), found.ancestors[1:],
-        cut(epochs, 1, None), there[1:],
+        _cut(found.states, None, -1), found.log_weights[:-1], _cut(found.states, 1, None), found.ancestors[1:],
+        _cut(epochs, 1, None), there[1:],
     )  # fmt: skip
     _, weights = jax.lax.scan(back, last, pairs, reverse=True)
     return jnp.concatenate([weights, last[None]])
@@ -147,3 +141,8 @@ def smooth_particles(
         return SmoothedParticles(found.states, weights, found.log_evidence, found.lost)
     states = draw_paths(model, found, epochs, there, levels, key, how)
     return SmoothedParticles(states, jnp.full(found.log_weights.shape, 1.0 / how.count), found.log_evidence, found.lost)
+
+
+def _cut(tree: Any, start: int | None, stop: int | None) -> Any:
+    """Some of what leads in every array."""
+    return jax.tree.map(lambda leaf: leaf[start:stop], tree)
