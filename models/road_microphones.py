@@ -3,8 +3,8 @@
 Log powers (Paper A 6, its natural logarithm) of one vehicle, 30 of them a second apart, noise 0.2. True places are
 those of its Table 1; the stated ones of microphones 3 and 4 are swapped, and of 7 and 8, so that the biases of
 microphone 3 are about (-16.6, -6.3) m (its Table 2 has survey minus truth). Biases: x and y (5 m) and gain (0.1) of
-each; process noise of the paper in its form of full rank. What the paper leaves open: the roads (a main road with a
-bend, two junctions and two side roads), the start (2 m, 0.3 m/s), and 3 m/s along the main road.
+each; process noise of the paper in its form of full rank. What the paper leaves open: the roads (twelve,
+with five junctions), the start (2 m, 0.5 m/s), and 5 m/s along a way that turns at every junction.
 
 The vehicle moves freely, or on the road (`--set motion=road`):
 
@@ -27,15 +27,23 @@ PLACES = {
 }  # fmt: skip
 SWAPPED = {3: 4, 4: 3, 7: 8, 8: 7}
 TIME = np.arange(30.0)  # s
-SPEED = 3.0  # m/s
-START, PACE = 2.0, 0.3  # m, m/s: how well the start is known
+SPEED = 5.0  # m/s
+START, PACE = 2.0, 0.5  # m, m/s: how well the start is known
 ROADS = {
-    "main west": [(0.0, 22.0), (18.0, 25.0), (36.0, 30.0)],
-    "main middle": [(36.0, 30.0), (52.0, 28.0), (66.0, 25.0)],
-    "main east": [(66.0, 25.0), (82.0, 33.0), (100.0, 38.0)],
-    "north": [(36.0, 30.0), (34.0, 44.0), (42.0, 60.0)],
-    "south": [(66.0, 25.0), (62.0, 10.0), (64.0, -8.0)],
+    "west": [(0.0, 27.0), (8.0, 25.0), (17.0, 26.0)],
+    "north west": [(17.0, 26.0), (16.0, 45.0), (20.0, 60.0)],
+    "first": [(17.0, 26.0), (19.0, 16.0), (23.0, 5.0)],
+    "south west": [(23.0, 5.0), (10.0, -4.0)],
+    "lower": [(23.0, 5.0), (37.0, 4.0), (51.0, 6.0)],
+    "south": [(51.0, 6.0), (56.0, -10.0)],
+    "second": [(51.0, 6.0), (52.0, 26.0), (54.0, 45.0)],
+    "north": [(54.0, 45.0), (50.0, 64.0)],
+    "upper": [(54.0, 45.0), (72.0, 44.0)],
+    "north east": [(72.0, 44.0), (95.0, 50.0)],
+    "third": [(72.0, 44.0), (73.0, 28.0), (80.0, 14.0)],
+    "south east": [(80.0, 14.0), (84.0, 0.0), (90.0, -8.0)],
 }
+WAY = ("west", "first", "lower", "second", "upper", "third", "south east")  # that the vehicle takes
 POWER = RandomWalk("power", "1", np.sqrt(0.1), (10.0, 1.0))  # natural logarithm
 
 
@@ -54,17 +62,17 @@ def network():
 
 @cache
 def roads():
-    """The roads: a main road with a bend, and a side road at each of its two junctions."""
+    """The roads: twelve, with five junctions, at each of which the vehicle turns a corner."""
     from probcal.roads import RoadNetwork
 
     return RoadNetwork.from_lines(ROADS)
 
 
 def path():
-    """True places and velocities of the vehicle (30, 4): along the main road."""
-    line = np.array(ROADS["main west"] + ROADS["main middle"][1:] + ROADS["main east"][1:])
+    """True places and velocities of the vehicle (30, 4): along its way."""
+    line = np.array(ROADS[WAY[0]] + [point for name in WAY[1:] for point in ROADS[name][1:]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    gone = 5.0 + SPEED * TIME
+    gone = 3.0 + SPEED * TIME
     place = np.stack([np.interp(gone, along, column) for column in line.T], 1)
     ahead = np.stack([np.interp(gone + 0.1, along, column) for column in line.T], 1)
     return np.hstack([place, SPEED * (ahead - place) / np.linalg.norm(ahead - place, axis=1)[:, None]])

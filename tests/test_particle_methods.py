@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -36,6 +38,10 @@ from probcal import (
     simulate,
     track,
 )
+from probcal.inference.run import given_of
+from probcal.inference.weighted import Ended, Paths, conclude_particles, louis
+from probcal.particle.ensemble import ensemble, nearest_states
+from probcal.particle.targets import targets_of
 from probcal.plots import plot_particles, plot_roads
 from probcal.plots.base import write_figure
 
@@ -88,6 +94,55 @@ def test_em_by_particles_ends_where_the_exact_answer_is(linear, m_step):
     assert (np.abs(mine["mean"] - theirs["mean"]) < 0.4 * theirs["sd"]).all()
     assert (np.abs(np.log(mine["sd"] / theirs["sd"])) < np.log(1.4)).all()
     assert np.isfinite(found["log_likelihood"]["y"].values).all()
+
+
+def ended_at(problem, away, how):
+    """The answer of a climb that ended some sd from the exact one, and a fit that starts there."""
+    exact = fit(problem, probcal.MAP(), prior=Gaussian())["calibration"].to_dataset()
+    z = exact["mean"].values + away * exact["sd"].values
+    method, prior = EM(how), Gaussian()
+    with jax.enable_x64(True):
+        given, levels = given_of(method, problem, prior), np.zeros(len(problem.levels))
+        ended = Ended(jnp.asarray(z), jnp.asarray(levels), given.prior.alpha, np.zeros(1), z[None], True, "")
+        targets, key = targets_of(problem.model), jax.random.key(2)
+        told = louis(Paths(problem, how, targets), z, levels, key)
+        return exact, z, told, conclude_particles(problem, method, how, prior, given, targets, ended, key)
+
+
+@pytest.mark.parametrize(("away", "status"), [(0.0, "converged"), (2.0, "not converged")])
+def test_where_a_climb_is_not_at_the_top_its_slope_says_so(linear, away, status):
+    """Eight filters of 400 particles: score and information exact within a fifth, and the status with them."""
+    problem, _ = linear
+    exact, z, told, answer = ended_at(problem, away, Particles(400))
+    curvature = np.linalg.inv(exact["covariance"].values)
+    slope = told.score - z / np.array([b.scale for b in problem.biases]) ** 2
+    sd = exact["sd"].values
+    assert np.abs((slope + curvature @ (z - exact["mean"].values)) * sd).max() < 0.6
+    np.testing.assert_allclose(
+        sd[:, None] * told.information * sd, sd[:, None] * (curvature - np.diag(1 / 9.0 * np.ones(len(sd)))) * sd,
+        atol=0.25,
+    )  # fmt: skip
+    assert str(answer.status) == status
+    assert ("asks for a step of" in answer.message) == (away > 0)
+
+
+def test_the_state_that_stands_for_particles_on_a_road_is_like_them_in_all_it_is():
+    """Not only in its place: no further, in sd, than particles are on average, however uneven their weights."""
+    network, motion = offsets(), crossing("road")
+    model = Problem(network, motion, simulate(network, motion, TIME, key=4).table).model
+    with jax.enable_x64(True):
+        found = ensemble(
+            model, targets_of(model), np.zeros(model.biases), np.zeros(0), jax.random.key(0), Particles(60)
+        )
+        drawn = np.random.default_rng(0).gumbel(size=found.weights[0].shape) * 40.0
+        weights = np.exp(drawn - np.logaddexp.reduce(drawn, axis=1, keepdims=True))
+        found = found._replace(weights=(jnp.asarray(weights),))
+        seen = np.stack([np.asarray(model.vectors(0, jax.tree.map(lambda a, k=k: a[:, k], found.states[0])))
+                         for k in range(60)], 1)  # fmt: skip
+        mean = np.einsum("en,enu->eu", weights, seen)
+        variance = np.einsum("en,enu->eu", weights, (seen - mean[:, None]) ** 2)
+        off = np.asarray(model.vectors(0, nearest_states(model, found)[0])) - mean
+    assert (np.sum(off**2 / np.maximum(variance, 1e-12), 1) <= mean.shape[1] + 1e-6).all()
 
 
 def test_particle_gibbs_draws_the_exact_posterior(linear):

@@ -572,7 +572,7 @@ def checked(problem, how, seed=0):
         z, levels = np.zeros(problem.model.biases), np.zeros(len(problem.levels))
         found = ensemble(problem.model, targets, z, levels, jax.random.key(seed), how)
         seen = state_moments(problem.model, found)
-        nearest = nearest_states(problem.model, found, tuple(epochs.position for epochs in problem.epochs))
+        nearest = nearest_states(problem.model, found)
     for leaf in jax.tree.leaves((found, seen, nearest)):
         assert np.isfinite(np.asarray(leaf)).all()
     for weights in found.weights:

@@ -13,7 +13,7 @@ import numpy as np
 from probcal import linalg
 from probcal.inference.progress import Progress
 from probcal.inference.run import Context, Given, Maximiser, bare, check_method, given_of, learn
-from probcal.inference.weighted import Ended, Place, conclude_particles, places, prepared
+from probcal.inference.weighted import Ended, conclude_particles, prepared
 from probcal.model.model import At, Model
 from probcal.particle.ensemble import (
     Ensemble,
@@ -68,10 +68,10 @@ class Trace(NamedTuple):
     log_likelihood: jax.Array  # (I,) at the biases before the step, trajectories integrated, or given where averaged
 
 
-@partial(jax.jit, static_argnames=("prior", "how", "place"))
+@partial(jax.jit, static_argnames=("prior", "how"))
 def em_chunk(
     model: Model, targets: tuple[Targets, ...], prior: Prior, given: Given, state: Climb, last: jax.Array,
-    how: Particles, place: Place,
+    how: Particles,
 ) -> tuple[Climb, Trace]:  # fmt: skip
     """A few iterations, none after the `last`."""
 
@@ -79,7 +79,7 @@ def em_chunk(
         blank = Trace(state.z, jnp.zeros_like(state.z), jnp.zeros(()))
         return jax.lax.cond(
             state.k < last,
-            lambda: iterate(model, targets, prior, given, state, how, place),
+            lambda: iterate(model, targets, prior, given, state, how),
             lambda: (state, blank),
         )
 
@@ -87,7 +87,7 @@ def em_chunk(
 
 
 def iterate(
-    model: Model, targets: tuple[Targets, ...], prior: Prior, given: Given, state: Climb, how: Particles, place: Place
+    model: Model, targets: tuple[Targets, ...], prior: Prior, given: Given, state: Climb, how: Particles
 ) -> tuple[Climb, Trace]:
     """One E-step and one M-step, with the prior of the biases (Paper A 20-21), then precisions and levels."""
     keys, now = jax.random.split(state.key), given.prior._replace(alpha=state.alpha)
@@ -101,7 +101,7 @@ def iterate(
     else:
         found = ensemble(model, targets, state.z, state.levels, keys[0], how)
         told = found.log_evidence
-    states = nearest_states(model, found, place) if how.m_step == "mean" else None
+    states = nearest_states(model, found) if how.m_step == "mean" else None
     expected = over_paths(model, found, state.z, state.levels) if states is None else at_states(
         model, states, state.z, state.levels
     )  # fmt: skip
@@ -190,9 +190,7 @@ def climb(problem: Problem, how: Particles, prior: Prior, z: Any, iterations: in
     targets = prepared(problem, how)
     state = _begun(problem, targets, how, given, z, key)
     while int(state.k) < iterations:
-        state, _ = em_chunk(
-            problem.model, targets, bare(prior), given, state, jnp.asarray(iterations), how, places(problem)
-        )
+        state, _ = em_chunk(problem.model, targets, bare(prior), given, state, jnp.asarray(iterations), how)
     return state
 
 
@@ -228,13 +226,13 @@ def climb_by_particles(
     if problem.model.driven and how.smoother == "marginal":
         how = replace(how, smoother="exact")  # levels of process noise are learnt along paths
     how = replace(how, tempered=0) if np.any(np.asarray(z)) else how  # a start that is known is not left again
-    model, given, place = problem.model, given_of(method, problem, prior), places(problem)
+    model, given = problem.model, given_of(method, problem, prior)
     keys = jax.random.split(context.key)
     state = _begun(problem, targets, how, given, z, keys[0])
     parts: list[Trace] = []
     count, known, still = 0, bare(prior), Wandering(False, 0, np.inf)
     while count < method.iterations:
-        state, part = em_chunk(model, targets, known, given, state, jnp.asarray(method.iterations), how, place)
+        state, part = em_chunk(model, targets, known, given, state, jnp.asarray(method.iterations), how)
         part = jax.tree.map(lambda leaf, left=method.iterations - count: np.asarray(leaf)[:left], part)
         parts.append(part)
         count += len(part.log_likelihood)

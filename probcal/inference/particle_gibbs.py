@@ -29,7 +29,7 @@ from probcal.inference.posterior import Chains, conclude_draws
 from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
-from probcal.inference.weighted import Paths, louis_information, misfit, positive, prepared, unexplained
+from probcal.inference.weighted import Paths, louis, misfit, positive, prepared, unexplained
 from probcal.model.model import At, Model
 from probcal.particle.conditional import conditional_path
 from probcal.particle.ensemble import ensemble, expected_over_paths, first_paths, log_motion_of, state_moments
@@ -124,11 +124,12 @@ class ParticleGibbs(Sampler):
             begun = climb(problem, crowd, Gaussian(), z, SEARCH, keys[3])
             z, levels = np.asarray(begun.z), np.asarray(begun.levels)
         paths = Paths(problem, crowd, targets)
-        information, score, found = louis_information(paths, z, levels, keys[0])
-        reference = expected_over_paths(problem.model, found, jnp.asarray(z), jnp.asarray(levels)).information
+        told = louis(paths, z, levels, keys[0])
+        reference = expected_over_paths(problem.model, told.found, jnp.asarray(z), jnp.asarray(levels)).information
         H = len(levels)
         natural = Natural(
-            jnp.asarray(np.pad(information, (0, H))), jnp.asarray(np.pad(information @ z + score, (0, H))),
+            jnp.asarray(np.pad(told.information, (0, H))),
+            jnp.asarray(np.pad(told.information @ z + told.score, (0, H))),
             problem.model.level_spread, prior.precision(problem.labels, problem.surveyed),
         )  # fmt: skip
         form = Form(problem.model.biases, hierarchy_of(prior, problem))

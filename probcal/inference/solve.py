@@ -14,6 +14,9 @@ from probcal.results.answer import Answer
 from probcal.smoothing.mirrors import NEAR, SAME, Mirrored, other_sides
 from probcal.smoothing.mode import Point
 from probcal.smoothing.start import automatic_start, follow_states, further_starts
+from probcal.status import Status
+
+TRIES = 3  # climbs by particles from one start
 
 
 def solve(
@@ -51,7 +54,7 @@ def _by_particles(
 
     Where none is given it is the joint mode, mirrors seen to, with motions of a linear form in the place of others
     (`Motion.loose`), and zero where there is none. Further starts are draws of the biases within their scales; the one
-    of the greatest evidence is the answer.
+    of the greatest evidence is the answer. A climb that particles threw off is tried again with others.
     """
     linear = all(form is None for form in problem.model.sampled)
     near = problem if linear else problem.loosened()
@@ -65,7 +68,11 @@ def _by_particles(
     for k, z in enumerate(places):
         key = context.key if k == 0 else jax.random.fold_in(context.key, 1 + k)
         point = Point((), (), jnp.asarray(z), jnp.zeros(len(problem.levels)))
-        answers.append(method.answer(problem, prior, point, context._replace(key=key)))
+        tries = [method.answer(problem, prior, point, context._replace(key=key))]
+        while method.climbs and tries[-1].status in (Status.NOT_CONVERGED, Status.MISFIT) and len(tries) < TRIES:
+            other = context._replace(key=jax.random.fold_in(key, len(tries)))
+            tries.append(method.answer(problem, prior, point, other))
+        answers.append(max(tries, key=_rank))
     best = max(range(starts), key=lambda k: _rank(answers[k]))
     return replace(answers[best], optima=tuple(answers) if starts > 1 else (), best=best)
 

@@ -32,10 +32,9 @@ from probcal.status import Status
 if TYPE_CHECKING:
     import xarray as xr
 
-Place = tuple[tuple[int, int], ...]  # first and last (excluded) entry of the position, of each recursion
-LAST = 1000  # least particles of the last pass, whose scores give the information
-FILTERS = 8  # whose mean likelihood is the evidence
+FILTERS = 8  # of the last passes, whose scores give the information and whose mean likelihood is the evidence
 SCATTER = 1.5  # mean square of what is left, 1 expected, from which another optimum is looked for
+AHEAD = 1.0  # sd a bias of the Newton step, from which the fit is not at the top
 SURE = 6.0  # sd by which that mean square lies above 1 at least
 SPREAD = 32  # draws of the biases behind the sd of a track, and behind values by datum
 
@@ -45,11 +44,6 @@ def prepared(problem: Problem, how: Particles) -> tuple[Targets, ...]:
     check_installed()
     check_proposal(problem.model, how)
     return targets_of(problem.model)
-
-
-def places(problem: Problem) -> Place:
-    """Where the position stands in what rows see of the states."""
-    return tuple(epochs.position for epochs in problem.epochs)
 
 
 class Ended(NamedTuple):
@@ -64,6 +58,14 @@ class Ended(NamedTuple):
     said: str  # what still moves
 
 
+class Trajectories(NamedTuple):
+    """What particles say of all states over draws of the biases."""
+
+    z: np.ndarray  # (D, M)
+    tracks: list[Tracks]  # of each recursion
+    paths: list[np.ndarray]  # (D, E, n) one for each draw, as rows see it, of each recursion
+
+
 @dataclass(frozen=True, eq=False)
 class Paths:
     """Particles of the targets of a problem, run at any biases and levels."""
@@ -73,36 +75,36 @@ class Paths:
     targets: tuple[Targets, ...]
 
     def at(self, z: Any, levels: Any, key: jax.Array) -> Ensemble:
-        """SmoothedParticles particles at biases z (M,) and log levels (H,)."""
+        """Smoothed particles at biases z (M,) and log levels (H,)."""
         return ensemble(self.problem.model, self.targets, jnp.asarray(z), jnp.asarray(levels), key, self.how)
+
+    def along_paths(self) -> Paths:
+        """The same, its smoothed particles joined to paths."""
+        if self.how.smoother != "marginal":
+            return self
+        return replace(self, how=replace(self.how, smoother="backward"))
 
     def seen(self, found: Ensemble) -> list[jax.Array]:
         """What rows see of the states, (E, N, n) of each recursion."""
         return list(vectors_of(self.problem.model, found.states))
 
-    def drawn(self, z: np.ndarray, levels: np.ndarray, key: jax.Array) -> list[np.ndarray]:
-        """A path for each draw of the biases z (D, M), as rows see it: (D, E, n) of each recursion."""
-        parts = []
+    def over(self, z: np.ndarray, levels: np.ndarray, key: jax.Array) -> Trajectories:
+        """Mean and sd of all states over draws of the biases z (D, M), and a path for each of the draws."""
+        moments, single, model, walked = [], [], self.problem.model, self.along_paths()
         for k, own in enumerate(z):
-            found = self.at(own, levels, jax.random.fold_in(key, k))
-            parts.append([np.asarray(x)[:, 0] for x in self.seen(found)])  # paths come in no order
-        return [np.stack(column) for column in zip(*parts, strict=True)]
-
-    def tracks(self, z: np.ndarray, levels: np.ndarray, key: jax.Array) -> list[Tracks]:
-        """Mean and sd of all states over draws of the biases z (D, M)."""
-        each = []
-        for k, own in enumerate(z):
-            found = state_moments(self.problem.model, self.at(own, levels, jax.random.fold_in(key, k)))
-            each.append([(np.asarray(m.mean), np.asarray(m.variance)) for m in found])
+            found = walked.at(own, levels, jax.random.fold_in(key, k))
+            first = tuple(jax.tree.map(lambda leaf: leaf[:, 0], x) for x in found.states)  # paths come in no order
+            single.append([np.asarray(x) for x in single_vectors(model, first)])
+            moments.append([(np.asarray(m.mean), np.asarray(m.variance)) for m in state_moments(model, found)])
         tracks = []
-        for column in zip(*each, strict=True):
+        for column in zip(*moments, strict=True):
             mean, variance = (np.stack(part) for part in zip(*column, strict=True))
             tracks.append(Tracks(mean.mean(0), np.sqrt(variance.mean(0) + mean.var(0))))
-        return tracks
+        return Trajectories(np.asarray(z), tracks, [np.stack(column) for column in zip(*single, strict=True)])
 
     def point(self, found: Ensemble, z: Any, levels: Any) -> Point:
         """The states that stand for the particles: on the road where there is one (Paper A 43)."""
-        states = nearest_states(self.problem.model, found, places(self.problem))
+        states = nearest_states(self.problem.model, found)
         vectors = single_vectors(self.problem.model, states)
         noises = tuple(jax.device_put(np.zeros((x.shape[0], 0))) for x in vectors)
         return Point(vectors, noises, jnp.asarray(z), jnp.asarray(levels))
@@ -115,8 +117,7 @@ class EnsemblePosterior(Posterior):
     paths: Paths
     term: np.ndarray  # (M,)
     without: Point
-    own: Sequence[Tracks]
-    key: jax.Array
+    over: Trajectories
     numbers: Mapping[str, float]
 
     chained: ClassVar[bool] = False
@@ -125,28 +126,32 @@ class EnsemblePosterior(Posterior):
     @property
     def states(self) -> Sequence[np.ndarray]:
         """Mean states (E, n) of each recursion."""
-        return [own.mean for own in self.own]
+        return [own.mean for own in self.over.tracks]
 
     def tracks(self) -> Sequence[Tracks]:
         """Mean and sd of all states, the biases uncertain."""
-        return self.own
+        return self.over.tracks
 
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """Independent draws of the biases; of some of them, or of all where states are kept, a path and its values."""
         M, model = self.problem.model.biases, self.problem.model
         shape, keys = (CHAINS, draws_a_chain(model.size, CHAINS)), jax.random.split(key, 3)
         covariance = jnp.asarray(self.summary.covariance)
-        z = np.asarray(draw_biases(self.point._replace(z=jnp.asarray(self.summary.mean)), covariance, keys[0],
-                                   shape[0] * shape[1])).reshape(*shape, M)  # fmt: skip
+        z = np.array(draw_biases(self.point._replace(z=jnp.asarray(self.summary.mean)), covariance, keys[0],
+                                 shape[0] * shape[1])).reshape(*shape, M)  # fmt: skip
         count = shape[1] if "states" in keep else min(shape[1], SPREAD // CHAINS)
         kept = np.unique(np.linspace(0, shape[1] - 1, count).round().astype(int))
         levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
         if not keep:
             return Draws(z, levels, [], kept, [], [])
-        flat = z[:, kept].reshape(-1, M)
-        states = self.paths.drawn(flat, self.summary.levels, keys[1])
+        number, over = CHAINS * len(kept), self.over
+        if number <= len(over.z):  # those that the tracks came from serve again
+            z[:, kept] = over.z[:number].reshape(CHAINS, len(kept), M)
+        else:
+            over = self.paths.over(z[:, kept].reshape(-1, M), self.summary.levels, keys[1])
+        states = [x[:number] for x in over.paths]
         found = predictive(
-            model, jnp.asarray(levels[:, kept].reshape(len(flat), -1)), jnp.asarray(flat),
+            model, jnp.asarray(levels[:, kept].reshape(number, -1)), jnp.asarray(over.z[:number]),
             tuple(jnp.asarray(x) for x in states), keys[2], keep,
         )  # fmt: skip
 
@@ -177,17 +182,41 @@ class EnsemblePosterior(Posterior):
         return self.numbers
 
 
-def louis_information(paths: Paths, z: Any, levels: Any, key: jax.Array) -> tuple[np.ndarray, np.ndarray, Ensemble]:
-    """Information (M, M) of the data about the biases, trajectories integrated, their score, and the particles.
+class Louis(NamedTuple):
+    """What some filters and smoothers say of the biases at a place, pooled by their likelihoods."""
 
-    By Louis' identity (1982): the curvature at given states, less the covariance of the score over paths.
+    information: np.ndarray  # (M, M) of the data, trajectories integrated
+    score: np.ndarray  # (M,) of the log-likelihood by the biases
+    noise: np.ndarray  # (M, M) covariance of that score over the filters
+    log_likelihood: float
+    error: float  # standard error of the log-likelihood
+    found: Ensemble  # of the likeliest filter
+
+
+def louis(paths: Paths, z: Any, levels: Any, key: jax.Array) -> Louis:
+    """Information and score of the biases z (M,), trajectories integrated, by Louis' identity (1982).
+
+    The information is the curvature at given states, less the covariance of the score over paths. Filters count by
+    their estimates of the likelihood, so that one that lost a target counts for nothing.
     """
-    how = paths.how
-    smoother = "backward" if how.smoother == "marginal" else how.smoother
-    more = replace(paths, how=replace(how, smoother=smoother, count=max(how.count, LAST)))
-    found = more.at(z, levels, key)
-    expected = observed_over_paths(paths.problem.model, found, jnp.asarray(z), jnp.asarray(levels))
-    return positive(np.asarray(expected.information - expected.spread)), np.asarray(expected.score), found
+    z, levels, paths = jnp.asarray(z), jnp.asarray(levels), paths.along_paths()
+    logs, parts, best = [], [], None
+    for k in range(FILTERS):
+        found = paths.at(z, levels, jax.random.fold_in(key, k))
+        parts.append(jax.tree.map(np.asarray, observed_over_paths(paths.problem.model, found, z, levels)))
+        logs.append(float(found.log_evidence))
+        best = found if best is None or logs[-1] >= max(logs) else best
+    assert best is not None
+    share = np.exp(np.array(logs) - max(logs))
+    share /= share.sum()
+    scores, information, spread = (np.stack(column) for column in zip(*parts, strict=True))
+    score = share @ scores
+    off = scores - score
+    within = np.einsum("k,kab->ab", share, spread) + np.einsum("k,ka,kb->ab", share, off, off)
+    return Louis(
+        positive(np.einsum("k,kab->ab", share, information) - within), score,
+        np.einsum("k,ka,kb->ab", share**2, off, off), *log_mean(np.array(logs)), best,
+    )  # fmt: skip
 
 
 @jax.jit
@@ -216,10 +245,15 @@ def positive(matrix: np.ndarray) -> np.ndarray:
 
 def log_likelihood_at(paths: Paths, z: Any, levels: Any, key: jax.Array, filters: int = FILTERS) -> tuple[float, float]:
     """Log of the mean likelihood over some filters, and the standard error of that log."""
-    logs = np.array([float(paths.at(z, levels, jax.random.fold_in(key, k)).log_evidence) for k in range(filters)])
+    keys = (jax.random.fold_in(key, k) for k in range(filters))
+    return log_mean(np.array([float(paths.at(z, levels, own).log_evidence) for own in keys]))
+
+
+def log_mean(logs: np.ndarray) -> tuple[float, float]:
+    """Log of the mean of likelihoods whose logs (F,) are given, and the standard error of that log."""
     weights = np.exp(logs - logs.max())
     mean = weights.mean()
-    return float(logs.max() + np.log(mean)), float(weights.std(ddof=1) / mean / np.sqrt(filters))
+    return float(logs.max() + np.log(mean)), float(weights.std(ddof=1) / mean / np.sqrt(len(logs)))
 
 
 def conclude_particles(
@@ -227,26 +261,27 @@ def conclude_particles(
     ended: Ended, key: jax.Array,
 ) -> Answer:  # fmt: skip
     """The answer of a climb by particles."""
-    paths, keys = Paths(problem, how, targets), jax.random.split(key, 6)
+    paths, keys = Paths(problem, how, targets), jax.random.split(key)
     z, levels, M = np.asarray(ended.z), np.asarray(ended.levels), problem.model.biases
-    information, score, found = louis_information(paths, z, levels, keys[0])
+    told = louis(paths, z, levels, keys[0])
     now = given.prior._replace(alpha=ended.alpha)
-    matrix = jnp.asarray(information) + now.matrix()
+    matrix = jnp.asarray(told.information) + now.matrix()
     covariance, volume = (np.asarray(a) for a in linalg.inverse_and_logdet(matrix))
-    likelihood, error = log_likelihood_at(paths, z, levels, keys[1])
-    evidence = likelihood + 0.5 * float(now.log_determinant() - now.square(ended.z)) - 0.5 * float(volume)
+    evidence = told.log_likelihood + 0.5 * float(now.log_determinant() - now.square(ended.z)) - 0.5 * float(volume)
     alpha = np.asarray(ended.alpha)
     with np.errstate(invalid="ignore"):  # a singular problem has no sd
         half = HALF * np.sqrt(np.diag(covariance))
     gamma = np.clip(1.0 - alpha * np.diag(covariance), 0.0, 1.0)
     summary = Summary(
         "Laplace", "maximised" if prior.learns else "given", z, covariance, z - half, z + half, gamma, alpha,
-        information, levels, evidence if prior.proper else None,
+        told.information, levels, evidence if prior.proper else None,
     )  # fmt: skip
-    numbers = {"log_likelihood": likelihood, "log_likelihood_se": error, "particles": float(how.count)}
-    posterior = posterior_of(paths, prior, summary, score, found, keys[2], numbers)
+    numbers = {"log_likelihood": told.log_likelihood, "log_likelihood_se": told.error, "particles": float(how.count)}
+    posterior = posterior_of(paths, prior, summary, told, keys[1], numbers)
     low, far = low_and_far(prior, summary, problem.surveyed)
-    status, message = _judged(posterior, method, ended, bool(low.any()), bool(far.any()))
+    slope = told.score - np.asarray(now.matrix()) @ z
+    ahead = np.sqrt(max(slope @ covariance @ slope - np.sum(covariance * told.noise), 0.0) / max(M, 1))
+    status, message = _judged(posterior, method, ended, bool(low.any()), bool(far.any()), ahead)
     words = np.select(
         [problem.surveyed, low, far], ["survey", "at bound", "diverged"], "estimated"
     ).tolist() if M else []  # fmt: skip
@@ -257,27 +292,26 @@ def conclude_particles(
 
 
 def posterior_of(
-    paths: Paths, prior: Prior, summary: Summary, score: np.ndarray, found: Ensemble, key: jax.Array,
-    numbers: Mapping[str, float],
+    paths: Paths, prior: Prior, summary: Summary, told: Louis, key: jax.Array, numbers: Mapping[str, float]
 ) -> EnsemblePosterior:  # fmt: skip
     """The posterior around a Gaussian of the biases, with tracks made by particles."""
     problem, keys = paths.problem, jax.random.split(key, 3)
     z, levels = jnp.asarray(summary.mean), summary.levels
-    point = paths.point(found, z, levels)
+    point = paths.point(told.found, z, levels)
     zero = paths.at(jnp.zeros_like(z), levels, keys[0])
     before = paths.point(zero, jnp.zeros_like(z), levels)
     before = before._replace(states=tuple(m.mean for m in state_moments(problem.model, zero)))
     drawn = np.asarray(draw_biases(point, jnp.asarray(summary.covariance), keys[1], SPREAD))
     sound = np.isfinite(drawn).all()
-    tracks = paths.tracks(drawn if sound else np.asarray(z)[None], levels, keys[2])
+    over = paths.over(drawn if sound else np.asarray(z)[None], levels, keys[2])
     seen = problem
     if any(form is not None for form in problem.model.sampled):
         seen = problem.seen()
     else:
         near = follow_states(problem, [np.asarray(x) for x in point.states])
         point = track_mode(problem, near._replace(z=z, levels=jnp.asarray(levels)))
-    pull = summary.information @ np.asarray(z) + score
-    return EnsemblePosterior(seen, prior, point, summary, paths, pull, before, tracks, keys[0], numbers)
+    pull = summary.information @ np.asarray(z) + told.score
+    return EnsemblePosterior(seen, prior, point, summary, paths, pull, before, over, numbers)
 
 
 def track_by_particles(
@@ -289,7 +323,7 @@ def track_by_particles(
     point = paths.point(found, z, levels)
     zero = state_moments(problem.model, paths.at(np.zeros_like(z), levels, keys[1]))
     drawn = np.asarray(draw_biases(point, jnp.asarray(covariance), keys[2], SPREAD)) if len(z) else np.zeros((1, 0))
-    tracks = paths.tracks(drawn, levels, keys[3])
+    tracks = paths.over(drawn, levels, keys[3]).tracks
     seen = problem.seen()
     tree = build_tracks(seen, [Band(t.mean, t.sd, np.asarray(m.mean)) for t, m in zip(tracks, zero, strict=True)])
     names = unexplained(seen, point)
@@ -329,8 +363,10 @@ def misfit(names: Sequence[str]) -> str:
     )
 
 
-def _judged(posterior: EnsemblePosterior, method: Maximiser, ended: Ended, low: bool, far: bool) -> tuple[Status, str]:
-    """Status of a climb by particles, and a sentence."""
+def _judged(
+    posterior: EnsemblePosterior, method: Maximiser, ended: Ended, low: bool, far: bool, ahead: float
+) -> tuple[Status, str]:
+    """Status of a climb by particles, and a sentence; `ahead` is how far a Newton step would go, in sd a bias."""
     if names := unexplained(posterior.problem, posterior.point):
         return Status.MISFIT, misfit(names)
     if far or not posterior.sound:
@@ -343,6 +379,11 @@ def _judged(posterior: EnsemblePosterior, method: Maximiser, ended: Ended, low: 
         return Status.NOT_CONVERGED, (
             f"What is left of the rows has a mean square of {square:.1f} where 1 is expected: another optimum may"
             ' explain them, or the noise std is too small. Take m_step="averaged", more particles, or further starts.'
+        )
+    if ahead > AHEAD:
+        return Status.NOT_CONVERGED, (
+            f"The slope of the likelihood where the fit ended asks for a step of {ahead:.1f} sd a bias: it is not the"
+            ' top. Take m_step="averaged", more particles or more iterations.'
         )
     if ended.still:
         return Status.CONVERGED, ""

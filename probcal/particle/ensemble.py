@@ -132,21 +132,20 @@ def state_moments(model: Model, found: Ensemble) -> tuple[StateMoments, ...]:
     return tuple(parts)
 
 
-@partial(jax.jit, static_argnames="place")
-def nearest_states(model: Model, found: Ensemble, place: tuple[slice, ...]) -> tuple[Any, ...]:
+@jax.jit
+def nearest_states(model: Model, found: Ensemble) -> tuple[Any, ...]:
     """States (E leading) that stand for the particles: their mean, or, of a motion without linear form, the particle
-    whose position is nearest to the mean position, so that it is on the road (Paper A 43).
-
-    `place` says which entries of what rows see are the position, of each recursion.
+    that is nearest to the mean of all that rows see, in units of its sd, so that it is on the road (Paper A 43).
     """
     chosen = []
     for r, (states, weights) in enumerate(zip(found.states, found.weights, strict=True)):
         if model.sampled[r] is None:
             chosen.append(jnp.einsum("en,enu->eu", weights, states))
             continue
-        where = jax.vmap(partial(model.vectors, r))(states)[:, :, place[r]]
-        middle = jnp.einsum("en,enu->eu", weights, where)
-        away = jnp.sum((where - middle[:, None]) ** 2, 2)
+        seen = jax.vmap(partial(model.vectors, r))(states)
+        off = seen - jnp.einsum("en,enu->eu", weights, seen)[:, None]
+        variance = jnp.einsum("en,enu->eu", weights, off**2)[:, None]
+        away = jnp.sum(off**2 / jnp.maximum(variance, 1e-12), 2)
         best = jnp.argmin(jnp.where(weights > 0, away, jnp.inf), 1)
         chosen.append(jax.tree.map(lambda leaf, k=best: jax.vmap(lambda own, j: own[j])(leaf, k), states))
     return tuple(chosen)
