@@ -4,8 +4,8 @@ uv run python benchmarks/gallery.py --fits fits
 uv run python benchmarks/gallery.py --fits fits --data ../shared/data
 
 A notebook is shown by the first picture of its committed output, a model by the map of its fit: that in the folder
-`--fits` if there is one, else `probcal fit` runs (seed 0, the default method) and leaves it there. Models whose
-recording is not at `--data` keep the picture that they have.
+`--fits` if there is one, else `probcal fit` runs (seed 0, the default method or that of `HOW`) and leaves it there.
+Models whose recording is not at `--data`, or that `--only` does not name, keep the picture that they have.
 """
 
 import argparse
@@ -31,6 +31,10 @@ WIDTH = 480  # px
 RECORDINGS = {
     "sflab": "sflab_mic_toa/dataset_1_exp2.mat", "tdoa_flight": "uwb_tdoa",
     "robots": "mrclam/MRCLAM_Dataset6", "receivers": "mlat_locards/set_1.csv",
+}  # fmt: skip
+HOW = {
+    "road_microphones": ("--set", "motion=road", "--method", "em-particles"), "town": ("--method", "em-particles"),
+    "presence": ("--method", "particle-gibbs", "--prior", "gaussian"),
 }  # fmt: skip
 HEAD = """# Notebooks and models
 
@@ -68,17 +72,19 @@ def notebooks():
         yield title.removeprefix("# "), path.name, text.strip().split("\n")[0], f"pictures/{path.stem}.png"
 
 
-def models(fits, data):
+def models(fits, data, only):
     """Title, link and picture of each model with a problem of its own or a recording that is there."""
     for path in sorted((ROOT / "models").glob("*.py")):
         if path.stem == "networks":
             continue  # many small ones, made by a call
         picture, recording = PICTURES / f"model_{path.stem}.png", RECORDINGS.get(path.stem)
         there = recording is None or (data is not None and (data / recording).exists())
+        there = there and (not only or path.stem in only)
         out = fits / path.stem
         if there and not (out / "fit.nc").exists():
             given = [] if recording is None else [data / recording]
             command = [sys.executable, "-m", "probcal.cli", "fit", path, *given, "--out", out, "--no-assess"]
+            command += HOW.get(path.stem, ())
             subprocess.run(list(map(str, command)), check=False)
         if (out / "fit.nc").exists():
             sheet = io.BytesIO()
@@ -93,10 +99,11 @@ def main():
     ask = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     ask.add_argument("--fits", type=Path, required=True)
     ask.add_argument("--data", type=Path)
+    ask.add_argument("--only", nargs="+", default=[], help="models to fit; the others keep their pictures")
     given = ask.parse_args()
     PICTURES.mkdir(exist_ok=True)
     parts = [HEAD]
-    for heading, entries in (("Notebooks", notebooks()), ("Models", models(given.fits, given.data))):
+    for heading, entries in (("Notebooks", notebooks()), ("Models", models(given.fits, given.data, given.only))):
         parts.append(f"\n## {heading}\n")
         for title, link, text, picture in entries:
             parts.append(f"\n### [{title}]({link})\n\n{text}\n\n![{title}]({picture})\n")

@@ -4,6 +4,7 @@
     uv run python benchmarks/particles.py cost             # cost over particles and epochs, exponents fitted
     uv run python benchmarks/particles.py paper --runs 70  # table 2 of Paper A on the twin, free and on the road
     uv run python benchmarks/particles.py coverage         # intervals of EM by particles over runs of its own model
+    uv run python benchmarks/particles.py presence         # yes-or-no sensors: particle Gibbs and Laplace
     uv run python benchmarks/particles.py sbc --runs 200   # particle Gibbs on a small presence network
 
 Every figure of `benchmarks/README.md` on particles is printed by one of these; times are the best of several, compiled.
@@ -29,7 +30,19 @@ import presence
 import road_microphones as microphones
 
 import probcal
-from probcal import EM, ConstantVelocity, Gaussian, Network, Node, ParticleGibbs, Particles, Problem, Target, simulate
+from probcal import (
+    EM,
+    MAP,
+    ConstantVelocity,
+    Gaussian,
+    Network,
+    Node,
+    ParticleGibbs,
+    Particles,
+    Problem,
+    Target,
+    simulate,
+)
 from probcal.particle.ensemble import ensemble
 from probcal.particle.targets import targets_of
 
@@ -181,6 +194,32 @@ def coverage(runs):
             )
 
 
+def yes_and_no(runs):
+    """Presence sensors drawn from their scales: particle Gibbs, and what the Laplace approximation says."""
+    methods = {"particle Gibbs": ParticleGibbs(chains=2, draws=800, particles=Particles(60)), "Laplace": MAP()}
+    told = {name: [] for name in methods}
+    for run in range(runs):
+        problem, truth = presence.setting(run)
+        true = np.array([truth.biases[label] for label in problem.labels])
+        for name, method in methods.items():
+            began = time.perf_counter()
+            tree = probcal.fit(problem, method, prior=Gaussian(), key=run)
+            group = tree["calibration"].to_dataset()
+            away = group["mean"].values - true
+            told[name].append({
+                "seconds": time.perf_counter() - began,
+                "RMS": np.sqrt(np.mean(away**2)), "sd": group["sd"].mean().item(),
+                "held": ((group["lower"].values < true) & (true < group["upper"].values)).mean(),
+                "NEES": away @ np.linalg.solve(group["covariance"].values, away) / len(away),
+                "converged": tree.attrs["status"] == "converged",
+            })  # fmt: skip
+            print(run, name, {k: round(float(v), 2) for k, v in told[name][-1].items()}, flush=True)
+    for name, rows in told.items():
+        frame = pd.DataFrame(rows).astype(float)
+        error = frame["held"].std(ddof=1) / np.sqrt(runs)
+        print(f"{name}: {runs} runs, {frame.mean().round(2).to_dict()}, held ± {error:.3f} (0.89 nominal)")
+
+
 def small():
     """Three presence sensors and two known posts beside two walkers: small enough for simulation-based calibration."""
     nodes = [Node(f"p{k}", (4.0 * k, 2.0 * (-1) ** k), scale=2.0) for k in (1, 2, 3)]
@@ -202,7 +241,7 @@ def calibration(runs):
 
 if __name__ == "__main__":
     asked = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    asked.add_argument("what", choices=("speed", "cost", "paper", "coverage", "sbc"))
+    asked.add_argument("what", choices=("speed", "cost", "paper", "coverage", "presence", "sbc"))
     asked.add_argument("--peer", nargs="+", help="a command that prints its seconds last: filter, then smoother")
     asked.add_argument("--runs", type=int, default=20)
     asked.add_argument("--beside", type=int, default=0, help="runs of every other method, in `paper`")
@@ -215,5 +254,7 @@ if __name__ == "__main__":
         paper(given.runs, given.beside)
     elif given.what == "coverage":
         coverage(given.runs)
+    elif given.what == "presence":
+        yes_and_no(given.runs)
     else:
         calibration(given.runs)
