@@ -107,7 +107,7 @@ METHODS = {
     "EM, mean": EM(Particles(500, "bootstrap", m_step="mean"), iterations=30, tolerance=0.0),
     "EM, mean, O(M^2)": EM(Particles(500, "bootstrap", "marginal", m_step="mean"), iterations=30, tolerance=0.0),
     "EM, extended": EM(iterations=30, tolerance=0.0),
-    "particle Gibbs": ParticleGibbs(particles=Particles(100)),
+    "particle Gibbs": ParticleGibbs(chains=2, warmup=300, draws=400, patience=1, particles=Particles(60)),
 }
 SHOWN = [f"mic_{n}.{part}" for n in (3, 4, 7, 8) for part in ("position_x", "position_y", "gain")]
 
@@ -147,14 +147,14 @@ def runs_of(motion, name, runs):
     return lines, [f"{m:.2f} ± {sd:.2f}" for m, sd in zip(mean, spread, strict=True)], squares.values
 
 
-def paper(runs, beside):
+def paper(runs, beside, names):
     """Table 2 of Paper A on the twin, free and on the road side by side, then the other methods on some of the runs."""
     truth = microphones.biases()
     table = pd.DataFrame({"true": [truth[label] for label in SHOWN]}, index=SHOWN)
     asked = [(motion, "EM, particles", runs) for motion in ("free", "road")]
     if beside:
-        asked += [(m, name, beside) for name in METHODS for m in ("free", "road") if name != "EM, particles"]
-        asked.remove(("road", "EM, extended", beside))  # it needs a motion of linear form
+        motions = {name: ("free",) if name == "EM, extended" else ("free", "road") for name in names}  # of linear form
+        asked += [(motion, name, beside) for name in names for motion in motions[name]]
     began, squares = time.perf_counter(), {}
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         waiting = [(one, pool.submit(runs_of, *one)) for one in asked]
@@ -245,13 +245,16 @@ if __name__ == "__main__":
     asked.add_argument("--peer", nargs="+", help="a command that prints its seconds last: filter, then smoother")
     asked.add_argument("--runs", type=int, default=20)
     asked.add_argument("--beside", type=int, default=0, help="runs of every other method, in `paper`")
+    asked.add_argument(
+        "--methods", nargs="+", choices=list(METHODS)[1:], default=list(METHODS)[1:], help="those beside"
+    )
     given = asked.parse_args()
     if given.what == "speed":
         speed(given.peer)
     elif given.what == "cost":
         cost()
     elif given.what == "paper":
-        paper(given.runs, given.beside)
+        paper(given.runs, given.beside, given.methods)
     elif given.what == "coverage":
         coverage(given.runs)
     elif given.what == "presence":

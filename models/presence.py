@@ -41,7 +41,7 @@ def stated():
 
 
 def network():
-    """Presence sensors of uncertain place, and two anchors that measure the distance."""
+    """Presence sensors of uncertain place, and three anchors that measure the distance."""
     seen = [presence.on(Node(f"presence_{k}", place, scale=SCALE)) for k, place in enumerate(stated(), 1)]
     anchors = [Node("gate_west", (0.0, 12.0)), Node("gate_east", (55.0, -12.0)), Node("gate_north", (28.0, 20.0))]
     return Network([*seen, *(gate.on(node) for node in anchors)])
@@ -62,7 +62,7 @@ def scenario(key=0):
 
 
 def problem(data=None):
-    """The network with a table of its own (columns time, target, sensor, near, range), or that of run 0."""
+    """The network with a table of its own (columns time, target, sensor, near, distance), or that of run 0."""
     return Problem(network(), motion(), scenario().table if data is None else data)
 
 

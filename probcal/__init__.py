@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     )
     from probcal.network import Network, Node, Path
     from probcal.nodes import read_nodes, write_nodes
-    from probcal.noise import Bernoulli, Mixture, StudentT, Unknown
+    from probcal.noise import Bernoulli, Censored, Mixture, StudentT, Truncated, Unknown
     from probcal.particle.settings import Particles
     from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
     from probcal.problem import Problem
@@ -92,7 +92,7 @@ __all__ = lazy(
         ),
         "probcal.network": "Network Node Path",
         "probcal.nodes": "read_nodes write_nodes",
-        "probcal.noise": "Bernoulli Mixture StudentT Unknown",
+        "probcal.noise": "Bernoulli Censored Mixture StudentT Truncated Unknown",
         "probcal.particle.settings": "Particles",
         "probcal.priors": "ARD BernoulliGaussian Flat Gaussian Horseshoe Laplace",
         "probcal.problem": "Problem",

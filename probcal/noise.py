@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import digamma, gammaln
+from jax.scipy.special import digamma, gammaln, log_ndtr, ndtr, ndtri
 
 from probcal.errors import InputError
 from probcal.geometry import wrap
@@ -66,6 +66,7 @@ def check_level(level: Level, what: str, *, zero: bool = False) -> None:
 
 
 NEAR = 0.1  # std within which a residual has the weight of one at that distance: a density may have a kink at zero
+FAR = 6.0  # std of a floor above the predicted value, from which draws are those of the tail
 FARTHEST = 30.0  # asinh of the farthest point of a quadrature, in std
 
 
@@ -80,6 +81,8 @@ class Family(Protocol):
     def level_score(self, y, predicted, std, period: float | None): ...
     def reliance(self, y, predicted, std, period: float | None): ...
     def sample(self, key, predicted, std): ...
+    def emit(self, key, predicted, std): ...
+    def reported(self, y): ...
     def check(self, y: np.ndarray) -> np.ndarray: ...
 
 
@@ -170,6 +173,14 @@ class AdditiveNoise:
     def sample(self, key, predicted, std):
         """Draw measured values around the predicted ones."""
         return predicted + std * self.draw(key, predicted.shape)
+
+    def emit(self, key, predicted, std):
+        """Draw what reaches the sensor, of which it says what is `reported`; a family that hears all: `sample`."""
+        return self.sample(key, predicted, std)
+
+    def reported(self, y):
+        """What a sensor writes of what reaches it, NaN where it writes nothing; all of it here."""
+        return y
 
     def check(self, y):
         """Which values are legal: all."""
@@ -430,6 +441,149 @@ class Mixture(AdditiveNoise):
         return jnp.where(jax.random.uniform(key, shape) < self.share, self.scale**-2.0, 1.0)
 
 
+SMALLEST = 1e-9  # weight of a datum that says nothing, times std^2
+
+
+def _mills(a):
+    """Normal density over its distribution function at a, for any a."""
+    return jnp.exp(-0.5 * a**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(a))
+
+
+class Heard(AdditiveNoise):
+    """Gaussian noise of a receiver that hears nothing at or below its `floor`: what it reports of that is its own."""
+
+    floor: float
+
+    def __post_init__(self):
+        if not np.isfinite(self.floor):
+            raise InputError(f"{type(self).__name__}(floor={self.floor}): give the least value that is heard")
+
+    def emit(self, key, predicted, std):
+        """Draw what reaches the receiver, heard or not."""
+        return predicted + std * jax.random.normal(key, predicted.shape, predicted.dtype)
+
+    def reliance(self, y, predicted, std, period):
+        """One: every datum counts alike."""
+        return jnp.ones_like(predicted)
+
+    def _log_normal(self, y, predicted, std):
+        """Log density of a value, heard or not."""
+        return -0.5 * (((y - predicted) / std) ** 2 + np.log(2 * np.pi)) - jnp.log(std)
+
+
+@dataclass(frozen=True)
+class Censored(Heard):
+    """Gaussian noise of a receiver that hears nothing at or below `floor` and says so (Tobin 1958).
+
+    In a table a cell `<-95`, or any value at or below the floor, says only that; with `blanks` every blank cell in a
+    row of such a sensor says it too. `simulate` writes the floor there.
+
+    >>> round(float(jnp.exp(Censored(-95.0).log_likelihood(-95.0, -95.0, 4.0, None))), 6)  # half of it is not heard
+    0.5
+    """
+
+    floor: float
+    blanks: bool = False
+
+    def reported(self, y):
+        """The floor in the place of what is not heard."""
+        return np.maximum(y, self.floor)
+
+    def _below(self, predicted, std):
+        """How far in std the floor lies above the predicted value."""
+        return (self.floor - predicted) / std
+
+    def innovation(self, y, predicted, period):
+        """Measured minus predicted value; of what is not heard, how far the predicted value lies above the floor."""
+        return jnp.where(y <= self.floor, jnp.minimum(self.floor - predicted, 0.0), y - predicted)
+
+    def log_likelihood(self, y, predicted, std, period):
+        """Log density of what is heard, log probability of the rest."""
+        nothing = log_ndtr(self._below(predicted, std))
+        return jnp.where(y <= self.floor, nothing, self._log_normal(y, predicted, std))
+
+    def score(self, y, predicted, std, period):
+        """Derivative by the predicted value."""
+        return jnp.where(y <= self.floor, -_mills(self._below(predicted, std)), (y - predicted) / std) / std
+
+    def weight(self, y, predicted, std, period):
+        """Curvature, which is positive."""
+        a = self._below(predicted, std)
+        ratio = _mills(a)
+        return jnp.where(y <= self.floor, jnp.maximum(ratio * (ratio + a), SMALLEST), 1.0) / std**2
+
+    def information(self, predicted, std):
+        """Expected information about the predicted value: little far below the floor."""
+        a = self._below(predicted, std)
+        density = jnp.exp(-0.5 * a**2) / np.sqrt(2 * np.pi)
+        return jnp.maximum(ndtr(-a) + a * density + density * _mills(a), SMALLEST) / std**2
+
+    def level_score(self, y, predicted, std, period):
+        """One plus the derivative by log std."""
+        a = self._below(predicted, std)
+        return jnp.where(y <= self.floor, 1.0 - a * _mills(a), ((y - predicted) / std) ** 2)
+
+    def sample(self, key, predicted, std):
+        """Draw what is reported: the floor where nothing is heard."""
+        return jnp.maximum(self.emit(key, predicted, std), self.floor)
+
+
+@dataclass(frozen=True)
+class Truncated(Heard):
+    """Gaussian noise of a receiver that writes no row of what lies at or below `floor` (a truncated normal).
+
+    A row that is there then says that something was heard; `simulate` leaves the others out.
+
+    >>> round(float(jnp.exp(Truncated(-95.0).log_likelihood(-95.0, -95.0, 4.0, None))), 6)  # twice the normal density
+    0.199471
+    """
+
+    floor: float
+
+    def reported(self, y):
+        """Nothing (NaN) where nothing is heard."""
+        return np.where(y > self.floor, y, np.nan)
+
+    def _above(self, predicted, std):
+        """How far in std the predicted value lies above the floor."""
+        return (predicted - self.floor) / std
+
+    def log_likelihood(self, y, predicted, std, period):
+        """Log density of each datum, given that it was heard."""
+        return self._log_normal(y, predicted, std) - log_ndtr(self._above(predicted, std))
+
+    def score(self, y, predicted, std, period):
+        """Derivative by the predicted value."""
+        return ((y - predicted) / std - _mills(self._above(predicted, std))) / std
+
+    def weight(self, y, predicted, std, period):
+        """Curvature, which is positive."""
+        return self.information(predicted, std)
+
+    def information(self, predicted, std):
+        """Expected information about the predicted value."""
+        u = self._above(predicted, std)
+        ratio = _mills(u)
+        return jnp.maximum(1.0 - ratio * (u + ratio), SMALLEST) / std**2
+
+    def level_score(self, y, predicted, std, period):
+        """One plus the derivative by log std."""
+        u = self._above(predicted, std)
+        return ((y - predicted) / std) ** 2 + u * _mills(u)
+
+    def sample(self, key, predicted, std):
+        """Draw values above the floor around the predicted ones, by the inverse of their distribution function."""
+        u = self._above(predicted, std)
+        share = jax.random.uniform(key, predicted.shape, predicted.dtype, minval=np.finfo(np.float32).tiny)
+        far = jnp.sqrt(u**2 - 2.0 * jnp.log(share))  # of a floor many std above, where the inverse has no digits left
+        near = -ndtri(share * ndtr(jnp.maximum(u, -FAR)))
+        return predicted + std * jnp.where(u < -FAR, far, near)
+
+    def check(self, y):
+        """Which values are legal: those above the floor."""
+        return y > self.floor
+
+
 @dataclass(frozen=True)
 class Bernoulli:
     """A yes-or-no channel (1 or 0): the sensor function returns the log odds of 1; `std` has no meaning."""
@@ -465,6 +619,12 @@ class Bernoulli:
     def sample(self, key, predicted, std):
         """Draw ones and zeros."""
         return jax.random.bernoulli(key, jax.nn.sigmoid(predicted)).astype(predicted.dtype)
+
+    emit = sample
+
+    def reported(self, y):
+        """All of it."""
+        return y
 
     def check(self, y):
         """Which values are legal: 0 and 1."""

@@ -229,8 +229,8 @@ def simulate(
 def _drawn(
     block: rows.Block, data: rows.Rows, states: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array
 ) -> jax.Array:
-    """Measured values (N, C) of a block, drawn around what its sensors predict."""
-    return rows.sample(block, data, rows.predict(block, data, states, z), levels, key)
+    """What reaches the sensors of a block (N, C), drawn around what they predict."""
+    return rows.sample(block, data, rows.predict(block, data, states, z), levels, key, "emit")
 
 
 def _plan(network: Network, time: np.ndarray, targets: list[str]) -> pd.DataFrame:
@@ -320,7 +320,7 @@ def _frame(track: Any, dimension: int, epochs: int, name: str) -> pd.DataFrame:
 def _spoil(
     block: rows.Block, data: rows.Rows, value: np.ndarray, share: float, scale: float, key: jax.Array
 ) -> np.ndarray:
-    """Put outliers on a share of the data: more noise, or the wrong answer of a yes-or-no channel."""
+    """What sensors report, outliers put on a share of it: more noise, or the wrong answer of a yes-or-no channel."""
     pick, size = jax.random.split(key)
     hit = np.asarray(jax.random.uniform(pick, value.shape)) < share
     extra = scale * np.asarray(data.std) * np.asarray(jax.random.normal(size, value.shape))
@@ -329,4 +329,5 @@ def _spoil(
         value[:, c] = np.where(hit[:, c], wrong, value[:, c])
         if channel.period is not None:
             value[:, c] = (value[:, c] + channel.period / 2) % channel.period - channel.period / 2
+        value[:, c] = channel.noise.reported(value[:, c])
     return value

@@ -15,7 +15,8 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.lazy import Later
 from probcal.network import Network
-from probcal.noise import Bernoulli
+from probcal.noise import Bernoulli, Censored
+from probcal.sensor import Channel
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -150,12 +151,14 @@ def measure(table: Table, network: Network) -> Measurements:
     value, std = np.zeros(shape), np.zeros(shape)
     measured, has_std = np.zeros(shape, bool), np.zeros(shape, bool)
     for j, name in enumerate(channels):
+        below = np.zeros(len(frame), bool)
         if name in names:
-            value[:, j], measured[:, j] = numbers(table, frame[name], name)
+            cells, below = _limits(frame[name])
+            value[:, j], measured[:, j] = numbers(table, cells, name)
         if f"{name}_std" in names:
             std[:, j], has_std[:, j] = numbers(table, frame[f"{name}_std"], f"{name}_std")
         _check_stds(table, f"{name}_std", std[:, j], has_std[:, j])
-        _to_channel(table, network, name, j, sensor, units, value, std, measured)
+        _to_channel(table, network, name, j, sensor, units, value, std, measured, below)
     result = Measurements(time, sensor, target, target_names, channels, value, measured, std, has_std & measured, table)
     _check_duplicates(result, network)
     return result
@@ -299,9 +302,12 @@ def _check_stds(table: Table, name: str, std: np.ndarray, given: np.ndarray) -> 
 
 def _to_channel(
     table: Table, network: Network, name: str, j: int, sensor: np.ndarray, units: dict[str, str | None],
-    value: np.ndarray, std: np.ndarray, measured: np.ndarray,
+    value: np.ndarray, std: np.ndarray, measured: np.ndarray, below: np.ndarray,
 ) -> None:  # fmt: skip
-    """Convert a column to the unit of each sensor's channel, in place, and check that the sensors have it."""
+    """Convert a column to the unit of each sensor's channel, in place, and check that the sensors have it.
+
+    `below` (N,) says which cells are limits such as `<-95`, under which nothing was heard.
+    """
     kinds = np.array([network.types.index(placed.type) for placed in network.sensors])[sensor]
     for k, kind in enumerate(network.types):
         rows = (kinds == k) & measured[:, j]
@@ -317,10 +323,42 @@ def _to_channel(
             continue
         for column, array in ((name, value), (f"{name}_std", std)):
             array[kinds == k, j] *= unit_factor(table, column, units.get(column), channel.unit)
-        if isinstance(channel.noise, Bernoulli):
-            wrong = np.flatnonzero(rows & ~channel.noise.check(value[:, j]))
-            if len(wrong):
-                raise InputError(f'{table.where(wrong[0])} column "{name}": {value[wrong[0], j]:g} is not 0 or 1')
+        if isinstance(channel.noise, Censored) and channel.noise.blanks:
+            blank = (kinds == k) & ~measured[:, j]
+            value[blank, j], measured[blank, j] = channel.noise.floor, True
+        _check_limits(table, name, channel, value[:, j], np.flatnonzero(rows & below))
+        wrong = np.flatnonzero(rows & ~channel.noise.check(value[:, j]))
+        if len(wrong):
+            shown = f'{table.where(wrong[0])} column "{name}": {value[wrong[0], j]:g}'
+            if isinstance(channel.noise, Bernoulli):
+                raise InputError(f"{shown} is not 0 or 1")
+            raise InputError(f"{shown} does not suit {channel.noise!r}; leave it blank, or move the floor below it")
+
+
+def _limits(column: pd.Series) -> tuple[pd.Series, np.ndarray]:
+    """A column whose limits such as `<-95` are numbers, and which cells (N,) were limits."""
+    if column.dtype.kind not in "OUST":
+        return column, np.zeros(len(column), bool)
+    text = column.astype(str).str.strip()
+    below = (text.str.startswith("<") & column.notna()).to_numpy(bool)
+    if not below.any():
+        return column, below
+    return column.astype(object).where(~below, text.str.removeprefix("<")), below
+
+
+def _check_limits(table: Table, name: str, channel: Channel, value: np.ndarray, below: np.ndarray) -> None:
+    """Raise `InputError` for limits of a channel that hears all, or above its floor."""
+    if not len(below):
+        return
+    shown = f'{table.where(below[0])} column "{name}": "<{value[below[0]]:g}"'
+    if not isinstance(channel.noise, Censored):
+        raise InputError(f"{shown} is a limit, but the channel hears all; declare it with noise=Censored(floor)")
+    high = below[value[below] > channel.noise.floor]
+    if len(high):
+        raise InputError(
+            f'{table.where(high[0])} column "{name}": "<{value[high[0]]:g}" lies above the floor'
+            f" {channel.noise.floor:g} of its channel; declare the highest limit of such sensors as their floor"
+        )
 
 
 def unit_factor(table: Table, name: str, unit: str | None, wanted: str) -> float:

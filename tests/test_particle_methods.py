@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -38,6 +39,7 @@ from probcal import (
     simulate,
     track,
 )
+from probcal.inference.particle_em import wandering
 from probcal.inference.run import given_of
 from probcal.inference.weighted import Ended, Paths, conclude_particles, louis
 from probcal.particle.ensemble import ensemble, nearest_states
@@ -120,6 +122,47 @@ def test_where_a_climb_is_not_at_the_top_its_slope_says_so(linear, away, status)
     assert np.abs(sd[:, None] * (told.information - curvature + np.eye(len(sd))) * sd).max() < 0.25
     assert str(answer.status) == status
     assert ("asks for a step of" in answer.message) == (away > 0)
+
+
+def test_a_trace_that_drifts_is_not_still():
+    """A line or an approach that has some sd to go is none, whatever its pace; noise about a place is."""
+    k, noise = np.arange(60.0)[:, None], np.random.default_rng(0).normal(size=(60, 3))
+    assert wandering(0.3 * noise, np.ones(3)).still
+    for trace in (0.1 * k, 10.0 * k, -20.0 * np.exp(-k / 20.0), 0.5 * k + 0.3 * noise[:, :1]):
+        assert not wandering(np.hstack([0.3 * noise[:, :2], trace * np.ones(1)]), np.ones(3)).still
+
+
+def test_particles_that_collapsed_are_not_called_converged(linear):
+    """A bootstrap filter of few particles under very sharp rows, by `track` and by `particle_filter`."""
+    kind = replace(relative, channels={"place": replace(relative.channels["place"], std=0.02)})
+    network = Network([kind.on(Node("known", (0.0, 0.0)))])
+    problem = Problem(network, MOTION, simulate(network, MOTION, TIME, key=1).table)
+    few = Particles(50, proposal="bootstrap")
+    for tree in (track(problem, calibrated(problem), smoother=few), particle_filter(problem, few, runs=4)):
+        assert tree.attrs["status"] in ("not converged", "misfit")
+        assert "more particles" in tree.attrs["message"]
+    assert tree.attrs["log_likelihood_se"] > 1.0
+    assert track(problem, calibrated(problem), smoother=Particles(400)).attrs["status"] == "converged"
+
+
+def test_the_first_path_is_a_draw_like_any_other():
+    """One particle that has nearly all the weight stands first as often as it has weight: 400 keys, limit five sd."""
+    network = Network([relative.on(Node("known", (0.0, 0.0)))])
+    problem = Problem(network, MOTION, simulate(network, MOTION, np.arange(2.0), key=1).table)
+    with jax.enable_x64(True):
+        model, targets, z = problem.model, targets_of(problem.model), np.zeros(0)
+
+        @jax.jit
+        def ends(keys):
+            how = Particles(40, proposal="bootstrap")
+            return jax.lax.map(lambda k: ensemble(model, targets, z, z, k, how).states[0][-1, :, 0], keys)
+
+        last = np.asarray(ends(jax.random.split(jax.random.key(0), 400)))
+    rest, first = last.mean(1), last[:, 0]
+    spread = np.sqrt(((last - rest[:, None]) ** 2).mean(1))
+    z = (first - rest) / np.maximum(spread, 1e-9)
+    assert abs(z.mean()) < 5 / np.sqrt(400)
+    assert 0.7 < (z**2).mean() < 1.35
 
 
 def test_the_state_that_stands_for_particles_on_a_road_is_like_them_in_all_it_is():

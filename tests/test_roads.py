@@ -481,6 +481,7 @@ BAD = [
     (BOW | {"c": [(100, 0), (100, 0)]}, {}, 'edge "c" has no length; leave it out'),
     (BOW | {"c": [(100, 0), (120, 9), (120, -9), (100, 0)]}, {}, 'edge "c" ends where it starts; split the loop'),
     (BOW | {"c": [(100, 50), (100, 0)]}, {}, 'edge "c" is edge "b" once more; leave one of them out'),
+    (BOW | {"c": [(100, 50), (100, 80), (120, 80), (90, 60)]}, {}, 'edge "c" crosses itself; split it where it does'),
     (BOW | {"c": [(100, 50), (60, -30)]}, {}, r'edges "a" and "c" cross at \(75.0, 0.0\) without a node; split both'),
     (BOW | {"c": [(100, 50), (40, 0)]}, {}, r'edge "c" ends on edge "a" at \(40.0, 0.0\), away from its ends;'),
     (BOW | {"c": [(100, 50), (40, 0.005)]}, {}, 'edge "c" ends on edge "a" at'),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.weighted import FILTERS, Paths, log_likelihood_at, misfit, prepared, unexplained
+from probcal.inference.weighted import FILTERS, Paths, judged_tracks, log_likelihood_at, prepared
 from probcal.lazy import Later
 from probcal.particle.ensemble import filter_ensemble
 from probcal.particle.settings import Particles
@@ -17,7 +17,6 @@ from probcal.problem import Problem
 from probcal.results.groups import by_target
 from probcal.results.read import apply
 from probcal.simulate import Key, as_key
-from probcal.status import Status
 from probcal.types import float64
 
 if TYPE_CHECKING:
@@ -37,8 +36,9 @@ def particle_filter(
 
     Nodes `filtered/<target>` and `smoothed/<target>` have `state` (particle, time, component) and `weight` (particle,
     time) that sum to 1 at each time. The attributes hold `log_likelihood`, the logarithm of its mean over `runs`
-    filters, and its standard error `log_likelihood_se`; `status` is misfit where no path explains a target. Raises
-    `InputError` for less than 2 runs, and if the calibration lacks a bias.
+    filters, and its standard error `log_likelihood_se`; `status` is misfit where no path explains a target, and not
+    converged where particles were too few. Raises `InputError` for less than 2 runs, and if the calibration lacks a
+    bias.
 
     >>> from probcal import Particles
     >>> found = particle_filter(problem, Particles(50), runs=2)
@@ -67,9 +67,10 @@ def particle_filter(
         groups |= {f"{name}/{target}": own for target, own in by_target(problem, columns).items()}
     tree = xr.DataTree.from_dict(groups)
     likelihood, error = log_likelihood_at(paths, z, levels, keys[2], runs)
-    names = unexplained(problem.seen(), paths.point(parts["smoothed"], z, levels))
+    point = paths.point(parts["smoothed"], z, levels)
+    status, message = judged_tracks(problem.seen(), point, parts["smoothed"])
     tree.attrs |= {
         "log_likelihood": likelihood, "log_likelihood_se": error, "particles": repr(particles),
-        "status": str(Status.MISFIT if names else Status.CONVERGED), "message": misfit(names) if names else "",
+        "status": str(status), "message": message,
     }  # fmt: skip
     return tree

@@ -41,7 +41,7 @@ COOL = 0.02  # by which the log-likelihood counts at first, where it is tempered
 RIDGE = 1e-12  # of the information, where a flat prior meets a bias that no row reads
 WINDOW = 20  # iterations that are compared with as many before them
 DRIFT = 4.0  # standard errors by which these may differ, beside
-NEAR = 0.1  # so many sd of a bias
+NEAR = 0.25  # so many sd of a bias
 CROWD = 500  # least particles of the pass that a conditional filter begins with
 
 
@@ -168,17 +168,18 @@ def wandering(trace: np.ndarray, sd: np.ndarray) -> Wandering:
         return Wandering(False, 0, np.inf)
     late, before = trace[-size:], trace[-2 * size : -size]
     away = np.abs(late.mean(0) - before.mean(0))
-    error = np.sqrt((late.var(0) + before.var(0)) * _correlation(trace[-2 * size :]) / size)
+    error = np.sqrt(_variance_of_mean(late) + _variance_of_mean(before))
     over = (away - DRIFT * error) / np.maximum(sd, 1e-12)
     worst = int(np.argmax(over))
     return Wandering(bool((over < NEAR).all()), worst, float(away[worst] / max(sd[worst], 1e-12)))
 
 
-def _correlation(trace: np.ndarray) -> np.ndarray:
-    """By how much the variance of a mean (M,) grows with the correlation of neighbours, one order of it."""
-    around = trace - trace.mean(0)
+def _variance_of_mean(trace: np.ndarray) -> np.ndarray:
+    """Variance (M,) of the mean of a stretch of the trace about its own line, neighbours correlated to first order."""
+    k = np.arange(len(trace)) - 0.5 * (len(trace) - 1)
+    around = trace - trace.mean(0) - k[:, None] * (k @ trace / (k @ k))
     r = np.clip((around[1:] * around[:-1]).mean(0) / np.maximum(around.var(0), 1e-300), 0.0, 0.9)
-    return (1 + r) / (1 - r)
+    return np.asarray(around.var(0) * (1 + r) / (1 - r) / len(trace))
 
 
 def climb(problem: Problem, how: Particles, prior: Prior, z: Any, iterations: int, key: jax.Array) -> Climb:

@@ -54,13 +54,16 @@ def _by_particles(
 
     Where none is given it is the joint mode, mirrors seen to, with motions of a linear form in the place of others
     (`Motion.loose`), and zero where there is none. Further starts are draws of the biases within their scales; the one
-    of the greatest evidence is the answer. A climb that particles threw off is tried again with others.
+    of the greatest evidence is the answer. A climb that particles threw off is tried again with others. Mirrored
+    answers are those of the joint mode.
     """
     linear = all(form is None for form in problem.model.sampled)
     near = problem if linear else problem.loosened()
+    mirrors: tuple[Mirrored, ...] = ()
     if start is None and near is not None:
         first = solve(near, MAP(trajectory="joint"), Gaussian(), context._replace(progress=None))
         start = first.posterior.point if first.status.valid and first.posterior.sound else None
+        mirrors = first.mirrors if linear and start is not None and method.climbs else ()
     drawn = np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(context.key, 1))))
     begin = np.zeros(problem.model.biases) if start is None else np.asarray(start.z)
     places = [begin, *drawn.standard_normal((starts - 1, len(begin)))]
@@ -74,7 +77,7 @@ def _by_particles(
             tries.append(method.answer(problem, prior, point, other))
         answers.append(max(tries, key=_rank))
     best = max(range(starts), key=lambda k: _rank(answers[k]))
-    return replace(answers[best], optima=tuple(answers) if starts > 1 else (), best=best)
+    return replace(answers[best], optima=tuple(answers) if starts > 1 else (), best=best, mirrors=mirrors)
 
 
 def _beside_mirrors(answer: Answer, method: Method, context: Context) -> Answer:

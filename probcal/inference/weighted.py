@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 FILTERS = 8  # of the last passes, whose scores give the information and whose mean likelihood is the evidence
 SCATTER = 1.5  # mean square of what is left, 1 expected, from which another optimum is looked for
+FEW = 5  # different smoothed particles at an epoch, below which their spread says nothing
 AHEAD = 1.0  # sd a bias of the Newton step, from which the fit is not at the top
 SURE = 6.0  # sd by which that mean square lies above 1 at least
 SPREAD = 32  # draws of the biases behind the sd of a track, and behind values by datum
@@ -250,10 +251,14 @@ def log_likelihood_at(paths: Paths, z: Any, levels: Any, key: jax.Array, filters
 
 
 def log_mean(logs: np.ndarray) -> tuple[float, float]:
-    """Log of the mean of likelihoods whose logs (F,) are given, and the standard error of that log."""
-    weights = np.exp(logs - logs.max())
+    """Log of the mean of likelihoods whose logs (F,) are given, and the standard error of that log.
+
+    Where the logs scatter by more than 1 one filter makes the mean, whose error is then that scatter at least.
+    """
+    weights, scatter = np.exp(logs - logs.max()), float(logs.std(ddof=1))
     mean = weights.mean()
-    return float(logs.max() + np.log(mean)), float(weights.std(ddof=1) / mean / np.sqrt(len(logs)))
+    error = float(weights.std(ddof=1) / mean / np.sqrt(len(logs)))
+    return float(logs.max() + np.log(mean)), max(error, scatter) if scatter > 1 else error
 
 
 def conclude_particles(
@@ -280,7 +285,7 @@ def conclude_particles(
     posterior = posterior_of(paths, prior, summary, told, keys[1], numbers)
     low, far = low_and_far(prior, summary, problem.surveyed)
     slope = told.score - np.asarray(now.matrix()) @ z
-    ahead = np.sqrt(max(slope @ covariance @ slope - np.sum(covariance * told.noise), 0.0) / max(M, 1))
+    ahead = steepness(slope, covariance, told.noise)
     status, message = _judged(posterior, method, ended, bool(low.any()), bool(far.any()), ahead)
     words = np.select(
         [problem.surveyed, low, far], ["survey", "at bound", "diverged"], "estimated"
@@ -289,6 +294,16 @@ def conclude_particles(
         posterior.problem, method, method, prior, posterior, status, message, tuple(words), len(ended.trace),
         ended.trace, ended.steps,
     )  # fmt: skip
+
+
+def steepness(slope: np.ndarray, covariance: np.ndarray, noise: np.ndarray) -> float:
+    """How far a Newton step would go in sd a bias, less the noise of the slope: on average, or half the largest."""
+    if not len(slope):
+        return 0.0
+    step, sd = covariance @ slope, np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    mean = np.sqrt(max(slope @ step - np.sum(covariance * noise), 0.0) / len(slope))
+    error = np.sqrt(np.maximum(np.diag(covariance @ noise @ covariance), 0.0))
+    return float(max(mean, 0.5 * np.max((np.abs(step) - 3.0 * error) / sd)))
 
 
 def posterior_of(
@@ -326,11 +341,38 @@ def track_by_particles(
     tracks = paths.over(drawn, levels, keys[3]).tracks
     seen = problem.seen()
     tree = build_tracks(seen, [Band(t.mean, t.sd, np.asarray(m.mean)) for t, m in zip(tracks, zero, strict=True)])
-    names = unexplained(seen, point)
-    tree.attrs["status"] = str(Status.MISFIT if names else Status.CONVERGED)
-    tree.attrs["message"] = misfit(names) if names else ""
-    tree.attrs["smoother"] = repr(how)
+    status, message = judged_tracks(seen, point, found)
+    tree.attrs |= {"status": str(status), "message": message, "smoother": repr(how)}
     return tree
+
+
+def judged_tracks(problem: Problem, point: Point, found: Ensemble) -> tuple[Status, str]:
+    """Status of tracks by particles at known biases, and a sentence: whether they explain the rows, and are enough."""
+    if names := unexplained(problem, point):
+        return Status.MISFIT, misfit(names)
+    square, count = scatter(problem, point)
+    if square > max(SCATTER, 1 + SURE * np.sqrt(2 / count)):
+        return Status.NOT_CONVERGED, (
+            f"What is left of the rows has a mean square of {square:.1f} where 1 is expected: particles lost a target,"
+            " or its motion, the calibration or the noise std is not right. Take more particles."
+        )
+    if (least := fewest(found)) < FEW:
+        return Status.NOT_CONVERGED, (
+            f"At some epoch only {least} of the smoothed particles differ, so that their spread says little: take more"
+            ' of them, or Particles(proposal="extended") where the motion has a linear form.'
+        )
+    return Status.CONVERGED, ""
+
+
+def fewest(found: Ensemble) -> int:
+    """The least number of different smoothed particles at any epoch."""
+    least = 10**9
+    for states, weights in zip(found.states, found.weights, strict=True):
+        columns = [np.asarray(leaf).reshape(*weights.shape, -1) for leaf in jax.tree.leaves(states)]
+        together, heavy = np.concatenate(columns, 2), np.asarray(weights) > 1e-6
+        for there, epoch in zip(heavy, together, strict=True):
+            least = min(least, len(np.unique(epoch[there], axis=0)))
+    return least
 
 
 def unexplained(problem: Problem, point: Point) -> list[str]:
@@ -374,16 +416,17 @@ def _judged(
         return Status.DIVERGED, f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases."
     if low:
         return Status.AT_BOUND, "A precision stands at its lower bound: the estimate is invalid."
+    better = "more particles" if posterior.paths.how.m_step == "averaged" else 'm_step="averaged", more particles'
     square, count = scatter(posterior.problem, posterior.point)
     if square > max(SCATTER, 1 + SURE * np.sqrt(2 / count)):
         return Status.NOT_CONVERGED, (
             f"What is left of the rows has a mean square of {square:.1f} where 1 is expected: another optimum may"
-            ' explain them, or the noise std is too small. Take m_step="averaged", more particles, or further starts.'
+            f" explain them, or the noise std is too small. Take {better} or further starts."
         )
     if ahead > AHEAD:
         return Status.NOT_CONVERGED, (
             f"The slope of the likelihood where the fit ended asks for a step of {ahead:.1f} sd a bias: it is not the"
-            ' top. Take m_step="averaged", more particles or more iterations.'
+            f" top. Take {better} or more iterations."
         )
     if ended.still:
         return Status.CONVERGED, ""

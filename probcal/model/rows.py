@@ -219,11 +219,16 @@ def information(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Arra
     return rows.mask * _by_channel(block, "information", predicted, noise_std(rows, levels), period=False)
 
 
-def sample(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array, key: jax.Array) -> jax.Array:
-    """Draw measured values (N, C) around the predicted ones; angles are wrapped."""
+def sample(
+    block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array, key: jax.Array, how: str = "sample"
+) -> jax.Array:
+    """Draw measured values (N, C) around the predicted ones; angles are wrapped.
+
+    `how` is the method of the noise families: "sample", or "emit" for what sensors need not hear.
+    """
     std, drawn = noise_std(rows, levels), []
     for c, channel in enumerate(block.channels):
-        value = channel.noise.sample(jax.random.fold_in(key, c), predicted[:, c], std[:, c])
+        value = getattr(channel.noise, how)(jax.random.fold_in(key, c), predicted[:, c], std[:, c])
         if channel.period is not None:
             value = jnp.mod(value + channel.period / 2, channel.period) - channel.period / 2
         drawn.append(value)

@@ -78,8 +78,9 @@ def draw_paths(
     how: Particles,
 ) -> State:
     """As many paths as particles, (K, M) leading, drawn from a target's smoothing distribution."""
-    sampler, keys = sampler_of(how), jax.random.split(key)
+    sampler, keys = sampler_of(how), jax.random.split(key, 3)
     last, _, _ = systematic(keys[0], found.log_weights[-1], (), how.count)
+    last = jax.random.permutation(keys[2], last)  # so that each path by itself is a draw
 
     def back(chosen: jax.Array, inputs: Any) -> tuple[jax.Array, jax.Array]:
         before, weights, after, ancestors, epoch, really, own = inputs

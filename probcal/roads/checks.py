@@ -105,12 +105,15 @@ def check_crossings(
     bridges: Collection[str],
     snap: float,
 ) -> None:
-    """Raise `InputError` for two edges that meet in the plane away from a node that they share."""
+    """Raise `InputError` for edges that meet in the plane, or one that meets itself, away from a node."""
     flat = shapely.linestrings(
         np.concatenate([line[:, :2] for line in lines]), indices=np.repeat(np.arange(len(lines)), [*map(len, lines)])
     )
     tree = shapely.STRtree(flat)
     over = np.isin(names, list(bridges))
+    for e in map(int, np.flatnonzero(~shapely.is_simple(flat) & ~over)):
+        if nodes.shape[1] == 2:
+            raise InputError(f'edge "{names[e]}" crosses itself; split it where it does, or name it in bridges')
 
     def clear(i: int, j: int, point: np.ndarray) -> bool:
         """Whether one edge passes over the other at a point."""

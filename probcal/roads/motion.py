@@ -36,7 +36,7 @@ class Road(Motion):
     displacement along the road and the speed gain noise of covariance std^2 [[T^3/3, T^2/2], [T^2/2, T]], `std` in
     m s^-3/2, as in `ConstantVelocity`. At a node all edges that may be entered but the one it comes from are as likely,
     or as `turns` {(from_edge, to_edge): weight} says, where an edge that is not named beside others has 0; where none
-    leads on, it turns back. A one-way edge is never entered at its end.
+    leads on, it turns back. A one-way edge is entered at its end by who turns back there alone.
 
     `speed` (mean, sd) is that of the start in the direction of travel, which is either one with probability 1/2, on
     one-way edges the allowed one. `position` ((x, y), sd) starts it there on the roads; None, anywhere by length.

@@ -96,6 +96,11 @@ def _geojson(path: Path, frame: Any, crs: Any, dimension: Any, snap: float, conn
     return RoadNetwork.from_pieces(pieces, snap, connected, bridges)
 
 
+def _mapping(value: Any) -> dict[str, Any]:
+    """A mapping as it is, an empty one for anything else."""
+    return value if isinstance(value, dict) else {}
+
+
 def _features(content: Any) -> tuple[list[str], list[np.ndarray], list[int], list[bool]]:
     """Names, lines, ways (1, -1 or 0) and whether it is a bridge, of every line of a GeoJSON object."""
     if not isinstance(content, dict):
@@ -106,8 +111,8 @@ def _features(content: Any) -> tuple[list[str], list[np.ndarray], list[int], lis
     ways: list[int] = []
     over: list[bool] = []
     for k, feature in enumerate(features if isinstance(features, list) else []):
-        feature = feature if isinstance(feature, dict) else {}
-        geometry, own = feature.get("geometry") or {}, feature.get("properties") or {}
+        feature = _mapping(feature)
+        geometry, own = _mapping(feature.get("geometry")), _mapping(feature.get("properties"))
         kind, parts = geometry.get("type"), geometry.get("coordinates") or []
         if kind not in ("LineString", "MultiLineString"):
             continue
