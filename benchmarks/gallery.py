@@ -34,7 +34,7 @@ RECORDINGS = {
 }  # fmt: skip
 HOW = {
     "road_microphones": ("--set", "motion=road", "--method", "em-particles"), "town": ("--method", "em-particles"),
-    "presence": ("--method", "particle-gibbs", "--prior", "gaussian"),
+    "presence": ("--method", "particle-gibbs", "--prior", "gaussian", "--chains", "2", "--draws", "300"),
 }  # fmt: skip
 HEAD = """# Notebooks and models
 

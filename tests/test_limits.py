@@ -145,7 +145,7 @@ def likeliest(run, kind):
 HEARS = -72.0
 
 
-@pytest.mark.parametrize("noise", [Censored(HEARS), Truncated(HEARS)], ids=repr)
+@pytest.mark.parametrize("noise", [Censored(HEARS), pytest.param(Truncated(HEARS), marks=pytest.mark.ci)], ids=repr)
 def test_what_is_not_heard_is_simulated_and_fitted(noise):
     """Rows below the floor are limits, or gone; the mode is that of scipy, and without the floor it is elsewhere."""
     network, motion, run = heard(noise, 3)
@@ -182,6 +182,7 @@ def test_intervals_hold_where_little_is_heard(kind):
     assert abs(np.mean(held) - 0.89) < 4 * np.std(held, ddof=1) / np.sqrt(40)
 
 
+@pytest.mark.ci
 def test_an_unknown_noise_level_is_found_among_limits():
     network, motion, run = heard(Censored(HEARS), 5)
     unknown = Network([radio(Censored(HEARS), Unknown(4.0)).on(node) for node in network.nodes])
