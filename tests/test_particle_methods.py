@@ -33,6 +33,7 @@ from probcal import (
     RoadNetwork,
     Target,
     Unknown,
+    White,
     fit,
     particle_filter,
     sensor,
@@ -375,6 +376,9 @@ ERRORS = [
     (lambda p: particle_filter(p, runs=1), "at least 2 filters give an error"),
     (lambda p: EM("particles"), "Cubature\\(\\) or Particles\\(500\\)"),
     (lambda p: ParticleGibbs(steps=0), "ParticleGibbs\\(steps=0\\): it must be at least 1"),
+    (lambda p: fit(Problem(p.network, Target(ConstantVelocity(0.5) + White("power", "dB", Unknown(1.0)), START), p.
+                   measurements.table.frame), EM(Particles(50))),
+     "particles do not learn the level of a noise without memory"),
     (lambda p: fit(Problem(p.network, Target(ConstantVelocity(0.5, singular=True), START), p.measurements.table.frame),
                    ParticleGibbs()), "the motion has no density: its noise"),
 ]  # fmt: skip

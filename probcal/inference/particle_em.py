@@ -13,7 +13,7 @@ import numpy as np
 from probcal import linalg
 from probcal.inference.progress import Progress
 from probcal.inference.run import Context, Given, Maximiser, bare, check_method, given_of, learn
-from probcal.inference.weighted import Ended, conclude_particles, prepared
+from probcal.inference.weighted import Ended, check_learnt, conclude_particles, prepared
 from probcal.model.model import At, Model
 from probcal.particle.ensemble import (
     Ensemble,
@@ -223,6 +223,7 @@ def climb_by_particles(
 ) -> Answer:
     """Run the loop from biases z (M,) and conclude: a Gaussian about them, its information by Louis' identity."""
     check_method(method)
+    check_learnt(problem)
     targets = prepared(problem, how)
     if problem.model.driven and how.smoother == "marginal":
         how = replace(how, smoother="exact")  # levels of process noise are learnt along paths

@@ -29,7 +29,7 @@ from probcal.inference.posterior import Chains, conclude_draws
 from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
-from probcal.inference.weighted import Paths, louis, misfit, positive, prepared, unexplained
+from probcal.inference.weighted import Paths, check_learnt, louis, misfit, positive, prepared, unexplained
 from probcal.model.model import At, Model
 from probcal.particle.conditional import conditional_path
 from probcal.particle.ensemble import ensemble, expected_over_paths, first_paths, log_motion_of, state_moments
@@ -113,6 +113,7 @@ class ParticleGibbs(Sampler):
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Draws of the posterior from biases of a start, zero for a search, and what they say."""
         began = time.perf_counter()
+        check_learnt(problem)
         targets = prepared(problem, self.particles)
         check_proposal(problem.model, self.particles, conditional=True)
         for own in targets:

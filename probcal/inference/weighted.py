@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.errors import InputError
 from probcal.inference.ending import ABSURD, FAR, low_and_far
 from probcal.inference.run import Given, Maximiser
 from probcal.model.model import Model
@@ -45,6 +46,16 @@ def prepared(problem: Problem, how: Particles) -> tuple[Targets, ...]:
     check_installed()
     check_proposal(problem.model, how)
     return targets_of(problem.model)
+
+
+def check_learnt(problem: Problem) -> None:
+    """Raise `InputError` for an unknown level of noise that is drawn anew at every epoch, a target's first included."""
+    for part in problem.model.recursions:
+        if (np.asarray(part.level)[np.asarray(part.first)] < len(problem.levels)).any():
+            raise InputError(
+                "particles do not learn the level of a noise without memory (White, Known): give it as a number, or use"
+                " EA() or NUTS()"
+            )
 
 
 class Ended(NamedTuple):
