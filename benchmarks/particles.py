@@ -171,11 +171,11 @@ def paper(runs, beside, names):
 
 
 def coverage(runs):
-    """Biases drawn from their scales, four targets: how often intervals of 89 % hold the truth."""
+    """Biases and ways drawn from the model: how often intervals of 89 % hold the truth, and those called converged."""
     network = microphones.network()
     for motion in ("free", "road"):
         for name in ("EM, particles", "EM, paths", "EM, mean"):
-            method, inside, squares = METHODS[name], [], []
+            method, inside, squares, settled = METHODS[name], [], [], []
             for run in range(runs):
                 drawn = np.random.default_rng(run)
                 biases = {b.label: b.scale * drawn.standard_normal() for b in network.biases}
@@ -184,12 +184,14 @@ def coverage(runs):
                 tree = probcal.fit(problem, replace(method, iterations=60), prior=Gaussian(), key=run)
                 group, true = tree["calibration"].to_dataset(), np.array([biases[b] for b in problem.labels])
                 inside.append(((group["lower"].values < true) & (true < group["upper"].values)).mean())
+                settled.append(tree.attrs["status"] == "converged")
                 away = group["mean"].values - true
                 squares.append(away @ np.linalg.solve(group["covariance"].values, away) / len(away))
             error = np.std(inside, ddof=1) / np.sqrt(runs)
             print(
                 f"{motion}, {name}: {runs} runs, coverage {np.mean(inside):.3f} ± {error:.3f} (0.89 nominal), NEES a"
-                f" bias {np.mean(squares):.2f}, worst {np.max(squares):.1f}",
+                f" bias {np.mean(squares):.2f}, worst {np.max(squares):.1f}; {sum(settled)} converged, coverage"
+                f" {np.mean(np.array(inside)[settled]) if any(settled) else np.nan:.3f}",
                 flush=True,
             )
 

@@ -101,6 +101,10 @@ def test_limits_are_drawn_as_they_are_weighed(predicted):
     np.testing.assert_array_equal(np.isnan(Truncated(FLOOR).reported(emitted)), emitted <= FLOOR)
 
 
+HEARS = -72.0
+PLACES = [(0.0, 0.0), (60.0, 10.0), (20.0, 45.0), (70.0, 60.0)]
+
+
 def radio(noise, std=2.0):
     """A receiver of levels in dB whose exponent is not known: 10 n log10 of the distance are lost."""
 
@@ -114,8 +118,7 @@ def radio(noise, std=2.0):
 
 def heard(noise, run):
     """Receivers, a walk that is known, and what they tell of it."""
-    places = [(0.0, 0.0), (60.0, 10.0), (20.0, 45.0), (70.0, 60.0)]
-    network = Network([radio(noise).on(Node(f"r{k}", p)) for k, p in enumerate(places)])
+    network = Network([radio(noise).on(Node(f"r{k}", p)) for k, p in enumerate(PLACES)])
     time = np.arange(60.0)
     walk = Known((time, np.stack([5 + 1.2 * time, 25 + 15 * np.sin(time / 9.0)], 1)))
     drawn = np.random.default_rng(run)
@@ -126,7 +129,7 @@ def heard(noise, run):
 def likeliest(run, kind):
     """Offset and exponent of every receiver by scipy, from the densities as they stand in a textbook."""
     found = {}
-    for k, place in enumerate([(0.0, 0.0), (60.0, 10.0), (20.0, 45.0), (70.0, 60.0)]):
+    for k, place in enumerate(PLACES):
         rows = run.table[run.table["sensor"] == f"r{k}"]
         t, y = rows["time"].to_numpy(), rows["level"].to_numpy()
         lost = 10 * np.log10(np.maximum(np.hypot(5 + 1.2 * t - place[0], 25 + 15 * np.sin(t / 9.0) - place[1]), 1.0))
@@ -140,9 +143,6 @@ def likeliest(run, kind):
         best = optimize.minimize(cost, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-10})
         found |= {f"r{k}.offset": best.x[0], f"r{k}.exponent": best.x[1]}
     return found
-
-
-HEARS = -72.0
 
 
 @pytest.mark.parametrize("noise", [Censored(HEARS), pytest.param(Truncated(HEARS), marks=pytest.mark.ci)], ids=repr)
