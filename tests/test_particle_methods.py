@@ -135,14 +135,14 @@ def test_a_trace_that_drifts_is_not_still():
 
 def test_particles_that_collapsed_are_not_called_converged(linear):
     """A bootstrap filter of few particles under very sharp rows, by `track` and by `particle_filter`."""
-    kind = replace(relative, channels={"place": replace(relative.channels["place"], std=0.02)})
+    kind = replace(relative, channels={"place": replace(relative.channels["place"], std=0.1)})
     network = Network([kind.on(Node("known", (0.0, 0.0)))])
     problem = Problem(network, MOTION, simulate(network, MOTION, TIME, key=1).table)
     few = Particles(50, proposal="bootstrap")
     for tree in (track(problem, calibrated(problem), smoother=few), particle_filter(problem, few, runs=4)):
-        assert tree.attrs["status"] in ("not converged", "misfit")
+        assert tree.attrs["status"] == "not converged"
         assert "more particles" in tree.attrs["message"]
-    assert tree.attrs["log_likelihood_se"] > 1.0
+    assert tree.attrs["log_likelihood_se"] > 0.5
     assert track(problem, calibrated(problem), smoother=Particles(400)).attrs["status"] == "converged"
 
 
