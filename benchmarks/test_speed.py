@@ -21,9 +21,10 @@ from probcal.analysis import next_passes, observability
 from probcal.inference.run import Context, maximise
 from probcal.priors import Precision
 from probcal.sensors import radar
+from probcal.smoothing.grid import project, track_mode
 from probcal.smoothing.linearised import laplace
 from probcal.smoothing.mode import Point, find_mode
-from probcal.smoothing.start import automatic_start, project, track_mode
+from probcal.starts import automatic_start
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import radars

@@ -43,8 +43,8 @@ from probcal.plots import plot_bound_map, plot_sensitivity
 from probcal.priors import Precision
 from probcal.results.read import each_track
 from probcal.smoothing import recursion as rec
+from probcal.smoothing.grid import project
 from probcal.smoothing.mode import Point, cost, factors, find_mode
-from probcal.smoothing.start import project
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import radars

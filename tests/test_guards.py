@@ -45,7 +45,7 @@ from probcal.sensors import doa
 from probcal.smoothing.information import mean_square, squares_of
 from probcal.smoothing.linearised import laplace
 from probcal.smoothing.mode import _proposal, find_mode
-from probcal.smoothing.start import automatic_start
+from probcal.starts import automatic_start
 from probcal.status import INVALID, Status
 
 

@@ -15,7 +15,7 @@ from probcal.inference.integrate import CHAINS, KEPT, Integration, begin, likeli
 from probcal.inference.posed import Form, Natural
 from probcal.inference.propagate import nodes_of, propagate
 from probcal.priors import Precision
-from probcal.smoothing.start import track_mode
+from probcal.smoothing.grid import track_mode
 
 PRIORS = [ARD(shape=1.5, rate=0.5), Laplace(), Horseshoe(), BernoulliGaussian(share=0.4)]
 KINDS = {ARD: GammaPrecision, Laplace: LaplaceMixture, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab}

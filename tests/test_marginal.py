@@ -17,7 +17,7 @@ from probcal.priors import Precision
 from probcal.smoothing.linearised import laplace
 from probcal.smoothing.marginal import find_marginal_mode, volume_slope
 from probcal.smoothing.mode import cost, eliminate, find_mode
-from probcal.smoothing.start import automatic_start
+from probcal.starts import automatic_start
 
 STEP = 3e-4  # of z in the differences
 

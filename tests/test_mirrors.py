@@ -16,10 +16,11 @@ from probcal.inference import solve
 from probcal.plots.map import plot_map
 from probcal.sensors import radar, ranger
 from probcal.smoothing import recursion
+from probcal.smoothing.grid import track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mirrors import Sides, other_sides, planes, reflect, reflect_nodes
 from probcal.smoothing.mode import factors
-from probcal.smoothing.start import automatic_start, track_mode
+from probcal.starts import automatic_start
 from probcal.status import Status
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))

@@ -17,8 +17,9 @@ from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.sampling import Plan
 from probcal.inference.sides import distances, shifted
 from probcal.smoothing.frame import frame_at, log_joint, log_weight, unit_normals, volume
+from probcal.smoothing.grid import track_mode
 from probcal.smoothing.mirrors import other_sides
-from probcal.smoothing.start import automatic_start, track_mode
+from probcal.starts import automatic_start
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import networks

@@ -36,7 +36,7 @@ from probcal.identifiability.gauge import gauge
 from probcal.model import rows as waist
 from probcal.smoothing.linearised import marginal_information
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import automatic_start
+from probcal.starts import automatic_start
 from probcal.types import float64
 
 TIME = np.arange(30.0)

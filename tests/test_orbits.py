@@ -18,7 +18,7 @@ from probcal.inference.prior_draws import draw_prior
 from probcal.motion import RandomWalk
 from probcal.sensors import doa, ranger
 from probcal.smoothing.frame import frame_at, log_weight, place, unit_normals, volume
-from probcal.smoothing.start import automatic_start
+from probcal.starts import automatic_start
 
 
 @cache

@@ -29,7 +29,7 @@ from probcal.smoothing.frame import frame_at, log_weight, place, unit_normals, v
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import laplace
 from probcal.smoothing.mode import factors, find_mode, smooth_tracks
-from probcal.smoothing.start import automatic_start
+from probcal.starts import automatic_start
 
 PRIORS = [ARD(shape=2.0, rate=0.7), ARD(by="node", rate=0.5), Laplace(), Horseshoe()]
 ALARM = 1e-4  # rate at which a right sampler fails one of these tests, for each comparison

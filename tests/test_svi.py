@@ -15,7 +15,7 @@ from probcal.inference.sampling import sample
 from probcal.inference.svi import noncentred
 from probcal.smoothing.frame import place, unit_normals
 from probcal.smoothing.mode import smooth_tracks
-from probcal.smoothing.start import automatic_start
+from probcal.starts import automatic_start
 
 ALARM = 5.0  # standard errors: a right sampler fails one comparison in a million
 

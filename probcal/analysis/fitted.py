@@ -16,10 +16,10 @@ from probcal.problem import Epochs, Problem
 from probcal.results.answer import Answer
 from probcal.results.groups import datum_of, gather, weight_name
 from probcal.results.read import each_track
+from probcal.smoothing.grid import follow_states, track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import Linearisation, linearise
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import follow_states, track_mode
 
 
 class Fitted(NamedTuple):

@@ -14,9 +14,9 @@ from probcal.errors import InputError, nearest
 from probcal.model.model import At, Model
 from probcal.problem import Problem
 from probcal.simulate import Key, Truth, as_key
+from probcal.smoothing.grid import follow_states
 from probcal.smoothing.linearised import linearise
 from probcal.smoothing.mode import Point, smooth_tracks
-from probcal.smoothing.start import follow_states
 from probcal.types import float64
 
 ITERATIONS = 30  # of a track

@@ -10,8 +10,9 @@ from probcal.errors import InputError, nearest
 from probcal.problem import Problem, check_linear
 from probcal.simulate import Truth, on_tracks
 from probcal.smoothing import recursion as rec
+from probcal.smoothing.grid import track_mode
 from probcal.smoothing.mode import Point, factors
-from probcal.smoothing.start import automatic_start, track_mode
+from probcal.starts import automatic_start
 
 
 def check_free(problem: Problem) -> None:

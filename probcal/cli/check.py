@@ -16,7 +16,7 @@ from probcal.cli.progress import line
 from probcal.files import Outputs
 from probcal.problem import Problem
 from probcal.results.io import save
-from probcal.smoothing.start import automatic_start
+from probcal.starts import automatic_start
 
 MAP_CELLS = 60  # of a bound map an axis
 STATUS = {

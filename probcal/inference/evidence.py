@@ -20,7 +20,7 @@ from probcal.priors import Flat, Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import automatic_start
+from probcal.starts import automatic_start
 from probcal.types import float64
 
 RUNS, PARTICLES = 8, 50  # independent runs, and the hyper-parameters that each of them carries

@@ -30,12 +30,13 @@ from probcal.results.answer import Answer, tracks_of, uncalibrated
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
 from probcal.results.read import apply
 from probcal.simulate import Key, as_key
+from probcal.smoothing.grid import track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import linearise
 from probcal.smoothing.mirrors import SAME, Mirrored
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import automatic_start, track_mode
 from probcal.smoothing.tails import settle
+from probcal.starts import automatic_start
 from probcal.status import Status
 from probcal.types import float64
 

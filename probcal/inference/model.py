@@ -29,10 +29,11 @@ from probcal.priors import PRIORS, Flat, Horseshoe, Precision, Prior
 from probcal.problem import Problem, check_linear
 from probcal.results.read import apply
 from probcal.smoothing.frame import frame_at
+from probcal.smoothing.grid import track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import Point, factors
 from probcal.smoothing.recursion import trajectory
-from probcal.smoothing.start import automatic_start, track_mode
+from probcal.starts import automatic_start
 from probcal.types import float64
 
 if TYPE_CHECKING:

@@ -39,8 +39,8 @@ from probcal.particle.targets import Targets, place_by_epoch
 from probcal.priors import Gaussian, Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
+from probcal.smoothing.grid import follow_states, track_mode
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import follow_states, track_mode
 from probcal.status import Status
 
 SPREAD = 1.5  # by how much chains start further out than the data leave the biases

@@ -21,10 +21,10 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
 from probcal.results.schema import INTERVAL, ROPE
 from probcal.smoothing.draws import draws_a_chain, predictive
+from probcal.smoothing.grid import track_mode
 from probcal.smoothing.information import at_levels, mean_square
 from probcal.smoothing.mirrors import Mirrored
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import track_mode
 from probcal.status import Status
 
 RARE = 0.05  # share of leaps, or of swings, taken below which it is said

@@ -38,9 +38,9 @@ from probcal.priors import Precision, Prior
 from probcal.problem import Problem
 from probcal.results.read import each_track, saved_states
 from probcal.simulate import Key, as_key
+from probcal.smoothing.grid import follow_states
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import Point, find_mode
-from probcal.smoothing.start import follow_states
 from probcal.types import float64
 
 BATCH = 5  # runs of one file

@@ -15,10 +15,10 @@ from probcal.inference.leaps import Place
 from probcal.inference.posed import Form, Posed, log_prior
 from probcal.problem import Problem
 from probcal.smoothing.frame import log_weight, place, unit_normals
+from probcal.smoothing.grid import track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mirrors import distance, new
 from probcal.smoothing.mode import Point, mixed_density
-from probcal.smoothing.start import track_mode
 
 
 class Sided(NamedTuple):

@@ -11,9 +11,10 @@ from probcal.inference.run import Context, Method
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
+from probcal.smoothing.grid import follow_states
 from probcal.smoothing.mirrors import NEAR, SAME, Mirrored, other_sides
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import automatic_start, follow_states, further_starts
+from probcal.starts import automatic_start, further_starts
 from probcal.status import Status
 
 TRIES = 3  # climbs by particles from one start

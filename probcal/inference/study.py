@@ -44,7 +44,7 @@ from probcal.results.schema import INTERVAL
 from probcal.simulate import Truth
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import automatic_start
+from probcal.starts import automatic_start
 
 BATCH = 10  # runs that one compiled call solves
 CHECKED = 20  # stored problems that a resumed study makes anew, to see whether the model is still the same

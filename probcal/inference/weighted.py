@@ -26,8 +26,8 @@ from probcal.results.answer import CHAINS, HALF, Answer, Draws, Posterior, Summa
 from probcal.results.build import build_tracks
 from probcal.results.groups import Band
 from probcal.smoothing.draws import draw_biases, draws_a_chain, predictive
+from probcal.smoothing.grid import follow_states, track_mode
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import follow_states, track_mode
 from probcal.status import Status
 
 if TYPE_CHECKING:

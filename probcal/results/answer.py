@@ -19,11 +19,11 @@ import numpy as np
 from probcal.priors import Prior
 from probcal.results.schema import INTERVAL
 from probcal.smoothing.draws import draw, draw_biases, draws_a_chain
+from probcal.smoothing.grid import track_mode
 from probcal.smoothing.linearised import LaplaceApproximation, Linearisation, linearise
 from probcal.smoothing.marginal import volume_slope
 from probcal.smoothing.mirrors import Mirrored
 from probcal.smoothing.mode import Point
-from probcal.smoothing.start import track_mode
 from probcal.status import Status
 
 if TYPE_CHECKING:

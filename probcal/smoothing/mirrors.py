@@ -17,10 +17,10 @@ from probcal import linalg
 from probcal.labels import AXES
 from probcal.priors import Precision
 from probcal.problem import Problem
+from probcal.smoothing.grid import follow_states, grid_start, known_places, profile, track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import laplace
 from probcal.smoothing.mode import Mode, Point, find_mode
-from probcal.smoothing.start import follow_states, grid_start, known_places, profile, track_mode
 from probcal.types import float64
 
 WORSE = 0.4  # nats a datum by which a reflected place may fit worse and is still polished: 0 to 0.2 beside a mirror,

@@ -1,4 +1,4 @@
-"""The automatic start: a track found from the data alone, without truth and without a hand-made guess.
+"""A track found on a grid from the data alone, at given biases: without truth and without a hand-made guess.
 
 Every target is placed on a grid of candidate positions; for each epoch and candidate the other state
 components (power, emission range, ...) are profiled out, and the noise is widened by the prior spread of the
@@ -6,7 +6,6 @@ biases. The best path through the grid (Viterbi, over windows of epochs) is then
 into a consistent trajectory.
 """
 
-import itertools
 from functools import partial
 from typing import Any
 
@@ -18,11 +17,9 @@ from probcal import linalg
 from probcal.model import variants
 from probcal.model.model import At, Model, Recursion
 from probcal.model.rows import Linearised
-from probcal.priors import Precision
-from probcal.problem import Problem, check_linear
+from probcal.problem import Problem
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Point, cost, factors, find_mode, smooth_tracks
-from probcal.types import float64
+from probcal.smoothing.mode import Point, cost, factors, smooth_tracks
 
 WINDOWS = 60  # at most so many windows a target
 INNER = {2: 24, 3: 10}  # grid points an axis inside the network
@@ -32,9 +29,6 @@ CLOSE = 1e6  # precision of every state component at which a trajectory follows 
 NEAR = 0.05  # error of a position found on the grid, in extents
 WINDOW_ROWS = 60  # rows of a window that are looked at, where there are more
 BEAM = 200  # candidates a window that the path may pass
-TRIED = 60  # swaps of two nodes that are tried for further starts
-DRAWN = 3  # draws of the biases that are tried for one further start
-SPARSE = 0.3  # share of the biases that a draw moves
 ROBUST = 4.0  # degrees of freedom of the start's Student-t loss
 
 
@@ -222,60 +216,9 @@ def grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
     return track_mode(problem, project(problem, tracks, precisions)._replace(z=z), iterations)
 
 
-@float64
-def automatic_start(problem: Problem, iterations: int = 30) -> Point:
-    """Trajectories and biases from the data alone, near the joint mode at the declared scales.
-
-    Grid, Viterbi path, motion model, iterated EKS at zero biases, then a few joint steps.
-    """
-    check_linear(problem)
-    tracked = grid_start(problem, jax.device_put(np.zeros(problem.model.biases)), iterations)
-    prior = Precision.single(jnp.ones(problem.model.biases))
-    return find_mode(problem.model, tracked, prior, iterations, 1e-3).point
-
-
 def track_mode(problem: Problem, point: Point, iterations: int = 100) -> Point:
     """Trajectories at held biases: iterated EKS from a point."""
     return smooth_tracks(problem.model, point, iterations)
-
-
-def _swaps(problem: Problem) -> np.ndarray:
-    """Biases (swaps, M) that exchange the places of two nodes, for every pair of fixed ones with free positions."""
-    place: dict[str, list[int]] = {}
-    for m, bias in enumerate(problem.biases):
-        if bias.component == "position" and bias.kind == "scale":
-            place.setdefault(bias.owner, []).append(m)
-    d = problem.network.dimension
-    free = [n for n in problem.network.nodes if n.path is None and len(place.get(n.name, ())) == d]
-    found = []
-    for a, b in itertools.combinations(free, 2):
-        z = np.zeros(len(problem.labels))
-        z[place[a.name]], z[place[b.name]] = b.position - a.position, a.position - b.position
-        found.append(z / problem.scales)
-    return np.array(found).reshape(-1, len(problem.labels))
-
-
-def further_starts(problem: Problem, count: int, key: jax.Array) -> list[Point]:
-    """`count` other starts: of swapped pairs of nodes and of sparse draws of the biases, those that fit best.
-
-    A swap is the field's commonest gross error, and no local search finds it; draws move a share of the biases by
-    two scales. Each comes with the track that suits it; half of the starts are swaps where there are any.
-    """
-    if not count:
-        return []
-    seeds = jax.random.split(key, 3)
-    swaps = _swaps(problem)
-    swaps = swaps[np.sort(np.asarray(jax.random.permutation(seeds[0], len(swaps)))[:TRIED])]
-    shape = (DRAWN * count, len(problem.labels))
-    moved = np.asarray(jax.random.uniform(seeds[1], shape)) < SPARSE
-    drawn = np.where(moved, 2.0 * np.asarray(jax.random.normal(seeds[2], shape)), 0.0)
-    points = [grid_start(problem, jnp.asarray(z), 30) for z in np.concatenate([swaps, drawn])]
-    flat = Precision.single(jnp.zeros(len(problem.labels)))
-    costs = [float(joint_cost(problem.model, point, flat)) for point in points]
-    value = np.nan_to_num(costs, nan=np.inf)
-    pairs, others = np.argsort(value[: len(swaps)]), len(swaps) + np.argsort(value[len(swaps) :])
-    half = min(len(pairs), (count + 1) // 2)
-    return [points[k] for k in (*pairs[:half], *others[: count - half])]
 
 
 joint_cost = jax.jit(cost)

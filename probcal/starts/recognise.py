@@ -1,0 +1,184 @@
+"""What a declared sensor measures, found by trying its function: a direction, a range, an arrival, a level.
+
+A user declares a function, not a family. Tried at random places and poses, its channels are compared with the
+geometry that each family has in closed form; what fits none is left to the grid.
+"""
+
+from collections.abc import Mapping
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.geometry import bearing, elevation, norm
+from probcal.labels import AXES
+from probcal.network import ANGLES
+from probcal.noise import guess_of
+from probcal.problem import Problem
+from probcal.sensor import SensorType
+from probcal.types import PoseView, TargetView
+
+TRIALS = 24  # random configurations at which a function is tried
+EXACT = 1e-6  # by how much a channel may miss the geometry of its family
+STEP = 0.1  # by which a bias is moved to see whether it turns or shifts a channel
+
+
+class Kind(NamedTuple):
+    """What a channel measures: `sign` times the geometry plus `shift`; `by` is what each own bias adds, per unit."""
+
+    family: str  # "azimuth", "elevation", "range", "arrival", "difference", "level"
+    sign: float
+    shift: float
+    by: Mapping[str, float]
+
+
+def kinds(problem: Problem) -> dict[tuple[str, str], Kind]:
+    """Kind of every channel that is recognised, by sensor type and channel."""
+    d = problem.network.dimension
+    return {
+        (kind.name, name): found
+        for kind in problem.network.types
+        if d in kind.dimensions
+        for name, found in _tried(kind, d).items()
+    }
+
+
+@cache
+def _tried(kind: SensorType, d: int) -> dict[str, Kind]:
+    """Kinds of the channels of one sensor type, by name."""
+    rng = np.random.default_rng(0)
+    others = sorted(kind.target_components - {"position", "at"})
+    extras = sorted(kind.pose_components - {"position", *ANGLES, "time_offset", "velocity"})
+    names = list(kind.biases)
+    place = rng.normal(size=(TRIALS, d)) * 50.0
+    nodes = rng.normal(size=(TRIALS, kind.arity, d)) * 50.0
+    turned = rng.uniform(-0.4, 0.4, size=(TRIALS, kind.arity, len(ANGLES))) * (1.0 if d == 3 else np.array([1.0, 0, 0]))
+
+    def width(name: str) -> tuple[int, ...]:
+        return (d,) if name in kind.vectors else ()
+
+    def one(p: jax.Array, s: jax.Array, angles: jax.Array, level: jax.Array, biases: jax.Array) -> tuple:
+        own = {name: jnp.full(width(name), 1.0 + 0.1 * k) * level for k, name in enumerate(others)}
+        target = TargetView("the target", {"position": p, "velocity": jnp.zeros(d), "acceleration": jnp.zeros(d)} | own)
+        poses = []
+        for a in range(kind.arity):
+            parts = {"position": s[a], "velocity": jnp.zeros(d), "time_offset": jnp.zeros(()), "clock": jnp.zeros(())}
+            parts |= {name: jnp.zeros(width(name)) for name in extras}
+            poses.append(PoseView("the node", parts | dict(zip(ANGLES, angles[a], strict=True))))
+        value = kind.evaluate(
+            target, poses, {n: kind.biases[n].nominal + b for n, b in zip(names, biases, strict=True)}
+        )
+        local = [pose.local(p) for pose in poses]
+        shape = [bearing(local[0]), elevation(local[0]) if d == 3 else jnp.zeros(()), norm(local[0])]
+        return value, jnp.stack([*shape, norm(local[-1]) - norm(local[0])])
+
+    look = jax.jit(jax.vmap(one, (0, 0, 0, None, None)))
+
+    def at(level: float, biases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        value, shape = look(*(jnp.asarray(x, float) for x in (place, nodes, turned, level, biases)))
+        return np.asarray(value), np.asarray(shape)
+
+    rest = np.zeros(len(names))
+    (value, shape), (other, _) = at(1.0, rest), at(2.0, rest)
+    moved = {name: at(1.0, rest + STEP * np.eye(len(names))[k])[0] for k, name in enumerate(names)}
+    found = {}
+    for c, (name, channel) in enumerate(kind.expand(d)):
+        unit = np.pi / 180 if channel.unit == "deg" else 1.0
+        own = {n: (v[:, c] - value[:, c]) / STEP for n, v in moved.items()}
+        by = {n: float(v[0]) for n, v in own.items() if np.ptp(v) < EXACT * max(1.0, abs(v[0])) and abs(v[0]) > EXACT}
+        if kind.arity > 2:
+            continue
+        kind_of = _family(value[:, c] * unit, other[:, c] * unit, shape, kind.arity, channel.period is not None)
+        if kind_of is not None:
+            found[name] = Kind(*kind_of, by)
+    return found
+
+
+def _family(
+    value: np.ndarray, other: np.ndarray, shape: np.ndarray, arity: int, wraps: bool
+) -> tuple[str, float, float] | None:
+    """Family, sign and shift of a channel: its values with the target's other components at one level and another."""
+    azimuth, elevation_, distance, difference = shape.T
+    if arity == 2:
+        return _shifted("difference", value, difference)
+    if wraps or np.ptp(azimuth) == 0:
+        for sign in (1.0, -1.0):
+            turn = np.exp(1j * (value - sign * azimuth)).mean()
+            if abs(turn) > 1 - EXACT**2 and np.allclose(value, other):
+                return "azimuth", sign, float(np.angle(turn))
+    if np.ptp(elevation_) > 0 and (found := _shifted("elevation", value, elevation_)):
+        return found
+    if found := _shifted("range", value, distance):
+        return found if np.allclose(value, other) else ("arrival", *found[1:])
+    log = np.stack([np.ones_like(distance), np.log10(distance)], 1)
+    fit = np.linalg.lstsq(log, value, rcond=None)[0]
+    if abs(fit[1]) > EXACT and np.abs(log @ fit - value).max() < EXACT * max(1.0, np.abs(value).max()):
+        return "level", float(fit[1]), float(fit[0])
+    return None
+
+
+def _shifted(family: str, value: np.ndarray, shape: np.ndarray) -> tuple[str, float, float] | None:
+    """The family where the values are its geometry, either sign, with a constant added."""
+    for sign in (1.0, -1.0):
+        left = value - sign * shape
+        if np.ptp(left) < EXACT * max(1.0, np.abs(value).max()):
+            return family, sign, float(left.mean())
+    return None
+
+
+class Directions(NamedTuple):
+    """What one resting node sees of one target: times (N,), azimuths (N,) or azimuths and elevations (N, 2), stds."""
+
+    node: str
+    target: str
+    time: np.ndarray
+    angles: np.ndarray
+    std: np.ndarray
+
+
+def seen_directions(problem: Problem) -> list[Directions]:
+    """Rows of all recognised direction channels of resting nodes, as mathematical angles in the node's own axes.
+
+    Several rows of one target at one time are averaged on the circle. In 3-D only rows with azimuth and elevation.
+    """
+    known, data, found = kinds(problem), problem.measurements, []
+    d = problem.network.dimension
+    for k, sensor in enumerate(problem.network.sensors):
+        if len(sensor.nodes) != 1 or sensor.nodes[0].path is not None:
+            continue
+        own: dict[str, tuple[int, Kind, float, float]] = {}
+        for name, channel in sensor.type.expand(d):
+            kind = known.get((sensor.type.name, name))
+            if kind is not None and kind.family in ("azimuth", "elevation") and name in data.channels:
+                unit = np.pi / 180 if channel.unit == "deg" else 1.0
+                own[kind.family] = (data.channels.index(name), kind, unit, guess_of(channel.std) * unit)
+        if "azimuth" not in own or (d == 3 and "elevation" not in own):
+            continue
+        for t, target in enumerate(data.target_names):
+            columns = [own["azimuth"][0]] + ([own["elevation"][0]] if d == 3 else [])
+            mine = np.flatnonzero((data.sensor == k) & (data.target == t) & data.measured[:, columns].all(1))
+            if not len(mine):
+                continue
+            angles, stds = [], []
+            for family in ("azimuth", "elevation")[: len(columns)]:
+                j, kind, unit, guess = own[family]
+                angles.append((data.value[mine, j] * unit - kind.shift) * kind.sign)
+                stds.append(np.where(data.has_std[mine, j], data.std[mine, j] * unit, guess))
+            time, group = np.unique(data.time[mine], return_inverse=True)
+            count = np.bincount(group)
+            mean = [np.angle(np.bincount(group, np.cos(a)) + 1j * np.bincount(group, np.sin(a))) for a in angles]
+            spread = [np.bincount(group, s) / count for s in stds]
+            found.append(Directions(sensor.nodes[0].name, target, time, np.stack(mean, 1), np.stack(spread, 1)))
+    return found
+
+
+def members(problem: Problem) -> dict[str, dict[str, int]]:
+    """Number of the free constant bias of each component of each node: `heading`, `position_x`, ..."""
+    found: dict[str, dict[str, int]] = {node.name: {} for node in problem.network.nodes}
+    for m, bias in enumerate(problem.biases):
+        if bias.owner in found and bias.since is None:
+            name = f"position_{AXES[bias.axis]}" if bias.component == "position" else bias.component
+            found[bias.owner][name] = m
+    return found
