@@ -21,6 +21,7 @@ from probcal.results.read import each_track
 from probcal.smoothing.mode import mixed_density
 from probcal.smoothing.recursion import trajectory
 from probcal.smoothing.tails import rewhitened
+from probcal.starts import automatic_start
 
 FAMILIES = [StudentT(3.0), Mixture(0.2, 6.0)]
 START = {"position": ((0.0, 0.0), 2.0), "velocity": ((1.0, 0.0), 1.0)}

@@ -1,5 +1,6 @@
 """Solve a problem by a method, from one start or several: the answer that `fit`, `study` and `sbc` read."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import jax
@@ -14,10 +15,13 @@ from probcal.results.answer import Answer
 from probcal.smoothing.grid import follow_states
 from probcal.smoothing.mirrors import NEAR, SAME, Mirrored, other_sides
 from probcal.smoothing.mode import Point
-from probcal.starts import automatic_start, further_starts
+from probcal.starts import further_starts
+from probcal.starts import optima as optima_of
 from probcal.status import Status
 
 TRIES = 3  # climbs by particles from one start
+DIFFERENT = 2.0  # sd by which an answer from another start must differ in some bias to be one of its own
+APART = 0.01  # scales that count as an sd where that is smaller
 
 
 def solve(
@@ -32,20 +36,23 @@ def solve(
         return _by_particles(problem, method, prior, context, start, starts)
     given, problem = problem, method.prepare(problem)
     used = problem is given
-    first = automatic_start(problem) if start is None else _suited(given, problem, start)
-    points = [first, *further_starts(problem, starts - 1, jax.random.fold_in(context.key, 1))]
+    points = [o.point for o in optima_of(problem)] if start is None else [_suited(given, problem, start)]
+    points += further_starts(problem, starts - len(points), jax.random.fold_in(context.key, 1))
     climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint"), Gaussian())
     optima: list[Answer] = []
-    if method.climbs or starts > 1 or problem.levels or problem.model.tailed:
+    if method.climbs or len(points) > 1 or problem.levels or problem.model.tailed:
         optima = [climber.answer(problem, own, point, context) for point in points]
         points = [optimum.posterior.point for optimum in optima]
-    best = max(range(starts), key=lambda k: _rank(optima[k])) if len(optima) > 1 else 0
+    best = max(range(len(optima)), key=lambda k: _rank(optima[k])) if optima else 0
     if optima and not method.climbs:  # with the precisions that its process noise has there
         problem = optima[best].problem
     found = optima[best] if method.climbs else method.answer(problem, prior, points[best], context)
     motion = "used" if used else "left out"
-    found = replace(found, motion=motion, optima=tuple(optima) if starts > 1 else (), best=best)
-    return _beside_mirrors(found, method, context) if method.climbs and used else found
+    found = replace(found, motion=motion, optima=tuple(optima) if len(points) > 1 else (), best=best)
+    if not (method.climbs and used):
+        return found
+    beside = _beside_mirrors(found, method, context)
+    return replace(beside, mirrors=(*beside.mirrors, *_beside_optima(beside, (found, *found.optima))))
 
 
 def _by_particles(
@@ -90,7 +97,7 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context) -> Answer:
     if sides.moved:
         again = method.answer(answer.problem, answer.prior, sides.point, context)
         gain = again.objective - answer.objective
-        if not (again.status.valid and gain > -SAME):  # better under the declared scales, not under the prior
+        if not (again.status.valid and gain > 0):  # better under the declared scales, not under the prior
             name = sides.others[0].name if sides.others else "pieces of tracks on their other side"
             shift = np.asarray(sides.point.z) - answer.posterior.summary.mean
             near = again.status.valid and gain > -NEAR
@@ -104,6 +111,24 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context) -> Answer:
                 other = other._replace(point=own.point, shift=own.summary.mean - found.posterior.summary.mean)
         others.append(other)
     return replace(found, mirrors=tuple(others))
+
+
+def _beside_optima(answer: Answer, others: Sequence[Answer]) -> tuple[Mirrored, ...]:
+    """Answers from other starts whose evidence is near that of the answer, each once, as answers beside it."""
+    if not (answer.status.valid and answer.posterior.sound):
+        return ()
+    mean, sd = answer.posterior.here
+    known = [mean, *(mean + other.shift for other in answer.mirrors)]
+    found = []
+    for other in sorted(others, key=lambda one: -one.objective):
+        gain = other.objective - answer.objective
+        if not (other.status.valid and other.posterior.sound and gain > -NEAR):
+            continue
+        there = other.posterior.here[0]
+        if all(np.max(np.abs(there - one) / np.maximum(sd, APART), initial=0.0) > DIFFERENT for one in known):
+            found.append(Mirrored("found from another start", gain, other.posterior.point, there - mean))
+            known.append(there)
+    return tuple(found)
 
 
 def _suited(given: Problem, problem: Problem, start: Point) -> Point:

@@ -1,47 +1,85 @@
-"""The automatic start: the grid at what is stated, and beside it what each family of sensors tells of wide biases."""
+"""The automatic start: the grid at what is stated, what families of sensors tell of wide biases, exchanged nodes."""
 
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.model.model import Model
 from probcal.priors import Precision
 from probcal.problem import Problem, check_linear
 from probcal.smoothing.grid import grid_start
-from probcal.smoothing.mode import Point, find_mode
-from probcal.starts.bearings import by_directions
+from probcal.smoothing.mode import Point, cost, find_mode
+from probcal.starts.bearings import by_directions, turned
+from probcal.starts.swaps import exchanged
 from probcal.types import float64
 
 FAMILIES: tuple[Callable[[Problem], Iterator[np.ndarray]], ...] = (by_directions,)
 """Geometric starts: each yields biases z (M,) for a problem whose spread makes the grid at z = 0 uncertain."""
 SAME = 1e-2  # nats within which two starts have come to one optimum
+NEAR = 15.0  # nats under a sparse prior within which another optimum is climbed too
+MOST = 3  # optima that are
+
+
+class Optimum(NamedTuple):
+    """A joint mode at the declared scales, its cost under a sparse prior, by which modes are ordered, if it settled."""
+
+    value: float
+    point: Point
+    settled: bool = True
 
 
 @float64
 def automatic_start(problem: Problem, iterations: int = 30) -> Point:
     """Trajectories and biases from the data alone, near the joint mode at the declared scales: the best of `optima`."""
-    return optima(problem, iterations)[0]
+    return optima(problem, iterations)[0].point
 
 
-def optima(problem: Problem, iterations: int = 30) -> list[Point]:
-    """Joint modes at the declared scales that the data alone lead to, the best first.
+@float64
+def optima(problem: Problem, iterations: int = 30) -> list[Optimum]:
+    """Joint modes at the declared scales that the data alone lead to: the best, and those that may be better.
 
     The grid, Viterbi path, motion model and iterated EKS at zero biases, then a few joint steps; the same at the biases
-    that the geometry of a family of sensors tells (`FAMILIES`), where the stated network is too uncertain for the grid.
+    that the geometry of a family of sensors tells (`FAMILIES`), where the stated network is too uncertain for the grid;
+    and, where a node ends far from its stated place, at places exchanged. Modes are ordered by their cost under a
+    Cauchy prior of the declared scales, to which one gross error costs little: a Gaussian one would rather spread it.
     """
     check_linear(problem)
+    first = grid_start(problem, jax.device_put(np.zeros(problem.model.biases)), iterations)
+    found = [_polished(problem, first, iterations)]
+    if (z := turned(problem, first)) is not None:
+        found.append(_polished(problem, first._replace(z=jax.device_put(z)), iterations))
+    for family in FAMILIES:
+        for z in family(problem):
+            found.append(_polished(problem, grid_start(problem, jax.device_put(z), iterations), iterations))
+    best = min(found, key=_order)
+    for tracked in exchanged(problem, first, best.point, best.settled):
+        value = min(float(_sparse_cost(problem.model, tracked)), _polished(problem, tracked, iterations).value)
+        found.append(Optimum(value, tracked))
+    if len(found) == 1:
+        return found
+    kept: list[Optimum] = []
+    for one in sorted(found, key=_order):
+        if len(kept) < MOST and not any(abs(one.value - other.value) < SAME for other in kept):
+            kept.append(one)
+    return [one for one in kept if one is kept[0] or one.value < kept[0].value + NEAR]
+
+
+def _order(optimum: Optimum) -> float:
+    return optimum.value if np.isfinite(optimum.value) else np.inf
+
+
+def _polished(problem: Problem, tracked: Point, iterations: int) -> Optimum:
+    """The joint mode at the declared scales next to a point."""
     scales = Precision.single(jnp.ones(problem.model.biases))
-    places = [np.zeros(problem.model.biases), *(z for family in FAMILIES for z in family(problem))]
-    found: list[tuple[float, Point]] = []
-    for z in places:
-        tracked = grid_start(problem, jax.device_put(z), iterations)
-        mode = find_mode(problem.model, tracked, scales, iterations, 1e-3)
-        cost = float(mode.cost)
-        if len(places) == 1:
-            return [mode.point]
-        if np.isfinite(cost) and not any(abs(cost - other) < SAME for other, _ in found):
-            found.append((cost, mode.point))
-        elif not found:
-            found.append((np.inf, mode.point))
-    return [point for _, point in sorted(found, key=lambda pair: pair[0])]
+    mode = find_mode(problem.model, tracked, scales, iterations, 1e-3)
+    return Optimum(float(_sparse_cost(problem.model, mode.point)), mode.point, bool(mode.converged))
+
+
+@jax.jit
+def _sparse_cost(model: Model, point: Point) -> jax.Array:
+    """Joint cost of a point with a Cauchy prior of scale one for each bias."""
+    flat = Precision.single(jnp.zeros(model.biases))
+    return cost(model, point, flat) + jnp.sum(jnp.log1p(point.z**2))

@@ -9,6 +9,7 @@ from probcal.errors import InputError
 from probcal.geometry import attitude
 from probcal.labels import AXES
 from probcal.problem import Problem
+from probcal.smoothing.mode import Point
 from probcal.starts.recognise import Directions, kinds, members, seen_directions
 
 WIDE = 0.3  # rad, spread of a heading from which the grid alone is not trusted
@@ -70,6 +71,35 @@ def _stated(problem: Problem) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     place = {n.name: n.position + [fixed.get(f"{n.name}.position_{a}", 0.0) for a in AXES[:d]] for n in nodes}
     turn = {n.name: float(n.components["heading"]) + fixed.get(f"{n.name}.heading", 0.0) for n in nodes}
     return place, turn
+
+
+def turned(problem: Problem, point: Point) -> np.ndarray | None:
+    """Biases z (M,) of a point with wide headings turned so that the directions agree with its track; None without any.
+
+    A sensor that sees a range too has a good track whatever its heading; where that is off by half a turn the wrapped
+    innovations of the directions cancel, and no descent moves it.
+    """
+    turning = {n: t for n, t in _turning(problem).items() if problem.scales[t[0]] > WIDE}
+    if not turning:
+        return None
+    place, turn = _stated(problem)
+    z = np.array(point.z)
+    total: dict[str, complex] = {}
+    for s in seen_directions(problem):
+        if s.node not in turning:
+            continue
+        for epochs, states in zip(problem.epochs, point.states, strict=True):
+            mine = epochs.target == s.target
+            if not mine.any():
+                continue
+            track = np.asarray(states)[mine][:, slice(*epochs.position)]
+            at = np.searchsorted(epochs.time[mine], s.time).clip(0, mine.sum() - 1)
+            line = track[at] - place[s.node]
+            off = np.arctan2(line[:, 1], line[:, 0]) - s.angles[:, 0]
+            total[s.node] = total.get(s.node, 0.0) + complex(np.exp(1j * off).sum())
+    for name, sum_ in total.items():
+        _turn(problem, z, turning, name, float(np.angle(sum_)) - turn[name])
+    return z if total else None
 
 
 # -- headings: crossings of lines of sight ---------------------------------------------------------------------------

@@ -1,0 +1,82 @@
+"""Exchanged nodes: the commonest gross error of a survey, which no local search undoes."""
+
+import itertools
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.priors import Precision
+from probcal.problem import Problem
+from probcal.smoothing.grid import grid_start, joint_cost, track_mode
+from probcal.smoothing.mode import Point
+
+GROSS = 3.0  # scales from its stated place at which a node makes exchanges worth trying
+TRIED = 60  # exchanges that are tried
+KEPT = 2  # of which so many are kept
+SCREENED = 5  # steps of a track by which an exchange is screened
+ROUNDS = 3  # exchanges of one network, one after the other
+GAIN = 10.0  # nats by which one must fit better than what is stated
+
+
+def free_places(problem: Problem) -> dict[str, list[int]]:
+    """Numbers of the biases (d,) of the place of every node at rest whose place is free in all axes."""
+    place: dict[str, list[int]] = {}
+    for m, bias in enumerate(problem.biases):
+        if bias.component == "position" and bias.kind == "scale" and bias.since is None:
+            place.setdefault(bias.owner, []).append(m)
+    resting = {n.name for n in problem.network.nodes if n.path is None}
+    return {name: own for name, own in place.items() if len(own) == problem.network.dimension and name in resting}
+
+
+def swaps(problem: Problem) -> dict[tuple[str, str], np.ndarray]:
+    """Biases (M,) that exchange the places of two nodes, by their names, for every pair of free places."""
+    place = free_places(problem)
+    stand = {n.name: n.position for n in problem.network.nodes if n.name in place}
+    found = {}
+    for a, b in itertools.combinations(stand, 2):
+        z = np.zeros(len(problem.labels))
+        z[place[a]], z[place[b]] = stand[b] - stand[a], stand[a] - stand[b]
+        if z.any():
+            found[a, b] = z / problem.scales
+    return found
+
+
+def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> Iterator[Point]:
+    """Tracked starts with the places of nodes exchanged and all other biases zero, where these fit far better.
+
+    `tracked` is the track at zero biases, `point` the mode that it led to: pairs are tried where that has a node far
+    from its stated place or has not `settled`. Each pair is screened by a few steps from the track at
+    zero biases, which robust losses keep near the truth; on top of the best a further pair, while that fits better.
+    """
+    place, z = free_places(problem), np.asarray(point.z)
+    far = {name: float(np.abs(z[own]).max()) for name, own in place.items()}
+    if not far or (settled and max(far.values()) < GROSS):
+        return
+    pairs = swaps(problem)
+    order = sorted(pairs, key=lambda pair: -max(far[pair[0]], far[pair[1]]))[:TRIED]
+    flat = Precision.single(jnp.zeros(len(problem.labels)))
+
+    def fitted(start: Point, iterations: int) -> tuple[float, Point]:
+        smoothed = track_mode(problem, start, iterations)
+        value = float(joint_cost(problem.model, smoothed, flat))
+        return (value if np.isfinite(value) else np.inf), smoothed
+
+    best, at = fitted(tracked, SCREENED)
+    base = np.zeros(len(problem.labels))
+    taken: set[str] = set()
+    for _ in range(ROUNDS):
+        tried = [
+            (fitted(at._replace(z=jax.device_put(base + pairs[pair])), SCREENED)[0], pair)
+            for pair in order
+            if not taken & set(pair)
+        ]
+        tried = sorted(tried)[:KEPT]
+        better = [pair for value, pair in tried if value < best - GAIN]
+        if not better:
+            return
+        starts = [grid_start(problem, jax.device_put(base + pairs[pair]), 30) for pair in better]
+        yield from starts
+        pair, at = better[0], starts[0]
+        base, taken, best = base + pairs[pair], taken | set(pair), tried[0][0]
