@@ -17,7 +17,7 @@ FLOORS = {
     2: ("sensors",),
     3: ("geodesy", "network", "table", "nodes", "plausible", "roads"),
     4: ("model", "problem", "simulate"),
-    5: ("smoothing", "particle", "doa", "starts"),
+    5: ("smoothing", "particle", "doa", "starts", "rss"),
     6: ("identifiability", "results"),
     7: ("inference",),
     8: ("analysis",),

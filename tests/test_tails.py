@@ -185,7 +185,7 @@ def test_samplers_draw_the_exact_posterior(method):
 def test_the_density_is_one_at_whatever_weights_and_that_of_numpyro():
     with jax.enable_x64(True):
         problem = turned()
-        point = probcal.smoothing.start.automatic_start(problem)
+        point = automatic_start(problem)
         weights = ((jnp.linspace(0.1, 3.0, len(TIME)).at[0].set(1.0),),)
         other = problem.model.with_mixing(weights)
         moved = rewhitened(problem.model, point, weights)
