@@ -5,8 +5,8 @@ philotuxo/Position-Annotated-BLE-RSSI-Dataset), described in Pervasive and Mobil
 the path of a folder with `cnf_tetam.dev` and the tracks `*.mbd`. Places of the beacon are known to centimetres by
 cameras; they are used for scoring only.
 
-Levels in dBm twice a second. The body of the carrier shadows a receiver for a second or two by several decibels: to a
-model of independent noise that is a gain, so the shadow of each receiver is a state of its own, whose level is learnt.
+Levels in dBm twice a second. The body of the carrier shadows a receiver for a second or two by several decibels, so
+that successive levels are no independent data: the mean level of `PERIOD` seconds is one row, and its noise is learnt.
 The nominal exponent 2 is that of free space. Calibrate on three straight walks, track others:
 
     probcal fit models/ble_office.py PATH --out ble
@@ -14,19 +14,17 @@ The nominal exponent 2 is that of free space. Calibrate on three straight walks,
 """
 
 import ast
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
 from probcal import (
+    ARD,
     Bias,
     Channel,
     ConstantVelocity,
-    Gaussian,
     InputError,
     Network,
     Node,
@@ -36,54 +34,21 @@ from probcal import (
     Unknown,
     sensor,
 )
-from probcal.noise import guess_of
 
 STRAIGHT = ("straight_01", "straight_02", "straight_03")
 OTHERS = ("rectangular_without_rotation", "zigzagging_without_rotation")
-RECEIVERS = ("10", "11", "12", "20", "21", "22", "30", "31", "32", "40", "41", "42")
+PERIOD = 1.0  # s, of which one row is made
 HEIGHT = 1.8  # m, at which the beacon is carried
 GAIN = 4.0  # dB, spread of the gains
 POWER = (-60.0, 5.0)  # dBm at 1 m, and how well that is known
-PRIOR = Gaussian()  # every receiver has a gain of its own
-
-
-@dataclass(frozen=True)
-class Shadow:
-    """Shadow before each receiver: independent, mean 0, `std` in dB, correlation exp(-t / memory), `memory` in s."""
-
-    memoryless: ClassVar[bool] = False
-    driven: ClassVar[str] = "shadow"
-
-    std: Any
-    memory: float
-
-    def names(self):
-        """One scalar component a receiver."""
-        return tuple((f"shadow_{n}", False) for n in RECEIVERS)
-
-    def transition(self, dt, dimension):
-        """Decay over each time step, shape (E, receivers, receivers)."""
-        return np.exp(-dt / self.memory)[:, None, None] * np.eye(len(RECEIVERS))
-
-    def noise_factor(self, dt, dimension):
-        """What keeps the variance at 1, shape (E, receivers, receivers)."""
-        return np.sqrt(-np.expm1(-2 * dt / self.memory))[:, None, None] * np.eye(len(RECEIVERS))
-
-    def means(self, time, dimension):
-        """Zero, shape (E, receivers)."""
-        return np.zeros((len(time), len(RECEIVERS)))
-
-    def start(self):
-        """The stationary spread."""
-        return {name: (0.0, guess_of(self.std)) for name, _ in self.names()}
+PRIOR = ARD(by="component", rate=0.5)  # one learnt spread for all gains: every receiver has one of its own
 
 
 @sensor(level=Channel("dB", std=Unknown(4.0)))
 def receiver(target, pose, *, gain=Bias("dB", GAIN), exponent=Bias("1", 0.7, nominal=2.0, shared="type")):
-    """Level of a beacon carried at a known height, behind the shadow of the body."""
+    """Level of a beacon carried at a known height."""
     squared = jnp.sum((target.position - pose.position) ** 2) + (pose.height - HEIGHT) ** 2
-    shadow = jnp.stack([getattr(target, f"shadow_{n}") for n in RECEIVERS])[pose.number.astype(int)]
-    return dict(level=target.power + gain - 5 * exponent * jnp.log10(squared) - shadow)
+    return dict(level=target.power + gain - 5 * exponent * jnp.log10(squared))
 
 
 def folder(data):
@@ -120,30 +85,31 @@ def named(walks):
 
 
 def table(data, walks=STRAIGHT):
-    """Rows of several tracks, each a target of its own."""
+    """Rows of several tracks, each a target of its own: mean levels of each period and receiver."""
     names = {mac: name for mac, (name, _) in receivers(data).items()}
     parts = [walk(data, w).assign(target=w) for w in named(walks)]
     rows = pd.concat(parts, ignore_index=True)
-    return rows.assign(sensor=rows["mac"].map(names))[["time", "target", "sensor", "level"]]
+    middle = (np.floor(rows["time"] / PERIOD) + 0.5) * PERIOD
+    rows = rows.assign(time=middle, sensor=rows["mac"].map(names))
+    return rows.groupby(["target", "time", "sensor"], as_index=False)["level"].mean()
 
 
 def network(data):
     """Twelve receivers at surveyed places; their height is known."""
     return Network([
-        receiver.on(Node(name, (x, y), height=z, number=RECEIVERS.index(name.removeprefix("receiver_"))))
+        receiver.on(Node(name, (x, y), height=z))
         for name, (x, y, z) in sorted(receivers(data).values())
     ])  # fmt: skip
 
 
 def motion():
-    """A walk, a beacon whose power hardly changes, and the shadows."""
-    own = ConstantVelocity(0.4) + RandomWalk("power", "dB", 0.05, POWER)
-    return own + Shadow(Unknown(4.0), memory=2.0)
+    """A walk, and a beacon whose power hardly changes."""
+    return ConstantVelocity(0.4) + RandomWalk("power", "dB", 0.05, POWER)
 
 
 def problem(data=None, walks=STRAIGHT):
-    """Tracks of the recording in the folder `data`, brought to common epochs of half a second."""
-    return Problem(network(data), motion(), table(data, walks), epoch=0.5)
+    """Tracks of the recording in the folder `data`."""
+    return Problem(network(data), motion(), table(data, walks))
 
 
 def truth(data=None, walks=STRAIGHT):
