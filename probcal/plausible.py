@@ -19,6 +19,7 @@ SENTINELS = (-9999.0, -999.0, -99999.0, 9999.0, 99999.0, 999999.0, -999999.0, 32
 APART = 20.0  # spreads of its column from which a sentinel is one
 FAR = 1e6  # spreads from which any value is nonsense
 FEW = 8  # values below which a column has no spread
+FAINT, RANGE = 0.1, 30.0  # largest value of a column of powers in W, and the ratio to its smallest
 NARROW, WIDE = 1e-9, 1e6  # of the size of a column: smallest and largest std
 
 
@@ -38,6 +39,7 @@ def check_plausible(data: Measurements, network: Network) -> None:
                 continue
             if channel.wrap and channel.unit == "rad":
                 _check_angles(data, name, j, rows, units.get(name))
+            _check_powers(data, name, j, rows, channel.unit, units.get(name))
             _check_values(data, name, j, rows, unit_factor(data.table, name, units.get(name), channel.unit))
             _check_sizes(data, name, j, rows)
 
@@ -70,6 +72,18 @@ def _check_unit(data: Measurements, name: str, units: Mapping[str, str | None], 
             f'{data.table.source} column "{name}_std" has no unit beside "{name} [{own}]": write {name}_std [{own}], or'
             f" {name}_std [{wanted}]"
         )
+
+
+def _check_powers(data: Measurements, name: str, j: int, rows: np.ndarray, unit: str, stated: str | None) -> None:
+    """Powers in a channel of decibels, and decibels in one of powers."""
+    value = data.value[rows, j]
+    if len(rows) < FEW or stated is not None:
+        return
+    shown = f'{data.table.where(int(rows[0]))} column "{name}": {value[0]:g}'
+    if unit in ("dB", "dBm") and value.min() > 0 and value.max() < FAINT and value.max() > RANGE * value.min():
+        raise InputError(f"{shown} {unit} looks like power in W, as all of the column; write 10 log10 of it")
+    if unit in ("W", "mW", "V^2") and np.median(value) < 0:
+        raise InputError(f"{shown} {unit}: most of the column is negative, which no power is; it looks like dB")
 
 
 def _check_angles(data: Measurements, name: str, j: int, rows: np.ndarray, unit: str | None) -> None:

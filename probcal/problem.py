@@ -230,7 +230,8 @@ class Problem:
                 for k in np.unique(data.sensor[data.measured[:, j]]):
                     channel = dict(self.network.sensors[k].type.expand(self.network.dimension))[name]
                     mine = (data.sensor == k) & data.measured[:, j]
-                    column[mine] = value[mine, j] / unit_factor(data.table, name, units[name], channel.unit)
+                    own = channel.turned(value[mine, j])
+                    column[mine] = own / unit_factor(data.table, name, units[name], channel.unit)
                 frame[frame.columns[names.index(name)]] = column
         other = copy(self)
         other.measurements = replace(data, value=value, table=replace(data.table, frame=frame))

@@ -103,7 +103,8 @@ class Channel:
     """One measured quantity: its unit, noise level (a number or `Unknown`), noise family and wrapping.
 
     `wrap=True` compares angles around the circle; `per_axis=True` makes one channel a coordinate
-    (`position_x`, `position_y`, ...).
+    (`position_x`, `position_y`, ...). `compass=True`: tables hold bearings clockwise from north, which are turned into
+    mathematical angles (from east, counter-clockwise) when they are read, and back when they are written.
 
     >>> Channel("rad", std=0.01, wrap=True).period  # doctest: +ELLIPSIS
     6.28...
@@ -114,6 +115,7 @@ class Channel:
     noise: Family = field(default_factory=Normal)
     wrap: bool = False
     per_axis: bool = False
+    compass: bool = False
 
     def __post_init__(self):
         if not isinstance(self.unit, str):
@@ -127,11 +129,17 @@ class Channel:
             check_level(self.std, f"Channel({self.unit!r}): std")
         if self.wrap and self.unit not in PERIODS:
             raise InputError(f"Channel({self.unit!r}, wrap=True): only angles in rad or deg wrap")
+        if self.compass and not self.wrap:
+            raise InputError(f"Channel({self.unit!r}, compass=True): a compass bearing wraps; give wrap=True too")
 
     @property
     def period(self) -> float | None:
         """Length of the circle in the channel's unit, or None."""
         return PERIODS[self.unit] if self.wrap else None
+
+    def turned(self, value: Any) -> Any:
+        """A value of a table as the sensor function counts it, or the other way: a compass bearing is mirrored."""
+        return PERIODS[self.unit] / 4 - value if self.compass else value
 
 
 @dataclass(frozen=True, eq=False)

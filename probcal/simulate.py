@@ -211,8 +211,8 @@ def simulate(
         drawn = np.array(_drawn(block, data, states[r], z, levels, seed[0]))
         drawn = _spoil(block, data, drawn, outliers, outlier_scale, seed[1])
         gone = np.asarray(jax.random.uniform(seed[2], drawn.shape)) < missing
-        for c, (name, _) in enumerate(block.type.expand(network.dimension)):
-            columns[name][index] = np.where(gone[:, c], np.nan, drawn[:, c])
+        for c, (name, channel) in enumerate(block.type.expand(network.dimension)):
+            columns[name][index] = np.where(gone[:, c], np.nan, channel.turned(drawn[:, c]))
     table = plan[["time", "sensor", *(["target"] if "target" in plan else [])]].assign(**columns)
     table = table[~table[list(columns)].isna().all(axis=1)].reset_index(drop=True)
     parts = [

@@ -323,6 +323,7 @@ def _to_channel(
             continue
         for column, array in ((name, value), (f"{name}_std", std)):
             array[kinds == k, j] *= unit_factor(table, column, units.get(column), channel.unit)
+        value[rows, j] = channel.turned(value[rows, j])
         if isinstance(channel.noise, Censored) and channel.noise.blanks:
             blank = (kinds == k) & ~measured[:, j]
             value[blank, j], measured[blank, j] = channel.noise.floor, True

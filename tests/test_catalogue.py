@@ -343,7 +343,8 @@ def seen(kind, motion, gain=True):
 
 
 RECORDINGS = {"sflab": "sflab_mic_toa/dataset_1_exp2.mat", "robots": "mrclam/MRCLAM_Dataset6",
-              "receivers": "mlat_locards/set_1.csv", "tdoa_flight": "uwb_tdoa"}  # fmt: skip
+              "receivers": "mlat_locards/set_1.csv", "tdoa_flight": "uwb_tdoa", "ble_office": "ble_rss",
+              "bearing_beacons": "roh_bearing"}  # fmt: skip
 
 
 @pytest.mark.parametrize("file", sorted((File(__file__).parents[1] / "models").glob("*.py")), ids=lambda p: p.stem)

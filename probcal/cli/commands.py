@@ -232,6 +232,22 @@ def changes_command(
     raise typer.Exit(changes.run(first, second, name, results))
 
 
+@app.command(name="levels")
+def levels_command(
+    recordings: Annotated[list[Path], typer.Argument(help="WAV files, each named like its sensor", show_default=False)],
+    out: Annotated[Path, typer.Option(help="table to write (CSV): time, sensor and the column")],
+    band: Annotated[str | None, typer.Option(help="frequencies that pass, in Hz: 50,500")] = None,
+    window: Annotated[float, typer.Option(help="s of one row")] = 0.5,
+    start: Annotated[float, typer.Option(help="s at which the recordings begin")] = 0.0,
+    column: Annotated[str, typer.Option(help="name of the channel")] = "level",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the table")] = False,
+) -> None:
+    """Levels: from raw samples to received signal strength in dB, a table for `fit`."""
+    from probcal.cli import levels
+
+    levels.run(recordings, out, band, window, start, column, overwrite)
+
+
 @app.command(name="report")
 def report_command(
     folder: Annotated[Path, typer.Argument(help="folder of a fit", show_default=False)],

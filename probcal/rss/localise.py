@@ -23,6 +23,7 @@ CELLS = 41  # points an axis of the grid
 LOCAL = 2  # steps of the small grid around the best point to which the quadratic is fitted
 RISE, NARROWED = 3.0, 20  # nats over the small grid, and how often it is halved to get there
 STEPS = 60  # of Levenberg and Marquardt
+WITHIN = 16.0  # square of the diagonal of the area over the variance, below which a place counts as open
 
 
 class Snapshot(NamedTuple):
@@ -54,7 +55,7 @@ class Location(NamedTuple):
     message: str
 
 
-def snapshot(
+def _checked(
     position: np.ndarray, level: np.ndarray, kind: np.ndarray | None = None, std: np.ndarray | float = 3.0
 ) -> Snapshot:
     """A checked snapshot; rows without a level (NaN) are dropped. Raises `InputError` naming what is wrong."""
@@ -211,7 +212,7 @@ def localise(
     >>> np.round(localise(nodes, heard).position, 3).tolist()
     [18.0, 22.0]
     """
-    at = snapshot(position, level, kind, std)
+    at = _checked(position, level, kind, std)
     ways = ("quadratic", "gauss-newton", "marquardt", "none")
     if refine not in ways:
         raise InputError(f'localise: refine is "{refine}"{nearest(refine, ways)}')
@@ -246,6 +247,8 @@ def localise(
         message = "the levels do not fall with the distance from any place: they tell no place"
     elif values[0] <= 1e-12 * max(values[-1], 1e-300):
         message = "the levels tell no place: the information is singular"
+    elif values[0] * float(((box[:, 1] - box[:, 0]) ** 2).sum()) < WITHIN:
+        message = "the levels tell the place no better than the area does"
     elif (reflected := _mirrored(at, x, criterion, exponent, cost)) is not None:
         message = f"the nodes lie on a line or plane: {np.round(reflected, 1).tolist()} on its other side fits as well"
     if covariance is None:
