@@ -120,7 +120,7 @@ def test_what_the_rows_do_not_tell_is_named():
     with pytest.raises(InputError, match="power_law: no row has a target of known place"):
         power_law(problem, Truth())
     still = truth.tracks.assign(position_x=50.0, position_y=82.0)
-    with pytest.raises(InputError, match="the rows do not tell theta_.* from the other parameters"):
+    with pytest.raises(InputError, match=r"the rows do not tell theta_.* from the other parameters"):
         power_law(problem, Truth(still))
     few = Problem(problem.network, problem.motion, trial.scenario(0).table.groupby("sensor").head(1))
     with pytest.raises(InputError, match="has 12 rows for 13 parameters; give more rows"):
@@ -326,19 +326,19 @@ def test_wav_files_become_a_table(tmp_path, capsys):
 
 
 def test_bad_samples_are_refused(tmp_path):
-    with pytest.raises(InputError, match="missing.wav: no such file"):
+    with pytest.raises(InputError, match=r"missing\.wav: no such file"):
         read_wav(tmp_path / "missing.wav")
     (tmp_path / "text.wav").write_text("no sound")
-    with pytest.raises(InputError, match="text.wav is no WAV file that can be read"):
+    with pytest.raises(InputError, match=r"text\.wav is no WAV file that can be read"):
         read_wav(tmp_path / "text.wav")
     wavfile.write(tmp_path / "empty.wav", 100, np.zeros(0, np.int16))
-    with pytest.raises(InputError, match="empty.wav holds no samples"):
+    with pytest.raises(InputError, match=r"empty\.wav holds no samples"):
         read_wav(tmp_path / "empty.wav")
     with pytest.raises(InputError, match=r"levels_of: give finite samples \(N,\) of one channel"):
         levels_of(np.full(10, np.nan), 100.0)
-    with pytest.raises(InputError, match="and reference 1.0 must be positive"):
+    with pytest.raises(InputError, match=r"and reference 1\.0 must be positive"):
         levels_of(np.ones(10), 0.0)
-    with pytest.raises(InputError, match="10 samples at 100 Hz are less than one window of 0.5 s"):
+    with pytest.raises(InputError, match=r"10 samples at 100 Hz are less than one window of 0\.5 s"):
         levels_of(np.ones(10), 100.0)
     with pytest.raises(InputError, match="must lie between 0 and half the rate, 50 Hz"):
         levels_of(np.ones(100), 100.0, band=(10.0, 80.0))

@@ -72,7 +72,8 @@ class Information:
 
     def __init__(self, information: np.ndarray):
         self.information = information
-        self.covariance = np.linalg.inv(information + np.eye(len(information)))
+        values, vectors = np.linalg.eigh(information)  # what rounding leaves below 0 is nothing
+        self.covariance = (vectors / (1.0 + np.maximum(values, 0.0))) @ vectors.T
 
     @property
     def share(self) -> np.ndarray:

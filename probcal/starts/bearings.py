@@ -69,8 +69,9 @@ def _stated(problem: Problem) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     nodes = [n for n in problem.network.nodes if n.path is None]
     fixed = problem.fixed
     place = {n.name: n.position + [fixed.get(f"{n.name}.position_{a}", 0.0) for a in AXES[:d]] for n in nodes}
+    turning = {n.name for s in problem.network.sensors if "heading" in s.type.pose_components for n in s.nodes}
     turn = {n.name: float(n.components["heading"]) + fixed.get(f"{n.name}.heading", 0.0) for n in nodes}
-    return place, turn
+    return place, {name: angle if name in turning else 0.0 for name, angle in turn.items()}
 
 
 def turned(problem: Problem, point: Point) -> np.ndarray | None:

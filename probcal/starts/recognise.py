@@ -18,7 +18,7 @@ from probcal.network import ANGLES
 from probcal.noise import guess_of
 from probcal.problem import Problem
 from probcal.sensor import SensorType
-from probcal.types import PoseView, TargetView
+from probcal.types import PoseView, TargetView, float64
 
 TRIALS = 24  # random configurations at which a function is tried
 EXACT = 1e-6  # by how much a channel may miss the geometry of its family
@@ -34,6 +34,7 @@ class Kind(NamedTuple):
     by: Mapping[str, float]
 
 
+@float64
 def kinds(problem: Problem) -> dict[tuple[str, str], Kind]:
     """Kind of every channel that is recognised, by sensor type and channel."""
     d = problem.network.dimension
@@ -54,7 +55,9 @@ def _tried(kind: SensorType, d: int) -> dict[str, Kind]:
     names = list(kind.biases)
     place = rng.normal(size=(TRIALS, d)) * 50.0
     nodes = rng.normal(size=(TRIALS, kind.arity, d)) * 50.0
-    turned = rng.uniform(-0.4, 0.4, size=(TRIALS, kind.arity, len(ANGLES))) * (1.0 if d == 3 else np.array([1.0, 0, 0]))
+    turned = rng.uniform(-0.4, 0.4, size=(TRIALS, kind.arity, len(ANGLES))) * [
+        name in kind.pose_components for name in ANGLES
+    ]
 
     def width(name: str) -> tuple[int, ...]:
         return (d,) if name in kind.vectors else ()
