@@ -7,7 +7,10 @@ cameras; they are used for scoring only.
 
 Levels in dBm twice a second. The body of the carrier shadows a receiver for a second or two by several decibels, so
 that successive levels are no independent data: the mean level of `PERIOD` seconds is one row, and its noise is learnt.
-The nominal exponent 2 is that of free space. Calibrate on three straight walks, track others:
+What shadows a receiver for the whole of a walk is another on the next: regressions on single walks differ by a decibel,
+three times more than their own noise. So a gain drifts from walk to walk, by `CHANGE` in the hour of the recording, and
+a walk that was not calibrated on has wider gains. The nominal exponent 2 is that of free space.
+Calibrate on three straight walks, track others:
 
     probcal fit models/ble_office.py PATH --out ble
     probcal track models/ble_office.py PATH --calibration ble --set walks=rectangular_without_rotation --out ble-track
@@ -25,6 +28,7 @@ from probcal import (
     Bias,
     Channel,
     ConstantVelocity,
+    Drift,
     InputError,
     Network,
     Node,
@@ -37,15 +41,24 @@ from probcal import (
 
 STRAIGHT = ("straight_01", "straight_02", "straight_03")
 OTHERS = ("rectangular_without_rotation", "zigzagging_without_rotation")
+BEGAN = 1581249601.0  # s, Unix time of the first walk
+STARTS = (0.0, 1100.0, 1550.0, 2680.0, 3250.0)  # s after that, of each walk in the order of their recording
 PERIOD = 1.0  # s, of which one row is made
 HEIGHT = 1.8  # m, at which the beacon is carried
 GAIN = 4.0  # dB, spread of the gains
+CHANGE = 0.05  # dB s^-1/2, their random walk: a decibel or two from one walk to the next
 POWER = (-60.0, 5.0)  # dBm at 1 m, and how well that is known
 PRIOR = ARD(by="component", rate=0.5)  # one learnt spread for all gains: every receiver has one of its own
 
 
 @sensor(level=Channel("dB", std=Unknown(4.0)))
-def receiver(target, pose, *, gain=Bias("dB", GAIN), exponent=Bias("1", 0.7, nominal=2.0, shared="type")):
+def receiver(
+    target,
+    pose,
+    *,
+    gain=Bias("dB", GAIN, drift=Drift(STARTS, std=CHANGE)),
+    exponent=Bias("1", 0.7, nominal=2.0, shared="type"),
+):
     """Level of a beacon carried at a known height."""
     squared = jnp.sum((target.position - pose.position) ** 2) + (pose.height - HEIGHT) ** 2
     return dict(level=target.power + gain - 5 * exponent * jnp.log10(squared))
@@ -69,14 +82,14 @@ def receivers(data):
 
 
 def walk(data, name):
-    """Rows of one track: time from its start, address, level, x, y."""
+    """Rows of one track: time from the first walk, address, level, x, y."""
     path = folder(data) / f"{name}_all_sensors.mbd"
     if not path.is_file():
         raise InputError(f"{path}: no such track; give walks=(...) of those in the folder")
     rows = pd.read_csv(
         path, header=None, usecols=[0, 1, 3, 4, 5], names=["time", "mac", "level", "x", "y"], dtype={1: str}
     )
-    return rows.assign(time=rows["time"] - rows["time"].min())
+    return rows.assign(time=rows["time"] - BEGAN)
 
 
 def named(walks):
