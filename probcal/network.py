@@ -11,6 +11,7 @@ from probcal.errors import InputError, nearest
 from probcal.geodesy import LocalFrame
 from probcal.geometry import slopes
 from probcal.labels import AXES
+from probcal.noise import Heard
 from probcal.sensor import Bias, Drift, Sensor, SensorType
 
 POSE_UNITS = {"position": "m", "heading": "rad", "pitch": "rad", "roll": "rad", "clock": "m", "time_offset": "s"}
@@ -249,6 +250,21 @@ class Network:
     def channel_names(self) -> tuple[str, ...]:
         """Scalar channels of all sensor types, each once."""
         return tuple(dict.fromkeys(name for t in self.types for name, _ in t.expand(self.dimension)))
+
+    def with_floors(self, floors: Mapping[tuple[int, str], float]) -> "Network":
+        """This network with floors of what is heard, by number of the sensor type and channel; itself without any."""
+        if not floors:
+            return self
+        types = {}
+        for k, kind in enumerate(self.types):
+            channels = dict(kind.channels)
+            for name, channel in kind.channels.items():
+                axes = [f"{name}_{axis}" for axis in AXES] if channel.per_axis else [name]
+                own = [floors[k, axis] for axis in axes if (k, axis) in floors]
+                if own and isinstance(channel.noise, Heard):
+                    channels[name] = replace(channel, noise=channel.noise.at(min(own)))
+            types[kind] = replace(kind, channels=channels)
+        return Network([replace(placed, type=types[placed.type]) for placed in self.sensors], frame=self.frame)
 
     def _collect_nodes(self) -> tuple[Node, ...]:
         nodes: dict[str, Node] = {}

@@ -7,7 +7,7 @@ drive a motion too, write the methods of `ScaleMixture`: a vector of noise is th
 at every epoch.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, Protocol, runtime_checkable
 
@@ -449,14 +449,46 @@ def _mills(a):
     return jnp.exp(-0.5 * a**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(a))
 
 
+@dataclass(frozen=True)
 class Heard(AdditiveNoise):
-    """Gaussian noise of a receiver that hears nothing at or below its `floor`: what it reports of that is its own."""
+    """Gaussian noise of a receiver that hears nothing at or below its `floor`: what it reports of that is its own.
 
-    floor: float
+    A floor that nobody knows is None: a problem then takes it from its table (`found`).
+    """
+
+    floor: float | None = None
 
     def __post_init__(self):
-        if not np.isfinite(self.floor):
+        if self.floor is not None and not np.isfinite(self.floor):
             raise InputError(f"{type(self).__name__}(floor={self.floor}): give the least value that is heard")
+
+    def found(self, heard: np.ndarray, limits: np.ndarray):
+        """This family with a floor, where it has none, from values that were heard and limits such as `<-95`.
+
+        The likelihood grows with the floor up to the least value that was heard. There it is put, less half of the
+        smallest difference of two values (levels are rounded); or at the highest limit. It is off by one over the
+        density of rows there, an order less than the rows leave of anything else.
+        """
+        if self.floor is not None:
+            return self
+        if len(limits):
+            return self.at(limits.max())
+        values = np.unique(heard)
+        if len(values) < 2:
+            return self.at(values[0] - 1.0 if len(values) else 0.0)
+        return self.at(values[0] - 0.5 * np.diff(values).min())
+
+    def at(self, floor: float):
+        """This family with a floor."""
+        return replace(self, floor=float(floor))
+
+    def known(self) -> float:
+        """The floor; raises `InputError` where it was not given."""
+        if self.floor is None:
+            raise InputError(
+                f"{type(self).__name__}(): a floor is found in a table, here is none; state it in the channel's unit"
+            )
+        return self.floor
 
     def emit(self, key, predicted, std):
         """Draw what reaches the receiver, heard or not."""
@@ -476,41 +508,42 @@ class Censored(Heard):
     """Gaussian noise of a receiver that hears nothing at or below `floor` and says so (Tobin 1958).
 
     In a table a cell `<-95`, or any value at or below the floor, says only that; with `blanks` every blank cell in a
-    row of such a sensor says it too. `simulate` writes the floor there.
+    row of such a sensor says it too. `simulate` writes the floor there. Without a floor the table tells it.
 
     >>> round(float(jnp.exp(Censored(-95.0).log_likelihood(-95.0, -95.0, 4.0, None))), 6)  # half of it is not heard
     0.5
     """
 
-    floor: float
+    floor: float | None = None
     blanks: bool = False
 
     def reported(self, y):
         """The floor in the place of what is not heard."""
-        return np.maximum(y, self.floor)
+        return np.maximum(y, self.known())
 
     def _below(self, predicted, std):
         """How far in std the floor lies above the predicted value."""
-        return (self.floor - predicted) / std
+        return (self.known() - predicted) / std
 
     def innovation(self, y, predicted, period):
         """Measured minus predicted value; of what is not heard, how far the predicted value lies above the floor."""
-        return jnp.where(y <= self.floor, jnp.minimum(self.floor - predicted, 0.0), y - predicted)
+        floor = self.known()
+        return jnp.where(y <= floor, jnp.minimum(floor - predicted, 0.0), y - predicted)
 
     def log_likelihood(self, y, predicted, std, period):
         """Log density of what is heard, log probability of the rest."""
         nothing = log_ndtr(self._below(predicted, std))
-        return jnp.where(y <= self.floor, nothing, self._log_normal(y, predicted, std))
+        return jnp.where(y <= self.known(), nothing, self._log_normal(y, predicted, std))
 
     def score(self, y, predicted, std, period):
         """Derivative by the predicted value."""
-        return jnp.where(y <= self.floor, -_mills(self._below(predicted, std)), (y - predicted) / std) / std
+        return jnp.where(y <= self.known(), -_mills(self._below(predicted, std)), (y - predicted) / std) / std
 
     def weight(self, y, predicted, std, period):
         """Curvature, which is positive."""
         a = self._below(predicted, std)
         ratio = _mills(a)
-        return jnp.where(y <= self.floor, jnp.maximum(ratio * (ratio + a), SMALLEST), 1.0) / std**2
+        return jnp.where(y <= self.known(), jnp.maximum(ratio * (ratio + a), SMALLEST), 1.0) / std**2
 
     def information(self, predicted, std):
         """Expected information about the predicted value: little far below the floor."""
@@ -521,32 +554,33 @@ class Censored(Heard):
     def level_score(self, y, predicted, std, period):
         """One plus the derivative by log std."""
         a = self._below(predicted, std)
-        return jnp.where(y <= self.floor, 1.0 - a * _mills(a), ((y - predicted) / std) ** 2)
+        return jnp.where(y <= self.known(), 1.0 - a * _mills(a), ((y - predicted) / std) ** 2)
 
     def sample(self, key, predicted, std):
         """Draw what is reported: the floor where nothing is heard."""
-        return jnp.maximum(self.emit(key, predicted, std), self.floor)
+        return jnp.maximum(self.emit(key, predicted, std), self.known())
 
 
 @dataclass(frozen=True)
 class Truncated(Heard):
     """Gaussian noise of a receiver that writes no row of what lies at or below `floor` (a truncated normal).
 
-    A row that is there then says that something was heard; `simulate` leaves the others out.
+    A row that is there then says that something was heard; `simulate` leaves the others out. Without a floor the table
+    tells it.
 
     >>> round(float(jnp.exp(Truncated(-95.0).log_likelihood(-95.0, -95.0, 4.0, None))), 6)  # twice the normal density
     0.199471
     """
 
-    floor: float
+    floor: float | None = None
 
     def reported(self, y):
         """Nothing (NaN) where nothing is heard."""
-        return np.where(y > self.floor, y, np.nan)
+        return np.where(y > self.known(), y, np.nan)
 
     def _above(self, predicted, std):
         """How far in std the predicted value lies above the floor."""
-        return (predicted - self.floor) / std
+        return (predicted - self.known()) / std
 
     def log_likelihood(self, y, predicted, std, period):
         """Log density of each datum, given that it was heard."""
@@ -581,7 +615,7 @@ class Truncated(Heard):
 
     def check(self, y):
         """Which values are legal: those above the floor."""
-        return y > self.floor
+        return y > self.known()
 
 
 @dataclass(frozen=True)

@@ -102,6 +102,8 @@ class Problem:
         fix: Mapping[str, float] | Iterable[str] = (),
         epoch: float | None = None,
     ):
+        whole = measure(read_table(data), network)
+        network = network.with_floors(whole.floors)
         self.network = network
         self.motion = {str(name): value for name, value in motion.items()} if isinstance(motion, Mapping) else motion
         self.fixed = _fixed(network, fix)
@@ -109,7 +111,6 @@ class Problem:
         self.scales = np.array([bias.scale for bias in self.biases])
         self.surveyed = np.array([bias.kind != "scale" for bias in self.biases], bool)
         self.epoch = _positive(epoch)
-        whole = measure(read_table(data), network)
         check_plausible(whole, network)
         self.measurements = self._at_epochs(whole)
         self.epoch_shift = float(np.abs(self.measurements.time - whole.time).max())  # s, of the rows to their epochs

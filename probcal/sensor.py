@@ -14,7 +14,7 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.fingerprint import computes
 from probcal.labels import AXES
-from probcal.noise import Bernoulli, Family, Level, Normal, check_level
+from probcal.noise import Bernoulli, Family, Heard, Level, Normal, check_level
 from probcal.types import PoseView, TargetView
 
 VECTORS = ("position", "velocity", "acceleration", "moment")  # have one value an axis without being declared so
@@ -129,6 +129,8 @@ class Channel:
             check_level(self.std, f"Channel({self.unit!r}): std")
         if self.wrap and self.unit not in PERIODS:
             raise InputError(f"Channel({self.unit!r}, wrap=True): only angles in rad or deg wrap")
+        if self.wrap and isinstance(self.noise, Heard):
+            raise InputError(f"Channel({self.unit!r}, wrap=True): an angle has no least value; give another noise")
         if self.compass and not self.wrap:
             raise InputError(f"Channel({self.unit!r}, compass=True): a compass bearing wraps; give wrap=True too")
 

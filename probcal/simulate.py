@@ -19,8 +19,9 @@ from probcal.lazy import Later
 from probcal.model import rows
 from probcal.model.sampled import path
 from probcal.network import Network
-from probcal.noise import Bernoulli
+from probcal.noise import Bernoulli, Heard
 from probcal.problem import Epochs, Problem
+from probcal.sensor import Channel
 from probcal.table import Table, header, name_as_text, numbers, read_table, unit_factor
 from probcal.types import float64
 
@@ -241,13 +242,18 @@ def _plan(network: Network, time: np.ndarray, targets: list[str]) -> pd.DataFram
 
 
 def blank(network: Network, plan: pd.DataFrame) -> pd.DataFrame:
-    """The plan with every channel of its sensors filled with 0, so that all rows exist."""
-    own = {s.name: {name for name, _ in s.type.expand(network.dimension)} for s in network.sensors}
+    """The plan with every channel of its sensors filled with 0, or what is heard, so that all rows exist."""
+    own = {s.name: dict(s.type.expand(network.dimension)) for s in network.sensors}
     filled = {
-        name: [0.0 if name in own.get(sensor, ()) else np.nan for sensor in plan["sensor"]]
+        name: [_legal(own[sensor][name]) if name in own.get(sensor, ()) else np.nan for sensor in plan["sensor"]]
         for name in network.channel_names
     }
     return plan.assign(**filled)
+
+
+def _legal(channel: Channel) -> float:
+    """A value that a table may hold."""
+    return max(channel.noise.known() + 1.0, 0.0) if isinstance(channel.noise, Heard) else 0.0
 
 
 def _biases(problem: Problem, share: float, given: Mapping[str, float] | None, key: jax.Array) -> np.ndarray:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from numbers import Number
 from os import PathLike
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.lazy import Later
 from probcal.network import Network
-from probcal.noise import Bernoulli, Censored
+from probcal.noise import Bernoulli, Censored, Heard
 from probcal.sensor import Channel
 
 if TYPE_CHECKING:
@@ -70,6 +70,7 @@ class Measurements:
     std: np.ndarray
     has_std: np.ndarray
     table: Table
+    floors: Mapping[tuple[int, str], float] = field(default_factory=dict)  # found, by number of the type and channel
 
 
 def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
@@ -150,6 +151,7 @@ def measure(table: Table, network: Network) -> Measurements:
     shape = (len(frame), len(channels))
     value, std = np.zeros(shape), np.zeros(shape)
     measured, has_std = np.zeros(shape, bool), np.zeros(shape, bool)
+    floors: dict[tuple[int, str], float] = {}
     for j, name in enumerate(channels):
         below = np.zeros(len(frame), bool)
         if name in names:
@@ -158,8 +160,9 @@ def measure(table: Table, network: Network) -> Measurements:
         if f"{name}_std" in names:
             std[:, j], has_std[:, j] = numbers(table, frame[f"{name}_std"], f"{name}_std")
         _check_stds(table, f"{name}_std", std[:, j], has_std[:, j])
-        _to_channel(table, network, name, j, sensor, units, value, std, measured, below)
-    result = Measurements(time, sensor, target, target_names, channels, value, measured, std, has_std & measured, table)
+        _to_channel(table, network, name, j, sensor, units, value, std, measured, below, floors)
+    own = has_std & measured
+    result = Measurements(time, sensor, target, target_names, channels, value, measured, std, own, table, floors)
     _check_duplicates(result, network)
     return result
 
@@ -302,11 +305,12 @@ def _check_stds(table: Table, name: str, std: np.ndarray, given: np.ndarray) -> 
 
 def _to_channel(
     table: Table, network: Network, name: str, j: int, sensor: np.ndarray, units: dict[str, str | None],
-    value: np.ndarray, std: np.ndarray, measured: np.ndarray, below: np.ndarray,
+    value: np.ndarray, std: np.ndarray, measured: np.ndarray, below: np.ndarray, floors: dict[tuple[int, str], float],
 ) -> None:  # fmt: skip
     """Convert a column to the unit of each sensor's channel, in place, and check that the sensors have it.
 
-    `below` (N,) says which cells are limits such as `<-95`, under which nothing was heard.
+    `below` (N,) says which cells are limits such as `<-95`, under which nothing was heard. A floor that the channel
+    does not state is found here and kept in `floors`.
     """
     kinds = np.array([network.types.index(placed.type) for placed in network.sensors])[sensor]
     for k, kind in enumerate(network.types):
@@ -324,6 +328,9 @@ def _to_channel(
         for column, array in ((name, value), (f"{name}_std", std)):
             array[kinds == k, j] *= unit_factor(table, column, units.get(column), channel.unit)
         value[rows, j] = channel.turned(value[rows, j])
+        if isinstance(channel.noise, Heard) and channel.noise.floor is None:
+            known = channel.noise.found(value[rows & ~below, j], value[rows & below, j])
+            channel, floors[k, name] = replace(channel, noise=known), known.known()
         if isinstance(channel.noise, Censored) and channel.noise.blanks:
             blank = (kinds == k) & ~measured[:, j]
             value[blank, j], measured[blank, j] = channel.noise.floor, True

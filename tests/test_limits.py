@@ -126,6 +126,20 @@ def heard(noise, run):
     return network, walk, simulate(network, walk, time, key=run, biases=biases)
 
 
+def test_a_floor_above_zero_is_simulated():
+    """Decibels above 20 micropascal are positive numbers."""
+
+    @sensor(level=Channel("dB", std=2.0, noise=Truncated(60.0)))
+    def loud(target, pose, *, offset=Bias("dB", 2.0)):
+        return dict(level=100.0 - 20.0 * jnp.log10(norm(target.position - pose.position)) + offset)
+
+    time = np.arange(20.0)
+    network = Network([loud.on(Node("a", (0.0, 0.0)))])
+    run = simulate(network, Known((time, np.stack([20 + 10 * time, 0 * time], 1))), time, key=0)
+    assert run.table["level"].min() > 60.0
+    assert len(run.table) < 20
+
+
 def likeliest(run, kind):
     """Offset and exponent of every receiver by scipy, from the densities as they stand in a textbook."""
     found = {}
@@ -182,6 +196,31 @@ def test_intervals_hold_where_little_is_heard(kind):
     assert abs(np.mean(held) - 0.89) < 4 * np.std(held, ddof=1) / np.sqrt(40)
 
 
+@pytest.mark.parametrize("kind", [Censored, Truncated])
+def test_an_unknown_floor_is_found_in_the_table(kind):
+    """The least value that was heard, less half of the step to which values are rounded; or the highest limit."""
+    network, motion, run = heard(kind(HEARS), 3)
+    other = Network([radio(kind()).on(node) for node in network.nodes])
+    table = run.table[run.table["level"] > HEARS]
+    noise = Problem(other, motion, table).network.types[0].channels["level"].noise
+    assert isinstance(noise, kind)
+    assert HEARS < noise.floor < HEARS + 0.3
+    assert noise.floor < table["level"].min()
+    rounded = Problem(other, motion, table.assign(level=np.round(table["level"]))).network
+    assert rounded.types[0].channels["level"].noise.floor == np.round(table["level"]).min() - 0.5
+    assert rounded.types[0] == rounded.sensors[-1].type
+    if kind is Censored:
+        told = run.table.assign(level=run.table["level"].astype(object).where(run.table["level"] > HEARS, "<-72"))
+        problem = Problem(other, motion, told)
+        assert problem.network.types[0].channels["level"].noise == Censored(HEARS)
+        np.testing.assert_allclose(problem.measurements.value, Problem(network, motion, run.table).measurements.value)
+        blank = Network([radio(Censored(blanks=True)).on(node) for node in network.nodes])
+        silent = run.table.assign(level=run.table["level"].where(run.table["level"] > HEARS))
+        assert Problem(blank, motion, silent).measurements.measured.all()
+    with pytest.raises(InputError, match="a floor is found in a table, here is none"):
+        simulate(other, motion, np.arange(60.0), key=0)
+
+
 @pytest.mark.ci
 def test_an_unknown_noise_level_is_found_among_limits():
     network, motion, run = heard(Censored(HEARS), 5)
@@ -222,5 +261,7 @@ def test_limits_that_cannot_be_are_refused(noise, cell, text):
     table.loc[3, "level"] = cell
     with pytest.raises(InputError, match=text):
         Problem(other, motion, table)
+    with pytest.raises(InputError, match="an angle has no least value"):
+        Channel("rad", noise=Censored(0.0), wrap=True)
     with pytest.raises(InputError, match="give the least value that is heard"):
         Truncated(float("nan"))

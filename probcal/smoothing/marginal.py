@@ -36,7 +36,10 @@ ENOUGH = 0.1  # share of the promised rise that a step must bring: along what mo
 SMALL = 1e-6  # share of its first square from which on an adjoint solve is good enough
 LEAST_CURVED = 0.05  # share of its curvature so far that a secant must show
 SHORT = 0.25  # part of a step above which the damping falls again
-TRACK_STEPS, SETTLED = 30, 1e-10  # of Gauss-Newton after every step of the biases, and nats at which they end: log det W
+TRACK_STEPS, SETTLED = (
+    30,
+    1e-10,
+)  # of Gauss-Newton after every step of the biases, and nats at which they end: log det W
 # moves with the trajectories to first order
 
 
