@@ -159,7 +159,8 @@ def likeliest(run, kind):
     return found
 
 
-@pytest.mark.parametrize("noise", [Censored(HEARS), pytest.param(Truncated(HEARS), marks=pytest.mark.ci)], ids=repr)
+@pytest.mark.ci
+@pytest.mark.parametrize("noise", [Censored(HEARS), Truncated(HEARS)], ids=repr)
 def test_what_is_not_heard_is_simulated_and_fitted(noise):
     """Rows below the floor are limits, or gone; the mode is that of scipy, and without the floor it is elsewhere."""
     network, motion, run = heard(noise, 3)

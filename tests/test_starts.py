@@ -137,7 +137,8 @@ def off_by(problem, truth, point):
     return max(places, default=0.0), max(turns)
 
 
-@pytest.mark.parametrize("space", [False, pytest.param(True, marks=pytest.mark.ci)], ids=["plane", "space"])
+@pytest.mark.ci
+@pytest.mark.parametrize("space", [False, True], ids=["plane", "space"])
 @float64
 def test_an_array_of_which_nothing_is_known_starts_right(space):
     """The five sensors of the DOA paper, headings drawn from all around, places unknown: 3 runs each."""
@@ -163,6 +164,7 @@ def test_open_headings_of_known_places_are_found_by_crossings():
     assert off_by(problem, run.truth, optima(problem)[0].point)[1] < np.deg2rad(2.0)
 
 
+@pytest.mark.ci
 @float64
 def test_exchanged_nodes_are_found_without_being_asked_for():
     places = [(0, 0), (60, 5), (70, 60), (5, 55), (30, -5), (35, 62)]

@@ -7,6 +7,8 @@ the two parameters have a closed form (RSS paper 7), and what is left is a funct
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
+from scipy.special import log_ndtr, logsumexp
 
 from probcal.errors import InputError, nearest
 
@@ -23,6 +25,8 @@ CELLS = 41  # points an axis of the grid
 LOCAL = 2  # steps of the small grid around the best point to which the quadratic is fitted
 RISE, NARROWED = 3.0, 20  # nats over the small grid, and how often it is halved to get there
 STEPS = 60  # of Levenberg and Marquardt
+ROUNDS, FINE = 6, {2: 101, 3: 41}  # grids of a posterior, each around what the last one left, and their points an axis
+FAR = 14.0  # nats below the best point of a grid beyond which the next one does not go
 WITHIN = 16.0  # square of the diagonal of the area over the variance, below which a place counts as open
 
 
@@ -40,7 +44,7 @@ class Snapshot(NamedTuple):
 
 
 class Location(NamedTuple):
-    """A place (d,) in m with its covariance (d, d), and power and exponent of each kind of sensor.
+    """A place (d,) in m with its covariance (d, d), the interval (d, 2) of each coordinate, power, exponent of each kind.
 
     `determined` is False where the levels tell no place: the information is singular, the exponent came out at 0, or
     the best point lies on the edge of the area; then the covariance is not to be used.
@@ -48,6 +52,7 @@ class Location(NamedTuple):
 
     position: np.ndarray
     covariance: np.ndarray
+    interval: np.ndarray
     power: np.ndarray
     exponent: np.ndarray
     cost: float
@@ -90,12 +95,17 @@ def _regressors(at: Snapshot, places: np.ndarray) -> np.ndarray:
 
 
 class _Fit(NamedTuple):
-    """Of one kind at places (L,): intercept, slope (minus the exponent), residuals and leverages (L, m)."""
+    """Of one kind at places (L,): intercept, slope (minus the exponent), residuals and leverages (L, m).
+
+    `rising` is the slope where it came out positive and was put to zero, else what it is; `about` its information.
+    """
 
     power: np.ndarray
     slope: np.ndarray
     left: np.ndarray
     leverage: np.ndarray
+    rising: np.ndarray
+    about: np.ndarray
 
 
 def _line(c: np.ndarray, y: np.ndarray, w: np.ndarray, exponent: float | None) -> _Fit:
@@ -108,11 +118,11 @@ def _line(c: np.ndarray, y: np.ndarray, w: np.ndarray, exponent: float | None) -
     dc = c - cm[:, None]
     about = np.maximum((w * dc**2).sum(1), 1e-300)
     slope = (w * dc * y).sum(1) / about if exponent is None else np.full(len(c), -exponent)
-    slope = np.minimum(slope, 0.0)
+    rising, slope = slope, np.minimum(slope, 0.0)
     power = ym - slope * cm
     left = y - power[:, None] - slope[:, None] * c
     own = w * dc**2 / about[:, None] if exponent is None else 0.0
-    return _Fit(power, slope, left, np.clip(w / total[:, None] + own, EDGE, 1 - EDGE))
+    return _Fit(power, slope, left, np.clip(w / total[:, None] + own, EDGE, 1 - EDGE), rising, about)
 
 
 def _fits(at: Snapshot, places: np.ndarray, criterion: str, exponent: float | None) -> list[tuple[np.ndarray, _Fit]]:
@@ -197,6 +207,7 @@ def localise(
     area: np.ndarray | None = None,
     cells: int = CELLS,
     refine: str = "marquardt",
+    probability: float = 0.9,
 ) -> Location:
     """Place of a source from the levels of one instant, its power and exponent unknown (RSS paper, sections 4 and 5).
 
@@ -205,7 +216,9 @@ def localise(
     axis; the nodes and a half of their extent around) and refined from its best point: `refine` is "quadratic" (15-17:
     the place and the covariance of a quadratic fitted to the grid around it), "gauss-newton", "marquardt" or "none".
     The covariance is otherwise the inverse Fisher information there, with the noise estimated by (10) under `gml`.
-    Raises `InputError` for levels that cannot tell a place.
+    "posterior" integrates power, exponent and place (all flat, the exponent positive, the place in the area) instead:
+    its mean, covariance and quantiles, which hold where a quadratic does not: at strong noise, and next to a node.
+    `interval` holds each coordinate with the `probability`. Raises `InputError` for levels that cannot tell a place.
 
     >>> nodes = np.array([(0, 0), (50, 0), (50, 40), (0, 40), (25, 55.0), (20, -20)])
     >>> heard = 80 - 25 * np.log10(np.linalg.norm(nodes - [18.0, 22.0], axis=1))
@@ -213,9 +226,13 @@ def localise(
     [18.0, 22.0]
     """
     at = _checked(position, level, kind, std)
-    ways = ("quadratic", "gauss-newton", "marquardt", "none")
+    ways = ("quadratic", "gauss-newton", "marquardt", "none", "posterior")
     if refine not in ways:
         raise InputError(f'localise: refine is "{refine}"{nearest(refine, ways)}')
+    if refine == "posterior" and criterion in ("predicted", "residual", "virtual"):
+        raise InputError(f'localise: criterion "{criterion}" is no likelihood and has no posterior; take "snls"')
+    if not 0 < probability < 1:
+        raise InputError(f"localise: probability is {probability:g}; give one between 0 and 1")
     d = at.position.shape[1]
     low, high = at.position.min(0), at.position.max(0)
     margin = 0.5 * float(np.linalg.norm(high - low))
@@ -229,11 +246,11 @@ def localise(
     x, cost = grid[k], float(value[k])
     step = np.array([axis[1] - axis[0] for axis in axes])
     known = exponent if criterion == "nls" else None
-    covariance = None
+    covariance = interval = None
     if refine == "quadratic":
         x, covariance = _quadratic(at, x, step, criterion, known)
     elif refine != "none":
-        x = _climbed(at, x, criterion, known, damped=refine == "marquardt", reach=4 * step)
+        x = _climbed(at, x, criterion, known, damped=refine != "gauss-newton", reach=4 * step)
     cost = float(losses(at, x[None], criterion, exponent=exponent)[0])
     fits = _fits(at, x[None], criterion, known)
     power, slope = (np.array([getattr(f, name)[0] for _, f in fits]) for name in ("power", "slope"))
@@ -251,9 +268,70 @@ def localise(
         message = "the levels tell the place no better than the area does"
     elif (reflected := _mirrored(at, x, criterion, exponent, cost)) is not None:
         message = f"the nodes lie on a line or plane: {np.round(reflected, 1).tolist()} on its other side fits as well"
+    if refine == "posterior":
+        x, covariance, interval = _integrated(at, box, grid, criterion, known, probability)
     if covariance is None:
         covariance = (vectors / np.maximum(values, 1e-300)) @ vectors.T
-    return Location(x, covariance, power, -slope, cost, not message, message)
+    if interval is None:
+        half = stats.norm.isf(0.5 - 0.5 * probability) * np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        interval = np.stack([x - half, x + half], 1)
+    return Location(x, covariance, interval, power, -slope, cost, not message, message)
+
+
+def _log_posterior(at: Snapshot, places: np.ndarray, criterion: str, exponent: float | None) -> np.ndarray:
+    """Log density (L,) of places under flat priors, power and exponent (positive) integrated, and under `gml` the noise.
+
+    Of a robust criterion the profile takes the place of the integral.
+    """
+    total = np.zeros(len(places))
+    for mine, fit in _fits(at, places, criterion, exponent):
+        squares = ((fit.left / at.std[mine]) ** 2).sum(1)
+        if exponent is not None and criterion == "nls":
+            total = total - 0.5 * squares
+            continue
+        wide = np.sqrt(fit.about)
+        squares = np.maximum(squares - fit.about * np.maximum(fit.rising, 0.0) ** 2, 1e-12)
+        total = total - np.log(wide)
+        if criterion == "gml":
+            free = len(mine) - 2
+            falls = stats.t.logcdf(-fit.rising * wide * np.sqrt(free / squares), free)
+            total = total - 0.5 * free * np.log(squares) + falls
+        else:
+            total = total - 0.5 * squares + log_ndtr(-fit.rising * wide)
+    if criterion in ("huber", "student"):
+        flat = sum(0.5 * np.log(fit.about) for _, fit in _fits(at, places, criterion, exponent))
+        return -losses(at, places, criterion) - flat
+    return total
+
+
+def _integrated(
+    at: Snapshot, box: np.ndarray, grid: np.ndarray, criterion: str, exponent: float | None, probability: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean, covariance and quantiles of a place, on grids that narrow to where the posterior is."""
+    d = len(box)
+    low, high = box[:, 0], box[:, 1]
+    told = _log_posterior(at, grid, criterion, exponent)
+    step = (high - low) / (round(len(grid) ** (1 / d)) - 1)
+    for _ in range(ROUNDS):
+        kept = grid[told > told.max() - FAR]
+        low, high, before = np.maximum(kept.min(0) - step, low), np.minimum(kept.max(0) + step, high), high - low
+        axes = [np.linspace(a, b, FINE[d]) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, d)
+        told = _log_posterior(at, grid, criterion, exponent)
+        step = (high - low) / (FINE[d] - 1)
+        if (high - low > 0.8 * before).all():
+            break
+    p = np.exp(told - logsumexp(told))
+    mean = p @ grid
+    covariance = (grid - mean).T @ ((grid - mean) * p[:, None]) + np.diag(step**2 / 12)
+    tails = 0.5 - 0.5 * probability, 0.5 + 0.5 * probability
+    shape = p.reshape([FINE[d]] * d)
+    interval = np.empty((d, 2))
+    for k, axis in enumerate(axes):
+        along = np.cumsum(shape.sum(axis=tuple(j for j in range(d) if j != k)))
+        edges = np.concatenate([[axis[0] - step[k] / 2], axis + step[k] / 2])
+        interval[k] = np.interp(tails, np.concatenate([[0.0], along]), edges)
+    return mean, covariance, interval
 
 
 def _mirrored(at: Snapshot, x: np.ndarray, criterion: str, exponent: float | None, cost: float) -> np.ndarray | None:
