@@ -44,7 +44,7 @@ class Snapshot(NamedTuple):
 
 
 class Location(NamedTuple):
-    """A place (d,) in m with its covariance (d, d), the interval (d, 2) of each coordinate, power, exponent of each kind.
+    """A place (d,) in m with covariance (d, d), interval (d, 2) of each coordinate, power and exponent of each kind.
 
     `determined` is False where the levels tell no place: the information is singular, the exponent came out at 0, or
     the best point lies on the edge of the area; then the covariance is not to be used.
@@ -279,7 +279,7 @@ def localise(
 
 
 def _log_posterior(at: Snapshot, places: np.ndarray, criterion: str, exponent: float | None) -> np.ndarray:
-    """Log density (L,) of places under flat priors, power and exponent (positive) integrated, and under `gml` the noise.
+    """Log density (L,) of places under flat priors, power, exponent (positive) and, under `gml`, the noise integrated.
 
     Of a robust criterion the profile takes the place of the integral.
     """

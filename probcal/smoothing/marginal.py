@@ -36,11 +36,9 @@ ENOUGH = 0.1  # share of the promised rise that a step must bring: along what mo
 SMALL = 1e-6  # share of its first square from which on an adjoint solve is good enough
 LEAST_CURVED = 0.05  # share of its curvature so far that a secant must show
 SHORT = 0.25  # part of a step above which the damping falls again
-TRACK_STEPS, SETTLED = (
-    30,
-    1e-10,
-)  # of Gauss-Newton after every step of the biases, and nats at which they end: log det W
-# moves with the trajectories to first order
+TRACK_STEPS = 30  # of Gauss-Newton after every step of the biases
+SETTLED = 1e-10  # nats at which they end: log det W moves with the trajectories to first order
+NOTHING = 1e-4  # nats (0.014 sd) that a slope may promise in vain: tracks that settle slowly leave it that uncertain
 
 
 @jax.jit
@@ -212,10 +210,11 @@ def _turned(
 def _shorter(s: _Search, prior: Precision) -> _Search:
     """The search with half the step, or with more damping where that was tried often enough.
 
-    A step that promised less than the rounding of the density, and shows nothing, is the end.
+    A step that promised less than the rounding of the density, and shows nothing, is the end; one that promised
+    `NOTHING` is where no part of it shows anything.
     """
-    found = (s.promised <= ROUNDING * jnp.abs(s.value)) & (s.damping <= 1.0)
     spent = s.share <= 0.5**HALVINGS
+    found = (s.promised <= jnp.where(spent, NOTHING, ROUNDING * jnp.abs(s.value))) & (s.damping <= 1.0)
     damping = jnp.where(spent, jnp.maximum(s.damping * 10.0, 1e-3), s.damping)
     matrix = s.solved.information + prior.matrix() + s.bent + damping * jnp.eye(len(s.score))
     step = jnp.where(spent, Dense.of(matrix).solve(s.score), s.step)
