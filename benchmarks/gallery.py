@@ -30,7 +30,8 @@ PICTURES = ROOT / "notebooks" / "pictures"
 WIDTH = 480  # px
 RECORDINGS = {
     "sflab": "sflab_mic_toa/dataset_1_exp2.mat", "tdoa_flight": "uwb_tdoa",
-    "robots": "mrclam/MRCLAM_Dataset6", "receivers": "mlat_locards/set_1.csv",
+    "robots": "mrclam/MRCLAM_Dataset6", "receivers": "mlat_locards/set_1.csv", "ble_office": "ble_rss",
+    "bearing_beacons": "roh_bearing",
 }  # fmt: skip
 HOW = {
     "road_microphones": ("--set", "motion=road", "--method", "em-particles"), "town": ("--method", "em-particles"),

@@ -47,10 +47,10 @@ def receiver(noise):
     return radio
 
 
-def network(noise):
-    """The receivers at known places."""
+def network(noise, names):
+    """The receivers of these names, at known places."""
     kind = receiver(noise)
-    return pc.Network([kind.on(pc.Node(f"r{k}", place)) for k, place in enumerate(PLACES)])
+    return pc.Network([kind.on(pc.Node(f"r{k}", place)) for k, place in enumerate(PLACES) if f"r{k}" in names])
 
 
 def motion():
@@ -112,7 +112,7 @@ def quadrature(drawn, kind):
 METHODS = {
     "map": lambda: pc.MAP(),
     "collapsed": lambda: pc.Collapsed(warmup=300, draws=400, chains=2),
-    "particle-gibbs": lambda: pc.ParticleGibbs(particles=200, warmup=200, draws=400, chains=2),
+    "particle-gibbs": lambda: pc.ParticleGibbs(particles=pc.Particles(200), warmup=200, draws=400, chains=2),
 }
 
 
@@ -139,7 +139,12 @@ def main():
                 rows = table if noise is family else table[table["level"] > FLOOR]
                 used = {n: t for n, t in targets.items() if n in set(rows["target"])}
                 begun = time.perf_counter()
-                tree = pc.fit(pc.Problem(network(noise), used, rows), METHODS[name](), prior=pc.Gaussian(), key=run)
+                tree = pc.fit(
+                    pc.Problem(network(noise, set(rows["sensor"])), used, rows),
+                    METHODS[name](),
+                    prior=pc.Gaussian(),
+                    key=run,
+                )
                 took = time.perf_counter() - begun
                 group = tree["calibration"].to_dataset().isel(bias_label=0)
                 low, high = (float(group[k]) for k in ("lower", "upper"))

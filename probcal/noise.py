@@ -566,7 +566,9 @@ class Truncated(Heard):
     """Gaussian noise of a receiver that writes no row of what lies at or below `floor` (a truncated normal).
 
     A row that is there then says that something was heard; `simulate` leaves the others out. Without a floor the table
-    tells it.
+    tells it. How many rows there are says nothing here, though a place from which little is heard has few: where a
+    target stands hardly known and another receiver's row shows that it was sent, `rss.with_silence` and `Censored` know
+    more, and do not err (`benchmarks/rings.py`).
 
     >>> round(float(jnp.exp(Truncated(-95.0).log_likelihood(-95.0, -95.0, 4.0, None))), 6)  # twice the normal density
     0.199471

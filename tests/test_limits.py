@@ -27,6 +27,7 @@ from probcal import (
     simulate,
 )
 from probcal.geometry import norm
+from probcal.rss import with_silence
 
 FLOOR, STD = -2.0, 0.7
 PREDICTED = np.array([-12.0, -4.0, -2.3, -1.0, 1.0, 9.0])
@@ -244,6 +245,29 @@ def test_cells_below_a_limit_are_read(tmp_path):
     blank = Problem(silent, motion, table.assign(level=pd.to_numeric(run.table["level"].where(~low)))).measurements
     np.testing.assert_allclose(blank.value, number.value)
     assert blank.measured.all()
+
+
+def test_who_listened_and_heard_nothing_gets_a_row():
+    """What falls silent is put back, but for times at which nobody heard anything; a column without rows stays."""
+    network, motion, run = heard(Censored(HEARS), 3)
+    listening = Network([radio(Censored(HEARS, blanks=True)).on(node) for node in network.nodes])
+    log = run.table[run.table["level"] > HEARS]
+    whole = with_silence(log, listening)
+    known = run.table[run.table["time"].isin(log["time"])]
+    assert len(log) < len(whole) == len(known)
+    left, right = (Problem(network_, motion, t.sort_values(["time", "sensor"])).measurements
+                   for network_, t in ((listening, whole), (network, known)))  # fmt: skip
+    np.testing.assert_array_equal(left.value, right.value)
+    name = whole["sensor"][whole["level"].isna()].iloc[0]
+    some = with_silence(log, listening, listens=[name])
+    assert set(some["sensor"][some["level"].isna()]) == {name}
+    assert len(with_silence(whole, listening)) == len(whole)
+    with pytest.raises(InputError, match=r"with_silence: no channel has noise=Censored\(floor, blanks=True\)"):
+        with_silence(log, network)
+    with pytest.raises(InputError, match=r'with_silence: listens "r9".* is no receiver with a floor'):
+        with_silence(log, listening, listens=["r9"])
+    with pytest.raises(InputError, match='with_silence: the table lacks "time"'):
+        with_silence(log.drop(columns="time"), listening)
 
 
 COMPLAINTS = [

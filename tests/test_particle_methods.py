@@ -375,6 +375,7 @@ ERRORS = [
     (lambda p: particle_filter(p, 100), "particle_filter\\(particles=100\\): give Particles"),
     (lambda p: particle_filter(p, runs=1), "at least 2 filters give an error"),
     (lambda p: EM("particles"), "Cubature\\(\\) or Particles\\(500\\)"),
+    (lambda p: ParticleGibbs(particles=200), r"ParticleGibbs\(particles=200\): give settings such as Particles"),
     (lambda p: ParticleGibbs(steps=0), "ParticleGibbs\\(steps=0\\): it must be at least 1"),
     (lambda p: fit(Problem(p.network, Target(ConstantVelocity(0.5) + White("power", "dB", Unknown(1.0)), START), p.
                    measurements.table.frame), EM(Particles(50))),

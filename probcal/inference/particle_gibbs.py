@@ -97,6 +97,8 @@ class ParticleGibbs(Sampler):
 
     def __post_init__(self):
         super().__post_init__()
+        if not isinstance(self.particles, Particles):
+            raise InputError(f"ParticleGibbs(particles={self.particles!r}): give settings such as Particles(200)")
         for name, value in (("steps", self.steps), ("patience", self.patience)):
             if value < 1:
                 raise InputError(f"ParticleGibbs({name}={value}): it must be at least 1")

@@ -3,6 +3,7 @@
 from probcal.rss.localise import CRITERIA, Location, Snapshot, localise, losses, position_information
 from probcal.rss.regression import power_law
 from probcal.rss.samples import levels_of, read_wav
+from probcal.rss.silence import with_silence
 from probcal.rss.tracking import track_snapshots
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "power_law",
     "read_wav",
     "track_snapshots",
+    "with_silence",
 ]
