@@ -19,6 +19,7 @@ import pandas as pd
 from scipy.special import log_ndtr, logsumexp, ndtr, ndtri
 
 import probcal as pc
+import probcal.rss
 
 PLACES = [
     (0.0, 0.0),
@@ -100,7 +101,11 @@ def quadrature(drawn, kind):
                 told -= log_ndtr((mean - FLOOR) / STD) @ count
             else:
                 told += log_ndtr((FLOOR - mean) / STD) @ unheard
-            log_p.append(logsumexp(told[:, seen], axis=0).sum() - 0.5 * ((value - NOMINAL) / SCALE) ** 2)
+            each = logsumexp(told[:, seen], axis=0)
+            if kind == "dropped":  # of a tag that nobody heard nobody knows
+                silent = np.exp(READINGS * log_ndtr((FLOOR - mean) / STD).sum(1))
+                each = each - logsumexp(prior[:, 0] + np.log1p(-silent))
+            log_p.append(each.sum() - 0.5 * ((value - NOMINAL) / SCALE) ** 2)
         p = np.exp(np.array(log_p) - max(log_p))
         p /= p.sum()
         mean = p @ values
@@ -114,6 +119,7 @@ METHODS = {
     "collapsed": lambda: pc.Collapsed(warmup=300, draws=400, chains=2),
     "particle-gibbs": lambda: pc.ParticleGibbs(particles=pc.Particles(200), warmup=200, draws=400, chains=2),
 }
+WORDS = {pc.noise.Normal: ", all is heard", pc.Censored: ", silent rows put back"}
 
 
 def main():
@@ -124,6 +130,8 @@ def main():
     parser.add_argument("--kind", choices=("truncated", "censored", "dropped"), default="truncated")
     chosen = parser.parse_args()
     family = (pc.Censored if chosen.kind == "censored" else pc.Truncated)(FLOOR)
+    whole = pc.Censored(FLOOR, blanks=True)
+    noises = (family, pc.noise.Normal(), *((whole,) if chosen.kind == "dropped" else ()))
     found = {}
     few = []
     for run in range(chosen.runs):
@@ -134,9 +142,11 @@ def main():
         there = set(table["target"])
         targets = {name: target for name, target in motion().items() if name in there}
         for name in chosen.methods.split(","):
-            for noise in (family, pc.noise.Normal()):
-                label = name + (", all is heard" if noise is not family else "")
-                rows = table if noise is family else table[table["level"] > FLOOR]
+            for noise in noises:
+                label = name + ("" if noise is family else WORDS[type(noise)])
+                rows = table[table["level"] > FLOOR] if isinstance(noise, pc.noise.Normal) else table
+                if noise is whole:
+                    rows = pc.rss.with_silence(rows, network(noise, {f"r{k}" for k in range(len(PLACES))}))
                 used = {n: t for n, t in targets.items() if n in set(rows["target"])}
                 begun = time.perf_counter()
                 tree = pc.fit(

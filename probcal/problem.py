@@ -248,6 +248,12 @@ class Problem:
             declared = declared[name]
         return declared if isinstance(declared, Target) else Target(declared)
 
+    def with_tilt(self, tilt: tuple[Any, Any] | None) -> Problem:
+        """The same problem with a linear term of the log-likelihood of its biases, or without."""
+        other = copy(self)
+        other.model = self.model.with_tilt(tilt)
+        return other
+
     def with_mixing(self, weights: Mixing) -> Problem:
         """The same problem with other precisions (E,) of the process noises that are not Gaussian."""
         if not self.model.tailed:

@@ -238,6 +238,11 @@ class EA(Maximiser):
             " narrow; Horseshoe() or ARD(rate=0.5) is integrated."
         )
 
+    @property
+    def integrates_places(self) -> bool:
+        """Where the mode is that of the marginal."""
+        return self.trajectory == "marginal"
+
     def steps_on_host(self, model: Model, prior: Prior) -> bool:
         """Where the marginal mode is all that is climbed to: each iteration is then long."""
         return _alone(model, prior, self.trajectory)
@@ -268,6 +273,11 @@ class MAP(Maximiser):
     def __post_init__(self):
         if self.trajectory not in MODES:
             raise InputError(f'{self.name}(trajectory="{self.trajectory}"): give one of {", ".join(MODES)}')
+
+    @property
+    def integrates_places(self) -> bool:
+        """Where the mode is that of the marginal."""
+        return self.trajectory == "marginal"
 
     def steps_on_host(self, model: Model, prior: Prior) -> bool:
         """Where the marginal mode is all that is climbed to: each iteration is then long."""

@@ -27,9 +27,11 @@ from probcal.results.answer import Answer
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.linearised import LaplaceApproximation
 from probcal.smoothing.mode import Point
+from probcal.smoothing.places import tilt_of
 from probcal.smoothing.tails import expected_mixing, rewhitened
 
 CHUNK = 5  # outer iterations between two reports of progress
+TILTS, ASIDE = 3, 0.02  # most climbs with integrated places, and sds by which one must move a bias
 
 
 class Given(NamedTuple):
@@ -113,8 +115,20 @@ class Maximiser(Method, ABC):
     tolerance: float  # change of the objective at which it stops
 
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
-        """Climb from a start until it is done or its iterations are spent."""
+        """Climb from a start until it is done or its iterations are spent.
+
+        Where a method integrates trajectories, places that are far from Gaussian are integrated at the point that was
+        reached, and it climbs again with what they add.
+        """
+        problem = self._tilted(problem, start)
         state, trace = self.climb(problem, prior, start, context)
+        for _ in range(TILTS):
+            tilted = self._tilted(problem, state.point)
+            if not _moves(problem.model, tilted.model, state):
+                break
+            problem = tilted
+            state, more = self.climb(problem, prior, state.point, context)
+            trace = np.concatenate([trace, more])
         how, mixed = self.integration(problem, prior), None
         problem = problem.with_mixing(state.mixing)
         if how is not None:
@@ -122,6 +136,15 @@ class Maximiser(Method, ABC):
             mixed = integrate(how, problem.model, first, state.point, context.key, search=True)
         square = float(mean_square(problem.model, state.point if mixed is None else mixed.point))
         return conclude(problem, self, prior, state, trace, square, len(trace), how, mixed)
+
+    def _tilted(self, problem: Problem, point: Point) -> Problem:
+        """The problem with what places that are far from Gaussian add at a point, where the method integrates them."""
+        return problem.with_tilt(tilt_of(problem.model.with_tilt(None), point) if self.integrates_places else None)
+
+    @property
+    def integrates_places(self) -> bool:
+        """Whether trajectories are integrated, so that places that are far from Gaussian matter."""
+        return False
 
     def climb(self, problem: Problem, prior: Prior, start: Point, context: Context) -> tuple[State, np.ndarray]:
         """The last state of the outer loop and the objectives on the way."""
@@ -150,6 +173,15 @@ class Maximiser(Method, ABC):
     def close(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """What is computed once a chunk."""
         return state
+
+
+def _moves(before: Model, after: Model, state: State) -> bool:
+    """Whether the tilt of a model moves the biases by more than `ASIDE` of an sd from where that before left them."""
+    if before.tilt is None or after.tilt is None:
+        return (before.tilt is None) != (after.tilt is None)
+    covariance = np.asarray(state.found.covariance)
+    moved = covariance @ np.asarray(after.tilt[1] - before.tilt[1])
+    return bool(np.any(np.abs(moved) > ASIDE * np.sqrt(np.maximum(np.diagonal(covariance), 0.0))))
 
 
 def kernel(method: Any) -> Any:

@@ -96,7 +96,7 @@ class Recursion(NamedTuple):
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["recursions", "rows", "level_spread"],
+    data_fields=["recursions", "rows", "level_spread", "tilt"],
     meta_fields=["blocks", "recursion", "biases", "driven", "targets", "full_rank", "sampled"],
 )
 @dataclass(frozen=True)
@@ -113,6 +113,7 @@ class Model(Stepwise):
     recursions: tuple[Recursion, ...]
     rows: tuple[Rows, ...]  # of each block
     level_spread: jax.Array  # (H,) standard deviation of each log level
+    tilt: tuple[jax.Array, jax.Array] | None = None  # constant and slope (M,) by z of the log-likelihood beside rows
 
     # at a point
 
@@ -204,6 +205,7 @@ class Model(Stepwise):
         """Rows compressed onto the biases at fixed trajectories: information (M, M), score (M,) (Paper C 35-36)."""
         M = self.biases
         G, g = jnp.zeros((M + 1, M + 1)), jnp.zeros(M + 1)
+        g = g if self.tilt is None else g.at[:M].add(self.tilt[1])
         for data, lin in zip(self.rows, lins, strict=True):
             S = data.bias.shape[0]
             own = jax.ops.segment_sum(jnp.einsum("ncp,nc,ncq->npq", lin.bias, lin.weight, lin.bias), data.sensor, S)
@@ -340,6 +342,10 @@ class Model(Stepwise):
     def mixing(self) -> Mixing:
         """Precisions (E,) that the noises of each tail of each recursion are taken to have."""
         return tuple(tuple(tail.weight for tail in part.tails) for part in self.recursions)
+
+    def with_tilt(self, tilt: tuple[jax.Array, jax.Array] | None) -> "Model":
+        """The model with a linear term of the log-likelihood of the biases, or without (see `smoothing.places`)."""
+        return replace(self, tilt=tilt)
 
     def with_mixing(self, weights: Mixing) -> "Model":
         """The model with other precisions of its process noise, where this is not Gaussian."""

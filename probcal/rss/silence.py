@@ -46,7 +46,8 @@ def with_silence(
             raise InputError(f'with_silence: listens "{name}"{nearest(name, told)} is no receiver with a floor')
     frame = read_table(data).frame
     if missing := {"time", "sensor"} - set(frame):
-        raise InputError(f'with_silence: the table lacks "{sorted(missing)[0]}"; its columns are {", ".join(frame)}')
+        columns = ", ".join(map(str, frame.columns))
+        raise InputError(f'with_silence: the table lacks "{sorted(missing)[0]}"; its columns are {columns}')
     keys = ["time", "target"] if "target" in frame else ["time"]
     heard = frame.loc[frame["sensor"].isin(told), keys].drop_duplicates()
     all_rows = heard.merge(pd.DataFrame({"sensor": list(told if listens is None else listens)}), how="cross")

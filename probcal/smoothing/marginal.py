@@ -42,8 +42,12 @@ NOTHING = 1e-4  # nats (0.014 sd) that a slope may promise in vain: tracks that 
 
 
 @jax.jit
-def volume_slope(model: Model, point: Point, solved: Eliminated) -> tuple[jax.Array, jax.Array]:
+def volume_slope(
+    model: Model, point: Point, solved: Eliminated, only: tuple[jax.Array, ...] | None = None
+) -> tuple[jax.Array, jax.Array]:
     """Derivative (M,) of log det W by z at a point whose trajectories are at their mode, these following.
+
+    `only` (E,) of each recursion marks the epochs of the targets that count; all without it.
 
     d log det W = sum over k of tr(P_k dJ_k), P_k the smoothed covariance of the states given z. The way through the
     trajectories is one adjoint smooth with the second derivatives of the density (see `_adjoint`). Where a target
@@ -54,9 +58,14 @@ def volume_slope(model: Model, point: Point, solved: Eliminated) -> tuple[jax.Ar
         for part, kept in zip(model.recursions, solved.parts, strict=True)
     ]
 
+    if only is not None:
+        counted = [jnp.where(on[:, None, None], P, 0.0) for P, on in zip(spread, only, strict=True)]
+    else:
+        counted = spread
+
     def volume(z: jax.Array, states: States) -> jax.Array:
         lins = model.linearise(At(states, z, point.levels), expected=True)
-        pairs = zip(spread, model.of_states(lins), strict=True)
+        pairs = zip(counted, model.of_states(lins), strict=True)
         return sum((jnp.sum(P * J) for P, (J, _) in pairs), jnp.zeros(()))
 
     own, by_state = jax.grad(volume, argnums=(0, 1))(point.z, point.states)

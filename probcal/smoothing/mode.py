@@ -68,8 +68,9 @@ def factors(part: Recursion, levels: jax.Array) -> jax.Array:
 
 
 def log_likelihood(model: Model, point: Where) -> jax.Array:
-    """Log-likelihood of all data at a point."""
-    return sum((jnp.sum(part) for part in model.log_likelihood(point)), jnp.zeros(()))
+    """Log-likelihood of all data at a point, with the tilt of the model."""
+    beside = jnp.zeros(()) if model.tilt is None else model.tilt[0] + model.tilt[1] @ point.z
+    return sum((jnp.sum(part) for part in model.log_likelihood(point)), beside)
 
 
 def log_density(model: Model, point: Point) -> jax.Array:

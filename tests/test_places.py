@@ -1,0 +1,125 @@
+"""Places of targets that stand still, integrated: rings and pairs of places against a grid, and where it is left be."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.special import logsumexp
+
+import probcal as pc
+from probcal.inference.run import Maximiser
+from probcal.priors import Precision
+from probcal.smoothing.mode import find_mode
+from probcal.smoothing.places import tilt_of
+from probcal.starts import automatic_start
+
+ANCHORS = np.array([(0.0, 0.0), (40.0, 0.0), (0.0, 40.0)])
+STD, OFFSET, CENTRE, SPREAD = 1.0, 6.0, np.array([15.0, 12.0]), 10.0
+
+
+@pc.sensor(range=pc.Channel("m", std=STD))
+def anchor(target, pose, *, offset=pc.Bias("m", OFFSET, shared="type")):
+    """Distance with an offset that all anchors have in common."""
+    return dict(range=jnp.sqrt(jnp.sum((target.position - pose.position) ** 2) + 1e-6) + offset)
+
+
+def tags(seed, hears, at=CENTRE, spread=SPREAD):
+    """Network, motion and table of tags at unknown places of which each is heard by some of the anchors."""
+    rng = np.random.default_rng(seed)
+    offset, rows, motion = OFFSET * rng.standard_normal(), [], {}
+    for k, count in enumerate(hears):
+        place = at + spread * rng.standard_normal(2)
+        motion[f"t{k}"] = pc.Target(pc.Static(), {"position": (tuple(at), spread)})
+        for a in rng.permutation(len(ANCHORS))[:count]:
+            told = np.linalg.norm(place - ANCHORS[a]) + offset + STD * rng.standard_normal()
+            rows.append(dict(time=0.0, sensor=f"a{a}", target=f"t{k}", range=told))
+    network = pc.Network([anchor.on(pc.Node(f"a{k}", tuple(place))) for k, place in enumerate(ANCHORS)])
+    table = pd.DataFrame(rows)
+    return network, motion, table
+
+
+def on_a_grid(table, offsets):
+    """Log posterior density of the offset with every place summed over a grid."""
+    axes = [np.linspace(c - 5 * SPREAD, c + 5 * SPREAD, 501) for c in CENTRE]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    prior = -0.5 * ((grid - CENTRE) ** 2).sum(1) / SPREAD**2
+    far = {f"a{k}": np.linalg.norm(grid - place, axis=1) for k, place in enumerate(ANCHORS)}
+    log_p = -0.5 * (offsets / OFFSET) ** 2
+    for _, own in table.groupby("target"):
+        for k, offset in enumerate(offsets):
+            off = [far[row.sensor] + offset - row.range for row in own.itertuples()]
+            log_p[k] += logsumexp(prior - 0.5 * sum(e**2 for e in off) / STD**2)
+    return log_p - logsumexp(log_p)
+
+
+def moments(table):
+    """Mean and sd of the offset by quadrature."""
+    offsets = np.linspace(-3 * OFFSET, 3 * OFFSET, 61)
+    for _ in range(2):
+        p = np.exp(on_a_grid(table, offsets))
+        mean = p @ offsets
+        sd = np.sqrt(p @ (offsets - mean) ** 2)
+        offsets = np.linspace(mean - 5 * sd, mean + 5 * sd, 31)
+    return mean, sd
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.ci), pytest.param(2, marks=pytest.mark.ci)])
+def test_tags_that_one_or_two_hear_are_integrated(seed, monkeypatch):
+    """A ring and a pair of places: MAP agrees with a grid, from which Laplace's formula is far."""
+    world = tags(seed, hears=[1, 2] * 8)
+    mean, sd = moments(world[-1])
+    tree = pc.fit(pc.Problem(*world), method=pc.MAP(), prior=pc.Gaussian())
+    found = tree.posterior.dataset["bias"]
+    print(f"grid {mean:.3f} +- {sd:.3f}, MAP {float(found.mean()):.3f} +- {float(found.std()):.3f}")
+    assert abs(float(found.mean()) - mean) < 0.25 * sd
+    assert 0.75 < float(found.std()) / sd < 1.3
+    assert tree.posterior.attrs["converged"]
+    monkeypatch.setattr(Maximiser, "_tilted", lambda self, problem, point: problem)
+    plain = float(pc.fit(pc.Problem(*world), method=pc.MAP(), prior=pc.Gaussian()).posterior.dataset["bias"].mean())
+    print(f"Laplace {plain:.3f}")
+    assert abs(plain - mean) > 0.3 * sd, "the scene tells the two apart"
+
+
+def consistent(problem, z=None):
+    """The point with trajectories at their mode at these biases, or at the mode of all."""
+    model = problem.model
+    start = automatic_start(problem)
+    if z is not None:
+        start = start._replace(z=jnp.asarray(z))
+    flat = Precision.single(jnp.zeros(model.biases))
+    return find_mode(model, start, flat, 200, 1e-10, joint=z is None).point
+
+
+def test_the_slope_is_that_of_the_constant():
+    """Central differences of what is added at a point, over the offset."""
+    problem = pc.Problem(*tags(3, hears=[1, 2, 3]))
+    with jax.enable_x64(True):
+        z = np.asarray(consistent(problem).z)
+        added = []
+        for step in (-1e-3, 0.0, 1e-3):
+            point = consistent(problem, z + step)
+            constant, slope = tilt_of(problem.model, point)
+            added.append(float(constant + slope @ point.z))
+            if step == 0.0:
+                here = float(slope[0])
+    assert (added[2] - added[0]) / 2e-3 == pytest.approx(here, rel=0.02, abs=0.02)
+
+
+def test_a_tag_that_all_hear_well_is_left_to_laplace():
+    """Where many see a place sharply there is nothing to add, nor where the target moves or is known."""
+    rng = np.random.default_rng(0)
+    places = {f"a{k}": 80 * rng.random(2) for k in range(7)}
+    network = pc.Network([anchor.on(pc.Node(name, tuple(own))) for name, own in places.items()])
+    place = np.array([30.0, 35.0])
+    rows = [
+        dict(time=t, sensor=name, range=np.linalg.norm(place - own) + 2.0 + rng.standard_normal())
+        for name, own in places.items()
+        for t in range(4)
+    ]
+    prior = {"position": ((40.0, 40.0), 20.0)}
+    moving = pc.Target(pc.ConstantVelocity(std=0.1), prior | {"velocity": ((0.0, 0.0), 1.0)})
+    for target in (pc.Target(pc.Static(), prior), moving):
+        problem = pc.Problem(network, target, pd.DataFrame(rows))
+        with jax.enable_x64(True):
+            assert tilt_of(problem.model, consistent(problem)) is None
