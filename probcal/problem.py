@@ -16,7 +16,7 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.model.epochs import Epoch, merged
-from probcal.model.model import Mixing, Model, Recursion, Tail
+from probcal.model.model import Mixing, Model, Recursion, Tail, Tilt
 from probcal.model.motions import (
     DIFFUSE,
     FAR,
@@ -248,8 +248,8 @@ class Problem:
             declared = declared[name]
         return declared if isinstance(declared, Target) else Target(declared)
 
-    def with_tilt(self, tilt: tuple[Any, Any] | None) -> Problem:
-        """The same problem with a linear term of the log-likelihood of its biases, or without."""
+    def with_tilt(self, tilt: Tilt | None) -> Problem:
+        """The same problem with a term of the log-likelihood of its biases beside that of the rows, or without."""
         other = copy(self)
         other.model = self.model.with_tilt(tilt)
         return other

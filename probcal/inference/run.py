@@ -25,13 +25,14 @@ from probcal.priors import Laplace as LaplacePrior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.information import mean_square
-from probcal.smoothing.linearised import LaplaceApproximation
-from probcal.smoothing.mode import Point
-from probcal.smoothing.places import tilt_of
+from probcal.smoothing.linearised import LaplaceApproximation, compress_and_eliminate, laplace, linearise_rows
+from probcal.smoothing.mode import Point, cost
+from probcal.smoothing.places import places_of, tilt_of
 from probcal.smoothing.tails import expected_mixing, rewhitened
 
 CHUNK = 5  # outer iterations between two reports of progress
-TILTS, ASIDE = 3, 0.02  # most climbs with integrated places, and sds by which one must move a bias
+TILTS, ASIDE = 12, 0.02  # most climbs with integrated places, and sds by which the last may leave a bias aside
+SLACK = 0.02  # nats by which the density of integrated places may fall by rounding
 
 
 class Given(NamedTuple):
@@ -120,15 +121,10 @@ class Maximiser(Method, ABC):
         Where a method integrates trajectories, places that are far from Gaussian are integrated at the point that was
         reached, and it climbs again with what they add.
         """
-        problem = self._tilted(problem, start)
         state, trace = self.climb(problem, prior, start, context)
-        for _ in range(TILTS):
-            tilted = self._tilted(problem, state.point)
-            if not _moves(problem.model, tilted.model, state):
-                break
-            problem = tilted
-            state, more = self.climb(problem, prior, state.point, context)
-            trace = np.concatenate([trace, more])
+        chosen = places_of(problem.model, state.point) if self.integrates_places else None
+        if chosen is not None and any(np.any(own.on) for own in chosen):
+            problem, state, trace = self._with_places(problem, prior, state, trace, chosen, context)
         how, mixed = self.integration(problem, prior), None
         problem = problem.with_mixing(state.mixing)
         if how is not None:
@@ -137,9 +133,51 @@ class Maximiser(Method, ABC):
         square = float(mean_square(problem.model, state.point if mixed is None else mixed.point))
         return conclude(problem, self, prior, state, trace, square, len(trace), how, mixed)
 
-    def _tilted(self, problem: Problem, point: Point) -> Problem:
-        """The problem with what places that are far from Gaussian add at a point, where the method integrates them."""
-        return problem.with_tilt(tilt_of(problem.model.with_tilt(None), point) if self.integrates_places else None)
+    def _with_places(
+        self, plain: Problem, prior: Prior, state: State, trace: np.ndarray, chosen: Any, context: Context
+    ) -> tuple[Problem, State, np.ndarray]:
+        """The problem with what chosen places add where the density is largest, the state there and all objectives.
+
+        What they add is known near a point: a climb that does not raise the density is repeated with a leash, and
+        has one where it leaves as much to go as the climb before.
+        """
+        tilt, leash, wanted = tilt_of(plain.model, state.point, chosen), 0.0, np.inf
+        if tilt is None:
+            return plain, state._replace(done=jnp.zeros((), bool)), trace
+        worth = self._worth(plain, prior, state) + float(tilt.height)
+        for _ in range(TILTS):
+            held = tilt._replace(curvature=tilt.curvature + leash * np.asarray(_metric(state)))
+            problem = plain.with_tilt(held)
+            tried, more = self.climb(problem, prior, state.point, context)
+            trace = np.concatenate([trace, more])
+            after = tilt_of(plain.model, tried.point, chosen)
+            better = -np.inf if after is None else self._worth(problem, prior, tried) + float(after.height)
+            if after is None or not better > worth - SLACK:
+                leash = max(4.0 * leash, 1.0)
+                continue
+            wants = _sds(tried, after.slope - held.pull(tried.point.z))
+            state, tilt, worth = tried, after, better
+            if wants < ASIDE:
+                break
+            looser = 0.25 * leash if leash > 0.1 else 0.0
+            leash, wanted = max(4.0 * leash, 1.0) if wants > 0.5 * wanted else looser, wants
+        else:
+            state = state._replace(done=jnp.zeros((), bool))
+        problem = plain.with_tilt(tilt)
+        given = given_of(self, problem, prior)
+        model = problem.model.with_mixing(state.mixing)
+        found = laplace(model, state.point, given.prior._replace(alpha=state.alpha))
+        return problem, state._replace(found=found), trace
+
+    def _worth(self, problem: Problem, prior: Prior, state: State) -> float:
+        """What a climb maximises but for the tilt: the marginal density of the biases, its own where it learns more."""
+        model = problem.model.with_mixing(state.mixing)
+        point, beside = state.point, 0.0 if model.tilt is None else float(model.tilt.value(state.point.z))
+        if self.climbs_under(prior).learns or model.level_spread.shape[0] or model.tailed:
+            return float(state.worth) - beside
+        given = given_of(self, problem, prior).prior._replace(alpha=state.alpha)
+        _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
+        return -float(cost(model, point, given) + 0.5 * solved.logdet) - beside
 
     @property
     def integrates_places(self) -> bool:
@@ -175,13 +213,16 @@ class Maximiser(Method, ABC):
         return state
 
 
-def _moves(before: Model, after: Model, state: State) -> bool:
-    """Whether the tilt of a model moves the biases by more than `ASIDE` of an sd from where that before left them."""
-    if before.tilt is None or after.tilt is None:
-        return (before.tilt is None) != (after.tilt is None)
+def _metric(state: State) -> np.ndarray:
+    """Information (M, M) of the data and of a prior of unit scale."""
+    return np.asarray(state.found.information) + np.eye(len(state.point.z))
+
+
+def _sds(state: State, pull: jax.Array) -> float:
+    """The most sds by which a pull (M,) on the biases would move one."""
     covariance = np.asarray(state.found.covariance)
-    moved = covariance @ np.asarray(after.tilt[1] - before.tilt[1])
-    return bool(np.any(np.abs(moved) > ASIDE * np.sqrt(np.maximum(np.diagonal(covariance), 0.0))))
+    scale = np.sqrt(np.maximum(np.diagonal(covariance), np.finfo(float).tiny))
+    return float(np.max(np.abs(covariance @ np.asarray(pull)) / scale, initial=0.0))
 
 
 def kernel(method: Any) -> Any:

@@ -72,6 +72,27 @@ class Tail:
         return jnp.sum(u[:, slice(*self.columns)] ** 2, 1) / self.weight
 
 
+class Tilt(NamedTuple):
+    """A term of the log-likelihood of the biases beside that of the rows, quadratic about a point.
+
+    Places that are integrated add it (see `smoothing.places`).
+    """
+
+    at: jax.Array  # (M,) point z
+    height: jax.Array  # () value there
+    slope: jax.Array  # (M,) by z there
+    curvature: jax.Array  # (M, M) minus its second derivative
+
+    def value(self, z: jax.Array) -> jax.Array:
+        """What is added at z."""
+        moved = z - self.at
+        return self.height + moved @ (self.slope - 0.5 * self.curvature @ moved)
+
+    def pull(self, z: jax.Array) -> jax.Array:
+        """Slope (M,) at z."""
+        return self.slope - self.curvature @ (z - self.at)
+
+
 class Recursion(NamedTuple):
     """Arrays of one recursion: E epochs of targets that share a state layout, n entries of it with a linear form."""
 
@@ -113,7 +134,7 @@ class Model(Stepwise):
     recursions: tuple[Recursion, ...]
     rows: tuple[Rows, ...]  # of each block
     level_spread: jax.Array  # (H,) standard deviation of each log level
-    tilt: tuple[jax.Array, jax.Array] | None = None  # constant and slope (M,) by z of the log-likelihood beside rows
+    tilt: Tilt | None = None
 
     # at a point
 
@@ -205,7 +226,6 @@ class Model(Stepwise):
         """Rows compressed onto the biases at fixed trajectories: information (M, M), score (M,) (Paper C 35-36)."""
         M = self.biases
         G, g = jnp.zeros((M + 1, M + 1)), jnp.zeros(M + 1)
-        g = g if self.tilt is None else g.at[:M].add(self.tilt[1])
         for data, lin in zip(self.rows, lins, strict=True):
             S = data.bias.shape[0]
             own = jax.ops.segment_sum(jnp.einsum("ncp,nc,ncq->npq", lin.bias, lin.weight, lin.bias), data.sensor, S)
@@ -343,8 +363,8 @@ class Model(Stepwise):
         """Precisions (E,) that the noises of each tail of each recursion are taken to have."""
         return tuple(tuple(tail.weight for tail in part.tails) for part in self.recursions)
 
-    def with_tilt(self, tilt: tuple[jax.Array, jax.Array] | None) -> "Model":
-        """The model with a linear term of the log-likelihood of the biases, or without (see `smoothing.places`)."""
+    def with_tilt(self, tilt: Tilt | None) -> "Model":
+        """The model with a term of the log-likelihood of the biases beside that of the rows, or without."""
         return replace(self, tilt=tilt)
 
     def with_mixing(self, weights: Mixing) -> "Model":

@@ -25,6 +25,7 @@ from probcal.smoothing.mode import (
     factors,
     log_density,
     mixing_gain,
+    tilted,
 )
 from probcal.smoothing.solves import Dense
 
@@ -144,7 +145,7 @@ def linearise_rows(model: Model, point: Point) -> tuple[Linearised, ...]:
 @jax.jit
 def compress_and_eliminate(model: Model, point: Point, rows: tuple[Linearised, ...]) -> tuple[Compressed, Eliminated]:
     """Linearised rows compressed, and the system without its trajectories."""
-    system = compress(model, rows)
+    system = tilted(model, point.z, compress(model, rows))
     return system, eliminate_compressed(model, point.noises, point.levels, system)
 
 

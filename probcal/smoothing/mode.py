@@ -69,7 +69,7 @@ def factors(part: Recursion, levels: jax.Array) -> jax.Array:
 
 def log_likelihood(model: Model, point: Where) -> jax.Array:
     """Log-likelihood of all data at a point, with the tilt of the model."""
-    beside = jnp.zeros(()) if model.tilt is None else model.tilt[0] + model.tilt[1] @ point.z
+    beside = jnp.zeros(()) if model.tilt is None else model.tilt.value(point.z)
     return sum((jnp.sum(part) for part in model.log_likelihood(point)), beside)
 
 
@@ -128,6 +128,7 @@ def eliminate(model: Model, point: Point, *, expected: bool, joint: bool = True)
 def eliminate_rows(model: Model, point: Point, lins: Sequence[Linearised], *, joint: bool = True) -> Eliminated:
     """Eliminate every trajectory from rows linearised around a point by any rule."""
     compressed = compress(model, lins, joint=joint)
+    compressed = tilted(model, point.z, compressed) if joint else compressed
     return eliminate_compressed(model, point.noises, point.levels, compressed, joint=joint)
 
 
@@ -138,6 +139,14 @@ def compress(model: Model, lins: Sequence[Linearised], *, joint: bool = True) ->
         return Compressed(*model.of_biases(lins), own, tuple(model.of_both(lins)))
     crosses = tuple(jnp.zeros((*part.drift.shape, 0)) for part in model.recursions)
     return Compressed(jnp.zeros((0, 0)), jnp.zeros(0), own, crosses)
+
+
+def tilted(model: Model, z: jax.Array, compressed: Compressed) -> Compressed:
+    """Compressed rows with the tilt of the model at z."""
+    if model.tilt is None:
+        return compressed
+    information, score = compressed.information + model.tilt.curvature, compressed.score + model.tilt.pull(z)
+    return compressed._replace(information=information, score=score)
 
 
 def eliminate_compressed(

@@ -1,11 +1,12 @@
 """Places of targets that stand still, integrated by quadrature where Laplace's formula is wrong.
 
 A tag that one receiver hears stands anywhere on a ring, one that two hear on either side of their line. What such an
-integral adds to that of the Gaussian at the mode changes slowly with the biases: near a point it is a linear term of
-their log-likelihood, the tilt, which a model carries like one more datum.
+integral adds to that of the Gaussian at the mode is near a point a quadratic term of the log-likelihood of the biases,
+the tilt, which a model carries like one more datum.
 """
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import logsumexp
 
-from probcal.model.model import At, Model
+from probcal.model.model import At, Model, Tilt
 from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
 from probcal.smoothing.marginal import volume_slope
 from probcal.smoothing.mode import Point, factors
@@ -26,6 +27,8 @@ FINE = 0.8  # sds of what is left that a cell may be wide
 FAR = 22.0  # nats below the best within which cells are kept
 LEVELS, CELLS = 14, 2048  # most halvings, and cells of a target that are halved at once
 WORK = 4e7  # cells times rows of a look: more rows have fewer cells
+LEAST = 0.1  # share of the information of Laplace's formula that is left along every direction
+CURVED = 200  # biases up to which the curvature of what is added is worked out
 BATCH, ROWS = 256, 2_000_000  # cells evaluated by one call, and rows times cells of it that are in memory at once
 
 
@@ -37,25 +40,44 @@ class Still(NamedTuple):
     root: jax.Array
 
 
-def tilt_of(model: Model, point: Point) -> tuple[jax.Array, jax.Array] | None:
-    """Constant and slope (M,) of what exact integrals over places add to Laplace's formula near a consistent point.
+def places_of(model: Model, point: Point) -> tuple[Still, ...] | None:
+    """Targets that stand still, and of these those that Laplace's formula is wrong for at a consistent point.
 
-    None where no target stands still, or where the formula is right for all that do.
+    None where no target stands still; where the formula is right for all that do, none of them is on.
     """
     still = _still(model, point)
-    if still is None or not model.biases:
-        return None
-    still = _curved(model, point, still)
+    return None if still is None or not model.biases else _curved(model, point, still)
+
+
+def tilt_of(model: Model, point: Point, still: tuple[Still, ...]) -> Tilt | None:
+    """What exact integrals over chosen places add to Laplace's formula near a consistent point; None if not finite.
+
+    Its curvature is what the information of the biases becomes: expected information less the variance of the score
+    over the places (Louis 1982), in the place of the Schur complement.
+    """
+    M = model.biases
     if not any(np.any(s.on) for s in still):
-        return None
-    height, slope = _gain(model, point, still, *_cells(model, point, still))
+        return Tilt(point.z, jnp.zeros(()), jnp.zeros(M), jnp.zeros((M, M)))
+    height, slope, information = _gain(model, point, still, *_cells(model, point, still))
     _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
     epochs = tuple(s.on[part.target] for s, part in zip(still, model.recursions, strict=True))
     volume, sound = volume_slope(model, point, solved, epochs)
     slope = slope + 0.5 * np.asarray(volume)
-    if not (bool(sound) and np.isfinite(height) and np.isfinite(slope).all()):
+    curvature = np.zeros((M, M))
+    if information is not None:
+        curvature = _bounded(np.asarray(solved.information), information + np.asarray(_schur(model, point, still)))
+    if not (bool(sound) and np.isfinite(height) and np.isfinite(slope).all() and np.isfinite(curvature).all()):
         return None
-    return jnp.asarray(height - slope @ np.asarray(point.z)), jnp.asarray(slope)
+    return Tilt(point.z, jnp.asarray(height), jnp.asarray(slope), jnp.asarray(curvature))
+
+
+def _bounded(information: np.ndarray, curvature: np.ndarray) -> np.ndarray:
+    """A curvature (M, M) that leaves its share of the information (M, M) of Laplace's formula along every direction."""
+    root = np.linalg.cholesky(information + (1e-9 * np.trace(information) + 1e-6) * np.eye(len(information)))
+    half = np.linalg.solve(root, np.linalg.solve(root, 0.5 * (curvature + curvature.T)).T)
+    values, vectors = np.linalg.eigh(0.5 * (half + half.T))
+    back = root @ vectors
+    return (back * np.maximum(values, LEAST - 1.0)) @ back.T
 
 
 def _still(model: Model, point: Point) -> tuple[Still, ...] | None:
@@ -101,12 +123,14 @@ def _densities(
     return _by_target(model, model.by_epoch(model.log_likelihood(at)))
 
 
+States = tuple[jax.Array, ...]
 Look = list[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def _together(model: Model) -> int:
-    """Cells evaluated side by side."""
-    return max(1, min(BATCH, ROWS // max(sum(data.y.shape[0] for data in model.rows), 1)))
+    """Cells evaluated side by side, a power of two."""
+    each = max(sum(data.y.shape[0] for data in model.rows), sum(model.targets) * model.biases, 1)
+    return min(BATCH, 1 << (max(ROWS // each, 1).bit_length() - 1))
 
 
 @jax.jit
@@ -127,18 +151,59 @@ def _look(model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.Arr
     return jax.lax.map(one, u, batch_size=_together(model))
 
 
+class Moments(NamedTuple):
+    """Of scores by the biases over shares of places: sums (T, M) of each recursion, squares and information (M, M)."""
+
+    first: tuple[jax.Array, ...]
+    second: jax.Array
+    information: jax.Array
+
+
+@partial(jax.jit, static_argnames="curved")
+def _moments(
+    model: Model, point: Point, still: tuple[Still, ...], u: States, shares: States, *, curved: bool
+) -> Moments:
+    """Moments over `BATCH` whitened places (K, T, n) of every target, each with its share (K, T)."""
+    M, together = model.biases, _together(model)
+
+    def one(u: States, p: States) -> Moments:
+        lins = model.linearise(At(_placed(model, point, still, u), point.z, point.levels), expected=True)
+        first = [jnp.zeros((T, M + 1)) for T in model.targets]
+        weighed, second, information = [], jnp.zeros((M, M)), jnp.zeros((M, M))
+        for data, r, lin in zip(model.rows, model.recursion, lins, strict=True):
+            target = model.recursions[r].target[data.epoch]
+            w = p[r][target][:, None]
+            bias, score = jnp.where((w > 0)[:, :, None], lin.bias, 0.0), jnp.where(w > 0, lin.score, 0.0)
+            pull = jnp.einsum("ncp,nc->np", bias, score)
+            first[r] = first[r].at[target[:, None], data.bias[data.sensor]].add(pull)
+            weighed.append(lin._replace(bias=bias, score=score, weight=jnp.where(w > 0, lin.weight * w, 0.0)))
+        g = [own[:, :M] for own in first]
+        if curved:
+            information, _ = model.of_biases(weighed)
+            second = sum((jnp.einsum("tm,t,tn->mn", own, share, own) for own, share in zip(g, p, strict=True)), second)
+        return Moments(tuple(own * w[:, None] for own, w in zip(g, p, strict=True)), second, information)
+
+    def add(total: Moments, some: tuple[States, States]) -> tuple[Moments, None]:
+        found = jax.vmap(one)(*some)
+        return jax.tree.map(lambda a, b: a + jnp.sum(b, 0), total, found), None
+
+    parts = jax.tree.map(lambda x: x.reshape(-1, together, *x.shape[1:]), (u, shares))
+    nothing = Moments(tuple(jnp.zeros((T, M)) for T in model.targets), jnp.zeros((M, M)), jnp.zeros((M, M)))
+    return jax.lax.scan(add, nothing, parts)[0]
+
+
 @jax.jit
-def _pulled(
-    model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.Array, ...], shares: tuple[jax.Array, ...]
-) -> jax.Array:
-    """Slope (M,) by z of the log-likelihoods at `BATCH` places of every target, each with its share (K, T)."""
-
-    def weighted(z: jax.Array, u: tuple[jax.Array, ...], p: tuple[jax.Array, ...]) -> jax.Array:
-        pairs = zip(_densities(model, point, still, z, u), p, strict=True)
-        return sum((jnp.sum(jnp.where(w > 0, f, 0.0) * w) for f, w in pairs), jnp.zeros(()))
-
-    pulls = jax.lax.map(lambda at: jax.grad(weighted)(point.z, *at), (u, shares), batch_size=_together(model))
-    return jnp.sum(pulls, 0)
+def _schur(model: Model, point: Point, still: tuple[Still, ...]) -> jax.Array:
+    """What Laplace's formula takes the chosen places to leave unknown: J_zx W^-1 J_xz (M, M) summed over targets."""
+    lins = model.linearise(point, expected=True)
+    J = _by_target(model, [own for own, _ in model.of_states(lins)])
+    cross = _by_target(model, model.of_both(lins))
+    lost = jnp.zeros((model.biases, model.biases))
+    for s, j, c in zip(still, J, cross, strict=True):
+        W = jnp.eye(j.shape[1])[None] + jnp.einsum("tji,tjk,tkl->til", s.root, j, s.root)
+        right = jnp.einsum("tji,tjm->tim", s.root, c)
+        lost = lost + jnp.einsum("tim,tin,t->mn", right, jnp.linalg.solve(W, right), s.on.astype(right.dtype))
+    return lost
 
 
 def _looked(model: Model, point: Point, still: tuple[Still, ...], u: list[np.ndarray]) -> Look:
@@ -280,8 +345,11 @@ def _padded(model: Model, cells: dict[tuple[int, int], np.ndarray]) -> list[np.n
 
 def _gain(
     model: Model, point: Point, still: tuple[Still, ...], u: list[np.ndarray], log_weights: list[np.ndarray]
-) -> tuple[float, np.ndarray]:
-    """Sum over the chosen targets of the log integral less Laplace's, and its slope (M,) but for the determinants."""
+) -> tuple[float, np.ndarray, np.ndarray | None]:
+    """Sum over the chosen targets of the log integral less Laplace's, and its slope (M,) but for the determinants.
+
+    Third, what they tell about the biases less what their rows tell at the places of the point, (M, M).
+    """
     looked = _looked(model, point, still, u)
     here = _first(model, point)
     tops = _looked(model, point, still, [m[None] for m in here])
@@ -293,13 +361,16 @@ def _gain(
             shares.append(np.where(on, np.exp(f + log_weight - total), 0.0))
         ones.append(np.where(on, 1.0, 0.0)[None])
         height += float(np.sum((total - top[0] + 0.5 * np.linalg.slogdet(W[0])[1])[on]))
-    slope = -np.asarray(
-        sum(_pulled(model, point, still, *_halves(b, len(u))) for b in _batches([m[None] for m in here] + ones))
-    )
-    for both in _batches(u + shares):
-        slope = slope + np.asarray(_pulled(model, point, still, *_halves(both, len(u))))
-    return height, slope
+    curved = model.biases <= CURVED
 
+    def moments(u: list[np.ndarray], shares: list[np.ndarray]) -> Moments:
+        parts = [(both[: len(u)], both[len(u) :]) for both in _batches(u + shares)]
+        found = [_moments(model, point, still, *part, curved=curved) for part in parts]
+        return jax.tree.map(lambda *leaves: sum(np.asarray(leaf) for leaf in leaves), *found)
 
-def _halves(both: tuple[jax.Array, ...], count: int) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
-    return both[:count], both[count:]
+    over, top_ = moments(u, shares), moments([m[None] for m in here], ones)
+    slope = np.concatenate(over.first).sum(0) - np.concatenate(top_.first).sum(0)
+    if not curved:
+        return height, slope, None
+    first = np.concatenate(over.first)
+    return height, slope, np.asarray(over.information - top_.information - over.second) + first.T @ first
