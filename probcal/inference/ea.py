@@ -131,8 +131,9 @@ class EA(Maximiser):
     posterior and is always maximised. Noise levels that are unknown maximise the evidence and are held.
 
     `trajectory` says what the reported point is: "marginal" the mode of the biases with the trajectory integrated
-    (Laplace; see `smoothing.marginal`), "joint" that of biases and trajectory together, which shrinks a scene whose
-    size only the motion tells, "smoothed" Paper B as printed: the smoothed density of each epoch alone stands for
+    (Laplace, see `smoothing.marginal`; the places of targets at rest by quadrature where Laplace is wrong, on a ring or
+    on either side of a line, see `smoothing.places`), "joint" that of biases and trajectory together, which shrinks a
+    scene whose size only the motion tells, "smoothed" Paper B as printed: the smoothed density of each epoch alone stands for
     the trajectory (R-bar, 10-17), so that the data count twice. `EA.as_printed()` is the joint mode with precisions
     maximised. `update` of maximised precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed points,
     slower). `tolerance` is the change of log evidence, in nats, at which it stops; `iterations` caps the outer loop.
@@ -259,7 +260,7 @@ class MAP(Maximiser):
     """Mode under a given prior with its Laplace covariance: of the marginal, or of trajectories and biases jointly.
 
     `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood; `trajectory` "marginal" or "joint", as
-    in `EA`. Raises `InputError` for another trajectory.
+    in `EA`, places on rings included. Raises `InputError` for another trajectory.
     """
 
     iterations: int = 500
