@@ -133,11 +133,11 @@ class EA(Maximiser):
     `trajectory` says what the reported point is: "marginal" the mode of the biases with the trajectory integrated
     (Laplace, see `smoothing.marginal`; the places of targets at rest by quadrature where Laplace is wrong, on a ring or
     on either side of a line, see `smoothing.places`), "joint" that of biases and trajectory together, which shrinks a
-    scene whose size only the motion tells, "smoothed" Paper B as printed: the smoothed density of each epoch alone stands for
-    the trajectory (R-bar, 10-17), so that the data count twice. `EA.as_printed()` is the joint mode with precisions
-    maximised. `update` of maximised precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed points,
-    slower). `tolerance` is the change of log evidence, in nats, at which it stops; `iterations` caps the outer loop.
-    Raises `InputError` for another update, trajectory or kind of precisions.
+    scene whose size only the motion tells, "smoothed" Paper B as printed: the smoothed density of each epoch alone
+    stands for the trajectory (R-bar, 10-17), so that the data count twice. `EA.as_printed()` is the joint mode with
+    precisions maximised. `update` of maximised precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed
+    points, slower). `tolerance` is the change of log evidence, in nats, at which it stops; `iterations` caps the outer
+    loop. Raises `InputError` for another update, trajectory or kind of precisions.
 
     >>> type(EA().first_prior()), type(EA.as_printed().first_prior())
     (<class 'probcal.priors.Horseshoe'>, <class 'probcal.priors.ARD'>)

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import logsumexp
 
+from probcal import linalg
 from probcal.model.model import At, Model, Tilt
 from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
 from probcal.smoothing.marginal import volume_slope
@@ -151,7 +151,7 @@ def _look(model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.Arr
     return jax.lax.map(one, u, batch_size=_together(model))
 
 
-class Moments(NamedTuple):
+class PlaceScores(NamedTuple):
     """Of scores by the biases over shares of places: sums (T, M) of each recursion, squares and information (M, M)."""
 
     first: tuple[jax.Array, ...]
@@ -162,11 +162,11 @@ class Moments(NamedTuple):
 @partial(jax.jit, static_argnames="curved")
 def _moments(
     model: Model, point: Point, still: tuple[Still, ...], u: States, shares: States, *, curved: bool
-) -> Moments:
-    """Moments over `BATCH` whitened places (K, T, n) of every target, each with its share (K, T)."""
+) -> PlaceScores:
+    """PlaceScores over `BATCH` whitened places (K, T, n) of every target, each with its share (K, T)."""
     M, together = model.biases, _together(model)
 
-    def one(u: States, p: States) -> Moments:
+    def one(u: States, p: States) -> PlaceScores:
         lins = model.linearise(At(_placed(model, point, still, u), point.z, point.levels), expected=True)
         first = [jnp.zeros((T, M + 1)) for T in model.targets]
         weighed, second, information = [], jnp.zeros((M, M)), jnp.zeros((M, M))
@@ -181,14 +181,14 @@ def _moments(
         if curved:
             information, _ = model.of_biases(weighed)
             second = sum((jnp.einsum("tm,t,tn->mn", own, share, own) for own, share in zip(g, p, strict=True)), second)
-        return Moments(tuple(own * w[:, None] for own, w in zip(g, p, strict=True)), second, information)
+        return PlaceScores(tuple(own * w[:, None] for own, w in zip(g, p, strict=True)), second, information)
 
-    def add(total: Moments, some: tuple[States, States]) -> tuple[Moments, None]:
+    def add(total: PlaceScores, some: tuple[States, States]) -> tuple[PlaceScores, None]:
         found = jax.vmap(one)(*some)
         return jax.tree.map(lambda a, b: a + jnp.sum(b, 0), total, found), None
 
     parts = jax.tree.map(lambda x: x.reshape(-1, together, *x.shape[1:]), (u, shares))
-    nothing = Moments(tuple(jnp.zeros((T, M)) for T in model.targets), jnp.zeros((M, M)), jnp.zeros((M, M)))
+    nothing = PlaceScores(tuple(jnp.zeros((T, M)) for T in model.targets), jnp.zeros((M, M)), jnp.zeros((M, M)))
     return jax.lax.scan(add, nothing, parts)[0]
 
 
@@ -202,7 +202,8 @@ def _schur(model: Model, point: Point, still: tuple[Still, ...]) -> jax.Array:
     for s, j, c in zip(still, J, cross, strict=True):
         W = jnp.eye(j.shape[1])[None] + jnp.einsum("tji,tjk,tkl->til", s.root, j, s.root)
         right = jnp.einsum("tji,tjm->tim", s.root, c)
-        lost = lost + jnp.einsum("tim,tin,t->mn", right, jnp.linalg.solve(W, right), s.on.astype(right.dtype))
+        alone = linalg.forward(linalg.semi_cholesky(W), right)
+        lost = lost + jnp.einsum("tim,tin,t->mn", alone, alone, s.on.astype(alone.dtype))
     return lost
 
 
@@ -264,7 +265,7 @@ def _curved(model: Model, point: Point, still: tuple[Still, ...]) -> tuple[Still
     chosen = []
     parts = zip(still, rules, looked, here, _poses(model), strict=True)
     for s, (_, log_w), (f, _, _), (top, _, _), poses in parts:
-        off = np.abs(logsumexp(f[: len(log_w)] - top + log_w[:, None], axis=0))
+        off = np.abs(np.logaddexp.reduce(f[: len(log_w)] - top + log_w[:, None], axis=0))
         few = poses <= s.mean.shape[1] + FEW
         chosen.append(s._replace(on=jnp.asarray(np.asarray(s.on) & (poses > 0) & (few | (off > OFF)))))
     return tuple(chosen)
@@ -357,13 +358,13 @@ def _gain(
     for s, (f, _, _), (top, _, W), log_weight in zip(still, looked, tops, log_weights, strict=True):
         on = np.asarray(s.on)
         with np.errstate(invalid="ignore"):
-            total = logsumexp(f + log_weight, axis=0)
+            total = np.logaddexp.reduce(f + log_weight, axis=0)
             shares.append(np.where(on, np.exp(f + log_weight - total), 0.0))
         ones.append(np.where(on, 1.0, 0.0)[None])
         height += float(np.sum((total - top[0] + 0.5 * np.linalg.slogdet(W[0])[1])[on]))
     curved = model.biases <= CURVED
 
-    def moments(u: list[np.ndarray], shares: list[np.ndarray]) -> Moments:
+    def moments(u: list[np.ndarray], shares: list[np.ndarray]) -> PlaceScores:
         parts = [(both[: len(u)], both[len(u) :]) for both in _batches(u + shares)]
         found = [_moments(model, point, still, *part, curved=curved) for part in parts]
         return jax.tree.map(lambda *leaves: sum(np.asarray(leaf) for leaf in leaves), *found)
