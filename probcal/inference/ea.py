@@ -89,10 +89,10 @@ def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode,
         found.evidence if prior.proper or not prior.learns else _density(model, prior, given, mode.point) - mode.volume
     )
     still = jnp.abs(objective - state.objective) < given.tolerance
-    # where a target grazes a sensor the density has a cusp: no step lowers the cost, and none is needed
-    settled = mode.converged | (mode.gained < given.tolerance)
+    # on a cusp, where a target grazes a sensor, and where rounding hides what is left, no step lowers the cost
+    nothing = still & (mode.gained < given.tolerance)
     learns = prior.learns or mode.point.levels.shape[0] or model.tailed
-    done = still & settled if learns else mode.converged
+    done = nothing | (mode.converged & still if learns else mode.converged)
     refused = state.refused & mode.refused
     state = state._replace(point=mode.point, found=found, objective=objective, refused=refused, done=done)
     return valued(prior, given, state)
