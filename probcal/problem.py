@@ -16,7 +16,7 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.model.epochs import Epoch, merged
-from probcal.model.model import Mixing, Model, Recursion, Tail, Tilt
+from probcal.model.model import TILTED, Mixing, Model, Recursion, Tail, Tilt, at_rest
 from probcal.model.motions import (
     DIFFUSE,
     FAR,
@@ -248,8 +248,8 @@ class Problem:
             declared = declared[name]
         return declared if isinstance(declared, Target) else Target(declared)
 
-    def with_tilt(self, tilt: Tilt | None) -> Problem:
-        """The same problem with a term of the log-likelihood of its biases beside that of the rows, or without."""
+    def with_tilt(self, tilt: Tilt) -> Problem:
+        """The same problem with a term of the log-likelihood of its biases beside that of the rows."""
         other = copy(self)
         other.model = self.model.with_tilt(tilt)
         return other
@@ -333,6 +333,8 @@ class Problem:
             number >= 0 for sampled in sampled_of_each if sampled is not None for *_, number in sampled.levels
         )
         spread: Any = np.array([np.log(level.factor) for level in self.levels])
+        counts = tuple(len(dict.fromkeys(epochs.target)) for epochs in self.epochs)
+        rest = any(at_rest(part, T).any() for part, T in zip(recursions, counts, strict=True))
         # put, not `asarray`: that compiles a copy for every new shape
         self.model = jax.device_put(
             Model(
@@ -340,12 +342,13 @@ class Problem:
                 tuple(own.recursion for own in gathered),
                 len(self.biases),
                 driven,
-                tuple(len(dict.fromkeys(epochs.target)) for epochs in self.epochs),
+                counts,
                 all(bool((np.linalg.slogdet(part.L)[0] != 0).all()) for part in recursions),
                 sampled_of_each,
                 recursions,
                 rows,
                 spread,
+                Tilt.none(len(self.biases)) if rest and len(self.biases) <= TILTED else None,
             ),
             may_alias=False,
         )

@@ -26,7 +26,7 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.linearised import LaplaceApproximation, compress_and_eliminate, laplace, linearise_rows
-from probcal.smoothing.mode import Point, cost
+from probcal.smoothing.mode import Eliminated, Point, cost
 from probcal.smoothing.places import places_of, tilt_of
 from probcal.smoothing.tails import expected_mixing, rewhitened
 
@@ -143,7 +143,7 @@ class Maximiser(Method, ABC):
         """
         tilt, leash, wanted = tilt_of(plain.model, state.point, chosen), 0.0, np.inf
         if tilt is None:
-            return plain, state._replace(done=jnp.zeros((), bool)), trace
+            return plain, state._replace(done=jax.device_put(np.array(False))), trace
         worth = self._worth(plain, prior, state) + float(tilt.height)
         for _ in range(TILTS):
             held = tilt._replace(curvature=tilt.curvature + leash * np.asarray(_metric(state)))
@@ -155,14 +155,14 @@ class Maximiser(Method, ABC):
             if after is None or not better > worth - SLACK:
                 leash = max(4.0 * leash, 1.0)
                 continue
-            wants = _sds(tried, after.slope - held.pull(tried.point.z))
+            wants = _sds(tried, after.slope - held.pull(np.asarray(tried.point.z)))
             state, tilt, worth = tried, after, better
             if wants < ASIDE:
                 break
             looser = 0.25 * leash if leash > 0.1 else 0.0
             leash, wanted = max(4.0 * leash, 1.0) if wants > 0.5 * wanted else looser, wants
         else:
-            state = state._replace(done=jnp.zeros((), bool))
+            state = state._replace(done=jax.device_put(np.array(False)))
         problem = plain.with_tilt(tilt)
         given = given_of(self, problem, prior)
         model = problem.model.with_mixing(state.mixing)
@@ -172,12 +172,13 @@ class Maximiser(Method, ABC):
     def _worth(self, problem: Problem, prior: Prior, state: State) -> float:
         """What a climb maximises but for the tilt: the marginal density of the biases, its own where it learns more."""
         model = problem.model.with_mixing(state.mixing)
-        point, beside = state.point, 0.0 if model.tilt is None else float(model.tilt.value(state.point.z))
+        tilt = jax.device_get(model.tilt)
+        beside = 0.0 if tilt is None else float(tilt.value(np.asarray(state.point.z)))
         if self.climbs_under(prior).learns or model.level_spread.shape[0] or model.tailed:
             return float(state.worth) - beside
         given = given_of(self, problem, prior).prior._replace(alpha=state.alpha)
-        _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
-        return -float(cost(model, point, given) + 0.5 * solved.logdet) - beside
+        _, solved = compress_and_eliminate(model, state.point, linearise_rows(model, state.point))
+        return -float(_marginal_cost(model, state.point, given, solved)) - beside
 
     @property
     def integrates_places(self) -> bool:
@@ -211,6 +212,12 @@ class Maximiser(Method, ABC):
     def close(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """What is computed once a chunk."""
         return state
+
+
+@jax.jit
+def _marginal_cost(model: Model, point: Point, prior: Precision, solved: Eliminated) -> jax.Array:
+    """Negative log marginal density of the biases at a point whose trajectories are at their mode."""
+    return cost(model, point, prior) + 0.5 * solved.logdet
 
 
 def _metric(state: State) -> np.ndarray:

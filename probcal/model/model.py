@@ -72,23 +72,32 @@ class Tail:
         return jnp.sum(u[:, slice(*self.columns)] ** 2, 1) / self.weight
 
 
+TILTED = 200  # biases up to which the curvature of a tilt is worked out, and room for one is kept
+
+
 class Tilt(NamedTuple):
     """A term of the log-likelihood of the biases beside that of the rows, quadratic about a point.
 
     Places that are integrated add it (see `smoothing.places`).
     """
 
-    at: jax.Array  # (M,) point z
-    height: jax.Array  # () value there
-    slope: jax.Array  # (M,) by z there
-    curvature: jax.Array  # (M, M) minus its second derivative
+    at: Any  # (M,) point z
+    height: Any  # () value there
+    slope: Any  # (M,) by z there
+    curvature: Any  # (M, M) minus its second derivative
 
-    def value(self, z: jax.Array) -> jax.Array:
+    @classmethod
+    def none(cls, biases: int) -> "Tilt":
+        """Nothing, in the form of something: kernels compiled for it serve what is found later."""
+        zero = np.zeros(biases)
+        return cls(zero, np.zeros(()), zero, np.zeros((biases, biases)))
+
+    def value(self, z: Any) -> Any:
         """What is added at z."""
         moved = z - self.at
         return self.height + moved @ (self.slope - 0.5 * self.curvature @ moved)
 
-    def pull(self, z: jax.Array) -> jax.Array:
+    def pull(self, z: Any) -> Any:
         """Slope (M,) at z."""
         return self.slope - self.curvature @ (z - self.at)
 
@@ -115,6 +124,18 @@ class Recursion(NamedTuple):
         return found
 
 
+def at_rest(part: Recursion, targets: int) -> np.ndarray:
+    """Which of so many targets (T,) of a recursion never leave a first place that is not known."""
+    E, n = part.drift.shape
+    if not E or part.tails:
+        return np.zeros(targets, bool)
+    first, target, L = np.asarray(part.first), np.asarray(part.target), np.asarray(part.L)
+    held = np.all(L == 0, (1, 2))
+    rests = np.all(np.asarray(part.F) == np.eye(n), (1, 2)) & held & np.all(np.asarray(part.drift) == 0, 1)
+    moves = np.bincount(target, ~(first | rests), targets) > 0
+    return ~moves & (np.bincount(target, first & ~held, targets) == 1)
+
+
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["recursions", "rows", "level_spread", "tilt"],
@@ -134,7 +155,7 @@ class Model(Stepwise):
     recursions: tuple[Recursion, ...]
     rows: tuple[Rows, ...]  # of each block
     level_spread: jax.Array  # (H,) standard deviation of each log level
-    tilt: Tilt | None = None
+    tilt: Tilt | None = None  # where a target is at rest and the biases are not many
 
     # at a point
 
@@ -363,8 +384,8 @@ class Model(Stepwise):
         """Precisions (E,) that the noises of each tail of each recursion are taken to have."""
         return tuple(tuple(tail.weight for tail in part.tails) for part in self.recursions)
 
-    def with_tilt(self, tilt: Tilt | None) -> "Model":
-        """The model with a term of the log-likelihood of the biases beside that of the rows, or without."""
+    def with_tilt(self, tilt: Tilt) -> "Model":
+        """The model with a term of the log-likelihood of the biases beside that of the rows."""
         return replace(self, tilt=tilt)
 
     def with_mixing(self, weights: Mixing) -> "Model":

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.model.model import At, Model, Tilt
+from probcal.model.model import TILTED, At, Model, Tilt, at_rest
 from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
 from probcal.smoothing.marginal import volume_slope
 from probcal.smoothing.mode import Point, factors
@@ -28,7 +28,6 @@ FAR = 22.0  # nats below the best within which cells are kept
 LEVELS, CELLS = 14, 2048  # most halvings, and cells of a target that are halved at once
 WORK = 4e7  # cells times rows of a look: more rows have fewer cells
 LEAST = 0.1  # share of the information of Laplace's formula that is left along every direction
-CURVED = 200  # biases up to which the curvature of what is added is worked out
 BATCH, ROWS = 256, 2_000_000  # cells evaluated by one call, and rows times cells of it that are in memory at once
 
 
@@ -57,7 +56,7 @@ def tilt_of(model: Model, point: Point, still: tuple[Still, ...]) -> Tilt | None
     """
     M = model.biases
     if not any(np.any(s.on) for s in still):
-        return Tilt(point.z, jnp.zeros(()), jnp.zeros(M), jnp.zeros((M, M)))
+        return Tilt.none(M)
     height, slope, information = _gain(model, point, still, *_cells(model, point, still))
     _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
     epochs = tuple(s.on[part.target] for s, part in zip(still, model.recursions, strict=True))
@@ -68,7 +67,7 @@ def tilt_of(model: Model, point: Point, still: tuple[Still, ...]) -> Tilt | None
         curvature = _bounded(np.asarray(solved.information), information + np.asarray(_schur(model, point, still)))
     if not (bool(sound) and np.isfinite(height) and np.isfinite(slope).all() and np.isfinite(curvature).all()):
         return None
-    return Tilt(point.z, jnp.asarray(height), jnp.asarray(slope), jnp.asarray(curvature))
+    return Tilt(np.asarray(point.z), np.asarray(height), slope, curvature)
 
 
 def _bounded(information: np.ndarray, curvature: np.ndarray) -> np.ndarray:
@@ -82,22 +81,17 @@ def _bounded(information: np.ndarray, curvature: np.ndarray) -> np.ndarray:
 
 def _still(model: Model, point: Point) -> tuple[Still, ...] | None:
     """The targets that stand still at a place that is not known; None without any."""
-    found, some = [], False
-    for r, part in enumerate(model.recursions):
-        E, n = part.drift.shape
-        T = model.targets[r]
-        on = np.zeros(T, bool)
-        L, drift = np.asarray(factors(part, point.levels)), np.asarray(part.drift)
+    resting = [at_rest(part, T) for part, T in zip(model.recursions, model.targets, strict=True)]
+    if not any(on.any() for on in resting):
+        return None
+    found = []
+    for part, T, on in zip(model.recursions, model.targets, resting, strict=True):
+        n = part.drift.shape[1]
+        first, target, L = np.asarray(part.first), np.asarray(part.target), np.asarray(factors(part, point.levels))
         mean, root = np.zeros((T, n)), np.zeros((T, n, n))
-        if n <= MOST and E and not part.tails:
-            first, target = np.asarray(part.first), np.asarray(part.target)
-            rests = np.all(np.asarray(part.F) == np.eye(n), (1, 2)) & np.all(L == 0, (1, 2)) & np.all(drift == 0, 1)
-            moves = np.bincount(target, ~(first | rests), T) > 0
-            mean[target[first]], root[target[first]] = drift[first], L[first]
-            on = ~moves & np.any(root != 0, (1, 2)) & (np.bincount(target, first, T) == 1)
-        some = some or bool(on.any())
-        found.append(Still(jnp.asarray(on), jnp.asarray(mean), jnp.asarray(root)))
-    return tuple(found) if some else None
+        mean[target[first]], root[target[first]] = np.asarray(part.drift)[first], L[first]
+        found.append(Still(*jax.device_put((on & (n <= MOST), mean, root))))
+    return tuple(found)
 
 
 def _by_target(model: Model, values: list[jax.Array]) -> list[jax.Array]:
@@ -362,7 +356,7 @@ def _gain(
             shares.append(np.where(on, np.exp(f + log_weight - total), 0.0))
         ones.append(np.where(on, 1.0, 0.0)[None])
         height += float(np.sum((total - top[0] + 0.5 * np.linalg.slogdet(W[0])[1])[on]))
-    curved = model.biases <= CURVED
+    curved = model.biases <= TILTED
 
     def moments(u: list[np.ndarray], shares: list[np.ndarray]) -> PlaceScores:
         parts = [(both[: len(u)], both[len(u) :]) for both in _batches(u + shares)]
