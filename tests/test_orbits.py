@@ -74,6 +74,7 @@ def test_an_orbit_is_a_group_that_leaves_what_the_sensors_see(case):
                     np.testing.assert_allclose(np.sin(gone) if d == 2 else gone, 0.0, atol=1e-9)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("case", CASES)
 def test_its_volume_is_the_determinant_of_its_derivative(case):
     problem, _, made, orbits = posed(*case)

@@ -254,6 +254,7 @@ def test_other_measured_values():
 # verdicts
 
 
+@pytest.mark.ci
 def test_a_method_that_is_exact_is_uniform():
     """MAP on a linear network, 40 runs; coverage within 4 standard errors."""
     tree = sbc(linear(), MAP(), prior=Gaussian(), runs=40, threads=2)

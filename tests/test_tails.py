@@ -182,6 +182,7 @@ def test_samplers_draw_the_exact_posterior(method):
     assert abs(float(found["sd"][0]) - sd) < 4 * error
 
 
+@pytest.mark.ci
 def test_the_density_is_one_at_whatever_weights_and_that_of_numpyro():
     with jax.enable_x64(True):
         problem = turned()
