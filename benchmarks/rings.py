@@ -103,7 +103,7 @@ def quadrature(drawn, kind):
                 told += log_ndtr((FLOOR - mean) / STD) @ unheard
             each = logsumexp(told[:, seen], axis=0)
             if kind == "dropped":  # of a tag that nobody heard nobody knows
-                silent = np.exp(READINGS * log_ndtr((FLOOR - mean) / STD).sum(1))
+                silent = np.minimum(np.exp(READINGS * log_ndtr((FLOOR - mean) / STD).sum(1)), 1.0 - 1e-15)
                 each = each - logsumexp(prior[:, 0] + np.log1p(-silent))
             log_p.append(each.sum() - 0.5 * ((value - NOMINAL) / SCALE) ** 2)
         p = np.exp(np.array(log_p) - max(log_p))

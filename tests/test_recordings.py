@@ -47,7 +47,7 @@ def fit_sflab(swap, starts=1, prior=None):
     tree = probcal.fit(sflab.problem(data, swap), EA(), prior=prior, starts=starts)
     assert tree.attrs["status"] == "converged"
     found = displaced(tree, sflab.truth(data, swap), [f"mic_{n}" for n in range(1, 9)], "xy")
-    evidence = f"log evidence under declared scales {tree.attrs['log_evidence_declared']:.1f}"
+    evidence = f"log evidence under declared scales {tree.attrs.get('log_evidence_declared', np.nan):.1f}"
     say(f"sflab, swap {swap}, {starts} start(s), prior {prior or 'ARD()'}, {evidence}, m from its place", found)
     return found, tree
 
