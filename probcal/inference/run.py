@@ -31,6 +31,7 @@ from probcal.smoothing.places import places_of, tilt_of
 from probcal.smoothing.tails import expected_mixing, rewhitened
 
 CHUNK = 5  # outer iterations between two reports of progress
+STALLED = 8  # climbs on the host after which one that gains nothing is given up
 TILTS, ASIDE = 12, 0.02  # most climbs with integrated places, and sds by which the last may leave a bias aside
 SLACK = 0.02  # nats by which the density of integrated places may fall by rounding
 
@@ -341,6 +342,8 @@ def maximise(
             state = stepped(method, problem.model, prior, given, state)
             state = method.close(problem.model.with_mixing(state.mixing), prior, given, state)
             trace = np.append(trace, float(state.objective))
+            if len(trace) > STALLED and not max(trace[-STALLED:]) > max(trace[:-STALLED]) + method.tolerance:
+                break  # it wanders: each of these is many steps
         else:
             left = method.iterations - len(trace)
             state, (objective, idle) = chunk(kernel(method), problem.model, prior, given, state, left)
