@@ -22,6 +22,8 @@ if TYPE_CHECKING:
         observability,
         sensitivity,
     )
+    from probcal.association.objects import Objects, track_objects
+    from probcal.detection import Detection, Sector
     from probcal.errors import FitError, InputError
     from probcal.geodesy import LocalFrame
     from probcal.inference import (
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
         Extended,
         LeastSquares,
         ParticleGibbs,
+        SelfConfiguration,
         Unscented,
         coverage_table,
         fit,
@@ -79,13 +82,15 @@ __all__ = lazy(
             "assess bound_map bounds changes compare interchangeable next_anchors next_passes next_sensors "
             "observability sensitivity"
         ),
+        "probcal.association.objects": "Objects track_objects",
+        "probcal.detection": "Detection Sector",
         "probcal.results.drifts": "drift_table",
         "probcal.results.scores": "add_scores scores",
         "probcal.errors": "FitError InputError",
         "probcal.geodesy": "LocalFrame",
         "probcal.inference": (
-            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares ParticleGibbs Unscented coverage_table "
-            "fit log_evidence numpyro_model particle_filter sbc study track"
+            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares ParticleGibbs SelfConfiguration "
+            "Unscented coverage_table fit log_evidence numpyro_model particle_filter sbc study track"
         ),
         "probcal.motion": (
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"

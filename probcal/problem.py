@@ -37,8 +37,9 @@ from probcal.motion import Layout, LinearMotion, Static, Target, White, as_motio
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, guess_of
 from probcal.plausible import check_plausible
+from probcal.scans import Scans, assigned_rows, scans_of
 from probcal.sensor import Sensor
-from probcal.table import Measurements, Table, header, measure, read_table, unit_factor
+from probcal.table import OBJECT, Measurements, Table, header, measure, read_table, unit_factor
 from probcal.types import float64
 
 if TYPE_CHECKING:
@@ -206,6 +207,27 @@ class Problem:
         """The same problem with other data or fixed biases."""
         settings: dict[str, Any] = {"fix": self.fixed, "epoch": self.epoch} | changes
         return Problem(self.network, self.motion, self.measurements.table if data is None else data, **settings)
+
+    @property
+    def scans(self) -> Scans | None:
+        """The scans of the detections that name no target; None where every row names its own."""
+        return scans_of(self.measurements) if self.measurements.detection.any() else None
+
+    def assigned(self, tracks: Any) -> Problem:
+        """The labelled problem: detections that belong to tracks, each with its weight, and the rows with targets.
+
+        `tracks` is a table with the columns row (of this table, from 0), track and, where not certain, weight, as
+        `track_objects` gives it. Each track has the motion that all objects share. Raises `InputError`.
+        """
+        if self.scans is None:
+            raise InputError("assigned: every row names its target already")
+        table = assigned_rows(self.measurements, tracks)
+        motion = self.motion
+        if isinstance(motion, Mapping):
+            shared = self.target(OBJECT)
+            names = dict.fromkeys(str(name) for name in table.frame["target"])
+            motion = {name: motion.get(name, shared) for name in names}
+        return Problem(self.network, motion, table, fix=self.fixed, epoch=self.epoch)
 
     def select(self, rows: np.ndarray) -> Problem:
         """The same problem with some rows of its table only: a mask or numbers (N,)."""
@@ -459,7 +481,7 @@ class Problem:
         return dict(
             epoch=epoch, sensor=sensor, pose=pose, **local,
             y=np.where(data.measured[pick], data.value[pick], 0.0),
-            mask=data.measured[pick].astype(float),
+            mask=data.measured[pick] * data.weight[chosen, None],
             std=std,
             level=np.where(own, -1, np.asarray(level_of)),
         )  # fmt: skip

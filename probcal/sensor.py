@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.detection import Detection
 from probcal.errors import InputError, nearest
 from probcal.fingerprint import computes
 from probcal.labels import AXES
@@ -197,11 +198,23 @@ class SensorType:
     def __hash__(self) -> int:
         return hash(self.fingerprint)
 
-    def on(self, *nodes: Any, name: str | None = None) -> "Sensor":
-        """Place a sensor of this type on its node(s); the name defaults to that of the node(s)."""
+    def on(self, *nodes: Any, name: str | None = None, detection: Detection | None = None) -> "Sensor":
+        """Place a sensor of this type on its node(s); the name defaults to that of the node(s).
+
+        With `detection` its rows need not name a target: they are detections, those of one time a scan.
+        """
         if len(nodes) != self.arity:
             raise InputError(f"{self.name} uses {self.arity} node(s), {len(nodes)} given")
-        return Sensor(self, tuple(nodes), name or "-".join(str(node.name) for node in nodes))
+        if detection is not None and not isinstance(detection, Detection):
+            raise InputError(
+                f"{self.name}: detection is {type(detection).__name__}; give Detection(probability, clutter)"
+            )
+        if detection is not None:
+            known = {f"{n}_{axis}" if c.per_axis else n for n, c in self.channels.items() for axis in AXES}
+            for channel, _ in detection.limits:
+                if channel not in known:
+                    raise InputError(f'{self.name}: detection limits "{channel}"{nearest(channel, known)}')
+        return Sensor(self, tuple(nodes), name or "-".join(str(node.name) for node in nodes), detection)
 
     def expand(self, dimension: int) -> tuple[tuple[str, Channel], ...]:
         """Scalar channels by name, those declared per axis once a coordinate."""
@@ -232,6 +245,7 @@ class Sensor:
     type: SensorType
     nodes: tuple[Any, ...]
     name: str
+    detection: Detection | None = None  # where its rows need not name a target
 
 
 class _Probe:

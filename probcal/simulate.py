@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError, nearest
@@ -216,6 +217,8 @@ def simulate(
             columns[name][index] = np.where(gone[:, c], np.nan, channel.turned(drawn[:, c]))
     table = plan[["time", "sensor", *(["target"] if "target" in plan else [])]].assign(**columns)
     table = table[~table[list(columns)].isna().all(axis=1)].reset_index(drop=True)
+    if any(placed.detection is not None for placed in network.sensors):
+        table = _detections(problem, table, plan, columns, states, z, keys[3])
     parts = [
         pd.DataFrame(np.asarray(x), columns=list(e.components)).assign(time=e.time, target=e.target)
         for x, e in zip(states, problem.epochs, strict=True)
@@ -224,6 +227,52 @@ def simulate(
     track = track[["time", "target", *(c for c in track.columns if c not in ("time", "target"))]]
     values = dict(zip(problem.labels, (z * problem.scales).tolist(), strict=True))
     return Simulation(table, Truth(track, values))
+
+
+def _detections(
+    problem: Problem, table: pd.DataFrame, plan: pd.DataFrame, columns: Mapping[str, np.ndarray],
+    states: list[np.ndarray], z: np.ndarray, key: jax.Array,
+) -> pd.DataFrame:  # fmt: skip
+    """The table as the sensors report it: some targets missed, false detections, no names, a blank row for nothing."""
+    network, rng = problem.network, np.random.default_rng(np.asarray(jax.random.bits(key, (4,))))
+    placed = {s.name: s for s in network.sensors}
+    kept = np.ones(len(plan), bool)
+    pieces = zip(problem.model.blocks, problem.model.rows, problem.model.recursion, problem.row_index, strict=True)
+    for block, data, r, index in pieces:
+        told = [placed[str(name)].detection for name in plan["sensor"].to_numpy()[index]]
+        chance = np.array([1.0 if own is None else own.probability for own in told])
+        for view in {own.view for own in told if own is not None and own.view is not None}:
+            seen: Any = rows.look(block, data, jnp.asarray(states[r]), jnp.asarray(z), view)
+            mine = np.array([own is not None and own.view is view for own in told])
+            chance = np.where(mine, chance * np.asarray(seen, float), chance)
+        kept[index] = rng.uniform(size=len(index)) < chance
+    detects = plan["sensor"].map(lambda name: placed[str(name)].detection is not None).to_numpy(bool)
+    there = ~np.stack([np.isnan(column) for column in columns.values()]).all(0)
+    found = plan.loc[there & kept & ~detects, [c for c in ("time", "sensor", "target") if c in plan]]
+    found = found.assign(**{name: column[found.index] for name, column in columns.items()})
+    reported = plan.loc[there & kept & detects, ["time", "sensor"]]
+    reported = reported.assign(**{name: column[reported.index] for name, column in columns.items()})
+    parts = [found, reported]
+    for (time, name), _ in plan[detects].groupby(["time", "sensor"], sort=False):
+        own, kind = placed[str(name)].detection, placed[str(name)].type
+        assert own is not None
+        count = rng.poisson(own.clutter)
+        false = {}
+        for channel, declared in kind.expand(network.dimension):
+            pair = own.within(channel, declared.unit, declared.period)
+            if pair is None and own.clutter:
+                raise InputError(
+                    f'simulate: sensor "{name}" has false detections of "{channel}", but nothing tells where; say it in'
+                    f' Detection(..., limits={{"{channel}": (low, high)}})'
+                )
+            low, high = pair or (0.0, 0.0)
+            false[channel] = declared.turned(rng.uniform(low, high, size=count))
+        parts.append(pd.DataFrame({"time": np.full(count, time), "sensor": np.full(count, name, object), **false}))
+        if not count and not ((reported["time"] == time) & (reported["sensor"] == name)).any():
+            parts.append(pd.DataFrame({"time": [time], "sensor": [name]}))
+    whole = pd.concat([part for part in parts if len(part)], ignore_index=True)
+    whole = whole.iloc[rng.permutation(len(whole))].sort_values("time", kind="stable").reset_index(drop=True)
+    return whole[[*(c for c in table.columns if c in whole)]]
 
 
 @partial(jax.jit, static_argnums=0)

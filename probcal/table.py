@@ -36,6 +36,7 @@ UNITS = {
 }  # fmt: skip
 BLANK = ("", "nan", "NaN", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None", "-nan")  # cells without a number
 LARGEST = 1e100  # of a cell: what is computed from it, squares included, stays finite
+OBJECT = "object"  # the target of rows that name none
 NAMES = ("sensor", "target", "node", "name")  # columns whose cells are read as text: 01 stays 01, NA is a name
 
 
@@ -70,6 +71,8 @@ class Measurements:
     std: np.ndarray
     has_std: np.ndarray
     table: Table
+    weight: np.ndarray  # (N,) how much each row counts, 1 where nothing is said
+    detection: np.ndarray  # (N,) whether a row names no target
     floors: Mapping[tuple[int, str], float] = field(default_factory=dict)  # found, by number of the type and channel
 
 
@@ -139,7 +142,7 @@ def measure(table: Table, network: Network) -> Measurements:
         if column not in names:
             raise InputError(f'{table.source} has no column "{column}"{nearest(column, names)}')
     channels = network.channel_names
-    allowed = ["time", "sensor", "target", *channels, *(f"{c}_std" for c in channels)]
+    allowed = ["time", "sensor", "target", *channels, *(f"{c}_std" for c in channels), "weight"]
     for name in names:
         if name not in allowed:
             raise InputError(f'{table.source} column "{name}" is not a channel of the network{nearest(name, allowed)}')
@@ -147,7 +150,9 @@ def measure(table: Table, network: Network) -> Measurements:
         raise InputError(f"{table.source} has no rows")
     sensor = _sensors(table, frame["sensor"], network)
     time = _times(table, frame["time"], units["time"])
-    target_names, target = _targets(table, frame.get("target"), len(frame))
+    detecting = np.array([placed.detection is not None for placed in network.sensors])[sensor]
+    target_names, target, unnamed = _targets(table, frame.get("target"), detecting)
+    weight = _weights(table, frame["weight"] if "weight" in names and "weight" not in channels else None)
     shape = (len(frame), len(channels))
     value, std = np.zeros(shape), np.zeros(shape)
     measured, has_std = np.zeros(shape, bool), np.zeros(shape, bool)
@@ -162,7 +167,9 @@ def measure(table: Table, network: Network) -> Measurements:
         _check_stds(table, f"{name}_std", std[:, j], has_std[:, j])
         _to_channel(table, network, name, j, sensor, units, value, std, measured, below, floors)
     own = has_std & measured
-    result = Measurements(time, sensor, target, target_names, channels, value, measured, std, own, table, floors)
+    result = Measurements(
+        time, sensor, target, target_names, channels, value, measured, std, own, table, weight, unnamed, floors
+    )
     _check_duplicates(result, network)
     return result
 
@@ -285,15 +292,41 @@ def _sensors(table: Table, column: pd.Series, network: Network) -> np.ndarray:
     return found
 
 
-def _targets(table: Table, column: pd.Series | None, rows: int) -> tuple[tuple[str, ...], np.ndarray]:
+def _targets(
+    table: Table, column: pd.Series | None, detecting: np.ndarray
+) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Names of the targets, number of that of each row (N,), and which rows (N,) are detections that name none.
+
+    Detections have the target `OBJECT`, which stands for every object.
+    """
     if column is None:
-        return ("target",), np.zeros(rows, int)
-    text = pd.Series([name_as_text(value) for value in column], dtype=object)
-    blank = np.flatnonzero(column.isna().to_numpy() | (text == "").to_numpy())
-    if len(blank):
-        raise InputError(f'{table.where(blank[0])} column "target" is blank; name the target or drop the column')
+        text, unnamed = pd.Series(np.where(detecting, OBJECT, "target"), dtype=object), detecting
+    else:
+        text = pd.Series([name_as_text(value) for value in column], dtype=object)
+        blank = column.isna().to_numpy() | (text == "").to_numpy()
+        wrong = np.flatnonzero(blank & ~detecting)
+        if len(wrong):
+            raise InputError(
+                f'{table.where(wrong[0])} column "target" is blank; name the target or drop the column, or place the'
+                " sensor with detection=Detection(...)"
+            )
+        unnamed = blank
+        same = np.flatnonzero((text == OBJECT).to_numpy())
+        if blank.any() and len(same):
+            raise InputError(f'{table.where(same[0])}: "{OBJECT}" stands for the detections; rename the target')
+        text[blank] = OBJECT
     codes, names = pd.factorize(text)
-    return tuple(names), codes
+    return tuple(names), codes, unnamed
+
+
+def _weights(table: Table, column: pd.Series | None) -> np.ndarray:
+    if column is None:
+        return np.ones(len(table.frame))
+    value, there = numbers(table, column, "weight")
+    bad = np.flatnonzero(there & ~((value >= 0) & (value <= 1)))
+    if len(bad):
+        raise InputError(f'{table.where(bad[0])} column "weight": {value[bad[0]]:g} does not lie between 0 and 1')
+    return np.where(there, value, 1.0)
 
 
 def _check_stds(table: Table, name: str, std: np.ndarray, given: np.ndarray) -> None:
@@ -383,10 +416,13 @@ def unit_factor(table: Table, name: str, unit: str | None, wanted: str) -> float
 
 def _check_duplicates(data: Measurements, network: Network) -> None:
     for j, name in enumerate(data.channels):
-        rows = np.flatnonzero(data.measured[:, j])
+        rows = np.flatnonzero(data.measured[:, j] & ~data.detection)
         columns = (data.time[rows], data.sensor[rows], data.target[rows])
         frame = pd.DataFrame(dict(zip(("time", "sensor", "target"), columns, strict=True)))
         repeated = np.flatnonzero(frame.duplicated().to_numpy())
+        if len(repeated) and (data.weight[rows] < 1).any():  # shares of one datum add up to one at most
+            total = frame.assign(w=data.weight[rows]).groupby(["time", "sensor", "target"])["w"].transform("sum")
+            repeated = repeated[total.to_numpy()[repeated] > 1 + 1e-3]
         if len(repeated):
             again = rows[repeated[0]]
             same = (

@@ -13,11 +13,11 @@ from probcal.inference.methods import METHODS as BY_NAME
 ROOT = Path(probcal.__file__).parent
 FLOORS = {
     0: ("linalg", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files", "status"),
-    1: ("sensor", "motion", "priors", "noise"),
+    1: ("sensor", "motion", "priors", "noise", "detection"),
     2: ("sensors",),
     3: ("geodesy", "network", "table", "nodes", "plausible", "roads"),
-    4: ("model", "problem", "simulate"),
-    5: ("smoothing", "particle", "doa", "starts", "rss"),
+    4: ("model", "problem", "scans", "simulate"),
+    5: ("smoothing", "particle", "doa", "starts", "rss", "association"),
     6: ("identifiability", "results"),
     7: ("inference",),
     8: ("analysis",),
@@ -25,7 +25,7 @@ FLOORS = {
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
 METHODS = tuple(
-    f"inference.{name}" for name in ("ea", "em", "collapsed", "nuts", "particle_gibbs", "svi")
+    f"inference.{name}" for name in ("ea", "em", "collapsed", "nuts", "particle_gibbs", "selfconfig", "svi")
 )  # algorithms
 SHARED = tuple(
     f"inference.{name}"

@@ -60,7 +60,8 @@ def run(
 
             with _safe(tree, outputs, time.perf_counter() - began > LONG):
                 near = truth if align is None else None  # of a truth in another frame no NEES
-                tree = assess(problem, tree, truth=near, key=seed, answer=answer)
+                named = problem if problem.scans is None else answer.problem
+                tree = assess(named, tree, truth=near, key=seed, answer=answer)
     tree.attrs["model"] = model.stem
     if given:
         tree.attrs["set"] = ", ".join(f"{name}={value}" for name, value in given.items())

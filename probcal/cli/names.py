@@ -45,6 +45,7 @@ METHODS = {
     "collapsed-spike": KnownMethod("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
     "nuts": KnownMethod("NUTS", True, _SAMPLED),
     "particle-gibbs": KnownMethod("ParticleGibbs", True, _SAMPLED),
+    "self-config": KnownMethod("self-configuration", False, _INTEGRATED),
     "svi": KnownMethod("SVI", True, _SAMPLED),
     "svi-mean-field": KnownMethod("SVI", True, _SAMPLED),
     "svi-low-rank": KnownMethod("SVI", True, _SAMPLED),

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from probcal.inference.model import numpyro_model
     from probcal.inference.run import Method
     from probcal.inference.sbc import sbc
+    from probcal.inference.selfconfig import SelfConfiguration
     from probcal.inference.study import ORACLE, study
     from probcal.inference.svi import SVI
     from probcal.smoothing.esteps import Cubature, EStep, Extended, Unscented
@@ -39,6 +40,7 @@ __all__ = lazy(
         "probcal.inference.model": "numpyro_model",
         "probcal.inference.run": "Method",
         "probcal.inference.sbc": "sbc",
+        "probcal.inference.selfconfig": "SelfConfiguration",
         "probcal.inference.study": "ORACLE study",
         "probcal.inference.svi": "SVI",
         "probcal.smoothing.esteps": "Cubature EStep Extended Unscented",

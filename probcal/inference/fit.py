@@ -5,24 +5,28 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.association.objects import Objects, track_objects
 from probcal.errors import FitError, InputError
 from probcal.identifiability.directions import weak_directions
 from probcal.identifiability.remedies import Direction
 from probcal.identifiability.watch import runs, strained_starts
+from probcal.inference.configure import configure
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.manifest import stored_run
 from probcal.inference.methods import EA, NUTS, check_problem, choose_prior
 from probcal.inference.progress import OnProgress
 from probcal.inference.run import Context, Method
+from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.solve import solve
 from probcal.inference.storage import Storage
 from probcal.inference.weighted import track_by_particles
+from probcal.lazy import Later
 from probcal.particle.settings import Particles
 from probcal.priors import Prior
 from probcal.problem import Problem, check_linear
@@ -42,6 +46,8 @@ from probcal.types import float64
 
 if TYPE_CHECKING:
     import xarray as xr
+else:
+    xr = Later("xarray")
 
 SAVE = ("states", "predictive")
 NAMED = 4  # directions, or biases, that a message names
@@ -99,6 +105,11 @@ def calibrate(
         raise InputError(f"method must be a value such as EA() or MAP(), got {method!r}")
     prior = choose_prior(method, prior)
     check_problem(problem, linear=not method.by_particles)
+    if problem.scans is not None:
+        return _configured(
+            problem, method, prior=prior, key=key, starts=starts, progress=progress, save=save, store=store,
+            resume=resume, overwrite=overwrite,
+        )  # fmt: skip
     keep = _kept(save)
     if starts < 1:
         raise InputError(f"starts={starts}: at least one start is needed")
@@ -128,6 +139,37 @@ def calibrate(
     if store is not None:
         found.attrs["identity"] = storage.digest
     return found, answer
+
+
+def _configured(
+    problem: Problem, method: Method, *, prior: Prior, key: Key, progress: OnProgress | None, **settings: Any
+) -> tuple[xr.DataTree, Answer]:
+    """The fit of detections that name no target, with the objects that were found as groups of the tree."""
+    scans = problem.scans
+    assert scans is not None
+    if not isinstance(method, SelfConfiguration):
+        raise InputError(
+            f"{int(scans.count.sum())} detections in {problem.measurements.table.source} name no target: take"
+            f" SelfConfiguration({method.name.replace('-', '')}()), on the command line --method self-config, or name"
+            " them, as in problem.assigned(track_objects(problem).rows)"
+        )
+    context = Context(jax.random.split(as_key(key))[0], progress, None, fallback=NUTS())
+    found = configure(problem, method, prior, context)
+    tree, answer = calibrate(found.problem, method.method, prior=prior, key=key, progress=progress, **settings)
+    if not found.rests and Status(tree.attrs["status"]).settled:
+        said = f"{method.name} did not come to rest in {found.rounds} rounds: objects and biases still change."
+        answer = replace(answer, status=Status.NOT_CONVERGED, message=f"{said} {answer.message}".strip())
+        tree.attrs |= {"status": str(answer.status), "message": answer.message}
+    tree.attrs["rounds"] = found.rounds
+    return _with_objects(tree, found.objects), answer
+
+
+def _with_objects(tree: xr.DataTree, objects: Objects) -> xr.DataTree:
+    """The tree with the groups `association` (pairs of detection and track) and `object` (their paths by scan)."""
+    tree.attrs["objects"] = len(objects.names)
+    tree["association"] = xr.DataTree(objects.rows.rename_axis("pair").to_xarray())
+    tree["object"] = xr.DataTree(objects.path.rename_axis("line").to_xarray())
+    return tree
 
 
 def _directions(answer: Answer) -> tuple[Direction, ...]:
@@ -231,13 +273,22 @@ def track(
     The biases are held at the calibrated means; the sd carries their covariance. Biases are matched by label. Without
     a `smoother` each track is its mode and the Gaussian about it; `Particles(2000)` filters and smooths any motion, a
     road too, by draws that `key` seeds, and says in the attributes `status` and `message` whether some target's rows
-    are explained by no path. Raises `InputError` if the calibration lacks a bias, and where a motion has no linear
+    are explained by no path. Of detections that name no target the objects are found first (`track_objects`), as groups
+    `association` and `object`. Raises `InputError` if the calibration lacks a bias, and where a motion has no linear
     form and there is no smoother.
 
     >>> later = track(Problem(network, motion, run.table), tree)
     >>> later["track/target"]["mean"].dims
     ('time', 'component')
     """
+    if problem.scans is not None:
+        check_linear(problem)
+        known = apply(problem, calibration)
+        objects = track_objects(problem, known.z, known.covariance)
+        if not objects.names:
+            raise FitError(f"no object is confirmed in {len(problem.scans)} scans: nothing stands out from clutter")
+        named = problem.assigned(objects.rows)
+        return _with_objects(track(named, calibration, smoother=smoother, key=key), objects)
     found = apply(problem, calibration)
     problem, covariance = found.problem, jnp.asarray(found.covariance)
     if smoother is not None:

@@ -14,6 +14,7 @@ from probcal.inference.em import EM, EMEA
 from probcal.inference.nuts import NUTS
 from probcal.inference.particle_gibbs import ParticleGibbs
 from probcal.inference.run import Method
+from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.svi import SVI
 from probcal.lazy import Later
 from probcal.particle.settings import Particles
@@ -45,6 +46,7 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
     "collapsed-spike": (Collapsed(), BernoulliGaussian()),
     "nuts": (NUTS(), None),
     "particle-gibbs": (ParticleGibbs(), None),
+    "self-config": (SelfConfiguration(EA()), None),
     "svi": (SVI(), None),
     "svi-mean-field": (SVI(guide="mean-field"), None),
     "svi-low-rank": (SVI(guide="low-rank"), None),

@@ -261,12 +261,12 @@ def merged(model: Any, fill: tuple[Rows, ...], sizes: tuple[int, ...]) -> Epoch:
         driving: Any = tuple(mixed)
         moves.append(Move(*nothing)._replace(mixed=driving))
     for b, (data, r) in enumerate(zip(model.rows, model.recursion, strict=True)):
-        rows.append(_padded(data, of[r][np.asarray(data.epoch)], K, sizes[b], fill[b], model.blocks[b]))
+        rows.append(padded_rows(data, of[r][np.asarray(data.epoch)], K, sizes[b], fill[b], model.blocks[b]))
     found: Any = Epoch(**shared, target=tuple(targets), move=tuple(moves), rows=tuple(rows))
     return jax.device_put(found)
 
 
-def _padded(data: Rows, epoch: np.ndarray, count: int, size: int, fill: Rows, block: Block) -> Seen:
+def padded_rows(data: Rows, epoch: np.ndarray, count: int, size: int, fill: Rows, block: Block) -> Seen:
     """Rows of a block by epoch (N,), `size` to each of `count`."""
     taken = np.bincount(epoch, minlength=count)
     most = int(taken.max(initial=0))

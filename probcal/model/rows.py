@@ -4,7 +4,7 @@ A block holds the rows of one sensor type seeing targets of one state layout, ga
 Labels stay above; here are a static `Block` (what to compute) and a pytree `Rows` (the numbers).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -166,6 +166,12 @@ def _view(block: Block, pose: jax.Array) -> PoseView:
 
 def _one(block: Block, state: jax.Array, pose: jax.Array, local: jax.Array) -> jax.Array:
     """Predicted channels (C,) of one row from its state (n,), poses (nodes, P) and biases (p,)."""
+    poses, biases = _scene(block, pose, local)
+    return block.type.evaluate(view(block.layout, state), poses, biases)
+
+
+def _scene(block: Block, pose: jax.Array, local: jax.Array) -> tuple[list[PoseView], dict[str, jax.Array]]:
+    """Poses of one row, put right by their biases, and the biases that its sensor reads beside."""
     if block.steps:
         constant = len(local) - len(block.steps)
         local = local[:constant].at[np.asarray(block.steps)].add(local[constant:])
@@ -173,8 +179,18 @@ def _one(block: Block, state: jax.Array, pose: jax.Array, local: jax.Array) -> j
         where = np.asarray(block.free)
         pose = pose.at[where[:, 0], where[:, 1]].add(local[: len(where)])
     poses = [_view(block, pose[a]) for a in range(block.type.arity)]
-    biases = dict(zip(block.type.biases, local[len(block.free) :], strict=True))
-    return block.type.evaluate(view(block.layout, state), poses, biases)
+    return poses, dict(zip(block.type.biases, local[len(block.free) :], strict=True))
+
+
+def look(block: Block, rows: Rows, states: jax.Array, z: jax.Array, seen: Callable[..., Any]) -> jax.Array:
+    """A function of target and pose(s), such as a field of view, at every row: (N, ...)."""
+    local = _local(block, rows, z)
+
+    def one(state: jax.Array, pose: jax.Array, b: jax.Array) -> jax.Array:
+        poses, _ = _scene(block, pose, b)
+        return jnp.asarray(seen(view(block.layout, state), *poses))
+
+    return jax.vmap(one)(states[rows.epoch], rows.pose, local)
 
 
 def predict(block: Block, rows: Rows, states: jax.Array, z: jax.Array) -> jax.Array:

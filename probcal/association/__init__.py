@@ -1,0 +1,1 @@
+"""Detections without names: which belong together, and to what."""

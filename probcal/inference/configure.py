@@ -1,0 +1,64 @@
+"""Objects and biases in turn, until they agree: what `SelfConfiguration` does with detections that name no target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from probcal.association.objects import Objects, track_objects
+from probcal.errors import FitError
+from probcal.inference.run import Context
+from probcal.inference.selfconfig import SelfConfiguration
+from probcal.inference.solve import solve
+from probcal.lazy import Later
+from probcal.priors import Prior
+from probcal.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = Later("pandas")
+
+ALIKE = 0.02  # by which the weight of no pair may change from one round to the next
+
+
+@dataclass(frozen=True, eq=False)
+class Configured:
+    """The objects of the last round, the labelled problem, the rounds, and whether they came to rest."""
+
+    objects: Objects
+    problem: Problem
+    rounds: int
+    rests: bool
+
+
+def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context: Context) -> Configured:
+    """Track and fit in turn; raises `FitError` where no object is confirmed."""
+    M = len(problem.labels)
+    z, covariance, before = np.zeros(M), np.eye(M), None
+    for k in range(method.iterations):
+        objects = track_objects(problem, z, covariance, **method.chances)
+        if not objects.names:
+            raise FitError(
+                f"no object is confirmed in {len(problem.scans or ())} scans (round {k + 1}): nothing is seen often"
+                " enough to tell it from clutter. Check the noise std, probability and clutter of Detection(...), the"
+                " start of the motion, and objects=, births= of SelfConfiguration"
+            )
+        labelled = problem.assigned(objects.rows)
+        if before is not None and _same(before.rows, objects.rows):
+            return Configured(objects, labelled, k, True)
+        before = objects
+        summary = solve(labelled, method.method, prior, context).posterior.summary
+        moved = np.abs(summary.mean - z) / np.sqrt(np.maximum(np.diagonal(summary.covariance), 1e-300))
+        z, covariance = summary.mean, summary.covariance
+        if k and moved.max(initial=0.0) < method.tolerance:
+            return Configured(objects, labelled, k + 1, True)
+    return Configured(objects, labelled, method.iterations, False)
+
+
+def _same(before: pd.DataFrame, after: pd.DataFrame) -> bool:
+    """Whether no pair of detection and track has another weight than before."""
+    both = before.merge(after, on=["row", "track"], how="outer", suffixes=("", "_after")).fillna(0.0)
+    return bool(np.all(np.abs(both["weight"] - both["weight_after"]) < ALIKE))
