@@ -104,7 +104,8 @@ def test_rows_with_the_names_put_to_them_are_the_labelled_problem():
         (lambda: network(pc.Detection(0.9, limits={"rang": (0.0, 1.0)})), 'detection limits "rang"'),
         (lambda: network(0.9), "give Detection(probability, clutter)"),
         (lambda: pc.fit(problem(drawn().table)), "take SelfConfiguration(EA())"),
-        (lambda: pc.track_objects(problem(drawn(named=True).table)), "every row names its target; use fit, or track with a calibration"),
+        (lambda: pc.track_objects(problem(drawn(named=True).table)),
+         "every row names its target; use fit, or track with a calibration"),
         (lambda: problem(drawn(named=True).table).assigned([]), "every row names its target already"),
         (lambda: problem(drawn().table).assigned({"row": [0]}), 'assigned: the tracks have no column "track"'),
         (lambda: problem(drawn().table).assigned({"row": [9999], "track": ["a"]}), "row counts the rows"),
@@ -126,7 +127,7 @@ def test_what_is_wrong_is_said(act, said):
 
 
 def test_a_blank_name_is_refused_where_nothing_is_detected():
-    named = drawn(named=True).table
+    named = drawn(named=True).table.copy()
     named.loc[0, "target"] = None
     with pytest.raises(InputError, match="place the sensor with detection"):
         problem(named, None)
@@ -210,7 +211,7 @@ def test_clutter_alone_confirms_nothing():
 
 
 def test_a_row_with_a_name_is_not_assigned_again():
-    table = drawn(named=True).table
+    table = drawn(named=True).table.copy()
     table.loc[1:, "target"] = None
     mixed = pc.Problem(network(), {"t0": pc.ConstantVelocity(0.5), "object": pc.ConstantVelocity(0.5)}, table)
     with pytest.raises(InputError, match="names its target; only detections are assigned"):

@@ -1,4 +1,4 @@
-"""BernoulliTracks of an unknown number of objects from scans: a filter of Bernoulli tracks with the rest a Poisson process.
+"""Tracks of an unknown number of objects from scans: a filter of Bernoulli tracks with the rest a Poisson process.
 
 Each track has a Gaussian state and a probability of existence; what was never detected is a Poisson process spread as
 the start of the motion. Which detection belongs to which track is found by belief propagation, and each track becomes
@@ -29,6 +29,9 @@ class BernoulliTracks(NamedTuple):
     mean: jax.Array
     covariance: jax.Array
     number: jax.Array
+
+
+Carry = tuple[BernoulliTracks, jax.Array]  # and the mean number of objects never detected
 
 
 class Step(NamedTuple):
@@ -195,9 +198,7 @@ def filter_tracks(
     """
     model, n = watch.model, len(watch.mean)
 
-    def step(
-        carry: tuple[BernoulliTracks, jax.Array], at: tuple[jax.Array, Scan]
-    ) -> tuple[tuple[BernoulliTracks, jax.Array], Step]:
+    def step(carry: Carry, at: tuple[jax.Array, Scan]) -> tuple[Carry, Step]:
         (tracks, hidden), (k, scan) = carry, at
         move = scan.epoch.move[0]
         scale = jnp.concatenate([jnp.exp(known.levels), jnp.ones(1)])[move.level]
