@@ -31,9 +31,10 @@ WIDTH = 480  # px
 RECORDINGS = {
     "sflab": "sflab_mic_toa/dataset_1_exp2.mat", "tdoa_flight": "uwb_tdoa",
     "robots": "mrclam/MRCLAM_Dataset6", "receivers": "mlat_locards/set_1.csv", "ble_office": "ble_rss",
-    "bearing_beacons": "roh_bearing",
+    "bearing_beacons": "roh_bearing", "harbour": "autoferry_radar/scenario3_detections.json",
 }  # fmt: skip
 HOW = {
+    "harbour": ("--method", "self-config"),
     "road_microphones": ("--set", "motion=road", "--method", "em-particles"), "town": ("--method", "em-particles"),
     "presence": ("--method", "particle-gibbs", "--prior", "gaussian", "--chains", "2", "--draws", "300"),
 }  # fmt: skip

@@ -11,6 +11,7 @@ import pytest
 
 import probcal as pc
 from probcal.association.bernoulli import associate
+from probcal.association.gospa import gospa
 from probcal.errors import FitError, InputError
 from probcal.geometry import bearing, norm
 
@@ -238,3 +239,28 @@ def test_biases_are_found_with_the_objects(seed):
         pc.track(problem(empty.assign(azimuth=rng.uniform(-3.0, 3.0, 40))), tree)
     later = pc.track(own, tree)
     assert len(later["track"].children) == 4
+
+
+# distances between sets
+
+
+def test_gospa_counts_what_is_missed_and_what_is_false():
+    here, there = [(0.0, 0.0), (100.0, 0.0)], [(3.0, 4.0)]
+    one = gospa([here], [there], cut=20.0)
+    assert one.distance == pytest.approx(np.sqrt(25.0 + 200.0))
+    assert (one.place, one.missed, one.false) == (5.0, 0.0, 1.0)
+    assert one.ospa == pytest.approx(np.sqrt((25.0 + 400.0) / 2))
+    swapped = gospa([there], [here], cut=20.0)
+    assert (swapped.distance, swapped.missed, swapped.false) == (one.distance, 1.0, 0.0)
+    assert gospa([here, []], [here, []]).distance == 0.0
+    far = gospa([[(0.0, 0.0)]], [[(500.0, 0.0)]], cut=20.0)
+    assert (far.distance, far.missed, far.false) == (20.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("found", "true", "cut", "said"),
+    [([[]], [], 20.0, "give the same instants, one or more"), ([[]], [[]], 0.0, "give metres above 0")],
+)
+def test_gospa_says_what_is_wrong(found, true, cut, said):
+    with pytest.raises(InputError, match=said):
+        gospa(found, true, cut)

@@ -344,7 +344,7 @@ def seen(kind, motion, gain=True):
 
 RECORDINGS = {"sflab": "sflab_mic_toa/dataset_1_exp2.mat", "robots": "mrclam/MRCLAM_Dataset6",
               "receivers": "mlat_locards/set_1.csv", "tdoa_flight": "uwb_tdoa", "ble_office": "ble_rss",
-              "bearing_beacons": "roh_bearing"}  # fmt: skip
+              "bearing_beacons": "roh_bearing", "harbour": "autoferry_radar/scenario2_detections.json"}  # fmt: skip
 
 
 @pytest.mark.parametrize("file", sorted((File(__file__).parents[1] / "models").glob("*.py")), ids=lambda p: p.stem)

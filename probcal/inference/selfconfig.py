@@ -22,6 +22,7 @@ class SelfConfiguration(Method):
     weights of the last round. The stated poses, within their scales, are where it starts: objects that two sensors see
     must lie nearer to each other than to others. Raises `InputError` naming a setting that is none.
 
+    >>> from probcal import EA
     >>> SelfConfiguration(EA()).iterations
     12
     """
