@@ -160,7 +160,8 @@ def _configured(
         said = f"{method.name} did not come to rest in {found.rounds} rounds: objects and biases still change."
         answer = replace(answer, status=Status.NOT_CONVERGED, message=f"{said} {answer.message}".strip())
         tree.attrs |= {"status": str(answer.status), "message": answer.message}
-    tree.attrs["rounds"] = found.rounds
+    said = f"{len(found.objects.names)} objects in {len(scans)} scans, found in {found.rounds} rounds of {method.name}."
+    tree.attrs |= {"rounds": found.rounds, "message": f"{said} {tree.attrs['message']}".strip()}
     return _with_objects(tree, found.objects), answer
 
 

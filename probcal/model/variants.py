@@ -26,6 +26,7 @@ def part(model: Model, r: int) -> Model:
         targets=(model.targets[r],),
         sampled=(model.sampled[r],),
         rows=tuple(data for _, data in pairs),
+        tilt=None,
     )
 
 
@@ -91,7 +92,7 @@ def split(model: Model, piece: Sequence[np.ndarray], count: int) -> Model:
             "base": np.tile(data.base, (count, 1)),
         }
         rows.append(data._replace(**copied))
-    return replace(model, biases=count * M, rows=tuple(rows))
+    return replace(model, biases=count * M, rows=tuple(rows), tilt=None)
 
 
 def placed(model: Model, block: int, mine: jax.Array, place: jax.Array) -> Model:
