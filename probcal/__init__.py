@@ -22,7 +22,9 @@ if TYPE_CHECKING:
         observability,
         sensitivity,
     )
+    from probcal.association.gospa import gospa
     from probcal.association.objects import Objects, track_objects
+    from probcal.association.registration import Registration, register_tracks
     from probcal.detection import Detection, Sector
     from probcal.errors import FitError, InputError
     from probcal.geodesy import LocalFrame
@@ -82,7 +84,9 @@ __all__ = lazy(
             "assess bound_map bounds changes compare interchangeable next_anchors next_passes next_sensors "
             "observability sensitivity"
         ),
+        "probcal.association.gospa": "gospa",
         "probcal.association.objects": "Objects track_objects",
+        "probcal.association.registration": "Registration register_tracks",
         "probcal.detection": "Detection Sector",
         "probcal.results.drifts": "drift_table",
         "probcal.results.scores": "add_scores scores",
