@@ -116,6 +116,8 @@ def test_rows_with_the_names_put_to_them_are_the_labelled_problem():
         (lambda: pc.track_objects(problem(drawn().table), z=[0.0]), "z has shape (1,)"),
         (lambda: pc.SelfConfiguration("ea"), "give the method that fits labelled rows"),
         (lambda: pc.SelfConfiguration(pc.EA(), iterations=0), "take 1 or more"),
+        (lambda: pc.SelfConfiguration(pc.EA(), start="here"), "start is stated or tracks, cut metres above 0"),
+        (lambda: pc.track_objects(problem(drawn().table), sensors=["north"]), 'track_objects: sensors names "north"'),
         (lambda: problem(drawn().table.assign(weight=2.0)), 'column "weight": 2 does not lie between 0 and 1'),
         (lambda: problem(drawn().table.assign(target=["object", *[None] * (len(drawn().table) - 1)])),
          '"object" stands for the detections'),
@@ -234,6 +236,10 @@ def test_biases_are_found_with_the_objects(seed):
         assert abs(mean - value) < 4 * sd, label
         assert sd < 2 * float(known["calibration"]["sd"].sel(bias_label=label))
     rng = np.random.default_rng(0)
+    loose = pc.Network([radar.on(pc.Node(n, (0.0, 0.0), scale=9.0), detection=REPORT) for n in ("west", "east")])
+    with pytest.raises(FitError, match="no sensor has a known pose, from which the others could be told"):
+        free = pc.Problem(loose, pc.Target(pc.ConstantVelocity(0.5), START), drawn(seed=seed).table)
+        pc.fit(free, pc.SelfConfiguration(pc.EA(), start="tracks"))
     empty = pd.DataFrame({"time": TIME, "sensor": ["west", "east"] * 20, "range": 2999.0 * rng.uniform(size=40)})
     with pytest.raises(FitError, match="scans: nothing stands out from clutter"):
         pc.track(problem(empty.assign(azimuth=rng.uniform(-3.0, 3.0, 40))), tree)
@@ -259,7 +265,7 @@ def test_gospa_counts_what_is_missed_and_what_is_false():
 
 @pytest.mark.parametrize(
     ("found", "true", "cut", "said"),
-    [([[]], [], 20.0, "give the same instants, one or more"), ([[]], [[]], 0.0, "give metres above 0")],
+    [([[]], [], 20.0, "give the same instants, one or more"), ([[]], [[]], 0.0, "the cut is a distance in m above 0")],
 )
 def test_gospa_says_what_is_wrong(found, true, cut, said):
     with pytest.raises(InputError, match=said):

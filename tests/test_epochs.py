@@ -228,7 +228,8 @@ def test_the_particle_filter_of_cuthbert_takes_a_model(name):
         assert (np.abs(error) < 5 * spread + 0.02 * np.sqrt(np.diagonal(np.asarray(P), axis1=1, axis2=2))).all()
 
 
-@pytest.mark.parametrize("name", [pytest.param("mixed", marks=pytest.mark.ci), "space"])
+@pytest.mark.ci
+@pytest.mark.parametrize("name", ["mixed", "space"])
 def test_an_epoch_predicts_what_whole_trajectories_predict(name):
     """Row by row, two-node sensors and missing rows too: the sorted predictions of both ways are one list."""
     problem = worlds.linear(name)[0]

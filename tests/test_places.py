@@ -106,6 +106,7 @@ def test_the_slope_is_that_of_the_height():
     assert rise == pytest.approx(float(at.slope[0]), rel=0.02, abs=0.02)
 
 
+@pytest.mark.ci
 def test_a_linear_problem_gains_nothing():
     """Where the places are Gaussian what is added is zero, and so are its slope and its curvature."""
 

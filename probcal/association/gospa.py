@@ -34,7 +34,7 @@ def gospa(found: Any, true: Any, cut: float = 20.0) -> Gospa:
     if len(found) != len(true) or not len(true):
         raise InputError(f"gospa: {len(found)} instants found, {len(true)} true; give the same instants, one or more")
     if not cut > 0:
-        raise InputError(f"gospa(cut={cut}): give metres above 0")
+        raise InputError(f"gospa(cut={cut}): the cut is a distance in m above 0")
     rows = []
     for mine, own in zip(found, true, strict=True):
         x, y = (np.asarray(v, float).reshape(len(v), -1 if len(v) else 1) for v in (mine, own))

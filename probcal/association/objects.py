@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -9,8 +10,8 @@ import jax
 import numpy as np
 
 from probcal.association.bernoulli import Biases, Chances, Step, filter_tracks
-from probcal.association.scan import alone, watch_of
-from probcal.errors import InputError
+from probcal.association.scan import alone, heeded, watch_of
+from probcal.errors import InputError, nearest
 from probcal.lazy import Later
 from probcal.problem import Problem, check_linear
 from probcal.types import float64
@@ -52,6 +53,7 @@ def track_objects(
     lifetime: float = 600.0,
     most: int = 32,
     confirmed: float = 0.9,
+    sensors: Collection[str] = (),
 ) -> Objects:
     """Track the objects behind detections that name none, with biases z (M,) held (in their scales; 0 by default).
 
@@ -59,8 +61,9 @@ def track_objects(
 
     At the first scan `objects` are expected anywhere in the start of the motion, `births` a second appear later, and
     each stays for `lifetime` s in the mean. `most` tracks are followed at a time; reported are those whose existence
-    reaches `confirmed` and which hold two detections. Association is by belief propagation (Williams, Lau 2014;
-    Williams 2015). Raises `InputError` where every row names its target, or the motion has no linear form.
+    reaches `confirmed` and which hold two detections. `sensors` are the names of those that are heeded, all by default.
+    Association is by belief propagation (Williams, Lau 2014; Williams 2015). Raises `InputError` where every row names
+    its target, or the motion has no linear form.
     """
     if problem.scans is None:
         raise InputError("track_objects: every row names its target; use fit, or track with a calibration")
@@ -72,6 +75,14 @@ def track_objects(
         raise InputError("track_objects: most is a number of tracks, confirmed a probability")
     own = alone(problem)
     watch, views = watch_of(problem)
+    if sensors:
+        names = [placed.name for placed in problem.network.sensors]
+        for name in sensors:
+            if name not in names:
+                raise InputError(f'track_objects: sensors names "{name}"{nearest(name, names)}')
+        own_scans = own.scans
+        assert own_scans is not None
+        watch = heeded(watch, np.isin(np.array(names)[own_scans.sensor], list(sensors)))
     z = np.zeros(len(problem.labels)) if z is None else np.asarray(z, float)
     if z.shape != (len(problem.labels),):
         raise InputError(f"track_objects: z has shape {z.shape}, the problem {len(problem.labels)} free biases")

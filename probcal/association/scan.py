@@ -86,6 +86,14 @@ def watch_of(problem: Problem) -> tuple[Watch, tuple[View, ...]]:
     return Watch(model, jax.device_put(stacked), part.drift[0], part.L[0]), views
 
 
+def heeded(watch: Watch, kept: np.ndarray) -> Watch:
+    """The same scans, those that are not kept (K,) of sensors that see nothing; shapes stay."""
+    scans = watch.scans
+    rows = tuple(seen._replace(mask=seen.mask * kept[:, None, None]) for seen in scans.epoch.rows)
+    epoch, chance = scans.epoch._replace(rows=rows), scans.probability * kept
+    return watch._replace(scans=scans._replace(epoch=epoch, probability=chance))
+
+
 def alone(problem: Problem) -> Problem:
     """The problem of the detections alone, all of one object."""
     found = problem.measurements.detection

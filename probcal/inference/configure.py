@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from probcal.association.objects import Objects, track_objects
-from probcal.errors import FitError
+from probcal.association.registration import Registration, laid, register_tracks
+from probcal.errors import FitError, InputError
 from probcal.inference.run import Context
 from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.solve import solve
+from probcal.labels import AXES
 from probcal.lazy import Later
 from probcal.priors import Prior
 from probcal.problem import Problem
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 else:
     pd = Later("pandas")
 
+SURE = 0.9  # existence from which on the path of a track is used
+WIDER = 4.0  # times the variance of a registration that is granted at the start
 ALIKE = 0.02  # by which the weight of no pair may change from one round to the next
 
 
@@ -36,8 +40,8 @@ class Configured:
 
 def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context: Context) -> Configured:
     """Track and fit in turn; raises `FitError` where no object is confirmed."""
-    M = len(problem.labels)
-    z, covariance, before = np.zeros(M), np.eye(M), None
+    M, before = len(problem.labels), None
+    z, covariance = (np.zeros(M), np.eye(M)) if method.start == "stated" else registered(problem, method)
     for k in range(method.iterations):
         objects = track_objects(problem, z, covariance, **method.chances)
         if not objects.names:
@@ -56,6 +60,71 @@ def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context
         if k and moved.max(initial=0.0) < method.tolerance:
             return Configured(objects, labelled, k + 1, True)
     return Configured(objects, labelled, method.iterations, False)
+
+
+def registered(problem: Problem, method: SelfConfiguration) -> tuple[np.ndarray, np.ndarray]:
+    """Biases z (M,) and their covariance by the tracks of each sensor alone, from sensors of known pose outward.
+
+    A tree of the pairs that explain most seconds of tracks carries poses from sensor to sensor; a pair with a rival
+    frame is left out. What it does not reach stays as stated. Raises `FitError` where no pose is known.
+    """
+    M = len(problem.labels)
+    z, variance = np.zeros(M), np.ones(M)
+    network, d = problem.network, problem.network.dimension
+    sensors = [s for s in network.sensors if s.detection is not None and len(s.nodes) == 1]
+    free = {s.name: [f"{s.nodes[0].name}.{part}" for part in ("heading", *(f"position_{a}" for a in AXES[:d]))]
+            for s in sensors}  # fmt: skip
+    found = {s.name: track_objects(problem, sensors=[s.name], **method.chances).path for s in sensors}
+    placed = {
+        s.name: (0.0, np.zeros(d), np.zeros(1 + d)) for s in sensors if not set(free[s.name]) & set(problem.labels)
+    }
+    if not placed:
+        raise FitError(
+            'SelfConfiguration(start="tracks"): no sensor has a known pose, from which the others could be told; leave'
+            " out the survey and scale of one node"
+        )
+    tried: dict[tuple[str, str], Any] = {}
+    while len(placed) < len(sensors):
+        best: Any = None
+        for known in placed:
+            for name in found:
+                if name in placed:
+                    continue
+                if (known, name) not in tried:
+                    tried[known, name] = _between(found[known], found[name], method.cut)
+                pair = tried[known, name]
+                if pair is not None and (best is None or pair.pairs["seconds"].sum() > best[0].pairs["seconds"].sum()):
+                    best = (pair, known, name)
+        if best is None:
+            break
+        pair, known, name = best
+        heading, position, square = placed[known]
+        place = laid(pair.position[None], heading, position)[0]
+        spread = square + np.r_[pair.sd["heading"], pair.sd["position"]] ** 2
+        placed[name] = (heading + pair.heading, place, spread)
+    for s in sensors:
+        if s.name in placed:
+            heading, position, spread = placed[s.name]
+            own = s.nodes[0].position
+            values = np.r_[heading, laid(own[None], heading, position)[0] - own]
+            lever = spread[0] * np.sum(own**2)  # of the heading about the origin
+            for label, value, square in zip(free[s.name], values, spread + np.r_[0.0, np.full(d, lever)], strict=True):
+                if label in problem.labels:
+                    m = problem.labels.index(label)
+                    z[m], variance[m] = value / problem.scales[m], WIDER * square / problem.scales[m] ** 2
+    return z, np.diag(np.minimum(variance, 1.0))
+
+
+def _between(first: pd.DataFrame, second: pd.DataFrame, cut: float) -> Registration | None:
+    """How the tracks of two sensors lie to each other; None where they do not say."""
+    first, second = (path[path["existence"] > SURE] for path in (first, second))
+    if first.empty or second.empty:
+        return None
+    try:
+        found = register_tracks(first, second, cut=cut)
+    except InputError:
+        return None
+    return found if found.sound else None
 
 
 def _same(before: pd.DataFrame, after: pd.DataFrame) -> bool:

@@ -10,6 +10,8 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.mode import Point
 
+STARTS = ("stated", "tracks")
+
 
 @dataclass(frozen=True)
 class SelfConfiguration(Method):
@@ -18,9 +20,11 @@ class SelfConfiguration(Method):
     Each round tracks the objects at the biases of the last one, whose uncertainty counts as noise of each detection
     (`track_objects`: `objects` expected at first, `births` a second, `lifetime` in s, `most` tracks at a time, those
     `confirmed` count), and fits what belongs together, each pair of detection and track with its weight, by `method`.
-    It ends when no bias moves by more than `tolerance` of its sd. The intervals are those of `method` given the
-    weights of the last round. The stated poses, within their scales, are where it starts: objects that two sensors see
-    must lie nearer to each other than to others. Raises `InputError` naming a setting that is none.
+    It ends when no bias moves by more than `tolerance` of its sd. The intervals are those of `method` given the weights
+    of the last round. The stated poses, within their scales, are where it starts: objects that two sensors see must lie
+    nearer to each other than to others; with `start="tracks"` each sensor first tracks alone, and the tracks of any two
+    tell how they stand to each other (`register_tracks`, within `cut` m), from sensors of known pose outward, so that
+    nothing need be stated of the others. Raises `InputError` naming a setting that is none.
 
     >>> from probcal import EA
     >>> SelfConfiguration(EA()).iterations
@@ -35,12 +39,17 @@ class SelfConfiguration(Method):
     lifetime: float = 600.0
     most: int = 32
     confirmed: float = 0.9
+    start: str = "stated"
+    cut: float = 30.0
 
     name: ClassVar[str] = "self-configuration"
 
     def __post_init__(self):
         if not isinstance(self.method, Method) or isinstance(self.method, SelfConfiguration):
             raise InputError("SelfConfiguration(method): give the method that fits labelled rows, such as EA()")
+        if self.start not in STARTS or not self.cut > 0:
+            given = f'start="{self.start}", cut={self.cut}'
+            raise InputError(f"SelfConfiguration({given}): start is stated or tracks, cut metres above 0")
         if self.iterations < 1 or not self.tolerance > 0:
             given = f"iterations={self.iterations}, tolerance={self.tolerance}"
             raise InputError(f"SelfConfiguration({given}): take 1 or more iterations and a positive tolerance")
