@@ -237,8 +237,8 @@ def test_biases_are_found_with_the_objects(seed):
         assert sd < 2 * float(known["calibration"]["sd"].sel(bias_label=label))
     rng = np.random.default_rng(0)
     loose = pc.Network([radar.on(pc.Node(n, (0.0, 0.0), scale=9.0), detection=REPORT) for n in ("west", "east")])
+    free = pc.Problem(loose, pc.Target(pc.ConstantVelocity(0.5), START), drawn(seed=seed).table)
     with pytest.raises(FitError, match="no sensor has a known pose, from which the others could be told"):
-        free = pc.Problem(loose, pc.Target(pc.ConstantVelocity(0.5), START), drawn(seed=seed).table)
         pc.fit(free, pc.SelfConfiguration(pc.EA(), start="tracks"))
     empty = pd.DataFrame({"time": TIME, "sensor": ["west", "east"] * 20, "range": 2999.0 * rng.uniform(size=40)})
     with pytest.raises(FitError, match="scans: nothing stands out from clutter"):

@@ -48,7 +48,7 @@ class Registration:
         """Tracks of the second frame in the first one, times put right; other columns stay."""
         frame = pd.DataFrame(tracks).copy()
         columns = [f"position_{axis}" for axis in AXES[: len(self.position)]]
-        frame[columns] = laid(frame[columns].to_numpy(float), self.heading, self.position)
+        frame[columns] = in_frame(frame[columns].to_numpy(float), self.heading, self.position)
         frame["time"] = frame["time"] + self.clock
         return frame
 
@@ -165,10 +165,10 @@ def _rigid(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
     dx, dy = x - x.mean(0), y - y.mean(0)
     turned = (dy[:, 0] - 1j * dy[:, 1]) @ (dx[:, 0] + 1j * dx[:, 1])
     heading = float(np.angle(turned))
-    return heading, x.mean(0) - laid(y.mean(0)[None], heading, np.zeros(x.shape[1]))[0]
+    return heading, x.mean(0) - in_frame(y.mean(0)[None], heading, np.zeros(x.shape[1]))[0]
 
 
-def laid(y: np.ndarray, heading: float, position: np.ndarray) -> np.ndarray:
+def in_frame(y: np.ndarray, heading: float, position: np.ndarray) -> np.ndarray:
     """Places (K, d) turned about the vertical through the origin by a heading in rad, then shifted."""
     c, s = np.cos(heading), np.sin(heading)
     plane = np.stack([c * y[:, 0] - s * y[:, 1], s * y[:, 0] + c * y[:, 1], *y[:, 2:].T], 1)
@@ -176,7 +176,7 @@ def laid(y: np.ndarray, heading: float, position: np.ndarray) -> np.ndarray:
 
 
 def _rms(x: np.ndarray, y: np.ndarray, heading: float, position: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.sum((x - laid(y, heading, position)) ** 2, 1))))
+    return float(np.sqrt(np.mean(np.sum((x - in_frame(y, heading, position)) ** 2, 1))))
 
 
 def _matched(a: dict[str, Track], b: dict[str, Track], frame: Frame, cut: float) -> tuple[float, list[Any]]:
@@ -211,8 +211,8 @@ def _refined(a: dict[str, Track], b: dict[str, Track], frame: Frame, cut: float,
         heading, position, shift = frame
         J, r = [], []
         for i, j, x, y, _ in pairs:
-            off = x - laid(y, heading, position)
-            turned = laid(y, heading, np.zeros(d))
+            off = x - in_frame(y, heading, position)
+            turned = in_frame(y, heading, np.zeros(d))
             by = np.zeros((len(y), d, 2 + d))
             by[:, 0, 0], by[:, 1, 0] = -turned[:, 1], turned[:, 0]
             by[:, :, 1 : 1 + d] = np.eye(d)
@@ -248,5 +248,5 @@ def _refined(a: dict[str, Track], b: dict[str, Track], frame: Frame, cut: float,
 def _far(b: dict[str, Track], one: Frame, other: Frame, cut: float) -> bool:
     """Whether two frames lay the tracks of the second list elsewhere."""
     places = np.concatenate([x for _, x in b.values()])
-    away = laid(places, one[0], one[1]) - laid(places, other[0], other[1])
+    away = in_frame(places, one[0], one[1]) - in_frame(places, other[0], other[1])
     return bool(np.sqrt(np.mean(np.sum(away**2, 1))) > APART * cut)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probcal.association.objects import Objects, track_objects
-from probcal.association.registration import Registration, laid, register_tracks
+from probcal.association.registration import Registration, in_frame, register_tracks
 from probcal.errors import FitError, InputError
 from probcal.inference.run import Context
 from probcal.inference.selfconfig import SelfConfiguration
@@ -99,14 +99,14 @@ def registered(problem: Problem, method: SelfConfiguration) -> tuple[np.ndarray,
             break
         pair, known, name = best
         heading, position, square = placed[known]
-        place = laid(pair.position[None], heading, position)[0]
+        place = in_frame(pair.position[None], heading, position)[0]
         spread = square + np.r_[pair.sd["heading"], pair.sd["position"]] ** 2
         placed[name] = (heading + pair.heading, place, spread)
     for s in sensors:
         if s.name in placed:
             heading, position, spread = placed[s.name]
             own = s.nodes[0].position
-            values = np.r_[heading, laid(own[None], heading, position)[0] - own]
+            values = np.r_[heading, in_frame(own[None], heading, position)[0] - own]
             lever = spread[0] * np.sum(own**2)  # of the heading about the origin
             for label, value, square in zip(free[s.name], values, spread + np.r_[0.0, np.full(d, lever)], strict=True):
                 if label in problem.labels:
