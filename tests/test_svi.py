@@ -26,7 +26,11 @@ def double():
         yield
 
 
-@pytest.mark.parametrize("guide", [MeanField(), LowRank(2), Structured(3)], ids=lambda g: type(g).__name__)
+@pytest.mark.parametrize(
+    "guide",
+    [MeanField(), LowRank(2), pytest.param(Structured(3), marks=pytest.mark.ci)],
+    ids=lambda g: type(g).__name__,
+)
 def test_guides_know_their_density_and_its_slope(guide):
     """Against the change of variables by automatic differentiation, and the derivative of the density by x."""
     size, keys = 5, jax.random.split(jax.random.key(0), 4)

@@ -202,6 +202,7 @@ def test_the_density_is_one_at_whatever_weights_and_that_of_numpyro():
         assert abs(likelihood + own + 0.5 * np.log(2 * np.pi) * point.noises[0].size - here) < 1e-9
 
 
+@pytest.mark.ci
 def test_steps_have_the_density_of_the_motion_and_its_tails():
     with jax.enable_x64(True):
         problem = turned()
