@@ -34,7 +34,7 @@ RECORDINGS = {
     "bearing_beacons": "roh_bearing", "harbour": "autoferry_radar/scenario3_detections.json",
 }  # fmt: skip
 HOW = {
-    "harbour": ("--method", "self-config"),
+    "harbour": ("--method", "self-config"), "self_configuring_grid": ("--method", "self-config-tracks"),
     "road_microphones": ("--set", "motion=road", "--method", "em-particles"), "town": ("--method", "em-particles"),
     "presence": ("--method", "particle-gibbs", "--prior", "gaussian", "--chains", "2", "--draws", "300"),
 }  # fmt: skip
