@@ -1,9 +1,9 @@
-"""The sixteen radars of `models/self_configuring_grid.py`: configured without names, beside the same rows with names.
+"""The sixteen radars of `models/self_configuring_grid.py`, configured from detections without names.
 
     uv run python benchmarks/grid.py --runs 5
 
-Printed for every run: error of places and headings at the start (`register_tracks` of the sensors' own tracks), after
-the fit, and by the labelled rows from the true poses' mode; how often 89 % intervals hold; objects, rounds, seconds.
+Printed for every run: error of places and headings at the start (`register_tracks` of the sensors' own tracks) and
+after the fit, the stated sds; rms z, how often 89 % intervals hold, objects, rounds, seconds of the start and of the fit.
 """
 
 import argparse
@@ -37,7 +37,7 @@ def main():
         true = np.array([grid.truth(run=run).biases[label] for label in problem.labels])
         place = np.array(["position" in label for label in problem.labels])
         begun = time.perf_counter()
-        z, _ = registered(problem, method)
+        z, _, _ = registered(problem, method)
         start = z * problem.scales - true
         between = time.perf_counter()
         tree = pc.fit(problem, method, prior=pc.Gaussian())

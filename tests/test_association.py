@@ -14,6 +14,7 @@ from probcal.association.bernoulli import associate
 from probcal.association.gospa import gospa
 from probcal.errors import FitError, InputError
 from probcal.geometry import bearing, norm
+from probcal.inference.configure import registered
 
 REPORT = pc.Detection(0.9, clutter=3.0, view=pc.Sector(range=3000.0))
 TIME = np.arange(40.0)
@@ -199,6 +200,21 @@ def test_every_object_has_one_track_and_keeps_its_detections():
     share = found.rows["weight"].sum() / (0.9 * 2 * 4 * len(TIME))
     assert 0.9 < share < 1.1
     assert found.rows.groupby("row")["weight"].sum().max() <= 1 + 1e-9
+
+
+def test_a_sensor_without_a_common_track_is_named():
+    """One radar in clutter: its bias stays as stated, and it is said not to be found."""
+    table = drawn().table
+    rng = np.random.default_rng(0)
+    blind = table["sensor"] == "east"
+    table = table.assign(
+        range=table["range"].mask(blind, rng.uniform(0.0, 3000.0, len(table))),
+        azimuth=table["azimuth"].mask(blind, rng.uniform(-3.0, 3.0, len(table))),
+    )
+    z, covariance, apart = registered(problem(table), pc.SelfConfiguration(pc.EA(), start="tracks"))
+    assert apart == ("east",)
+    assert not z.any()
+    np.testing.assert_array_equal(covariance, np.eye(3))
 
 
 def test_clutter_alone_confirms_nothing():

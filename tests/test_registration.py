@@ -64,6 +64,13 @@ def test_frames_clock_and_pairs_are_found_whatever_the_frames(space, clock):
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
 
 
+def test_a_single_pair_of_tracks_is_not_relied_on():
+    first, second, *_ = lists(0)
+    one = register_tracks(first[first["track"] == "a1"], second[second["track"] == "b1"])
+    assert len(one.pairs) == 1
+    assert not one.sound
+
+
 def test_tracks_that_are_all_alike_leave_rivals():
     """Straight tracks of one speed lie on each other in many ways: no confident frame."""
     first, second, *_ = lists(0, straight=True)

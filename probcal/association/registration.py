@@ -42,7 +42,7 @@ class Registration:
     @property
     def sound(self) -> bool:
         """Whether two tracks or more agree, and no other frame explains nearly as much."""
-        return len(self.pairs) >= 1 and self.rivals == 0
+        return len(self.pairs) >= 2 and self.rivals == 0
 
     def apply(self, tracks: Any) -> pd.DataFrame:
         """Tracks of the second frame in the first one, times put right; other columns stay."""

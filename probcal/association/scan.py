@@ -28,7 +28,7 @@ class Scan(NamedTuple):
 
 
 class Watch(NamedTuple):
-    """What a tracker reads: the model of one object, its scans and start, and the views; the last is static."""
+    """What a tracker reads: the model of one object, its scans and its start."""
 
     model: Model
     scans: Scan
@@ -68,12 +68,12 @@ def watch_of(problem: Problem) -> tuple[Watch, tuple[View, ...]]:
     columns = [[data.channels.index(name) for name in own.columns[of_type[kinds[s]]]] for s in scans.sensor]
     density = [1.0 / np.prod(np.diff(limits[s, c], axis=1)) for s, c in zip(scans.sensor, columns, strict=True)]
     zero = np.zeros(K)
-    epoch = Epoch(scans.time, zero, zero.astype(bool), zero.astype(int), (zero.astype(int),), (move,), tuple(rows))  # type: ignore[arg-type]
+    stamped: Any = (scans.time, zero, zero.astype(bool), zero.astype(int), (zero.astype(int),), (move,), tuple(rows))
     stacked = Scan(
-        epoch,
-        np.diff(scans.time, prepend=scans.time[0]),  # type: ignore[arg-type]
+        Epoch(*stamped),
         *jax.device_put(
             (
+                np.diff(scans.time, prepend=scans.time[0]),
                 np.array([of_type[kinds[s]] for s in scans.sensor]),
                 np.array([d.probability for d in told]),
                 np.array([d.clutter for d in told], float),

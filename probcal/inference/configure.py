@@ -36,12 +36,15 @@ class Configured:
     problem: Problem
     rounds: int
     rests: bool
+    apart: tuple[str, ...] = ()  # sensors of unknown pose whose tracks do not tell how they stand to the others
 
 
 def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context: Context) -> Configured:
     """Track and fit in turn; raises `FitError` where no object is confirmed."""
     M, before = len(problem.labels), None
-    z, covariance = (np.zeros(M), np.eye(M)) if method.start == "stated" else registered(problem, method)
+    z, covariance, apart = np.zeros(M), np.eye(M), tuple[str, ...]()
+    if method.start == "tracks":
+        z, covariance, apart = registered(problem, method)
     for k in range(method.iterations):
         objects = track_objects(problem, z, covariance, **method.chances)
         if not objects.names:
@@ -52,21 +55,22 @@ def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context
             )
         labelled = problem.assigned(objects.rows)
         if before is not None and _same(before.rows, objects.rows):
-            return Configured(objects, labelled, k, True)
+            return Configured(objects, labelled, k, True, apart)
         before = objects
         summary = solve(labelled, method.method, prior, context).posterior.summary
         moved = np.abs(summary.mean - z) / np.sqrt(np.maximum(np.diagonal(summary.covariance), 1e-300))
         z, covariance = summary.mean, summary.covariance
         if k and moved.max(initial=0.0) < method.tolerance:
-            return Configured(objects, labelled, k + 1, True)
-    return Configured(objects, labelled, method.iterations, False)
+            return Configured(objects, labelled, k + 1, True, apart)
+    return Configured(objects, labelled, method.iterations, False, apart)
 
 
-def registered(problem: Problem, method: SelfConfiguration) -> tuple[np.ndarray, np.ndarray]:
+def registered(problem: Problem, method: SelfConfiguration) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Biases z (M,) and their covariance by the tracks of each sensor alone, from sensors of known pose outward.
 
     A tree of the pairs that explain most seconds of tracks carries poses from sensor to sensor; a pair with a rival
-    frame is left out. What it does not reach stays as stated. Raises `FitError` where no pose is known.
+    frame is left out. Third, the sensors that it does not reach, which stay as stated. Raises `FitError` where no
+    pose is known.
     """
     M = len(problem.labels)
     z, variance = np.zeros(M), np.ones(M)
@@ -101,7 +105,7 @@ def registered(problem: Problem, method: SelfConfiguration) -> tuple[np.ndarray,
         heading, position, square = placed[known]
         place = in_frame(pair.position[None], heading, position)[0]
         spread = square + np.r_[pair.sd["heading"], pair.sd["position"]] ** 2
-        placed[name] = (heading + pair.heading, place, spread)
+        placed[name] = (float(np.angle(np.exp(1j * (heading + pair.heading)))), place, spread)
     for s in sensors:
         if s.name in placed:
             heading, position, spread = placed[s.name]
@@ -112,7 +116,7 @@ def registered(problem: Problem, method: SelfConfiguration) -> tuple[np.ndarray,
                 if label in problem.labels:
                     m = problem.labels.index(label)
                     z[m], variance[m] = value / problem.scales[m], WIDER * square / problem.scales[m] ** 2
-    return z, np.diag(np.minimum(variance, 1.0))
+    return z, np.diag(np.minimum(variance, 1.0)), tuple(name for name in found if name not in placed)
 
 
 def _between(first: pd.DataFrame, second: pd.DataFrame, cut: float) -> Registration | None:

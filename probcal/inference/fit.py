@@ -156,9 +156,16 @@ def _configured(
     context = Context(jax.random.split(as_key(key))[0], progress, None, fallback=NUTS())
     found = configure(problem, method, prior, context)
     tree, answer = calibrate(found.problem, method.method, prior=prior, key=key, progress=progress, **settings)
-    if not found.rests and Status(tree.attrs["status"]).settled:
-        said = f"{method.name} did not come to rest in {found.rounds} rounds: objects and biases still change."
-        answer = replace(answer, status=Status.NOT_CONVERGED, message=f"{said} {answer.message}".strip())
+    wrong = []
+    if not found.rests:
+        wrong.append(f"{method.name} did not come to rest in {found.rounds} rounds: objects and biases still change.")
+    if found.apart:
+        wrong.append(
+            f"The tracks of {', '.join(found.apart)} do not tell how they stand to the sensors of known pose: their"
+            " biases are not found; give more common tracks that turn, or state the pose."
+        )
+    if wrong and Status(tree.attrs["status"]).settled:
+        answer = replace(answer, status=Status.NOT_CONVERGED, message=f"{' '.join(wrong)} {answer.message}".strip())
         tree.attrs |= {"status": str(answer.status), "message": answer.message}
     said = f"{len(found.objects.names)} objects in {len(scans)} scans, found in {found.rounds} rounds of {method.name}."
     tree.attrs |= {"rounds": found.rounds, "message": f"{said} {tree.attrs['message']}".strip()}
