@@ -3,7 +3,8 @@
     uv run python benchmarks/grid.py --runs 5
 
 Printed for every run: error of places and headings at the start (`register_tracks` of the sensors' own tracks) and
-after the fit, the stated sds; rms z, how often 89 % intervals hold, objects, rounds, seconds of the start and of the fit.
+after the fit, the stated sds; rms z, how often 89 % intervals hold, objects, rounds, seconds of the start and of the
+fit.
 """
 
 import argparse
