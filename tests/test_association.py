@@ -77,6 +77,11 @@ def test_what_is_simulated_has_the_rates_that_were_declared():
     sd = np.sqrt(np.sum(0.09 * np.array(seen) + 3.0))
     assert abs(scans.count.sum() - expected.sum()) < 4 * sd
     assert "target" not in table
+    tracks = paths(4)
+    motion = dict.fromkeys(tracks, pc.ConstantVelocity(0.5))
+    sharp = pc.simulate(network(pc.Detection(0.7, clutter=0.0)), motion, TIME, tracks=tracks, key=1).table
+    looked = 2 * len(tracks) * len(TIME)
+    assert abs(sharp["range"].notna().sum() - 0.7 * looked) < 4 * np.sqrt(0.21 * looked), "no clutter hides the misses"
 
 
 def test_rows_with_the_names_put_to_them_are_the_labelled_problem():
