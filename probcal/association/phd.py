@@ -1,0 +1,282 @@
+"""Intensity of an unknown number of objects from scans: Gaussian-mixture PHD and cardinalised PHD filters.
+
+The intensity is a Gaussian mixture whose weights add up to the mean number of objects that were detected at least once
+(Vo, Ma 2006); those never detected are a Poisson process spread as the start of the motion, whose share in a detection
+begins a component. The cardinalised filter (Vo, Vo, Cantoni 2007) carries the distribution of the number of all of
+them beside it.
+"""
+
+from functools import partial
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import gammaln, logsumexp, xlogy
+
+from probcal import linalg
+from probcal.association.scan import Scan, View, Watch, detected, present
+from probcal.association.update import TINY, Biases, Chances, births, rows_from, updated
+
+Kind = Literal["phd", "cphd"]
+Update = Literal["extended", "cubature"]
+PRUNE = 1e-5  # weight up to which a component is dropped
+MERGE = 4.0  # squared Mahalanobis distance up to which two become one
+HIGHEST = 60  # most objects whose number has a probability
+
+
+class Intensity(NamedTuple):
+    """A Gaussian mixture of J components whose weights add up to a mean number of objects; weight 0 is none."""
+
+    weight: jax.Array  # (J,)
+    mean: jax.Array  # (J, n)
+    covariance: jax.Array  # (J, n, n)
+
+
+class Passed(NamedTuple):
+    """What a filter knows at each of K scans (leading), of objects detected at least once and of their number."""
+
+    before: Intensity  # predicted to the scan
+    after: Intensity
+    count: jax.Array  # () mean number of all objects after it
+    undetected: jax.Array  # () of it, mean number never detected
+    spread: jax.Array  # () variance of the number of all
+    log_likelihood: jax.Array  # () of the scan given those before
+
+
+class _Detections(NamedTuple):
+    """What the slots of a scan say of the predicted components and of objects never detected."""
+
+    there: jax.Array  # (D,)
+    chance: jax.Array  # (J,) of detection
+    pair: jax.Array  # (D, J) log of weight, chance and density of a slot
+    fresh: jax.Array  # (D,) the same of objects never detected
+    false: jax.Array  # (D,) log density of false detections
+    share: jax.Array  # () chance of detection of an object never detected
+
+
+class _Shares(NamedTuple):
+    """What becomes of the parts: factors of what was missed, and of each slot's pairs; and what the scan is worth."""
+
+    missed: jax.Array  # () factor, besides the chance of being missed
+    slot: jax.Array  # (D,) log factor of the pairs of each slot
+    log_likelihood: jax.Array  # ()
+    number: jax.Array  # (N,) log probability of each number of objects
+
+
+def _moved(watch: Watch, scan: Scan, held: Intensity, stays: jax.Array, known: Biases) -> Intensity:
+    """The components that survive, at the time of a scan."""
+    move = scan.epoch.move[0]
+    L = move.L * jnp.concatenate([jnp.exp(known.levels), jnp.ones(1)])[move.level][None, :]
+    mean = held.mean @ move.F.T + move.drift[None]
+    covariance = jnp.einsum("ij,tjk,lk->til", move.F, held.covariance, move.F) + (L @ L.T)[None]
+    return Intensity(held.weight * stays, mean, covariance)
+
+
+def _log(value: jax.Array) -> jax.Array:
+    return jnp.where(value > 0, jnp.log(jnp.where(value > 0, value, 1.0)), -jnp.inf)
+
+
+# the number of objects
+
+
+def _log_binomial(n: jax.Array, k: jax.Array) -> jax.Array:
+    return gammaln(n + 1.0) - gammaln(k + 1.0) - gammaln(n - k + 1.0)
+
+
+def _poisson(mean: jax.Array, highest: int) -> jax.Array:
+    """Log probabilities (N,) of the numbers up to the highest."""
+    n = jnp.arange(highest + 1.0)
+    found = xlogy(n, mean) - mean - gammaln(n + 1.0)
+    return found - logsumexp(found)
+
+
+def _outlived(number: jax.Array, stays: jax.Array, born: jax.Array) -> jax.Array:
+    """Log probabilities (N,) of the numbers after some went, each staying with a probability, and others came."""
+    n = jnp.arange(float(len(number)))
+    k = n[:, None]
+    alive = k <= n[None]
+    gone = jnp.where(alive, n[None] - k, 0.0)
+    thinned = _log_binomial(k + gone, k) + xlogy(k, stays) + xlogy(gone, -jnp.expm1(_log(stays)))
+    left = logsumexp(jnp.where(alive, thinned + number[None], -jnp.inf), 1)
+    more = jnp.where(alive, 0.0, k - n[None])  # of k those that came, where n were left
+    came = xlogy(more, born) - born - gammaln(more + 1.0)
+    found = logsumexp(jnp.where(k >= n[None], came + left[None], -jnp.inf), 1)
+    return found - logsumexp(found)
+
+
+def _moments(number: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean and variance of a number with log probabilities (N,)."""
+    n = jnp.arange(float(len(number)))
+    mean = jnp.sum(n * jnp.exp(number))
+    return mean, jnp.sum((n - mean) ** 2 * jnp.exp(number))
+
+
+def symmetric(false: jax.Array, found: jax.Array, used: jax.Array, degree: int) -> jax.Array:
+    """Log coefficients (degree + 1,) of the product over slots (D,) of exp(false) + exp(found) t, those used.
+
+    They are the elementary symmetric functions of the ratios times the densities of false detections: sums of
+    positive terms alone, so that nothing cancels.
+    """
+
+    def grow(c: jax.Array, slot: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        f, a, on = slot
+        higher = jnp.concatenate([jnp.full(1, -jnp.inf), c[:-1]])
+        return jnp.where(on, jnp.logaddexp(c + f, higher + a), c), None
+
+    first = jnp.full(degree + 1, -jnp.inf).at[0].set(0.0)
+    return jax.lax.scan(grow, first, (false, found, used))[0]
+
+
+def _as_poisson(seen: _Detections, before: Intensity, hidden: jax.Array, clutter: jax.Array) -> _Shares:
+    """The update of a Poisson process (Vo, Ma 2006)."""
+    total = jnp.logaddexp(logsumexp(seen.pair, 1), jnp.logaddexp(seen.fresh, seen.false))
+    expected = clutter + jnp.sum(before.weight * seen.chance) + hidden * seen.share
+    value = jnp.sum(jnp.where(seen.there, total, 0.0)) - expected
+    return _Shares(jnp.ones(()), -total, value, jnp.zeros(0))
+
+
+def _as_cluster(
+    seen: _Detections, before: Intensity, hidden: jax.Array, clutter: jax.Array, number: jax.Array
+) -> _Shares:
+    """The update of a process of independent objects of any number (Vo, Vo, Cantoni 2007, 13 to 17)."""
+    N, D = len(number), len(seen.there)
+    degree = min(D, N - 1)
+    whole = jnp.sum(before.weight) + hidden
+    missed = jnp.sum(before.weight * (1.0 - seen.chance)) + hidden * (1.0 - seen.share)
+    a = jnp.logaddexp(logsumexp(seen.pair, 1), seen.fresh) - jnp.log(whole)  # of a slot, by one object
+    n, j = jnp.arange(float(N))[:, None], jnp.arange(degree + 1.0)[None]
+
+    def ways(u: int) -> jax.Array:
+        """Log of the ways in which j + u of n objects are picked in order, the others missed."""
+        there = n >= j + u
+        rest = jnp.where(there, n - j - u, 0.0)
+        picked = gammaln(n + 1.0) - gammaln(rest + 1.0) + xlogy(rest, jnp.minimum(missed / whole, 1.0))
+        return jnp.where(there, picked, -jnp.inf)
+
+    none, one = ways(0), ways(1)
+    beside = logsumexp(number[:, None] + one, 0)  # (J,) where one object more is picked
+    all_of = symmetric(seen.false, a, seen.there, degree)
+    others = jax.vmap(lambda left: symmetric(seen.false, a, seen.there & ~left, degree))(jnp.eye(D, dtype=bool))
+    found = number + logsumexp(none + all_of[None], 1)
+    total = logsumexp(found)
+    return _Shares(
+        jnp.exp(logsumexp(all_of + beside) - total) / whole,
+        logsumexp(others + beside[None], 1) - total - jnp.log(whole),
+        total - clutter,
+        found - total,
+    )
+
+
+# few components
+
+
+def reduced(mixture: Intensity, most: int, prune: jax.Array | float, merge: jax.Array | float) -> Intensity:
+    """At most `most` components: light ones dropped, near ones merged, the sum of the weights kept.
+
+    From the heaviest on, each takes those within a squared Mahalanobis distance `merge` by the covariances of both; a
+    group becomes the Gaussian with its moments. What was dropped is made up by the weights of the others.
+    """
+    weight, mean, covariance = mixture
+    white = jax.vmap(linalg.inverse_cholesky)(covariance)
+    own = jnp.einsum("tij,tj->ti", white, mean)
+    rank = jnp.arange(len(weight))
+
+    def group(left: jax.Array, _: None) -> tuple[jax.Array, Intensity]:
+        top = jnp.argmax(left)
+        off = mean - mean[top][None]
+        theirs = jnp.sum((own - jnp.einsum("tij,j->ti", white, mean[top])) ** 2, 1)
+        mine = jnp.sum((off @ white[top].T) ** 2, 1)
+        near = (left > 0) & ((jnp.maximum(theirs, mine) <= merge) | (rank == top))
+        taken = jnp.where(near, left, 0.0)
+        total = jnp.sum(taken)
+        share = jnp.where(total > 0, taken / jnp.where(total > 0, total, 1.0), (rank == top).astype(float))
+        shift = share @ off
+        wide = off - shift[None]
+        spread = jnp.einsum("t,tij->ij", share, covariance) + (wide * share[:, None]).T @ wide
+        return jnp.where(near, 0.0, left), Intensity(total, mean[top] + shift, spread)
+
+    _, found = jax.lax.scan(group, jnp.where(weight > prune, weight, 0.0), length=most)
+    kept = jnp.sum(found.weight)
+    return found._replace(weight=found.weight * jnp.where(kept > 0, jnp.sum(weight) / jnp.where(kept > 0, kept, 1), 0))
+
+
+Carry = tuple[Intensity, jax.Array, jax.Array]  # and the mean number never detected, log probabilities of the number
+
+
+@partial(jax.jit, static_argnames=("views", "most", "kind", "update", "highest"))
+def filter_intensity(
+    watch: Watch,
+    views: tuple[View, ...],
+    known: Biases,
+    chances: Chances,
+    cloud: jax.Array,
+    most: int,
+    *,
+    kind: Kind = "phd",
+    update: Update = "extended",
+    prune: jax.Array | float = PRUNE,
+    merge: jax.Array | float = MERGE,
+    highest: int = HIGHEST,
+) -> Passed:
+    """All scans one after the other with `most` components kept, biases and levels held; K leading.
+
+    What is not known of the biases counts as noise of each detection alone. A scan of a sensor that sees nothing and
+    reports nothing updates nothing, and moves nothing if no time went by.
+    """
+    model, n = watch.model, len(watch.mean)
+
+    def read(scan: Scan, before: Intensity, hidden: jax.Array) -> tuple[_Detections, Intensity]:
+        """The slots of a scan, and the components that each would make: (J D + D,) with unit weights."""
+        there = present(scan)
+        chance = jax.vmap(lambda x: detected(model, scan, views, x, known.z))(before.mean)
+        rows = jax.vmap(lambda x: rows_from(model, scan, x, known))(before.mean)
+        evidence, mean, covariance = jax.vmap(updated)(rows, before.mean, before.covariance)  # (J, D), ...
+        born, born_mean, born_covariance, share = births(watch, scan, views, cloud, known)
+        false = jnp.log(jnp.maximum(scan.clutter * scan.density, TINY))
+        pair = (_log(before.weight * chance)[:, None] + evidence).T
+        seen = _Detections(
+            there, chance, pair, jnp.log(jnp.maximum(hidden, TINY)) + born, jnp.full(len(there), false), share
+        )
+        D = len(there)
+        means = jnp.concatenate([jnp.swapaxes(mean, 0, 1).reshape(-1, n), born_mean])
+        spreads = jnp.concatenate([jnp.swapaxes(covariance, 0, 1).reshape(-1, n, n), born_covariance])
+        return seen, Intensity(jnp.ones(D * (most + 1)), means, spreads)
+
+    def step(carry: Carry, scan: Scan) -> tuple[Carry, Passed]:
+        held, hidden, number = carry
+        stays = jnp.exp(-scan.elapsed / chances.lifetime)
+        born = chances.births * scan.elapsed
+        later = _moved(watch, scan, held, stays, known)
+        before, hidden, number = jax.tree.map(
+            lambda new, old: jnp.where(scan.elapsed > 0, new, old),
+            (later, hidden * stays + born, _outlived(number, stays, born) if kind == "cphd" else number),
+            carry,
+        )
+        if kind == "cphd":  # the number that is cut at the highest rules
+            factor = _moments(number)[0] / jnp.maximum(jnp.sum(before.weight) + hidden, TINY)
+            before, hidden = before._replace(weight=before.weight * factor), hidden * factor
+        seen, parts = read(scan, before, hidden)
+        shares = (
+            _as_cluster(seen, before, hidden, scan.clutter, number)
+            if kind == "cphd"
+            else _as_poisson(seen, before, hidden, scan.clutter)
+        )
+        taken = jnp.concatenate([(seen.pair + shares.slot[:, None]).reshape(-1), seen.fresh + shares.slot])
+        on = jnp.concatenate([jnp.repeat(seen.there, most), seen.there])
+        whole = Intensity(
+            jnp.concatenate([before.weight * (1.0 - seen.chance) * shares.missed, jnp.where(on, jnp.exp(taken), 0.0)]),
+            jnp.concatenate([before.mean, parts.mean]),
+            jnp.concatenate([before.covariance, parts.covariance]),
+        )
+        told = jnp.any(seen.there) | (scan.probability > 0)
+        new = reduced(whole, most, prune, merge), hidden * (1.0 - seen.share) * shares.missed, shares.number
+        after, hidden, number = jax.tree.map(lambda a, b: jnp.where(told, a, b), new, (before, hidden, number))
+        count = jnp.sum(after.weight) + hidden
+        spread = _moments(number)[1] if kind == "cphd" else count
+        passed = Passed(before, after, count, hidden, spread, jnp.where(told, shares.log_likelihood, 0.0))
+        return (after, hidden, number), passed
+
+    start = Intensity(jnp.zeros(most), jnp.tile(watch.mean[None], (most, 1)), jnp.tile(jnp.eye(n)[None], (most, 1, 1)))
+    hidden = jnp.asarray(chances.undetected, float)
+    number = _poisson(hidden, highest) if kind == "cphd" else jnp.zeros(0)
+    return jax.lax.scan(step, (start, hidden, number), watch.scans)[1]
