@@ -243,7 +243,7 @@ def _detections(
         chance = np.array([1.0 if own is None else own.probability for own in told])
         for view in {own.view for own in told if own is not None and own.view is not None}:
             seen: Any = rows.look(block, data, jnp.asarray(states[r]), jnp.asarray(z), view)
-            mine = np.array([own is not None and own.view is view for own in told])
+            mine = np.array([own is not None and own.view == view for own in told])
             chance = np.where(mine, chance * np.asarray(seen, float), chance)
         kept[index] = rng.uniform(size=len(index)) < chance
     detects = plan["sensor"].map(lambda name: placed[str(name)].detection is not None).to_numpy(bool)
