@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     )
     from probcal.association.gospa import gospa
     from probcal.association.objects import Objects, track_objects
+    from probcal.association.phd import Intensities, phd_filter
     from probcal.association.registration import Registration, register_tracks
     from probcal.detection import Detection, Sector
     from probcal.errors import FitError, InputError
@@ -86,6 +87,7 @@ __all__ = lazy(
         ),
         "probcal.association.gospa": "gospa",
         "probcal.association.objects": "Objects track_objects",
+        "probcal.association.phd": "Intensities phd_filter",
         "probcal.association.registration": "Registration register_tracks",
         "probcal.detection": "Detection Sector",
         "probcal.results.drifts": "drift_table",

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from probcal.association.bernoulli import Biases, Chances, Step, filter_tracks
-from probcal.association.scan import alone, heeded, watch_of
-from probcal.errors import InputError, nearest
+from probcal.association.bernoulli import Step, filter_tracks
+from probcal.association.entry import asked
+from probcal.errors import InputError
 from probcal.lazy import Later
-from probcal.problem import Problem, check_linear
+from probcal.problem import Problem
 from probcal.types import float64
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 else:
     pd = Later("pandas")
 
-CLOUD = 512  # states among which that behind a first detection is looked for
 LEAST = 0.02  # share of a detection below which it is not listed
 
 
@@ -65,36 +64,13 @@ def track_objects(
     Association is by belief propagation (Williams, Lau 2014; Williams 2015). Raises `InputError` where every row names
     its target, or the motion has no linear form.
     """
-    if problem.scans is None:
-        raise InputError("track_objects: every row names its target; use fit, or track with a calibration")
-    check_linear(problem)
-    for name, value in (("objects", objects), ("births", births), ("lifetime", lifetime)):
-        if not (isinstance(value, (int, float)) and np.isfinite(value) and value > 0):
-            raise InputError(f"track_objects({name}={value!r}): give a positive number")
-    if not (isinstance(most, int) and most >= 1 and 0 < confirmed <= 1):
-        raise InputError("track_objects: most is a number of tracks, confirmed a probability")
-    own = alone(problem)
-    watch, views = watch_of(problem)
-    if sensors:
-        names = [placed.name for placed in problem.network.sensors]
-        for name in sensors:
-            if name not in names:
-                raise InputError(f'track_objects: sensors names "{name}"{nearest(name, names)}')
-        own_scans = own.scans
-        assert own_scans is not None
-        watch = heeded(watch, np.isin(np.array(names)[own_scans.sensor], list(sensors)))
-    z = np.zeros(len(problem.labels)) if z is None else np.asarray(z, float)
-    if z.shape != (len(problem.labels),):
-        raise InputError(f"track_objects: z has shape {z.shape}, the problem {len(problem.labels)} free biases")
-    covariance = np.zeros((len(z), len(z))) if covariance is None else np.asarray(covariance, float)
-    from scipy.stats import norm, qmc
-
-    n = len(np.asarray(watch.mean))
-    cloud = norm.ppf(np.clip(qmc.Sobol(n, scramble=False).random(CLOUD), 1e-3, 1 - 1e-3))
-    used = np.any(np.asarray(watch.root) != 0, 0)
-    chances = Chances(*jax.device_put((float(objects), float(births), float(lifetime))))
-    known = Biases(*jax.device_put((z, covariance, np.zeros(len(own.levels)))))
-    found = filter_tracks(watch, views, known, chances, cloud * used, most)
+    if not 0 < confirmed <= 1:
+        raise InputError(f"track_objects(confirmed={confirmed!r}): give a probability of existence above 0, up to 1")
+    own, watch, views, known, chances, cloud = asked(
+        "track_objects", problem, z, covariance,
+        objects=objects, births=births, lifetime=lifetime, most=most, sensors=sensors,
+    )  # fmt: skip
+    found = filter_tracks(watch, views, known, chances, cloud, most)
     own_rows = np.flatnonzero(problem.measurements.detection)
     return _listed(jax.device_get(found), np.asarray(watch.scans.number), own_rows, own, confirmed)
 

@@ -6,16 +6,31 @@ begins a component. The cardinalised filter (Vo, Vo, Cantoni 2007) carries the d
 them beside it.
 """
 
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.special import gammaln, logsumexp, xlogy
 
 from probcal import linalg
+from probcal.association.entry import asked
 from probcal.association.scan import Scan, View, Watch, detected, present
-from probcal.association.update import TINY, Biases, Chances, births, rows_from, updated
+from probcal.association.update import TINY, Biases, Chances, births, rows_from, updated, updated_by_points
+from probcal.errors import InputError
+from probcal.lazy import Later
+from probcal.problem import Problem
+from probcal.types import float64
+
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = Later("pandas")
 
 Kind = Literal["phd", "cphd"]
 Update = Literal["extended", "cubature"]
@@ -37,7 +52,7 @@ class Passed(NamedTuple):
 
     before: Intensity  # predicted to the scan
     after: Intensity
-    count: jax.Array  # () mean number of all objects after it
+    count: jax.Array  # type: ignore[assignment]  # () mean number of all objects after it
     undetected: jax.Array  # () of it, mean number never detected
     spread: jax.Array  # () variance of the number of all
     log_likelihood: jax.Array  # () of the scan given those before
@@ -225,12 +240,16 @@ def filter_intensity(
     """
     model, n = watch.model, len(watch.mean)
 
+    def one(scan: Scan, mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        if update == "cubature":
+            return updated_by_points(model, scan, mean, covariance, known)
+        return updated(rows_from(model, scan, mean, known), mean, covariance)
+
     def read(scan: Scan, before: Intensity, hidden: jax.Array) -> tuple[_Detections, Intensity]:
         """The slots of a scan, and the components that each would make: (J D + D,) with unit weights."""
         there = present(scan)
         chance = jax.vmap(lambda x: detected(model, scan, views, x, known.z))(before.mean)
-        rows = jax.vmap(lambda x: rows_from(model, scan, x, known))(before.mean)
-        evidence, mean, covariance = jax.vmap(updated)(rows, before.mean, before.covariance)  # (J, D), ...
+        evidence, mean, covariance = jax.vmap(partial(one, scan))(before.mean, before.covariance)  # (J, D), ...
         born, born_mean, born_covariance, share = births(watch, scan, views, cloud, known)
         false = jnp.log(jnp.maximum(scan.clutter * scan.density, TINY))
         pair = (_log(before.weight * chance)[:, None] + evidence).T
@@ -280,3 +299,79 @@ def filter_intensity(
     hidden = jnp.asarray(chances.undetected, float)
     number = _poisson(hidden, highest) if kind == "cphd" else jnp.zeros(0)
     return jax.lax.scan(step, (start, hidden, number), watch.scans)[1]
+
+
+# tables
+
+
+@dataclass(frozen=True, eq=False)
+class Intensities:
+    """The intensity of the objects in a table of detections after each of its scans.
+
+    `count` has a line for each scan: time, count (mean number of all objects), sd, and undetected (of it, the mean
+    number never detected). `components` lists the Gaussians of each scan (time, weight, and the mean and sd of each
+    state component), `peaks` those that are taken for objects: as many of the heaviest as their weights add up to.
+    """
+
+    count: pd.DataFrame
+    components: pd.DataFrame
+    peaks: pd.DataFrame
+
+
+@float64
+def phd_filter(
+    problem: Problem,
+    z: Any = None,
+    covariance: Any = None,
+    *,
+    kind: Kind = "phd",
+    update: Update = "extended",
+    objects: float = 3.0,
+    births: float = 0.02,
+    lifetime: float = 600.0,
+    most: int = 32,
+    sensors: Collection[str] = (),
+) -> Intensities:
+    """Count and place the objects behind detections that name none, with biases z (M,) held (in their scales; 0).
+
+    A Gaussian-mixture PHD filter (Vo, Ma 2006) of at most `most` components, or with `kind="cphd"` a cardinalised one
+    (Vo, Vo, Cantoni 2007), whose number of objects is surer; both follow objects without saying which is which, as
+    `track_objects` does. What is not known of the biases, `covariance` (M, M), counts as noise of each detection.
+
+    At the first scan `objects` are expected anywhere in the start of the motion, `births` a second appear later, and
+    each stays for `lifetime` s in the mean; one begins with the first detection of it. `update` takes a detection in by
+    derivatives at the mean of a component ("extended") or by points around it ("cubature"). `sensors` are the names of
+    those that are heeded, all by default. Raises `InputError` where every row names its target, or the motion has no
+    linear form.
+    """
+    for name, value, allowed in (("kind", kind, get_args(Kind)), ("update", update, get_args(Update))):
+        if value not in allowed:
+            raise InputError(f'phd_filter({name}={value!r}): give "{allowed[0]}" or "{allowed[1]}"')
+    own, watch, views, known, chances, cloud = asked(
+        "phd_filter", problem, z, covariance,
+        objects=objects, births=births, lifetime=lifetime, most=most, sensors=sensors,
+    )  # fmt: skip
+    passed = filter_intensity(watch, views, known, chances, cloud, most, kind=kind, update=update)
+    scans = own.scans
+    assert scans is not None
+    return _tables(jax.device_get(passed), scans.time, own.epochs[0].components)
+
+
+def _tables(passed: Passed, time: np.ndarray, names: Collection[str]) -> Intensities:
+    """What was passed, K leading, with the names of the state components; heavy components first."""
+    count = pd.DataFrame(
+        {"time": time, "count": passed.count, "sd": np.sqrt(passed.spread), "undetected": passed.undetected}
+    )
+    weight = np.asarray(passed.after.weight)
+    order = np.argsort(-weight, axis=1, kind="stable")
+    place = np.argsort(order, axis=1)  # 0 of the heaviest
+    k, j = np.nonzero(weight > 0)
+    line = np.lexsort((place[k, j], k))
+    k, j = k[line], j[line]
+    components = pd.DataFrame({"time": time[k], "weight": weight[k, j]})
+    mean, covariance = np.asarray(passed.after.mean)[k, j], np.asarray(passed.after.covariance)[k, j]
+    sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
+    for i, name in enumerate(names):
+        components[name], components[f"{name}_sd"] = mean[:, i], sd[:, i]
+    peak = place[k, j] < np.round(weight.sum(1))[k]
+    return Intensities(count, components, components[peak].reset_index(drop=True))
