@@ -191,6 +191,26 @@ class Stepwise:
             found.append(lin._replace(state=whole.at[:, :, np.asarray(block.used, int)].set(lin.state)))
         return tuple(found)
 
+    def innovations_at(
+        self, epoch: Epoch, predicted: tuple[jax.Array, ...], levels: jax.Array
+    ) -> tuple[tuple[jax.Array, jax.Array], ...]:
+        """Innovation (P, C) of every row of an epoch from predicted values (P, C) or (1, C), and their information.
+
+        That is the expected information of a datum about its predicted value, 0 where nothing was measured.
+        """
+        found = []
+        for block, data, seen, value in zip(self.blocks, self.rows, epoch.rows, predicted, strict=True):
+            here = data._replace(epoch=jnp.zeros_like(seen.sensor), **seen._asdict())
+            whole = jnp.broadcast_to(value, here.y.shape)
+            there = here.mask > 0
+            off = jnp.where(there, waist.difference(block, here.y, whole), 0.0)
+            found.append((off, jnp.where(there, waist.information(block, here, whole, levels), 0.0)))
+        return tuple(found)
+
+    def look_at(self, epoch: Epoch, x: State, z: jax.Array, seen: Any) -> tuple[jax.Array, ...]:
+        """A function of target and pose(s), such as a field of view, at every row (P, ...) of an epoch by block."""
+        return tuple(waist.look(block, data, states, z, seen) for block, data, states in self._seen(epoch, x))
+
     def _seen(self, epoch: Epoch, x: State) -> list[tuple[Block, Rows, jax.Array]]:
         """Blocks, their rows at an epoch, and the state (1, n) of the target that they see."""
         found = []

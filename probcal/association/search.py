@@ -1,0 +1,174 @@
+"""The pose of one sensor by another's: a population that narrows, then the modes that it found and their evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.association.scan import View
+from probcal.association.separable import Crossed, Explained, crossed
+
+POPULATION = 512  # points of the search
+CLOSE, FOLLOWED = 0.1, 160  # width from which on so many of them go on
+BATCH = 32  # of them evaluated at once
+WIDTHS = 0.5 ** np.arange(1, 10)  # of the kernel, in scales of the biases
+SPREAD = 8  # share of the population that counts after each step
+FEW = 16  # scans that the search looks at
+MODES = 4  # that are kept
+BEHIND = 30.0  # nats by which a mode may lie behind the best and is followed
+CLIMB = 50  # steps at most
+STILL = 1e-3  # of an sd, by which a step that ends a climb moves
+
+
+class Term(NamedTuple):
+    """One part of the potential of an edge: what explains one sensor's scans, and the views of its model."""
+
+    each: Explained
+    views: tuple[View, ...]
+
+    def few(self) -> Term:
+        """The same on at most `FEW` of the scans that have a partner and a detection."""
+        used = np.asarray(self.each.used) & (np.asarray(self.each.scans.number) >= 0).any(1)
+        kept = np.flatnonzero(used)
+        kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), FEW)).round().astype(int)] if len(kept) else kept[:0]
+        kept = np.concatenate([kept, np.zeros(FEW - len(kept), int)])
+        each = self.each
+        parts = (each.scans, each.stand, each.mixture, each.background, each.used)
+        scans, stand, mixture, background, _ = jax.tree.map(lambda leaf: leaf[kept], parts)
+        there = jnp.asarray(np.arange(FEW) < used.sum())
+        return Term(each._replace(scans=scans, stand=stand, mixture=mixture, background=background, used=there), self.views)
+
+
+@partial(jax.jit, static_argnames=("views",))
+def _values(each: Explained, views: Any, z: jax.Array, theta: jax.Array, at: jax.Array, spread: jax.Array) -> jax.Array:
+    """Log-likelihood (L,) at each of the theta (L, p)."""
+    return jax.lax.map(
+        lambda one: crossed(each, views, z, one, at, spread).value, theta, batch_size=BATCH
+    )
+
+
+@partial(jax.jit, static_argnames=("views",))
+def _expanded(each: Explained, views: Any, z: jax.Array, theta: jax.Array, at: jax.Array) -> Crossed:
+    """Value, slope (p,) and information (p, p) at one theta (p,)."""
+    return crossed(each, views, z, theta, at, jnp.zeros((len(theta), len(theta))))
+
+
+@dataclass(frozen=True, eq=False)
+class Potential:
+    """The log of an edge's potential, as a function of the biases theta (p,) at the places `at` of z."""
+
+    terms: tuple[Term, ...]
+    z: np.ndarray  # (M,) where the others are held
+    at: np.ndarray  # (p,)
+
+    def values(self, theta: np.ndarray, width: float = 0.0) -> np.ndarray:
+        """At each of the theta (L, p), blurred by a kernel."""
+        spread = width**2 * jnp.eye(theta.shape[1])
+        z, points, at = jnp.asarray(self.z), jnp.asarray(theta), jnp.asarray(self.at)
+        return np.sum([np.asarray(_values(t.each, t.views, z, points, at, spread)) for t in self.terms], 0)
+
+    def expanded(self, theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Value, slope (p,) and information (p, p) at theta (p,)."""
+        z, point, at = jnp.asarray(self.z), jnp.asarray(theta), jnp.asarray(self.at)
+        parts = [jax.device_get(_expanded(t.each, t.views, z, point, at)) for t in self.terms]
+        value, slope, information = (np.sum(leaves, 0) for leaves in zip(*parts, strict=True))
+        return float(value), slope, information
+
+    def few(self) -> Potential:
+        """The same on a few of its scans."""
+        return Potential(tuple(term.few() for term in self.terms), self.z, self.at)
+
+
+class Mode(NamedTuple):
+    """A maximum of potential times prior: biases (p,), their covariance by the curvature, and log evidence."""
+
+    theta: np.ndarray
+    covariance: np.ndarray
+    evidence: float  # over that of no object in common
+
+
+def search(potential: Potential, rng: np.random.Generator) -> list[Mode]:
+    """Modes of a potential under the prior N(0, I) of its biases, the one of most evidence first.
+
+    A population drawn from the prior is weighed by the potential blurred by a kernel, tempered so that an eighth of it
+    counts, drawn anew and moved, the kernel narrower by half each time; its best points are where climbs begin.
+    """
+    from scipy.stats import norm, qmc
+
+    p, few = len(potential.at), potential.few()
+    theta = norm.ppf(np.clip(qmc.Sobol(p, seed=rng).random(POPULATION), 1e-6, 1 - 1e-6))
+    for width in WIDTHS:
+        value = few.values(theta, width)
+        size = POPULATION if width > CLOSE else FOLLOWED
+        theta = theta[_drawn(value, size, rng)] + 0.5 * width * rng.standard_normal(theta.shape)
+    value = potential.values(theta, float(WIDTHS[-1]))
+    return climbed(potential, _best(theta, value, 8.0 * float(WIDTHS[-1])))
+
+
+def climbed(potential: Potential, starts: np.ndarray) -> list[Mode]:
+    """The different modes that starts (S, p) lead to."""
+    found: list[Mode] = []
+    for start in starts:
+        mode = climb(potential, start)
+        if mode is not None and not any(same(mode, other) for other in found):
+            found.append(mode)
+    found.sort(key=lambda mode: -mode.evidence)
+    return [mode for mode in found if mode.evidence > found[0].evidence - BEHIND]
+
+
+def climb(potential: Potential, start: np.ndarray) -> Mode | None:
+    """The maximum of potential times prior by damped Gauss-Newton steps, with Laplace's evidence; None at none."""
+    eye = np.eye(len(start))
+    theta, damping = start, 1e-3
+    value, slope, H = potential.expanded(theta)
+    for _ in range(CLIMB):
+        W = H + eye
+        step = np.linalg.solve(W + damping * np.diag(np.diagonal(W)), slope - theta)
+        new = potential.expanded(theta + step)
+        if new[0] - 0.5 * np.sum((theta + step) ** 2) >= value - 0.5 * theta @ theta - 1e-9:
+            theta, (value, slope, H), damping = theta + step, new, 0.1 * damping
+            if np.sqrt(step @ W @ step) < STILL:
+                break
+        else:
+            damping = max(10.0 * damping, 1e-3)
+            if damping > 1e8:
+                break
+    W = H + eye
+    if not np.isfinite(W).all():
+        return None
+    covariance, logdet = (np.asarray(part) for part in linalg.inverse_and_logdet(jnp.asarray(W)))
+    return Mode(theta, covariance, float(value - 0.5 * theta @ theta - 0.5 * logdet))
+
+
+def same(one: Mode, other: Mode) -> bool:
+    """Whether two modes lie within three of their sds."""
+    away = one.theta - other.theta
+    return bool(np.all(np.abs(away) < 3.0 * np.sqrt(np.diagonal(one.covariance + other.covariance))))
+
+
+def _drawn(value: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
+    """Numbers (size,) of the population drawn by weights exp(power value), the power such that a share of it counts."""
+    L = len(value)
+    low, high, weight = 0.0, 1.0, np.full(L, 1.0 / L)
+    for _ in range(40):
+        power = 0.5 * (low + high)
+        weight = np.exp(power * (value - value.max()))
+        weight /= weight.sum()
+        low, high = (power, high) if 1.0 / np.sum(weight**2) > L / SPREAD else (low, power)
+    return np.minimum(np.searchsorted(np.cumsum(weight), (rng.random() + np.arange(size)) / size), L - 1)
+
+
+def _best(theta: np.ndarray, value: np.ndarray, apart: float) -> np.ndarray:
+    """The best points that lie apart from better ones."""
+    order, kept = np.argsort(-value), list[int]()
+    for k in order:
+        if len(kept) < MODES and value[k] > value[order[0]] - BEHIND:
+            if all(np.abs(theta[k] - theta[other]).max() > apart for other in kept):
+                kept.append(int(k))
+    return theta[kept]

@@ -1,0 +1,136 @@
+"""A network as a graph: sensors that share biases are one vertex, and an edge is what two vertices tell each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.association.local import Alone, each_alone
+from probcal.association.phd import Intensity, filter_intensity
+from probcal.association.search import Potential, Term
+from probcal.association.separable import explained, partners
+from probcal.association.update import Biases, Chances
+from probcal.network import ANGLES
+from probcal.problem import Problem
+
+POSE = ("position", *ANGLES)
+MOST = 8  # components of a mixture that explain another sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Vertex:
+    """Sensors with the biases `at` (p,) of z that they read; `known` where none of these is of a pose."""
+
+    name: str
+    sensors: tuple[int, ...]
+    at: np.ndarray
+    known: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """The sensors by themselves, what each knows after its own scans, and the vertices that they form."""
+
+    problem: Problem
+    sensors: list[Alone]
+    after: list[Intensity]
+    count: list[np.ndarray]  # (K,) of objects that a sensor holds
+    vertices: list[Vertex]
+    window: float
+    lifetime: float
+    held: dict[tuple[int, int], float] = field(default_factory=dict)  # of `common`
+
+    @cached_property
+    def placed(self) -> dict[str, Any]:
+        """The sensors as they are placed, by name."""
+        return {sensor.name: sensor for sensor in self.problem.network.sensors}
+
+    def nearest(self, v: int, others: list[int], z: np.ndarray) -> list[int]:
+        """Other vertices, those first whose nodes stand nearest to its own at biases z."""
+        scales, biases = self.problem.scales, self.problem.biases
+        moved = {(b.owner, b.axis): z[m] * scales[m] for m, b in enumerate(biases) if b.component == "position"}
+
+        def place(u: int) -> np.ndarray:
+            node = self.placed[self.sensors[self.vertices[u].sensors[0]].name].nodes[0]
+            return node.position + [moved.get((node.name, axis), 0.0) for axis in range(node.dimension)]
+
+        return sorted((u for u in others if u != v), key=lambda u: float(np.sum((place(u) - place(v)) ** 2)))
+
+    def common(self, u: int, v: int) -> float:
+        """Scans of the sensors of two vertices that have a partner, each counted by the objects that both hold."""
+        if (u, v) in self.held:
+            return self.held[u, v]
+        total = 0.0
+        for i in self.vertices[u].sensors:
+            for j in self.vertices[v].sensors:
+                for a, b in ((i, j), (j, i)):
+                    one, other = self.sensors[a], self.sensors[b]
+                    pair = partners(one.time[one.there], other.time[other.there], self.window, before=True)
+                    held = np.minimum(self.count[a][: len(pair)], self.count[b][pair])
+                    total += float(np.sum(held[pair >= 0]))
+        self.held[u, v] = self.held[v, u] = total
+        return total
+
+    def potential(self, u: int, v: int, z: np.ndarray, at: np.ndarray) -> Potential:
+        """What the sensors of two vertices tell each other, as a function of the biases at some places of z."""
+        terms = []
+        for i in self.vertices[u].sensors:
+            for j in self.vertices[v].sensors:
+                for a, b in ((i, j), (j, i)):
+                    one, other = self.sensors[a], self.sensors[b]
+                    each = explained(
+                        self.problem, one, other, self.after[b], self.count[a], self.window, self.lifetime, before=True
+                    )
+                    terms.append(Term(each, one.views))
+        return Potential(tuple(terms), z, at)
+
+
+def graph_of(problem: Problem, chances: Chances, cloud: np.ndarray, most: int, window: float | None) -> Graph:
+    """Filter every sensor by itself and find the vertices."""
+    sensors = each_alone(problem)
+    vertices = vertices_of(problem, [one.name for one in sensors])
+    M = len(problem.labels)
+    pose = np.array([bias.component in POSE for bias in problem.biases], bool)
+    covariance = np.diag(np.where(pose, 0.0, 1.0))  # a sensor measures in its own axes, wherever it stands
+    known = Biases(*jax.device_put((np.zeros(M), covariance, np.zeros(len(problem.levels)))))
+    after, count = [], []
+    for one in sensors:
+        passed = filter_intensity(one.watch, one.views, known, chances, jnp.asarray(cloud), most)
+        held = jax.device_get(passed.after)
+        heavy = np.argsort(-held.weight, axis=1)[:, :MOST]
+        after.append(Intensity(*(_taken(leaf, heavy) for leaf in held)))
+        count.append(held.weight.sum(1))
+    if window is None:
+        window = 3.0 * max(float(np.median(np.diff(one.time[one.there]) if one.there.sum() > 1 else 0.0)) for one in sensors)
+    return Graph(problem, sensors, after, count, vertices, window, float(chances.lifetime))
+
+
+def _taken(leaf: np.ndarray, which: np.ndarray) -> np.ndarray:
+    return np.take_along_axis(leaf, which.reshape(which.shape + (1,) * (leaf.ndim - 2)), 1)
+
+
+def vertices_of(problem: Problem, names: list[str]) -> list[Vertex]:
+    """Sensors joined where they read the same bias of a node; biases of a type or of a time belong to none."""
+    placed = {sensor.name: sensor for sensor in problem.network.sensors}
+    reads: list[set[int]] = []
+    for name in names:
+        owners = {name, *(node.name for node in placed[name].nodes)}
+        reads.append({m for m, bias in enumerate(problem.biases) if bias.owner in owners and bias.since is None})
+    groups: list[tuple[set[int], list[int]]] = []
+    for s, own in enumerate(reads):
+        joined = [group for group in groups if group[0] & own]
+        groups = [group for group in groups if not group[0] & own]
+        biases = own.union(*(group[0] for group in joined))
+        groups.append((biases, sorted([s, *(other for group in joined for other in group[1])])))
+    groups.sort(key=lambda group: group[1])
+    found = []
+    for biases, sensors in groups:
+        pose: Any = [problem.biases[m].component in POSE for m in biases]
+        name = " and ".join(names[s] for s in sensors)
+        found.append(Vertex(name, tuple(sensors), np.array(sorted(biases), int), not any(pose)))
+    return found
