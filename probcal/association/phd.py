@@ -36,6 +36,7 @@ Kind = Literal["phd", "cphd"]
 Update = Literal["extended", "cubature"]
 PRUNE = 1e-5  # weight up to which a component is dropped
 MERGE = 4.0  # squared Mahalanobis distance up to which two become one
+CONSIDERED = 4  # times as many components as are kept may be merged, the heaviest
 HIGHEST = 60  # most objects whose number has a probability
 
 
@@ -188,18 +189,19 @@ def _as_cluster(
 def reduced(mixture: Intensity, most: int, prune: jax.Array | float, merge: jax.Array | float) -> Intensity:
     """At most `most` components: light ones dropped, near ones merged, the sum of the weights kept.
 
-    From the heaviest on, each takes those within a squared Mahalanobis distance `merge` by the covariances of both; a
-    group becomes the Gaussian with its moments. What was dropped is made up by the weights of the others.
+    From the heaviest on, each takes those within a squared Mahalanobis distance `merge` by the covariances of both (one
+    that is wide widens no narrow one beside it); a group becomes the Gaussian with its moments. What was dropped is
+    made up by the weights of the others.
     """
-    weight, mean, covariance = mixture
+    weight, which = jax.lax.top_k(mixture.weight, min(CONSIDERED * most, len(mixture.weight)))
+    mean, covariance = mixture.mean[which], mixture.covariance[which]
     white = jax.vmap(linalg.inverse_cholesky)(covariance)
-    own = jnp.einsum("tij,tj->ti", white, mean)
     rank = jnp.arange(len(weight))
 
     def group(left: jax.Array, _: None) -> tuple[jax.Array, Intensity]:
         top = jnp.argmax(left)
         off = mean - mean[top][None]
-        theirs = jnp.sum((own - jnp.einsum("tij,j->ti", white, mean[top])) ** 2, 1)
+        theirs = jnp.sum(jnp.einsum("tij,tj->ti", white, off) ** 2, 1)
         mine = jnp.sum((off @ white[top].T) ** 2, 1)
         near = (left > 0) & ((jnp.maximum(theirs, mine) <= merge) | (rank == top))
         taken = jnp.where(near, left, 0.0)
@@ -212,7 +214,8 @@ def reduced(mixture: Intensity, most: int, prune: jax.Array | float, merge: jax.
 
     _, found = jax.lax.scan(group, jnp.where(weight > prune, weight, 0.0), length=most)
     kept = jnp.sum(found.weight)
-    return found._replace(weight=found.weight * jnp.where(kept > 0, jnp.sum(weight) / jnp.where(kept > 0, kept, 1), 0))
+    whole = jnp.sum(mixture.weight)
+    return found._replace(weight=found.weight * jnp.where(kept > 0, whole / jnp.where(kept > 0, kept, 1.0), 0.0))
 
 
 Carry = tuple[Intensity, jax.Array, jax.Array]  # and the mean number never detected, log probabilities of the number
