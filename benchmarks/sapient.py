@@ -55,8 +55,8 @@ def main():
         held = np.mean((low < -off) & (-off < high))
         place, heading = by_sensor(problem.labels, off)
         place_sd, heading_sd = by_sensor(problem.labels, sd)
-        for k in range(len(place)):
-            print(f"  sensor {k + 2}: {place[k]:.3f} m, {heading[k]:.3f} deg (sd {place_sd[k]:.3f}, {heading_sd[k]:.3f})")
+        for k, (m, deg, m_sd, deg_sd) in enumerate(zip(place, heading, place_sd, heading_sd, strict=True)):
+            print(f"  sensor {k + 2}: {m:.3f} m, {deg:.3f} deg (sd {m_sd:.3f}, {deg_sd:.3f})")
         print(
             f"run {run}: {tree.attrs['status']}; worst {place.max():.3f} m, {heading.max():.3f} deg; 89 % hold"
             f" {held:.2f}, rms z {np.sqrt(np.mean((off / sd) ** 2)):.2f}; {tree.attrs['objects']} objects,"
@@ -66,7 +66,8 @@ def main():
         worst.append((place.max(), heading.max()))
     worst = np.array(worst)
     good = np.sum((worst <= WITHIN).all(1))
-    print(f"\nstart={chosen.start}: every sensor within {WITHIN[0]} m and {WITHIN[1]} deg in {good} of {len(worst)} runs")
+    within = f"within {WITHIN[0]} m and {WITHIN[1]} deg"
+    print(f"\nstart={chosen.start}: every sensor {within} in {good} of {len(worst)} runs")
 
 
 if __name__ == "__main__":

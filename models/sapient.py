@@ -2,13 +2,13 @@
 
 The network of Uney, Mulgrew and Clark (Separable likelihoods for network self-configuration, section 4): places and
 boresights are those of Table 1. Every sensor reports range and azimuth from its boresight, out to 25 m: lidars within
-240 deg, radars within 40 deg. Each has a clock of its own (period, phase, jitter), so that no two share a time. Sensor 1
-is the anchor; of the others only the middle of the fence and "west" are stated. The recording is not public: this one is
-simulated. Noise, false alarms, clocks and walks are those of this file, since the paper does not print its own.
+240 deg, radars within 40 deg. Each has a clock of its own (period, phase, jitter), so that no two look together. Sensor
+1 is the anchor; of the others only the middle of the fence and "west" are stated. The recording is not public: this one
+is simulated. Noise, false alarms, clocks and walks are those of this file, since the paper does not print its own.
 
-Three pedestrians walk for three minutes, each up the fence on one lane and down it on another, 3 to 14 m before it: past
-all three lidars and through the view of every radar, as in Fig. 6. The sensors of the paper report upon detection only.
-How often a sensor looked must be known here: a scan that detected nothing is a blank row.
+Three pedestrians walk for three minutes, each up the fence on one lane and down it on another, 3 to 14 m before it:
+past all three lidars and through the view of every radar, as in Fig. 6. The sensors of the paper report upon detection
+only. How often a sensor looked must be known here: a scan that detected nothing is a blank row.
 
     probcal fit models/sapient.py --method self-config-tracks --out sapient
 """

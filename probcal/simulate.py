@@ -287,7 +287,8 @@ def _plan(network: Network, time: np.ndarray, targets: list[str]) -> pd.DataFram
     names = [placed.name for placed in network.sensors]
     grid = [(t, sensor, target) for target in targets for t in time for sensor in names]
     plan = pd.DataFrame(grid, columns=["time", "sensor", "target"])
-    return plan if targets != ["target"] else plan.drop(columns="target")
+    detects = any(placed.detection is not None for placed in network.sensors)  # whose rows would lose the name
+    return plan if detects or targets != ["target"] else plan.drop(columns="target")
 
 
 def blank(network: Network, plan: pd.DataFrame) -> pd.DataFrame:

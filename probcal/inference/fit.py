@@ -32,6 +32,7 @@ from probcal.priors import Prior
 from probcal.problem import Problem, check_linear
 from probcal.results.answer import Answer, tracks_of, uncalibrated
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
+from probcal.results.objects import object_groups
 from probcal.results.read import apply
 from probcal.simulate import Key, as_key
 from probcal.smoothing.grid import track_mode
@@ -169,14 +170,14 @@ def _configured(
         tree.attrs |= {"status": str(answer.status), "message": answer.message}
     said = f"{len(found.objects.names)} objects in {len(scans)} scans, found in {found.rounds} rounds of {method.name}."
     tree.attrs |= {"rounds": found.rounds, "message": f"{said} {tree.attrs['message']}".strip()}
-    return _with_objects(tree, found.objects), answer
+    return _with_objects(tree, found.objects, problem, answer.posterior.summary.mean), answer
 
 
-def _with_objects(tree: xr.DataTree, objects: Objects) -> xr.DataTree:
-    """The tree with the groups `association` (pairs of detection and track) and `object` (their paths by scan)."""
+def _with_objects(tree: xr.DataTree, objects: Objects, problem: Problem, z: Any) -> xr.DataTree:
+    """The tree with the groups `association`, `object` and `detection`, at biases z (M,)."""
     tree.attrs["objects"] = len(objects.names)
-    tree["association"] = xr.DataTree(objects.rows.rename_axis("pair").to_xarray())
-    tree["object"] = xr.DataTree(objects.path.rename_axis("line").to_xarray())
+    for name, group in object_groups(problem, objects, z).items():
+        tree[name] = xr.DataTree(group)
     return tree
 
 
@@ -296,7 +297,7 @@ def track(
         if not objects.names:
             raise FitError(f"no object is confirmed in {len(problem.scans)} scans: nothing stands out from clutter")
         named = problem.assigned(objects.rows)
-        return _with_objects(track(named, calibration, smoother=smoother, key=key), objects)
+        return _with_objects(track(named, calibration, smoother=smoother, key=key), objects, problem, known.z)
     found = apply(problem, calibration)
     problem, covariance = found.problem, jnp.asarray(found.covariance)
     if smoother is not None:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     )
     from probcal.plots.interactive import interactive_map
     from probcal.plots.map import plot_map
+    from probcal.plots.objects import plot_objects
     from probcal.plots.observability import draw_check, plot_directions, plot_passes, plot_spectrum
     from probcal.plots.roads import plot_particles, plot_roads
     from probcal.plots.sbc import draw_sbc, plot_coverage, plot_ranks
@@ -34,6 +35,7 @@ __all__ = lazy(
         "probcal.plots.fit": "plot_biases plot_drift plot_gamma plot_objective plot_outliers plot_residuals",
         "probcal.plots.interactive": "interactive_map",
         "probcal.plots.map": "plot_map",
+        "probcal.plots.objects": "plot_objects",
         "probcal.plots.observability": "draw_check plot_directions plot_passes plot_spectrum",
         "probcal.plots.roads": "plot_particles plot_roads",
         "probcal.plots.sbc": "draw_sbc plot_coverage plot_ranks",

@@ -12,15 +12,16 @@ from bokeh.models import (
     DataRange1d,
     HoverTool,
     LayoutDOM,
+    LinearColorMapper,
     WheelZoomTool,
 )
-from bokeh.models.annotations.legends import Legend, LegendItem
+from bokeh.models.annotations.legends import ColorBar, Legend, LegendItem
 from bokeh.plotting import figure
 
 from probcal.geodesy import LocalFrame
 from probcal.labels import AXES
-from probcal.plots.base import BEFORE, NAMED, colour, probability
-from probcal.plots.scene import Scene, Track, ellipse, scene
+from probcal.plots.base import BEFORE, FAINT, NAMED, SURE, colour, probability
+from probcal.plots.scene import Outline, Scene, Track, ellipse, scene
 
 POINTS = 5_000  # epochs of all tracks together
 CORNERS = 32  # of an ellipse
@@ -32,7 +33,7 @@ TEXT: dict[str, Any] = {"text_color": MIDDLE, "text_font_size": "12px"}
 HEIGHTS = (320, 620)  # px of the plan
 LAYERS = {
     "before": "before calibration", "after": "after", "truth": "truth", "mirror": "fits as well",
-    "ellipses": "ellipses", "names": "names",
+    "objects": "objects by existence", "views": "views", "ellipses": "ellipses", "names": "names",
 }  # fmt: skip
 
 
@@ -41,7 +42,8 @@ def interactive_map(tree: xr.DataTree) -> LayoutDOM:
 
     Nodes as stated and calibrated with their ellipses and headings, tracks before and after calibration, the truth
     where `add_scores` has met it, meridians and parallels where the network has a `frame`. Every node and epoch has a
-    word. In 3-D a second panel shows the heights. Layers carry a tag: before, after, truth, mirror, ellipses, names.
+    word. Of detections that nobody named also the objects, coloured by existence, and what each sensor sees. In 3-D a
+    second panel shows the heights. Layers carry a tag: before, after, truth, mirror, objects, views, ellipses, names.
 
     >>> interactive_map(tree).select_one({"name": "map"}).x_range.name
     'x'
@@ -61,6 +63,7 @@ def layers(shown: Scene) -> dict[str, str]:
     has = {
         "before": bool(shown.tracks), "after": bool(shown.tracks), "mirror": bool(shown.mirrored),
         "truth": any(np.isfinite(track.true).any() for track in shown.tracks),
+        "objects": bool(shown.objects), "views": bool(shown.views),
         "ellipses": _encircled(shown), "names": len(shown.nodes.name) <= NAMED,
     }  # fmt: skip
     return {tag: text for tag, text in LAYERS.items() if has[tag]}
@@ -139,9 +142,65 @@ def _panel(shown: Scene, sources: dict[str, ColumnDataSource], axes: tuple[int, 
     sheet.grid.grid_line_color, sheet.grid.grid_line_alpha = MIDDLE, 0.25
     if flat and shown.frame is not None:
         _draw_graticule(sheet, shown.frame, low, high, shown.dimension)
+    if flat:
+        _draw_views(sheet, shown.views)
+    _draw_objects(sheet, shown, plane)
     _draw_tracks(sheet, shown, sources["epochs"], plane)
     _draw_nodes(sheet, shown, sources["nodes"], plane, probability)
     return sheet
+
+
+def _draw_views(sheet: figure, views: list[Outline]) -> None:
+    """Where the view of each sensor ends; filled where one line goes round it."""
+    columns: dict[str, list[Any]] = {"xs": [], "ys": [], "colour": [], "fill": [], "sensor": []}
+    for k, own in enumerate(views):
+        for line in own.lines:
+            one = (line[:, 0], line[:, 1], colour(k), 0.05 if own.whole else 0.0, own.sensor)
+            for name, value in zip(columns, one, strict=True):
+                columns[name].append(value)
+    if columns["xs"]:
+        source = ColumnDataSource(data=columns)
+        _tagged("views", sheet.patches("xs", "ys", source=source, color="colour", alpha="fill", line_color=None))
+        ends = sheet.multi_line("xs", "ys", source=source, line_color="colour", line_dash="dotdash", line_alpha=0.7)
+        said = "<b>@sensor</b><div>its view ends here</div>"
+        sheet.add_tools(HoverTool(renderers=[_tagged("views", ends)], tooltips=said, visible=False, name="views"))
+
+
+def _draw_objects(sheet: figure, shown: Scene, plane: list[int]) -> None:
+    """Objects that nobody named, by existence, with a bar that says which colour is how sure."""
+    if not shown.objects:
+        return
+    tracks = [own.thin(max(2, POINTS // len(shown.objects))) for own in shown.objects]
+    sure = np.concatenate([own.existence[1:] for own in tracks])
+    columns: dict[str, Any] = {
+        "name": [own.name for own in tracks for _ in own.time[1:]],
+        "time": np.concatenate([own.time[1:] for own in tracks]), "existence": sure, "opacity": 0.2 + 0.7 * sure,
+    }  # fmt: skip
+    for name, axis in zip("xy", plane, strict=True):
+        columns[f"{name}0"] = np.concatenate([own.position[:-1, axis] for own in tracks])
+        columns[f"{name}1"] = np.concatenate([own.position[1:, axis] for own in tracks])
+    tint = LinearColorMapper(palette=shades(FAINT, SURE), low=0.0, high=1.0)
+    band = sheet.segment(
+        "x0", "y0", "x1", "y1", source=ColumnDataSource(data=columns), line_width=5, line_alpha="opacity",
+        line_color={"field": "existence", "transform": tint},
+    )  # fmt: skip
+    said = "<b>@name</b><div>time @time{0.000} s</div><div>existence @existence{0.00}</div>"
+    sheet.add_tools(
+        HoverTool(renderers=[_tagged("objects", band)], tooltips=said, description="Objects", name="objects")
+    )
+    if plane == [0, 1]:
+        bar = ColorBar(
+            color_mapper=tint, title="existence", width=10, height=120, background_fill_alpha=0.0, location=(0, 0),
+            major_label_text_color=MIDDLE, title_text_color=MIDDLE, major_tick_line_color=None, bar_line_color=MIDDLE,
+        )  # fmt: skip
+        sheet.add_layout(_tagged("objects", bar), "right")
+
+
+def shades(first: str, last: str, count: int = 64) -> list[str]:
+    """Colours from one to another, in even steps."""
+    ends = np.array([[int(text[k : k + 2], 16) for k in (1, 3, 5)] for text in (first, last)])
+    steps = ends[0] + np.linspace(0.0, 1.0, count)[:, None] * (ends[1] - ends[0])
+    return [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in steps.round().astype(int).tolist()]
 
 
 def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: list[int]) -> None:

@@ -6,34 +6,42 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.lines import Line2D
-from matplotlib.patches import FancyArrowPatch
+from matplotlib.patches import FancyArrowPatch, Polygon
 
 from probcal.plots.base import (
     ALL_POINTS,
     BEFORE,
     NAMED,
+    PALE,
     POINTS,
+    SURE,
     colour,
     ellipse_patch,
+    figure_of,
     new_axes,
     plain_text,
     probability,
 )
-from probcal.plots.scene import Places, Track, scene
+from probcal.plots.scene import Found, Outline, Places, Track, scene
 
 
 def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw stated and calibrated nodes with their ellipses, the tracks before and after calibration.
 
     Dotted: the true tracks, where `add_scores` has met them. Dashed: the tracks of an answer on the other side of a
-    mirror that fits as well.
+    mirror that fits as well. Of detections that nobody named: a broad line where an object was, in the colour of its
+    existence and faint where that is small; and what each sensor sees, from where it was found to stand.
     """
     ax = new_axes(ax, 9.0, 6.5)
     ax.set_aspect("equal", adjustable="box")
     shown = scene(tree)
     ax.set(xlim=(shown.low[0], shown.high[0]), ylim=(shown.low[1], shown.high[1]))
-    keys = _draw_tracks(ax, shown.tracks) + _draw_mirrored(ax, shown.mirrored)
+    keys = _draw_views(ax, shown.views) + _draw_objects(ax, shown.objects)
+    keys += _draw_tracks(ax, shown.tracks) + _draw_mirrored(ax, shown.mirrored)
     keys += _draw_nodes(ax, shown.nodes, probability(tree))
     ax.set(xlabel="x in m", ylabel="y in m")
     ax.set_title("Map of nodes and tracks" + (" (x-y plane, z not shown)" if shown.dimension > 2 else ""), loc="left")
@@ -44,6 +52,33 @@ def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
 def _most(tracks: Sequence[Track]) -> int:
     """Epochs of each track that are drawn."""
     return min(POINTS, max(2, ALL_POINTS // max(len(tracks), 1)))
+
+
+def _draw_views(ax: Axes, views: list[Outline]) -> list[Line2D]:
+    """Draw where the view of each sensor ends and return the legend entry."""
+    for k, own in enumerate(views):
+        for line in own.lines:
+            ax.plot(*line.T, "-.", color=colour(k), linewidth=0.8, alpha=0.7, zorder=1.5)
+            if own.whole:
+                ax.add_patch(Polygon(line, facecolor=colour(k), edgecolor="none", alpha=0.05, zorder=1))
+    return [Line2D([], [], color="0.3", linestyle="-.", linewidth=0.8, label="view of a sensor")] if views else []
+
+
+def _draw_objects(ax: Axes, objects: list[Found]) -> list[Line2D]:
+    """Draw objects that nobody named by existence, with a colour bar, and return the legend entry."""
+    if not objects:
+        return []
+    most, tint = max(2, ALL_POINTS // len(objects)), LinearSegmentedColormap.from_list("existence", [PALE, SURE])
+    for whole in objects:
+        own = whole.thin(most)
+        places, sure = own.position[:, :2], own.existence[1:]
+        lines = list(np.stack([places[:-1], places[1:]], 1))
+        ax.add_collection(
+            LineCollection(lines, colors=tint(sure), linewidths=4.0, capstyle="round", zorder=1.8), autolim=False
+        )
+    bar = ax.inset_axes((1.03, 0.05, 0.02, 0.3))
+    figure_of(ax).colorbar(ScalarMappable(Normalize(0.0, 1.0), tint), cax=bar, label="existence")
+    return [Line2D([], [], color=SURE, linewidth=4.0, label=f"{len(objects)} objects, by existence")]
 
 
 def _draw_mirrored(ax: Axes, tracks: list[Track]) -> list[Line2D]:

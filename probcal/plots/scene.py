@@ -1,4 +1,7 @@
-"""What a map shows: nodes as stated and as calibrated, tracks without and with calibration, the truth, a mirror."""
+"""What a map shows: nodes as stated and as calibrated, tracks without and with calibration, the truth, a mirror.
+
+Of detections that nobody named also the objects found, and what each sensor sees.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,7 +12,12 @@ import xarray as xr
 from probcal.errors import InputError
 from probcal.geodesy import GEODETIC, LocalFrame
 from probcal.labels import AXES
-from probcal.results.read import each_track
+from probcal.results.read import each_object, each_track
+
+ARC = 48  # corners of a sector's arc
+SEEN = 0.5  # share of an object in view at which the outline of a view is drawn
+ASIDE = 0.25  # of the extent of nodes and tracks up to which views and faint objects widen the map
+SURE = 0.5  # existence from which an object widens it at all
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,32 @@ class Track:
 
 
 @dataclass(frozen=True)
+class Found:
+    """Positions (L, d) in m of one object that nobody named, in order of time in s, and how surely it exists (L,)."""
+
+    name: str
+    time: np.ndarray
+    position: np.ndarray
+    existence: np.ndarray
+
+    def thin(self, most: int) -> "Found":
+        """At most `most` instants, evenly spaced, both ends kept."""
+        if len(self.time) <= most:
+            return self
+        kept = np.linspace(0, len(self.time) - 1, most).round().astype(int)
+        return Found(self.name, self.time[kept], self.position[kept], self.existence[kept])
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Where the view of one sensor ends in the plane: lines (P, 2) in m; `whole` where a single one goes round it."""
+
+    sensor: str
+    lines: list[np.ndarray]
+    whole: bool
+
+
+@dataclass(frozen=True)
 class Places:
     """Nodes: positions (N, d) in m, which of them are biased, which move, headings (N,) in rad where one is biased."""
 
@@ -52,6 +86,8 @@ class Scene:
     nodes: Places
     tracks: list[Track]
     mirrored: list[Track]  # of the best answer on the other side of a mirror, where one fits as well
+    objects: list[Found]
+    views: list[Outline]
     low: np.ndarray
     high: np.ndarray
     frame: LocalFrame | None  # of the coordinates, where they come from latitude and longitude
@@ -69,8 +105,12 @@ def scene(tree: xr.DataTree) -> Scene:
     nodes, tracks, mirrored = _places(tree), list(_tracks(tree)), list(_mirrored(tree))
     attrs = tree["constant_data"].attrs
     frame = LocalFrame(*(float(attrs[name]) for name in GEODETIC)) if GEODETIC[0] in attrs else None
+    objects = [Found(name, *rest) for name, *rest in each_object(tree, AXES[: nodes.stated.shape[1]])]
     low, high = _limits(nodes, [*tracks, *mirrored], diverged=tree.attrs.get("status") == "diverged")
-    return Scene(nodes, tracks, mirrored, low, high, frame)
+    views = list(_views(tree, nodes, float(np.linalg.norm(high - low))))
+    sure = [own.position[own.existence >= SURE] for own in objects]
+    low, high = _widened(low, high, sure, [line for own in views for line in own.lines])
+    return Scene(nodes, tracks, mirrored, objects, views, low, high, frame)
 
 
 def ellipse(covariance: np.ndarray, probability: float) -> tuple[float, float, float]:
@@ -129,6 +169,49 @@ def _mirrored(tree: xr.DataTree) -> Iterator[Track]:
         places = there["position"].isel(mirror=best).values
         nothing = np.full(places.shape, np.nan)
         yield Track(target, there["time"].values, places, places, nothing, nothing)
+
+
+def _views(tree: xr.DataTree, nodes: Places, far: float) -> Iterator[Outline]:
+    """What each sensor sees from its calibrated node, in the plane; a view without an end ends `far` m away."""
+    group, moved = tree["constant_data"].to_dataset(), shifts(tree)
+    if "view_range" not in group:
+        return
+    on = list(zip(group["placed_sensor"].values.tolist(), group["placed_node"].values.tolist(), strict=True))
+    names, at = nodes.name.tolist(), {}
+    for sensor, node in on:
+        at[sensor] = names.index(node) if [own for own, _ in on].count(sensor) == 1 else -1
+    parts = (group[f"view_{part}"].values.tolist() for part in ("range", "width", "towards"))
+    for sensor, reach, width, towards in zip(group["sensor"].values.tolist(), *parts, strict=True):
+        k, round_ = at.get(sensor, -1), width >= 2 * np.pi - 1e-6
+        if k < 0 or np.isnan(reach) or (round_ and np.isinf(reach)) or (nodes.moving[k] and not round_):
+            continue
+        turned = float(group["node_heading"].values[k]) + moved.get(f"{names[k]}.heading", 0.0) + towards
+        angle = turned + width * np.linspace(-0.5, 0.5, ARC)
+        arc = nodes.calibrated[k, :2] + min(reach, far) * np.stack([np.cos(angle), np.sin(angle)], 1)
+        corner = np.empty((0, 2)) if round_ else nodes.calibrated[k, :2][None]
+        yield Outline(sensor, [np.concatenate([corner, arc, corner])], whole=True)
+    if "view" in group:
+        from contourpy import contour_generator  # what both libraries of pictures draw with
+
+        for sensor, seen in zip(group["viewing"].values.tolist(), group["view"].values, strict=True):
+            lines = contour_generator(group["view_x"].values, group["view_y"].values, seen).lines(SEEN)
+            yield Outline(sensor, [np.asarray(line) for line in lines], whole=False)
+
+
+def _widened(
+    low: np.ndarray, high: np.ndarray, objects: list[np.ndarray], views: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corners that hold objects and views too, as far as they lie beside what is there."""
+    aside = ASIDE * float((high - low).max())
+    low, high = low.copy(), high.copy()
+    near, far = low - aside, high + aside
+    for points in (*objects, *views):
+        some = points[np.isfinite(points).all(1)]
+        if len(some):
+            d = some.shape[1]
+            low[:d] = np.minimum(low[:d], np.maximum(some.min(0), near[:d]))
+            high[:d] = np.maximum(high[:d], np.minimum(some.max(0), far[:d]))
+    return low, high
 
 
 def _limits(nodes: Places, tracks: list[Track], *, diverged: bool) -> tuple[np.ndarray, np.ndarray]:

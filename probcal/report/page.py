@@ -127,6 +127,8 @@ def _pictures(tree: xr.DataTree, light: tuple[str, ...]) -> list[dict[str, str]]
         text = "Values of the drifting biases over time with their intervals"
         found.insert(2, ("Drift", text, {"posterior"}, lambda: plots.plot_drift(tree)))
     found += [
+        ("Objects", "Existence of every object that nobody named over time, and how many there are", {"object"},
+         lambda: plots.plot_objects(tree)[0]),
         ("Verdicts", "Gamma of every bias against how much the data narrow it, coloured by verdict", {"verdict"},
          lambda: plots.plot_shrinkage(tree)),
         ("Innovations", "NIS of every epoch with its limits", {"epoch_check"},

@@ -1,4 +1,4 @@
-"""Tables of a report: every bias, levels, fixed biases, optima, outliers, checks; and the sentences beside them."""
+"""Tables of a report: every bias, levels, fixed biases, optima, outliers, objects, checks; sentences beside them."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from probcal.status import INVALID
 BIASES = 400  # of the table of all: the others are in summary.csv
 EXTRA = {"r_hat": "r_hat", "ess_bulk": "ess bulk", "ess_tail": "ess tail", "ess": "ess"}  # of samplers
 LISTED = 20  # outlying data in the table
-CHECKED = 60  # rows of a table of checks
+CHECKED = 60  # rows of a table of checks, objects or sensors
 # group of an assessment -> title, what a row is, and its columns with what they are called
 CHECKS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
     "sensor_check": (
@@ -164,6 +164,53 @@ def _checked(tree: xr.DataTree, name: str) -> dict[str, Any] | None:
     return {"title": title + (f", the first {CHECKED}" if left else ""), "columns": [keys[-1], *columns], "rows": rows}
 
 
+def _objects(tree: xr.DataTree) -> dict[str, Any] | None:
+    """Table of the objects that nobody named: when each was there, how surely, and how often it was detected."""
+    if not {"object", "association"} <= set(tree.children):
+        return None
+    held = tree["association"].to_dataset().to_dataframe().groupby("track")["weight"].sum()
+    found = tree["object"].to_dataset().to_dataframe().groupby("track", sort=False)
+    spans = found.agg(first=("time", "min"), last=("time", "max"), existence=("existence", "max"))
+    rows = [
+        [str(name), number(first, 6), number(last, 6), f"{existence:.2f}", f"{held.get(name, 0.0):.1f}"]
+        for name, first, last, existence in spans.head(CHECKED).itertuples()
+    ]
+    title = f"Objects: {len(spans)} in the detections" + (f", the first {CHECKED}" if len(spans) > CHECKED else "")
+    columns = ["object", "first time, s", "last time, s", "largest existence", "detections"]
+    return {"title": title, "columns": columns, "rows": rows}
+
+
+def _share(value: float) -> str:
+    return f"{value:.2f}" if np.isfinite(value) else NONE
+
+
+def _detections(tree: xr.DataTree) -> dict[str, Any] | None:
+    """Table of what each sensor detected, of objects and falsely, beside what it is declared to."""
+    if not {"detection", "constant_data"} <= set(tree.children):
+        return None
+    stated = tree["constant_data"].to_dataset()
+    group = tree["detection"].to_dataset().assign(stated[["detection_probability", "clutter"]])
+    frame = group.to_dataframe()
+    frame = frame[frame["scans"] > 0]
+    rows = []
+    for name, own in frame.head(CHECKED).iterrows():
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = np.divide(own["of_objects"], own["detections"])
+            false = np.divide(own["detections"] - own["of_objects"], own["scans"])
+            seen = np.divide(own["of_objects"], own["looks"])
+        clutter, probability = (number(own[column]) for column in ("clutter", "detection_probability"))
+        rows.append(
+            [str(name), str(int(own["scans"])), str(int(own["detections"])), _share(share), number(false), clutter,
+             f"{own['looks']:.0f}", _share(seen), probability]
+        )  # fmt: skip
+    title = "Detections by sensor" + (f", the first {CHECKED}" if len(frame) > CHECKED else "")
+    columns = [
+        "sensor", "scans", "detections", "share of objects", "false a scan", "declared clutter", "looks",
+        "share of looks detected", "declared probability",
+    ]  # fmt: skip
+    return {"title": title, "columns": columns, "rows": rows}
+
+
 def noted(tree: xr.DataTree) -> list[str]:
     """Sentences of an assessment."""
     return tree["finding"].to_dataset()["sentence"].values.tolist() if "finding" in tree.children else []
@@ -180,5 +227,8 @@ def directions(tree: xr.DataTree) -> list[str]:
 
 def tables(tree: xr.DataTree) -> list[dict[str, Any]]:
     """All tables behind that of the biases: title, columns, rows of texts."""
-    found = (_levels(tree), _fixed(tree), _optima(tree), _outliers(tree), *(_checked(tree, name) for name in CHECKS))
+    found = (
+        _levels(tree), _fixed(tree), _objects(tree), _detections(tree), _optima(tree), _outliers(tree),
+        *(_checked(tree, name) for name in CHECKS),
+    )  # fmt: skip
     return [table for table in found if table]

@@ -55,7 +55,7 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
         "posterior": _posterior_group(answer, draws),
         "calibration": _calibration_group(answer),
         **track_groups(problem, tracks, draws.states, _sample(draws) if len(draws.states) else None),
-        "constant_data": constant_group(problem),
+        "constant_data": constant_group(problem, posterior.point),
         **_data_groups(answer, draws, before),
     }
     if answer.trace is not None:

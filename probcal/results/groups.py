@@ -10,11 +10,13 @@ import numpy as np
 from probcal.geodesy import GEODETIC
 from probcal.labels import AXES
 from probcal.lazy import Later
+from probcal.results.objects import view_variables
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from probcal.problem import Problem
+    from probcal.smoothing.mode import Point
 else:
     xr = Later("xarray")
 
@@ -154,8 +156,11 @@ def by_target(
     return found
 
 
-def constant_group(problem: Problem) -> xr.Dataset:
-    """Stated values of the nodes, which of them move, what is placed on them, and the fixed biases."""
+def constant_group(problem: Problem, point: Point | None = None) -> xr.Dataset:
+    """Stated values of the nodes, which of them move, what is placed on them, the fixed biases, and what sensors see.
+
+    A view that is no sector is evaluated at a `point`.
+    """
     d, nodes = problem.network.dimension, problem.network.nodes
     stated = [(n.name, component, float(value)) for n in nodes for component, value in n.numbers.items()]
     owners, components, numbers = zip(*stated, strict=True)
@@ -172,6 +177,8 @@ def constant_group(problem: Problem) -> xr.Dataset:
         "placed_sensor": ("placement", np.array([s.name for s, _ in placed])),
         "placed_node": ("placement", np.array([n.name for _, n in placed])),
     }  # fmt: skip
+    seen, where = view_variables(problem, point)
+    values, coords = values | seen, coords | where
     if problem.fixed:
         values["fixed"] = ("fixed_label", np.array(list(problem.fixed.values())))
         coords["fixed_label"] = list(problem.fixed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +40,19 @@ def each_track(tree: xr.DataTree, group: str = "track") -> Iterator[tuple[str, x
     if group in tree.children:
         for node in tree[group].children.values():
             yield str(node.attrs["target"]), node.to_dataset(inherit=False)
+
+
+def each_object(tree: xr.DataTree, axes: Sequence[str]) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    """Name, times (L,), positions (L, d) and existence (L,) of every object that nobody named; none without a group.
+
+    Where several sensors looked at one time, what the last of them left is taken.
+    """
+    if "object" in tree.children:
+        frame = tree["object"].to_dataset().to_dataframe().drop_duplicates(["track", "time"], keep="last")
+        columns = [f"position_{axis}" for axis in axes]
+        if set(columns) <= set(frame):
+            for name, own in frame.groupby("track", sort=False):
+                yield str(name), own["time"].to_numpy(), own[columns].to_numpy(float), own["existence"].to_numpy()
 
 
 def tracks(tree: xr.DataTree) -> pd.DataFrame:
