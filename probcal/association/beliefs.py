@@ -72,7 +72,7 @@ def propagated(graph: Graph, seed: int, iterations: int, messages: str, toleranc
         for v, belief in passing.beliefs.items():
             found.put(v, belief)
         found.note(k + 1, "loopy")
-        if moved < tolerance:
+        if moved < tolerance and k > hops:  # the first messages know of the priors alone
             found.rests = True
             break
     _check_rivals(found, edges)

@@ -41,6 +41,12 @@ def _normal(precision: np.ndarray, pull: np.ndarray) -> Belief:
     return Belief(covariance @ pull, 0.5 * (covariance + covariance.T))
 
 
+def _forms(belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+    """Precision and pull of a belief."""
+    precision = np.linalg.solve(belief.covariance, np.eye(len(belief.mean)))
+    return precision, precision @ belief.mean
+
+
 class Normals:
     """Gaussian messages: each potential is expanded where the beliefs are, and again where they have moved."""
 
@@ -63,7 +69,7 @@ class Normals:
             for source, mine, to, theirs in ((edge.first, first, edge.second, second), (edge.second, second, edge.first, first)):
                 if not len(place[theirs]):
                     continue
-                precision, h = self._gathered(source, e)
+                precision, h = self._gathered(source, e) if self.sent else _forms(before[source])
                 whole = H[mine, mine] + precision
                 gain = np.linalg.solve(whole, H[mine, theirs]).T if len(place[mine]) else np.zeros((len(place[theirs]), 0))
                 sent[e, to] = H[theirs, theirs] - gain @ H[mine, theirs], pull[theirs] - gain @ (pull[mine] + h)

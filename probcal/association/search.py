@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.association.quad import Paired, normaliser
 from probcal.association.scan import View
 from probcal.association.separable import Crossed, Explained, crossed
 
@@ -19,11 +20,19 @@ CLOSE, FOLLOWED = 0.1, 160  # width from which on so many of them go on
 BATCH = 32  # of them evaluated at once
 WIDTHS = 0.5 ** np.arange(1, 10)  # of the kernel, in scales of the biases
 SPREAD = 8  # share of the population that counts after each step
-FEW = 16  # scans that the search looks at
+FEW = 24  # scans that the search looks at
 MODES = 4  # that are kept
 BEHIND = 30.0  # nats by which a mode may lie behind the best and is followed
 CLIMB = 50  # steps at most
 STILL = 1e-3  # of an sd, by which a step that ends a climb moves
+
+
+def _spread_out(worth: np.ndarray, count: int) -> np.ndarray:
+    """Numbers (count,) spread over the scans (K,) by what each is worth."""
+    total = np.cumsum(worth)
+    if not total[-1] > 0:
+        return np.zeros(count, int)
+    return np.minimum(np.searchsorted(total, (np.arange(count) + 0.5) / count * total[-1]), len(worth) - 1)
 
 
 class Term(NamedTuple):
@@ -31,25 +40,29 @@ class Term(NamedTuple):
 
     each: Explained
     views: tuple[View, ...]
+    power: float = 1.0
 
     def few(self) -> Term:
         """The same on at most `FEW` of the scans that have a partner and a detection."""
-        used = np.asarray(self.each.used) & (np.asarray(self.each.scans.number) >= 0).any(1)
-        kept = np.flatnonzero(used)
-        kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), FEW)).round().astype(int)] if len(kept) else kept[:0]
-        kept = np.concatenate([kept, np.zeros(FEW - len(kept), int)])
+        held = np.asarray(self.each.mixture.weight).sum(1)
+        seen = np.sum([np.asarray(rows.mask).any(2).sum(1) for rows in self.each.scans.epoch.rows], 0)
+        worth = np.where(np.asarray(self.each.used), np.minimum(held, seen), 0.0)
+        kept = _spread_out(worth, FEW)
+        used = worth > 0
         each = self.each
         parts = (each.scans, each.stand, each.mixture, each.background, each.used)
         scans, stand, mixture, background, _ = jax.tree.map(lambda leaf: leaf[kept], parts)
-        there = jnp.asarray(np.arange(FEW) < used.sum())
-        return Term(each._replace(scans=scans, stand=stand, mixture=mixture, background=background, used=there), self.views)
+        there = jnp.asarray(used[kept])
+        return Term(each._replace(scans=scans, stand=stand, mixture=mixture, background=background, used=there), self.views, self.power)
 
 
 @partial(jax.jit, static_argnames=("views",))
-def _values(each: Explained, views: Any, z: jax.Array, theta: jax.Array, at: jax.Array, spread: jax.Array) -> jax.Array:
+def _values(
+    each: Explained, views: Any, z: jax.Array, theta: jax.Array, at: jax.Array, spread: jax.Array, missed: jax.Array
+) -> jax.Array:
     """Log-likelihood (L,) at each of the theta (L, p)."""
     return jax.lax.map(
-        lambda one: crossed(each, views, z, one, at, spread).value, theta, batch_size=BATCH
+        lambda one: crossed(each, views, z, one, at, spread, missed).value, theta, batch_size=BATCH
     )
 
 
@@ -59,6 +72,12 @@ def _expanded(each: Explained, views: Any, z: jax.Array, theta: jax.Array, at: j
     return crossed(each, views, z, theta, at, jnp.zeros((len(theta), len(theta))))
 
 
+@jax.jit
+def _normalised(each: Paired, z: jax.Array, theta: jax.Array, at: jax.Array) -> Crossed:
+    """`normaliser` at each of the theta (L, p)."""
+    return jax.lax.map(lambda one: normaliser(each, z, one, at), theta, batch_size=BATCH)
+
+
 @dataclass(frozen=True, eq=False)
 class Potential:
     """The log of an edge's potential, as a function of the biases theta (p,) at the places `at` of z."""
@@ -66,17 +85,24 @@ class Potential:
     terms: tuple[Term, ...]
     z: np.ndarray  # (M,) where the others are held
     at: np.ndarray  # (p,)
+    quad: tuple[Paired, ...] = ()  # of the quad term
 
-    def values(self, theta: np.ndarray, width: float = 0.0) -> np.ndarray:
-        """At each of the theta (L, p), blurred by a kernel."""
+    def values(self, theta: np.ndarray, width: float = 0.0, missed: float = 1.0) -> np.ndarray:
+        """At each of the theta (L, p), blurred by a kernel; with `missed` 0 what was not detected does not count."""
         spread = width**2 * jnp.eye(theta.shape[1])
         z, points, at = jnp.asarray(self.z), jnp.asarray(theta), jnp.asarray(self.at)
-        return np.sum([np.asarray(_values(t.each, t.views, z, points, at, spread)) for t in self.terms], 0)
+        parts = [t.power * np.asarray(_values(t.each, t.views, z, points, at, spread, missed)) for t in self.terms]
+        parts += [np.asarray(_normalised(each, z, points, at).value) for each in self.quad]
+        return np.sum(parts, 0)
 
     def expanded(self, theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Value, slope (p,) and information (p, p) at theta (p,)."""
         z, point, at = jnp.asarray(self.z), jnp.asarray(theta), jnp.asarray(self.at)
-        parts = [jax.device_get(_expanded(t.each, t.views, z, point, at)) for t in self.terms]
+        parts = [
+            jax.tree.map(lambda leaf, w=t.power: w * leaf, jax.device_get(_expanded(t.each, t.views, z, point, at)))
+            for t in self.terms
+        ]
+        parts += [jax.tree.map(lambda leaf: leaf[0], jax.device_get(_normalised(each, z, point[None], at))) for each in self.quad]
         value, slope, information = (np.sum(leaves, 0) for leaves in zip(*parts, strict=True))
         return float(value), slope, information
 
@@ -104,9 +130,9 @@ def search(potential: Potential, rng: np.random.Generator) -> list[Mode]:
     p, few = len(potential.at), potential.few()
     theta = norm.ppf(np.clip(qmc.Sobol(p, seed=rng).random(POPULATION), 1e-6, 1 - 1e-6))
     for width in WIDTHS:
-        value = few.values(theta, width)
+        value = few.values(theta, width, missed=0.0)
         size = POPULATION if width > CLOSE else FOLLOWED
-        theta = theta[_drawn(value, size, rng)] + 0.5 * width * rng.standard_normal(theta.shape)
+        theta = theta[_drawn(value, size, rng)] + 0.5 * width * rng.standard_normal((size, p))
     value = potential.values(theta, float(WIDTHS[-1]))
     return climbed(potential, _best(theta, value, 8.0 * float(WIDTHS[-1])))
 

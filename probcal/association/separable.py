@@ -64,32 +64,39 @@ def partners(time: np.ndarray, other: np.ndarray, window: float, *, before: bool
     return np.where(matched & (taken >= 0), taken, -1)
 
 
+def match(one: Alone, other: Alone, window: float, *, before: bool) -> np.ndarray:
+    """The scan (K,) of the other sensor behind each of the first, -1 of none; padded scans have none."""
+    pair = partners(one.time[one.there], other.time[other.there], window, before=before)
+    return np.concatenate([pair, np.full(len(one.time) - len(pair), -1)])
+
+
+def carry(problem: Problem, after: Intensity, which: np.ndarray, dt: np.ndarray, lifetime: float) -> Intensity:
+    """Mixtures (K, J) of some scans carried on by times dt (K,) in s."""
+    dt = np.maximum(dt, 0.0)
+    F, L, _, drift = (np.asarray(leaf) for leaf in carried(problem, dt)[:4])
+    weight, mean, covariance = (np.asarray(leaf)[which] for leaf in after)
+    return Intensity(
+        weight * np.exp(-dt / lifetime)[:, None],
+        np.einsum("kij,kaj->kai", F, mean) + drift[:, None],
+        np.einsum("kij,kajl,kml->kaim", F, covariance, F) + (L @ L.transpose(0, 2, 1))[:, None],
+    )
+
+
 def explained(
     problem: Problem, one: Alone, other: Alone, after: Intensity, count: np.ndarray, window: float, lifetime: float, *,
     before: bool,
 ) -> Explained:  # fmt: skip
     """What explains the scans of `one` by the mixtures (K, J) that the `other` has after its own scans."""
-    own, theirs = one.time[one.there], other.time[other.there]
-    pair = partners(own, theirs, window, before=before)
-    pair = np.concatenate([pair, np.full(len(one.time) - len(own), -1)])
+    pair = match(one, other, window, before=before)
     behind = np.maximum(pair, 0)
-    dt = np.where(pair >= 0, one.time - other.time[behind], 0.0)
-    move = carried(problem, np.maximum(dt, 0.0))
-    L = np.asarray(move.L)
-    weight, mean, covariance = (np.asarray(leaf)[behind] for leaf in after)
-    F = np.asarray(move.F)
-    mixture = Intensity(
-        weight * np.exp(-dt / lifetime)[:, None],
-        np.einsum("kij,kaj->kai", F, mean) + np.asarray(move.drift)[:, None],
-        np.einsum("kij,kajl,kml->kaim", F, covariance, F) + (L @ L.transpose(0, 2, 1))[:, None],
-    )
+    mixture = carry(problem, after, behind, np.where(pair >= 0, one.time - other.time[behind], 0.0), lifetime)
     stand = jax.tree.map(lambda leaf: leaf[behind], other.watch.scans)
     levels = jnp.zeros(len(problem.levels))
     arrays = (mixture, jnp.asarray(background(one, count)), jnp.asarray(pair >= 0), levels)
     return Explained(one.watch.model, one.watch.scans, other.watch.model, stand, *jax.device_put(arrays))
 
 
-def _first(scan: Scan) -> Scan:
+def first_slot(scan: Scan) -> Scan:
     """A scan with its first slot alone, whose value is there: it tells the pose of the sensor."""
     rows = tuple(jax.tree.map(lambda leaf: leaf[:1], seen) for seen in scan.epoch.rows)
     rows = tuple(seen._replace(mask=jnp.ones_like(seen.mask)) for seen in rows)
@@ -107,7 +114,7 @@ def placed(model: Model, scan: Scan, x: jax.Array, z: jax.Array) -> jax.Array:
 
     Positions go along with the node, vectors turn with it, other components stay.
     """
-    first = _first(scan).epoch
+    first = first_slot(scan).epoch
     (stated,), (moved,) = (
         tuple(part[0] for part in model.look_at(first, (x[None],), at, _axes)) for at in (jnp.zeros_like(z), z)
     )
@@ -150,7 +157,7 @@ def told(
     `spread` (p, p) is the covariance of theta, which counts as noise of each detection. Noise that is not Gaussian
     counts by its expected information.
     """
-    first = _first(scan).epoch
+    first = first_slot(scan).epoch
 
     def where(x: jax.Array, theta: jax.Array) -> jax.Array:
         return placed(each.other, stand, x, z.at[at].set(theta))
@@ -171,19 +178,25 @@ def told(
         seen = information > 0
         volume = jnp.where(seen, jnp.log(jnp.where(seen, information, 1.0) / (2.0 * jnp.pi)), 0.0)
         density = 0.5 * jnp.sum(volume - white**2, 1) + jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=1, axis2=2)), 1)
-        chance = detected(each.model, scan, views, where(x, theta), z.at[at].set(theta))
+        n = len(x)
+        away = jnp.sqrt(float(n)) * linalg.semi_cholesky(P[None])[0].T
+        around = x[None] + jnp.concatenate([away, -away])  # cubature points: part of a wide component may be in view
+        chance = jnp.mean(
+            jax.vmap(lambda x: detected(each.model, scan, views, where(x, theta), z.at[at].set(theta)))(around)
+        )
         return Told(chance, density, jnp.einsum("dip,di->dp", by, white), jnp.einsum("dip,diq->dpq", by, by))
 
     return jax.vmap(of)(mixture.mean, mixture.covariance)
 
 
 def crossed(
-    each: Explained, views: tuple[View, ...], z: jax.Array, theta: jax.Array, at: jax.Array, spread: jax.Array
-) -> Crossed:
+    each: Explained, views: tuple[View, ...], z: jax.Array, theta: jax.Array, at: jax.Array, spread: jax.Array,
+    missed: jax.Array | float = 1.0,
+) -> Crossed:  # fmt: skip
     """The dual-term likelihood of all scans in one direction (Separable likelihoods 5).
 
     Detections are a Poisson process (Uney, Mulgrew, Clark 2016): those that the other sensor's mixture predicts where
-    it is seen, and a background.
+    it is seen, and a background. With `missed` 0 nothing speaks against objects that were expected and not detected.
     """
 
     def of(scan: Scan, stand: Scan, mixture: Intensity, density: jax.Array, used: jax.Array) -> Crossed:
@@ -192,7 +205,7 @@ def crossed(
         share = weight[:, None] * jnp.exp(seen.density) / jnp.maximum(density, TINY)  # (J, D)
         share = jnp.where(present(scan)[None], share, 0.0)
         total = jnp.sum(share, 0)
-        value = jnp.sum(jnp.log1p(total)) - jnp.sum(weight)
+        value = jnp.sum(jnp.log1p(total)) - missed * jnp.sum(weight)
         share = share / (1.0 + total)[None]
         slope, information = jnp.einsum("jd,jdp->p", share, seen.slope), jnp.einsum("jd,jdpq->pq", share, seen.information)
         return jax.tree.map(lambda leaf: jnp.where(used, leaf, 0.0), Crossed(value, slope, information))

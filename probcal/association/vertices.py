@@ -7,13 +7,14 @@ from functools import cached_property
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from probcal.association.bernoulli import filter_tracks
 from probcal.association.local import Alone, each_alone
 from probcal.association.phd import Intensity, filter_intensity
+from probcal.association.quad import paired
 from probcal.association.search import Potential, Term
-from probcal.association.separable import explained, partners
+from probcal.association.separable import explained, match
 from probcal.association.update import Biases, Chances
 from probcal.network import ANGLES
 from probcal.problem import Problem
@@ -43,6 +44,7 @@ class Graph:
     vertices: list[Vertex]
     window: float
     lifetime: float
+    terms: str
     held: dict[tuple[int, int], float] = field(default_factory=dict)  # of `common`
 
     @cached_property
@@ -70,28 +72,38 @@ class Graph:
             for j in self.vertices[v].sensors:
                 for a, b in ((i, j), (j, i)):
                     one, other = self.sensors[a], self.sensors[b]
-                    pair = partners(one.time[one.there], other.time[other.there], self.window, before=True)
-                    held = np.minimum(self.count[a][: len(pair)], self.count[b][pair])
+                    pair = match(one, other, self.window, before=True)
+                    held = np.minimum(self.count[a], self.count[b][pair])
                     total += float(np.sum(held[pair >= 0]))
         self.held[u, v] = self.held[v, u] = total
         return total
 
+    def pair(self, i: int, j: int, z: np.ndarray, at: np.ndarray) -> Potential:
+        """What two sensors tell each other, as a function of the biases at some places of z."""
+        terms, quad = [], []
+        settings = self.window, self.lifetime
+        for a, b in ((i, j), (j, i)):
+            one, other = self.sensors[a], self.sensors[b]
+            dual = self.terms == "dual"
+            each = explained(self.problem, one, other, self.after[b], self.count[a], *settings, before=dual)
+            terms.append(Term(each, one.views, 1.0 if dual else 0.5))
+        if self.terms == "quad":
+            quad.append(paired(self.problem, self.sensors[i], self.sensors[j], self.after[i], self.after[j], *settings))
+        return Potential(tuple(terms), z, at, tuple(quad))
+
     def potential(self, u: int, v: int, z: np.ndarray, at: np.ndarray) -> Potential:
         """What the sensors of two vertices tell each other, as a function of the biases at some places of z."""
-        terms = []
-        for i in self.vertices[u].sensors:
-            for j in self.vertices[v].sensors:
-                for a, b in ((i, j), (j, i)):
-                    one, other = self.sensors[a], self.sensors[b]
-                    each = explained(
-                        self.problem, one, other, self.after[b], self.count[a], self.window, self.lifetime, before=True
-                    )
-                    terms.append(Term(each, one.views))
-        return Potential(tuple(terms), z, at)
+        own, others = self.vertices[u].sensors, self.vertices[v].sensors
+        parts = [self.pair(i, j, z, at) for i in own for j in others]
+        return Potential(
+            tuple(term for part in parts for term in part.terms), z, at, tuple(q for part in parts for q in part.quad)
+        )
 
 
-def graph_of(problem: Problem, chances: Chances, cloud: np.ndarray, most: int, window: float | None) -> Graph:
-    """Filter every sensor by itself and find the vertices."""
+def graph_of(
+    problem: Problem, chances: Chances, cloud: Any, most: int, window: float | None, terms: str = "dual"
+) -> Graph:
+    """Filter every sensor by itself and find the vertices; quad terms take tracks, dual ones an intensity."""
     sensors = each_alone(problem)
     vertices = vertices_of(problem, [one.name for one in sensors])
     M = len(problem.labels)
@@ -100,14 +112,16 @@ def graph_of(problem: Problem, chances: Chances, cloud: np.ndarray, most: int, w
     known = Biases(*jax.device_put((np.zeros(M), covariance, np.zeros(len(problem.levels)))))
     after, count = [], []
     for one in sensors:
-        passed = filter_intensity(one.watch, one.views, known, chances, jnp.asarray(cloud), most)
-        held = jax.device_get(passed.after)
+        if terms == "dual":
+            held = jax.device_get(filter_intensity(one.watch, one.views, known, chances, cloud, most).after)
+        else:
+            held = Intensity(*jax.device_get(filter_tracks(one.watch, one.views, known, chances, cloud, most).after[:3]))
         heavy = np.argsort(-held.weight, axis=1)[:, :MOST]
         after.append(Intensity(*(_taken(leaf, heavy) for leaf in held)))
         count.append(held.weight.sum(1))
     if window is None:
         window = 3.0 * max(float(np.median(np.diff(one.time[one.there]) if one.there.sum() > 1 else 0.0)) for one in sensors)
-    return Graph(problem, sensors, after, count, vertices, window, float(chances.lifetime))
+    return Graph(problem, sensors, after, count, vertices, window, float(chances.lifetime), terms)
 
 
 def _taken(leaf: np.ndarray, which: np.ndarray) -> np.ndarray:
