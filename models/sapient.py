@@ -10,7 +10,7 @@ Three pedestrians walk for three minutes, each up the fence on one lane and down
 past all three lidars and through the view of every radar, as in Fig. 6. The sensors of the paper report upon detection
 only. How often a sensor looked must be known here: a scan that detected nothing is a blank row.
 
-    probcal fit models/sapient.py --method self-config-tracks --out sapient
+    probcal fit models/sapient.py --method self-config-beliefs --out sapient
 """
 
 from functools import cache

@@ -5,7 +5,7 @@ The scene of Uney, Mulgrew and Clark (Separable likelihoods for network self-con
 objects pass. One inner sensor is the anchor; of the others only the middle of the field is stated, and north within ten
 degrees. Noise, false alarms and detection are those of this file, since the paper does not print its own. Simulated.
 
-    probcal fit models/self_configuring_grid.py --method self-config-tracks --out grid
+    probcal fit models/self_configuring_grid.py --method self-config-beliefs --out grid
 """
 
 from functools import cache

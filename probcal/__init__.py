@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from probcal.association.gospa import gospa
     from probcal.association.objects import Objects, track_objects
     from probcal.association.phd import Intensities, phd_filter
+    from probcal.association.poses import Beliefs, propagate_beliefs, separable_likelihood
     from probcal.association.registration import Registration, register_tracks
     from probcal.detection import Detection, Sector
     from probcal.errors import FitError, InputError
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
         study,
         track,
     )
+    from probcal.inference.associations import sample_associations
     from probcal.motion import (
         ConstantAcceleration,
         ConstantVelocity,
@@ -88,6 +90,7 @@ __all__ = lazy(
         "probcal.association.gospa": "gospa",
         "probcal.association.objects": "Objects track_objects",
         "probcal.association.phd": "Intensities phd_filter",
+        "probcal.association.poses": "Beliefs propagate_beliefs separable_likelihood",
         "probcal.association.registration": "Registration register_tracks",
         "probcal.detection": "Detection Sector",
         "probcal.results.drifts": "drift_table",
@@ -98,6 +101,7 @@ __all__ = lazy(
             "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares ParticleGibbs SelfConfiguration "
             "Unscented coverage_table fit log_evidence numpyro_model particle_filter sbc study track"
         ),
+        "probcal.inference.associations": "sample_associations",
         "probcal.motion": (
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"
         ),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probcal.association.messages import MESSAGES, Belief, Edge, Kernels, Normals
+from probcal.association.messages import Belief, Edge, Kernels, Normals
 from probcal.association.search import Mode, Potential, search
 from probcal.association.vertices import Graph
 from probcal.lazy import Later
@@ -98,8 +98,8 @@ def _grow(found: Field, rng: np.random.Generator) -> int:
             if v in found.beliefs:
                 continue
             near = graph.nearest(v, placed, np.zeros_like(found.z))[:NEAR]
-            ways = [u for u in sorted(near, key=lambda u, v=v: -graph.common(u, v)) if (u, v) not in tried]
-            ways = [u for u in ways if graph.common(u, v) > 0]
+            worth = sorted(((graph.common(u, v), u) for u in near if (u, v) not in tried), key=lambda pair: -pair[0])
+            ways = [u for common, u in worth if common > 0]
             for u in ways[: TRIED - sum(pair[1] == v for pair in tried)]:
                 tried.add((u, v))
                 vertex = graph.vertices[v]

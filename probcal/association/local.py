@@ -12,7 +12,6 @@ import numpy as np
 
 from probcal.association.scan import Scan, View, Watch, alone, watch_of
 from probcal.model.epochs import Move
-from probcal.model.model import Model
 from probcal.model.motions import Levels, chain
 from probcal.problem import Problem
 from probcal.table import OBJECT
@@ -91,10 +90,11 @@ def _padded(one: Alone, K: int, D: int) -> Alone:
     n = len(one.watch.mean)
     epoch = jax.tree.map(last, scans.epoch._replace(rows=()))
     move = epoch.move[0]
-    still = Move(move.F.at[own:].set(jnp.eye(n)), none(scans.epoch.move[0].L), move.level, none(scans.epoch.move[0].drift))
+    start = scans.epoch.move[0]
+    still = Move(move.F.at[own:].set(jnp.eye(n)), none(start.L), move.level, none(start.drift))
     padded = Scan(
-        epoch._replace(rows=tuple(rows), move=(still,)), none(scans.elapsed), last(scans.block), none(scans.probability),
-        none(scans.clutter), last(scans.density), last(scans.view),
+        epoch._replace(rows=tuple(rows), move=(still,)), none(scans.elapsed), last(scans.block),
+        none(scans.probability), none(scans.clutter), last(scans.density), last(scans.view),
         jnp.pad(scans.number, ((0, more), (0, wide)), constant_values=-1),
     )  # fmt: skip
     time = np.concatenate([one.time, np.full(more, one.time[-1])])

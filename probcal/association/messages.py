@@ -58,7 +58,7 @@ class Normals:
 
     def step(self, beliefs: dict[int, Belief], z: np.ndarray) -> float:
         """One message each way along every edge, all at once; returns how far a mean moved, in sds, or a sd."""
-        before = {v: belief for v, belief in beliefs.items()}
+        before = dict(beliefs)
         for e, edge in enumerate(self.edges):
             self._expand(e, z[edge.potential.at])
         sent = {}
@@ -66,12 +66,13 @@ class Normals:
             place, H, pull = self.expanded[e]
             p = len(self.vertices[edge.first].at)
             first, second = slice(0, p), slice(p, len(place))
-            for source, mine, to, theirs in ((edge.first, first, edge.second, second), (edge.second, second, edge.first, first)):
+            ways = (edge.first, first, edge.second, second), (edge.second, second, edge.first, first)
+            for source, mine, to, theirs in ways:
                 if not len(place[theirs]):
                     continue
                 precision, h = self._gathered(source, e) if self.sent else _forms(before[source])
                 whole = H[mine, mine] + precision
-                gain = np.linalg.solve(whole, H[mine, theirs]).T if len(place[mine]) else np.zeros((len(place[theirs]), 0))
+                gain = np.linalg.solve(whole, H[mine, theirs]).T
                 sent[e, to] = H[theirs, theirs] - gain @ H[mine, theirs], pull[theirs] - gain @ (pull[mine] + h)
         self.sent |= sent
         moved = 0.0

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from probcal.association.beliefs import Field, propagated
 from probcal.association.entry import asked, cloud_of
 from probcal.association.messages import MESSAGES
-from probcal.association.separable import TERMS, Explained, crossed, explained
+from probcal.association.separable import TERMS
 from probcal.association.vertices import Graph, graph_of
 from probcal.errors import InputError, nearest
 from probcal.lazy import Later
@@ -68,7 +67,7 @@ def propagate_beliefs(
     likelihoods 4, `terms="quad"` 6), on scans of both within `window` s (15, 16; three times the longest time between
     two scans by default). A tree grows from the sensors of known pose, each searched for within its prior; then
     `messages`, "gaussian" or "kernel" mixtures (10 to 14), go along all edges for at most `iterations`, until no mean
-    moves by more than `tolerance` sds. Raises `InputError` where rows name their targets, or for a setting that is none.
+    moves by more than `tolerance` sds. Raises `InputError` where rows name their targets, or a setting is none.
     """
     if messages not in MESSAGES or terms not in TERMS:
         raise InputError(
@@ -122,9 +121,7 @@ def _graph(
 ) -> Graph:  # fmt: skip
     if window is not None and not window > 0:
         raise InputError(f"{verb}(window={window}): give seconds above 0, or None")
-    found = asked(
-        verb, problem, None, None, objects=objects, births=births, lifetime=lifetime, most=most, sensors=()
-    )
+    found = asked(verb, problem, None, None, objects=objects, births=births, lifetime=lifetime, most=most, sensors=())
     return graph_of(found.problem, found.chances, cloud_of(found.watch), most, window, terms)
 
 
@@ -137,7 +134,7 @@ def _listed(found: Field) -> Beliefs:
     for v, belief in found.beliefs.items():
         degree = max(sum(v in pair[:2] for pair in found.edges), 1)
         at = vertices[v].at
-        covariance[np.ix_(at, at)] = np.minimum(degree, 1e6) * belief.covariance if not vertices[v].known else belief.covariance
+        covariance[np.ix_(at, at)] = belief.covariance * (1 if vertices[v].known else degree)
     by = {v: (u, evidence) for u, v, evidence in found.tree}
     apart = tuple(vertex.name for v, vertex in enumerate(vertices) if v not in found.beliefs)
     rows = []

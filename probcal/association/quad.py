@@ -102,9 +102,8 @@ def normaliser(each: Paired, z: jax.Array, theta: jax.Array, at: jax.Array) -> C
         value, slope, information = jax.vmap(lambda a: jax.vmap(lambda b: two(a, b))(second))(first)
         ratio = mine.weight[:, None] * theirs.weight[None] * jnp.exp(value) / AGREE
         share, _ = associate(ratio)
-        found = Crossed(
-            -jnp.sum(share * value), -jnp.einsum("ab,abp->p", share, slope), -jnp.einsum("ab,abpq->pq", share, information)
-        )
+        slope, information = jnp.einsum("ab,abp->p", share, slope), jnp.einsum("ab,abpq->pq", share, information)
+        found = Crossed(-jnp.sum(share * value), -slope, -information)
         return jax.tree.map(lambda leaf: jnp.where(used, leaf, 0.0), found)
 
     parts = jax.vmap(of)(each.scans, each.stand, each.mine, each.theirs, each.used)

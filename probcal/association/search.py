@@ -50,10 +50,11 @@ class Term(NamedTuple):
         kept = _spread_out(worth, FEW)
         used = worth > 0
         each = self.each
-        parts = (each.scans, each.stand, each.mixture, each.background, each.used)
-        scans, stand, mixture, background, _ = jax.tree.map(lambda leaf: leaf[kept], parts)
-        there = jnp.asarray(used[kept])
-        return Term(each._replace(scans=scans, stand=stand, mixture=mixture, background=background, used=there), self.views, self.power)
+        taken = {
+            name: jax.tree.map(lambda leaf: leaf[kept], getattr(each, name))
+            for name in ("scans", "stand", "mixture", "background")
+        }
+        return self._replace(each=each._replace(**taken, used=jnp.asarray(used[kept])))
 
 
 @partial(jax.jit, static_argnames=("views",))
@@ -61,9 +62,7 @@ def _values(
     each: Explained, views: Any, z: jax.Array, theta: jax.Array, at: jax.Array, spread: jax.Array, missed: jax.Array
 ) -> jax.Array:
     """Log-likelihood (L,) at each of the theta (L, p)."""
-    return jax.lax.map(
-        lambda one: crossed(each, views, z, one, at, spread, missed).value, theta, batch_size=BATCH
-    )
+    return jax.lax.map(lambda one: crossed(each, views, z, one, at, spread, missed).value, theta, batch_size=BATCH)
 
 
 @partial(jax.jit, static_argnames=("views",))
@@ -102,7 +101,8 @@ class Potential:
             jax.tree.map(lambda leaf, w=t.power: w * leaf, jax.device_get(_expanded(t.each, t.views, z, point, at)))
             for t in self.terms
         ]
-        parts += [jax.tree.map(lambda leaf: leaf[0], jax.device_get(_normalised(each, z, point[None], at))) for each in self.quad]
+        for each in self.quad:
+            parts.append(jax.tree.map(lambda leaf: leaf[0], jax.device_get(_normalised(each, z, point[None], at))))
         value, slope, information = (np.sum(leaves, 0) for leaves in zip(*parts, strict=True))
         return float(value), slope, information
 
@@ -193,8 +193,7 @@ def _drawn(value: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray
 def _best(theta: np.ndarray, value: np.ndarray, apart: float) -> np.ndarray:
     """The best points that lie apart from better ones."""
     order, kept = np.argsort(-value), list[int]()
-    for k in order:
-        if len(kept) < MODES and value[k] > value[order[0]] - BEHIND:
-            if all(np.abs(theta[k] - theta[other]).max() > apart for other in kept):
-                kept.append(int(k))
+    for k in order[value[order] > value[order[0]] - BEHIND]:
+        if len(kept) < MODES and all(np.abs(theta[k] - theta[other]).max() > apart for other in kept):
+            kept.append(int(k))
     return theta[kept]

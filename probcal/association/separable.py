@@ -141,7 +141,7 @@ class Told(NamedTuple):
 
 
 class Crossed(NamedTuple):
-    """Log-likelihood of scans given another sensor's mixtures, over that of no object in common, and its derivatives."""
+    """Log-likelihood of scans given another sensor's mixtures over that of no object in common, and derivatives."""
 
     value: jax.Array  # ()
     slope: jax.Array  # (p,)
@@ -207,7 +207,10 @@ def crossed(
         total = jnp.sum(share, 0)
         value = jnp.sum(jnp.log1p(total)) - missed * jnp.sum(weight)
         share = share / (1.0 + total)[None]
-        slope, information = jnp.einsum("jd,jdp->p", share, seen.slope), jnp.einsum("jd,jdpq->pq", share, seen.information)
+        slope, information = (
+            jnp.einsum("jd,jdp->p", share, seen.slope),
+            jnp.einsum("jd,jdpq->pq", share, seen.information),
+        )
         return jax.tree.map(lambda leaf: jnp.where(used, leaf, 0.0), Crossed(value, slope, information))
 
     parts = jax.vmap(of)(each.scans, each.stand, each.mixture, each.background, each.used)

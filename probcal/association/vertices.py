@@ -115,12 +115,15 @@ def graph_of(
         if terms == "dual":
             held = jax.device_get(filter_intensity(one.watch, one.views, known, chances, cloud, most).after)
         else:
-            held = Intensity(*jax.device_get(filter_tracks(one.watch, one.views, known, chances, cloud, most).after[:3]))
+            held = Intensity(
+                *jax.device_get(filter_tracks(one.watch, one.views, known, chances, cloud, most).after[:3])
+            )
         heavy = np.argsort(-held.weight, axis=1)[:, :MOST]
-        after.append(Intensity(*(_taken(leaf, heavy) for leaf in held)))
+        after.append(Intensity(*jax.device_put([_taken(leaf, heavy) for leaf in held])))
         count.append(held.weight.sum(1))
     if window is None:
-        window = 3.0 * max(float(np.median(np.diff(one.time[one.there]) if one.there.sum() > 1 else 0.0)) for one in sensors)
+        gaps = [np.median(np.diff(one.time[one.there])) for one in sensors if one.there.sum() > 1]
+        window = 3.0 * float(max(gaps, default=1.0))
     return Graph(problem, sensors, after, count, vertices, window, float(chances.lifetime), terms)
 
 

@@ -46,7 +46,7 @@ METHODS = {
     "nuts": KnownMethod("NUTS", True, _SAMPLED),
     "particle-gibbs": KnownMethod("ParticleGibbs", True, _SAMPLED),
     "self-config": KnownMethod("self-configuration", False, _INTEGRATED),
-    "self-config-tracks": KnownMethod("self-configuration", False, _INTEGRATED),
+    "self-config-beliefs": KnownMethod("self-configuration", False, _INTEGRATED),
     "svi": KnownMethod("SVI", True, _SAMPLED),
     "svi-mean-field": KnownMethod("SVI", True, _SAMPLED),
     "svi-low-rank": KnownMethod("SVI", True, _SAMPLED),

@@ -160,10 +160,16 @@ def _configured(
     wrong = []
     if not found.rests:
         wrong.append(f"{method.name} did not come to rest in {found.rounds} rounds: objects and biases still change.")
-    if found.apart:
+    if found.beliefs is not None and found.beliefs.apart:
         wrong.append(
-            f"The tracks of {', '.join(found.apart)} do not tell how they stand to the sensors of known pose: their"
-            " biases are not found; give more common tracks that turn, or state the pose."
+            f"The objects of {', '.join(found.beliefs.apart)} do not tell how they stand to the other sensors: their"
+            " biases are not found; give more common objects that turn, or state the pose."
+        )
+    if found.beliefs is not None and found.beliefs.rivals:
+        listed = ", ".join(f"{name} ({1 + count})" for name, count in found.beliefs.rivals.items())
+        wrong.append(
+            f"Several poses explain the detections as well (how many): {listed}. Survey one of these, or give objects"
+            " that turn."
         )
     if wrong and Status(tree.attrs["status"]).settled:
         answer = replace(answer, status=Status.NOT_CONVERGED, message=f"{' '.join(wrong)} {answer.message}".strip())

@@ -47,7 +47,7 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
     "nuts": (NUTS(), None),
     "particle-gibbs": (ParticleGibbs(), None),
     "self-config": (SelfConfiguration(EA()), None),
-    "self-config-tracks": (SelfConfiguration(EA(), start="tracks", cut=60.0), None),
+    "self-config-beliefs": (SelfConfiguration(EA(), start="beliefs"), None),
     "svi": (SVI(), None),
     "svi-mean-field": (SVI(guide="mean-field"), None),
     "svi-low-rank": (SVI(guide="low-rank"), None),

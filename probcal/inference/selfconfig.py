@@ -10,7 +10,7 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.mode import Point
 
-STARTS = ("stated", "tracks")
+STARTS = ("stated", "beliefs")
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class SelfConfiguration(Method):
     `confirmed` count), and fits what belongs together, each pair of detection and track with its weight, by `method`.
     It ends when no bias moves by more than `tolerance` of its sd. The intervals are those of `method` given the weights
     of the last round. The stated poses, within their scales, are where it starts: objects that two sensors see must lie
-    nearer to each other than to others; with `start="tracks"` each sensor first tracks alone, and the tracks of any two
-    tell how they stand to each other (`register_tracks`, within `cut` m), from sensors of known pose outward, so that
-    nothing need be stated of the others. Raises `InputError` naming a setting that is none.
+    nearer to each other than to others. With `start="beliefs"` each sensor is first tracked alone, and belief
+    propagation over the pairs finds where they stand (`propagate_beliefs`, scans within `window` s), however far that
+    is within their scales. Raises `InputError` naming a setting that is none.
 
     >>> from probcal import EA
     >>> SelfConfiguration(EA()).iterations
@@ -40,24 +40,29 @@ class SelfConfiguration(Method):
     most: int = 32
     confirmed: float = 0.9
     start: str = "stated"
-    cut: float = 30.0
+    window: float | None = None
 
     name: ClassVar[str] = "self-configuration"
 
     def __post_init__(self):
         if not isinstance(self.method, Method) or isinstance(self.method, SelfConfiguration):
             raise InputError("SelfConfiguration(method): give the method that fits labelled rows, such as EA()")
-        if self.start not in STARTS or not self.cut > 0:
-            given = f'start="{self.start}", cut={self.cut}'
-            raise InputError(f"SelfConfiguration({given}): start is stated or tracks, cut metres above 0")
+        if self.start not in STARTS or not (self.window is None or self.window > 0):
+            given = f'start="{self.start}", window={self.window}'
+            raise InputError(f"SelfConfiguration({given}): start is stated or beliefs, window seconds above 0 or None")
         if self.iterations < 1 or not self.tolerance > 0:
             given = f"iterations={self.iterations}, tolerance={self.tolerance}"
             raise InputError(f"SelfConfiguration({given}): take 1 or more iterations and a positive tolerance")
 
     @property
+    def expected(self) -> dict[str, Any]:
+        """What is expected of objects."""
+        return {name: getattr(self, name) for name in ("objects", "births", "lifetime")}
+
+    @property
     def chances(self) -> dict[str, Any]:
         """The settings of `track_objects`."""
-        return {name: getattr(self, name) for name in ("objects", "births", "lifetime", "most", "confirmed")}
+        return self.expected | {"most": self.most, "confirmed": self.confirmed}
 
     def first_prior(self) -> Prior:
         """That of the method within."""
