@@ -24,6 +24,8 @@ else:
 
 WIDER = 4.0  # times the variance of a belief that is granted at the start
 ALIKE = 0.02  # by which the weight of no pair may change from one round to the next
+LITTLE = 0.5  # sds that rounds which go in a circle may move
+SPARE = 0.05  # room for the rows and epochs of later rounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +41,15 @@ class Configured:
 
 def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context: Context) -> Configured:
     """Track and fit in turn; raises `FitError` where no object is confirmed."""
-    M, before = len(problem.labels), None
+    M = len(problem.labels)
     z, covariance, beliefs = np.zeros(M), np.eye(M), None
     if method.start == "beliefs":
         beliefs = propagate_beliefs(problem, window=method.window, **method.expected)
         wider = np.sqrt(np.clip(1.0 / np.diagonal(beliefs.covariance), 1.0, WIDER))  # to the prior at most
         z, covariance = beliefs.z, wider[:, None] * beliefs.covariance * wider
+    held: list[pd.DataFrame] = []
+    moves: list[float] = []
+    room = Room(problem)
     for k in range(method.iterations):
         objects = track_objects(problem, z, covariance, **method.chances)
         if not objects.names:
@@ -53,16 +58,62 @@ def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context
                 " enough to tell it from clutter. Check the noise std, probability and clutter of Detection(...), the"
                 " start of the motion, and objects=, births= of SelfConfiguration"
             )
-        labelled = problem.assigned(objects.rows)
-        if before is not None and _same(before.rows, objects.rows):
-            return Configured(objects, labelled, k, True, beliefs)
-        before = objects
-        summary = solve(labelled, method.method, prior, context).posterior.summary
-        moved = np.abs(summary.mean - z) / np.sqrt(np.maximum(np.diagonal(summary.covariance), 1e-300))
+        again = [back for back, rows in enumerate(reversed(held)) if _same(rows, objects.rows)]
+        if again and max(moves[len(moves) - again[0] :], default=0.0) < LITTLE:  # rounds that go in a circle
+            return Configured(objects, problem.assigned(objects.rows), k, True, beliefs)
+        held.append(objects.rows)
+        summary = solve(problem.assigned(room.filled(objects.rows)), method.method, prior, context).posterior.summary
+        sd = np.sqrt(np.maximum(np.diagonal(summary.covariance), 1e-300))
+        moves.append(float(np.max(np.abs(summary.mean - z) / sd, initial=0.0)))
         z, covariance = summary.mean, summary.covariance
-        if k and moved.max(initial=0.0) < method.tolerance:
-            return Configured(objects, labelled, k + 1, True, beliefs)
-    return Configured(objects, labelled, method.iterations, False, beliefs)
+        if k and moves[-1] < method.tolerance:
+            return Configured(objects, problem.assigned(objects.rows), k + 1, True, beliefs)
+    return Configured(objects, problem.assigned(objects.rows), method.iterations, False, beliefs)
+
+
+class Room:
+    """Sizes that the labelled problems of all rounds share, so that what one round compiles serves the next.
+
+    What is left over is filled with detections of weight 0, which say nothing.
+    """
+
+    def __init__(self, problem: Problem):
+        scans = problem.scans
+        assert scans is not None
+        data, network = problem.measurements, problem.network
+        self.time = data.time
+        kinds = np.array([network.types.index(sensor.type) for sensor in network.sensors])
+        self.kind = kinds[data.sensor]  # type of each row
+        rows = np.flatnonzero(scans.of_row >= 0)
+        self.times, first = np.unique(self.time[rows], return_index=True)
+        self.row_at = rows[first]
+        self.epochs: dict[int, int] = {}  # by the number of tracks
+        self.rows: dict[tuple[int, int], int] = {}  # and by type
+
+    def filled(self, pairs: pd.DataFrame) -> pd.DataFrame:
+        """The pairs of row and track, and others of weight 0: at other times of the tracks, and over again."""
+        names = pairs["track"].unique()
+        there = np.zeros((len(names), len(self.times)), bool)
+        at = np.searchsorted(self.times, self.time[pairs["row"]])
+        there[pd.Index(names).get_indexer(pairs["track"]), at] = True
+        used = int(there.sum())
+        if self.epochs.get(len(names), 0) < used:
+            self.epochs[len(names)] = min(_roomy(used), there.size)
+        more = np.argwhere(~there)[: self.epochs[len(names)] - used]
+        whole = pd.DataFrame({"row": self.row_at[more[:, 1]], "track": names[more[:, 0]], "weight": 0.0})
+        whole = pd.concat([pairs, whole], ignore_index=True)
+        kind, added = self.kind[whole["row"]], [whole]
+        for number in np.unique(kind):
+            own = whole[kind == number]
+            if self.rows.get((len(names), number), 0) < len(own):
+                self.rows[len(names), number] = _roomy(len(own))
+            size = self.rows[len(names), number]
+            added.append(own.iloc[np.arange(size - len(own)) % len(own)].assign(weight=0.0))
+        return pd.concat(added, ignore_index=True)
+
+
+def _roomy(count: int) -> int:
+    return int((1.0 + SPARE) * count) + 8
 
 
 def _same(before: pd.DataFrame, after: pd.DataFrame) -> bool:
