@@ -37,6 +37,7 @@ Update = Literal["extended", "cubature"]
 PRUNE = 1e-5  # weight up to which a component is dropped
 MERGE = 4.0  # squared Mahalanobis distance up to which two become one
 CONSIDERED = 4  # times as many components as are kept may be merged, the heaviest
+LEAST = 0.05  # weight of a component that may be taken for an object
 HIGHEST = 60  # most objects whose number has a probability
 
 
@@ -276,6 +277,7 @@ def filter_intensity(
         )
         if kind == "cphd":  # the number that is cut at the highest rules
             factor = _moments(number)[0] / jnp.maximum(jnp.sum(before.weight) + hidden, TINY)
+            factor = jnp.where(scan.elapsed > 0, factor, 1.0)
             before, hidden = before._replace(weight=before.weight * factor), hidden * factor
         seen, parts = read(scan, before, hidden)
         shares = (
@@ -311,9 +313,10 @@ def filter_intensity(
 class Intensities:
     """The intensity of the objects in a table of detections after each of its scans.
 
-    `count` has a line for each scan: time, count (mean number of all objects), sd, and undetected (of it, the mean
-    number never detected). `components` lists the Gaussians of each scan (time, weight, and the mean and sd of each
-    state component), `peaks` those that are taken for objects: as many of the heaviest as their weights add up to.
+    `count` has a line for each scan: its number, time, sensor, count (mean number of all objects), sd, and undetected
+    (of it, the mean number never detected). `components` lists the Gaussians of each scan (scan, time, weight, and the
+    mean and sd of each state component), the heaviest first; `peaks` those that are taken for objects: as many of the
+    heaviest as the weights of the scan add up to, none of less than 0.05.
     """
 
     count: pd.DataFrame
@@ -355,26 +358,27 @@ def phd_filter(
         objects=objects, births=births, lifetime=lifetime, most=most, sensors=sensors,
     )  # fmt: skip
     passed = filter_intensity(watch, views, known, chances, cloud, most, kind=kind, update=update)
-    scans = own.scans
+    return _tables(jax.device_get(passed), own)
+
+
+def _tables(passed: Passed, problem: Problem) -> Intensities:
+    """What was passed, K leading, with its names."""
+    scans = problem.scans
     assert scans is not None
-    return _tables(jax.device_get(passed), scans.time, own.epochs[0].components)
-
-
-def _tables(passed: Passed, time: np.ndarray, names: Collection[str]) -> Intensities:
-    """What was passed, K leading, with the names of the state components; heavy components first."""
-    count = pd.DataFrame(
-        {"time": time, "count": passed.count, "sd": np.sqrt(passed.spread), "undetected": passed.undetected}
-    )
+    number, time = np.arange(len(scans)), scans.time
+    sensor = np.array([placed.name for placed in problem.network.sensors])[scans.sensor]
+    count = pd.DataFrame({"scan": number, "time": time, "sensor": sensor, "count": passed.count})
+    count["sd"], count["undetected"] = np.sqrt(passed.spread), passed.undetected
     weight = np.asarray(passed.after.weight)
     order = np.argsort(-weight, axis=1, kind="stable")
     place = np.argsort(order, axis=1)  # 0 of the heaviest
     k, j = np.nonzero(weight > 0)
     line = np.lexsort((place[k, j], k))
     k, j = k[line], j[line]
-    components = pd.DataFrame({"time": time[k], "weight": weight[k, j]})
+    components = pd.DataFrame({"scan": k, "time": time[k], "weight": weight[k, j]})
     mean, covariance = np.asarray(passed.after.mean)[k, j], np.asarray(passed.after.covariance)[k, j]
     sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
-    for i, name in enumerate(names):
+    for i, name in enumerate(problem.epochs[0].components):
         components[name], components[f"{name}_sd"] = mean[:, i], sd[:, i]
-    peak = place[k, j] < np.round(weight.sum(1))[k]
+    peak = (place[k, j] < np.round(weight.sum(1))[k]) & (weight[k, j] >= LEAST)
     return Intensities(count, components, components[peak].reset_index(drop=True))
