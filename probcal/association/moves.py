@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.association.sampled import Association, Fit, Scene, chances, fitted, log_clutter
+from probcal.association.sampled import Association, Fit, Recording, chances, fitted, log_clutter
 from probcal.association.scan import View, detected, present
 from probcal.association.update import TINY, Biases, rows_from, updated
 from probcal.smoothing import recursion as rec
@@ -110,7 +110,7 @@ def _nothing(fit: Fit) -> Drawn:
     return Drawn(jnp.zeros_like(fit.z), jnp.zeros_like(fit.states), jnp.zeros_like(fit.noises))
 
 
-def _all_scans(scene: Scene, views: tuple[View, ...], a: Association, fit: Fit, key: jax.Array) -> Proposal:
+def _all_scans(scene: Recording, views: tuple[View, ...], a: Association, fit: Fit, key: jax.Array) -> Proposal:
     """States and biases drawn from the Gaussian of an association, then every scan anew, exactly given these.
 
     Where that Gaussian is the posterior, a Gibbs step.
@@ -147,7 +147,7 @@ def log_drawn(fit: Fit, drawn: Drawn) -> jax.Array:
     return 0.5 * (fit.biases.log_determinant() + fit.volume - square)
 
 
-def _told(scene: Scene, states: jax.Array, z: jax.Array) -> jax.Array:
+def _told(scene: Recording, states: jax.Array, z: jax.Array) -> jax.Array:
     """Log density (K, T, D) of every slot of every scan by the states (T, E, n)."""
     model = scene.watch.model
     levels = jnp.zeros(model.level_spread.shape[0])
@@ -161,7 +161,7 @@ def _told(scene: Scene, states: jax.Array, z: jax.Array) -> jax.Array:
     )
 
 
-def _ratios(scene: Scene, a: Association, chance: jax.Array, told: jax.Array) -> jax.Array:
+def _ratios(scene: Recording, a: Association, chance: jax.Array, told: jax.Array) -> jax.Array:
     """Log ratios (K, T, D) of every pair by the probability of detection (T, K) and log densities (K, T, D)."""
     odds = jnp.log(jnp.maximum(chance, TINY)) - jnp.log(jnp.maximum(1.0 - chance, TINY))
     ratio = jnp.maximum(odds.T[:, :, None] + told - log_clutter(scene.watch)[:, None, None], LEAST)
@@ -170,7 +170,7 @@ def _ratios(scene: Scene, a: Association, chance: jax.Array, told: jax.Array) ->
 
 
 def _one_scan(
-    scene: Scene, views: tuple[View, ...], a: Association, rest: Association, fit: Fit, k: jax.Array, key: jax.Array
+    scene: Recording, views: tuple[View, ...], a: Association, rest: Association, fit: Fit, k: jax.Array, key: jax.Array
 ) -> Proposal:
     """One scan anew, each pair by what the others predict of it; the fit is that without the scan."""
     model = scene.watch.model
@@ -226,7 +226,7 @@ def _swap(a: Association, fit: Fit, key: jax.Array) -> Proposal:
 
 
 def _track(
-    scene: Scene, views: tuple[View, ...], a: Association, rest: Association, fit: Fit, t: jax.Array, key: jax.Array
+    scene: Recording, views: tuple[View, ...], a: Association, rest: Association, fit: Fit, t: jax.Array, key: jax.Array
 ) -> Proposal:
     """A whole track anew: none, or one of the detections that are of no other; the fit is that without the track."""
     keys = jax.random.split(key)
@@ -244,7 +244,7 @@ def _track(
 
 
 def _walked(
-    scene: Scene,
+    scene: Recording,
     views: tuple[View, ...],
     known: Biases,
     free: jax.Array,
@@ -288,7 +288,7 @@ def _walked(
 # the chain
 
 
-class Place(NamedTuple):
+class Standing(NamedTuple):
     """An association where a chain stands, and what its fit says of it."""
 
     a: Association
@@ -297,7 +297,9 @@ class Place(NamedTuple):
     root: jax.Array  # (M, M) inverse root of their precision
 
 
-def move(scene: Scene, views: tuple[View, ...], which: jax.Array, at: Place, key: jax.Array) -> tuple[Place, jax.Array]:
+def move(
+    scene: Recording, views: tuple[View, ...], which: jax.Array, at: Standing, key: jax.Array
+) -> tuple[Standing, jax.Array]:
     """One move of Metropolis and Hastings, and whether its proposal was taken."""
     a = at.a
     keys = jax.random.split(key, 3)
@@ -327,12 +329,12 @@ def move(scene: Scene, views: tuple[View, ...], which: jax.Array, at: Place, key
     (there, found), both = jax.lax.scan(pass_, start, jnp.array([True, False]))
     fit = jax.tree.map(lambda leaf: leaf[0], both)
     whole = (which == ALL_SCANS) | (which == SWAP)  # what was left is the association itself; its prior may have moved
-    here = jax.tree.map(partial(jnp.where, whole), _place(a, fit), at)
+    here = jax.tree.map(partial(jnp.where, whole), _standing(a, fit), at)
     drawn = jnp.where(which == ALL_SCANS, log_drawn(there, found.drawn) - log_drawn(fit, found.drawn), 0.0)
     ratio = there.density - here.density + found.gain + drawn
     taken = jnp.log(jax.random.uniform(keys[2])) < jnp.where(jnp.isnan(ratio), -jnp.inf, ratio)
-    return jax.tree.map(partial(jnp.where, taken), _place(found.a, there), here), taken
+    return jax.tree.map(partial(jnp.where, taken), _standing(found.a, there), here), taken
 
 
-def _place(a: Association, fit: Fit) -> Place:
-    return Place(a, fit.density, fit.z, fit.biases.inverse)
+def _standing(a: Association, fit: Fit) -> Standing:
+    return Standing(a, fit.density, fit.z, fit.biases.inverse)

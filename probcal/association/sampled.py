@@ -30,8 +30,8 @@ SETTLED = 1e-9  # nats at which they end
 class Association(NamedTuple):
     """The slot of each scan (T, K) that holds the detection of an object, D where it was missed; who is there (T,)."""
 
-    choice: jax.Array
-    present: jax.Array
+    choice: Any
+    present: Any
 
 
 class First(NamedTuple):
@@ -45,7 +45,7 @@ class First(NamedTuple):
     pull: jax.Array  # (K, D, n) that times the state, and the score there
 
 
-class Scene(NamedTuple):
+class Recording(NamedTuple):
     """What the moves read of a problem; a pytree, so that one kernel serves every association and every recording."""
 
     watch: Watch
@@ -112,7 +112,7 @@ def log_clutter(watch: Watch) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames="views")
-def fitted(scene: Scene, views: tuple[View, ...], a: Association) -> Fit:
+def fitted(scene: Recording, views: tuple[View, ...], a: Association) -> Fit:
     """The mode of trajectories and biases given an association, and the density of that.
 
     The search begins where detections say by themselves, smoothed: it depends on the association alone. The system is
@@ -175,7 +175,7 @@ def fitted(scene: Scene, views: tuple[View, ...], a: Association) -> Fit:
     return Fit(known, z, biases, x, u, by_bias, kept, volume)
 
 
-def _begun(scene: Scene, L: jax.Array, used: tuple[int, ...], a: Association) -> tuple[jax.Array, jax.Array]:
+def _begun(scene: Recording, L: jax.Array, used: tuple[int, ...], a: Association) -> tuple[jax.Array, jax.Array]:
     """States and noises (T, E, n) of what the detections of each slot say by themselves, smoothed."""
     part, first = scene.watch.model.recursions[0], scene.first
     K, D, n = first.mean.shape
@@ -194,7 +194,7 @@ def _begun(scene: Scene, L: jax.Array, used: tuple[int, ...], a: Association) ->
     return jax.vmap(one)(J, b)
 
 
-def chances(scene: Scene, views: tuple[View, ...], states: jax.Array, z: jax.Array) -> jax.Array:
+def chances(scene: Recording, views: tuple[View, ...], states: jax.Array, z: jax.Array) -> jax.Array:
     """Probability (T, K) that each scan detects the object of each slot, by states (T, E, n)."""
 
     def one(x: jax.Array) -> jax.Array:
@@ -203,7 +203,7 @@ def chances(scene: Scene, views: tuple[View, ...], states: jax.Array, z: jax.Arr
     return jax.vmap(one)(states[:, scene.epoch])
 
 
-def _counted(scene: Scene, views: tuple[View, ...], a: Association, states: jax.Array, z: jax.Array) -> jax.Array:
+def _counted(scene: Recording, views: tuple[View, ...], a: Association, states: jax.Array, z: jax.Array) -> jax.Array:
     """Log of what an association says beside the measured values: who is there, what was missed, what is false."""
     there = jax.vmap(present)(scene.watch.scans)
     T, D = len(a.present), there.shape[1]

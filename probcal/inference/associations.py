@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.association.entry import asked
-from probcal.association.moves import ALL_SCANS, MOVES, ONE_SCAN, SWAP, TRACK, Place, move
+from probcal.association.moves import ALL_SCANS, MOVES, ONE_SCAN, SWAP, TRACK, Standing, move
 from probcal.association.objects import Objects, track_objects
-from probcal.association.sampled import Association, Scene, first_of, places
+from probcal.association.sampled import Association, Recording, first_of, places
 from probcal.association.scan import View
 from probcal.errors import InputError
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
@@ -44,16 +44,18 @@ TOGETHER = 200  # detections up to which every two have their probability of bei
 FULL = 0.01  # share of draws with an object in every slot from which on it is said
 SURE = 0.5  # share of a detection from which a track holds it at the start
 ROUNDS = 5  # of relabelling
+NUMBERS = 1.05  # r_hat above which counts have not mixed: where one is rare, that of good draws varies more
+BEGIN = 2**31 - 1  # number of the key of the first hyper-parameters, beyond all passes
 
 
 class Chain(NamedTuple):
     """Where a chain stands."""
 
-    at: Place  # of density minus infinity before the first move, which is then taken
+    at: Standing  # of density minus infinity before the first move, which is then taken
     phi: Phi  # hyper-parameters of the prior
 
 
-class Sample(NamedTuple):
+class AssociationDraw(NamedTuple):
     """One draw as it is kept."""
 
     a: Association
@@ -66,23 +68,23 @@ class Sample(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("views", "hierarchy"))
-def run_chunk(
-    scene: Scene,
+def run_pass(
+    scene: Recording,
     views: tuple[View, ...],
     hierarchy: Hierarchy,
     schedule: jax.Array,
     chains: Chain,
     key: jax.Array,
     number: jax.Array,
-) -> tuple[Chain, Sample]:
+) -> tuple[Chain, AssociationDraw]:
     """The `CHUNK` draws (C, N) of all chains in one pass by its number, each after the moves of a schedule (S,)."""
     learnt = jnp.asarray(hierarchy.learnt, int)
 
-    def sweep(chain: Chain, key: jax.Array) -> tuple[Chain, Sample]:
+    def sweep(chain: Chain, key: jax.Array) -> tuple[Chain, AssociationDraw]:
         keys = jax.random.split(key, 3)
         own = scene._replace(prior=scene.prior._replace(alpha=hierarchy.alpha(chain.phi, scene.prior.alpha)))
 
-        def one(at: Place, given: Any) -> tuple[Place, jax.Array]:
+        def one(at: Standing, given: Any) -> tuple[Standing, jax.Array]:
             return move(own, views, given[0], at, given[1])
 
         at, taken = jax.lax.scan(one, chain.at, (schedule, jax.random.split(keys[0], len(schedule))))
@@ -92,9 +94,9 @@ def run_chunk(
             phi = update(phi, z[learnt], jax.random.fold_in(keys[2], k))
         covariance = at.root.T @ at.root
         gamma = jnp.clip(1.0 - own.prior.alpha * jnp.diagonal(covariance), 0.0, 1.0)
-        return Chain(at, phi), Sample(at.a, z, at.z, covariance, gamma, at.density, taken)
+        return Chain(at, phi), AssociationDraw(at.a, z, at.z, covariance, gamma, at.density, taken)
 
-    def one(chains: Chain, key: jax.Array) -> tuple[Chain, Sample]:
+    def one(chains: Chain, key: jax.Array) -> tuple[Chain, AssociationDraw]:
         return jax.vmap(sweep)(chains, jax.random.split(key, len(chains.at.density)))
 
     chains, drawn = jax.lax.scan(one, chains, jax.random.split(jax.random.fold_in(key, number), CHUNK))
@@ -131,7 +133,7 @@ def sample_associations(
 
     >>> sample_associations(problem)
     Traceback (most recent call last):
-    probcal.errors.InputError: sample_associations: every row names its target; use fit, or track with a calibration
+    probcal.errors.InputError: sample_associations: no row leaves its target open, nothing is to be associated; use fit
     """
     prior = Gaussian() if prior is None else prior
     _check(problem, prior, objects, most, draws, warmup, chains)
@@ -143,11 +145,8 @@ def sample_associations(
     scene, views, rows = scene_of(problem, prior, objects, z)
     found = track_objects(problem, z, covariance, objects=objects, confirmed=SURE)
     hierarchy = hierarchy_of(prior, problem)
-    keys = jax.random.split(as_key(key), 3)
-    first = _starts(found, rows, most, chains)
-    phi = jax.vmap(hierarchy.draw)(jax.random.split(keys[0], chains))
-    state = begun_at(first, len(z), phi)
-    sampled = run(scene, views, hierarchy, state, SWEEP, warmup + draws, keys[1])
+    state = begun_at(_starts(found, rows, most, chains), len(z), hierarchy, as_key(key))
+    sampled = run_passes(scene, views, hierarchy, state, SWEEP, warmup + draws, as_key(key))
     kept = jax.tree.map(lambda leaf: leaf[:, warmup:], sampled)
     tree = _tree(problem, kept, rows, SWEEP)
     tree.attrs |= {
@@ -162,7 +161,7 @@ def sample_associations(
     return tree
 
 
-def scene_of(problem: Problem, prior: Prior, objects: float, z: np.ndarray) -> tuple[Scene, tuple[View, ...], Any]:
+def scene_of(problem: Problem, prior: Prior, objects: float, z: np.ndarray) -> tuple[Recording, tuple[View, ...], Any]:
     """What the moves read, the views, and the row of the table behind every slot (K, D) of the scans, -1 of none."""
     own, watch, views, _, _, cloud = asked(
         "sample_associations", problem, None, None, objects=objects, births=1.0, lifetime=1.0, most=1, sensors=()
@@ -174,27 +173,30 @@ def scene_of(problem: Problem, prior: Prior, objects: float, z: np.ndarray) -> t
     first = first_of(watch, views, cloud, jax.device_put(z))
     place = places(numbers, own.row_index)
     precision = prior.precision(problem.labels, problem.surveyed)
-    scene = Scene(watch, *jax.device_put((epoch, place)), first, *jax.device_put((z, precision, float(objects))))
+    put = jax.device_put
+    scene = Recording(watch, put(epoch), put(place), first, put(z), put(precision), put(float(objects)))
     there = np.isin(numbers, np.flatnonzero(scans.detected))
     return scene, views, np.where(there, numbers, -1)
 
 
-def begun_at(first: Association, biases: int, phi: Phi) -> Chain:
-    """Chains before their first move, at associations (C, ...)."""
-    C = len(first.present)
-    place = Place(first, np.full(C, -np.inf), np.zeros((C, biases)), np.zeros((C, biases, biases)))  # type: ignore
-    return jax.device_put(Chain(place, phi))
+def begun_at(first: Association, biases: int, hierarchy: Hierarchy, key: jax.Array) -> Chain:
+    """Chains before their first move, at associations (C, ...), hyper-parameters drawn from their prior."""
+    C, phi = len(first.present), dict[str, jax.Array]()
+    if hierarchy.updates():
+        phi = jax.vmap(hierarchy.draw)(jax.random.split(jax.random.fold_in(key, BEGIN), C))
+    nowhere: Any = (np.full(C, -np.inf), np.zeros((C, biases)), np.zeros((C, biases, biases)))
+    return jax.device_put(Chain(Standing(first, *nowhere), phi))
 
 
-def run(
-    scene: Scene, views: tuple[View, ...], hierarchy: Hierarchy, chains: Chain, schedule: Sequence[int], draws: int,
+def run_passes(
+    scene: Recording, views: tuple[View, ...], hierarchy: Hierarchy, chains: Chain, schedule: Sequence[int], draws: int,
     key: jax.Array,
-) -> Sample:  # fmt: skip
+) -> AssociationDraw:  # fmt: skip
     """As many draws (C, N) of all chains, on the host."""
     passes, moves = -(-draws // CHUNK), jax.device_put(np.array(schedule))
     parts = []
     for number in range(passes):
-        chains, drawn = run_chunk(scene, views, hierarchy, moves, chains, key, number)
+        chains, drawn = run_pass(scene, views, hierarchy, moves, chains, key, number)
         parts.append(jax.device_get(drawn))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves, 1)[:, :draws], *parts)
 
@@ -213,7 +215,7 @@ def _check(problem: Problem, prior: Prior, objects: float, most: int, draws: int
         )
     scans = problem.scans
     if scans is None:
-        raise InputError("sample_associations: every row names its target; use fit, or track with a calibration")
+        raise InputError("sample_associations: no row leaves its target open, nothing is to be associated; use fit")
     named = int((~problem.measurements.detection).sum())
     if named:
         raise InputError(
@@ -272,12 +274,12 @@ def matched(a: Association, density: np.ndarray, D: int) -> Association:
     return Association(np.minimum(choice, D), (choice <= D).all(2))
 
 
-def _tree(problem: Problem, kept: Sample, rows: np.ndarray, schedule: Sequence[int]) -> xr.DataTree:
+def _tree(problem: Problem, kept: AssociationDraw, rows: np.ndarray, schedule: Sequence[int]) -> xr.DataTree:
     """The tree of the draws."""
     (C, N), M, D = kept.density.shape, kept.z.shape[2], rows.shape[1]
     flat = Association(*(leaf.reshape(C * N, *leaf.shape[2:]) for leaf in kept.a))
-    flat = matched(flat, kept.density.ravel(), D)
-    T, number = flat.present.shape[1], kept.a.present.sum(2)
+    flat = matched(flat, np.ravel(kept.density), D)
+    T, number = flat.present.shape[1], np.asarray(kept.a.present).sum(2)
     sample = {"chain": np.arange(C), "draw": np.arange(N)}
     names = [f"track_{t}" for t in range(T)]
     shares = np.stack([(flat.choice == d).mean(0) for d in range(D)], 2)  # (T, K, D)
@@ -286,7 +288,10 @@ def _tree(problem: Problem, kept: Sample, rows: np.ndarray, schedule: Sequence[i
     pairs = pairs.sort_values(["row", "track"], ignore_index=True)
     density = kept.density.round(6)  # an association has one density, but for rounding
     scalars = np.stack([number, (kept.a.choice < D).sum((2, 3)), density], 2).astype(float)
-    mixed = mixing(np.concatenate([kept.z, scalars], 2))
+    with np.errstate(invalid="ignore", divide="ignore"):  # ranks of whole numbers
+        mixed = mixing(np.concatenate([kept.z, scalars], 2))
+    if C > 1:
+        mixed["r_hat"][M:] = [split_r_hat(scalars[:, :, k]) for k in range(scalars.shape[2])]
     moves = [MOVES[m] for m in schedule]
     taken = np.stack([kept.taken[:, :, np.array(schedule) == m].mean(2) for m in dict.fromkeys(schedule)], 2)
     groups = {
@@ -314,14 +319,25 @@ def _tree(problem: Problem, kept: Sample, rows: np.ndarray, schedule: Sequence[i
         ),
     }
     if (rows >= 0).sum() <= TOGETHER:
-        groups["together"] = together(flat, rows)
+        groups["together"] = co_association(flat, rows)
     tree = xr.DataTree.from_dict(groups)
     status, message = _judged(problem, mixed, number, C, N, T)
     tree.attrs |= {"status": str(status), "message": message, "objects": float(number.mean())}
     return tree
 
 
-def together(a: Association, rows: np.ndarray) -> xr.Dataset:
+def split_r_hat(draws: np.ndarray) -> float:
+    """How far the halves of chains (C, N) lie apart against the spread within, of numbers that many draws share."""
+    n = draws.shape[1] // 2
+    halves = np.concatenate([draws[:, :n], draws[:, -n:]]) if n > 1 else draws
+    n = halves.shape[1]
+    between, within = halves.mean(1).var(ddof=1), halves.var(1, ddof=min(1, n - 1)).mean()
+    if within == 0:
+        return np.inf if between > 0 else 1.0
+    return float(np.sqrt(between / within + (n - 1) / n))
+
+
+def co_association(a: Association, rows: np.ndarray) -> xr.Dataset:
     """Probability that two detections are of one object, and on the diagonal that one is of any."""
     there = np.argwhere(rows >= 0)
     there = there[np.argsort(rows[there[:, 0], there[:, 1]])]
@@ -331,7 +347,7 @@ def together(a: Association, rows: np.ndarray) -> xr.Dataset:
     return xr.Dataset({"probability": (("row", "row_other"), value)}, coords={"row": own, "row_other": own})
 
 
-def _calibration(problem: Problem, kept: Sample, mixed: dict[str, np.ndarray]) -> xr.Dataset:
+def _calibration(problem: Problem, kept: AssociationDraw, mixed: dict[str, np.ndarray]) -> xr.Dataset:
     """One entry a bias; mean and covariance are those of the draws' Gaussians, mixed."""
     scales, M = problem.scales, kept.z.shape[2]
     means = kept.mean.reshape(-1, M)
@@ -358,12 +374,14 @@ def _judged(
     said, status = [f"{number.mean():.2f} objects in {len(problem.scans or ())} scans."], Status.CONVERGED
     if "r_hat" not in mixed:
         said.append("One chain alone does not show whether it has mixed; take 2 or more.")
-    elif mixed["r_hat"].max() > R_HAT:
-        worst = int(mixed["r_hat"].argmax())
-        said.append(
-            f"The chains have not mixed: r_hat of {names[worst]} is {mixed['r_hat'][worst]:.3f}; take more draws."
-        )
-        status = Status.NOT_CONVERGED
+    else:
+        apart = mixed["r_hat"] - np.where(np.arange(len(names)) < len(problem.labels), R_HAT, NUMBERS)
+        worst = int(apart.argmax())
+        if apart[worst] > 0:
+            said.append(
+                f"The chains have not mixed: r_hat of {names[worst]} is {mixed['r_hat'][worst]:.3f}; take more draws."
+            )
+            status = Status.NOT_CONVERGED
     worst = int(mixed["ess"].argmin())
     if mixed["ess"][worst] < ESS * chains:
         said.append(f"Only {mixed['ess'][worst]:.0f} effective draws of {names[worst]}; take more draws.")
