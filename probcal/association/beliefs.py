@@ -65,8 +65,7 @@ def propagated(graph: Graph, seed: int, iterations: int, messages: str, toleranc
         found.put(v, Belief(np.zeros(p), np.eye(p)))
     hops = _grow(found, rng)
     edges = _edges(found)
-    kind = Kernels if messages == "kernel" else Normals
-    passing = kind(found.graph.vertices, edges, rng)
+    passing = Kernels(graph.vertices, edges, rng) if messages == "kernel" else Normals(graph.vertices, edges)
     for k in range(hops, iterations):
         moved = passing.step(found.beliefs, found.z)
         for v, belief in passing.beliefs.items():
@@ -75,7 +74,7 @@ def propagated(graph: Graph, seed: int, iterations: int, messages: str, toleranc
         if moved < tolerance and k > hops:  # the first messages know of the priors alone
             found.rests = True
             break
-    _check_rivals(found, edges)
+    check_rivals(found, edges)
     return found
 
 
@@ -147,7 +146,7 @@ def _edges(found: Field) -> list[Edge]:
     return [Edge(*pair, gains[pair][1]) for pair in sorted(chosen)]
 
 
-def _check_rivals(found: Field, edges: list[Edge]) -> None:
+def check_rivals(found: Field, edges: list[Edge]) -> None:
     """Of the other modes keep those that all edges together do not refute."""
     for v, modes in found.rivals.items():
         mine = [edge for edge in edges if v in (edge.first, edge.second)]

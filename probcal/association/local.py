@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.association.scan import Scan, View, Watch, alone, watch_of
-from probcal.model.epochs import Move
+from probcal.model.epochs import Move, Seen
 from probcal.model.motions import Levels, chain
 from probcal.problem import Problem
 from probcal.table import OBJECT
@@ -58,58 +56,49 @@ def each_alone(problem: Problem) -> list[Alone]:
 
 
 def _slim(watch: Watch) -> Watch:
-    """The watch with a model that holds one row and one epoch: scans bring their own."""
+    """The watch, on the host, with a model that holds one row and one epoch: scans bring their own."""
     model = watch.model
     rows = [
         data._replace(**{k: getattr(data, k)[:1] for k in ("epoch", "sensor", "pose", "y", "mask", "std", "level")})
-        for data in model.rows
+        for data in jax.device_get(model.rows)
     ]
-    parts = [jax.tree.map(lambda leaf: leaf[:1], part) for part in model.recursions]
-    return watch._replace(model=replace(model, rows=tuple(rows), recursions=tuple(parts)))
+    parts = jax.tree.map(lambda leaf: leaf[:1], jax.device_get(model.recursions))
+    return jax.device_get(watch._replace(model=replace(model, rows=tuple(rows), recursions=parts)))
 
 
 def _padded(one: Alone, K: int, D: int) -> Alone:
     """The same scans and `K` in all, those added without rows, of `D` slots each."""
     scans = one.watch.scans
     own, slots = scans.number.shape
-    more, wide = K - own, D - slots
 
-    def last(leaf: jax.Array) -> jax.Array:
-        return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], more, 0)])
+    def last(leaf: Any) -> Any:
+        return np.concatenate([leaf, np.repeat(leaf[-1:], K - own, 0)])
 
-    def none(leaf: jax.Array) -> jax.Array:
-        return last(leaf).at[own:].set(0)
-
-    def slot(leaf: jax.Array) -> jax.Array:
-        return jnp.concatenate([leaf, jnp.repeat(leaf[:, :1], wide, 1)], 1)
+    def none(leaf: Any) -> Any:
+        return np.concatenate([leaf, np.zeros((K - own, *leaf.shape[1:]), leaf.dtype)])
 
     rows = []
     for seen in scans.epoch.rows:
-        wider = jax.tree.map(lambda leaf: last(slot(leaf)), seen)
-        rows.append(wider._replace(mask=wider.mask.at[:, slots:].set(0.0).at[own:].set(0.0)))
-    n = len(one.watch.mean)
-    epoch = jax.tree.map(last, scans.epoch._replace(rows=()))
-    move = epoch.move[0]
-    start = scans.epoch.move[0]
-    still = Move(move.F.at[own:].set(jnp.eye(n)), none(start.L), move.level, none(start.drift))
+        wider = [last(np.concatenate([leaf, np.repeat(leaf[:, :1], D - slots, 1)], 1)) for leaf in seen]
+        mask = none(np.pad(seen.mask, ((0, 0), (0, D - slots), (0, 0))))
+        rows.append(Seen(*jax.device_get(wider))._replace(mask=mask))
+    (move,), n = scans.epoch.move, len(one.watch.mean)
+    F: Any = np.concatenate([move.F, np.tile(np.eye(n), (K - own, 1, 1))])
+    epoch = jax.tree.map(last, scans.epoch._replace(rows=(), move=()))
+    still = Move(F, none(move.L), last(move.level), none(move.drift))
+    number: Any = np.pad(scans.number, ((0, K - own), (0, D - slots)), constant_values=-1)
     padded = Scan(
         epoch._replace(rows=tuple(rows), move=(still,)), none(scans.elapsed), last(scans.block),
-        none(scans.probability), none(scans.clutter), last(scans.density), last(scans.view),
-        jnp.pad(scans.number, ((0, more), (0, wide)), constant_values=-1),
+        none(scans.probability), none(scans.clutter), last(scans.density), last(scans.view), number,
     )  # fmt: skip
-    time = np.concatenate([one.time, np.full(more, one.time[-1])])
+    time = np.concatenate([one.time, np.full(K - own, one.time[-1])])
     return replace(one, watch=one.watch._replace(scans=padded), time=time, there=np.arange(K) < own)
 
 
-def stacked(sensors: Sequence[Alone]) -> Watch:
-    """Watches of one form with a leading axis of sensors."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *[one.watch for one in sensors])
-
-
-def carried(problem: Problem, dt: np.ndarray) -> Move:
-    """How the state of an object gets on by each of the times dt (K,) in s, unknown levels at their first guess."""
+def carried(problem: Problem, dt: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """F, L and drift by which the state of an object gets on by times dt (K,) in s, levels at their first guess."""
     target = problem.target(OBJECT)
-    F, L, level, drift = chain("object", target, np.cumsum(dt), Levels(), 0.0, problem.area)
+    F, L, _, drift = chain("object", target, np.cumsum(dt), Levels(), 0.0, problem.area)
     still = np.flatnonzero(dt == 0)
     F[still], L[still], drift[still] = np.eye(F.shape[1]), 0.0, 0.0
-    return Move(*jax.device_put((F, L, level, drift)))
+    return F, L, drift

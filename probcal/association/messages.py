@@ -50,7 +50,7 @@ def _forms(belief: Belief) -> tuple[np.ndarray, np.ndarray]:
 class Normals:
     """Gaussian messages: each potential is expanded where the beliefs are, and again where they have moved."""
 
-    def __init__(self, vertices: Sequence[Vertex], edges: Sequence[Edge], rng: np.random.Generator):
+    def __init__(self, vertices: Sequence[Vertex], edges: Sequence[Edge]):
         self.vertices, self.edges = vertices, edges
         self.beliefs: dict[int, Belief] = {}
         self.expanded: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}  # place, information, pull

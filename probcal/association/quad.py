@@ -7,7 +7,7 @@ a density is their Bhattacharyya coefficient, which depends on the poses.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,13 +47,11 @@ def paired(
     back = np.where(pair >= 0, pair - 1, -1)  # its scan before, so that neither knows of the two
     used = (pair >= 0) & (own >= 0) & (back >= 0) & one.there
     stand = jax.tree.map(lambda leaf: leaf[np.maximum(pair, 0)], other.watch.scans)
-    predicted = (
-        carry(problem, mine, np.maximum(own, 0), one.time - one.time[np.maximum(own, 0)], lifetime),
-        carry(problem, theirs, np.maximum(back, 0), one.time - other.time[np.maximum(back, 0)], lifetime),
-    )
-    here, there = jax.device_put(predicted)
-    levels = jnp.zeros(len(problem.levels))
-    return Paired(one.watch.model, one.watch.scans, here, other.watch.model, stand, there, jnp.asarray(used), levels)
+    here = carry(problem, mine, np.maximum(own, 0), one.time - one.time[np.maximum(own, 0)], lifetime)
+    there = carry(problem, theirs, np.maximum(back, 0), one.time - other.time[np.maximum(back, 0)], lifetime)
+    levels = np.zeros(len(problem.levels))
+    sides: Any = one.watch.model, one.watch.scans, here, other.watch.model, stand, there, used, levels
+    return jax.device_put(Paired(*sides))
 
 
 def normaliser(each: Paired, z: jax.Array, theta: jax.Array, at: jax.Array) -> Crossed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -21,6 +22,8 @@ BATCH = 32  # of them evaluated at once
 WIDTHS = 0.5 ** np.arange(1, 10)  # of the kernel, in scales of the biases
 SPREAD = 8  # share of the population that counts after each step
 FEW = 24  # scans that the search looks at
+RUNS = 2  # of populations
+AWAY = 0.5  # from known modes, in scales, that a further population keeps
 MODES = 4  # that are kept
 BEHIND = 30.0  # nats by which a mode may lie behind the best and is followed
 CLIMB = 50  # steps at most
@@ -51,10 +54,10 @@ class Term(NamedTuple):
         used = worth > 0
         each = self.each
         taken = {
-            name: jax.tree.map(lambda leaf: leaf[kept], getattr(each, name))
+            name: jax.tree.map(lambda leaf: np.asarray(leaf)[kept], getattr(each, name))
             for name in ("scans", "stand", "mixture", "background")
         }
-        return self._replace(each=each._replace(**taken, used=jnp.asarray(used[kept])))
+        return self._replace(each=jax.device_put(each._replace(**taken, used=used[kept])))
 
 
 @partial(jax.jit, static_argnames=("views",))
@@ -88,21 +91,21 @@ class Potential:
 
     def values(self, theta: np.ndarray, width: float = 0.0, missed: float = 1.0) -> np.ndarray:
         """At each of the theta (L, p), blurred by a kernel; with `missed` 0 what was not detected does not count."""
-        spread = width**2 * jnp.eye(theta.shape[1])
-        z, points, at = jnp.asarray(self.z), jnp.asarray(theta), jnp.asarray(self.at)
-        parts = [t.power * np.asarray(_values(t.each, t.views, z, points, at, spread, missed)) for t in self.terms]
-        parts += [np.asarray(_normalised(each, z, points, at).value) for each in self.quad]
+        spread = width**2 * np.eye(theta.shape[1])
+        parts = [t.power * np.asarray(_values(*t[:2], self.z, theta, self.at, spread, missed)) for t in self.terms]
+        parts += [np.asarray(_normalised(each, self.z, theta, self.at).value) for each in self.quad]
         return np.sum(parts, 0)
 
     def expanded(self, theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Value, slope (p,) and information (p, p) at theta (p,)."""
-        z, point, at = jnp.asarray(self.z), jnp.asarray(theta), jnp.asarray(self.at)
         parts = [
-            jax.tree.map(lambda leaf, w=t.power: w * leaf, jax.device_get(_expanded(t.each, t.views, z, point, at)))
+            jax.tree.map(lambda leaf, w=t.power: w * leaf, jax.device_get(_expanded(*t[:2], self.z, theta, self.at)))
             for t in self.terms
         ]
         for each in self.quad:
-            parts.append(jax.tree.map(lambda leaf: leaf[0], jax.device_get(_normalised(each, z, point[None], at))))
+            parts.append(
+                jax.tree.map(lambda leaf: leaf[0], jax.device_get(_normalised(each, self.z, theta[None], self.at)))
+            )
         value, slope, information = (np.sum(leaves, 0) for leaves in zip(*parts, strict=True))
         return float(value), slope, information
 
@@ -123,23 +126,34 @@ def search(potential: Potential, rng: np.random.Generator) -> list[Mode]:
     """Modes of a potential under the prior N(0, I) of its biases, the one of most evidence first.
 
     A population drawn from the prior is weighed by the potential blurred by a kernel, tempered so that an eighth of it
-    counts, drawn anew and moved, the kernel narrower by half each time; its best points are where climbs begin.
+    counts, drawn anew and moved, the kernel narrower by half each time; its best points are where climbs begin. A
+    second population keeps away from what the first one found.
     """
+    few, found = potential.few(), list[Mode]()
+    for _ in range(RUNS):
+        theta = _narrowed(few, len(potential.at), rng, [mode.theta for mode in found])
+        value = potential.values(theta, float(WIDTHS[-1]))
+        found = climbed(potential, _best(theta, value, 8.0 * float(WIDTHS[-1])), found)
+    return found
+
+
+def _narrowed(few: Potential, p: int, rng: np.random.Generator, known: Sequence[np.ndarray]) -> np.ndarray:
+    """Points (L, p) to which a population has narrowed, away from what is known."""
     from scipy.stats import norm, qmc
 
-    p, few = len(potential.at), potential.few()
     theta = norm.ppf(np.clip(qmc.Sobol(p, seed=rng).random(POPULATION), 1e-6, 1 - 1e-6))
     for width in WIDTHS:
         value = few.values(theta, width, missed=0.0)
+        for place in known:
+            value = np.where(np.abs(theta - place).max(1) < min(3.0 * width, AWAY), value.min(), value)
         size = POPULATION if width > CLOSE else FOLLOWED
         theta = theta[_drawn(value, size, rng)] + 0.5 * width * rng.standard_normal((size, p))
-    value = potential.values(theta, float(WIDTHS[-1]))
-    return climbed(potential, _best(theta, value, 8.0 * float(WIDTHS[-1])))
+    return theta
 
 
-def climbed(potential: Potential, starts: np.ndarray) -> list[Mode]:
-    """The different modes that starts (S, p) lead to."""
-    found: list[Mode] = []
+def climbed(potential: Potential, starts: np.ndarray, known: Sequence[Mode] = ()) -> list[Mode]:
+    """The different modes that starts (S, p) lead to, and those known."""
+    found = list(known)
     for start in starts:
         mode = climb(potential, start)
         if mode is not None and not any(same(mode, other) for other in found):
@@ -179,7 +193,7 @@ def same(one: Mode, other: Mode) -> bool:
 
 
 def _drawn(value: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
-    """Numbers (size,) of the population drawn by weights exp(power value), the power such that a share of it counts."""
+    """Numbers (size,) drawn by weights exp(power value), the power such that a share of the population counts."""
     L = len(value)
     low, high, weight = 0.0, 1.0, np.full(L, 1.0 / L)
     for _ in range(40):

@@ -73,13 +73,14 @@ def match(one: Alone, other: Alone, window: float, *, before: bool) -> np.ndarra
 def carry(problem: Problem, after: Intensity, which: np.ndarray, dt: np.ndarray, lifetime: float) -> Intensity:
     """Mixtures (K, J) of some scans carried on by times dt (K,) in s."""
     dt = np.maximum(dt, 0.0)
-    F, L, _, drift = (np.asarray(leaf) for leaf in carried(problem, dt)[:4])
+    F, L, drift = carried(problem, dt)
     weight, mean, covariance = (np.asarray(leaf)[which] for leaf in after)
-    return Intensity(
+    found: Any = (
         weight * np.exp(-dt / lifetime)[:, None],
         np.einsum("kij,kaj->kai", F, mean) + drift[:, None],
         np.einsum("kij,kajl,kml->kaim", F, covariance, F) + (L @ L.transpose(0, 2, 1))[:, None],
     )
+    return Intensity(*found)
 
 
 def explained(
@@ -91,9 +92,8 @@ def explained(
     behind = np.maximum(pair, 0)
     mixture = carry(problem, after, behind, np.where(pair >= 0, one.time - other.time[behind], 0.0), lifetime)
     stand = jax.tree.map(lambda leaf: leaf[behind], other.watch.scans)
-    levels = jnp.zeros(len(problem.levels))
-    arrays = (mixture, jnp.asarray(background(one, count)), jnp.asarray(pair >= 0), levels)
-    return Explained(one.watch.model, one.watch.scans, other.watch.model, stand, *jax.device_put(arrays))
+    arrays: Any = (stand, mixture, background(one, count), pair >= 0, np.zeros(len(problem.levels)))
+    return jax.device_put(Explained(one.watch.model, one.watch.scans, other.watch.model, *arrays))
 
 
 def first_slot(scan: Scan) -> Scan:

@@ -119,7 +119,7 @@ def graph_of(
                 *jax.device_get(filter_tracks(one.watch, one.views, known, chances, cloud, most).after[:3])
             )
         heavy = np.argsort(-held.weight, axis=1)[:, :MOST]
-        after.append(Intensity(*jax.device_put([_taken(leaf, heavy) for leaf in held])))
+        after.append(held._replace(**{name: _taken(leaf, heavy) for name, leaf in held._asdict().items()}))
         count.append(held.weight.sum(1))
     if window is None:
         gaps = [np.median(np.diff(one.time[one.there])) for one in sensors if one.there.sum() > 1]
