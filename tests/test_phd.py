@@ -433,13 +433,13 @@ def test_the_number_is_unbiased_where_the_sensor_is_linear(kind):
 
 @pytest.mark.slow
 def test_the_cardinalised_number_is_surer():
-    """Its mean squared error is less than half of the other's, and it says so.
+    """Its mean squared error is less than three quarters of the other's, and it says so.
 
-    By runs the error of the second is 3 times the first; a half is 10 standard errors away.
+    Measured 0.088 and 0.228, three quarters 10 standard errors away: false-alarm rate below 1e-6.
     """
     (one, wide, true), (two, narrow, _) = counted("phd"), counted("cphd")
     square = [((count - true[:, None]) ** 2).mean() for count in (one, two)]
-    assert square[1] < 0.5 * square[0]
+    assert square[1] < 0.75 * square[0]
     assert narrow.mean() < 0.1 * wide.mean()
     assert 0.5 < narrow.mean() / square[1] < 1.5, "the variance is that of the errors"
 
