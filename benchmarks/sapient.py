@@ -1,6 +1,6 @@
 """The lidars and radars of `models/sapient.py`, configured from detections without names.
 
-    uv run python benchmarks/sapient.py --start tracks --runs 5
+    uv run python benchmarks/sapient.py --start beliefs --runs 5
 
 Printed for every run and sensor: error in place (m) and heading (deg), and their stated sds; then status, share of
 89 % intervals that hold, rms z, objects (three walk), rounds and seconds. Of all runs: the worst errors, and how many
@@ -36,10 +36,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--start", choices=STARTS, default="tracks")
+    parser.add_argument("--start", choices=STARTS, default="beliefs")
     parser.add_argument("--iterations", type=int, default=50)
     chosen = parser.parse_args()
-    method = pc.SelfConfiguration(pc.MAP(), start=chosen.start, cut=2.0, iterations=chosen.iterations)
+    method = pc.SelfConfiguration(pc.MAP(), start=chosen.start, iterations=chosen.iterations)
     worst = []
     for run in range(chosen.first, chosen.first + chosen.runs):
         problem = sapient.problem(run=run)

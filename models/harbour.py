@@ -2,19 +2,28 @@
 
 Recording of the Autoferry sensor fusion dataset (NTNU 2021; Helgesen et al., Ocean Engineering 252, 2022, CC0): not
 shipped, give the path of a `scenarioN_detections.json`. Radar and lidar report places (north, east) relative to the
-ferry, infrared and optical cameras directions from north; most scans hold false ones, and a boat of 8 to 31 m gives
-several, which are put together where they lie within `NEAR` m of each other, or `ABREAST` rad. The reference
-`scenarioN_groundTruth.json` beside it, an antenna on each boat, is for judging only.
+ferry, infrared and optical cameras directions from north. The reference `scenarioN_groundTruth.json` beside it, an
+antenna on each boat, is for judging only. A boat of 8 to 31 m gives several detections, which are put together where
+they lie within `NEAR` m of each other, or `ABREAST` rad; where its middle seems to be depends on the side that is seen,
+which the std allows for. Most false detections of the radar are no noise, and three kinds are left out:
 
-Unknown are the offsets in azimuth of radar and cameras against the lidar, and in range of radar and lidar.
+- echoes: behind a boat, in its beam and half as far again or more, up to five times; they move as it does;
+- what stands: reported within `STILL` m for longer than `LONG` s without a break of `BREAK` s; no boat under way is
+  seen there either, which the view of the radar says;
+- the ferry itself, within 25 m.
+
+Unknown are the offsets in azimuth of radar and cameras against the lidar, and in range of radar and lidar. What cameras
+alone see (`cameras=True`) has a direction and no place: its sd says so, tens of metres and more.
 
     probcal fit models/harbour.py PATH --method self-config --out harbour
     probcal track models/harbour.py OTHER --calibration harbour --out other
 """
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from scipy.cluster.hierarchy import fcluster, linkage
@@ -28,7 +37,6 @@ from probcal import (
     Network,
     Node,
     Problem,
-    Sector,
     Target,
     Truth,
     sensor,
@@ -39,23 +47,48 @@ from probcal import (
 from probcal.geometry import bearing, norm
 
 NAMES = {1: "lidar", 2: "radar", 3: "infrared", 4: "optical"}
-NEAR, ABREAST = 15.0, np.deg2rad(3.0)  # m and rad within which detections are of one boat
-RANGE = {"lidar": 130.0, "radar": 400.0}  # m
+NEAR, ABREAST = 25.0, np.deg2rad(3.0)  # m and rad within which detections are of one boat
+REACH = {"lidar": (5.0, 130.0), "radar": (25.0, 400.0)}  # m, within which detections are used
+SURE = {"lidar": 60.0, "radar": 150.0}  # m up to which small boats are seen as well as large ones
+BEAM, BEHIND = np.deg2rad(12.0), 1.5  # rad on each side of a boat, and times its range, where the radar reports echoes
+STILL, LONG, BREAK = 10.0, 40.0, 15.0  # m, s and s by which the radar knows what stands
 EVERY = 1.0  # s between two scans of a camera that are used
 SPEED = 3.0  # m/s, of a boat
 
 
-@sensor(range=Channel("m", std=3.0), azimuth=Channel("rad", std=np.deg2rad(2.0), wrap=True))
+@sensor(range=Channel("m", std=5.0), azimuth=Channel("rad", std=np.deg2rad(3.0), wrap=True))
 def ranging(target, pose, *, range_offset=Bias("m", 5.0), azimuth_offset=Bias("rad", 0.05)):
     """Distance and mathematical azimuth of the middle of a boat."""
     line = pose.local(target.position)
     return dict(range=norm(line) + range_offset, azimuth=bearing(line) + azimuth_offset)
 
 
-@sensor(azimuth=Channel("rad", std=np.deg2rad(1.5), wrap=True))
+@sensor(azimuth=Channel("rad", std=np.deg2rad(2.0), wrap=True))
 def camera(target, pose, *, azimuth_offset=Bias("rad", 0.05)):
     """Mathematical azimuth of a boat."""
     return dict(azimuth=bearing(pose.local(target.position)) + azimuth_offset)
+
+
+@dataclass(frozen=True)
+class Open:
+    """What radar and lidar see: open water, all boats up to `sure` m and ever fewer out to `far` m.
+
+    Nothing is seen within `STILL` m of what stands (east, north).
+    """
+
+    near: float
+    sure: float
+    far: float
+    stands: tuple = ()
+
+    def __call__(self, target, pose):
+        """Share of boats that are seen."""
+        away = norm(pose.local(target.position))
+        share = jnp.clip(1.0 - 0.8 * (away - self.sure) / (self.far - self.sure), 0.2, 1.0)
+        seen = (away >= self.near) & (away <= self.far)
+        for place in self.stands:
+            seen &= norm(target.position - jnp.array(place)) > STILL
+        return share * seen
 
 
 def detections(data):
@@ -74,18 +107,50 @@ def middle(values, width):
     return np.array([values[group == k].mean(0) for k in np.unique(group)])
 
 
+def standing(data):
+    """Places (k, 2), east and north, at which the radar reports something for long."""
+    scans = [scan for scan in detections(data) if NAMES[scan["sensorID"]] == "radar" and scan["measurement"]]
+    places = [np.reshape(scan["measurement"], (2, -1)).T + scan["ownshipPosition"] for scan in scans]
+    time = np.repeat([scan["time"] for scan in scans], [len(own) for own in places])
+    place = np.concatenate([np.zeros((0, 2)), *places])[:, ::-1]
+    near = np.linalg.norm(place[:, None] - place, axis=2) < STILL
+    return middle(place[[_stays(np.unique(time[own])) for own in near]], STILL)
+
+
+def _stays(time):
+    """Whether times (T,) in ascending order go on for long without a break."""
+    run = np.cumsum(np.diff(time, prepend=time[0]) > BREAK)
+    return max(np.ptp(time[run == k]) for k in range(run[-1] + 1)) > LONG
+
+
+def _echoes(polar):
+    """Which detections (k, 2) of one scan of the radar lie behind another."""
+    distance, azimuth = polar.T
+    apart = np.abs((azimuth[:, None] - azimuth + np.pi) % (2 * np.pi) - np.pi)
+    return ((apart < BEAM) & (distance[:, None] > BEHIND * distance)).any(1)
+
+
+def _open(polar, ferry, stands):
+    """Those detections (k, 2) of one scan of the radar that are neither echoes nor of what stands."""
+    at = ferry + polar[:, :1] * np.stack([np.cos(polar[:, 1]), np.sin(polar[:, 1])], 1)
+    held = (np.linalg.norm(at[:, None] - stands, axis=2) <= STILL).any(1)
+    return polar[~held & ~_echoes(polar)]
+
+
 def table(data, cameras=True):
     """Detections by scan, put together: time since the first, sensor, range and azimuth; a blank row for nothing."""
     rows, last = [], {}
-    listed = detections(data)
+    listed, stands = detections(data), standing(data)
     begun = min(scan["time"] for scan in listed)
     for scan in listed:
         name, time = NAMES[scan["sensorID"]], scan["time"] - begun
         found = np.atleast_1d(np.array(scan["measurement"], float))
-        if name in RANGE:
+        if name in REACH:
             places = middle(found.reshape(2, -1).T, NEAR) if found.size else np.zeros((0, 2))
             polar = np.stack([np.hypot(*places.T), np.arctan2(places[:, 0], places[:, 1])], 1)
-            polar = polar[polar[:, 0] < RANGE[name]]
+            polar = polar[(polar[:, 0] > REACH[name][0]) & (polar[:, 0] < REACH[name][1])]
+            if name == "radar":
+                polar = _open(polar, np.array(scan["ownshipPosition"][::-1]), stands)
         else:
             if not cameras or time - last.get(name, -np.inf) < EVERY:
                 continue
@@ -108,12 +173,15 @@ def path(data):
 def network(data, cameras=True):
     """Four sensors on one ferry; the lidar's azimuth is the reference."""
     node = Node("ferry", path=path(data))
-    placed = [
-        ranging.on(node, name="lidar", detection=Detection(0.7, clutter=0.5, view=Sector(range=RANGE["lidar"]))),
-        ranging.on(node, name="radar", detection=Detection(0.8, clutter=3.0, view=Sector(range=RANGE["radar"]))),
-    ]
+    stands = {"lidar": (), "radar": tuple(map(tuple, standing(data).round(1).tolist()))}
+    clutter = {"lidar": 0.5, "radar": 2.0}
+    placed = []
+    for name, (near, far) in REACH.items():
+        view = Open(near, SURE[name], far, stands[name])
+        report = Detection(0.9, clutter[name], view, {"range": (near, far)})
+        placed.append(ranging.on(node, name=name, detection=report))
     if cameras:
-        placed += [camera.on(node, name=n, detection=Detection(0.6, clutter=2.0)) for n in ("infrared", "optical")]
+        placed += [camera.on(node, name=name, detection=Detection(0.6, 4.0)) for name in ("infrared", "optical")]
     return Network(placed)
 
 

@@ -147,6 +147,19 @@ def test_a_view_without_an_end_is_a_wedge_and_one_that_sees_all_is_not_drawn():
     assert [own.sensor for own in scene.scene(found).views] == ["c"]
 
 
+def test_nodes_that_are_stated_at_one_place_are_named_where_they_were_found():
+    found = tree()
+    known = found["constant_data"].to_dataset()
+    known["node_position"][:] = 7.0
+    found["constant_data"] = xr.DataTree(known)
+    nodes = scene.scene(found).nodes
+    np.testing.assert_array_equal(nodes.named, nodes.calibrated)
+    named = {text.get_text(): text.xy for text in plots.plot_map(found).texts}
+    np.testing.assert_allclose(named["b"], nodes.calibrated[1])
+    plain = scene.scene(tree()).nodes
+    np.testing.assert_array_equal(plain.named, plain.stated)
+
+
 # Pictures and tables
 
 

@@ -263,11 +263,12 @@ def _draw_nodes(sheet: figure, shown: Scene, source: ColumnDataSource, plane: li
     said = '<b>@name</b><div style="white-space: pre-line">@words</div>'
     sheet.add_tools(HoverTool(renderers=[stated, found], tooltips=said, description="Nodes", name="nodes"))
     if plane == [0, 1] and len(nodes.name) <= NAMED:
-        inner = nodes.stated[:, 0] < shown.low[0] + 0.75 * (shown.high - shown.low)[0]  # names stay on the sheet
+        at = nodes.named
+        inner = at[:, 0] < shown.low[0] + 0.75 * (shown.high - shown.low)[0]  # names stay on the sheet
         side: dict[str, Any] = {
             "x_offset": np.where(inner, 8, -8), "text_align": np.where(inner, "left", "right").tolist()
         }  # fmt: skip
-        columns = {"x": nodes.stated[:, 0], "y": nodes.stated[:, 1], "name": nodes.name.tolist()} | side
+        columns = {"x": at[:, 0], "y": at[:, 1], "name": nodes.name.tolist()} | side
         named = ColumnDataSource(data=columns)
         aside: dict[str, Any] = {key: key for key in side}
         _tagged("names", sheet.text("x", "y", text="name", source=named, y_offset=-6, **aside, **TEXT))

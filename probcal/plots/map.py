@@ -133,7 +133,7 @@ def _draw_nodes(ax: Axes, nodes: Places, probability: float) -> list[Line2D]:
     keys += _draw_headings(ax, nodes)
     box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8}
     if len(nodes.name) <= NAMED:
-        for name, place in zip(nodes.name, stated, strict=True):
+        for name, place in zip(nodes.name, nodes.named[:, :2], strict=True):
             ax.annotate(
                 plain_text(name), place, xytext=(6, 6), textcoords="offset points", zorder=7, bbox=box,
                 fontsize=8 if few else 6, annotation_clip=True,

@@ -78,6 +78,12 @@ class Places:
     moving: np.ndarray
     heading: np.ndarray  # calibrated; NaN where it is no bias
 
+    @property
+    def named(self) -> np.ndarray:
+        """Where the name of each node stands (N, d): as stated, as calibrated where several are stated at one place."""
+        _, place, count = np.unique(self.stated, axis=0, return_inverse=True, return_counts=True)
+        return np.where((count[place] > 1)[:, None], self.calibrated, self.stated)
+
 
 @dataclass(frozen=True)
 class Scene:
