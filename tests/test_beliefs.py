@@ -11,7 +11,7 @@ import probcal as pc
 from probcal.association.beliefs import Field, check_rivals
 from probcal.association.entry import asked, cloud_of
 from probcal.association.messages import Belief, Edge, Kernels, Normals
-from probcal.association.search import Mode, search
+from probcal.association.search import Mode, Potential, search
 from probcal.association.separable import first_slot, partners, placed
 from probcal.association.vertices import Vertex, graph_of, vertices_of
 from probcal.errors import InputError
@@ -250,6 +250,9 @@ class Quadratic:
     def few(self):
         return self
 
+    def apart(self, theta, other):
+        return theta - other
+
 
 def chain(loop):
     """Four vertices of two biases, edges that know differences, and the same as one dense Gaussian."""
@@ -352,6 +355,13 @@ def test_a_rival_that_another_edge_refutes_is_dropped():
         found.rivals[1] = [Mode(np.array([-1.0, 0.0]), 1e-4 * np.eye(2), 0.0)]
         check_rivals(found, [Edge(0, 1, peaks), Edge(0, 1, Quadratic(np.arange(2), (1.0, 0.0), other))])
         assert len(found.rivals[1]) == left
+
+
+def test_a_turn_is_no_other_pose():
+    found = graph("dual")
+    two_turns = Potential((), np.zeros(2), np.arange(2), np.array([np.inf, 4.0]))
+    np.testing.assert_allclose(two_turns.apart(np.array([1.0, 3.9]), np.array([9.0, -0.2])), [-8.0, 0.1])
+    assert np.isinf(found.pair(0, 1, np.zeros(2), np.arange(2)).period).all()
 
 
 # the graph, and what is refused

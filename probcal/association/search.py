@@ -87,7 +87,14 @@ class Potential:
     terms: tuple[Term, ...]
     z: np.ndarray  # (M,) where the others are held
     at: np.ndarray  # (p,)
+    period: np.ndarray  # (p,) of angles, inf of the others
     quad: tuple[Paired, ...] = ()  # of the quad term
+
+    def apart(self, theta: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Difference (..., p) of biases, angles the short way round."""
+        turns = np.where(np.isfinite(self.period), self.period, 1.0)
+        off = theta - other
+        return np.where(np.isfinite(self.period), off - turns * np.round(off / turns), off)
 
     def values(self, theta: np.ndarray, width: float = 0.0, missed: float = 1.0) -> np.ndarray:
         """At each of the theta (L, p), blurred by a kernel; with `missed` 0 what was not detected does not count."""
@@ -111,7 +118,7 @@ class Potential:
 
     def few(self) -> Potential:
         """The same on a few of its scans."""
-        return Potential(tuple(term.few() for term in self.terms), self.z, self.at)
+        return Potential(tuple(term.few() for term in self.terms), self.z, self.at, self.period)
 
 
 class Mode(NamedTuple):
@@ -133,7 +140,7 @@ def search(potential: Potential, rng: np.random.Generator) -> list[Mode]:
     for _ in range(RUNS):
         theta = _narrowed(few, len(potential.at), rng, [mode.theta for mode in found])
         value = potential.values(theta, float(WIDTHS[-1]))
-        found = climbed(potential, _best(theta, value, 8.0 * float(WIDTHS[-1])), found)
+        found = climbed(potential, _best(potential, theta, value), found)
     return found
 
 
@@ -145,7 +152,7 @@ def _narrowed(few: Potential, p: int, rng: np.random.Generator, known: Sequence[
     for width in WIDTHS:
         value = few.values(theta, width, missed=0.0)
         for place in known:
-            value = np.where(np.abs(theta - place).max(1) < min(3.0 * width, AWAY), value.min(), value)
+            value = np.where(np.abs(few.apart(theta, place)).max(1) < min(3.0 * width, AWAY), value.min(), value)
         size = POPULATION if width > CLOSE else FOLLOWED
         theta = theta[_drawn(value, size, rng)] + 0.5 * width * rng.standard_normal((size, p))
     return theta
@@ -156,7 +163,7 @@ def climbed(potential: Potential, starts: np.ndarray, known: Sequence[Mode] = ()
     found = list(known)
     for start in starts:
         mode = climb(potential, start)
-        if mode is not None and not any(same(mode, other) for other in found):
+        if mode is not None and not any(same(potential, mode, other) for other in found):
             found.append(mode)
     found.sort(key=lambda mode: -mode.evidence)
     return [mode for mode in found if mode.evidence > found[0].evidence - BEHIND]
@@ -186,9 +193,9 @@ def climb(potential: Potential, start: np.ndarray) -> Mode | None:
     return Mode(theta, covariance, float(value - 0.5 * theta @ theta - 0.5 * logdet))
 
 
-def same(one: Mode, other: Mode) -> bool:
+def same(potential: Potential, one: Mode, other: Mode) -> bool:
     """Whether two modes lie within three of their sds."""
-    away = one.theta - other.theta
+    away = potential.apart(one.theta, other.theta)
     return bool(np.all(np.abs(away) < 3.0 * np.sqrt(np.diagonal(one.covariance + other.covariance))))
 
 
@@ -204,10 +211,11 @@ def _drawn(value: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray
     return np.minimum(np.searchsorted(np.cumsum(weight), (rng.random() + np.arange(size)) / size), L - 1)
 
 
-def _best(theta: np.ndarray, value: np.ndarray, apart: float) -> np.ndarray:
+def _best(potential: Potential, theta: np.ndarray, value: np.ndarray) -> np.ndarray:
     """The best points that lie apart from better ones."""
     order, kept = np.argsort(-value), list[int]()
     for k in order[value[order] > value[order[0]] - BEHIND]:
-        if len(kept) < MODES and all(np.abs(theta[k] - theta[other]).max() > apart for other in kept):
+        near = [np.abs(potential.apart(theta[k], theta[other])).max() < 8.0 * WIDTHS[-1] for other in kept]
+        if len(kept) < MODES and not any(near):
             kept.append(int(k))
     return theta[kept]

@@ -89,15 +89,19 @@ class Graph:
             terms.append(Term(each, one.views, 1.0 if dual else 0.5))
         if self.terms == "quad":
             quad.append(paired(self.problem, self.sensors[i], self.sensors[j], self.after[i], self.after[j], *settings))
-        return Potential(tuple(terms), z, at, tuple(quad))
+        return Potential(tuple(terms), z, at, self._periods(at), tuple(quad))
+
+    def _periods(self, at: np.ndarray) -> np.ndarray:
+        """Period (p,) of each bias in its scale, inf where it is no angle of a node."""
+        biases, scales = self.problem.biases, self.problem.scales
+        return np.array([2 * np.pi / scales[m] if biases[m].component in ANGLES else np.inf for m in at])
 
     def potential(self, u: int, v: int, z: np.ndarray, at: np.ndarray) -> Potential:
         """What the sensors of two vertices tell each other, as a function of the biases at some places of z."""
         own, others = self.vertices[u].sensors, self.vertices[v].sensors
         parts = [self.pair(i, j, z, at) for i in own for j in others]
-        return Potential(
-            tuple(term for part in parts for term in part.terms), z, at, tuple(q for part in parts for q in part.quad)
-        )
+        terms = tuple(term for part in parts for term in part.terms)
+        return Potential(terms, z, at, self._periods(at), tuple(each for part in parts for each in part.quad))
 
 
 def graph_of(

@@ -32,7 +32,7 @@ from probcal.priors import Prior
 from probcal.problem import Problem, check_linear
 from probcal.results.answer import Answer, tracks_of, uncalibrated
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
-from probcal.results.objects import object_groups
+from probcal.results.objects import disagreeing, object_groups
 from probcal.results.read import apply
 from probcal.simulate import Key, as_key
 from probcal.smoothing.grid import track_mode
@@ -171,8 +171,15 @@ def _configured(
             f"Several poses explain the detections as well (how many): {listed}. Survey one of these, or give objects"
             " that turn."
         )
+    status = Status.NOT_CONVERGED
+    for a, first, b, second in disagreeing(problem, found.objects, answer.posterior.summary.mean)[:1]:
+        status = Status.MISFIT
+        wrong.append(
+            f"{a} should see {first} and never does, {b} should see {second} and never does: the two differ by what no"
+            " bias allows for. Check their clocks and Detection(...), or give the sensor a bias for it."
+        )
     if wrong and Status(tree.attrs["status"]).settled:
-        answer = replace(answer, status=Status.NOT_CONVERGED, message=f"{' '.join(wrong)} {answer.message}".strip())
+        answer = replace(answer, status=status, message=f"{' '.join(wrong)} {answer.message}".strip())
         tree.attrs |= {"status": str(answer.status), "message": answer.message}
     said = f"{len(found.objects.names)} objects in {len(scans)} scans, found in {found.rounds} rounds of {method.name}."
     tree.attrs |= {"rounds": found.rounds, "message": f"{said} {tree.attrs['message']}".strip()}
