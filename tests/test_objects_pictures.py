@@ -105,10 +105,15 @@ def test_limits_hold_what_surely_is_and_a_part_of_far_views():
     shown, reach = scene.scene(far), float((before.high - before.low).max())
     np.testing.assert_allclose(before.low - shown.low, scene.ASIDE * reach)
     ghost, group = tree(), tree()["object"].to_dataset()
+    known = ghost["constant_data"].to_dataset().drop_vars(["view_range", "view"])
+    ghost["constant_data"] = xr.DataTree(known)
+    without = scene.scene(ghost).high
     ghost["object"] = xr.DataTree(
         group.assign(existence=0.1 * group["existence"], position_x=group["position_x"] + 500)
     )
-    np.testing.assert_allclose(scene.scene(ghost).high, after.high)
+    np.testing.assert_allclose(scene.scene(ghost).high, without)
+    ghost["object"] = xr.DataTree(group.assign(position_x=group["position_x"] + 500))
+    assert scene.scene(ghost).high[0] > without[0]
 
 
 def test_the_printed_map_colours_objects_by_existence():
@@ -224,6 +229,7 @@ def test_what_each_sensor_detected_is_counted_and_views_are_saved():
     problem = recorded()
     path = pd.DataFrame({"time": np.arange(4.0), "track": "track_0", "existence": [0.5, 1.0, 1.0, 1.0]})
     path = path.assign(position_x=50.0, position_y=[-9.0, -3.0, 3.0, 9.0], velocity_x=0.0, velocity_y=6.0)
+    path = pd.concat([path.head(1).assign(existence=0.2), path])  # after the first of two sensors at one time
     rows = pd.DataFrame({"row": [0, 3, 6, 8, 11], "track": "track_0", "weight": [1.0, 0.5, 1.0, 1.0, 0.75]})
     turned = np.array([0.0, 0.0, np.pi / 2 / 0.1])[: len(problem.labels)]
     with jax.enable_x64(True):
