@@ -421,7 +421,7 @@ def test_the_number_is_unbiased_where_the_sensor_is_linear(kind):
     """200 runs of 20 scans: the mean error over runs within 3.3 standard errors and 1 % of the number.
 
     False-alarm rate 0.001. The approximation is exact at the first scan alone; afterwards a missed object counts for
-    too little. Where objects come and go and more is false it is larger, see benchmarks/README.md.
+    too little in clutter. What that comes to, and where objects come and go, is in benchmarks/README.md.
     """
     count, _, true = counted(kind)
     off = count - true[:, None]

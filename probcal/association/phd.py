@@ -349,6 +349,14 @@ def phd_filter(
     derivatives at the mean of a component ("extended") or by points around it ("cubature"). `sensors` are the names of
     those that are heeded, all by default. Raises `InputError` where every row names its target, or the motion has no
     linear form.
+
+    >>> seen = probcal.Detection(0.9, clutter=0.1, view=probcal.Sector(range=500.0))
+    >>> sonars = probcal.Network([s.type.on(*s.nodes, detection=seen) for s in network.sensors])
+    >>> boats = probcal.Target(motion, {"position": ((100.0, 100.0), 100.0), "velocity": ((0.0, 0.0), 10.0)})
+    >>> unnamed = Problem(sonars, boats, run.table)
+    >>> found = probcal.phd_filter(unnamed, covariance=np.eye(len(unnamed.labels)), kind="cphd")
+    >>> round(found.count["count"].iloc[-1])
+    1
     """
     for name, value, allowed in (("kind", kind, get_args(Kind)), ("update", update, get_args(Update))):
         if value not in allowed:
@@ -368,7 +376,7 @@ def _tables(passed: Passed, problem: Problem) -> Intensities:
     number, time = np.arange(len(scans)), scans.time
     sensor = np.array([placed.name for placed in problem.network.sensors])[scans.sensor]
     count = pd.DataFrame({"scan": number, "time": time, "sensor": sensor, "count": passed.count})
-    count["sd"], count["undetected"] = np.sqrt(passed.spread), passed.undetected
+    count["sd"], count["undetected"] = np.sqrt(np.asarray(passed.spread)), np.asarray(passed.undetected)
     weight = np.asarray(passed.after.weight)
     order = np.argsort(-weight, axis=1, kind="stable")
     place = np.argsort(order, axis=1)  # 0 of the heaviest
