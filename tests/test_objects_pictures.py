@@ -165,6 +165,24 @@ def test_nodes_that_are_stated_at_one_place_are_named_where_they_were_found():
     np.testing.assert_array_equal(plain.named, plain.stated)
 
 
+def test_in_space_the_heights_show_objects_and_the_plane_shows_views():
+    found = tree()
+    known = found["constant_data"].to_dataset()
+    place = np.pad(known["node_position"].values, ((0, 0), (0, 1)), constant_values=2.0)
+    known = known.drop_vars(["node_position", "axis"]).assign(node_position=(("node", "axis"), place))
+    found["constant_data"] = xr.DataTree(known.assign_coords(axis=list("xyz")))
+    group = found["object"].to_dataset()
+    found["object"] = xr.DataTree(group.assign(position_z=group["position_x"] + 100.0))
+    del found["track"]
+    assert scene.scene(found).objects[0].position.shape == (4, 3)
+    plan, heights = plots.interactive_map(found).children
+    tags = [[tag for part in sheet.renderers for tag in part.tags] for sheet in (plan, heights)]
+    assert [own.count("objects") for own in tags] == [1, 1]
+    assert [own.count("views") for own in tags] == [2, 0]
+    (band,) = [part for part in heights.renderers if "objects" in part.tags]
+    assert band.data_source.data["y1"].min() >= 100.0
+
+
 # Pictures and tables
 
 
