@@ -4,7 +4,7 @@
 
 Printed: status, biases, and beside each azimuth the median by which the sensor disagrees with the boats' antennas,
 less that of the lidar; then GOSPA (cut 20 m) with its parts of the objects tracked without calibration, by that of the
-scenario itself, and with those of the scenarios that it has no part in. An object counts while it exists more surely
+scenario itself, by those of the others, and by the mean of these. An object counts while it exists more surely
 than not and its place is known better than the cut: what cameras alone see has none.
 """
 
@@ -55,6 +55,13 @@ def disagreement(file, cameras):
     return {name: float(np.median(least[kept & (rows["sensor"] == name)])) for name in rows["sensor"].unique()}
 
 
+def calibration(tree, problem):
+    """Biases z (M,) and their covariance (M, M) of a fit, in the scales of a problem."""
+    labels = list(problem.labels)
+    group = tree["calibration"].to_dataset().sel(bias_label=labels, bias_label_other=labels)
+    return group["mean"].values / problem.scales, group["covariance"].values / np.outer(problem.scales, problem.scales)
+
+
 def told(found):
     """GOSPA and its parts."""
     return f"{found.distance:.2f} (place {found.place:.2f}, missed {found.missed:.2f}, false {found.false:.2f})"
@@ -86,19 +93,25 @@ def main():
                 beside = np.rad2deg(reference[name] - reference["lidar"])
                 print(f"  {label} {np.rad2deg(mean):.2f} ± {np.rad2deg(sd):.2f} deg (by the antennas {beside:.2f})")
         print(tree["detection"].to_dataset().to_dataframe().round(1).to_string(), flush=True)
-    parts = {"as stated": [], "by itself": [], "by the others": []}
+    ways = ("as stated", "by itself", "by the others", "by the mean of the others")
+    parts = {name: [] for name in ways}
     for k, problem in problems.items():
         truth = harbour.truth(files[k])
-        stated = near(pc.track_objects(problem), truth)
-        print(f"scenario {k}, as stated: {told(stated)}")
-        parts["as stated"].append(stated)
-        for other, tree in found.items():
-            group = tree["calibration"].to_dataset().sel(bias_label=list(problem.labels))
-            spread = group["covariance"].sel(bias_label_other=list(problem.labels)).values
-            z, covariance = group["mean"].values / problem.scales, spread / np.outer(problem.scales, problem.scales)
-            own = near(pc.track_objects(problem, z, covariance), truth)
-            parts["by itself" if other == k else "by the others"].append(own)
-            print(f"scenario {k}, calibrated on {other}: {told(own)}", flush=True)
+
+        def judged(way, told_by, *calibration, k=k, problem=problem, truth=truth):
+            own = near(pc.track_objects(problem, *calibration), truth)
+            parts[way].append(own)
+            print(f"scenario {k}, {told_by}: {told(own)}", flush=True)
+
+        judged(ways[0], ways[0])
+        numbers = {other: calibration(tree, problem) for other, tree in found.items()}
+        for other, pair in numbers.items():
+            judged(ways[1 if other == k else 2], f"calibrated on {other}", *pair)
+        rest = [pair for other, pair in numbers.items() if other != k]
+        if rest:
+            z = np.array([pair[0] for pair in rest])
+            spread = np.mean([pair[1] for pair in rest], 0) + np.diag(z.var(0))
+            judged(ways[3], ways[3], z.mean(0), spread)
     for name, rows in parts.items():
         print(f"mean {name}: {told(Gospa(*np.mean(rows, 0)))}" if rows else "")
 
