@@ -345,7 +345,8 @@ def mixed(dimension):
 def test_sensors_of_several_kinds_in_space(dimension, update, kind):
     """Range, azimuth and height beside azimuth alone: two objects are counted, and where they are is found."""
     problem, paths = mixed(dimension)
-    found = pc.phd_filter(problem, covariance=0.1 * np.eye(len(problem.labels)), kind=kind, update=update)
+    asked = dict(covariance=0.1 * np.eye(len(problem.labels)), kind=kind, update=update)
+    found = pc.phd_filter(problem, **asked)
     late = found.count[found.count["time"] > 8.0]["count"]
     assert late.mean() == pytest.approx(2.0, abs=0.5)
     last = found.peaks[found.peaks["scan"] == found.peaks["scan"].max()]
@@ -356,6 +357,9 @@ def test_sensors_of_several_kinds_in_space(dimension, update, kind):
         sd = last[[f"{c}_sd" for c in columns]].to_numpy()[near]
         assert (np.abs(away[near]) < 4.5 * sd).all()
         assert (sd < 30.0).all()
+    alone = pc.phd_filter(problem, sensors=["west"], **asked).count.set_index("sensor")
+    for column in ("count", "sd", "undetected"):  # at each time the radar comes first
+        np.testing.assert_array_equal(alone.loc["south", column], alone.loc["west", column])
 
 
 @pytest.mark.ci
