@@ -10,6 +10,7 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.geometry import bearing, norm, wrap
+from probcal.noise import Level, Unknown, guess_of
 from probcal.types import PoseView, TargetView
 
 
@@ -45,21 +46,23 @@ class Detection:
     `probability` is that of detecting an object in `view` (a function of target and pose with values from 0 to 1, such
     as `Sector`; None sees all) in one scan: the rows of one sensor at one time. `clutter` is the mean number of false
     detections a scan, uniform within `limits`: low and high by channel, in its unit. A channel without limits has those
-    of its period, or of the range of a `Sector`, or what the table spans. Raises `InputError` naming what is wrong.
+    of its period, or of the range of a `Sector`, or what the table spans. Either may be `Unknown(guess, factor)`, of
+    the odds of a probability: `SelfConfiguration` then estimates it. Raises `InputError` naming what is wrong.
 
     >>> Detection(0.9, clutter=2.0, view=Sector(range=5000.0)).within("range", "m", None)
     (0.0, 5000.0)
     """
 
-    probability: float = 0.9
-    clutter: float = 1.0
+    probability: Level = 0.9
+    clutter: Level = 1.0
     view: Callable[[Any, Any], Any] | None = None
     limits: Any = ()
 
     def __post_init__(self):
-        if not (isinstance(self.probability, (int, float)) and 0 < self.probability <= 1):
+        sure = 1.0 if isinstance(self.probability, Unknown) else np.inf  # which cannot be learnt from
+        if not (isinstance(self.probability, Level) and 0 < self.chance <= 1 and self.chance < sure):
             raise InputError(f"Detection(probability={self.probability!r}): it lies above 0, up to 1")
-        if not (isinstance(self.clutter, (int, float)) and 0 <= self.clutter < np.inf):
+        if not (isinstance(self.clutter, Level) and 0 <= self.rate < np.inf):
             raise InputError(
                 f"Detection(clutter={self.clutter!r}): a mean number of false detections a scan, 0 or more"
             )
@@ -74,6 +77,16 @@ class Detection:
             if not (np.isfinite([low, high]).all() and low < high):
                 raise InputError(f'Detection: the limits of "{name}" are {low:g} and {high:g}; low lies below high')
         object.__setattr__(self, "limits", limits)
+
+    @property
+    def chance(self) -> float:
+        """Probability of detection in view, or its guess."""
+        return guess_of(self.probability)
+
+    @property
+    def rate(self) -> float:
+        """Mean number of false detections a scan, or its guess."""
+        return guess_of(self.clutter)
 
     def within(self, channel: str, unit: str, period: float | None) -> tuple[float, float] | None:
         """Where the false detections of a channel lie; None where only the table tells."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from probcal.detection import Detection
 from probcal.errors import InputError, nearest
 from probcal.geodesy import LocalFrame
 from probcal.geometry import slopes
@@ -250,6 +251,11 @@ class Network:
     def channel_names(self) -> tuple[str, ...]:
         """Scalar channels of all sensor types, each once."""
         return tuple(dict.fromkeys(name for t in self.types for name, _ in t.expand(self.dimension)))
+
+    def with_detections(self, detections: Mapping[str, Detection]) -> "Network":
+        """The same network, some sensors by name with other detection."""
+        sensors = [replace(s, detection=detections.get(s.name, s.detection)) for s in self.sensors]
+        return Network(sensors, frame=self.frame)
 
     def with_floors(self, floors: Mapping[tuple[int, str], float]) -> "Network":
         """This network with floors of what is heard, by number of the sensor type and channel; itself without any."""

@@ -240,7 +240,7 @@ def _detections(
     pieces = zip(problem.model.blocks, problem.model.rows, problem.model.recursion, problem.row_index, strict=True)
     for block, data, r, index in pieces:
         told = [placed[str(name)].detection for name in plan["sensor"].to_numpy()[index]]
-        chance = np.array([1.0 if own is None else own.probability for own in told])
+        chance = np.array([1.0 if own is None else own.chance for own in told])
         for view in {own.view for own in told if own is not None and own.view is not None}:
             seen: Any = rows.look(block, data, jnp.asarray(states[r]), jnp.asarray(z), view)
             mine = np.array([own is not None and own.view == view for own in told])
@@ -256,11 +256,11 @@ def _detections(
     for (time, name), _ in plan[detects].groupby(["time", "sensor"], sort=False):
         own, kind = placed[str(name)].detection, placed[str(name)].type
         assert own is not None
-        count = rng.poisson(own.clutter)
+        count = rng.poisson(own.rate)
         false = {}
         for channel, declared in kind.expand(network.dimension):
             pair = own.within(channel, declared.unit, declared.period)
-            if pair is None and own.clutter:
+            if pair is None and own.rate:
                 raise InputError(
                     f'simulate: sensor "{name}" has false detections of "{channel}", but nothing tells where; say it in'
                     f' Detection(..., limits={{"{channel}": (low, high)}})'

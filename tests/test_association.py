@@ -14,6 +14,7 @@ from probcal.association.bernoulli import associate
 from probcal.association.gospa import gospa
 from probcal.errors import FitError, InputError
 from probcal.geometry import bearing, norm
+from probcal.inference.rates import by_beta, by_gamma, of_calibration
 
 REPORT = pc.Detection(0.9, clutter=3.0, view=pc.Sector(range=3000.0))
 TIME = np.arange(40.0)
@@ -265,6 +266,39 @@ def test_biases_are_found_with_the_objects(seed):
         pc.track(problem(empty.assign(azimuth=rng.uniform(-3.0, 3.0, 40))), tree)
     later = pc.track(own, tree)
     assert len(later["track"].children) == 4
+
+
+# rates
+
+
+def test_rates_by_counts_beside_their_prior():
+    """Nothing counted: the guess; much counted: the share; the spread of the prior is that of its factor."""
+    prior = pc.Unknown(2.0, factor=1.2)
+    mean, sd = by_gamma(prior, 0.0, 0)
+    assert (mean, sd / mean) == pytest.approx((2.0, np.log(1.2)))
+    assert by_gamma(prior, 5e6, 1_000_000)[0] == pytest.approx(5.0, rel=1e-4)
+    odds = pc.Unknown(0.9, factor=1.2)
+    mean, sd = by_beta(odds, 0.0, 0.0)
+    assert mean == pytest.approx(0.9)
+    assert sd / (0.9 * 0.1) == pytest.approx(np.log(1.2), rel=0.2)
+    assert by_beta(odds, 700.0, 300.0)[0] == pytest.approx(0.7, abs=0.1)
+    with pytest.raises(InputError, match="it lies above 0, up to 1"):
+        pc.Detection(pc.Unknown(1.0))
+
+
+@pytest.mark.ci
+def test_rates_that_are_unknown_are_found():
+    """Clutter 3 and a probability of 0.9, guessed 1 and 0.6: found within four sds, and taken to other data."""
+    unknown = pc.Detection(pc.Unknown(0.6), clutter=pc.Unknown(1.0), view=pc.Sector(range=3000.0))
+    tree = pc.fit(problem(drawn().table, unknown), pc.SelfConfiguration(pc.MAP()), prior=pc.Gaussian())
+    assert tree.attrs["objects"] == 4
+    table = tree["rate"].to_dataset().to_dataframe()
+    assert len(table) == 4
+    for _, row in table.iterrows():
+        assert abs(row["mean"] - {"clutter": 3.0, "probability": 0.9}[row["rate"]]) < 4 * row["sd"], row
+    later = of_calibration(problem(drawn(seed=2).table, unknown), tree)
+    assert [s.detection.rate for s in later.network.sensors] == table[table["rate"] == "clutter"]["mean"].tolist()
+    assert of_calibration(problem(drawn().table), tree).network.sensors[0].detection == REPORT
 
 
 # distances between sets

@@ -75,8 +75,8 @@ def watch_of(problem: Problem) -> tuple[Watch, tuple[View, ...]]:
             (
                 np.diff(scans.time, prepend=scans.time[0]),
                 np.array([of_type[kinds[s]] for s in scans.sensor]),
-                np.array([d.probability for d in told]),
-                np.array([d.clutter for d in told], float),
+                np.array([d.chance for d in told]),
+                np.array([d.rate for d in told], float),
                 np.array(density),
                 np.array([views.index(d.view) for d in told]),
                 number,

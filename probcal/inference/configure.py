@@ -10,6 +10,7 @@ import numpy as np
 from probcal.association.objects import Objects, track_objects
 from probcal.association.poses import Beliefs, propagate_beliefs
 from probcal.errors import FitError
+from probcal.inference.rates import rated
 from probcal.inference.run import Context
 from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.solve import solve
@@ -30,13 +31,19 @@ SPARE = 0.05  # room for the rows and epochs of later rounds
 
 @dataclass(frozen=True, eq=False)
 class Configured:
-    """The objects of the last round, the labelled problem, the rounds, and whether they came to rest."""
+    """The objects of the last round, the rounds, and whether they came to rest."""
 
     objects: Objects
-    problem: Problem
+    problem: Problem  # with the rates of the last round
+    rates: pd.DataFrame
     rounds: int
     rests: bool
     beliefs: Beliefs | None = None  # with which it started
+
+    @property
+    def labelled(self) -> Problem:
+        """The problem whose rows name their objects."""
+        return self.problem.assigned(self.objects.rows)
 
 
 def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context: Context) -> Configured:
@@ -49,7 +56,7 @@ def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context
         z, covariance = beliefs.z, wider[:, None] * beliefs.covariance * wider
     held: list[pd.DataFrame] = []
     moves: list[float] = []
-    room = Room(problem)
+    room, stated = Room(problem), problem
     for k in range(method.iterations):
         objects = track_objects(problem, z, covariance, **method.chances)
         if not objects.names:
@@ -58,17 +65,18 @@ def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context
                 " enough to tell it from clutter. Check the noise std, probability and clutter of Detection(...), the"
                 " start of the motion, and objects=, births= of SelfConfiguration"
             )
+        problem, rates = rated(stated, objects, z)
         again = [back for back, rows in enumerate(reversed(held)) if _same(rows, objects.rows)]
         if again and max(moves[len(moves) - again[0] :], default=0.0) < LITTLE:  # rounds that go in a circle
-            return Configured(objects, problem.assigned(objects.rows), k, True, beliefs)
+            return Configured(objects, problem, rates, k, True, beliefs)
         held.append(objects.rows)
         summary = solve(problem.assigned(room.filled(objects.rows)), method.method, prior, context).posterior.summary
         sd = np.sqrt(np.maximum(np.diagonal(summary.covariance), 1e-300))
         moves.append(float(np.max(np.abs(summary.mean - z) / sd, initial=0.0)))
         z, covariance = summary.mean, summary.covariance
         if k and moves[-1] < method.tolerance:
-            return Configured(objects, problem.assigned(objects.rows), k + 1, True, beliefs)
-    return Configured(objects, problem.assigned(objects.rows), method.iterations, False, beliefs)
+            return Configured(objects, problem, rates, k + 1, True, beliefs)
+    return Configured(objects, problem, rates, method.iterations, False, beliefs)
 
 
 class Room:

@@ -21,6 +21,7 @@ from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.manifest import stored_run
 from probcal.inference.methods import EA, NUTS, check_problem, choose_prior
 from probcal.inference.progress import OnProgress
+from probcal.inference.rates import of_calibration
 from probcal.inference.run import Context, Method
 from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.solve import solve
@@ -156,7 +157,7 @@ def _configured(
         )
     context = Context(jax.random.split(as_key(key))[0], progress, None, fallback=NUTS())
     found = configure(problem, method, prior, context)
-    tree, answer = calibrate(found.problem, method.method, prior=prior, key=key, progress=progress, **settings)
+    tree, answer = calibrate(found.labelled, method.method, prior=prior, key=key, progress=progress, **settings)
     wrong = []
     if not found.rests:
         wrong.append(f"{method.name} did not come to rest in {found.rounds} rounds: objects and biases still change.")
@@ -172,7 +173,7 @@ def _configured(
             " that turn."
         )
     status = Status.NOT_CONVERGED
-    for a, first, b, second in disagreeing(problem, found.objects, answer.posterior.summary.mean)[:1]:
+    for a, first, b, second in disagreeing(found.problem, found.objects, answer.posterior.summary.mean)[:1]:
         status = Status.MISFIT
         wrong.append(
             f"{a} should see {first} and never does, {b} should see {second} and never does: the two differ by what no"
@@ -183,7 +184,10 @@ def _configured(
         tree.attrs |= {"status": str(answer.status), "message": answer.message}
     said = f"{len(found.objects.names)} objects in {len(scans)} scans, found in {found.rounds} rounds of {method.name}."
     tree.attrs |= {"rounds": found.rounds, "message": f"{said} {tree.attrs['message']}".strip()}
-    return _with_objects(tree, found.objects, problem, answer.posterior.summary.mean), answer
+    tree = _with_objects(tree, found.objects, found.problem, answer.posterior.summary.mean)
+    if len(found.rates):
+        tree["rate"] = xr.DataTree(found.rates.rename_axis("line").to_xarray())
+    return tree, answer
 
 
 def _with_objects(tree: xr.DataTree, objects: Objects, problem: Problem, z: Any) -> xr.DataTree:
@@ -303,12 +307,13 @@ def track(
     >>> later["track/target"]["mean"].dims
     ('time', 'component')
     """
-    if problem.scans is not None:
+    if (scans := problem.scans) is not None:
         check_linear(problem)
+        problem = of_calibration(problem, calibration)
         known = apply(problem, calibration)
         objects = track_objects(problem, known.z, known.covariance)
         if not objects.names:
-            raise FitError(f"no object is confirmed in {len(problem.scans)} scans: nothing stands out from clutter")
+            raise FitError(f"no object is confirmed in {len(scans)} scans: nothing stands out from clutter")
         named = problem.assigned(objects.rows)
         return _with_objects(track(named, calibration, smoother=smoother, key=key), objects, problem, known.z)
     found = apply(problem, calibration)

@@ -85,7 +85,7 @@ def disagreeing(problem: Problem, objects: Objects, z: Any) -> list[tuple[str, s
     """
     placed = problem.network.sensors
     pairs = looks_of(problem, objects, np.asarray(z, float))
-    chance = np.array([s.detection.probability if s.detection is not None else 0.0 for s in placed])
+    chance = np.array([s.detection.chance if s.detection is not None else 0.0 for s in placed])
     expected = pairs["looks"] * chance[pairs["sensor"]]
     sure = expected >= LOOKS
     missed = pairs[sure & (pairs["detections"] < UNSEEN * expected)]
@@ -132,8 +132,8 @@ def view_variables(problem: Problem, point: Point | None) -> tuple[dict[str, Any
         "view_range": [np.nan if own is None else own.range for own in sectors],
         "view_width": [np.nan if own is None else own.width for own in sectors],
         "view_towards": [np.nan if own is None else own.towards for own in sectors],
-        "detection_probability": [np.nan if own is None else own.probability for own in told],
-        "clutter": [np.nan if own is None else own.clutter for own in told],
+        "detection_probability": [np.nan if own is None else own.chance for own in told],
+        "clutter": [np.nan if own is None else own.rate for own in told],
     }
     values: dict[str, Any] = {name: ("sensor", np.array(column, float)) for name, column in columns.items()}
     coords: dict[str, Any] = {"sensor": [sensor.name for sensor in placed]}
