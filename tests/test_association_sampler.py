@@ -404,8 +404,13 @@ def test_what_is_wrong_is_said(change, settings, said):
     assert said in str(caught.value)
 
 
-def test_levels_that_are_not_known_are_refused():
+def test_levels_and_rates_that_are_not_known_are_refused():
     problem = problem_of(PLAIN)
+    table = problem.measurements.table
     motion = pc.Target(pc.ConstantVelocity(pc.Unknown(0.3)), {"position": (0.0, 3.0), "velocity": (0.0, 1.0)})
     with pytest.raises(InputError, match="noise levels must be known and the motion Gaussian"):
-        pc.sample_associations(pc.Problem(problem.network, motion, problem.measurements.table, fix=problem.fixed))
+        pc.sample_associations(pc.Problem(problem.network, motion, table, fix=problem.fixed))
+    seen = pc.Detection(CHANCE, clutter=pc.Unknown(1.0), limits={"height": (-6.0, 6.0)})
+    network = pc.Network([ruler.on(pc.Node(s, (0.0, 0.0)), name=f"ruler_{s}", detection=seen) for s in "ab"])
+    with pytest.raises(InputError, match="must be known; give numbers, such as SelfConfiguration finds"):
+        pc.sample_associations(pc.Problem(network, problem.motion, table))

@@ -20,6 +20,7 @@ from probcal.errors import InputError
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
 from probcal.inference.mixed import ESS, R_HAT, mixing
 from probcal.lazy import Later
+from probcal.noise import Unknown
 from probcal.priors import PRECISION_BOUNDS, Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.groups import bias_coords, constant_group
@@ -123,7 +124,7 @@ def sample_associations(
     whose hyper-parameters are drawn too. Each of the `chains` makes `draws` after `warmup`, seeded by `key`; even ones
     begin at the tracks of `track_objects`, odd ones without any object. `start`, a fit of the same network, says where
     the biases lie about which tracks and modes are looked for. Trajectories and biases are integrated by Laplace's
-    formula at their joint mode: exact where sensors are linear and Gaussian and see all.
+    formula at their joint mode: exact where sensors are linear and Gaussian and see all. Levels and rates are known.
 
     Returns a tree with the groups `posterior` (bias (chain, draw, bias_label), number of objects), `association` (row,
     track, probability, slots matched from draw to draw), `object` (probability of each track to be there), `together`
@@ -226,6 +227,12 @@ def _check(problem: Problem, prior: Prior, objects: float, most: int, draws: int
         raise InputError(
             "sample_associations: noise levels must be known and the motion Gaussian; give each std as a number, and"
             " motions without noise="
+        )
+    told = [placed.detection for placed in problem.network.sensors if placed.detection is not None]
+    if any(isinstance(rate, Unknown) for own in told for rate in (own.probability, own.clutter)):
+        raise InputError(
+            "sample_associations: the rates of Detection(probability, clutter) must be known; give numbers, such as"
+            " SelfConfiguration finds"
         )
     detections = int(scans.count.sum())
     if not 0 < detections * most <= PAIRS:
