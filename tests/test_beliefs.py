@@ -11,8 +11,8 @@ import probcal as pc
 from probcal.association.beliefs import Field, check_rivals
 from probcal.association.entry import asked, cloud_of
 from probcal.association.messages import Belief, Edge, Kernels, Normals
-from probcal.association.search import Mode, Potential, search
-from probcal.association.separable import first_slot, partners, placed
+from probcal.association.search import Peak, Potential, search
+from probcal.association.separable import first_slot, go_along, partners
 from probcal.association.vertices import Vertex, graph_of, vertices_of
 from probcal.errors import InputError
 from probcal.geometry import bearing, elevation, norm
@@ -212,7 +212,7 @@ def test_what_a_sensor_knows_goes_along_with_it():
 
         @jax.jit
         def both(x, z):
-            moved = placed(model, scan, x, z)
+            moved = go_along(model, scan, x, z)
             (there,) = model.predict_at(scan.epoch, (moved[None],), z)
             (here,) = model.predict_at(scan.epoch, (x[None],), 0.0 * z)
             return here[0], there[0], moved
@@ -352,7 +352,7 @@ def test_a_rival_that_another_edge_refutes_is_dropped():
     peaks = Peaks(np.arange(2), [(1.0, 0.0), (-1.0, 0.0)], 1e4 * np.eye(2))
     for other, left in ((np.diag([0.0, 1e4]), 1), (1e4 * np.eye(2), 0)):
         found = Field(type("G", (), {"vertices": vertices}), np.array([1.0, 0.0]))
-        found.rivals[1] = [Mode(np.array([-1.0, 0.0]), 1e-4 * np.eye(2), 0.0)]
+        found.rivals[1] = [Peak(np.array([-1.0, 0.0]), 1e-4 * np.eye(2), 0.0)]
         check_rivals(found, [Edge(0, 1, peaks), Edge(0, 1, Quadratic(np.arange(2), (1.0, 0.0), other))])
         assert len(found.rivals[1]) == left
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probcal.association.messages import Belief, Edge, Kernels, Normals
-from probcal.association.search import Mode, Potential, search
+from probcal.association.search import Peak, Potential, search
 from probcal.association.vertices import Graph
 from probcal.lazy import Later
 
@@ -23,7 +23,7 @@ else:
     pd = Later("pandas")
 
 DECISIVE = 10.0  # nats of evidence over no common object from which a pair tells how it stands
-RIVAL = 5.0  # nats within which another mode may be the right one
+RIVAL = 15.0  # nats within which another mode may be the right one: a pair counts its detections twice
 TRIED = 4  # placed vertices by which one is searched for at most
 NEIGHBOURS = 4  # edges of a vertex, besides those that others choose
 NEAR = 16  # vertices that are looked at for one, the nearest
@@ -36,7 +36,7 @@ class Field:
     graph: Graph
     z: np.ndarray  # (M,) means; 0 where nothing is known
     beliefs: dict[int, Belief] = field(default_factory=dict)  # of the vertices that are placed
-    rivals: dict[int, list[Mode]] = field(default_factory=dict)  # other modes that explain as much
+    rivals: dict[int, list[Peak]] = field(default_factory=dict)  # other modes that explain as much
     tree: list[tuple[int, int, float]] = field(default_factory=list)
     edges: list[tuple[int, int, float]] = field(default_factory=list)
     trace: list[dict[str, Any]] = field(default_factory=list)
@@ -55,7 +55,7 @@ class Field:
                 self.trace.append({"iteration": iteration, "phase": phase, "bias": int(m), "mean": mean, "sd": one})
 
 
-def propagated(graph: Graph, seed: int, iterations: int, messages: str, tolerance: float) -> Field:
+def spread_beliefs(graph: Graph, seed: int, iterations: int, messages: str, tolerance: float) -> Field:
     """Beliefs after a tree phase and at most `iterations` in all."""
     rng = np.random.default_rng(seed)
     found = Field(graph, np.zeros(len(graph.problem.labels)))
@@ -89,7 +89,7 @@ def _grow(found: Field, rng: np.random.Generator) -> int:
     """Place vertices from those that are placed, a hop an iteration; returns the hops."""
     graph = found.graph
     tried: set[tuple[int, int]] = set()
-    kept: dict[int, tuple[list[Mode], int]] = {}
+    kept: dict[int, tuple[list[Peak], int]] = {}
     hop = 0
     while True:
         placed, fresh = list(found.beliefs), list[int]()
@@ -122,7 +122,7 @@ def _grow(found: Field, rng: np.random.Generator) -> int:
         found.note(hop, "tree")
 
 
-def _clear(modes: list[Mode]) -> bool:
+def _clear(modes: list[Peak]) -> bool:
     """Whether a search has one answer."""
     return modes[0].evidence > DECISIVE and all(mode.evidence < modes[0].evidence - RIVAL for mode in modes[1:])
 

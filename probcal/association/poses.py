@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probcal.association.beliefs import Field, propagated
+from probcal.association.beliefs import Field, spread_beliefs
 from probcal.association.entry import asked, cloud_of
 from probcal.association.messages import MESSAGES
 from probcal.association.separable import TERMS
@@ -79,7 +79,7 @@ def propagate_beliefs(
             f"propagate_beliefs(iterations={iterations}, tolerance={tolerance}): take 1 or more and a positive number"
         )
     graph = _graph("propagate_beliefs", problem, terms, window, objects, births, lifetime, most)
-    return _listed(propagated(graph, key, iterations, messages, tolerance))
+    return _listed(spread_beliefs(graph, key, iterations, messages, tolerance))
 
 
 @float64

@@ -18,7 +18,7 @@ from probcal.association.bernoulli import associate
 from probcal.association.local import Alone
 from probcal.association.phd import Intensity
 from probcal.association.scan import Scan
-from probcal.association.separable import Crossed, carry, first_slot, match, placed
+from probcal.association.separable import Crossed, carry, first_slot, go_along, matched_scans
 from probcal.model.model import Model
 from probcal.problem import Problem
 
@@ -42,7 +42,7 @@ def paired(
     problem: Problem, one: Alone, other: Alone, mine: Intensity, theirs: Intensity, window: float, lifetime: float
 ) -> Paired:
     """Both sensors' tracks (K, J) after their own scans, predicted to the scans of the first."""
-    pair = match(one, other, window, before=False)
+    pair = matched_scans(one, other, window, before=False)
     own = np.arange(len(one.time)) - 1
     back = np.where(pair >= 0, pair - 1, -1)  # its scan before, so that neither knows of the two
     used = (pair >= 0) & (own >= 0) & (back >= 0) & one.there
@@ -63,7 +63,7 @@ def normaliser(each: Paired, z: jax.Array, theta: jax.Array, at: jax.Array) -> C
         def seen(x: jax.Array, theta: jax.Array, owner: int) -> tuple[jax.Array, ...]:
             """What both would measure of a state that one of them tracks."""
             whole = z.at[at].set(theta)
-            where = placed(*sides[owner], x, whole)
+            where = go_along(*sides[owner], x, whole)
             return tuple(model.predict_at(s.epoch, (where[None],), whole)[0][0] for model, s in sides)
 
         def by(x: jax.Array, P: jax.Array, owner: int) -> tuple[jax.Array, ...]:

@@ -121,7 +121,7 @@ class Potential:
         return Potential(tuple(term.few() for term in self.terms), self.z, self.at, self.period)
 
 
-class Mode(NamedTuple):
+class Peak(NamedTuple):
     """A maximum of potential times prior: biases (p,), their covariance by the curvature, and log evidence."""
 
     theta: np.ndarray
@@ -129,14 +129,14 @@ class Mode(NamedTuple):
     evidence: float  # over that of no object in common
 
 
-def search(potential: Potential, rng: np.random.Generator) -> list[Mode]:
+def search(potential: Potential, rng: np.random.Generator) -> list[Peak]:
     """Modes of a potential under the prior N(0, I) of its biases, the one of most evidence first.
 
     A population drawn from the prior is weighed by the potential blurred by a kernel, tempered so that an eighth of it
     counts, drawn anew and moved, the kernel narrower by half each time; its best points are where climbs begin. A
     second population keeps away from what the first one found.
     """
-    few, found = potential.few(), list[Mode]()
+    few, found = potential.few(), list[Peak]()
     for _ in range(RUNS):
         theta = _narrowed(few, len(potential.at), rng, [mode.theta for mode in found])
         value = potential.values(theta, float(WIDTHS[-1]))
@@ -158,18 +158,18 @@ def _narrowed(few: Potential, p: int, rng: np.random.Generator, known: Sequence[
     return theta
 
 
-def climbed(potential: Potential, starts: np.ndarray, known: Sequence[Mode] = ()) -> list[Mode]:
+def climbed(potential: Potential, starts: np.ndarray, known: Sequence[Peak] = ()) -> list[Peak]:
     """The different modes that starts (S, p) lead to, and those known."""
     found = list(known)
     for start in starts:
-        mode = climb(potential, start)
+        mode = ascend(potential, start)
         if mode is not None and not any(same(potential, mode, other) for other in found):
             found.append(mode)
     found.sort(key=lambda mode: -mode.evidence)
     return [mode for mode in found if mode.evidence > found[0].evidence - BEHIND]
 
 
-def climb(potential: Potential, start: np.ndarray) -> Mode | None:
+def ascend(potential: Potential, start: np.ndarray) -> Peak | None:
     """The maximum of potential times prior by damped Gauss-Newton steps, with Laplace's evidence; None at none."""
     eye = np.eye(len(start))
     theta, damping = start, 1e-3
@@ -190,10 +190,10 @@ def climb(potential: Potential, start: np.ndarray) -> Mode | None:
     if not np.isfinite(W).all():
         return None
     covariance, logdet = (np.asarray(part) for part in linalg.inverse_and_logdet(jnp.asarray(W)))
-    return Mode(theta, covariance, float(value - 0.5 * theta @ theta - 0.5 * logdet))
+    return Peak(theta, covariance, float(value - 0.5 * theta @ theta - 0.5 * logdet))
 
 
-def same(potential: Potential, one: Mode, other: Mode) -> bool:
+def same(potential: Potential, one: Peak, other: Peak) -> bool:
     """Whether two modes lie within three of their sds."""
     away = potential.apart(one.theta, other.theta)
     return bool(np.all(np.abs(away) < 3.0 * np.sqrt(np.diagonal(one.covariance + other.covariance))))

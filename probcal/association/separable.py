@@ -64,7 +64,7 @@ def partners(time: np.ndarray, other: np.ndarray, window: float, *, before: bool
     return np.where(matched & (taken >= 0), taken, -1)
 
 
-def match(one: Alone, other: Alone, window: float, *, before: bool) -> np.ndarray:
+def matched_scans(one: Alone, other: Alone, window: float, *, before: bool) -> np.ndarray:
     """The scan (K,) of the other sensor behind each of the first, -1 of none; padded scans have none."""
     pair = partners(one.time[one.there], other.time[other.there], window, before=before)
     return np.concatenate([pair, np.full(len(one.time) - len(pair), -1)])
@@ -88,7 +88,7 @@ def explained(
     before: bool,
 ) -> Explained:  # fmt: skip
     """What explains the scans of `one` by the mixtures (K, J) that the `other` has after its own scans."""
-    pair = match(one, other, window, before=before)
+    pair = matched_scans(one, other, window, before=before)
     behind = np.maximum(pair, 0)
     mixture = carry(problem, after, behind, np.where(pair >= 0, one.time - other.time[behind], 0.0), lifetime)
     stand = jax.tree.map(lambda leaf: leaf[behind], other.watch.scans)
@@ -109,7 +109,7 @@ def _axes(target: Any, pose: Any, *rest: Any) -> jax.Array:
     return jnp.concatenate([pose.position[None], jnp.stack([pose.turn(e) for e in jnp.eye(d)], 1)])
 
 
-def placed(model: Model, scan: Scan, x: jax.Array, z: jax.Array) -> jax.Array:
+def go_along(model: Model, scan: Scan, x: jax.Array, z: jax.Array) -> jax.Array:
     """A state x (n,) that a sensor knows at its stated pose, where it is if its biases are z.
 
     Positions go along with the node, vectors turn with it, other components stay.
@@ -160,7 +160,7 @@ def told(
     first = first_slot(scan).epoch
 
     def where(x: jax.Array, theta: jax.Array) -> jax.Array:
-        return placed(each.other, stand, x, z.at[at].set(theta))
+        return go_along(each.other, stand, x, z.at[at].set(theta))
 
     def predicted(x: jax.Array, theta: jax.Array) -> jax.Array:
         return each.model.predict_at(first, (where(x, theta)[None],), z.at[at].set(theta))[0][0]

@@ -14,7 +14,7 @@ from probcal.association.local import Alone, each_alone
 from probcal.association.phd import Intensity, filter_intensity
 from probcal.association.quad import paired
 from probcal.association.search import Potential, Term
-from probcal.association.separable import explained, match
+from probcal.association.separable import explained, matched_scans
 from probcal.association.update import Biases, Chances
 from probcal.network import ANGLES
 from probcal.problem import Problem
@@ -72,7 +72,7 @@ class Graph:
             for j in self.vertices[v].sensors:
                 for a, b in ((i, j), (j, i)):
                     one, other = self.sensors[a], self.sensors[b]
-                    pair = match(one, other, self.window, before=True)
+                    pair = matched_scans(one, other, self.window, before=True)
                     held = np.minimum(self.count[a], self.count[b][pair])
                     total += float(np.sum(held[pair >= 0]))
         self.held[u, v] = self.held[v, u] = total
