@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 import probcal as pc
-from probcal.association.moves import ALL_SCANS, ONE_SCAN, SWAP, TRACK
+from probcal.association.moves import ALL_SCANS, ONE_SCAN, SWAP, TRACK, draw_scan, log_scan
 from probcal.association.sampled import Association, fitted
 from probcal.errors import InputError
 from probcal.geometry import bearing, norm
@@ -187,6 +187,28 @@ def all_fitted(scene, views, a):
         return fit.density, fit.z, fit.biases.covariance()
 
     return jax.lax.map(one, a, batch_size=256)
+
+
+def test_one_scan_is_drawn_exactly():
+    """Three slots, one of them absent from some pairs, four detections; 34 frequencies of 20,000: false alarm 2e-5."""
+    ratio = np.random.default_rng(1).normal(0.0, 1.5, (3, 4))
+    ratio[1, 2] = -np.inf
+    whole = list(arrangements([True] * 3, 4))
+    choice = np.array([[4 if d is None else d for d in own] for own in whole])
+    weight = np.array([np.exp(sum(ratio[t, d] for t, d in enumerate(own) if d is not None)) for own in whole])
+
+    @jax.jit
+    def both(ratio, choice, key):
+        drawn = jax.vmap(partial(draw_scan, ratio))(jax.random.split(key, 20_000))
+        return jax.vmap(partial(log_scan, ratio))(choice), drawn
+
+    with jax.enable_x64(True):
+        density, drawn = jax.device_get(both(ratio, choice, jax.random.key(2)))
+    p = weight / weight.sum()
+    np.testing.assert_allclose(np.exp(density), p, atol=1e-12)
+    found = np.array([(drawn == own).all(1).mean() for own in choice])
+    assert found.sum() == 1.0
+    assert (np.abs(found - p) <= SIGMAS * np.sqrt(p / 20_000) + 1e-4).all()
 
 
 @pytest.mark.parametrize("name", ["plain", "crossing"])
