@@ -12,8 +12,10 @@ which the std allows for. Most false detections of the radar are no noise, and t
   seen there either, which the view of the radar says;
 - the ferry itself, within 25 m.
 
-Unknown are the offsets in azimuth of radar and cameras against the lidar, and in range of radar and lidar. What cameras
-alone see (`cameras=True`) has a direction and no place: its sd says so, tens of metres and more.
+A camera, too, leaves out what it sees in one direction (`ABREAST`) for so long. What cameras alone see
+(`cameras=True`) has a direction and no place: its sd says so, tens of metres and more.
+
+Unknown are the offsets in azimuth of radar and cameras against the lidar, and in range of radar and lidar.
 
     probcal fit models/harbour.py PATH --method self-config --out harbour
     probcal track models/harbour.py OTHER --calibration harbour --out other
@@ -44,14 +46,14 @@ from probcal import (
 from probcal import (
     Path as NodePath,
 )
-from probcal.geometry import bearing, norm
+from probcal.geometry import bearing, norm, wrap
 
 NAMES = {1: "lidar", 2: "radar", 3: "infrared", 4: "optical"}
 NEAR, ABREAST = 25.0, np.deg2rad(3.0)  # m and rad within which detections are of one boat
 REACH = {"lidar": (5.0, 130.0), "radar": (25.0, 400.0)}  # m, within which detections are used
 SURE = {"lidar": 60.0, "radar": 150.0}  # m up to which small boats are seen as well as large ones
 BEAM, BEHIND = np.deg2rad(12.0), 1.5  # rad on each side of a boat, and times its range, where the radar reports echoes
-STILL, LONG, BREAK = 10.0, 40.0, 15.0  # m, s and s by which the radar knows what stands
+STILL, LONG, BREAK = 10.0, 40.0, 15.0  # m, s and s by which it is known what stands
 EVERY = 1.0  # s between two scans of a camera that are used
 SPEED = 3.0  # m/s, of a boat
 
@@ -91,6 +93,20 @@ class Open:
         return share * seen
 
 
+@dataclass(frozen=True)
+class Clear:
+    """What a camera sees: all but the directions (mathematical azimuths) in which something stands."""
+
+    stands: tuple = ()
+
+    def __call__(self, target, pose):
+        """Whether a boat is seen, 1 or 0."""
+        azimuth, seen = bearing(pose.local(target.position)), jnp.ones((), bool)
+        for direction in self.stands:
+            seen &= jnp.abs(wrap(azimuth - direction)) > ABREAST
+        return seen.astype(float)
+
+
 def detections(data):
     """The list of detections of a recording; raises `InputError` where there is none."""
     if data is None or not Path(data).is_file():
@@ -113,21 +129,35 @@ def standing(data):
     places = [np.reshape(scan["measurement"], (2, -1)).T + scan["ownshipPosition"] for scan in scans]
     time = np.repeat([scan["time"] for scan in scans], [len(own) for own in places])
     place = np.concatenate([np.zeros((0, 2)), *places])[:, ::-1]
-    near = np.linalg.norm(place[:, None] - place, axis=2) < STILL
-    return middle(place[[_stays(np.unique(time[own])) for own in near]], STILL)
+    return middle(place[_stay(time, np.linalg.norm(place[:, None] - place, axis=2) < STILL)], STILL)
 
 
-def _stays(time):
-    """Whether times (T,) in ascending order go on for long without a break."""
-    run = np.cumsum(np.diff(time, prepend=time[0]) > BREAK)
-    return max(np.ptp(time[run == k]) for k in range(run[-1] + 1)) > LONG
+def fixed(azimuth, time):
+    """Directions (k,) in which a camera reports something for long, of the azimuths and times (N,) that it reports."""
+    stays = azimuth[_stay(time, _apart(azimuth) < ABREAST)]
+    return np.unique(np.round(stays / ABREAST)) * ABREAST
+
+
+def _stay(time, near):
+    """Which detections (N,) have others near (N, N) for long without a break."""
+
+    def goes_on(time):
+        run = np.cumsum(np.diff(time, prepend=time[0]) > BREAK)
+        return max(np.ptp(time[run == k]) for k in range(run[-1] + 1)) > LONG
+
+    return np.array([goes_on(np.unique(time[own])) for own in near], bool)
+
+
+def _apart(azimuth, other=None):
+    """Angles (N, M) between directions."""
+    other = azimuth if other is None else other
+    return np.abs((azimuth[:, None] - other + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _echoes(polar):
     """Which detections (k, 2) of one scan of the radar lie behind another."""
     distance, azimuth = polar.T
-    apart = np.abs((azimuth[:, None] - azimuth + np.pi) % (2 * np.pi) - np.pi)
-    return ((apart < BEAM) & (distance[:, None] > BEHIND * distance)).any(1)
+    return ((_apart(azimuth) < BEAM) & (distance[:, None] > BEHIND * distance)).any(1)
 
 
 def _open(polar, ferry, stands):
@@ -139,8 +169,13 @@ def _open(polar, ferry, stands):
 
 def table(data, cameras=True):
     """Detections by scan, put together: time since the first, sensor, range and azimuth; a blank row for nothing."""
-    rows, last = [], {}
-    listed, stands = detections(data), standing(data)
+    return reported(data, cameras)[0]
+
+
+def reported(data, cameras=True):
+    """The table, and what stands: places (k, 2) by the radar, directions (k,) by each camera."""
+    scans, last = [], {}
+    listed, stands = detections(data), {"radar": standing(data)}
     begun = min(scan["time"] for scan in listed)
     for scan in listed:
         name, time = NAMES[scan["sensorID"]], scan["time"] - begun
@@ -150,15 +185,24 @@ def table(data, cameras=True):
             polar = np.stack([np.hypot(*places.T), np.arctan2(places[:, 0], places[:, 1])], 1)
             polar = polar[(polar[:, 0] > REACH[name][0]) & (polar[:, 0] < REACH[name][1])]
             if name == "radar":
-                polar = _open(polar, np.array(scan["ownshipPosition"][::-1]), stands)
+                polar = _open(polar, np.array(scan["ownshipPosition"][::-1]), stands["radar"])
         else:
             if not cameras or time - last.get(name, -np.inf) < EVERY:
                 continue
             last[name] = time
             turned = middle(found.reshape(-1, 1), ABREAST)
             polar = np.column_stack([np.full(len(turned), np.nan), np.pi / 2 - turned[:, 0]])
+        scans.append((time, name, polar))
+    for name in last:
+        own = [(np.full(len(polar), time), polar[:, 1]) for time, camera, polar in scans if camera == name]
+        time, azimuth = (np.concatenate(parts) for parts in zip(*own, strict=True))
+        stands[name] = fixed(azimuth, time)
+    rows = []
+    for time, name, polar in scans:
+        if name in last:
+            polar = polar[~(_apart(polar[:, 1], stands[name]) < ABREAST).any(1)]
         rows += [(time, name, r, a) for r, a in polar] or [(time, name, np.nan, np.nan)]
-    return pd.DataFrame(rows, columns=["time", "sensor", "range", "azimuth"])
+    return pd.DataFrame(rows, columns=["time", "sensor", "range", "azimuth"]), stands
 
 
 def path(data):
@@ -170,18 +214,20 @@ def path(data):
     return NodePath(time, place[first])
 
 
-def network(data, cameras=True):
+def network(data, cameras=True, stands=None):
     """Four sensors on one ferry; the lidar's azimuth is the reference."""
     node = Node("ferry", path=path(data))
-    stands = {"lidar": (), "radar": tuple(map(tuple, standing(data).round(1).tolist()))}
+    stands = reported(data, cameras)[1] if stands is None else stands
+    places = {"lidar": (), "radar": tuple(map(tuple, stands["radar"].round(1).tolist()))}
     clutter = {"lidar": 0.5, "radar": 2.0}
     placed = []
     for name, (near, far) in REACH.items():
-        view = Open(near, SURE[name], far, stands[name])
+        view = Open(near, SURE[name], far, places[name])
         report = Detection(0.9, clutter[name], view, {"range": (near, far)})
         placed.append(ranging.on(node, name=name, detection=report))
-    if cameras:
-        placed += [camera.on(node, name=name, detection=Detection(0.6, 4.0)) for name in ("infrared", "optical")]
+    for name in ("infrared", "optical") if cameras else ():
+        view = Clear(tuple(stands[name].round(4).tolist()))
+        placed.append(camera.on(node, name=name, detection=Detection(0.6, 2.0, view)))
     return Network(placed)
 
 
@@ -194,7 +240,8 @@ def motion(data):
 
 def problem(data=None, cameras=False):
     """Detections without names; the lidar's azimuth is taken as right."""
-    return Problem(network(data, cameras), motion(data), table(data, cameras), fix="lidar.azimuth_offset")
+    rows, stands = reported(data, cameras)
+    return Problem(network(data, cameras, stands), motion(data), rows, fix="lidar.azimuth_offset")
 
 
 def truth(data=None, cameras=False):
