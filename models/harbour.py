@@ -88,8 +88,8 @@ class Open:
         away = norm(pose.local(target.position))
         share = jnp.clip(1.0 - 0.8 * (away - self.sure) / (self.far - self.sure), 0.2, 1.0)
         seen = (away >= self.near) & (away <= self.far)
-        for place in self.stands:
-            seen &= norm(target.position - jnp.array(place)) > STILL
+        if self.stands:
+            seen &= jnp.all(jnp.linalg.norm(target.position - jnp.array(self.stands), axis=1) > STILL)
         return share * seen
 
 
@@ -101,10 +101,8 @@ class Clear:
 
     def __call__(self, target, pose):
         """Whether a boat is seen, 1 or 0."""
-        azimuth, seen = bearing(pose.local(target.position)), jnp.ones((), bool)
-        for direction in self.stands:
-            seen &= jnp.abs(wrap(azimuth - direction)) > ABREAST
-        return seen.astype(float)
+        away = jnp.abs(wrap(bearing(pose.local(target.position)) - jnp.array(self.stands)))
+        return jnp.all(away > ABREAST).astype(float)
 
 
 def detections(data):
