@@ -23,6 +23,7 @@ else:
     pd = Later("pandas")
 
 DECISIVE = 10.0  # nats of evidence over no common object from which a pair tells how it stands
+STRONG = 0.2  # of the most evidence of a hop that is enough to be placed in it
 RIVAL = 15.0  # nats within which another mode may be the right one: a pair counts its detections twice
 TRIED = 4  # placed vertices by which one is searched for at most
 NEIGHBOURS = 4  # edges of a vertex, besides those that others choose
@@ -106,8 +107,11 @@ def _grow(found: Field, rng: np.random.Generator) -> int:
                 if modes and (v not in kept or modes[0].evidence > kept[v][0][0].evidence):
                     kept[v] = (modes, u)
                 if v in kept and _clear(kept[v][0]):
-                    fresh.append(v)
                     break
+            if v in kept and _clear(kept[v][0]):
+                fresh.append(v)
+        best = max((kept[v][0][0].evidence for v in fresh), default=0.0)
+        fresh = [v for v in fresh if kept[v][0][0].evidence >= STRONG * best]  # the others may be told better later
         if not fresh:  # what is not clear is taken where nothing clearer comes
             open_ = [v for v, (modes, _) in kept.items() if v not in found.beliefs and modes[0].evidence > DECISIVE]
             fresh = open_[:1]
