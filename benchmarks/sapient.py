@@ -63,6 +63,8 @@ def main():
             f" {tree.attrs['rounds']} rounds, {took:.0f} s",
             flush=True,
         )
+        if tree.attrs["status"] != "converged":
+            print(f"  {tree.attrs['message']}", flush=True)
         worst.append((place.max(), heading.max()))
     worst = np.array(worst)
     good = np.sum((worst <= WITHIN).all(1))
