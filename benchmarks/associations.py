@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 import probcal as pc
-from probcal.errors import FitError
+from probcal.errors import FitError, InputError
 from probcal.geometry import bearing, norm
 
 SCALE = {"position": 30.0, "heading": 0.05}
@@ -99,7 +99,7 @@ def main():
         for name in METHODS:
             try:
                 tree, took = fitted(name, free, labelled, run, chosen.draws)
-            except FitError as error:
+            except (FitError, InputError) as error:  # nothing is confirmed, or only by one sensor
                 print(run, name, error, flush=True)
                 continue
             group, own = tree["calibration"].to_dataset(), []
