@@ -40,6 +40,16 @@ def network(named=False):
     return Network([radar.on(node, detection=None if named else REPORT) for node in nodes])
 
 
+def shaken(rng):
+    """Places (T, 2) of an object that begins at rest: velocity and its integral driven by white noise, exactly."""
+    step = np.diff(TIME)[:, None]
+    first, second = rng.standard_normal((2, len(step), 2))
+    gained = NOISE * np.sqrt(step) * first
+    velocity = np.cumsum(gained, 0) - gained
+    moved = step * (velocity + gained / 2) + NOISE * np.sqrt(step**3 / 12) * second
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(moved, 0)])
+
+
 @cache
 def scenario(key=0, named=False):
     """Table and truth of one run."""
@@ -51,8 +61,7 @@ def scenario(key=0, named=False):
     paths = {}
     for k in range(OBJECTS):
         begin, speed = rng.uniform(-1500, 2000, 2), rng.uniform(-15, 15, 2)
-        shaken = np.cumsum(np.cumsum(NOISE * rng.standard_normal((len(TIME), 2)), 0), 0)
-        paths[f"object_{k}"] = begin + np.outer(TIME, speed) + shaken
+        paths[f"object_{k}"] = begin + np.outer(TIME, speed) + shaken(rng)
     motion = dict.fromkeys(paths, ConstantVelocity(NOISE))
     return simulate(network(named), motion, TIME, key=key, biases=biases, tracks=paths)
 

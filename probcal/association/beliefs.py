@@ -7,6 +7,7 @@ messages go along all edges until no belief moves.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,7 @@ class Field:
     edges: list[tuple[int, int, float]] = field(default_factory=list)
     trace: list[dict[str, Any]] = field(default_factory=list)
     rests: bool = False
+    begun: float = field(default_factory=time.perf_counter)
 
     def put(self, v: int, belief: Belief) -> None:
         """Take a belief of a vertex."""
@@ -49,11 +51,14 @@ class Field:
         self.z[self.graph.vertices[v].at] = belief.mean
 
     def note(self, iteration: int, phase: str) -> None:
-        """Keep where the beliefs are."""
+        """Keep where the beliefs are, and since when."""
+        seconds = time.perf_counter() - self.begun
         for v, belief in self.beliefs.items():
             sd = np.sqrt(np.diagonal(belief.covariance))
             for m, mean, one in zip(self.graph.vertices[v].at, belief.mean, sd, strict=True):
-                self.trace.append({"iteration": iteration, "phase": phase, "bias": int(m), "mean": mean, "sd": one})
+                self.trace.append({
+                    "iteration": iteration, "phase": phase, "seconds": seconds, "bias": int(m), "mean": mean, "sd": one
+                })  # fmt: skip
 
 
 def spread_beliefs(graph: Graph, seed: int, iterations: int, messages: str, tolerance: float) -> Field:

@@ -29,9 +29,9 @@ class Beliefs:
 
     Each detection counts in the likelihood of every pair of its sensor; the covariance is widened by the number of
     pairs. `sensors` has a line a vertex (sensors that share a node), how it was placed and with which evidence, in nats
-    over no object in common; `edges` the pairs; `trace` mean and sd of every bias by iteration, in units. `apart` names
-    those that no pair places, `rivals` counts for each other how many poses explain as much. `rests` says whether the
-    beliefs came to rest.
+    over no object in common; `edges` the pairs; `trace` mean and sd of every bias by iteration, in units, and seconds
+    since the first search. `apart` names those that no pair places, `rivals` counts for each other how many poses
+    explain as much. `rests` says whether the beliefs came to rest.
     """
 
     z: np.ndarray
@@ -147,7 +147,7 @@ def _listed(found: Field) -> Beliefs:
     edges = pd.DataFrame(
         [(vertices[u].name, vertices[v].name, gain) for u, v, gain in found.edges], columns=["first", "second", "gain"]
     )
-    trace = pd.DataFrame(found.trace, columns=["iteration", "phase", "bias", "mean", "sd"])
+    trace = pd.DataFrame(found.trace, columns=["iteration", "phase", "seconds", "bias", "mean", "sd"])
     scale = problem.scales[trace["bias"].to_numpy(int)]
     trace["mean"], trace["sd"] = trace["mean"] * scale, trace["sd"] * scale
     trace["bias"] = np.array(problem.labels, object)[trace["bias"].to_numpy(int)]

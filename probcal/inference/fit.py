@@ -33,7 +33,7 @@ from probcal.priors import Prior
 from probcal.problem import Problem, check_linear
 from probcal.results.answer import Answer, tracks_of, uncalibrated
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
-from probcal.results.objects import disagreeing, object_groups
+from probcal.results.objects import belief_group, disagreeing, object_groups
 from probcal.results.read import apply
 from probcal.simulate import Key, as_key
 from probcal.smoothing.grid import track_mode
@@ -185,6 +185,8 @@ def _configured(
     said = f"{len(found.objects.names)} objects in {len(scans)} scans, found in {found.rounds} rounds of {method.name}."
     tree.attrs |= {"rounds": found.rounds, "message": f"{said} {tree.attrs['message']}".strip()}
     tree = _with_objects(tree, found.objects, found.problem, answer.posterior.summary.mean)
+    if found.beliefs is not None:
+        tree["belief"] = xr.DataTree(belief_group(found.beliefs))
     if len(found.rates):
         tree["rate"] = xr.DataTree(found.rates.rename_axis("line").to_xarray())
     return tree, answer

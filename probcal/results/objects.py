@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
+    from probcal.association.poses import Beliefs
     from probcal.problem import Problem
     from probcal.smoothing.mode import Point
 else:
@@ -38,6 +39,16 @@ def object_groups(problem: Problem, objects: Objects, z: Any) -> dict[str, xr.Da
         "object": objects.path.rename_axis("line").to_xarray(),
         "detection": _by_sensor(problem, objects, np.asarray(z, float)),
     }
+
+
+def belief_group(beliefs: Beliefs) -> xr.Dataset:
+    """How beliefs went: mean and sd of each bias by iteration, how each sensor was placed, and the edges."""
+    trace = beliefs.trace
+    rounds = trace.drop_duplicates("iteration").set_index("iteration")[["phase", "seconds"]]
+    found = trace.set_index(["iteration", "bias"])[["mean", "sd"]].to_xarray().rename(bias="bias_label")
+    sensors = beliefs.sensors.set_index("sensor").rename_axis("vertex").to_xarray()
+    edges = beliefs.edges.rename_axis("edge").to_xarray()
+    return xr.merge([found, rounds.to_xarray(), sensors, edges]).assign_attrs(rests=int(beliefs.rests))
 
 
 def _by_sensor(problem: Problem, objects: Objects, z: np.ndarray) -> xr.Dataset:
