@@ -107,7 +107,7 @@ def naive(each, shift):
                 chance * w[j] * np.exp(log_normal(y[d], m[j][:2] + shift - pose, H @ P[j] @ H.T + R))
                 for j in range(len(w))
             ]
-            total += np.log1p(sum(found) / float(each.background[k]))
+            total += np.log1p(sum(found) / float(each.background[k, d]))
     return total
 
 

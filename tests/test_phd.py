@@ -275,6 +275,36 @@ def test_merging_keeps_the_moments_and_dropping_the_sum():
     assert (apart.weight > 0).sum() == 4, "one that is wide stands alone, though others are near by its covariance"
 
 
+@pc.sensor(x=pc.Channel("m", std=STD), y=pc.Channel("mm", std=1e3 * STD))
+def fix_in_mm(target, pose):
+    """The same, northing in mm."""
+    line = target.position - pose.position
+    return dict(x=line[0], y=1e3 * line[1])
+
+
+def test_the_unit_of_a_channel_that_rows_lack_changes_nothing():
+    """A false detection without northing lies anywhere along the easting, whatever northing is measured in."""
+    rows = pd.DataFrame(
+        [(0.0, "a", 35.0, 4.0), (0.0, "a", -80.0, None), (1.0, "a", 38.0, None), (4.0, "a", 52.0, 11.0)],
+        columns=["time", "sensor", "x", "y"],
+    )
+    count = []
+    for kind, unit in ((fix, 1.0), (fix_in_mm, 1e3)):
+        limits = {"x": LIMITS["x"], "y": (-300.0 * unit, 300.0 * unit)}
+        seen = pc.Detection(PROBABILITY, clutter=CLUTTER, limits=limits)
+        start = {"position": (START, SPREAD), "velocity": ((0.0, 0.0), SPEED)}
+        problem = pc.Problem(
+            pc.Network([kind.on(pc.Node("a", (0.0, 0.0)), detection=seen)]),
+            pc.Target(pc.ConstantVelocity(DRIVE), start),
+            rows.assign(y=rows["y"] * unit),
+        )
+        with jax.enable_x64(True):
+            density = np.asarray(watch_of(problem)[0].scans.density)
+        np.testing.assert_allclose(density[0], [1 / 600 / (600 * unit), 1 / 600])
+        count.append(pc.phd_filter(problem, most=8).count[["count", "undetected"]].to_numpy())
+    np.testing.assert_allclose(count[0], count[1], rtol=1e-9)
+
+
 # many at once
 
 

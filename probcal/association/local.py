@@ -86,10 +86,11 @@ def _padded(one: Alone, K: int, D: int) -> Alone:
     F: Any = np.concatenate([move.F, np.tile(np.eye(n), (K - own, 1, 1))])
     epoch = jax.tree.map(last, scans.epoch._replace(rows=(), move=()))
     still = Move(F, none(move.L), last(move.level), none(move.drift))
+    density = np.pad(scans.density, ((0, 0), (0, D - slots)), constant_values=1.0)
     number: Any = np.pad(scans.number, ((0, K - own), (0, D - slots)), constant_values=-1)
     padded = Scan(
         epoch._replace(rows=tuple(rows), move=(still,)), none(scans.elapsed), last(scans.block),
-        none(scans.probability), none(scans.clutter), last(scans.density), last(scans.view), number,
+        none(scans.probability), none(scans.clutter), last(density), last(scans.view), number,
     )  # fmt: skip
     time = np.concatenate([one.time, np.full(K - own, one.time[-1])])
     return replace(one, watch=one.watch._replace(scans=padded), time=time, there=np.arange(K) < own)

@@ -164,7 +164,7 @@ def _told(scene: Recording, states: jax.Array, z: jax.Array) -> jax.Array:
 def _ratios(scene: Recording, a: Association, chance: jax.Array, told: jax.Array) -> jax.Array:
     """Log ratios (K, T, D) of every pair by the probability of detection (T, K) and log densities (K, T, D)."""
     odds = jnp.log(jnp.maximum(chance, TINY)) - jnp.log(jnp.maximum(1.0 - chance, TINY))
-    ratio = jnp.maximum(odds.T[:, :, None] + told - log_clutter(scene.watch)[:, None, None], LEAST)
+    ratio = jnp.maximum(odds.T[:, :, None] + told - log_clutter(scene.watch)[:, None], LEAST)
     there = jax.vmap(present)(scene.watch.scans)
     return jnp.where(a.present[None, :, None] & there[:, None], ratio, -jnp.inf)
 

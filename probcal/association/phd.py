@@ -257,9 +257,7 @@ def filter_intensity(
         born, born_mean, born_covariance, share = births(watch, scan, views, cloud, known)
         false = jnp.log(jnp.maximum(scan.clutter * scan.density, TINY))
         pair = (_log(before.weight * chance)[:, None] + evidence).T
-        seen = _Detections(
-            there, chance, pair, jnp.log(jnp.maximum(hidden, TINY)) + born, jnp.full(len(there), false), share
-        )
+        seen = _Detections(there, chance, pair, jnp.log(jnp.maximum(hidden, TINY)) + born, false, share)
         D = len(there)
         means = jnp.concatenate([jnp.swapaxes(mean, 0, 1).reshape(-1, n), born_mean])
         spreads = jnp.concatenate([jnp.swapaxes(covariance, 0, 1).reshape(-1, n, n), born_covariance])

@@ -104,8 +104,8 @@ def places(numbers: np.ndarray, blocks: list[np.ndarray]) -> tuple[tuple[np.ndar
 
 
 def log_clutter(watch: Watch) -> jax.Array:
-    """Log density (K,) of a false detection."""
-    return jnp.log(jnp.maximum(watch.scans.clutter * watch.scans.density, TINY))
+    """Log density (K, D) of a false detection, by slot."""
+    return jnp.log(jnp.maximum(watch.scans.clutter[:, None] * watch.scans.density, TINY))
 
 
 # the density of an association
@@ -210,7 +210,8 @@ def _counted(scene: Recording, views: tuple[View, ...], a: Association, states: 
     taken = a.choice < D
     chance = chances(scene, views, states, z)
     told = jnp.log(jnp.maximum(jnp.where(taken, chance, 1.0 - chance), TINY))
-    false = (jnp.sum(there, 1) - jnp.sum(taken, 0)) * log_clutter(scene.watch)
+    left = there & ~jnp.any(a.choice[:, :, None] == jnp.arange(D)[None, None], 0)  # (K, D), of no object
+    false = jnp.where(left, log_clutter(scene.watch), 0.0)
     number = jnp.sum(a.present)
     known = number * jnp.log(scene.objects) + gammaln(T - number + 1.0)
     return known + jnp.sum(jnp.where(a.present[:, None], told, 0.0)) + jnp.sum(false)

@@ -22,7 +22,7 @@ class Scan(NamedTuple):
     block: jax.Array  # () of the rows
     probability: jax.Array  # () of detection in view
     clutter: jax.Array  # () mean number of false detections
-    density: jax.Array  # () of one of them, in the units of its channels
+    density: jax.Array  # (D,) of one of them that has the channels of a slot, in their units
     view: jax.Array  # () which of the views
     number: jax.Array  # (D,) row of the table behind each slot of all blocks, -1 of none
 
@@ -58,15 +58,15 @@ def watch_of(problem: Problem) -> tuple[Watch, tuple[View, ...]]:
     kinds = [network.types.index(s.type) for s in network.sensors]
     of_type = {network.types.index(block.type): b for b, block in enumerate(model.blocks)}
     told = [network.sensors[s].detection for s in scans.sensor]
-    numbers, rows = [], []
-    for data_, block, index in zip(model.rows, model.blocks, own.row_index, strict=True):
+    numbers, rows, density = [], [], []
+    for data_, block, index, names in zip(model.rows, model.blocks, own.row_index, own.columns, strict=True):
         of = scans.of_row[index]
         size = int(np.bincount(of, minlength=K).max())
         rows.append(padded_rows(data_, of, K, size, data_, block))
         numbers.append(_slots(of, index, K, size))
+        width = np.diff(limits[:, [data.channels.index(name) for name in names]], axis=2)[scans.sensor, :, 0]  # (K, C)
+        density.append(1.0 / np.prod(np.where(np.asarray(rows[-1].mask) > 0, width[:, None], 1.0), 2))
     number = np.concatenate(numbers, 1)
-    columns = [[data.channels.index(name) for name in own.columns[of_type[kinds[s]]]] for s in scans.sensor]
-    density = [1.0 / np.prod(np.diff(limits[s, c], axis=1)) for s, c in zip(scans.sensor, columns, strict=True)]
     zero = np.zeros(K)
     stamped: Any = (scans.time, zero, zero.astype(bool), zero.astype(int), (zero.astype(int),), (move,), tuple(rows))
     stacked = Scan(
@@ -77,7 +77,7 @@ def watch_of(problem: Problem) -> tuple[Watch, tuple[View, ...]]:
                 np.array([of_type[kinds[s]] for s in scans.sensor]),
                 np.array([d.chance for d in told]),
                 np.array([d.rate for d in told], float),
-                np.array(density),
+                np.concatenate(density, 1),
                 np.array([views.index(d.view) for d in told]),
                 number,
             )

@@ -31,18 +31,18 @@ class Explained(NamedTuple):
     other: Model  # of the sensor that explains
     stand: Scan  # its scan behind each of K, which tells its pose
     mixture: Intensity  # carried to each scan, at the stated pose of the sensor that explains
-    background: jax.Array  # (K,) density of detections that it does not know of
+    background: jax.Array  # (K, D) density of detections that it does not know of
     used: jax.Array  # (K,) whether the scan has a partner
     levels: jax.Array  # (H,)
 
 
 def background(one: Alone, count: np.ndarray) -> np.ndarray:
-    """Density (K,) of detections of a sensor that another need not know: clutter, and the objects that it sees itself.
+    """Density (K, D) of detections of a sensor that another need not know: clutter, and objects that it sees itself.
 
     `count` (K,) is how many it holds in the mean.
     """
     scans = one.watch.scans
-    return np.asarray(scans.density) * (np.asarray(scans.clutter) + np.maximum(count, 1.0))
+    return np.asarray(scans.density) * (np.asarray(scans.clutter) + np.maximum(count, 1.0))[:, None]
 
 
 def partners(time: np.ndarray, other: np.ndarray, window: float, *, before: bool) -> np.ndarray:
@@ -202,7 +202,7 @@ def crossed(
     def of(scan: Scan, stand: Scan, mixture: Intensity, density: jax.Array, used: jax.Array) -> Crossed:
         seen = told(each, views, scan, stand, mixture, z, theta, at, spread)
         weight = mixture.weight * seen.chance
-        share = weight[:, None] * jnp.exp(seen.density) / jnp.maximum(density, TINY)  # (J, D)
+        share = weight[:, None] * jnp.exp(seen.density) / jnp.maximum(density, TINY)[None]  # (J, D)
         share = jnp.where(present(scan)[None], share, 0.0)
         total = jnp.sum(share, 0)
         value = jnp.sum(jnp.log1p(total)) - missed * jnp.sum(weight)
