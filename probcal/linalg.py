@@ -244,6 +244,11 @@ def solve_batched(matrices: jax.Array, right: jax.Array) -> jax.Array:
     return (inverses.mT @ (inverses @ right[:, :, None]))[:, :, 0]
 
 
+def inverses(matrices: jax.Array) -> jax.Array:
+    """Inverses (E, n, n) of small regular matrices."""
+    return jnp.linalg.inv(matrices)
+
+
 def spectrum(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Eigenvalues (ascending) and eigenvectors (columns) of a symmetric matrix."""
     return jnp.linalg.eigh(matrix)

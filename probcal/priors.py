@@ -23,24 +23,32 @@ Members = Sequence[Mapping[str, str]]  # of each bias: what it belongs to, by th
 
 
 class Precision(NamedTuple):
-    """Gaussian prior of z with precision diag(alpha) + coupling; `logdet` is the coupling's share of log |.|."""
+    """Gaussian prior of z with precision diag(alpha) + coupling; `logdet` is the coupling's share of log |.|.
+
+    Independent biases have no coupling: nothing of size (M, M) is held for them.
+    """
 
     alpha: jax.Array  # (M,) precision of each bias alone, 0 where flat
-    coupling: jax.Array  # (M, M) what correlations add to diag(alpha)
+    coupling: jax.Array | None  # (M, M) what correlations add to diag(alpha)
     logdet: jax.Array  # ()
 
     @staticmethod
     def single(alpha: jax.Array) -> "Precision":
         """Independent biases of precisions alpha (M,)."""
-        return Precision(alpha, jnp.zeros((alpha.shape[0], alpha.shape[0])), jnp.zeros(()))
+        return Precision(alpha, None, jnp.zeros(()))
 
     def matrix(self) -> jax.Array:
         """The precision matrix (M, M)."""
-        return jnp.diag(self.alpha) + self.coupling
+        return jnp.diag(self.alpha) if self.coupling is None else jnp.diag(self.alpha) + self.coupling
+
+    def coupled(self) -> jax.Array:
+        """What correlations add to diag(alpha), (M, M)."""
+        M = self.alpha.shape[0]
+        return jnp.zeros((M, M)) if self.coupling is None else self.coupling
 
     def pull(self, z: jax.Array) -> jax.Array:
         """Precision times z, (M,)."""
-        return self.alpha * z + self.coupling @ z
+        return self.alpha * z if self.coupling is None else self.alpha * z + self.coupling @ z
 
     def square(self, z: jax.Array) -> jax.Array:
         """z' (precision) z."""
@@ -75,6 +83,9 @@ class Prior:
     def precision(self, labels: Sequence[str], surveyed: np.ndarray) -> Precision:
         """First precision of biases by label; those in `surveyed` (M,) have their own Gaussian."""
         M = len(labels)
+        alpha = jax.device_put(np.where(surveyed, 1.0, self.first))
+        if not self.correlation:
+            return Precision.single(alpha)
         matrix, coupled = np.eye(M), np.zeros(M, bool)
         for pattern, value in self.correlation:
             members = [m for m, label in enumerate(labels) if fnmatchcase(label, pattern)]
@@ -92,7 +103,6 @@ class Prior:
             matrix[np.ix_(members, members)] = np.where(np.eye(len(members)) > 0, 1.0, value)
             if 1 + (len(members) - 1) * value <= 0:
                 raise InputError(f'correlation "{pattern}" is {value:g}: too negative for {len(members)} biases')
-        alpha = jax.device_put(np.where(surveyed, 1.0, self.first))
         inverse, logdet = (np.asarray(part) for part in linalg.inverse_and_logdet(matrix))
         return Precision(alpha, jax.device_put(inverse - np.eye(M)), jax.device_put(-logdet))
 

@@ -522,7 +522,7 @@ def test_every_kind_of_noise_and_correlated_surveys():
     prior = probcal.ARD(correlation={"*.position_x": 0.6})
     tree = probcal.fit(problem, EA(), prior=prior)
     with jax.enable_x64(True):
-        coupling = np.asarray(take_up(problem, tree).prior.coupling)
+        coupling = np.asarray(take_up(problem, tree).prior.coupled())
         wanted = np.asarray(prior.precision(problem.labels, problem.surveyed).coupling)
     np.testing.assert_allclose(coupling, wanted, atol=1e-6)
     out = assess(problem, tree)

@@ -93,7 +93,7 @@ class _Refits:
             lins = scaled(lins, model.measured)
             _, solved = compress_and_eliminate(model, point, lins)
         found = _stepped(model, point, prior, lins, solved, jnp.asarray(held))
-        return float(found.evidence) + 0.5 * _logdet(fit.prior.coupling, alpha, held), float(found.square)
+        return float(found.evidence) + 0.5 * _logdet(fit.prior.coupled(), alpha, held), float(found.square)
 
 
 def masked(fit: Fitted, out: np.ndarray) -> Model:

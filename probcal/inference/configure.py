@@ -71,9 +71,9 @@ def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context
             return Configured(objects, problem, rates, k, True, beliefs)
         held.append(objects.rows)
         summary = solve(problem.assigned(room.filled(objects.rows)), method.method, prior, context).posterior.summary
-        sd = np.sqrt(np.maximum(np.diagonal(summary.covariance), 1e-300))
+        sd = np.sqrt(np.maximum(np.diagonal(summary.whole), 1e-300))
         moves.append(float(np.max(np.abs(summary.mean - z) / sd, initial=0.0)))
-        z, covariance = summary.mean, summary.covariance
+        z, covariance = summary.mean, summary.whole
         if k and moves[-1] < method.tolerance:
             return Configured(objects, problem, rates, k + 1, True, beliefs)
     return Configured(objects, problem, rates, method.iterations, False, beliefs)

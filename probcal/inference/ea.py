@@ -24,6 +24,7 @@ from probcal.inference.run import (
     reweighted,
     valued,
 )
+from probcal.inference.sparse import FORMS
 from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
@@ -137,7 +138,8 @@ class EA(Maximiser):
     stands for the trajectory (R-bar, 10-17), so that the data count twice. `EA.as_printed()` is the joint mode with
     precisions maximised. `update` of maximised precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed
     points, slower). `tolerance` is the change of log evidence, in nats, at which it stops; `iterations` caps the outer
-    loop. Raises `InputError` for another update, trajectory or kind of precisions.
+    loop. `form` "auto" takes the dense form where it needs up to 1 GB, the sparse one else (see `inference.sparse`);
+    "dense" and "sparse" take one of them. Raises `InputError` for another update, trajectory, form or precisions.
 
     >>> type(EA().first_prior()), type(EA.as_printed().first_prior())
     (<class 'probcal.priors.Horseshoe'>, <class 'probcal.priors.ARD'>)
@@ -148,6 +150,7 @@ class EA(Maximiser):
     update: str = "mackay"
     trajectory: str = "marginal"
     precisions: str = "integrated"
+    form: str = "auto"
 
     name: ClassVar[str] = "EA"
     intervals: ClassVar[str] = (
@@ -158,7 +161,7 @@ class EA(Maximiser):
     )
 
     def __post_init__(self):
-        known = {"update": RULES, "trajectory": TRAJECTORIES, "precisions": PRECISIONS}
+        known = {"update": RULES, "trajectory": TRAJECTORIES, "precisions": PRECISIONS, "form": FORMS}
         for field, words in known.items():
             if getattr(self, field) not in words:
                 raise InputError(f'EA({field}="{getattr(self, field)}"): give one of {", ".join(words)}')
@@ -207,7 +210,7 @@ class EA(Maximiser):
         learnt, members = np.flatnonzero(~problem.surveyed).tolist(), problem.members
         names = dict.fromkeys((kind, members[m][kind]) for kind in ("component", "owner") for m in learnt)
         sets = [[m for m in learnt if members[m][kind] == name] for kind, name in names]
-        information = np.asarray(known.information + known.first.coupling)
+        information = np.asarray(known.information + known.first.coupled())
         return best_precisions(information, np.asarray(known.pull), np.asarray(state.alpha), learnt, sets)
 
     def integrates(self, prior: Prior) -> bool:
@@ -260,12 +263,13 @@ class MAP(Maximiser):
     """Mode under a given prior with its Laplace covariance: of the marginal, or of trajectories and biases jointly.
 
     `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood; `trajectory` "marginal" or "joint", as
-    in `EA`, places on rings included. Raises `InputError` for another trajectory.
+    in `EA`, places on rings included. `form` as in `EA`. Raises `InputError` for another trajectory or form.
     """
 
     iterations: int = 500
     tolerance: float = 1e-6
     trajectory: str = "marginal"
+    form: str = "auto"
 
     name: ClassVar[str] = "MAP"
     priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat, Laplace)
@@ -274,6 +278,8 @@ class MAP(Maximiser):
     def __post_init__(self):
         if self.trajectory not in MODES:
             raise InputError(f'{self.name}(trajectory="{self.trajectory}"): give one of {", ".join(MODES)}')
+        if self.form not in FORMS:
+            raise InputError(f'{self.name}(form="{self.form}"): give one of {", ".join(FORMS)}')
 
     @property
     def integrates_places(self) -> bool:
@@ -298,6 +304,7 @@ class LeastSquares(MAP):
     """
 
     trajectory: str = "joint"
+    form: str = "dense"
 
     name: ClassVar[str] = "least squares"
     priors: ClassVar[tuple[type, ...]] = (Flat,)

@@ -38,20 +38,23 @@ def conclude(
 
     Where precisions were integrated after it, `mixed` is what came of it.
     """
-    posterior = _posterior(problem, prior, state, how, mixed)
-    point, found, summary = posterior.point, state.found, posterior.summary
+    return conclude_at(
+        problem, method, prior, _posterior(problem, prior, state, how, mixed), trace, square, iterations,
+        converged=bool(state.done), refused=bool(state.refused), evidence=float(state.found.evidence),
+        lost=fallen(prior, len(problem.levels), state.best, state.worth),
+    )  # fmt: skip
+
+
+def conclude_at(
+    problem: Problem, method: Maximiser, prior: Prior, posterior: Posterior, trace: np.ndarray, square: float,
+    iterations: int, *, converged: bool, refused: bool, evidence: float, lost: float = 0.0,
+) -> Answer:  # fmt: skip
+    """The answer of a climb that ended at a posterior: whether it converged, never left its start, lost evidence."""
+    point, summary = posterior.point, posterior.summary
     low, far = low_and_far(prior, summary, problem.surveyed)
     asked = method.tolerance == 0.0  # to run so many iterations, whatever they reach
-    end = End(
-        bool(state.done),
-        asked,
-        bool(low.any()),
-        bool(far.any()),
-        posterior.sound and bool(np.isfinite(found.evidence)),
-        bool(state.refused),
-        fallen(prior, len(problem.levels), state.best, state.worth),
-        square,
-    )
+    sound = posterior.sound and bool(np.isfinite(evidence))
+    end = End(converged, asked, bool(low.any()), bool(far.any()), sound, refused, lost, square)
     status = verdict(end)
     message = _message(problem, point, status, end, low, far, iterations, summary.precisions)
     if status is Status.SPENT and len(trace) > 1:

@@ -203,7 +203,7 @@ def _with_objects(tree: xr.DataTree, objects: Objects, problem: Problem, z: Any)
 def _directions(answer: Answer) -> tuple[Direction, ...]:
     """What the data leave open where the answer stands."""
     information = answer.posterior.summary.information
-    if not linear_form(answer) or not np.isfinite(information).all():
+    if information is None or not linear_form(answer) or not np.isfinite(information).all():
         return ()
     return weak_directions(answer.problem, information, answer.posterior.point)
 

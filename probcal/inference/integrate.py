@@ -204,11 +204,11 @@ def moments(form: Form, known: Natural, phi: Phi) -> Moments:
     covariance = total / count + jnp.cov(means, rowvar=False, bias=True).reshape(total.shape)
     sds = jnp.sqrt(jnp.maximum(variances, 0.0))
     tail = 0.5 * (1.0 - INTERVAL)
-    lower, upper = (_quantile(means, sds, share) for share in (tail, 1.0 - tail))
+    lower, upper = (quantile(means, sds, share) for share in (tail, 1.0 - tail))
     return Moments(mean, covariance, lower, upper, jnp.mean(gammas, 0))
 
 
-def _quantile(means: jax.Array, sds: jax.Array, share: float) -> jax.Array:
+def quantile(means: jax.Array, sds: jax.Array, share: float) -> jax.Array:
     """Quantile (M,) of each mixture of Gaussians of means and sds (S, M), by halving a bracket."""
     width = 10.0 * jnp.max(sds, 0) + 1e-12
 

@@ -255,7 +255,7 @@ def _started(problem: Problem, tree: xr.DataTree | None) -> Point:
 def _biases(hierarchy: Hierarchy, first: Precision, phi: Phi) -> jax.Array:
     """The site `z`, and where the prior is flat the factor `survey` of the biases that have one."""
     alpha = hierarchy.alpha(phi, first.alpha)
-    matrix = jnp.diag(alpha) + first.coupling
+    matrix = jnp.diag(alpha) + first.coupled()
     if isinstance(hierarchy.prior, Flat):
         z = numpyro.sample("z", dist.ImproperUniform(dist.constraints.real_vector, (), alpha.shape))
         unit = dist.Unit(-0.5 * z @ matrix @ z)

@@ -136,7 +136,7 @@ class ParticleGibbs(Sampler):
             problem.model.level_spread, prior.precision(problem.labels, problem.surveyed),
         )  # fmt: skip
         form = Form(problem.model.biases, hierarchy_of(prior, problem))
-        group, of_sensor = groups_of(problem.model, np.asarray(natural.first.coupling))
+        group, of_sensor = groups_of(problem.model, np.asarray(natural.first.coupled()))
         held = Held(problem.model, targets, natural, group, reference, of_sensor)
         runs = _Gibbs(self, form, held, paths, z, levels, keys[1])
         drawn, thin, interrupted = drawn_by(self, runs, 1, context.progress, context.storage, context.threads)
@@ -377,7 +377,7 @@ class ParticleChains(Chains):
         found = super().of(problem, prior, run, mixed)
         if run.form.hierarchy.learnt or run.z.shape[0] * run.z.shape[1] < MANY * run.form.biases:
             return found
-        told = np.linalg.inv(found.summary.covariance) - np.asarray(run.posed.first.matrix())
+        told = np.linalg.inv(found.summary.whole) - np.asarray(run.posed.first.matrix())
         return replace(found, summary=replace(found.summary, information=positive(told)))
 
     @classmethod

@@ -106,7 +106,7 @@ def prior_precision(form: Form, posed: Quadratic, phi: Phi) -> tuple[jax.Array, 
     H = posed.level_spread.shape[0]
     alpha = form.hierarchy.alpha(phi, posed.first.alpha)
     alpha = jnp.concatenate([alpha, 1.0 / posed.level_spread**2])
-    return alpha, jnp.pad(posed.first.coupling, (0, H))
+    return alpha, jnp.pad(posed.first.coupled(), (0, H))
 
 
 def activity(form: Form, posed: Quadratic, phi: Phi) -> jax.Array:

@@ -43,7 +43,7 @@ def draw_prior(form: Form, model: Model, first: Precision, key: jax.Array) -> Si
     keys = jax.random.split(key, 5)
     phi = form.hierarchy.draw(keys[0])
     alpha = form.hierarchy.alpha(phi, first.alpha)
-    _, inverse = linalg.factor_and_inverse(jnp.diag(alpha) + first.coupling)
+    _, inverse = linalg.factor_and_inverse(jnp.diag(alpha) + first.coupled())
     z = inverse.T @ jax.random.normal(keys[1], alpha.shape)
     z = jnp.where(form.hierarchy.active(phi, form.biases), z, 0.0)
     levels = model.level_spread * jax.random.normal(keys[2], model.level_spread.shape)

@@ -52,7 +52,7 @@ def propagate(form: Form, known: Natural, nodes: QuadratureNodes, key: jax.Array
     learnt = jnp.asarray(form.hierarchy.learnt, int)
     group = jnp.asarray(form.hierarchy.group, int)
     held = known.first.alpha.at[learnt].set(0.0)
-    base = known.information + known.first.coupling + jnp.diag(held)
+    base = known.information + known.first.coupled() + jnp.diag(held)
 
     def solve(sites: Sites) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         pull = known.pull.at[learnt].add(sites.nu)

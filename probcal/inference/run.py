@@ -18,6 +18,7 @@ from probcal.errors import InputError
 from probcal.inference.ending import conclude
 from probcal.inference.integrate import Integration, integrate
 from probcal.inference.progress import OnProgress, Progress
+from probcal.inference.sparse import sparse_answer, takes_sparse
 from probcal.inference.storage import Storage
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, PRECISION_BOUNDS, Precision, Prior
@@ -120,8 +121,10 @@ class Maximiser(Method, ABC):
         """Climb from a start until it is done or its iterations are spent.
 
         Where a method integrates trajectories, places that are far from Gaussian are integrated at the point that was
-        reached, and it climbs again with what they add.
+        reached, and it climbs again with what they add. What is too large for the dense form is solved in sparse form.
         """
+        if takes_sparse(self, problem):
+            return sparse_answer(self, problem, prior, start, context)
         state, trace = self.climb(problem, prior, start, context)
         chosen = places_of(problem.model, state.point) if self.integrates_places else None
         if chosen is not None and any(np.any(own.on) for own in chosen):

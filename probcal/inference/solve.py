@@ -7,12 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.errors import InputError
 from probcal.inference.methods import MAP
-from probcal.inference.run import Context, Method
+from probcal.inference.run import Context, Maximiser, Method
+from probcal.inference.sparse import check_sparse, takes_sparse
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.smoothing.grid import follow_states
+from probcal.smoothing.grid import follow_states, grid_start
+from probcal.smoothing.joint import ROOM, missing, numbers
 from probcal.smoothing.mirrors import NEAR, SAME, Mirrored, other_sides
 from probcal.smoothing.mode import Point
 from probcal.starts import further_starts
@@ -21,6 +24,7 @@ from probcal.status import Status
 
 TRIES = 3  # climbs by particles from one start
 DIFFERENT = 2.0  # sd by which an answer from another start must differ in some bias to be one of its own
+MOST = 10  # times the room of the dense form up to which a method that has no other is tried
 APART = 0.01  # scales that count as an sd where that is smaller
 
 
@@ -36,6 +40,9 @@ def solve(
         return _by_particles(problem, method, prior, context, start, starts)
     given, problem = problem, method.prepare(problem)
     used = problem is given
+    if _sparsely(problem, method, prior, starts):
+        first = grid_start(problem, jnp.zeros(problem.model.biases), 30) if start is None else start
+        return method.answer(problem, prior, first, context)
     points = [o.point for o in optima_of(problem)] if start is None else [_suited(given, problem, start)]
     points += further_starts(problem, starts - len(points), jax.random.fold_in(context.key, 1))
     climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint"), Gaussian())
@@ -53,6 +60,21 @@ def solve(
         return found
     beside = _beside_mirrors(found, method, context)
     return replace(beside, mirrors=(*beside.mirrors, *_beside_optima(beside, (found, *found.optima))))
+
+
+def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> bool:
+    """Whether a problem is solved in sparse form; raises `InputError` where it must be, and cannot."""
+    if isinstance(method, Maximiser) and takes_sparse(method, problem):
+        check_sparse(method, prior, starts)
+        return True
+    model = problem.model
+    if numbers(model) > MOST * ROOM:
+        lacks = missing(model)
+        raise InputError(
+            f"{method.name} holds matrices of all {model.biases} biases, some {8e-9 * numbers(model):.0f} GB: "
+            + (f"give fewer, since the sparse form does not take {lacks}" if lacks else "take EA() or MAP()")
+        )
+    return False
 
 
 def _by_particles(

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.errors import InputError
 from probcal.priors import Prior
 from probcal.results.schema import INTERVAL
 from probcal.smoothing.draws import draw, draw_biases, draws_a_chain
@@ -67,20 +68,31 @@ class Summary:
     kind: str  # "Laplace", "mixture", "exact" or "variational"
     precisions: str  # of the prior: "given", "maximised", "integrated" or "sampled"
     mean: np.ndarray  # (M,)
-    covariance: np.ndarray  # (M, M)
+    covariance: np.ndarray | None  # (M, M); None where the biases are too many for it
     lower: np.ndarray  # (M,) of the interval
     upper: np.ndarray  # (M,)
     gamma: np.ndarray  # (M,)
     precision: np.ndarray  # (M,) of the prior
-    information: np.ndarray  # (M, M) of the data, trajectories marginalised
+    information: np.ndarray | None  # (M, M) of the data, trajectories marginalised; None as well
     levels: np.ndarray  # (H,) log factors of the unknown noise levels
     evidence: float | None = None  # where the method has one
     columns: Mapping[str, np.ndarray] = field(default_factory=dict)  # further ones by name, (M,)
+    variance: np.ndarray | None = None  # (M,) where there is no covariance
+
+    @property
+    def whole(self) -> np.ndarray:
+        """The covariance (M, M); raises `InputError` where the biases are too many for it."""
+        if self.covariance is None:
+            raise InputError(f"a fit of {len(self.mean)} biases in sparse form holds no covariance of all of them")
+        return self.covariance
 
     @property
     def sd(self) -> np.ndarray:
         """Standard deviation of each bias, (M,)."""
-        return np.sqrt(np.diag(self.covariance))
+        if self.covariance is not None:
+            return np.sqrt(np.diag(self.covariance))
+        assert self.variance is not None
+        return np.sqrt(self.variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +127,7 @@ class Posterior(ABC):
     @property
     def sound(self) -> bool:
         """Whether every number is finite: a flat prior on a singular problem leaves no interval."""
-        return bool(np.isfinite(self.summary.covariance).all() and np.isfinite(self.summary.mean).all())
+        return bool(np.isfinite(self.summary.whole).all() and np.isfinite(self.summary.mean).all())
 
     @property
     def here(self) -> tuple[np.ndarray, np.ndarray]:

@@ -114,12 +114,15 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
         "status": np.array(answer.bias_status, str), "pull": answer.posterior.pull,
         "kind": np.array([b.kind for b in problem.biases], str), **found.columns,
     }  # fmt: skip
-    matrices = {"covariance": found.covariance * np.outer(scales, scales), "information": found.information}
+    matrices = {}
+    if found.covariance is not None:  # too many biases for it else
+        matrices = {"covariance": found.covariance * np.outer(scales, scales), "information": found.information}
     if answer.prior.correlation:
         matrices["coupling"] = np.asarray(answer.prior.precision(problem.labels, problem.surveyed).coupling)
     values: dict[str, Any] = {name: ("bias_label", column) for name, column in columns.items()}
     values |= {name: (("bias_label", "bias_label_other"), matrix) for name, matrix in matrices.items()}
-    return xr.Dataset(values, coords={**bias_coords(problem), "bias_label_other": labels})
+    coords = bias_coords(problem) | ({"bias_label_other": labels} if matrices else {})
+    return xr.Dataset(values, coords=coords)
 
 
 def _data_groups(answer: Answer, draws: Draws, before: Point) -> dict[str, xr.Dataset]:

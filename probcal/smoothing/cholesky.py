@@ -1,0 +1,165 @@
+"""Factors of large sparse matrices: by CHOLMOD through sparsax where it is installed, else by SciPy's SuperLU.
+
+Both take the upper triangle of a symmetric positive definite matrix as entries with places, those of one place added.
+Another library is another class with the members of `Factor`.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from importlib.util import find_spec
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+PROBES, BLOCK = 512, 64  # draws of a diagonal that is estimated, and of them at once
+
+
+class Places(NamedTuple):
+    """Where the entries of a matrix stand."""
+
+    row: np.ndarray  # (entries,), at most the column
+    column: np.ndarray  # (entries,)
+    size: int  # n
+    diagonal: np.ndarray  # (n,) one entry on each place of the diagonal
+
+
+class Factor(Protocol):
+    """A factorised matrix (n, n); everything is NumPy."""
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """The inverse times right, (n,) or (n, K)."""
+
+    def log_determinant(self) -> float:
+        """Log determinant."""
+
+    def inverse_diagonal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Diagonal (n,) of the inverse, and the standard error (n,) of each entry, 0 where it is exact."""
+
+    def inverse_entries(self) -> np.ndarray:
+        """The inverse at the place of each entry; raises `RuntimeError` where the library has no selected inverse."""
+
+    def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Draws (count, n) around zero with this precision."""
+
+
+def factorise(places: Places, values: np.ndarray) -> Factor:
+    """Factorise a matrix; raises `numpy.linalg.LinAlgError` where it is not positive definite."""
+    return Cholmod(places, values) if exact() else SuperLU(places, values)
+
+
+def exact() -> bool:
+    """Whether entries of the inverse are exact: with sparsax, an extra for Linux and Windows."""
+    return find_spec("sparsax") is not None
+
+
+class Cholmod:
+    """CHOLMOD by sparsax, whose analysis of a pattern is kept between factors; on the CPU."""
+
+    def __init__(self, places: Places, values: np.ndarray):
+        import sparsax  # an extra
+
+        self._library, self._places = sparsax, places
+        with jax.enable_x64(True), _on_cpu():
+            sparsax.set_num_cache_size(1)  # one factor may be gigabytes
+            sparsax.set_token_cache_size(1)
+            self._entries = tuple(jnp.asarray(part) for part in (places.row, places.column, values))
+            try:
+                self._token = jax.block_until_ready(sparsax.factor(*self._entries, places.size))
+            except Exception as error:  # of XLA: what the library raised within
+                raise np.linalg.LinAlgError(f"not positive definite: {error}") from None
+
+    def _apply(self, right: np.ndarray, *modes: Any) -> np.ndarray:
+        with jax.enable_x64(True), _on_cpu():
+            found = jnp.asarray(right)
+            for mode in modes:
+                found = self._library.solve_factor(self._token, found, mode)
+            return np.asarray(found)
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """The inverse times right, (n,) or (n, K)."""
+        return self._apply(right, self._library.MODE_A)
+
+    def log_determinant(self) -> float:
+        """Log determinant."""
+        with jax.enable_x64(True), _on_cpu():
+            return float(self._library.logdet_factor(self._token))
+
+    def inverse_entries(self) -> np.ndarray:
+        """The inverse at the place of each entry (Takahashi's selected inverse), exact."""
+        with jax.enable_x64(True), _on_cpu():
+            return np.asarray(self._library.selinv(*self._entries, self._places.size))
+
+    def inverse_diagonal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Diagonal (n,) of the inverse, and no error."""
+        diagonal = self.inverse_entries()[self._places.diagonal]
+        return diagonal, np.zeros_like(diagonal)
+
+    def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Draws (count, n) around zero with this precision."""
+        normal = rng.standard_normal((self._places.size, count))
+        return self._apply(normal, self._library.MODE_LT, self._library.MODE_PT).T
+
+
+class SuperLU:
+    """SuperLU of SciPy without pivoting; the diagonal of the inverse is estimated by draws."""
+
+    def __init__(self, places: Places, values: np.ndarray):
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.linalg import splu
+
+        upper = coo_matrix((values, (places.row, places.column)), (places.size, places.size)).tocsc()
+        own = upper.diagonal()
+        whole = upper + upper.T
+        whole.setdiag(own)
+        options = {"SymmetricMode": True, "Equil": False}
+        try:
+            self._lu = splu(whole, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        except RuntimeError as error:  # exactly singular
+            raise np.linalg.LinAlgError(f"not positive definite: {error}") from None
+        if not (self._pivots > 0).all() or not np.array_equal(self._lu.perm_r, self._lu.perm_c):
+            raise np.linalg.LinAlgError("not positive definite")
+        self._size, self._whole = places.size, whole
+
+    @cached_property
+    def _pivots(self) -> np.ndarray:
+        return np.asarray(self._lu.U.diagonal())
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """The inverse times right, (n,) or (n, K)."""
+        return np.asarray(self._lu.solve(np.asarray(right)))
+
+    def log_determinant(self) -> float:
+        """Log determinant."""
+        return float(np.sum(np.log(self._pivots)))
+
+    def inverse_diagonal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Diagonal (n,) of the inverse from draws, the rest of each given (Siden and others 2018), and its error."""
+        rng, own = np.random.default_rng(0), self._whole.diagonal()
+        total, fourth = np.zeros(self._size), np.zeros(self._size)
+        for _ in range(PROBES // BLOCK):
+            drawn = self.draw(rng, BLOCK).T
+            middle = drawn - (self._whole @ drawn) / own[:, None]  # the mean of each given all others
+            total += np.sum(middle**2, 1)
+            fourth += np.sum(middle**4, 1)
+        mean = total / PROBES
+        error = np.sqrt(np.maximum(fourth / PROBES - mean**2, 0.0) / PROBES)
+        return 1.0 / own + mean, error
+
+    def inverse_entries(self) -> np.ndarray:
+        """There is none."""
+        raise RuntimeError("SuperLU has no selected inverse")
+
+    def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Draws (count, n) around zero with this precision."""
+        from scipy.sparse.linalg import spsolve_triangular
+
+        normal = rng.standard_normal((self._size, count)) / np.sqrt(self._pivots)[:, None]
+        moved = spsolve_triangular(self._lu.L.T.tocsr(), normal, lower=False, unit_diagonal=True)
+        return np.asarray(moved)[self._lu.perm_c].T
+
+
+def _on_cpu() -> Any:
+    return jax.default_device(jax.devices("cpu")[0])

@@ -1,0 +1,208 @@
+"""The joint precision of all states and biases as a sparse matrix, for networks whose dense form does not fit.
+
+A row couples the state of its epoch with the biases of its sensor, and motion one epoch with the next: of the n^2
+entries few are not zero. One Cholesky factor solves what `eliminate` and a Schur complement do where it is dense.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.model.model import Model
+from probcal.model.rows import Linearised
+from probcal.smoothing.cholesky import Factor, Places, factorise
+from probcal.smoothing.mode import factors
+
+ROOM = 125_000_000  # numbers (1 GB) up to which responses of all states to all biases, and three (M, M), are held
+
+
+def numbers(model: Model) -> int:
+    """How many numbers the dense form holds: the response of every state to every bias, and three matrices (M, M)."""
+    return model.biases * model.state_size + 3 * model.biases**2
+
+
+def prefers_sparse(model: Model) -> bool:
+    """Whether the dense form takes more than 1 GB."""
+    return numbers(model) > ROOM
+
+
+def missing(model: Model) -> str:
+    """What a model has that the sparse form does not take, in words; empty where it takes the model."""
+    if model.level_spread.shape[0]:
+        return "unknown noise levels"
+    if model.tailed:
+        return "process noise that is not Gaussian"
+    if any(form is not None for form in model.sampled):
+        return "a motion without a linear form"
+    if any(not np.all(_drives(part) | _carries(part) | _fixes(part)) for part in model.recursions):
+        return "a motion whose noise reaches only a part of the state"
+    return ""
+
+
+def _drives(part: Any) -> np.ndarray:
+    """Epochs (E,) whose noise reaches every direction of the state."""
+    values = np.linalg.svd(np.asarray(part.L), compute_uv=False)
+    return values[:, -1] > 1e-12 * values[:, 0]
+
+
+def _carries(part: Any) -> np.ndarray:
+    """Epochs (E,) at which a state stays exactly what it was."""
+    still = np.all(np.asarray(part.F) == np.eye(part.F.shape[1]), (1, 2))
+    return still & np.all(np.asarray(part.L) == 0, (1, 2)) & np.all(np.asarray(part.drift) == 0, 1)
+
+
+def _fixes(part: Any) -> np.ndarray:
+    """Epochs (E,) whose state is known."""
+    return np.all(np.asarray(part.F) == 0, (1, 2)) & np.all(np.asarray(part.L) == 0, (1, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Where the entries of the joint precision of a model come from: states first, then the M biases.
+
+    `kept` (entries,) are their places among all values of `_values`, `times` (entries,) what each counts. A state that
+    stays what it was has the variables of the epoch before; one that is known has none, -1 in `slots`.
+    """
+
+    places: Places
+    kept: np.ndarray
+    times: np.ndarray
+    slots: tuple[np.ndarray, ...]  # (E, n) variable of each entry of the states of each recursion
+    driven: tuple[np.ndarray, ...]  # (E,) whether an epoch has variables of its own
+    states: int  # number of variables that are states
+
+    @classmethod
+    def of(cls, model: Model) -> Joint:
+        """The pattern of a model."""
+        slots, driven, start = [], [], 0
+        for part in model.recursions:
+            E, n = part.drift.shape
+            own = _drives(part) if E else np.zeros(0, bool)
+            at = start + n * (np.cumsum(own) - 1)
+            base = np.where(own, at, -1)
+            for k in np.flatnonzero(_carries(part) & ~own) if E else ():
+                base[k] = base[k - 1]
+            slots.append(np.where(base[:, None] >= 0, base[:, None] + np.arange(n), -1))
+            driven.append(own)
+            start += n * int(own.sum())
+        rows, columns, times = _entries(model, slots, driven, start)
+        kept = np.flatnonzero((rows >= 0) & (columns >= 0))
+        low, high = np.minimum(rows, columns)[kept], np.maximum(rows, columns)[kept]
+        size = start + model.biases
+        diagonal = np.zeros(size, int)
+        on = np.flatnonzero(low == high)
+        diagonal[low[on]] = on
+        places = Places(low.astype(np.int32), high.astype(np.int32), size, diagonal)
+        return cls(places, kept, times[kept], tuple(slots), tuple(driven), start)
+
+    def values(self, model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> np.ndarray:
+        """Entries (entries,) of the precision of data and motion, the biases without prior."""
+        found = np.asarray(_values(model, tuple(jnp.asarray(own) for own in self.driven), lins, levels))
+        return found[self.kept] * self.times
+
+    def factor(self, values: np.ndarray, alpha: np.ndarray) -> Factor:
+        """Factorise the precision with prior precisions alpha (M,) of the biases."""
+        whole = values.copy()
+        whole[-len(alpha) :] += alpha  # the last entries are the diagonal of the biases
+        return factorise(self.places, whole)
+
+    def blocks(self, model: Model) -> tuple[np.ndarray, np.ndarray]:
+        """Biases (B, p) of each sensor that no sensor before has, M of none, and the entries (B, p, p) of their pairs.
+
+        An entry of -1 stands where there is no pair.
+        """
+        M = model.biases
+        taken, members = np.zeros(M + 1, bool), list[np.ndarray]()
+        taken[M] = True
+        wide = max((data.bias.shape[1] for data in model.rows), default=1)
+        for data in model.rows:
+            own: np.ndarray = np.sort(np.asarray(data.bias), 1)
+            own = np.where(np.concatenate([np.zeros((len(own), 1), bool), own[:, 1:] == own[:, :-1]], 1), M, own)
+            values, first = np.unique(own, return_index=True)
+            mine: np.ndarray = np.full(own.size, M)
+            mine[first] = np.where(taken[values], M, values)
+            taken[values] = True
+            room = wide - own.shape[1]
+            members.append(np.pad(mine.reshape(own.shape), ((0, 0), (0, room)), constant_values=M))
+        found = np.concatenate([*members, np.zeros((0, wide), int)])
+        found = found[(found < M).any(1)]
+        keys = self.places.row.astype(np.int64) * self.places.size + self.places.column
+        order = np.argsort(keys, kind="stable")
+        low = np.minimum(found[:, :, None], found[:, None, :]) + self.states
+        high = np.maximum(found[:, :, None], found[:, None, :]) + self.states
+        wanted = low.astype(np.int64) * self.places.size + high
+        at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+        there = (high < self.states + M) & (keys[order][at] == wanted)
+        return found, np.where(there, order[at], -1)
+
+    def of_biases(self, pull: np.ndarray) -> np.ndarray:
+        """A right-hand side (n,) with entries (M,) or (M, K) for the biases alone."""
+        return np.concatenate([np.zeros((self.states, *pull.shape[1:])), pull])
+
+    def state_values(self, values: np.ndarray) -> list[np.ndarray]:
+        """Of values (n,) of all variables those of the states (E, n) of each recursion, 0 where they are known."""
+        padded = np.append(values, 0.0)
+        return [padded[own] for own in self.slots]
+
+    def correction(self, model: Model, levels: jax.Array) -> float:
+        """Twice the sum of log |L|, by which log det W of whitened noises is above that of the states."""
+        total = 0.0
+        for part, own in zip(model.recursions, self.driven, strict=True):
+            if own.any():
+                total += 2.0 * float(np.sum(np.linalg.slogdet(np.asarray(factors(part, levels))[own])[1]))
+        return total
+
+
+def _entries(
+    model: Model, slots: list[np.ndarray], driven: list[np.ndarray], states: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row, column and count of every value of `_values`, -1 where it has no place."""
+    M, rows, columns, times = model.biases, list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+
+    def add(row: np.ndarray, column: np.ndarray, count: Any = 1.0) -> None:
+        row, column = np.broadcast_arrays(row, column)
+        rows.append(row.ravel())
+        columns.append(column.ravel())
+        times.append(np.broadcast_to(count, row.shape).ravel())
+
+    for part, own, drives in zip(model.recursions, slots, driven, strict=True):
+        i, j = np.triu_indices(own.shape[1])
+        add(own[:, i], own[:, j])
+        follows = drives & np.any(np.asarray(part.F) != 0, (1, 2))
+        before = np.where(follows[:, None], np.concatenate([np.full_like(own[:1], -1), own[:-1]]), -1)
+        add(before[:, i], before[:, j])  # of the motion to the next epoch
+        add(before[:, :, None], own[:, None, :])
+    for block, data, r in zip(model.blocks, model.rows, model.recursion, strict=True):
+        reached = slots[r][np.asarray(data.epoch)][:, list(block.used)]  # (N, u)
+        bias = np.asarray(data.bias)
+        free = np.where(bias < M, states + bias, -1)
+        add(reached[:, None, :], free[np.asarray(data.sensor)][:, :, None])
+        i, j = np.triu_indices(bias.shape[1])
+        add(free[:, i], free[:, j], np.where((bias[:, i] == bias[:, j]) & (i != j), 2.0, 1.0))
+    add(states + np.arange(M), states + np.arange(M))
+    return np.concatenate(rows), np.concatenate(columns), np.concatenate(times)
+
+
+@jax.jit
+def _values(model: Model, driven: tuple[jax.Array, ...], lins: tuple[Linearised, ...], levels: jax.Array) -> jax.Array:
+    """Values of the blocks of the joint precision in the order of `_entries`, the diagonal of the biases zero."""
+    found = []
+    for (J, _), part, own in zip(model.of_states(lins), model.recursions, driven, strict=True):
+        n = J.shape[1]
+        i, j = np.triu_indices(n)
+        root = jnp.where(own[:, None, None], factors(part, levels), jnp.eye(n)[None])
+        inverse = jnp.where(own[:, None, None], linalg.inverses(root), 0.0)
+        back = inverse @ part.F
+        found += [(J + inverse.mT @ inverse)[:, i, j], (back.mT @ back)[:, i, j], -(back.mT @ inverse)]
+    for data, lin in zip(model.rows, lins, strict=True):
+        found.append(jnp.einsum("ncp,nc,ncu->npu", lin.bias, lin.weight, lin.state))
+        own = jnp.einsum("ncp,nc,ncq->npq", lin.bias, lin.weight, lin.bias)
+        i, j = np.triu_indices(own.shape[1])
+        found.append(jax.ops.segment_sum(own, data.sensor, data.bias.shape[0])[:, i, j])
+    return jnp.concatenate([*(part.ravel() for part in found), jnp.zeros(model.biases)])
