@@ -19,7 +19,7 @@ from probcal.analysis.verdict import RATE, limit_of
 from probcal.errors import InputError
 from probcal.labels import step_of
 from probcal.results.answer import HALF
-from probcal.results.schema import INTERVAL
+from probcal.results.schema import INTERVAL, matrix_of
 from probcal.status import Status
 
 PATTERN = np.array([[0.0], [1.0]])  # what the second recording has beyond the first
@@ -106,6 +106,7 @@ def _check(name: str, tree: xr.DataTree) -> None:
     group = tree["calibration"].to_dataset()
     if "pull" not in group:
         raise InputError(f'changes: "{name}" does not keep what its data say of the biases; fit it again')
+    matrix_of(group, "information", "changes")
     wide = _inflation(tree)
     if not all(np.isfinite(values).all() for values in (group["pull"], group["information"], wide)):
         raise InputError(f'changes: what the data of "{name}" say of the biases is not finite; fit it again')

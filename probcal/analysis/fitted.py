@@ -16,6 +16,7 @@ from probcal.problem import Epochs, Problem
 from probcal.results.answer import Answer
 from probcal.results.groups import datum_of, gather, weight_name
 from probcal.results.read import each_track
+from probcal.results.schema import matrix_of
 from probcal.smoothing.grid import follow_states, track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import Linearisation, linearise
@@ -82,7 +83,7 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
     datum, picks = datum_of(problem)
     if not np.array_equal(datum["y"], fit["observed_data"].to_dataset()["y"].values):
         raise InputError("assess: the tree was fitted to other data; give the problem as it was fitted")
-    covariance = group["covariance"].values / np.outer(problem.scales, problem.scales)
+    covariance = matrix_of(group, "covariance", "assess").values / np.outer(problem.scales, problem.scales)
     at = linearise(problem.model, _point(problem, fit)) if answer is None else answer.posterior.linearised
     data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
     return Fitted(problem, at, _prior(group), covariance, picks, data)

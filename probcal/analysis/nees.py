@@ -9,6 +9,7 @@ from scipy import special
 
 from probcal import linalg
 from probcal.labels import AXES
+from probcal.results.schema import matrix_of
 from probcal.simulate import Truth
 
 EXACT = 1e-9  # sd over the size of the scene below which a position is known: it has no error to be judged
@@ -59,6 +60,7 @@ def of_biases(tree: xr.DataTree, truth: Truth, rate: float) -> tuple[float, int,
     labels = [label for label in group["bias_label"].values.tolist() if label in truth.biases]
     if not labels:
         return None
+    matrix_of(group, "covariance", "nees")
     chosen = group.sel(bias_label=labels, bias_label_other=labels)
     error = (chosen["mean"].values - np.array([truth.biases[label] for label in labels])) / chosen["scale"].values
     covariance = chosen["covariance"].values / np.outer(chosen["scale"].values, chosen["scale"].values)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from probcal.cli.files import can_plot, report_of, say_written, write_csv
@@ -26,6 +27,7 @@ from probcal.results.schema import evidence_in
 from probcal.status import Status
 
 FINDINGS = 8  # sentences of an assessment that are printed
+MANY, SHOWN = 400, 40  # biases up to which all are printed, and of more so many
 LONG = 60.0  # s of a fit that is written before it is assessed
 
 
@@ -55,7 +57,7 @@ def run(
             problem, value, prior=chosen, key=seed, starts=starts, progress=progress, save=kept, store=store,
             resume=resume, overwrite=overwrite,
         )  # fmt: skip
-        if assessed and linear_form(answer):
+        if assessed and linear_form(answer) and answer.posterior.summary.covariance is not None:
             from probcal.analysis import assess
 
             with _safe(tree, outputs, time.perf_counter() - began > LONG):
@@ -103,6 +105,10 @@ def _safe(tree: xr.DataTree, outputs: Outputs | None, long: bool) -> Iterator[No
 def table_text(tree: xr.DataTree) -> str:
     """The table of biases as printed: label, unit, scale, mean, sd, interval, gamma, status, verdict."""
     frame = summary(tree)
+    whole = len(frame)
+    if whole > MANY:
+        sure = (frame["mean"] / frame["sd"]).abs().to_numpy()
+        frame = frame.iloc[sorted(np.argsort(-sure, kind="stable")[:SHOWN])].copy()
     numbers = ["scale", "mean", "sd", "lower", "upper"]
     for name in numbers:
         frame[name] = [f"{value:.4g}" for value in frame[name]]
@@ -111,7 +117,8 @@ def table_text(tree: xr.DataTree) -> str:
     for name in mixed:
         frame[name] = [f"{value:.0f}" if name == "ess" else f"{value:.3f}" for value in frame[name]]
     shown = frame[["bias", "unit", *numbers, "gamma", *mixed, "status", *(["verdict"] if "verdict" in frame else [])]]
-    return shown.to_string(index=False, justify="right")
+    listed = shown.to_string(index=False, justify="right")
+    return listed if whole <= MANY else f"{listed}\n{SHOWN} of {whole} biases, those that are surest not to be zero"
 
 
 def _print_verdict(tree: xr.DataTree, seconds: float) -> None:

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.errors import InputError
 from probcal.inference.methods import MAP
 from probcal.inference.run import Context, Maximiser, Method
 from probcal.inference.sparse import check_sparse, takes_sparse
@@ -15,16 +14,15 @@ from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.grid import follow_states, grid_start
-from probcal.smoothing.joint import ROOM, missing, numbers
 from probcal.smoothing.mirrors import NEAR, SAME, Mirrored, other_sides
 from probcal.smoothing.mode import Point
+from probcal.smoothing.room import check_room
 from probcal.starts import further_starts
 from probcal.starts import optima as optima_of
 from probcal.status import Status
 
 TRIES = 3  # climbs by particles from one start
 DIFFERENT = 2.0  # sd by which an answer from another start must differ in some bias to be one of its own
-MOST = 10  # times the room of the dense form up to which a method that has no other is tried
 APART = 0.01  # scales that count as an sd where that is smaller
 
 
@@ -63,17 +61,11 @@ def solve(
 
 
 def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> bool:
-    """Whether a problem is solved in sparse form; raises `InputError` where it must be, and cannot."""
+    """Whether a problem is solved in sparse form; raises `InputError` where it must be, and is not taken."""
     if isinstance(method, Maximiser) and takes_sparse(method, problem):
         check_sparse(method, prior, starts)
         return True
-    model = problem.model
-    if numbers(model) > MOST * ROOM:
-        lacks = missing(model)
-        raise InputError(
-            f"{method.name} holds matrices of all {model.biases} biases, some {8e-9 * numbers(model):.0f} GB: "
-            + (f"give fewer, since the sparse form does not take {lacks}" if lacks else "take EA() or MAP()")
-        )
+    check_room(problem.model)
     return False
 
 

@@ -29,7 +29,7 @@ from probcal.results.answer import HALF, Answer, Draws, Posterior, Summary, Trac
 from probcal.results.schema import INTERVAL, ROPE
 from probcal.smoothing.cholesky import Factor, exact
 from probcal.smoothing.information import mean_square
-from probcal.smoothing.joint import Joint, missing, prefers_sparse
+from probcal.smoothing.joint import JointPrecision, missing, prefers_sparse
 from probcal.smoothing.mode import Point
 from probcal.smoothing.sparse_mode import SparseMode, SparseSystem, find_sparse_mode, system_at
 
@@ -83,14 +83,14 @@ class Blocks(NamedTuple):
     pull: Any  # (B, p)
 
 
-class Chain(NamedTuple):
+class BlockChain(NamedTuple):
     """Where the sweeps of one chain stand."""
 
     z: jax.Array  # (M,)
     phi: Phi
 
 
-class Swept(NamedTuple):
+class BlocksSwept(NamedTuple):
     """What sweeps say of cavities times prior."""
 
     mean: Any  # (B, p)
@@ -102,8 +102,8 @@ class Swept(NamedTuple):
 
 @partial(jax.jit, static_argnames="form")
 def sweep_blocks(
-    form: Form, first: Precision, members: jax.Array, cavity: Blocks, chain: Chain, key: jax.Array
-) -> tuple[Chain, Swept]:
+    form: Form, first: Precision, members: jax.Array, cavity: Blocks, chain: BlockChain, key: jax.Array
+) -> tuple[BlockChain, BlocksSwept]:
     """Gibbs sweeps over the hyper-parameters of all biases and the biases of each block, given its cavity (B, p, p).
 
     The prior is exact, with all that biases share; moments are those of the Gaussians given hyper-parameters.
@@ -123,7 +123,7 @@ def sweep_blocks(
         """Values (B, p) of the members as (M,)."""
         return jnp.zeros(M + 1).at[members].set(values)[:M]
 
-    def one(carry: tuple[Chain, Any], k: jax.Array) -> tuple[tuple[Chain, Any], None]:
+    def one(carry: tuple[BlockChain, Any], k: jax.Array) -> tuple[tuple[BlockChain, Any], None]:
         (z, phi), (count, mean, second, gamma, means, sds) = carry
         keys = jax.random.split(jax.random.fold_in(key, k), len(updates) + 1)
         for update, own in zip(updates, keys, strict=False):
@@ -140,7 +140,7 @@ def sweep_blocks(
             gamma + on * jnp.clip(1.0 - alpha * variance, 0.0, 1.0),
             means.at[slot].set(spread_out(middle)), sds.at[slot].set(jnp.sqrt(variance)),
         )  # fmt: skip
-        return (Chain(spread_out(drawn), phi), sums), None
+        return (BlockChain(spread_out(drawn), phi), sums), None
 
     B, p = members.shape
     blank = (
@@ -150,7 +150,7 @@ def sweep_blocks(
     count, mean, second, gamma, means, sds = sums
     mean = mean / count
     covariance = second / count - mean[:, :, None] * mean[:, None, :]
-    return chain, Swept(mean, covariance, gamma / count, means, sds)
+    return chain, BlocksSwept(mean, covariance, gamma / count, means, sds)
 
 
 @dataclass(eq=False)
@@ -169,8 +169,8 @@ class Propagation:
     members: np.ndarray  # (B, p) biases of each block, M of none
     pairs: np.ndarray  # (B, p, p) where the entries of their covariances are, -1 of none
     key: jax.Array
-    chain: Chain | None = None
-    swept: Swept | None = None
+    chain: BlockChain | None = None
+    swept: BlocksSwept | None = None
     variance: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (n,) of all variables
 
     @property
@@ -209,7 +209,7 @@ class Propagation:
             _positive(precision - self.sites.precision), np.einsum("bij,bj->bi", precision, middle) - self.sites.pull
         )
         if self.chain is None:
-            self.chain = Chain(jnp.asarray(mean), self.form.hierarchy.begin(jax.random.fold_in(self.key, 0)))
+            self.chain = BlockChain(jnp.asarray(mean), self.form.hierarchy.begin(jax.random.fold_in(self.key, 0)))
         own = jax.random.fold_in(self.key, 1 + turn)
         self.chain, swept = sweep_blocks(self.form, self.first, self.members, cavity, self.chain, own)
         self.swept = swept = jax.device_get(swept)
@@ -308,7 +308,7 @@ class SparsePosterior(Posterior):
 
 def sparse_answer(method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
     """The answer of `EA` or `MAP` in sparse form; raises `FitError` where a flat prior leaves no interval."""
-    model, joint = problem.model, Joint.of(problem.model)
+    model, joint = problem.model, JointPrecision.of(problem.model)
     integrated = hasattr(method, "integrates") and method.integrates(prior)
     prior_first = prior.precision(problem.labels, problem.surveyed)
     first = np.asarray(prior_first.alpha)

@@ -143,13 +143,24 @@ def _places(tree: xr.DataTree) -> Places:
     labels = [[f"{name}.position_{axis}" for axis in AXES[: stated.shape[1]]] for name in names]
     index = {label: k for k, label in enumerate(group["bias_label"].values.tolist())}
     at = np.array([[index.get(label, -1) for label in own] for own in labels])
-    covariance = np.pad(group["covariance"].values, (0, 1))[at[:, :, None], at[:, None, :]]
+    covariance = _of_places(group, at)
     turned = [moved.get(f"{name}.heading", np.nan) for name in names]
     return Places(
         names, stated, stated + np.array([[moved.get(label, 0.0) for label in own] for own in labels]),
         covariance, (at >= 0).any(1), nodes["moving"].values.astype(bool),
         (nodes["node_heading"].values if "node_heading" in nodes else np.nan) + np.array(turned),
     )  # fmt: skip
+
+
+def _of_places(group: xr.Dataset, at: np.ndarray) -> np.ndarray:
+    """Covariances (S, d, d) of the places of nodes, whose biases have numbers `at` (S, d), -1 of none.
+
+    A fit in sparse form knows the variances alone.
+    """
+    if "covariance" in group:
+        return np.pad(group["covariance"].values, (0, 1))[at[:, :, None], at[:, None, :]]
+    variance = np.append(group["sd"].values ** 2, 0.0)[at]
+    return np.eye(at.shape[1])[None] * variance[:, None, :]
 
 
 def _tracks(tree: xr.DataTree) -> Iterator[Track]:

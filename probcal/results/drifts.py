@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from probcal.labels import step_of
+from probcal.results.schema import matrix_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -31,7 +32,7 @@ def drift_table(tree: xr.DataTree) -> pd.DataFrame:
     fixed = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
     every = [*labels, *fixed]
     units = dict(zip(labels, group["unit"].values, strict=True))
-    mean, covariance = group["mean"].values, group["covariance"].values
+    mean = group["mean"].values
     start = float(tree["observed_data"].to_dataset()["time"].min())
     tail = (1 - tree.attrs["interval_probability"]) / 2
     steps: dict[str, list[tuple[float, str]]] = {}
@@ -49,6 +50,7 @@ def drift_table(tree: xr.DataTree) -> pd.DataFrame:
             members = [labels.index(label) for label in so_far if label in units]
             held = sum(fixed.get(label, 0.0) for label in so_far)
             lower, upper = held + np.quantile(draws[..., members].sum(-1), [tail, 1 - tail])
+            covariance = matrix_of(group, "covariance", "drift_table").values
             sd = np.sqrt(covariance[np.ix_(members, members)].sum())
             table.append((name, units[known[0]], since, held + mean[members].sum(), sd, lower, upper))
     return pd.DataFrame(table, columns=columns)

@@ -120,5 +120,6 @@ def check_content(tree: xr.DataTree, path: Path) -> None:
     if missing := [name for name in ATTRIBUTES if name not in tree.attrs]:
         raise InputError(f"{path} is incomplete: it has no attribute {missing[0]}; fit again")
     calibration = tree["calibration"].to_dataset()
-    if not all(np.isfinite(calibration[name].values).all() for name in ("mean", "sd", "covariance")):
+    told = [name for name in ("mean", "sd", "covariance") if name in calibration]
+    if not all(np.isfinite(calibration[name].values).all() for name in told):
         raise InputError(f"{path}: its means or sds are not finite; fit again")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.results.schema import MORE, SUMMARY
+from probcal.results.schema import MORE, SUMMARY, matrix_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -123,7 +123,7 @@ def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
         if label not in known:
             raise InputError(f'the calibration has no bias "{label}"; fit the same network, or fix that bias')
     mean = group["mean"].sel(bias_label=labels).values
-    spread = group["covariance"].sel(bias_label=labels, bias_label_other=labels).values
+    spread = matrix_of(group, "covariance", "a calibration").sel(bias_label=labels, bias_label_other=labels).values
     levels = np.zeros(len(problem.levels))
     if problem.levels and "level" in calibration.children:
         found = calibration["level"].to_dataset()["std"].to_series()

@@ -17,7 +17,7 @@ import numpy as np
 PROBES, BLOCK = 512, 64  # draws of a diagonal that is estimated, and of them at once
 
 
-class Places(NamedTuple):
+class Entries(NamedTuple):
     """Where the entries of a matrix stand."""
 
     row: np.ndarray  # (entries,), at most the column
@@ -45,7 +45,7 @@ class Factor(Protocol):
         """Draws (count, n) around zero with this precision."""
 
 
-def factorise(places: Places, values: np.ndarray) -> Factor:
+def factorise(places: Entries, values: np.ndarray) -> Factor:
     """Factorise a matrix; raises `numpy.linalg.LinAlgError` where it is not positive definite."""
     return Cholmod(places, values) if exact() else SuperLU(places, values)
 
@@ -58,7 +58,7 @@ def exact() -> bool:
 class Cholmod:
     """CHOLMOD by sparsax, whose analysis of a pattern is kept between factors; on the CPU."""
 
-    def __init__(self, places: Places, values: np.ndarray):
+    def __init__(self, places: Entries, values: np.ndarray):
         import sparsax  # an extra
 
         self._library, self._places = sparsax, places
@@ -106,7 +106,7 @@ class Cholmod:
 class SuperLU:
     """SuperLU of SciPy without pivoting; the diagonal of the inverse is estimated by draws."""
 
-    def __init__(self, places: Places, values: np.ndarray):
+    def __init__(self, places: Entries, values: np.ndarray):
         from scipy.sparse import coo_matrix
         from scipy.sparse.linalg import splu
 

@@ -16,20 +16,14 @@ import numpy as np
 from probcal import linalg
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
-from probcal.smoothing.cholesky import Factor, Places, factorise
+from probcal.smoothing.cholesky import Entries, Factor, factorise
 from probcal.smoothing.mode import factors
-
-ROOM = 125_000_000  # numbers (1 GB) up to which responses of all states to all biases, and three (M, M), are held
-
-
-def numbers(model: Model) -> int:
-    """How many numbers the dense form holds: the response of every state to every bias, and three matrices (M, M)."""
-    return model.biases * model.state_size + 3 * model.biases**2
+from probcal.smoothing.room import ROOM, dense_numbers
 
 
 def prefers_sparse(model: Model) -> bool:
     """Whether the dense form takes more than 1 GB."""
-    return numbers(model) > ROOM
+    return dense_numbers(model) > ROOM
 
 
 def missing(model: Model) -> str:
@@ -63,14 +57,14 @@ def _fixes(part: Any) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Joint:
+class JointPrecision:
     """Where the entries of the joint precision of a model come from: states first, then the M biases.
 
     `kept` (entries,) are their places among all values of `_values`, `times` (entries,) what each counts. A state that
     stays what it was has the variables of the epoch before; one that is known has none, -1 in `slots`.
     """
 
-    places: Places
+    places: Entries
     kept: np.ndarray
     times: np.ndarray
     slots: tuple[np.ndarray, ...]  # (E, n) variable of each entry of the states of each recursion
@@ -78,7 +72,7 @@ class Joint:
     states: int  # number of variables that are states
 
     @classmethod
-    def of(cls, model: Model) -> Joint:
+    def of(cls, model: Model) -> JointPrecision:
         """The pattern of a model."""
         slots, driven, start = [], [], 0
         for part in model.recursions:
@@ -98,7 +92,7 @@ class Joint:
         diagonal = np.zeros(size, int)
         on = np.flatnonzero(low == high)
         diagonal[low[on]] = on
-        places = Places(low.astype(np.int32), high.astype(np.int32), size, diagonal)
+        places = Entries(low.astype(np.int32), high.astype(np.int32), size, diagonal)
         return cls(places, kept, times[kept], tuple(slots), tuple(driven), start)
 
     def values(self, model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> np.ndarray:

@@ -16,6 +16,7 @@ from probcal.model.model import Model, Recursion, Where
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
 from probcal.smoothing import recursion as rec
+from probcal.smoothing.room import check_room
 from probcal.smoothing.solves import Dense
 
 HALVINGS = 12  # step lengths tried before the damping grows
@@ -136,6 +137,7 @@ def compress(model: Model, lins: Sequence[Linearised], *, joint: bool = True) ->
     """Rows compressed onto states and biases; without `joint` the biases are held and have no columns."""
     own = tuple(model.of_states(lins))
     if joint:
+        check_room(model)
         return Compressed(*model.of_biases(lins), own, tuple(model.of_both(lins)))
     crosses = tuple(jnp.zeros((*part.drift.shape, 0)) for part in model.recursions)
     return Compressed(jnp.zeros((0, 0)), jnp.zeros(0), own, crosses)

@@ -19,7 +19,7 @@ from probcal.model.rows import Linearised
 from probcal.priors import Precision
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.cholesky import Factor
-from probcal.smoothing.joint import Joint
+from probcal.smoothing.joint import JointPrecision
 from probcal.smoothing.linearised import linearise_rows
 from probcal.smoothing.marginal import ENOUGH, HALVINGS, LEAST_CURVED, SETTLED, TRACK_STEPS, volume_slope
 from probcal.smoothing.mode import Eliminated, Point, cost, eliminate, eliminate_rows, factors, follow
@@ -36,7 +36,7 @@ class SparseSystem:
     """
 
     point: Point
-    joint: Joint
+    joint: JointPrecision
     rows: tuple[Linearised, ...]
     solved: Eliminated  # of the tracks at held biases
     entries: np.ndarray  # of the joint precision, the biases without prior
@@ -56,7 +56,7 @@ class SparseSystem:
         return _informed(model, self.rows, self.solved, z)
 
 
-def system_at(model: Model, joint: Joint, point: Point) -> SparseSystem:
+def system_at(model: Model, joint: JointPrecision, point: Point) -> SparseSystem:
     """The system at a point, its tracks settled first."""
     point = settle_each(model, point)
     rows = linearise_rows(model, point)
@@ -169,7 +169,7 @@ class SparseMode(NamedTuple):
 
 
 def find_sparse_mode(
-    model: Model, joint: Joint, start: Point, alpha: np.ndarray, iterations: int, tolerance: float,
+    model: Model, joint: JointPrecision, start: Point, alpha: np.ndarray, iterations: int, tolerance: float,
     told: Callable[[int, float], Any] | None = None,
 ) -> SparseMode:  # fmt: skip
     """Climb to the mode of the marginal density under precisions alpha (M,) until a step promises less than tolerance.
@@ -216,7 +216,7 @@ def find_sparse_mode(
 
 
 def _direction(
-    factor: Factor, joint: Joint, slope: np.ndarray, secants: list[tuple[np.ndarray, np.ndarray]]
+    factor: Factor, joint: JointPrecision, slope: np.ndarray, secants: list[tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray:
     """The step of L-BFGS around an inverse curvature (Nocedal, Wright 2006, algorithm 7.4)."""
     q, parts = slope.copy(), []

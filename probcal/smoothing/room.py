@@ -1,0 +1,23 @@
+"""How much the dense form of a problem holds, and where it is too much."""
+
+from probcal.errors import InputError
+from probcal.model.model import Model
+
+ROOM = 125_000_000  # numbers (1 GB) up to which the dense form is preferred
+MOST = 10  # times that room up to which it is tried where there is no other
+
+
+def dense_numbers(model: Model) -> int:
+    """How many numbers the dense form holds: the response of every state to every bias, and three matrices (M, M)."""
+    return model.biases * model.state_size + 3 * model.biases**2
+
+
+def check_room(model: Model) -> None:
+    """Raise `InputError` where the dense form does not fit an ordinary machine."""
+    if dense_numbers(model) > MOST * ROOM:
+        size = 8e-9 * dense_numbers(model)
+        raise InputError(
+            f"the dense form of {model.biases} biases and {model.state_size} states takes {size:.0f} GB: EA() and MAP()"
+            " fit a network of this size in sparse form, and what needs the covariance of all its biases is not there;"
+            " take fewer sensors or a shorter time"
+        )

@@ -1,0 +1,244 @@
+"""The sparse form beside the dense one: the same mode, variances, evidence and tracks; and what it refuses."""
+
+from functools import cache
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+
+import probcal as pc
+from probcal.errors import FitError, InputError
+from probcal.geometry import bearing, norm
+from probcal.inference.sparse import takes_sparse
+from probcal.smoothing import cholesky
+from probcal.smoothing.cholesky import Cholmod, Entries, SuperLU
+from probcal.smoothing.joint import JointPrecision, missing
+from probcal.smoothing.linearised import linearise_rows
+from probcal.smoothing.mode import compress
+from probcal.smoothing.room import check_room
+from probcal.starts import automatic_start
+
+TIME = np.arange(30.0)
+MOTION = {"car": pc.ConstantVelocity(1.0), "van": pc.ConstantVelocity(1.0), "mast": pc.Static()}
+LIBRARIES = [pytest.param(kind, id=kind.__name__) for kind in (Cholmod, SuperLU)]
+
+
+@pc.sensor(range=pc.Channel("m", std=2.0), azimuth=pc.Channel("rad", std=0.02, wrap=True))
+def radar(target, pose, *, range_offset=pc.Bias("m", 3.0), gain=pc.Bias("1", 0.01, shared="type")):
+    """Range with an offset of its own and a gain of its type, and azimuth."""
+    line = pose.local(target.position)
+    return dict(range=(1 + gain) * norm(line) + range_offset, azimuth=bearing(line))
+
+
+@pc.sensor(azimuth=pc.Channel("rad", std=0.01, wrap=True))
+def ear(target, pose):
+    """Azimuth alone."""
+    return dict(azimuth=bearing(pose.local(target.position)))
+
+
+@pc.sensor(azimuth=pc.Channel("rad", std=pc.Unknown(0.02), wrap=True))
+def loud_ear(target, pose):
+    """Azimuth alone, of unknown noise."""
+    return dict(azimuth=bearing(pose.local(target.position)))
+
+
+@cache
+def drawn():
+    """Two moving targets and one at rest, seen by three radars, one surveyed, and two ears; some rows lost."""
+    turned = {"heading": 0.05}
+    nodes = [
+        pc.Node("a", (0.0, 0.0), survey={"position": 0.5}, scale=turned),
+        pc.Node("b", (400.0, 0.0), scale={"position": 5.0} | turned),
+        pc.Node("c", (0.0, 400.0), scale={"position": 5.0} | turned),
+        pc.Node("d", (400.0, 400.0), scale=turned),
+        pc.Node("e", (-200.0, 200.0), scale=turned),
+    ]
+    network = pc.Network([kind.on(node) for kind, node in zip((radar, radar, radar, ear, ear), nodes, strict=True)])
+    way = np.stack([np.linspace(50, 350, len(TIME)), 120 + 60 * np.sin(TIME / 5)], 1)
+    tracks = {"car": way, "van": way[::-1] + np.array([0.0, 100.0]), "mast": np.array([[150.0, 250.0]])}
+    biases = {"b.position_x": 6.0, "c.heading": 0.08, "radar.gain": 0.015, "b.range_offset": -4.0}
+    run = pc.simulate(network, MOTION, TIME, key=3, tracks=tracks, biases=biases)
+    table = run.table.sample(frac=0.67, random_state=0)
+    return pc.Problem(network, MOTION, table), run.truth
+
+
+def fitted(method, prior=None):
+    return pc.fit(drawn()[0], method, prior=prior)
+
+
+@pytest.fixture(scope="module")
+def dense():
+    return fitted(pc.MAP(form="dense"), pc.Gaussian())
+
+
+@pytest.fixture
+def library(request, monkeypatch):
+    """A library of factors in the place of the one that is chosen."""
+    if request.param is Cholmod:
+        pytest.importorskip("sparsax", reason="sparsax is an extra")
+    monkeypatch.setattr(cholesky, "exact", lambda: request.param is Cholmod)
+    return request.param
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+def test_the_sparse_form_ends_where_the_dense_one_does(library, dense, monkeypatch):
+    """Means within 1e-4 sds; variances, tracks and evidence exact, or within 6 standard errors where estimated."""
+    monkeypatch.setattr("probcal.inference.sparse.exact", lambda: library is Cholmod)
+    sparse = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    a, b = (tree["calibration"].to_dataset() for tree in (dense, sparse))
+    assert sparse.attrs["status"] == dense.attrs["status"] == "converged"
+    assert "covariance" not in b
+    sd = a["sd"].values
+    np.testing.assert_allclose(b["mean"].values / sd, a["mean"].values / sd, atol=1e-4)
+    if library is Cholmod:
+        np.testing.assert_allclose(b["sd"].values, sd, rtol=1e-6)
+        np.testing.assert_allclose(b["gamma"], a["gamma"], atol=1e-6)
+        assert "sd_error" not in b
+    else:
+        off = np.abs(b["sd"].values / sd - 1.0)
+        assert (off < 6.0 * b["sd_error"].values + 1e-6).all()
+        assert 0 < b["sd_error"].values.max() < 0.1
+    np.testing.assert_allclose(b["pull"], a["pull"], rtol=1e-4, atol=1e-4)
+    assert sparse.attrs["log_evidence"] == pytest.approx(dense.attrs["log_evidence"], abs=1e-4)
+    for name in ("car", "van", "mast"):
+        one, other = (tree[f"track/{name}"].to_dataset() for tree in (dense, sparse))
+        np.testing.assert_allclose(other["mean"], one["mean"], atol=1e-3)
+        np.testing.assert_allclose(other["sd"], one["sd"], rtol=1e-5 if library is Cholmod else 0.3)
+
+
+@pytest.mark.ci
+def test_integrated_precisions_agree_with_sweeps_over_all_biases():
+    """Within what the Monte Carlo error of both leaves: 0.4 sds, a third of an sd; most intervals hold the truth."""
+    pytest.importorskip("sparsax", reason="sparsax is an extra")
+    a, b = (fitted(pc.EA(form=form))["calibration"].to_dataset() for form in ("dense", "sparse"))
+    sd = a["sd"].values
+    assert np.sqrt(np.mean(((b["mean"].values - a["mean"].values) / sd) ** 2)) < 0.15
+    np.testing.assert_allclose(b["mean"].values / sd, a["mean"].values / sd, atol=0.4)
+    np.testing.assert_allclose(np.log(b["sd"].values / sd), 0.0, atol=0.3)
+    np.testing.assert_allclose(b["gamma"], a["gamma"], atol=0.2)
+    true = np.array([drawn()[1].biases[label] for label in a["bias_label"].values.tolist()])
+    assert np.mean((b["lower"].values <= true) & (true <= b["upper"].values)) > 0.75
+
+
+def test_draws_have_the_means_and_sds(dense):
+    group, draws = dense["calibration"].to_dataset(), fitted(pc.MAP(form="sparse"), pc.Gaussian())["posterior"]["bias"]
+    flat = draws.values.reshape(-1, draws.shape[-1])
+    np.testing.assert_allclose(
+        (flat.mean(0) - group["mean"].values) / group["sd"].values, 0.0, atol=5 / len(flat) ** 0.5
+    )
+    np.testing.assert_allclose(flat.std(0) / group["sd"].values, 1.0, atol=5 / (2 * len(flat)) ** 0.5)
+
+
+def test_every_bias_is_in_one_block():
+    """Blocks of sensors share no bias, and the entries of their pairs stand where they say."""
+    with jax.enable_x64(True):
+        model = drawn()[0].model
+        joint = JointPrecision.of(model)
+        members, pairs = joint.blocks(model)
+    free = members[members < model.biases]
+    assert sorted(free) == list(range(model.biases))
+    for b, i, j in np.argwhere(pairs >= 0):
+        place = sorted(members[b, [i, j]] + joint.states)
+        assert [joint.places.row[pairs[b, i, j]], joint.places.column[pairs[b, i, j]]] == place
+    assert len(joint.slots[0]) + len(joint.slots[-1]) > 0
+    assert joint.states == 4 * 2 * len(TIME) + 2, "the mast has one place"
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+def test_factors_solve_and_say_what_is_not_positive(library):
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(7, 7))
+    A = A @ A.T + np.eye(7)
+    i, j = np.triu_indices(7)
+    places = Entries(i.astype(np.int32), j.astype(np.int32), 7, np.flatnonzero(i == j))
+    factor = library(places, A[i, j])
+    right = rng.normal(size=(7, 3))
+    np.testing.assert_allclose(factor.solve(right), np.linalg.solve(A, right), atol=1e-12)
+    assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(A)[1])
+    value, error = factor.inverse_diagonal()
+    assert (np.abs(value - np.diag(np.linalg.inv(A))) <= 5 * error + 1e-12).all()
+    draws = factor.draw(rng, 20_000)
+    np.testing.assert_allclose(np.cov(draws.T), np.linalg.inv(A), atol=0.05)
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        library(places, (A - 50 * np.eye(7))[i, j])
+
+
+# what is refused
+
+
+def test_a_flat_prior_on_what_no_row_tells_is_no_fit():
+    problem = drawn()[0]
+    table = problem.measurements.table.frame.copy()
+    table.loc[table["sensor"] == "b", "azimuth"] = np.nan  # then nothing tells how it is turned
+    tree = pc.fit(pc.Problem(problem.network, MOTION, table), pc.MAP(form="sparse"), prior=pc.Flat())
+    assert tree.attrs["status"] == "diverged"
+    assert "b.heading lie more than 10 scales" in tree.attrs["message"]
+
+
+def test_a_singular_matrix_is_no_fit(monkeypatch):
+    def singular(places, values):
+        raise np.linalg.LinAlgError("not positive definite")
+
+    monkeypatch.setattr("probcal.smoothing.joint.factorise", singular)
+    with pytest.raises(FitError, match="the information matrix is singular"):
+        fitted(pc.MAP(form="sparse"), pc.Flat())
+
+
+@pytest.mark.parametrize(
+    ("method", "prior", "settings", "said"),
+    [
+        (pc.MAP(form="sparse", trajectory="joint"), pc.Gaussian(), {}, 'takes trajectory="marginal" alone'),
+        (pc.MAP(form="sparse"), pc.Gaussian(correlation={"*.heading": 0.5}), {}, "takes a prior without correlations"),
+        (pc.EA(form="sparse", precisions="maximised"), None, {}, "precisions that are integrated or given"),
+        (pc.EA(form="sparse"), pc.BernoulliGaussian(), {}, "a prior that puts no bias at exactly zero"),
+        (pc.MAP(form="sparse"), pc.Gaussian(), {"starts": 3}, "takes one start"),
+        (pc.MAP(form="sparse"), pc.Gaussian(), {"save": ("states",)}, "keeps no draws of states or replicas"),
+    ],
+)
+def test_what_a_sparse_fit_does_not_do_is_said(method, prior, settings, said):
+    with pytest.raises(InputError) as error:
+        pc.fit(drawn()[0], method, prior=prior, **settings)
+    assert said in str(error.value)
+    if "save" not in settings:
+        assert "on a network of this size is solved in sparse form, which takes" in str(error.value)
+
+
+def test_forms_are_words():
+    for method in (pc.EA, pc.MAP):
+        with pytest.raises(InputError, match="give one of auto, dense, sparse"):
+            method(form="thin")
+
+
+def test_precisions_need_exact_variances(monkeypatch):
+    monkeypatch.setattr("probcal.inference.sparse.exact", lambda: False)
+    with pytest.raises(InputError, match=r"install probcal\[sparse\], or take MAP"):
+        fitted(pc.EA(form="sparse"))
+
+
+def test_what_has_no_sparse_form_is_named():
+    problem = drawn()[0]
+    levels = pc.Problem(
+        pc.Network([loud_ear.on(pc.Node("a", (0.0, 0.0), scale={"heading": 0.1}))]),
+        pc.ConstantVelocity(1.0),
+        pd.DataFrame({"time": [0.0, 1.0], "sensor": ["a", "a"], "azimuth": [0.1, 0.2]}),
+    )
+    assert missing(problem.model) == ""
+    with pytest.raises(InputError, match='form="sparse"\\) does not take unknown noise levels: give form="dense"'):
+        takes_sparse(pc.MAP(form="sparse"), levels)
+    assert not takes_sparse(pc.MAP(), problem)
+
+
+def test_what_needs_the_whole_covariance_says_so():
+    tree = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    for call in (lambda: pc.assess(drawn()[0], tree), lambda: pc.track(drawn()[0], tree)):
+        with pytest.raises(InputError, match="needs the covariance of all biases, which a fit in sparse form"):
+            call()
+
+
+def test_a_dense_form_that_fits_no_machine_is_refused(monkeypatch):
+    monkeypatch.setattr("probcal.smoothing.room.ROOM", 100)
+    with pytest.raises(InputError, match=r"the dense form of 15 biases and .* states takes .* GB"):
+        check_room(drawn()[0].model)
+    with jax.enable_x64(True), pytest.raises(InputError, match="in sparse form"):
+        compress(drawn()[0].model, linearise_rows(drawn()[0].model, automatic_start(drawn()[0])))
