@@ -1,13 +1,16 @@
-"""Ten thousand radars on a grid and a few vehicles that pass: a network whose dense form does not fit a laptop.
+"""Thousands of radars on a grid and a few vehicles that pass: a network whose dense form does not fit a laptop.
 
 Short-range radars stand 100 m apart, `side` along each edge; each sees what passes between 20 and 280 m away, some
 25 of them at any time. A third is displaced (sd 2 m), a third turned (3 deg), a third has a range offset (3 m). The
 joint precision of all states and biases is sparse: one Cholesky factor fits it. Simulated.
 
-    probcal fit models/large_network.py --set side=30 --set targets=4 --set epochs=300 --out large
+    probcal fit models/large_network.py --out large                                  (2500 radars)
+    probcal fit models/large_network.py --set side=100 --set targets=20 --set epochs=1000 --out larger
 """
 
 from functools import cache
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -60,45 +63,52 @@ def _unit(angle):
     return np.array([np.cos(angle), np.sin(angle)])
 
 
+class Scenario(NamedTuple):
+    """What was measured, and the truth."""
+
+    table: pd.DataFrame
+    truth: Truth
+
+
 @cache
-def scenario(key=0, side=100, targets=20, epochs=1000):
-    """Table and truth; rows are drawn by formula, since each radar sees few of the epochs."""
+def scenario(key=0, side=50, targets=6, epochs=500, reach=REACH):
+    """Table and truth, drawn by formula, since each radar sees few of the epochs; every key has the same ways."""
     from scipy.spatial import cKDTree
 
-    rng = np.random.default_rng(key)
-    stated = places(side)
-    sds = np.array([SCALE["position"], SCALE["position"], SCALE["heading"], OFFSET])
+    rng, ways = np.random.default_rng(key), np.random.default_rng(side)
+    stated, sds = places(side), np.array([*(SCALE["position"],) * 2, SCALE["heading"], OFFSET])
     biases = sds * rng.standard_normal((len(stated), 4)) * (rng.random((len(stated), 4)) < SHARE)
-    placed = stated + biases[:, :2]
-    tree, names = cKDTree(placed), np.array([f"radar_{k}" for k in range(len(placed))])
-    rows, tracks = [], []
+    tree, rows, tracks = cKDTree(stated), [], []
     for t in range(targets):
-        path = drive(APART * (side - 1), epochs, rng)
-        seen = tree.query_ball_point(path, REACH)
+        path = drive(APART * (side - 1), epochs, ways)
+        seen = tree.query_ball_point(path, reach)
         epoch = np.repeat(np.arange(epochs), [len(own) for own in seen])
         k = np.concatenate([np.asarray(own, int) for own in seen])
-        line = path[epoch] - placed[k]
-        away = np.hypot(*line.T)
-        epoch, k, line, away = (part[away > NEAR] for part in (epoch, k, line, away))
+        clear = np.hypot(*(path[epoch] - stated[k]).T) > NEAR
+        epoch, k = epoch[clear], k[clear]
+        line = path[epoch] - stated[k] - biases[k, :2]
         azimuth = np.arctan2(line[:, 1], line[:, 0]) - biases[k, 2] + NOISE["azimuth"] * rng.standard_normal(len(k))
         measured = {
-            "range": away + biases[k, 3] + NOISE["range"] * rng.standard_normal(len(k)),
+            "range": np.hypot(*line.T) + biases[k, 3] + NOISE["range"] * rng.standard_normal(len(k)),
             "azimuth": np.angle(np.exp(1j * azimuth)),
         }
-        rows.append(pd.DataFrame({"time": STEP * epoch, "target": f"vehicle_{t}", "sensor": names[k], **measured}))
+        names = np.char.add("radar_", k.astype(str))
+        rows.append(pd.DataFrame({"time": STEP * epoch, "target": f"vehicle_{t}", "sensor": names, **measured}))
         columns = {"position_x": path[:, 0], "position_y": path[:, 1]}
         tracks.append(pd.DataFrame({"time": STEP * np.arange(epochs), "target": f"vehicle_{t}", **columns}))
-    words = ("position_x", "position_y", "heading", "range_offset")
-    labels = {f"radar_{k}.{word}": float(b) for k, own in enumerate(biases) for word, b in zip(words, own, strict=True)}
-    return pd.concat(rows, ignore_index=True), Truth(pd.concat(tracks, ignore_index=True), labels)
+    table, words = pd.concat(rows, ignore_index=True), ("position_x", "position_y", "heading", "range_offset")
+    heard = np.unique(table["sensor"]).tolist()
+    labels = {f"{name}.{w}": float(b) for name in heard for w, b in zip(words, biases[int(name[6:])], strict=True)}
+    return Scenario(table, Truth(pd.concat(tracks, ignore_index=True), labels))
 
 
-def problem(data=None, side=100, targets=20, epochs=1000, key=0):
+def problem(data=None, side=50, targets=6, epochs=500, reach=REACH, key=0):
     """The rows of a scenario, or your own (columns time, target, sensor, range, azimuth)."""
-    table = scenario(key, side, targets, epochs)[0] if data is None else data
-    return Problem(network(side, set(table["sensor"])), ConstantVelocity(DRIVE), table)
+    table = scenario(key, side, targets, epochs, reach).table if data is None else data
+    heard = scenario(key, side, targets, epochs, reach).table if isinstance(data, (str, Path)) else table
+    return Problem(network(side, set(heard["sensor"])), ConstantVelocity(DRIVE), table)
 
 
-def truth(data=None, side=100, targets=20, epochs=1000, key=0):
+def truth(data=None, side=50, targets=6, epochs=500, reach=REACH, key=0):
     """What it was simulated with."""
-    return scenario(key, side, targets, epochs)[1] if data is None else Truth()
+    return scenario(key, side, targets, epochs, reach).truth if data is None else Truth()

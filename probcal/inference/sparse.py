@@ -1,7 +1,7 @@
 """Fits whose dense form does not fit: the marginal mode by sparse factors, precisions integrated by propagation.
 
-`EA()` and `MAP()` come here by themselves (`form="auto"`): where states times biases, or biases squared, take more than
-1 GB. What needs the whole covariance of the biases is not there; variances and gamma of each are.
+`EA()` and `MAP()` come here by themselves (`form="auto"`): where the matrices of the dense form take more than 240 MB.
+What needs the whole covariance of the biases is not there; variances and gamma of each are.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from probcal.smoothing.room import ROOM, dense_numbers
 
 
 def prefers_sparse(model: Model) -> bool:
-    """Whether the dense form takes more than 1 GB."""
+    """Whether the matrices of the dense form take more than 240 MB."""
     return dense_numbers(model) > ROOM
 
 

@@ -3,8 +3,8 @@
 from probcal.errors import InputError
 from probcal.model.model import Model
 
-ROOM = 125_000_000  # numbers (1 GB) up to which the dense form is preferred
-MOST = 10  # times that room up to which it is tried where there is no other
+ROOM = 30_000_000  # numbers (240 MB, and some 2 GB with all that is made of them) up to which dense is preferred
+MOST = 5  # times that room up to which it is tried where there is no other
 
 
 def dense_numbers(model: Model) -> int:

@@ -1,0 +1,69 @@
+"""Large networks: seconds, memory and coverage of a fit, in the form that is chosen or in another.
+
+    uv run python benchmarks/large.py --side 25 50 100
+    uv run python benchmarks/large.py --side 32 --targets 1 --reach 1e5     (every radar sees every epoch)
+
+Radars of `models/large_network.py` on a square of so many along each edge, one line each: rows, biases, form, seconds
+of building and of the fit (compiled anew), share of biases that 89 % intervals hold, rms z, the most memory of the
+process so far; then the exponent of seconds over rows between the smallest and the largest. One square in a process
+says what memory it takes.
+"""
+
+import argparse
+import resource
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+import probcal as pc
+from probcal.inference.sparse import takes_sparse
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
+import large_network
+
+METHODS = {"ea": (pc.EA, None), "map": (pc.MAP, pc.Gaussian())}
+
+
+def main():
+    """Fit and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--side", type=int, nargs="+", default=[25, 50, 100])
+    parser.add_argument("--targets", type=int, help="by default as many as keep the rows of a radar alike")
+    parser.add_argument("--epochs", type=int, default=1000)
+    parser.add_argument("--reach", type=float, default=large_network.REACH)
+    parser.add_argument("--method", choices=METHODS, default="ea")
+    parser.add_argument("--form", default="auto")
+    chosen = parser.parse_args()
+    kind, prior = METHODS[chosen.method]
+    method, found = kind(form=chosen.form), []
+    for side in chosen.side:
+        targets = chosen.targets or max(1, round(20 * (side / 100) ** 2))
+        given = {"side": side, "targets": targets, "epochs": chosen.epochs, "reach": chosen.reach}
+        truth = large_network.truth(**given)
+        begun = time.perf_counter()
+        problem = large_network.problem(**given)
+        built = time.perf_counter() - begun
+        begun = time.perf_counter()
+        tree = pc.fit(problem, method, prior=prior)
+        took = time.perf_counter() - begun
+        group = tree["calibration"].to_dataset()
+        true = np.array([truth.biases[label] for label in problem.labels])
+        held = np.mean((group["lower"].values <= true) & (true <= group["upper"].values))
+        z = np.sqrt(np.mean(((group["mean"].values - true) / group["sd"].values) ** 2))
+        rows, form = len(problem.measurements.time), "sparse" if takes_sparse(method, problem) else "dense"
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+        print(
+            f"{side} x {side}: {rows} rows, {len(true)} biases, {form}: built {built:.1f} s, fit {took:.1f} s,"
+            f" {tree.attrs['status']}; 89 % hold {held:.3f}, rms z {z:.2f}; {peak:.1f} GB",
+            flush=True,
+        )
+        found.append((rows, took))
+    if len(found) > 1:
+        (few, short), (many, long) = found[0], found[-1]
+        print(f"seconds grow with rows to the power of {np.log(long / short) / np.log(many / few):.2f}")
+
+
+if __name__ == "__main__":
+    main()
