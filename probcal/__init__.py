@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         Unscented,
         coverage_table,
         fit,
+        load_study,
         log_evidence,
         numpyro_model,
         particle_filter,
@@ -99,7 +100,7 @@ __all__ = lazy(
         "probcal.geodesy": "LocalFrame",
         "probcal.inference": (
             "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares ParticleGibbs SelfConfiguration "
-            "Unscented coverage_table fit log_evidence numpyro_model particle_filter sbc study track"
+            "Unscented coverage_table fit load_study log_evidence numpyro_model particle_filter sbc study track"
         ),
         "probcal.inference.associations": "sample_associations",
         "probcal.motion": (

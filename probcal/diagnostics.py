@@ -20,16 +20,20 @@ def grid_of(study: xr.Dataset) -> list[str]:
 
 
 def study_table(study: xr.Dataset) -> pd.DataFrame:
-    """One row a setting and method: mean, sd, median and worst bias error, position error, coverage, statuses."""
+    """One row a setting and method: mean, sd, median and worst bias error, position error, coverage, statuses.
+
+    Fits that are not finished do not count.
+    """
     frame = study[[name for name in study.data_vars if "bias_label" not in study[name].dims]].to_dataframe()
+    frame = frame[frame["status"] != ""]
     groups = frame.reset_index().groupby([*grid_of(study), "estimator"], sort=False)
     table = groups["bias_rmse"].agg(mean="mean", sd="std", median="median", worst="max")
     if "position_rmse" in frame:
         table["position"] = groups["position_rmse"].mean()
     table["coverage"] = groups["coverage"].mean()
-    there = study["true"] != 0
+    there = (study["true"] != 0) & study["true"].notnull()
     inside = ((study["lower"] <= 0) & (study["upper"] >= 0)).where(there)
-    if bool(there.any()) and not bool(there.all()):
+    if bool(there.any()) and not bool((there | study["true"].isnull()).all()):
         table["of non-zero"] = inside.mean(["run", "bias_label"]).to_series().reindex(table.index)
     table["runs"] = groups.size()
     for status in map(str, Status):

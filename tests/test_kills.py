@@ -51,7 +51,7 @@ KINDS = {  # command, its results, its parts while it runs, and groups that must
              ("posterior", "sample_stats", "calibration")),
     "sbc": (("sbc", "--method", "map", "--posterior", "--runs"), "sbc.nc", "runs/runs-*.npz",
             ("sbc", "uniformity", "coverage")),
-    "study": (("study", "--methods", "ml,em", "--runs"), "study.nc", "runs/fits-*.npz", ("",)),
+    "study": (("study", "--methods", "ml,em", "--runs"), "study.nc", "runs/fits.zarr/status/c/*/*", ("",)),
 }  # fmt: skip
 SIZES = {"collapsed": 300, "nuts": 100, "sbc": 30, "study": 40}
 LONGER = {"collapsed": 3000, "nuts": 800, "sbc": 100, "study": 200}
@@ -105,7 +105,7 @@ def check(kind, size, model, folder, kills):
             a, b = (tree[group].to_dataset() if group else tree.to_dataset() for tree in (wanted, found))
             for name in a.variables:
                 assert np.array_equal(a[name].values, b[name].values, equal_nan=a[name].dtype.kind == "f"), name
-    assert not list(out.rglob("*.part")), "drafts of killed writes are cleared"
+    assert not [*out.rglob("*.part"), *out.rglob("*.partial")], "drafts of killed writes are cleared"
     assert not (out / "draws").exists()
     return happened
 

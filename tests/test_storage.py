@@ -39,7 +39,7 @@ from probcal.files import LOCK, NOTE, Lock, Outputs, make_folder, write_whole
 from probcal.geometry import norm
 from probcal.inference import identity
 from probcal.inference.fit import _check_store
-from probcal.inference.manifest import MANIFEST, remove_run, stored_run
+from probcal.inference.manifest import MANIFEST, remove_run, stored_run, write_manifest
 from probcal.inference.storage import Chunks, Records, Storage
 from probcal.results.io import SEAL, SMALL, check_content
 
@@ -340,6 +340,15 @@ def test_a_run_of_an_older_version_is_refused(name, tmp_path):
         ):
             chunks(tmp_path, **options)
     assert listing(tmp_path) == [name]
+
+
+def test_fits_of_an_older_version_are_refused(tmp_path):
+    write_manifest(tmp_path, "study", RUN)
+    (tmp_path / "fits-000000.npz").write_text("old")
+    for options in ({}, {"resume": True}, {"overwrite": True}):
+        with pytest.raises(InputError, match=r"holds fits-\*\.npz of an older probcal: move them away, or"):
+            Storage(tmp_path, "study", RUN, **options)
+    assert listing(tmp_path) == ["fits-000000.npz", MANIFEST]
 
 
 def test_records_come_from_threads_and_missing_ones_are_made_anew(tmp_path):

@@ -27,6 +27,10 @@ LARGEST_SEED = 2**62
 SMOOTHERS = ("gaussian", "particles")
 Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="seed of everything random")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace the run in --out: the files that probcal wrote")]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(help='spread over a dask cluster: "local", or the address of its scheduler, tcp://host:8786'),
+]
 
 
 def main() -> None:
@@ -175,6 +179,7 @@ def study_command(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with the finished fits in --out")] = False,
     overwrite: Overwrite = False,
+    scheduler: Scheduler = None,
 ) -> None:
     """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
     chosen = options.method_names(methods)
@@ -187,7 +192,8 @@ def study_command(
 
         raise typer.Exit(
             study.run(
-                model, grid, chosen, runs=runs, seed=seed, outputs=results, resume=resume, overwrite=overwrite
+                model, grid, chosen, runs=runs, seed=seed, outputs=results, resume=resume, overwrite=overwrite,
+                scheduler=scheduler,
             )
         )  # fmt: skip
 
@@ -285,6 +291,7 @@ def sbc_command(
     out: Annotated[Path | None, typer.Option(help="folder for sbc.nc, sbc.csv, sbc.png, and finished runs")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with the finished runs in --out")] = False,
     overwrite: Overwrite = False,
+    scheduler: Scheduler = None,
 ) -> None:
     """Check a method on a model by simulation: do its intervals hold the truth as often as they say?"""
     if method not in METHODS:
@@ -304,5 +311,6 @@ def sbc_command(
             sbc.run(
                 model, data, method=method, prior=prior, truths=truths, fix=fix or (), given=arguments, runs=runs,
                 seed=seed, posterior=posterior, full=full, outputs=results, resume=resume, overwrite=overwrite,
+                scheduler=scheduler,
             )
         )  # fmt: skip

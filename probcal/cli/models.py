@@ -1,11 +1,15 @@
 """Model files: imported, their functions called, whatever they raise in one sentence."""
 
+import hashlib
 import importlib.util
 import inspect
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from socket import gethostname
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -63,6 +67,46 @@ def call(module: ModuleType, path: Path, name: str, /, *arguments: Any, **option
         )
     with _told(f"{path.name}: {name}() failed with"):
         return function(*arguments, **options)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The setting(run, ...) of a model file, which other processes load by its path, once each.
+
+    Raises `InputError` where they cannot read the file, or read another.
+    """
+
+    path: Path
+    digest: str
+
+    @classmethod
+    def of(cls, path: Path) -> "Setting":
+        """That of a file as it is now, loaded here."""
+        found = cls(path.resolve(), _digest(path))
+        _module_of(found)
+        return found
+
+    def __call__(self, run: int, **point: Any) -> Any:
+        """The problem of a run and its truth."""
+        return call(_module_of(self), self.path, "setting", run, **point)
+
+
+@cache
+def _module_of(setting: Setting) -> ModuleType:
+    if _digest(setting.path) != setting.digest:
+        raise InputError(
+            f"{setting.path} is not there on {gethostname()}, or another file than here; put it where all workers read"
+            " it by the same path"
+        )
+    return load_model(setting.path)
+
+
+def _digest(path: Path) -> str:
+    """Digest of a file, empty where it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""
 
 
 def load_problem(

@@ -24,7 +24,7 @@ def run(
     model: Path, data: Path | None, *, method: str, prior: str | None, truths: str | None, fix: Sequence[str],
     given: Mapping[str, Any],
     runs: int, seed: int, posterior: bool, full: bool, outputs: Outputs | None,
-    resume: bool, overwrite: bool,
+    resume: bool, overwrite: bool, scheduler: str | None = None,
 ) -> int:  # fmt: skip
     """Check a method on a model by simulation: do its intervals hold the truth as often as they say?"""
     keep_kernels()
@@ -39,7 +39,7 @@ def run(
         tree = sbc(
             problem, value, prior=chosen, runs=runs, simulate_from=PRIORS[truths] if truths is not None else None,
             around="data" if posterior else None, key=seed, progress=advance, resume=resume,
-            overwrite=overwrite, store=None if outputs is None else outputs.folder / "runs",
+            overwrite=overwrite, scheduler=scheduler, store=None if outputs is None else outputs.folder / "runs",
         )  # fmt: skip
     tree.attrs["model"] = model.stem
     table = coverage_table(tree)

@@ -1,7 +1,7 @@
 """`study`: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,46 +10,69 @@ import xarray as xr
 
 from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.cli.kernels import keep_kernels
-from probcal.cli.models import call, load_model
+from probcal.cli.models import Setting
 from probcal.cli.progress import bar
 from probcal.diagnostics import grid_of, study_table
+from probcal.errors import InputError
 from probcal.files import Outputs
-from probcal.inference import study
+from probcal.inference import load_study, study
+from probcal.inference.progress import OnProgress, Progress
 from probcal.inference.study import choose_methods
 from probcal.results.io import save
+
+PARTLY = 30.0  # s after which table and picture are made anew while fits go on
 
 
 def run(
     model: Path, grid: Mapping[str, list[Any]], methods: Sequence[str], *, runs: int, seed: int,
-    outputs: Outputs | None, resume: bool, overwrite: bool,
+    outputs: Outputs | None, resume: bool, overwrite: bool, scheduler: str | None = None,
 ) -> int:  # fmt: skip
     """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
     keep_kernels()
     chosen = choose_methods(methods)
-    module = load_model(model)
+    setting = Setting.of(model)
     began = time.perf_counter()
     if outputs is not None and overwrite:
         outputs.begin()
     with bar() as advance:
         found = study(
-            lambda run, **point: call(module, model, "setting", run, **point),
-            grid, chosen, runs=range(seed, seed + runs), progress=advance, resume=resume, overwrite=overwrite,
-            store=None if outputs is None else outputs.folder / "runs",
+            setting, grid, chosen, runs=range(seed, seed + runs), resume=resume, overwrite=overwrite,
+            store=None if outputs is None else outputs.folder / "runs", scheduler=scheduler,
+            progress=advance if outputs is None else partly(outputs, advance),
         )  # fmt: skip
     table = study_table(found)
     print(table.to_string(index=False, float_format=lambda value: f"{value:.4g}"))
     print(f"{found['status'].size} fits in {time.perf_counter() - began:.1f} s")
     if outputs is not None:
         with outputs.writing(found.attrs["identity"]):
-            write_csv(table, outputs.folder / "study.csv")
             save(xr.DataTree(found), outputs.folder / "study.nc")
-            say_written(_files(found, outputs.folder))
+            say_written([outputs.folder / "study.nc", *_drawn(found, outputs.folder)])
     return 0
 
 
-def _files(found: xr.Dataset, out: Path) -> list[Path]:
-    """The files of a study, its picture drawn."""
-    files = [out / "study.nc", out / "study.csv"]
+def partly(outputs: Outputs, advance: OnProgress, clock: Callable[[], float] = time.monotonic) -> OnProgress:
+    """Progress that now and then writes table and picture of the fits that are finished."""
+    last = clock()
+
+    def told(at: Progress) -> None:
+        nonlocal last
+        advance(at)
+        if at.done < at.total and clock() - last >= PARTLY:
+            found = load_study(outputs.folder)
+            try:
+                with outputs.writing(found.attrs["identity"]):
+                    _drawn(found, outputs.folder)
+            except InputError:  # another has changed them meanwhile: the end of the study says so
+                pass
+            last = clock()
+
+    return told
+
+
+def _drawn(found: xr.Dataset, out: Path) -> list[Path]:
+    """Write table and picture of a study: the files."""
+    files = [out / "study.csv"]
+    write_csv(study_table(found), files[0])
     if can_plot() and any(np.issubdtype(found[name].dtype, np.number) for name in grid_of(found)):
         from probcal.plots import draw_study  # the plot packages are an extra
 

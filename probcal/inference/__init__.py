@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from probcal.inference.coverage import coverage_table
     from probcal.inference.evidence import Evidence, log_evidence
     from probcal.inference.fit import calibrate, fit, track
+    from probcal.inference.fits import load_study
     from probcal.inference.methods import (
         EA,
         EM,
@@ -36,6 +37,7 @@ __all__ = lazy(
         "probcal.inference.coverage": "coverage_table",
         "probcal.inference.evidence": "Evidence log_evidence",
         "probcal.inference.fit": "calibrate fit track",
+        "probcal.inference.fits": "load_study",
         "probcal.inference.methods": "EA EM EMEA MAP METHODS NUTS Collapsed LeastSquares ParticleGibbs table",
         "probcal.inference.model": "numpyro_model",
         "probcal.inference.run": "Method",

@@ -1,4 +1,7 @@
-"""What run a folder holds: its manifest, the names of its parts, and their removal; nothing heavy is loaded."""
+"""What run a folder holds: its manifest, the names of its parts, and their removal; nothing heavy is loaded.
+
+The parts of a run are numbered files, or one zarr store: the fits of a study.
+"""
 
 import hashlib
 import json
@@ -13,8 +16,13 @@ from probcal.errors import InputError
 from probcal.files import Lock, cannot_write, write_whole
 
 MANIFEST = "probcal-run.json"
-KINDS = {"draws": "chunk", "sbc": "runs", "study": "fits"}  # what a folder holds: the name of its parts
+KINDS = {"draws": "chunk", "sbc": "runs"}  # what a folder holds: the name of its numbered parts
+STORE = "fits.zarr"  # the part of a study
+MARK = "probcal"  # attribute of a store that is complete: the digest of its run
 OLDER = re.compile(r"state\.npz|chunk-\d+\.nc|batch-\d+\.npz|runs\.json")  # of probcal before the manifest
+OLD_FITS = re.compile(r"fits-\d+\.npz")  # of probcal before the zarr store
+_IN_STORE = re.compile(r"(\w+/)?(zarr\.json|c(/\d+)+)")
+_DRAFT = re.compile(r".*\.[0-9a-f]{32}\.partial")  # that a killed write of zarr leaves
 OVERWRITE = "give --overwrite (overwrite=True) to begin anew"
 REMEDY = "give --resume (resume=True) to go on with it, --overwrite (overwrite=True) to replace it, or another folder"
 
@@ -43,6 +51,35 @@ def parts_of(path: Path) -> dict[int, Path]:
     return {int(match[2]): path / name for match, name in matches if match}
 
 
+def store_mark(path: Path) -> str:
+    """Digest of the run whose fits the zarr store in a folder holds; empty where there is none, or half of one."""
+    try:
+        return str(json.loads((path / STORE / "zarr.json").read_text())["attributes"][MARK])
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+
+
+def holds_parts(path: Path) -> bool:
+    """Whether a folder holds parts of a run."""
+    return bool(parts_of(path) or store_mark(path))
+
+
+def clear_store(path: Path, *, drafts: bool = False) -> None:
+    """Remove the zarr store in a folder, its description first: what a kill leaves is none. Or only killed writes."""
+    store = path / STORE
+    pattern = _DRAFT if drafts else re.compile(f"{_IN_STORE.pattern}|{_DRAFT.pattern}")
+    if not drafts:
+        (store / "zarr.json").unlink(missing_ok=True)
+    for folder, _, names in os.walk(store, topdown=False):
+        for name in names:
+            file = Path(folder, name)
+            if pattern.fullmatch(file.relative_to(store).as_posix()):
+                file.unlink(missing_ok=True)
+        if not drafts:
+            with suppress(OSError):  # it holds something else
+                os.rmdir(folder)
+
+
 def read_manifest(path: Path) -> tuple[str, dict[str, str]]:
     """Kind and identity of the run in a folder."""
     file = path / MANIFEST
@@ -66,6 +103,7 @@ def described(path: Path) -> str:
 def clear_parts(path: Path) -> None:
     """Remove all parts, the last first: what a kill leaves is a run that stopped earlier."""
     try:
+        clear_store(path)
         for _, file in sorted(parts_of(path).items(), reverse=True):
             file.unlink(missing_ok=True)
     except OSError as error:
@@ -104,6 +142,6 @@ def stored_digest(path: str | PathLike[str]) -> str:
 def stored_run(path: str | PathLike[str]) -> str:
     """What the run in a folder is, in a few words; empty where there is none."""
     path = Path(path)
-    if not path.is_dir() or not (path / MANIFEST).exists() or not parts_of(path):
+    if not path.is_dir() or not (path / MANIFEST).exists() or not holds_parts(path):
         return ""
     return described(path)

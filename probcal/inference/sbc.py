@@ -9,7 +9,7 @@ target whose start is not declared would pass many network sizes away.
 
 import os
 import time
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import closing
 from copy import copy
 from dataclasses import replace
 from typing import Any
@@ -31,6 +31,7 @@ from probcal.inference.quantities import TAKEN, Points, Pool, Trial, pool_of, ra
 from probcal.inference.run import Context, Method
 from probcal.inference.sampler import Sampler
 from probcal.inference.solve import solve
+from probcal.inference.spread import check_scheduler, spread
 from probcal.inference.storage import Records, Storage
 from probcal.inference.uniformity import NOMINAL
 from probcal.model import variants
@@ -66,6 +67,7 @@ def sbc(
     overwrite: bool = False,
     fallback: bool = True,
     threads: int | None = None,
+    scheduler: Any = None,
     progress: OnProgress | None = None,
 ) -> xr.DataTree:
     """Simulation-based calibration of a method on a problem: ranks, coverage of intervals, and a verdict.
@@ -77,13 +79,13 @@ def sbc(
     Without `fallback` a sampler stands alone: the joint sampler does not take over where its collapse does not fit.
     `store` is a folder that keeps finished runs, `resume` goes on with it, for more `runs` too, `overwrite` replaces
     what it holds; results depend neither on an interruption nor on the number of `threads`. Ctrl-C leaves what was
-    finished.
+    finished. `scheduler` spreads the runs over a dask cluster, as that of `study` does.
 
     Groups: `sbc` by run and quantity (`truth`, `mean`, `sd`, `rank` among `draws`, `place` in (0, 1), `inside` by
     nominal interval), `run` (`status`, `seconds`, ...), `uniformity` (p-values), `coverage` (see `coverage_table`).
     Attributes: `status` ("uniform", "not uniform"), `verdict`, `false_alarm_rate` of all quantities together.
     Raises `InputError` for a prior that cannot be drawn from and a folder that holds another run, and `FitError` where
-    no run left a posterior.
+    no run left a posterior, or a cluster is lost on the way.
     """
     if not isinstance(method, Method):
         raise InputError(f"sbc: method must be a value such as NUTS() or EA(), got {method!r}")
@@ -91,6 +93,7 @@ def sbc(
         raise InputError(f"sbc(runs={runs}, draws={draws}): give at least 2 runs and 10 draws")
     if start not in STARTS:
         raise InputError(f'sbc: start "{start}" is not known; give "automatic" or "truth"')
+    check_scheduler(scheduler)
     prior = choose_prior(method, prior)
     check_problem(problem)
     key = as_key(key)
@@ -99,7 +102,7 @@ def sbc(
     with Storage(store, "sbc", identity, resume=resume, overwrite=overwrite) as storage:
         kept = Records(storage)
         engine.prepare()
-        records, interrupted = _runs(engine, kept, runs, threads, progress)
+        records, interrupted = _runs(engine, kept, runs, threads, scheduler, progress)
     tree = _tree(engine, {k: records[k] for k in range(runs) if k in records}, interrupted)
     if store is not None:
         tree.attrs["identity"] = storage.digest
@@ -107,33 +110,18 @@ def sbc(
 
 
 def _runs(
-    engine: "_Engine", box: Records, runs: int, threads: int | None, progress: OnProgress | None
+    engine: "_Engine", box: Records, runs: int, threads: int | None, scheduler: Any, progress: OnProgress | None
 ) -> tuple[dict[int, dict[str, np.ndarray]], bool]:
     """Records of all runs, those kept and those made now, and whether Ctrl-C stopped them."""
     missing = [k for k in range(runs) if k not in box.records]
     batches = [missing[:1], *(missing[k : k + BATCH] for k in range(1, len(missing), BATCH))] if missing else []
-
-    def one(batch: list[int]) -> None:
-        with jax.enable_x64(True):
-            box.add(batch, [engine.run(k) for k in batch])
-
-    def told() -> None:
-        if progress is not None:
-            progress(Progress("runs", sum(k in box.records for k in range(runs)), runs))
-
     interrupted = False
     try:
-        if batches:
-            one(batches[0])  # compiles
-            told()
-        pool = ThreadPoolExecutor(threads or os.cpu_count())
-        waiting: list[Future[None]] = [pool.submit(one, batch) for batch in batches[1:]]
-        try:
-            for finished in as_completed(waiting):
-                finished.result()
-                told()
-        finally:
-            pool.shutdown(cancel_futures=True)
+        with closing(spread(engine.several, batches, scheduler=scheduler, threads=threads)) as finished:
+            for k, records in finished:
+                box.add(batches[k], records)
+                if progress is not None:
+                    progress(Progress("runs", sum(k in box.records for k in range(runs)), runs))
     except KeyboardInterrupt:
         interrupted = True
         if len(box.records) < 2:
@@ -213,6 +201,11 @@ class _Engine:
         context = Context(keys[0], threads=1, fallback=self.other)
         answer = solve(problem, self.method, self.prior, context, start=start)
         return pool_of(answer, keys[1])
+
+    def several(self, numbers: list[int]) -> list[dict[str, np.ndarray]]:
+        """The records of some runs."""
+        with jax.enable_x64(True):
+            return [self.run(number) for number in numbers]
 
     def run(self, number: int) -> dict[str, np.ndarray]:
         """The record of one run."""

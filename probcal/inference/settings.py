@@ -7,7 +7,7 @@ from probcal.errors import InputError
 
 RESERVED = ("run", "estimator", "method", "bias_label", "bias_rmse", "coverage", "position_rmse", "status",
             "iterations", "error", "lower", "upper", "true", "sd", "gamma", "mean", "median", "worst", "position",
-            "runs")  # fmt: skip
+            "runs", "ran", "problem")  # fmt: skip
 
 
 def check_setting(name: str, values: Sequence[Any]) -> None:

@@ -1,9 +1,9 @@
 """Work on its way to disk: a folder with the numbered parts of one run, each whole or absent, safe against a kill.
 
 A folder holds the manifest of a run (what it is, see `identity`) and a file for every part: a chunk of a sampler's
-draws with the state after it, or the records of some runs of `sbc` or `study`. Every part carries its number, the
-digest of its run and a checksum, and is written in one step. One process at a time works in a folder. Nothing is
-removed but files that carry the names made here, in a folder with a manifest.
+draws with the state after it, or the records of some runs of `sbc`. Every part carries its number, the digest of its
+run and a checksum, and is written in one step. The fits of a study are one zarr store instead (`fits.py`). One process
+at a time works in a folder. Nothing is removed but files that carry the names made here, in a folder with a manifest.
 """
 
 import io
@@ -22,6 +22,7 @@ from probcal.files import Lock, clear_drafts, make_folder, write_whole
 from probcal.inference.manifest import (
     KINDS,
     MANIFEST,
+    OLD_FITS,
     OLDER,
     OVERWRITE,
     REMEDY,
@@ -29,6 +30,7 @@ from probcal.inference.manifest import (
     clear_parts,
     described,
     digest_of,
+    holds_parts,
     parts_of,
     read_manifest,
     remove_parts,
@@ -76,12 +78,14 @@ class Storage:
     def _open(self, path: Path, resume: bool, overwrite: bool) -> None:
         clear_drafts(path)
         there = (path / MANIFEST).exists()
-        files = parts_of(path)
-        if not there and (files or any(OLDER.fullmatch(name) for name in os.listdir(path))):
+        files, names = holds_parts(path), os.listdir(path)
+        if not there and (files or any(OLDER.fullmatch(name) for name in names)):
             raise InputError(
                 f"{path} holds parts of a run without its manifest {MANIFEST} (it was lost, or written by an older"
                 " probcal): move them away, or give another folder"
             )
+        if any(OLD_FITS.fullmatch(name) for name in names):
+            raise InputError(f"{path} holds fits-*.npz of an older probcal: move them away, or give another folder")
         if there and files and not overwrite:
             if not resume:
                 raise InputError(f"{path} holds {described(path)} already; {REMEDY}")
@@ -155,7 +159,7 @@ class Storage:
         """Let another process work in the folder; one without any part is left as it was found."""
         if self.path is None or self._lock is None:
             return
-        if not self._numbers:
+        if not holds_parts(self.path):
             remove_parts(self.path, self._lock, folder=self._made)
         else:
             self._lock.release()

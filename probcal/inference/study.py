@@ -1,12 +1,11 @@
 """Studies: methods side by side over settings and simulated runs, many fits in one compiled kernel."""
 
 import itertools
-import json
-import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from functools import partial
 from os import PathLike
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +15,7 @@ import xarray as xr
 
 from probcal.errors import InputError, nearest
 from probcal.inference.ending import conclude
+from probcal.inference.fits import Fits, open_fits
 from probcal.inference.identity import identity, problem_digest
 from probcal.inference.integrate import Integrated, Integration, integrate
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
@@ -35,21 +35,19 @@ from probcal.inference.run import (
 from probcal.inference.sampler import Sampler
 from probcal.inference.settings import check_setting
 from probcal.inference.solve import solve
-from probcal.inference.storage import Records, Storage
+from probcal.inference.spread import check_scheduler, spread
+from probcal.inference.storage import Storage
 from probcal.model.model import Model
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.results.schema import INTERVAL
 from probcal.simulate import Truth
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.mode import Point
 from probcal.starts import automatic_start
 
-BATCH = 10  # runs that one compiled call solves
 CHECKED = 20  # stored problems that a resumed study makes anew, to see whether the model is still the same
 ORACLE = "oracle"  # MAP whose prior knows which biases are zero
-VECTORS = ("error", "lower", "upper", "true", "sd", "gamma")  # by bias, over its scale; the interval less the truth
 SEED = 0  # of what an E-step draws
 NOTHING = np.zeros(0)  # the trace of a batch, which keeps none
 Setting = Callable[..., tuple[Problem, Truth]]
@@ -128,18 +126,18 @@ def _form(run: _Run) -> tuple[Any, ...]:
 
 
 def _batch(
-    setting: Setting, cases: Sequence[tuple[dict[str, Any], int]], methods: Mapping[str, tuple[Method, Prior]], *,
-    stored: bool = False,
+    setting: Setting, methods: Mapping[str, tuple[Method, Prior]], stored: bool,
+    batch: tuple[dict[str, Any], list[int]],
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Records of all methods on some cases (grid point, run); one of them says what its problem was, if `stored`."""
+    """Records of all methods on some runs of a grid point; one of them says what its problem was, if `stored`."""
+    point, numbers = batch
     with jax.enable_x64(True):
-        whole = [_simulated(setting, point, run, _needs_linear(methods)) for point, run in cases]
+        whole = [_simulated(setting, point, number, _needs_linear(methods)) for number in numbers]
         found: list[dict[str, Any]] = []
         for name, (method, prior) in methods.items():
             if isinstance(method, Sampler) or method.by_particles:
                 found += [
-                    {"case": case, "method": name} | _record(run, _drawn(run, method, prior))
-                    for case, run in zip(cases, whole, strict=True)
+                    {"run": run.number, "method": name} | _record(run, _drawn(run, method, prior)) for run in whole
                 ]
                 continue
             assert isinstance(method, Maximiser)
@@ -164,11 +162,16 @@ def _batch(
                     state, mixed, square, count = jax.tree.map(lambda leaf, j=j: leaf[j], solved)
                     problem = chosen[j].problem.with_mixing(state.mixing)
                     answer = conclude(problem, method, prior, state, NOTHING, float(square), int(count), how, mixed)
-                    found.append({"case": cases[k], "method": name} | _record(chosen[j], answer))
+                    found.append({"run": runs[k].number, "method": name} | _record(chosen[j], answer))
         if stored:
-            first = next(record for record in found if record["case"] == cases[0])
-            first["problem"] = problem_digest(whole[0].problem, whole[0].truth.biases)
+            first = next(record for record in found if record["run"] == numbers[0])
+            first["problem"] = _number(whole[0].problem, whole[0].truth)
         return found
+
+
+def _number(problem: Problem, truth: Truth) -> int:
+    """A number that says what a problem and its truth are, not 0."""
+    return int(problem_digest(problem, truth.biases)[:15], 16) + 1
 
 
 def _simulated(setting: Setting, point: dict[str, Any], number: int, linear: bool) -> _Run:
@@ -263,6 +266,7 @@ def study(
     store: str | PathLike[str] | None = None,
     resume: bool = False,
     overwrite: bool = False,
+    scheduler: Any = None,
     progress: OnProgress | None = None,
 ) -> xr.Dataset:
     """Fit every run of every setting by every method: errors, coverage and status by setting, method and run.
@@ -274,11 +278,15 @@ def study(
     `bias_rmse` (root mean square of the errors over their scales), `position_rmse` in m, `coverage` of the
     intervals, `status`, `ran` (the method, or the one that took over), `iterations`; with `bias_label`: `error`,
     `lower` and `upper` end of the interval less the truth, `true`, `sd` (all over their scales) and `gamma`.
-    `store` is a folder that keeps finished fits, `resume` goes on with it, for more runs and settings too, `overwrite`
-    replaces what it holds; an interruption changes no result.
-    Raises `InputError` for an unknown method, settings whose biases differ and a folder that holds another study. Runs
-    are solved in batches by compiled kernels, on as many threads as there are processors.
+    `store` is a folder that keeps finished fits as zarr (`load_study` reads them meanwhile), `resume` goes on with it,
+    for more runs and settings too, `overwrite` replaces what it holds; an interruption changes no result.
+    Runs are solved in batches by compiled kernels, on as many threads as there are processors; `scheduler` spreads them
+    otherwise: "local" (processes of this machine), the address of a dask scheduler, or a `distributed.Client`. The
+    numbers are the same, bit for bit, on processors of one kind.
+    Raises `InputError` for an unknown method, settings whose biases differ and a folder that holds another study, and
+    `FitError` where a cluster is lost on the way.
     """
+    check_scheduler(scheduler)
     chosen = _pairs(methods) if isinstance(methods, Mapping) else choose_methods(methods)
     numbers = list(range(int(runs))) if isinstance(runs, (int, np.integer)) else [int(number) for number in runs]
     axes = {name: _values(name, values) for name, values in grid.items()}
@@ -286,123 +294,43 @@ def study(
         raise InputError("study: give at least one run, one method and one value of every setting")
     if len(set(numbers)) < len(numbers):
         raise InputError("study: a run is given twice; give every run once")
-    points = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
     made = {} if store is None else identity(list_of_methods=chosen)
     with Storage(store, "study", made, resume=resume, overwrite=overwrite) as storage:
-        kept = _Kept(storage, setting)
-        records = _fits(setting, points, numbers, chosen, kept, progress)
-    found = _dataset(records, axes, list(chosen), numbers)
+        fits = open_fits(storage, axes, list(chosen), numbers)
+        _check_model(fits, setting, storage.path)
+        _fit_missing(fits, setting, axes, numbers, chosen, storage.path is not None, scheduler, progress)
+    found = fits.dataset(axes, numbers)
     if store is not None:
         found.attrs["identity"] = storage.digest
     return found
 
 
-def _fits(
-    setting: Setting, points: list[dict[str, Any]], numbers: list[int],
-    methods: Mapping[str, tuple[Method, Prior]], kept: "_Kept", progress: OnProgress | None,
-) -> list[dict[str, Any]]:  # fmt: skip
-    """Records of all methods at all points and runs, those kept and those made now."""
-    wanted = {_case(point, run) for point in points for run in numbers}
-    records = [record for record in kept.records() if _case(*record["case"]) in wanted]
-    there = {_case(*record["case"]) for record in records}
-    batches = []
-    for point in points:
-        missing = [(point, run) for run in numbers if _case(point, run) not in there]
-        batches += [missing[k : k + BATCH] for k in range(0, len(missing), BATCH)]
-    firsts = [kept.next + k * BATCH * len(methods) for k in range(len(batches))]
-    total = len(wanted) * len(methods)
-
-    def one(cases: list[tuple[dict[str, Any], int]], first: int) -> list[dict[str, Any]]:
-        found = _batch(setting, cases, methods, stored=kept.stored)
-        kept.add(first, found)
-        return found
-
-    def take(found: list[dict[str, Any]]) -> None:
-        records.extend(found)
-        if progress is not None:
-            progress(Progress("fits", len(records), total))
-
-    if batches:
-        take(one(batches[0], firsts[0]))  # compiles
-        pool = ThreadPoolExecutor(os.cpu_count())
-        try:
-            for found in pool.map(one, batches[1:], firsts[1:]):
-                take(found)
-        finally:
-            pool.shutdown(cancel_futures=True)
-    return records
+def _fit_missing(
+    fits: Fits, setting: Setting, axes: Mapping[str, list[Any]], numbers: list[int],
+    methods: Mapping[str, tuple[Method, Prior]], stored: bool, scheduler: Any, progress: OnProgress | None,
+) -> None:  # fmt: skip
+    """Fit what is missing of a grid and runs."""
+    wanted = set(numbers)
+    points = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+    blocks = [(point, [run for run in runs if run in wanted]) for point in points for runs in fits.missing(point)]
+    batches = [(point, runs) for point, runs in blocks if runs]
+    total = len(points) * len(numbers) * len(methods)
+    with closing(spread(partial(_batch, setting, methods, stored), batches, scheduler=scheduler)) as finished:
+        for k, records in finished:
+            fits.add(batches[k][0], records)
+            if progress is not None:
+                progress(Progress("fits", fits.count(axes, numbers), total))
 
 
-def _case(point: Mapping[str, Any], run: int) -> str:
-    """A grid point and a run as text."""
-    return json.dumps([dict(point), run], sort_keys=True)
-
-
-class _Kept:
-    """Records of a study in a storage, where there is one; raises `InputError` where the model is another by now."""
-
-    def __init__(self, storage: Storage, setting: Setting):
-        self.stored = storage.path is not None
-        self.box = Records(storage)
-        marked = [record for record in self.box.records.values() if "problem" in record]
-        for record in marked[:: -(-len(marked) // CHECKED) or 1]:
-            point, run = json.loads(str(record["case"]))
-            with jax.enable_x64(True):
-                problem, truth = _made(setting, point, run, False)
-                same = problem_digest(problem, truth.biases) == str(record["problem"])
-            if not same:
-                raise InputError(
-                    f"{storage.path}: setting(run={run}, ...) gives another problem than when the study there began:"
-                    " the model has changed; go on with it as it was, give another folder, or --overwrite"
-                    " (overwrite=True)"
-                )
-
-    @property
-    def next(self) -> int:
-        """The first number that no record has."""
-        return max(self.box.records, default=-1) + 1
-
-    def records(self) -> list[dict[str, Any]]:
-        """What is kept, as `_batch` gave it."""
-        found = []
-        for record in self.box.records.values():
-            point, run = json.loads(str(record["case"]))
-            texts = {name: str(record[name]) for name in ("method", "status", "ran")}
-            labels = tuple(record["labels"].tolist())
-            found.append(record | texts | {"case": (point, run), "labels": labels})
-        return found
-
-    def add(self, first: int, records: list[dict[str, Any]]) -> None:
-        """Keep the records of a batch, from a number on."""
-        if self.stored:
-            named = [record | {"case": _case(*record["case"])} for record in records]
-            self.box.add(range(first, first + len(records)), named)
-
-
-def _dataset(
-    records: list[dict[str, Any]], axes: Mapping[str, list[Any]], methods: list[str], runs: list[int]
-) -> xr.Dataset:
-    labels = records[0]["labels"]
-    if any(record["labels"] != labels for record in records):
-        raise InputError("study: the settings have different biases; make one study for each network")
-    dims = (*axes, "estimator", "run")
-    shape = (*(len(values) for values in axes.values()), len(methods), len(runs))
-    scalars: dict[str, Any] = {name: np.full(shape, np.nan) for name in ("bias_rmse", "coverage", "position_rmse")}
-    scalars |= {name: np.full(shape, "", "<U16") for name in ("status", "ran")}
-    scalars["iterations"] = np.zeros(shape, int)
-    vectors = {name: np.full((*shape, len(labels)), np.nan) for name in VECTORS}
-    for record in records:
-        point, run = record["case"]
-        where = (
-            *(axes[name].index(point[name]) for name in axes), methods.index(record["method"]), runs.index(run),
-        )  # fmt: skip
-        for name, values in (scalars | vectors).items():
-            values[where] = record[name]
-    if np.isnan(scalars["position_rmse"]).all():
-        del scalars["position_rmse"]
-    return xr.Dataset(
-        {name: (dims, values) for name, values in scalars.items()}
-        | {name: ((*dims, "bias_label"), values) for name, values in vectors.items()},
-        coords={**axes, "estimator": methods, "run": runs, "bias_label": list(labels)},
-        attrs={"interval_probability": INTERVAL},
-    )
+def _check_model(fits: Fits, setting: Setting, path: Path | None) -> None:
+    """Raise `InputError` where a setting gives other problems than those that were fitted."""
+    known = fits.problems()
+    for point, run, number in known[:: -(-len(known) // CHECKED) or 1]:
+        with jax.enable_x64(True):
+            same = _number(*_made(setting, point, run, False)) == number
+        if not same:
+            raise InputError(
+                f"{path}: setting(run={run}, ...) gives another problem than when the study there began:"
+                " the model has changed; go on with it as it was, give another folder, or --overwrite"
+                " (overwrite=True)"
+            )

@@ -22,7 +22,7 @@ def plot_study(study: xr.Dataset, variable: str = "bias_rmse", axes: Sequence[Ax
     if along is None:
         raise InputError("plot_study: no setting of the study is a number; there is nothing to draw along")
     others = [name for name in grid if name != along]
-    facets = study[variable].stack(facet=others) if others else study[variable].expand_dims(facet=[()])
+    facets = study[variable].stack(facet=others) if others else study[variable].expand_dims("facet")
     count = facets.sizes["facet"]
     if axes is None:
         figure = Figure(figsize=(1.2 + 4.6 * count, 3.8), layout="constrained")
