@@ -107,15 +107,18 @@ def make_folder(path: str | PathLike[str]) -> Path:
 
 
 class Lock:
-    """The right to work in a folder, held by one process at a time; `release` gives it back, a kill too."""
+    """The right to work in a folder, held by one process at a time; `release` gives it back, a kill too.
 
-    def __init__(self, folder: Path):
+    Raises `InputError` where another holds it for longer than `wait` s.
+    """
+
+    def __init__(self, folder: Path, wait: float = 0.0):
         import filelock  # slow to load, and only writers of folders need it
 
         self.path = folder / LOCK
         self._lock = filelock.FileLock(self.path)
         try:
-            self._lock.acquire(timeout=0)
+            self._lock.acquire(timeout=wait)
         except filelock.Timeout:
             raise InputError(
                 f"{folder}: another process is working there; wait until it has ended, or give another folder"

@@ -17,7 +17,7 @@ from terminal import run
 from worlds import heights
 
 from probcal import MAP, FitError, Gaussian, InputError, load_study, sbc, study
-from probcal.cli.models import Setting
+from probcal.cli.models import ModelFile
 from probcal.cli.study import PARTLY, partly
 from probcal.files import Outputs
 from probcal.inference import spread as spreading
@@ -113,9 +113,9 @@ def test_a_worker_that_cannot_do_the_work_says_why(tmp_path, monkeypatch):
 def test_a_setting_is_loaded_where_it_is_used(tmp_path):
     path = tmp_path / "small.py"
     path.write_text(MODEL)
-    setting = cloudpickle.loads(cloudpickle.dumps(Setting.of(path)))
+    setting = cloudpickle.loads(cloudpickle.dumps(ModelFile.of(path).setting))
     assert setting(3)[0].labels == ("n0.shift", "n1.shift")
-    moved = Setting(path, "another digest")
+    moved = ModelFile(path, "another digest").setting
     path.unlink()
     with pytest.raises(InputError, match=r"small\.py is not there on .*, or another file than here; put it where all"):
         moved(3)

@@ -39,6 +39,13 @@ ERRORS = [  # of options and arguments, with the end of what is said
     ("fit {plaza} --method nuts --resume", "--resume needs --out, the folder of the run to go on with"),
     ("fit {plaza} --out none --resume", '--resume: "ea" keeps no draws to go on with; take collapsed, nuts or svi'),
     ("fit {plaza} --overwrite", "--overwrite needs --out, the folder whose run it replaces"),
+    ("fit {plaza} README.md CHANGELOG.md", "several recordings need --out, the folder for a fit of each and the table"),
+    ("fit {plaza} README.md none.csv --out none", "none.csv: no such file"),
+    (
+        "fit {plaza} README.md benchmarks/README.md --out none",
+        "README.md and benchmarks/README.md would both be fitted into none/README; give them different names",
+    ),
+    ("fit {plaza} README.md --scheduler local", "--scheduler spreads the fits of several recordings; give more"),
     ("study {plaza} --resume", "study: --resume needs --out DIR, the folder of the fits to go on with"),
     ("study {plaza} --set share=0:1:1e-9", "these are 1000000000 values; give 10000 of them at most"),
     ("fit {plaza} --out pyproject.toml/fit", "pyproject.toml/fit cannot be written: Not a directory"),

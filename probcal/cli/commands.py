@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -52,7 +52,10 @@ def _say(text: object) -> None:
 @app.command(name="fit")
 def fit_command(
     model: Model,
-    data: Data = None,
+    data: Annotated[
+        list[Path] | None,
+        typer.Argument(help="table of rows (CSV), or several recordings; the model's own data if left out"),
+    ] = None,
     method: Method = "ea",
     prior: Annotated[
         str | None, typer.Option(help=" | ".join(PRIORS) + "; the model's or the method's own if left out")
@@ -65,8 +68,11 @@ def fit_command(
     chains: Annotated[int | None, typer.Option(min=1, help="chains of a sampler")] = None,
     draws: Annotated[int | None, typer.Option(min=1, help="draws of each chain after warm-up")] = None,
     warmup: Annotated[int | None, typer.Option(min=0, help="steps of each chain before its draws")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="go on with the stopped run of a sampler in --out")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="go on with the stopped run of a sampler, or with the recordings, in --out")
+    ] = False,
     overwrite: Overwrite = False,
+    scheduler: Scheduler = None,
     save: Annotated[
         str, typer.Option(help="draws to keep in fit.nc besides those of the biases: states,predictive")
     ] = "",
@@ -78,7 +84,10 @@ def fit_command(
         str | None, typer.Option(help="rigid | similarity: how the answer is laid on a truth in another frame")
     ] = None,
 ) -> None:
-    """Calibrate: one row a bias, and where the truth is known the position error before and after."""
+    """Calibrate: one row a bias, and where the truth is known the position error before and after.
+
+    Several recordings of one network are fitted each into a folder below --out, with one table of all, fits.csv.
+    """
     if method not in METHODS:
         raise InputError(f'--method "{method}" is not known{nearest(method, METHODS)}')
     if prior is not None and prior not in PRIORS:
@@ -87,21 +96,33 @@ def fit_command(
     sizes = options.chain_sizes(method, {"chains": chains, "draws": draws, "warmup": warmup})
     if resume and out is None:
         raise InputError("--resume needs --out, the folder of the run to go on with")
-    options.check_resumed(method, resume)
+    recordings = options.recordings(data or (), out, scheduler)
+    if not recordings:
+        options.check_resumed(method, resume)
     kept = options.saved_names(save)
     arguments = options.given(given or ())
     options.check_alignment(align)
-    options.check_files(model, data)
+    chosen: dict[str, Any] = dict(
+        method=method, prior=prior, fix=fix or (), given=arguments, starts=starts, seed=seed, sizes=sizes, kept=kept,
+        assessed=assessed, epoch=epoch, align=align,
+    )  # fmt: skip
+    if recordings:
+        options.check_files(model)
+        with outputs.results_of_a_run(out, outputs.RECORDINGS, "runs", resume=resume, overwrite=overwrite) as table:
+            from probcal.cli import recordings as several
+
+            assert table is not None
+            raise typer.Exit(
+                several.run(
+                    model, recordings, outputs=table, resume=resume, overwrite=overwrite, scheduler=scheduler, **chosen
+                )
+            )  # fmt: skip
+    one = data[0] if data else None
+    options.check_files(model, one)
     with outputs.results_of_a_run(out, outputs.FIT, "draws", resume=resume, overwrite=overwrite) as results:
         from probcal.cli import fit
 
-        raise typer.Exit(
-            fit.run(
-                model, data, method=method, prior=prior, fix=fix or (), given=arguments, starts=starts,
-                seed=seed, outputs=results, sizes=sizes, resume=resume, overwrite=overwrite, kept=kept,
-                assessed=assessed, epoch=epoch, align=align,
-            )
-        )  # fmt: skip
+        raise typer.Exit(fit.run(model, one, outputs=results, resume=resume, overwrite=overwrite, **chosen))
 
 
 @app.command(name="simulate")

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from probcal.files import Outputs
 from probcal.inference import METHODS, calibrate
 from probcal.inference.fit import linear_form
 from probcal.inference.manifest import remove_run
+from probcal.inference.progress import OnProgress
 from probcal.results.alignment import KINDS
 from probcal.results.io import save
 from probcal.results.read import outliers, summary
@@ -32,19 +34,38 @@ LONG = 60.0  # s of a fit that is written before it is assessed
 
 
 def run(
-    model: Path, data: Path | None, *, method: str, prior: str | None, fix: Sequence[str], given: Mapping[str, Any],
-    starts: int, seed: int, outputs: Outputs | None, sizes: Mapping[str, int], resume: bool, overwrite: bool,
-    kept: Sequence[str], assessed: bool, epoch: float | None = None, align: str | None = None,
+    model: Path, data: Path | None, *, outputs: Outputs | None, resume: bool, overwrite: bool, **options: Any
 ) -> int:  # fmt: skip
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
     keep_kernels()
     drawn = ["probcal.report.page", "probcal.report.chart"] if outputs is not None and can_plot() else []
-    load_ahead(["scipy.stats", *drawn] if assessed else [])
+    load_ahead(["scipy.stats", *drawn] if options["assessed"] else [])
+    began = time.perf_counter()
+    with line() as progress:
+        tree = calibrated(
+            model, data, outputs=outputs, resume=resume, overwrite=overwrite, progress=progress, **options
+        )  # fmt: skip
+    print(table_text(tree))
+    _print_verdict(tree, time.perf_counter() - began)
+    if outputs is not None:
+        say_written(written(tree, outputs))
+        if not can_plot():
+            print('report.html is left out: pip install "probcal[plot]"')
+    return 0 if Status(tree.attrs["status"]).settled else 1
+
+
+def calibrated(
+    model: Path, data: Path | None, *, method: str, prior: str | None, fix: Sequence[str], given: Mapping[str, Any],
+    starts: int, seed: int, outputs: Outputs | None, sizes: Mapping[str, int], resume: bool, overwrite: bool,
+    kept: Sequence[str], assessed: bool, epoch: float | None = None, align: str | None = None,
+    progress: OnProgress | None = None, module: ModuleType | None = None,
+) -> xr.DataTree:  # fmt: skip
+    """The tree of a fit, assessed and scored; `module` is that of the model file where it is loaded already."""
     known, implied = METHODS[method]
     value: Any = known
     value = replace(value, **sizes) if sizes else value
     began = time.perf_counter()
-    module, problem = load_problem(model, data, fix, given, epoch)
+    module, problem = load_problem(model, data, fix, given, epoch, module)
     chosen = prior_named(module, value, implied, prior)
     truth = load_truth(module, model, data, problem, given)
     if align is not None and truth is None:
@@ -52,18 +73,17 @@ def run(
     store = None if outputs is None else outputs.folder / "draws"
     if outputs is not None and overwrite:
         outputs.begin()
-    with line() as progress:
-        tree, answer = calibrate(
-            problem, value, prior=chosen, key=seed, starts=starts, progress=progress, save=kept, store=store,
-            resume=resume, overwrite=overwrite,
-        )  # fmt: skip
-        if assessed and linear_form(answer) and answer.posterior.summary.covariance is not None:
-            from probcal.analysis import assess
+    tree, answer = calibrate(
+        problem, value, prior=chosen, key=seed, starts=starts, progress=progress, save=kept, store=store,
+        resume=resume, overwrite=overwrite,
+    )  # fmt: skip
+    if assessed and linear_form(answer) and answer.posterior.summary.covariance is not None:
+        from probcal.analysis import assess
 
-            with _safe(tree, outputs, time.perf_counter() - began > LONG):
-                near = truth if align is None else None  # of a truth in another frame no NEES
-                named = problem if problem.scans is None else answer.problem
-                tree = assess(named, tree, truth=near, key=seed, answer=answer)
+        with _safe(tree, outputs, time.perf_counter() - began > LONG):
+            near = truth if align is None else None  # of a truth in another frame no NEES
+            named = problem if problem.scans is None else answer.problem
+            tree = assess(named, tree, truth=near, key=seed, answer=answer)
     tree.attrs["model"] = model.stem
     if given:
         tree.attrs["set"] = ", ".join(f"{name}={value}" for name, value in given.items())
@@ -72,14 +92,16 @@ def run(
 
         with _safe(tree, outputs, False):
             add_scores(tree, truth, align=align)
-    print(table_text(tree))
-    _print_verdict(tree, time.perf_counter() - began)
-    if outputs is not None and store is not None:
-        with outputs.writing(tree.attrs["identity"]):
-            _write(tree, outputs)
-        if not tree.attrs.get("interrupted", 0):
-            remove_run(store, tree.attrs["identity"])  # its draws are in fit.nc now
-    return 0 if Status(tree.attrs["status"]).settled else 1
+    return tree
+
+
+def written(tree: xr.DataTree, outputs: Outputs) -> list[Path]:
+    """Write the files of a fit; the draws that it streamed are in them now and go."""
+    with outputs.writing(tree.attrs["identity"]):
+        files = _write(tree, outputs)
+    if not tree.attrs.get("interrupted", 0):
+        remove_run(outputs.folder / "draws", tree.attrs["identity"])
+    return files
 
 
 @contextmanager
@@ -163,7 +185,7 @@ def _print_findings(tree: xr.DataTree) -> None:
         print(f"- and {len(sentences) - FINDINGS} more (group finding of fit.nc, report.html)")
 
 
-def _write(tree: xr.DataTree, outputs: Outputs) -> None:
+def _write(tree: xr.DataTree, outputs: Outputs) -> list[Path]:
     out = outputs.folder
     save(tree, out / "fit.nc")
     files = [out / "fit.nc", out / "summary.csv"]
@@ -175,6 +197,4 @@ def _write(tree: xr.DataTree, outputs: Outputs) -> None:
         outputs.remove("outliers.csv")  # of an earlier fit
     if can_plot():
         files.append(report_of(tree, out))
-    say_written(files)
-    if not can_plot():
-        print('report.html is left out: pip install "probcal[plot]"')
+    return files

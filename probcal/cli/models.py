@@ -70,38 +70,48 @@ def call(module: ModuleType, path: Path, name: str, /, *arguments: Any, **option
 
 
 @dataclass(frozen=True)
-class Setting:
-    """The setting(run, ...) of a model file, which other processes load by its path, once each.
+class ModelFile:
+    """A model file, which other processes load by its path, once each; it and a table beside it must be the same there.
 
-    Raises `InputError` where they cannot read the file, or read another.
+    Raises `InputError` where they are not.
     """
 
     path: Path
     digest: str
 
     @classmethod
-    def of(cls, path: Path) -> "Setting":
-        """That of a file as it is now, loaded here."""
-        found = cls(path.resolve(), _digest(path))
-        _module_of(found)
+    def of(cls, path: Path) -> "ModelFile":
+        """A file as it is now, loaded here."""
+        check_files(path)
+        found = cls(path.resolve(), digest_of_file(path))
+        found.module()
         return found
 
-    def __call__(self, run: int, **point: Any) -> Any:
-        """The problem of a run and its truth."""
-        return call(_module_of(self), self.path, "setting", run, **point)
+    def module(self) -> ModuleType:
+        """The module of the file."""
+        return _module_of(self)
+
+    def setting(self, run: int, **point: Any) -> Any:
+        """What the setting(run, ...) of the file returns: a problem and its truth."""
+        return call(self.module(), self.path, "setting", run, **point)
 
 
 @cache
-def _module_of(setting: Setting) -> ModuleType:
-    if _digest(setting.path) != setting.digest:
+def _module_of(model: ModelFile) -> ModuleType:
+    check_here(model.path, model.digest)
+    return load_model(model.path)
+
+
+def check_here(path: Path, digest: str) -> None:
+    """Raise `InputError` where this process finds another file under a path than the one that sent it, or none."""
+    if digest_of_file(path) != digest:
         raise InputError(
-            f"{setting.path} is not there on {gethostname()}, or another file than here; put it where all workers read"
+            f"{path} is not there on {gethostname()}, or another file than here; put it where all workers read"
             " it by the same path"
         )
-    return load_model(setting.path)
 
 
-def _digest(path: Path) -> str:
+def digest_of_file(path: Path) -> str:
     """Digest of a file, empty where it cannot be read."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
@@ -115,10 +125,11 @@ def load_problem(
     fix: Sequence[str] | None = (),
     given: Mapping[str, Any] | None = None,
     epoch: float | None = None,
+    module: ModuleType | None = None,
 ) -> "tuple[ModuleType, Problem]":
     """A model file and its problem with given data and arguments, some biases held at 0, rows at common epochs."""
     check_files(model, data)
-    module, given = load_model(model), given or {}
+    module, given = load_model(model) if module is None else module, given or {}
     taken = arguments(module, "problem")
     for name in given:
         if taken is not None and name not in taken:

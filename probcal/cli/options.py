@@ -22,6 +22,29 @@ def check_files(model: Path, data: Path | None = None) -> None:
         raise InputError(f"{data}: no such file")
 
 
+def recordings(data: Sequence[Path], out: Path | None, scheduler: str | None) -> list[Path]:
+    """The recordings where there are several, none where there is one.
+
+    Raises `InputError` for those that are not there or would be fitted into one folder.
+    """
+    if len(data) < 2:
+        if scheduler is not None:
+            raise InputError("--scheduler spreads the fits of several recordings; give more than one")
+        return []
+    if out is None:
+        raise InputError("several recordings need --out, the folder for a fit of each and the table fits.csv")
+    seen: dict[str, Path] = {}
+    for path in data:
+        if not exists(path):
+            raise InputError(f"{path}: no such file")
+        if path.stem in seen:
+            raise InputError(
+                f"{seen[path.stem]} and {path} would both be fitted into {out / path.stem}; give them different names"
+            )
+        seen[path.stem] = path
+    return list(data)
+
+
 def check_fit(path: Path) -> None:
     """Raise `InputError` where there is no file of a fit to read."""
     file = path / "fit.nc" if exists(path) and path.is_dir() else path

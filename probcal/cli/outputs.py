@@ -12,13 +12,14 @@ FIT = ("fit.nc", "summary.csv", "outliers.csv", "report.html")
 SBC = ("sbc.nc", "sbc.csv", "sbc.png")
 STUDY = ("study.nc", "study.csv", "study.png")
 CHECK = ("check.nc", "check.csv", "check.png")
+RECORDINGS = ("fits.csv",)
 COMPARE = ("compare.nc", "compare.csv", "compare.png")
 CHANGES = ("changes.nc", "changes.csv", "changes.png")
 
 
 @contextmanager
 def results_of_a_run(
-    out: Path | None, names: tuple[str, ...], parts: str, *, resume: bool, overwrite: bool
+    out: Path | None, names: tuple[str, ...], parts: str, *, resume: bool, overwrite: bool, wait: float = 0.0
 ) -> Iterator[Outputs | None]:
     """The results of a run in a folder, and its parts in a folder below, for this process alone.
 
@@ -31,7 +32,7 @@ def results_of_a_run(
         return
     check_choice(resume, overwrite)
     outputs, store = replaceable(out, names), out / parts
-    lock = Lock(out)
+    lock = Lock(out, wait)
     try:
         if not resume and not overwrite:
             if outputs.there:

@@ -10,7 +10,7 @@ import xarray as xr
 
 from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.cli.kernels import keep_kernels
-from probcal.cli.models import Setting
+from probcal.cli.models import ModelFile
 from probcal.cli.progress import bar
 from probcal.diagnostics import grid_of, study_table
 from probcal.errors import InputError
@@ -30,7 +30,7 @@ def run(
     """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
     keep_kernels()
     chosen = choose_methods(methods)
-    setting = Setting.of(model)
+    setting = ModelFile.of(model).setting
     began = time.perf_counter()
     if outputs is not None and overwrite:
         outputs.begin()

@@ -18,6 +18,7 @@ from contextlib import ExitStack, contextmanager
 from functools import lru_cache
 from importlib.metadata import version
 from importlib.util import find_spec
+from threading import Lock
 from typing import TYPE_CHECKING, Any, NamedTuple
 from uuid import uuid4
 
@@ -28,9 +29,10 @@ from probcal.lazy import Later
 
 if TYPE_CHECKING:
     import cloudpickle
+    import dask
     import distributed
 else:
-    cloudpickle, distributed = Later("cloudpickle"), Later("distributed")
+    cloudpickle, dask, distributed = Later("cloudpickle"), Later("dask"), Later("distributed")
 
 LOCAL = "local"  # a scheduler and workers of this machine, for as long as the call lasts
 TIMEOUT = 10.0  # s in which a scheduler must answer
@@ -201,7 +203,30 @@ def _task(batch: Any, packed: bytes, here: _Here) -> Any:
     if folder and not jax.config.jax_compilation_cache_dir and os.path.isdir(folder):
         for name, value in here.kernels.items():
             jax.config.update(name, value)
-    return _unpacked(packed)(batch)
+    with _ALONE:
+        return _unpacked(packed)(batch)
+
+
+class _Alone:
+    """While a thread is inside, dask means threads: else xarray locks the files that it writes through the cluster."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._set = Lock(), 0, ExitStack()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._set.enter_context(dask.config.set(scheduler="threads"))
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                self._set.close()
+
+
+_ALONE = _Alone()
 
 
 @lru_cache(maxsize=4)

@@ -27,6 +27,7 @@ from probcal.inference.manifest import (
     OVERWRITE,
     REMEDY,
     check_choice,
+    check_same,
     clear_parts,
     described,
     digest_of,
@@ -98,12 +99,7 @@ class Storage:
         kind, other = read_manifest(path)
         if kind != self.kind:
             raise InputError(f"{path} holds a run of another kind ({kind}); give another folder, or {OVERWRITE}")
-        for name in sorted(self.identity.keys() | other.keys(), key=[*self.identity, *other].index):
-            if self.identity.get(name) != other.get(name):
-                raise InputError(
-                    f"{path}: the {name} has changed since the run there began; resume it as it began, give another"
-                    f" folder, or {OVERWRITE}"
-                )
+        check_same(path, self.identity, other)
         self._numbers = set(parts_of(path))
 
     @property
