@@ -13,7 +13,7 @@ from probcal.errors import InputError
 from probcal.files import write_whole
 from probcal.lazy import Later
 from probcal.results.accessor import register
-from probcal.results.schema import ATTRIBUTES, JUDGED, NEEDED, RESULTS_VERSION, SUMMARY, TRACKED
+from probcal.results.schema import ATTRIBUTES, JUDGED, NEEDED, RESULTS_VERSION, SUMMARY, TRACKED, WHOLE
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -108,7 +108,8 @@ def check_content(tree: xr.DataTree, path: Path) -> None:
     if (found := tree.attrs.get("results_version")) != RESULTS_VERSION:
         age = "a newer" if isinstance(found, (int, np.integer)) and found > RESULTS_VERSION else "an older"
         raise InputError(f"{path} was written by {age} probcal; fit again")
-    for group, names in NEEDED.items():
+    whole = {} if tree.attrs.get("sparse", 0) else {"calibration": WHOLE}
+    for group, names in [*NEEDED.items(), *whole.items()]:
         if group not in tree.children or not set(names) <= set(tree[group].variables):
             raise InputError(f"{path} is incomplete: its group {group} lacks what a fit holds; fit again")
     for group, names in JUDGED.items():

@@ -16,6 +16,7 @@ NEEDED = {  # what readers of a fit take for granted
     "residual": ("before", "after", "std", "weight"),
     "constant_data": ("node_position", "node_heading", "moving", "stated", "stated_node", "stated_component"),
 }
+WHOLE = ("covariance", "information")  # of `calibration`, but for a fit in sparse form
 TRACKED = ("mean", "sd", "before", "time", "component")  # of each target
 JUDGED = {"verdict": ("verdict", "reason"), "finding": ("sentence",), "level": ("std", "guess")}  # where they are
 ATTRIBUTES = ("method", "prior", "seed", "status", "message", "intervals", "settings", "interval_probability", "data")
