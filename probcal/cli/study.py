@@ -21,6 +21,7 @@ from probcal.inference.study import choose_methods
 from probcal.results.io import save
 
 PARTLY = 30.0  # s after which table and picture are made anew while fits go on
+SHARE = 20.0  # times as long as they took, where that is longer
 
 
 def run(
@@ -52,19 +53,20 @@ def run(
 
 def partly(outputs: Outputs, advance: OnProgress, clock: Callable[[], float] = time.monotonic) -> OnProgress:
     """Progress that now and then writes table and picture of the fits that are finished."""
-    last = clock()
+    due = clock() + PARTLY
 
     def told(at: Progress) -> None:
-        nonlocal last
+        nonlocal due
         advance(at)
-        if at.done < at.total and clock() - last >= PARTLY:
+        began = clock()
+        if at.done < at.total and began >= due:
             found = load_study(outputs.folder)
             try:
                 with outputs.writing(found.attrs["identity"]):
                     _drawn(found, outputs.folder)
             except InputError:  # another has changed them meanwhile: the end of the study says so
                 pass
-            last = clock()
+            due = clock() + max(PARTLY, SHARE * (clock() - began))
 
     return told
 
