@@ -1,9 +1,11 @@
 """Sensors that know next to nothing of where they stand: found from detections without names, or said not to be."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import probcal as pc
+from probcal.errors import FitError
 from probcal.geometry import bearing, elevation, norm
 
 pytestmark = pytest.mark.ci
@@ -108,3 +110,34 @@ def test_two_poses_that_explain_as_much_are_named():
     tree = fitted(whole, whole, {"east.heading": 0.3}, {"a": one, "b": 2 * middle - one}, 0)
     assert tree.attrs["status"] == "not converged"
     assert "Several poses explain the detections as well (how many): east" in tree.attrs["message"]
+
+
+def test_one_sensor_of_three_that_reports_clutter_alone_is_named():
+    """The radar that sees no object is not placed, and there is no fit with it; the other is found beside it."""
+    biases = {"east.position_x": -120.0, "east.position_y": 150.0, "east.heading": 0.4}
+    wide = {"position": 200.0, "heading": 0.6}
+    nodes = [
+        pc.Node("west", (0.0, 0.0)), pc.Node("east", (1000.0, 0.0), scale=wide),
+        pc.Node("north", (0.0, 1000.0), scale=wide),
+    ]  # fmt: skip
+    whole = pc.Network([radar.on(node, detection=REPORT) for node in nodes])
+    tracks = paths(1)
+    motion = dict.fromkeys(tracks, pc.ConstantVelocity(0.5))
+    table = pc.simulate(whole, motion, TIME, tracks=tracks, biases=biases, key=1).table
+    rng = np.random.default_rng(0)
+    false = [
+        (t, "north", rng.uniform(0, 3000.0), rng.uniform(-np.pi, np.pi))
+        for t in TIME for _ in range(max(rng.poisson(REPORT.clutter), 1))
+    ]  # fmt: skip
+    clutter = pd.DataFrame(false, columns=["time", "sensor", "range", "azimuth"])
+    table = pd.concat([table[table["sensor"] != "north"], clutter], ignore_index=True)
+    start = {"position": ((300.0, 300.0), 1500.0), "velocity": ((0.0, 0.0), 12.0)}
+    problem = pc.Problem(whole, pc.Target(pc.ConstantVelocity(0.5), start), table)
+    with pytest.raises(FitError, match="No detection of north belongs to an object that is confirmed"):
+        pc.fit(problem, METHOD, prior=pc.Gaussian())
+    found = pc.propagate_beliefs(problem)
+    assert found.apart == ("north",)
+    sd = np.sqrt(np.diag(found.covariance))
+    for label, value in biases.items():
+        m = problem.labels.index(label)
+        assert abs(found.z[m] - value / problem.scales[m]) < 4 * sd[m], label

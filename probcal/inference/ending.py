@@ -40,7 +40,8 @@ def conclude(
     """
     return conclude_at(
         problem, method, prior, _posterior(problem, prior, state, how, mixed), trace, square, iterations,
-        converged=bool(state.done), refused=bool(state.refused), evidence=float(state.found.evidence),
+        converged=bool(state.done) and (mixed is None or bool(mixed.settled)), refused=bool(state.refused),
+        evidence=float(state.found.evidence),
         lost=fallen(prior, len(problem.levels), state.best, state.worth),
     )  # fmt: skip
 

@@ -157,6 +157,11 @@ def _configured(
         )
     context = Context(jax.random.split(as_key(key))[0], progress, None, fallback=NUTS())
     found = configure(problem, method, prior, context)
+    if silent := found.labelled.silent:
+        raise FitError(
+            f"No detection of {', '.join(silent)} belongs to an object that is confirmed: all count as clutter, and its"
+            " biases are not found. Take it out of the network, or check its clock, its stated pose and Detection(...)."
+        )
     tree, answer = calibrate(found.labelled, method.method, prior=prior, key=key, progress=progress, **settings)
     wrong = []
     if not found.rests:

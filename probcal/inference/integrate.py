@@ -64,6 +64,7 @@ class Integrated(NamedTuple):
     moments: Moments
     z: jax.Array  # (CHAINS, KEPT, M)
     phi: Phi  # leading dims (CHAINS, KEPT)
+    settled: Any = True  # whether a propagation came to rest
 
 
 def integrate(
@@ -103,7 +104,7 @@ def _propagated(how: Integration, model: Model, known: Natural, point: Point, fo
     lower, upper = jnp.percentile(found.z, jnp.array([tail, 100.0 - tail]), axis=0)
     total = Moments(found.mean, found.covariance, lower, upper, found.gamma)
     z = found.z.reshape(CHAINS, KEPT, how.form.biases)
-    return Integrated(point_at(model, point, found.mean), known.information, total, z, {})
+    return Integrated(point_at(model, point, found.mean), known.information, total, z, {}, found.settled)
 
 
 def likelihood(how: Integration, model: Model, first: Precision, point: Point) -> tuple[Natural, jax.Array]:

@@ -18,6 +18,7 @@ from probcal.inference.hierarchy import QuadratureNodes
 from probcal.inference.posed import Form, Natural
 
 ROUNDS, CLOSE = 60, 1e-4  # rounds at most, and the share of an sd that the means may still move
+MOVED = 0.1  # sds by which a mean still moves after all rounds that are no end
 DAMPING = 0.6  # share of a new site that is taken
 LEAST = 1e-9  # precision of a site or a cavity
 
@@ -44,6 +45,7 @@ class Propagated(NamedTuple):
     covariance: jax.Array  # (M, M)
     gamma: jax.Array  # (M,)
     z: jax.Array  # (D, M)
+    settled: jax.Array  # () whether no mean moved much any more at the nodes that count
 
 
 @partial(jax.jit, static_argnames=("form", "count"))
@@ -95,7 +97,7 @@ def propagate(form: Form, known: Natural, nodes: QuadratureNodes, key: jax.Array
         def on(state: tuple[Sites, jax.Array, jax.Array]) -> jax.Array:
             return (state[1] > CLOSE) & (state[2] < ROUNDS)
 
-        sites, _, _ = jax.lax.while_loop(on, renew, (sites, jnp.full((), jnp.inf), jnp.zeros((), int)))
+        sites, off, _ = jax.lax.while_loop(on, renew, (sites, jnp.full((), jnp.inf), jnp.zeros((), int)))
         mean, covariance, logdet, pull = solve(sites)
         precision, middle = cavity(mean, covariance, sites)
         marginal, total = tilt(precision, middle, at)
@@ -104,10 +106,10 @@ def propagate(form: Form, known: Natural, nodes: QuadratureNodes, key: jax.Array
             jnp.log(precision / both) + (middle * precision + sites.nu) ** 2 / both - middle**2 * precision
         )
         evidence = total - jnp.sum(matched) + 0.5 * (pull @ mean - logdet) + at.log_prior
-        return sites, (mean, covariance, marginal, evidence)
+        return sites, (mean, covariance, marginal, evidence, off)
 
     first = Sites(jnp.ones(len(form.hierarchy.learnt)), jnp.zeros(len(form.hierarchy.learnt)))
-    _, (means, covariances, marginals, evidence) = jax.lax.scan(one, first, nodes)
+    _, (means, covariances, marginals, evidence, offs) = jax.lax.scan(one, first, nodes)
     share = jax.nn.softmax(jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf))
     mean = share @ means
     off = means - mean[None]
@@ -116,7 +118,8 @@ def propagate(form: Form, known: Natural, nodes: QuadratureNodes, key: jax.Array
     by_node = jnp.sum(jnp.exp(marginals.log_share) * (1.0 - alpha[:, None] * marginals.variance), 2)
     gamma = (1.0 - held * jnp.diagonal(covariance)).at[learnt].set(share @ by_node)
     z = _draws(form, mean, covariance, marginals, share, key, count)
-    return Propagated(mean, covariance, jnp.clip(gamma, 0.0, 1.0), z)
+    settled = jnp.sum(jnp.where(offs < MOVED, share, 0.0)) > 0.5
+    return Propagated(mean, covariance, jnp.clip(gamma, 0.0, 1.0), z, settled)
 
 
 def _draws(
