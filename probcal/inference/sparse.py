@@ -322,16 +322,16 @@ def sparse_answer(method: Maximiser, problem: Problem, prior: Prior, start: Poin
         mode = find_sparse_mode(
             model, joint, start, declared, min(STEPS, method.iterations), 1e-2 * method.tolerance, told
         )
+        evidence = _evidence(mode, problem, declared)
+        posterior, settled = (
+            _integrated(problem, prior, mode, evidence, prior_first, context.key, told) if integrated
+            else (_gaussian(problem, prior, mode, evidence, first), True)
+        )  # fmt: skip
     except np.linalg.LinAlgError:
         raise FitError(
             "The fit diverged: the information matrix is singular; the estimate is invalid. Use a prior, or fix some"
             " biases."
         ) from None
-    evidence = _evidence(mode, problem, declared)
-    posterior, settled = (
-        _integrated(problem, prior, mode, evidence, prior_first, context.key, told) if integrated
-        else (_gaussian(problem, prior, mode, evidence, first), True)
-    )  # fmt: skip
     square = float(mean_square(model, posterior.point))
     return conclude_at(
         problem, method, prior, posterior, mode.trace, square, len(mode.trace), converged=mode.converged and settled,
