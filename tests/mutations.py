@@ -81,9 +81,9 @@ MUTATIONS = [
     Mutation("inference/integrate.py", "solved.information @ z + score", "solved.information @ z - score", "test_integrate.py"),
     Mutation("inference/integrate.py", "clip(1.0 - alpha * jnp.diagonal(covariance)", "clip(1.0 - jnp.diagonal(covariance)", "test_integrate.py"),
     Mutation("inference/integrate.py", "total / count + jnp.cov(", "total / count + 0 * jnp.cov(", "test_integrate.py"),
-    Mutation("inference/propagate.py", "1.0 / own - sites.tau, LEAST", "1.0 / own, LEAST", "test_integrate.py"),
-    Mutation("inference/propagate.py", "nu = centre * (precision + tau) - middle * precision", "nu = centre * (precision + tau)", "test_integrate.py"),
-    Mutation("inference/propagate.py", "total - jnp.sum(matched)", "total", "test_integrate.py"),
+    Mutation("inference/propagate.py", "_positive(precision - self.sites.precision)", "_positive(precision)", "test_integrate.py"),
+    Mutation("inference/propagate.py", "middle) - self.sites.pull\n", "middle)\n", "test_integrate.py"),
+    Mutation("inference/propagate.py", "odds + 0.5 * jnp.log(", "0.5 * jnp.log(", "test_integrate.py"),
     # analysis/widen.py
     Mutation("analysis/widen.py", "1.0 + group[\"gamma\"].values * (inflation - 1.0)", "inflation", "test_watch.py"),
     # smoothing/information.py

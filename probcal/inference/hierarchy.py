@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -27,20 +27,10 @@ if TYPE_CHECKING:
 else:
     dist = Later("numpyro.distributions")
 
-SHARED, INNER = 15, 40  # nodes of what all biases share, and of what each has of its own
-HALF, SLABS = 8, (0.3, 0.6, 1.2, 3.0)  # nodes of a global scale where the slab is shared too, and those of the slab
 LEAST, MOST = 1e-12, 1e16  # precisions outside carry no mass that a draw could show
 CELLS, NEAR, FAR = 64, -10.0, 10.0  # by which scales of their own are proposed: even cells of their logarithm
 Phi = dict[str, jax.Array]
 Update = Callable[[Phi, jax.Array, jax.Array], Phi]  # phi, learnt z, key
-
-
-class QuadratureNodes(NamedTuple):
-    """The prior of one bias as a finite mixture of Gaussians, at nodes of what all biases share."""
-
-    variance: Any  # (K, J) of each Gaussian
-    log_weight: Any  # (K, J) log of its weight
-    log_prior: Any  # (K,) log weight of the node
 
 
 @dataclass(frozen=True)
@@ -82,10 +72,6 @@ class Hierarchy(ABC):
     @abstractmethod
     def drawn(self) -> dict[str, Callable[[jax.Array], jax.Array]]:
         """How each of them is drawn by a key; apart from `hyper`, so that what only draws need not load numpyro."""
-
-    def nodes(self) -> QuadratureNodes:
-        """The same prior as finite mixtures, for expectation propagation."""
-        raise AssertionError("a known prior has no scales to integrate")
 
     @abstractmethod
     def governed(self, phi: Phi) -> jax.Array:
@@ -176,16 +162,6 @@ def _from_line(d: dist.Distribution) -> dist.transforms.Transform:
     return dist.transforms.ComposeTransform([dist.transforms.SoftplusTransform(), scale])
 
 
-def _shares(count: int) -> np.ndarray:
-    """Probabilities in the middle of as many equal parts."""
-    return (np.arange(count) + 0.5) / count
-
-
-def _alone(variance: np.ndarray) -> QuadratureNodes:
-    """Nodes of biases that share nothing."""
-    return QuadratureNodes(variance[None], np.full((1, len(variance)), -np.log(len(variance))), np.zeros(1))
-
-
 class NoHyperprior(Hierarchy):
     """A prior without hyper-parameters: Gaussian or flat."""
 
@@ -223,12 +199,6 @@ class GammaPrecision(Hierarchy):
         """Gamma."""
         return {"alpha": lambda key: jax.random.gamma(key, self.prior.shape, (self.count,)) / self.prior.rate}
 
-    def nodes(self):
-        """Quantiles of the precision."""
-        from scipy.special import gammaincinv  # loaded where it is used
-
-        return _alone(self.prior.rate / gammaincinv(self.prior.shape, _shares(INNER)))
-
     def governed(self, phi):
         """The precision of the group."""
         return phi["alpha"][jnp.asarray(self.group)]
@@ -260,10 +230,6 @@ class LaplaceMixture(Hierarchy):
         """Exponential."""
         L = len(self.learnt)
         return {"variance": lambda key: jax.random.exponential(key, (L,)) / (0.5 * self.prior.rate**2)}
-
-    def nodes(self):
-        """Quantiles of the variance."""
-        return _alone(-np.log1p(-_shares(INNER)) / (0.5 * self.prior.rate**2))
 
     def governed(self, phi):
         """One over the variance."""
@@ -315,16 +281,6 @@ class RegularisedHorseshoe(Hierarchy):
         names = ("local_scale", "global_scale")
         scales = {name: drawn[name](k) for name, k in zip(names, keys, strict=True)}
         return scales | {"slab_variance": jnp.full((), self.prior.slab_scale**2, float)}
-
-    def nodes(self):
-        """Quantiles of local and global scale, and slabs around the declared one."""
-        width, declared = self.prior.expected / (1.0 - self.prior.expected), self.prior.slab_scale**2
-        scale = width * np.tan(0.5 * np.pi * _shares(HALF))[:, None] * np.tan(0.5 * np.pi * _shares(INNER))[None]
-        slab = declared * np.array(SLABS)
-        variance = 1.0 / (1.0 / slab[:, None, None] + 1.0 / scale[None] ** 2)
-        prior = -0.5 * self.prior.slab_df * (np.log(slab) + declared / slab)
-        shape = len(slab) * HALF, INNER
-        return QuadratureNodes(variance.reshape(shape), np.full(shape, -np.log(INNER)), np.repeat(prior, HALF))
 
     def governed(self, phi):
         """Slab and shrinkage added."""
@@ -395,16 +351,6 @@ class SpikeAndSlab(Hierarchy):
             return {}
         both = jnp.array([self.prior.a, self.prior.b])
         return {"share": lambda key: jax.random.dirichlet(key, both)[0]}
-
-    def nodes(self):
-        """In or out, at quantiles of the share that is in."""
-        from scipy.special import betaincinv  # loaded where it is used
-
-        given = self.prior.share
-        share = betaincinv(self.prior.a, self.prior.b, _shares(SHARED)) if given is None else np.array([given])
-        weight = np.stack([1.0 - share, share], 1)
-        variance = np.broadcast_to([1e-12, self.prior.slab**2], weight.shape)
-        return QuadratureNodes(variance, np.log(weight), np.zeros(len(share)))
 
     def governed(self, phi):
         """The slab."""

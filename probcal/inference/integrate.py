@@ -5,7 +5,7 @@ marginal density. Gibbs sweeps over hyper-parameters and biases sample what a hi
 then moves to the mean of the mixture, once, and the sweeps go on. Noise levels are held.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from probcal import linalg
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Natural, activity, draw_given, prior_precision
-from probcal.inference.propagate import Propagated, nodes_of, propagate
+from probcal.inference.propagate import BlockMarginals, Blocks, Propagation, blocks_of
 from probcal.model.model import Model
 from probcal.priors import Precision
 from probcal.results.schema import INTERVAL
@@ -35,6 +35,7 @@ CHAINS, BURN, FIRST, KEPT = (
 EVERY = 5  # kept draws between two whose conditional Gaussian enters the moments
 MOVES, NEAR = 6, 1.0  # most times that the point moves to the mean, and sd by which it may have moved at the last
 HALVINGS = 40  # of the bracket of a quantile
+ATOM = 1e-9  # scales within which a quantile is that of the biases that are exactly zero
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,11 @@ class Integration:
 class Moments(NamedTuple):
     """What a mixture says of the biases z."""
 
-    mean: jax.Array  # (M,)
-    covariance: jax.Array  # (M, M)
-    lower: jax.Array  # (M,) of the interval
-    upper: jax.Array  # (M,)
-    gamma: jax.Array  # (M,)
+    mean: Any  # (M,)
+    covariance: Any  # (M, M)
+    lower: Any  # (M,) of the interval
+    upper: Any  # (M,)
+    gamma: Any  # (M,)
 
 
 class Integrated(NamedTuple):
@@ -62,7 +63,7 @@ class Integrated(NamedTuple):
     point: Point  # biases at the mean, trajectories at their mode
     information: jax.Array  # (M, M) of the data about z
     moments: Moments
-    z: jax.Array  # (CHAINS, KEPT, M)
+    z: Any  # (CHAINS, KEPT, M)
     phi: Phi  # leading dims (CHAINS, KEPT)
     settled: Any = True  # whether a propagation came to rest
 
@@ -76,35 +77,90 @@ def integrate(
     there; with `search`, which no kernel can hold, until the mean moves by less than an sd.
     """
     known, _ = likelihood(how, model, first, start)
-    nodes = None if how.sweeps else nodes_of(how.form)
-    chains = begin(how.form, known, jax.random.fold_in(key, 0)) if how.sweeps else None
-    point = start
+    if not how.sweeps:
+        return _propagated(how, model, known, start, key)
+    chains, point = begin(how.form, known, jax.random.fold_in(key, 0)), start
     for turn in range(MOVES if search else 1):
-        own = jax.random.fold_in(key, turn + 2)
-        if nodes is None:
-            chains, swept = run_sweeps(how.form, known, chains, own, FIRST)
-            mean, spread = swept.mean, swept.spread
-        else:
-            found = propagate(how.form, known, nodes, own, CHAINS * KEPT)
-            mean, spread = found.mean, jnp.sqrt(jnp.diagonal(found.covariance))
+        chains, swept = run_sweeps(how.form, known, chains, jax.random.fold_in(key, turn + 2), FIRST)
         before = point.z
-        point, known = recentred(how, model, point, known, mean)
-        if search and np.max(np.abs(np.asarray(point.z) - before) / np.maximum(spread, 1e-9), initial=0.0) < NEAR:
+        point, known = recentred(how, model, point, known, swept.mean)
+        moved = (np.asarray(point.z) - before) / np.maximum(swept.spread, 1e-9) if search else np.zeros(0)
+        if search and np.max(np.abs(moved), initial=0.0) < NEAR:
             break
-    if nodes is not None:
-        return _propagated(how, model, known, point, propagate(how.form, known, nodes, key, CHAINS * KEPT))
     _, swept = run_sweeps(how.form, known, chains, jax.random.fold_in(key, 1), KEPT)
     total = moments(how.form, known, swept.phi)
     return Integrated(point_at(model, point, total.mean), known.information, total, swept.z, swept.phi)
 
 
-def _propagated(how: Integration, model: Model, known: Natural, point: Point, found: Propagated) -> Integrated:
-    """What expectation propagation leaves, which draws nothing of the hyper-parameters."""
-    tail = 50.0 * (1.0 - INTERVAL)
-    lower, upper = jnp.percentile(found.z, jnp.array([tail, 100.0 - tail]), axis=0)
-    total = Moments(found.mean, found.covariance, lower, upper, found.gamma)
-    z = found.z.reshape(CHAINS, KEPT, how.form.biases)
-    return Integrated(point_at(model, point, found.mean), known.information, total, z, {}, found.settled)
+@dataclass(frozen=True, eq=False)
+class DenseLikelihood:
+    """The likelihood of a model at a point as a propagation reads it."""
+
+    how: Integration
+    model: Model
+    known: Natural
+    point: Point
+
+    @property
+    def z(self) -> np.ndarray:
+        """Biases (M,) of the point."""
+        return np.asarray(self.point.z)
+
+    def marginals(self, members: np.ndarray, sites: Blocks) -> BlockMarginals:
+        """Marginals of the blocks, and the covariance (M, M) of all."""
+        from scipy.linalg import cho_solve  # loaded where it is used
+
+        M = len(self.z)
+        precision, pull = np.zeros((M + 1, M + 1)), np.zeros(M + 1)
+        precision[:M, :M] = self.known.information + self.known.first.coupled()
+        pull[:M] = self.known.pull
+        precision[members[:, :, None], members[:, None, :]] += sites.precision  # no two blocks have a bias in common
+        pull[members] += sites.pull
+        lower = np.linalg.cholesky(precision[:M, :M])  # what is not positive is said here
+        covariance = cho_solve((lower, True), np.eye(M))
+        at = np.minimum(members, M - 1)
+        none = (members == M)[:, :, None] | (members == M)[:, None, :]
+        blocks = np.where(none, np.eye(members.shape[1])[None], covariance[at[:, :, None], at[:, None, :]])
+        return BlockMarginals(covariance @ pull[:M], blocks, covariance)
+
+    def at(self, z: np.ndarray) -> "DenseLikelihood":
+        """The likelihood at other biases (M,); as it is where there is none there."""
+        point, known = recentred(self.how, self.model, self.point, self.known, jnp.asarray(z))
+        return replace(self, point=point, known=known)
+
+
+def _propagated(how: Integration, model: Model, known: Natural, point: Point, key: jax.Array) -> Integrated:
+    """What expectation propagation leaves, which keeps no draws of the hyper-parameters."""
+    work = Propagation.of(how.form, known.first, DenseLikelihood(how, model, known, point), blocks_of(model), key)
+    work.run()
+    swept, last = work.swept, work.likelihood
+    assert swept is not None
+    assert isinstance(last, DenseLikelihood)
+    z, covariance = joint_draws(work)
+    tail = 0.5 * (1.0 - INTERVAL)
+    lower, upper = (quantile(swept.means, swept.sds, share) for share in (tail, 1.0 - tail))
+    total = Moments(work.mean, covariance, lower, upper, swept.gamma)
+    z = z.reshape(CHAINS, KEPT, how.form.biases)
+    return Integrated(point_at(model, last.point, work.mean), last.known.information, total, z, {}, work.settled)
+
+
+def joint_draws(work: Propagation) -> tuple[np.ndarray, np.ndarray]:
+    """Draws (D, M) that have the marginals of a dense propagation, and their covariance (M, M).
+
+    They are ordered as those of the Gaussian of likelihood and sites are (Iman and Conover 1982).
+    """
+    swept, found = work.swept, work.found
+    assert swept is not None
+    assert found is not None
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(work.key)))
+    count, M, own = CHAINS * KEPT, work.form.biases, np.sqrt(np.diagonal(found.whole))
+    ordered = rng.standard_normal((count, M)) @ np.linalg.cholesky(found.whole).T
+    pick = rng.integers(len(swept.means), size=(count, M))
+    centre, spread = (np.take_along_axis(np.asarray(part), pick, 0) for part in (swept.means, swept.sds))
+    alone = np.sort(centre + spread * rng.standard_normal((count, M)), 0)
+    z = np.take_along_axis(alone, np.argsort(np.argsort(ordered, 0), 0), 0)
+    share = np.sqrt(work.variance) / own
+    return z, found.whole * np.outer(share, share)
 
 
 def likelihood(how: Integration, model: Model, first: Precision, point: Point) -> tuple[Natural, jax.Array]:
@@ -210,7 +266,7 @@ def moments(form: Form, known: Natural, phi: Phi) -> Moments:
 
 
 def quantile(means: jax.Array, sds: jax.Array, share: float) -> jax.Array:
-    """Quantile (M,) of each mixture of Gaussians of means and sds (S, M), by halving a bracket."""
+    """Quantile (M,) of each mixture of Gaussians of means and sds (S, M), by halving a bracket; zero in an atom there."""
     width = 10.0 * jnp.max(sds, 0) + 1e-12
 
     def half(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -220,4 +276,5 @@ def quantile(means: jax.Array, sds: jax.Array, share: float) -> jax.Array:
         return jnp.where(below, at, low), jnp.where(below, high, at)
 
     low, high = jax.lax.fori_loop(0, HALVINGS, half, (jnp.min(means, 0) - width, jnp.max(means, 0) + width))
-    return 0.5 * (low + high)
+    found = 0.5 * (low + high)
+    return jnp.where(jnp.abs(found) < ATOM, 0.0, found)

@@ -1,149 +1,280 @@
-"""Expectation propagation on a Gaussian likelihood: precisions integrated without sweeps, where biases are many.
+"""Expectation propagation on a Gaussian likelihood: precisions integrated where biases are many.
 
-The prior of each bias (or group of them) is a finite scale mixture at nodes of what all share; a Gaussian site stands
-for it and is renewed, all at once, until the marginals agree with those that the mixture gives (Minka 2001; Seeger
-2008). The nodes of what is shared are weighed by their evidence. One round costs one inverse of the biases.
+A Gaussian site stands for the priors of the biases of each sensor (a block), which its own data tell apart worst: what
+is left open between a place and an offset has several answers under a sparse prior. Sites are renewed, all at once,
+until the moments of every block agree with those that the prior gives (Minka 2001; Seeger 2008); these are found by
+Gibbs sweeps within the blocks. What gives marginals of blocks, dense or sparse, is a `BiasLikelihood`.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from itertools import combinations
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import logsumexp
 
 from probcal import linalg
-from probcal.inference.hierarchy import QuadratureNodes
-from probcal.inference.posed import Form, Natural
+from probcal.inference.hierarchy import Phi, SpikeAndSlab
+from probcal.inference.posed import Form
+from probcal.model.model import Model
+from probcal.priors import Precision
 
-ROUNDS, CLOSE = 60, 1e-4  # rounds at most, and the share of an sd that the means may still move
-MOVED = 0.1  # sds by which a mean still moves after all rounds that are no end
-DAMPING = 0.6  # share of a new site that is taken
-LEAST = 1e-9  # precision of a site or a cavity
-
-
-class Sites(NamedTuple):
-    """Gaussian factors exp(-tau z^2 / 2 + nu z) in the place of the prior of each governed bias."""
-
-    tau: jax.Array  # (L,)
-    nu: jax.Array  # (L,)
+ROUNDS, SURE, CLOSE, DAMPING = 10, 2, 0.15, 0.7  # rounds, those not yet averaged, sds (rms) of a move, share of a site
+BURN, KEPT, EVERY = 100, 100, 5  # sweeps in a round: before, whose Gaussians are kept, and from one to the next
+NEAR, AGAIN = 0.5, 0.05  # sds (rms) by which the mean may lie from the point of the likelihood, or this is taken anew
+MINUS = 0.5  # share of the precision of a cavity that a site may take away
+LEAST = 1e-9  # precision of a cavity
+SPIKE = 1e-8  # variance of a bias that is never in
 
 
-class Tilted(NamedTuple):
-    """Marginals of the governed biases at one node: a mixture of Gaussians each."""
+class Blocks(NamedTuple):
+    """Gaussians of the biases of each sensor by themselves, in natural form: B blocks of p biases at most."""
 
-    log_share: jax.Array  # (L, J) log weight of each component
-    mean: jax.Array  # (L, J)
-    variance: jax.Array  # (L, J)
-
-
-class Propagated(NamedTuple):
-    """Marginals and covariance of the biases, and draws with those marginals and correlations."""
-
-    mean: jax.Array  # (M,)
-    covariance: jax.Array  # (M, M)
-    gamma: jax.Array  # (M,)
-    z: jax.Array  # (D, M)
-    settled: jax.Array  # () whether no mean moved much any more at the nodes that count
+    precision: Any  # (B, p, p); 1 on the diagonal where a block has fewer
+    pull: Any  # (B, p)
 
 
-@partial(jax.jit, static_argnames=("form", "count"))
-def propagate(form: Form, known: Natural, nodes: QuadratureNodes, key: jax.Array, count: int) -> Propagated:
-    """What a hierarchy makes of a Gaussian likelihood, and `count` draws of it."""
-    learnt = jnp.asarray(form.hierarchy.learnt, int)
-    group = jnp.asarray(form.hierarchy.group, int)
-    held = known.first.alpha.at[learnt].set(0.0)
-    base = known.information + known.first.coupled() + jnp.diag(held)
+class BlockChain(NamedTuple):
+    """Where the sweeps of one chain stand."""
 
-    def solve(sites: Sites) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        pull = known.pull.at[learnt].add(sites.nu)
-        covariance, logdet = linalg.inverse_and_logdet(base + jnp.diag(jnp.zeros_like(held).at[learnt].set(sites.tau)))
-        mean = covariance @ pull
-        return mean, covariance, logdet, pull
+    z: jax.Array  # (M,)
+    phi: Phi
 
-    def cavity(mean: jax.Array, covariance: jax.Array, sites: Sites) -> tuple[jax.Array, jax.Array]:
-        """Precision and mean (L,) of what all but its own site say of each bias."""
-        own = jnp.diagonal(covariance)[learnt]
-        precision = jnp.maximum(1.0 / own - sites.tau, LEAST)
-        return precision, (mean[learnt] / own - sites.nu) / precision
 
-    def tilt(precision: jax.Array, middle: jax.Array, at: QuadratureNodes) -> tuple[Tilted, jax.Array]:
-        """Marginals of cavity and prior, and the log of what each group's prior integrates to."""
-        spread = 1.0 / precision[:, None] + at.variance[None]
-        own = -0.5 * jnp.log(2 * jnp.pi * spread) - 0.5 * middle[:, None] ** 2 / spread
-        joint = jax.ops.segment_sum(own, group, form.hierarchy.count) + at.log_weight[None]
-        total = logsumexp(joint, 1)
-        share = (joint - total[:, None])[group]
-        part = at.variance[None] / spread
-        return Tilted(share, middle[:, None] * part, part / precision[:, None]), jnp.sum(total)
+class BlocksSwept(NamedTuple):
+    """What sweeps say of cavities times prior."""
 
-    def one(sites: Sites, at: QuadratureNodes) -> tuple[Sites, Any]:
-        def renew(state: tuple[Sites, jax.Array, jax.Array]) -> tuple[Sites, jax.Array, jax.Array]:
-            sites, _, turn = state
-            mean, covariance, _, _ = solve(sites)
-            precision, middle = cavity(mean, covariance, sites)
-            marginal, _ = tilt(precision, middle, at)
-            share = jnp.exp(marginal.log_share)
-            centre = jnp.sum(share * marginal.mean, 1)
-            spread = jnp.sum(share * (marginal.variance + marginal.mean**2), 1) - centre**2
-            spread = jnp.maximum(spread, 1e-300)
-            tau = jnp.maximum(1.0 / spread - precision, LEAST)
-            nu = centre * (precision + tau) - middle * precision
-            off = jnp.max(jnp.abs(centre - mean[learnt]) / jnp.sqrt(jnp.diagonal(covariance)[learnt]))
-            mixed = [DAMPING * new + (1 - DAMPING) * old for new, old in zip((tau, nu), sites, strict=True)]
-            return Sites(*mixed), off, turn + 1
+    mean: Any  # (B, p)
+    covariance: Any  # (B, p, p)
+    gamma: Any  # (M,)
+    means: Any  # (KEPT, M) of single sweeps given their hyper-parameters
+    sds: Any  # (KEPT, M)
 
-        def on(state: tuple[Sites, jax.Array, jax.Array]) -> jax.Array:
-            return (state[1] > CLOSE) & (state[2] < ROUNDS)
 
-        sites, off, _ = jax.lax.while_loop(on, renew, (sites, jnp.full((), jnp.inf), jnp.zeros((), int)))
-        mean, covariance, logdet, pull = solve(sites)
-        precision, middle = cavity(mean, covariance, sites)
-        marginal, total = tilt(precision, middle, at)
-        both = precision + sites.tau
-        matched = 0.5 * (
-            jnp.log(precision / both) + (middle * precision + sites.nu) ** 2 / both - middle**2 * precision
+class BlockMarginals(NamedTuple):
+    """Marginals of the biases under a likelihood and sites."""
+
+    mean: np.ndarray  # (M,)
+    covariance: np.ndarray  # (B, p, p) of each block; 1 on the diagonal where a block has fewer
+    whole: np.ndarray  # what else the likelihood found on the way, for whoever made it
+
+
+class BiasLikelihood(Protocol):
+    """A Gaussian likelihood of the biases, taken at a point."""
+
+    @property
+    def z(self) -> np.ndarray:
+        """Biases (M,) of the point."""
+
+    def marginals(self, members: np.ndarray, sites: Blocks) -> BlockMarginals:
+        """Marginals of blocks of members (B, p); raises `numpy.linalg.LinAlgError` where there are none."""
+
+    def at(self, z: np.ndarray) -> BiasLikelihood:
+        """The likelihood taken at other biases (M,)."""
+
+
+def blocks_of(model: Model) -> np.ndarray:
+    """Biases (B, p) of each sensor that no sensor before has, M of none; those of no sensor by themselves."""
+    M = model.biases
+    taken, members = np.zeros(M + 1, bool), list[np.ndarray]()
+    taken[M] = True
+    wide = max((data.bias.shape[1] for data in model.rows), default=1)
+    for data in model.rows:
+        own: np.ndarray = np.sort(np.asarray(data.bias), 1)
+        own = np.where(np.concatenate([np.zeros((len(own), 1), bool), own[:, 1:] == own[:, :-1]], 1), M, own)
+        values, first = np.unique(own, return_index=True)
+        mine: np.ndarray = np.full(own.size, M)
+        mine[first] = np.where(taken[values], M, values)
+        taken[values] = True
+        room = wide - own.shape[1]
+        members.append(np.pad(mine.reshape(own.shape), ((0, 0), (0, room)), constant_values=M))
+    alone = np.flatnonzero(~taken)[:, None]
+    members.append(np.pad(alone, ((0, 0), (0, wide - 1)), constant_values=M))
+    found = np.concatenate(members)
+    return found[(found < M).any(1)]
+
+
+@partial(jax.jit, static_argnames="form")
+def sweep_blocks(
+    form: Form, first: Precision, members: jax.Array, cavity: Blocks, chain: BlockChain, key: jax.Array
+) -> tuple[BlockChain, BlocksSwept]:
+    """Gibbs sweeps over the hyper-parameters of all biases and the biases of each block, given its cavity (B, p, p).
+
+    The prior is exact, with all that biases share; moments are those of the Gaussians given hyper-parameters.
+    """
+    kind, M = form.hierarchy, form.biases
+    learnt, (B, p) = jnp.asarray(kind.learnt, int), members.shape
+    updates, eye = kind.updates(), jnp.eye(p)[None]
+    governed = jnp.zeros(M + 1, bool).at[learnt].set(True)[members]
+    toggles = np.array([np.isin(np.arange(p), pair) for k in (1, 2) for pair in combinations(range(p), k)])
+
+    def of_members(values: jax.Array, filling: Any) -> jax.Array:
+        """Values (M,) of the biases as (B, p)."""
+        return jnp.append(values, filling)[members]
+
+    def of_biases(values: jax.Array) -> jax.Array:
+        """Values (B, p) of the members as (M,)."""
+        return jnp.zeros(M + 1, values.dtype).at[members].set(values)[:M]
+
+    def given(alpha: jax.Array, active: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Root (B, p, p) of the covariances of the blocks and its product with the pull, of what is active (B, p)."""
+        both = active[:, :, None] & active[:, None, :]
+        root = jax.vmap(linalg.inverse_cholesky)(jnp.where(both, cavity.precision + eye * alpha[:, :, None], eye))
+        return root, jnp.einsum("bij,bj->bi", root, jnp.where(active, cavity.pull, 0.0))
+
+    def include(phi: Phi, key: jax.Array) -> Phi:
+        """Inclusions after moves of one or two members of each block, its biases integrated out."""
+        assert isinstance(kind, SpikeAndSlab)
+        share = kind.share(phi)
+        odds = jnp.log(share) - jnp.log1p(-share)
+        alpha = of_members(kind.alpha(phi, first.alpha), 0.0)
+
+        def weight(active: jax.Array) -> jax.Array:
+            root, half = given(alpha, active)
+            own = jnp.log(jnp.diagonal(root, axis1=1, axis2=2)) + 0.5 * half**2
+            slabs = jnp.where(active & governed, odds + 0.5 * jnp.log(jnp.where(governed, alpha, 1.0)), 0.0)
+            return jnp.sum(own + slabs, 1)
+
+        def move(carry: tuple[jax.Array, jax.Array], turn: Any) -> tuple[Any, None]:
+            (active, old), (toggle, draw) = carry, turn
+            other = active ^ (toggle[None] & governed)
+            new = weight(other)
+            takes = jnp.log(draw) < new - old
+            return (jnp.where(takes[:, None], other, active), jnp.where(takes, new, old)), None
+
+        active = of_members(kind.active(phi, M), True)
+        draws = jax.random.uniform(key, (len(toggles), B))
+        (active, _), _ = jax.lax.scan(move, (active, weight(active)), (jnp.asarray(toggles), draws))
+        return phi | {"included": of_biases(active)[learnt]}
+
+    def one(carry: tuple[BlockChain, Any], k: jax.Array) -> tuple[tuple[BlockChain, Any], None]:
+        (z, phi), (count, mean, second, gamma, means, sds) = carry
+        keys = jax.random.split(jax.random.fold_in(key, k), len(updates) + 2)
+        for update, own in zip(updates, keys, strict=False):
+            phi = update(phi, z[learnt], own)
+        if isinstance(kind, SpikeAndSlab):
+            phi = include(phi, keys[-2])
+        alpha, active = kind.alpha(phi, first.alpha), of_members(kind.active(phi, M), True)
+        root, half = given(of_members(alpha, 0.0), active)
+        both = active[:, :, None] & active[:, None, :]
+        middle = jnp.where(active, jnp.einsum("bji,bj->bi", root, half), 0.0)
+        covariance = jnp.where(both, root.mT @ root, 0.0)
+        noise = jnp.einsum("bji,bj->bi", root, jax.random.normal(keys[-1], half.shape))
+        variance = of_biases(jnp.diagonal(covariance, axis1=1, axis2=2))
+        on = (k >= BURN) * 1.0
+        slot = jnp.maximum(k - BURN, 0) // EVERY
+        inside = of_biases(active) & (variance > 0)
+        sums = (
+            count + on, mean + on * middle,
+            second + on * (covariance + middle[:, :, None] * middle[:, None, :]),
+            gamma + on * jnp.where(inside, jnp.clip(1.0 - alpha * variance, 0.0, 1.0), 0.0),
+            means.at[slot].set(of_biases(middle)), sds.at[slot].set(jnp.sqrt(variance)),
+        )  # fmt: skip
+        return (BlockChain(of_biases(jnp.where(active, middle + noise, 0.0)), phi), sums), None
+
+    blank = (
+        jnp.zeros(()), jnp.zeros((B, p)), jnp.zeros((B, p, p)), jnp.zeros(M), jnp.zeros((KEPT, M)), jnp.zeros((KEPT, M))
+    )  # fmt: skip
+    (chain, sums), _ = jax.lax.scan(one, (chain, blank), jnp.arange(BURN + EVERY * KEPT))
+    count, mean, second, gamma, means, sds = sums
+    mean = mean / count
+    covariance = second / count - mean[:, :, None] * mean[:, None, :]
+    return chain, BlocksSwept(mean, covariance + SPIKE * eye, gamma / count, means, sds)
+
+
+@dataclass(eq=False)
+class Propagation:
+    """Where a propagation stands: the likelihood, the sites in the place of the priors, and what both say."""
+
+    form: Form
+    first: Precision
+    likelihood: BiasLikelihood
+    members: np.ndarray  # (B, p) biases of each block, M of none
+    key: jax.Array
+    sites: Blocks
+    chain: BlockChain | None = None
+    swept: BlocksSwept | None = None
+    found: BlockMarginals | None = None
+    settled: bool = False  # whether the means came to rest
+
+    @classmethod
+    def of(cls, form: Form, first: Precision, likelihood: BiasLikelihood, members: np.ndarray, key: jax.Array) -> Any:
+        """The beginning: biases of their declared scales."""
+        precision = np.eye(members.shape[1])[None] * (members < form.biases)[:, :, None]
+        return cls(form, first, likelihood, members, key, Blocks(precision, np.zeros(members.shape)))
+
+    def of_biases(self, values: np.ndarray) -> np.ndarray:
+        """Values (B, p) of the members as (M,)."""
+        found = np.zeros(self.form.biases + 1)
+        found[self.members] = values
+        return found[:-1]
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Means (M,) of likelihood and prior."""
+        assert self.swept is not None
+        return self.of_biases(self.swept.mean)
+
+    @property
+    def variance(self) -> np.ndarray:
+        """Variances (M,) of likelihood and prior."""
+        assert self.swept is not None
+        return self.of_biases(np.diagonal(self.swept.covariance, axis1=1, axis2=2))
+
+    def _marginals(self) -> BlockMarginals:
+        """Marginals with the sites; those that take more away than the rest gives are cut to nothing."""
+        try:
+            return self.likelihood.marginals(self.members, self.sites)
+        except np.linalg.LinAlgError:
+            self.sites = self.sites._replace(precision=_positive(self.sites.precision))
+            return self.likelihood.marginals(self.members, self.sites)
+
+    def round(self, turn: int) -> float:
+        """Renew all sites; the root mean square of how far the means moved, in sds."""
+        self.found = found = self._marginals()
+        precision = np.linalg.inv(found.covariance)
+        middle = np.append(found.mean, 0.0)[self.members]
+        cavity = Blocks(
+            _positive(precision - self.sites.precision), np.einsum("bij,bj->bi", precision, middle) - self.sites.pull
         )
-        evidence = total - jnp.sum(matched) + 0.5 * (pull @ mean - logdet) + at.log_prior
-        return sites, (mean, covariance, marginal, evidence, off)
+        if self.chain is None:
+            begin = self.form.hierarchy.begin(jax.random.fold_in(self.key, 0))
+            self.chain = BlockChain(jnp.asarray(found.mean), begin)
+        own = jax.random.fold_in(self.key, 1 + turn)
+        self.chain, swept = sweep_blocks(self.form, self.first, self.members, cavity, self.chain, own)
+        self.swept = swept = jax.device_get(swept)
+        tilted = np.linalg.inv(swept.covariance)
+        new = Blocks(tilted - cavity.precision, np.einsum("bij,bj->bi", tilted, swept.mean) - cavity.pull)
+        floor = -MINUS * cavity.precision  # what is left of a cavity stays positive
+        new = new._replace(precision=_positive(new.precision - floor) + floor)
+        share = min(DAMPING, 1.0 / max(turn - SURE, 1))  # later rounds are averaged: sweeps are noisy
+        self.sites = Blocks(*(share * a + (1 - share) * b for a, b in zip(new, self.sites, strict=True)))
+        off = self.of_biases((swept.mean - middle) / np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)))
+        return float(np.sqrt(np.mean(off**2)))
 
-    first = Sites(jnp.ones(len(form.hierarchy.learnt)), jnp.zeros(len(form.hierarchy.learnt)))
-    _, (means, covariances, marginals, evidence, offs) = jax.lax.scan(one, first, nodes)
-    share = jax.nn.softmax(jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf))
-    mean = share @ means
-    off = means - mean[None]
-    covariance = jnp.tensordot(share, covariances, 1) + off.T @ (share[:, None] * off)
-    alpha = 1.0 / jnp.maximum(nodes.variance, 1e-12)
-    by_node = jnp.sum(jnp.exp(marginals.log_share) * (1.0 - alpha[:, None] * marginals.variance), 2)
-    gamma = (1.0 - held * jnp.diagonal(covariance)).at[learnt].set(share @ by_node)
-    z = _draws(form, mean, covariance, marginals, share, key, count)
-    settled = jnp.sum(jnp.where(offs < MOVED, share, 0.0)) > 0.5
-    return Propagated(mean, covariance, jnp.clip(gamma, 0.0, 1.0), z, settled)
+    def run(self, told: Callable[[int, float], Any] | None = None) -> None:
+        """Rounds until the means move by less than `CLOSE` sds in the root mean square, or all are spent.
 
-
-def _draws(
-    form: Form, mean: jax.Array, covariance: jax.Array, marginals: Tilted, share: jax.Array, key: jax.Array, count: int
-) -> jax.Array:
-    """Draws (D, M) that have the marginals, ordered as draws of the covariance are (Iman and Conover 1982)."""
-    keys = jax.random.split(key, 4)
-    learnt = jnp.asarray(form.hierarchy.learnt, int)
-    normal = mean[None] + jax.random.normal(keys[0], (count, len(mean))) @ linalg.factor(covariance).T
-    node = jax.random.categorical(keys[1], jnp.log(share), shape=(count,))
-
-    def one(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
-        k, own = pair
-        at = jax.tree.map(lambda leaf: leaf[k], marginals)
-        split = jax.random.split(own)
-        pick = jax.random.categorical(split[0], at.log_share, axis=1)
-        centre, variance = (jnp.take_along_axis(leaf, pick[:, None], 1)[:, 0] for leaf in (at.mean, at.variance))
-        return centre + jnp.sqrt(variance) * jax.random.normal(split[1], centre.shape)
-
-    alone = jax.lax.map(one, (node, jax.random.split(keys[2], count)))
-    rank = jnp.argsort(jnp.argsort(normal[:, learnt], 0), 0)
-    return normal.at[:, learnt].set(jnp.take_along_axis(jnp.sort(alone, 0), rank, 0))
+        Between rounds the likelihood is taken anew at the mean.
+        """
+        for turn in range(ROUNDS):
+            off = self.round(turn)
+            if told is not None:
+                told(turn, off)
+            far = np.sqrt(np.mean((self.mean - self.likelihood.z) ** 2 / self.variance))
+            self.settled = bool(turn >= SURE and off < CLOSE and far < NEAR)
+            if self.settled or turn + 1 == ROUNDS:
+                break
+            if far >= AGAIN:
+                self.likelihood = self.likelihood.at(self.mean)
 
 
-def nodes_of(form: Form) -> QuadratureNodes:
-    """The nodes of a hierarchy as arrays on the device."""
-    return jax.tree.map(jnp.asarray, QuadratureNodes(*(np.asarray(part, float) for part in form.hierarchy.nodes())))
+def _positive(matrices: np.ndarray) -> np.ndarray:
+    """Symmetric matrices (B, p, p) with eigenvalues that are not negative."""
+    values, vectors = np.linalg.eigh(0.5 * (matrices + matrices.transpose(0, 2, 1)))
+    return np.einsum("bik,bk,bjk->bij", vectors, np.maximum(values, LEAST), vectors)

@@ -6,28 +6,27 @@ What needs the whole covariance of the biases is not there; variances and gamma 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg
 from probcal.errors import FitError, InputError
 from probcal.inference.ending import conclude_at
-from probcal.inference.hierarchy import Phi, hierarchy_of
+from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.integrate import quantile
 from probcal.inference.posed import Form
 from probcal.inference.progress import Progress
+from probcal.inference.propagate import BlockMarginals, Blocks, Propagation, blocks_of
 from probcal.model.model import Model
-from probcal.priors import PRECISION_BOUNDS, BernoulliGaussian, Flat, Gaussian, Precision, Prior
+from probcal.priors import PRECISION_BOUNDS, Flat, Gaussian, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import HALF, Answer, Draws, Posterior, Summary, Tracks
 from probcal.results.schema import INTERVAL, ROPE
-from probcal.smoothing.cholesky import Factor, exact
+from probcal.smoothing.cholesky import exact
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.joint import JointPrecision, missing, prefers_sparse
 from probcal.smoothing.mode import Point
@@ -38,11 +37,6 @@ if TYPE_CHECKING:
 
 CHAINS, NUMBERS, MOST = 4, 400_000, 250  # of the draws of all biases that a tree holds, and draws of a chain
 STEPS = 60  # of the climb
-ROUNDS, SURE, CLOSE, DAMPING = 10, 2, 0.15, 0.7  # rounds, those not yet averaged, sds (rms) of a move, share of a site
-BURN, KEPT, EVERY = 100, 100, 5  # sweeps in a round: before, whose Gaussians are kept, and from one to the next
-NEAR, AGAIN = 0.5, 0.05  # sds (rms) by which the mean may lie from the point of the likelihood, or this is taken anew
-MINUS = 0.5  # share of the precision of a cavity that a site may take away
-LEAST = 1e-9  # precision of a cavity
 FORMS = ("auto", "dense", "sparse")
 
 
@@ -66,8 +60,6 @@ def check_sparse(method: Maximiser, prior: Prior, starts: int) -> None:
         wrong = (
             "precisions that are integrated or given (EA() with Horseshoe() or ARD(rate=0.5), MAP() with Gaussian())"
         )
-    elif isinstance(prior, BernoulliGaussian):
-        wrong = "a prior that puts no bias at exactly zero"
     elif starts > 1:
         wrong = "one start"
     elif not (exact() or isinstance(prior, (Gaussian, Flat))):
@@ -76,175 +68,42 @@ def check_sparse(method: Maximiser, prior: Prior, starts: int) -> None:
         raise InputError(f"{method.name} on a network of this size is solved in sparse form, which takes {wrong}")
 
 
-class Blocks(NamedTuple):
-    """Gaussians of the biases of each sensor by themselves, in natural form: B blocks of p biases at most."""
-
-    precision: Any  # (B, p, p); 1 on the diagonal where a block has fewer
-    pull: Any  # (B, p)
-
-
-class BlockChain(NamedTuple):
-    """Where the sweeps of one chain stand."""
-
-    z: jax.Array  # (M,)
-    phi: Phi
-
-
-class BlocksSwept(NamedTuple):
-    """What sweeps say of cavities times prior."""
-
-    mean: Any  # (B, p)
-    covariance: Any  # (B, p, p)
-    gamma: Any  # (M,)
-    means: Any  # (KEPT, M) of single sweeps given their hyper-parameters
-    sds: Any  # (KEPT, M)
-
-
-@partial(jax.jit, static_argnames="form")
-def sweep_blocks(
-    form: Form, first: Precision, members: jax.Array, cavity: Blocks, chain: BlockChain, key: jax.Array
-) -> tuple[BlockChain, BlocksSwept]:
-    """Gibbs sweeps over the hyper-parameters of all biases and the biases of each block, given its cavity (B, p, p).
-
-    The prior is exact, with all that biases share; moments are those of the Gaussians given hyper-parameters.
-    """
-    learnt, M = jnp.asarray(form.hierarchy.learnt, int), form.biases
-    updates = form.hierarchy.updates()
-
-    def given(phi: Phi) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Root (B, p, p) of the covariances of the blocks, their means (B, p), and precisions (M,) of the biases."""
-        alpha = form.hierarchy.alpha(phi, first.alpha)
-        own = jnp.append(alpha, 0.0)[members]
-        eye = jnp.eye(members.shape[1])[None]
-        root = jax.vmap(linalg.inverse_cholesky)(cavity.precision + eye * own[:, :, None])
-        return root, jnp.einsum("bji,bjk,bk->bi", root, root, cavity.pull), alpha
-
-    def spread_out(values: jax.Array) -> jax.Array:
-        """Values (B, p) of the members as (M,)."""
-        return jnp.zeros(M + 1).at[members].set(values)[:M]
-
-    def one(carry: tuple[BlockChain, Any], k: jax.Array) -> tuple[tuple[BlockChain, Any], None]:
-        (z, phi), (count, mean, second, gamma, means, sds) = carry
-        keys = jax.random.split(jax.random.fold_in(key, k), len(updates) + 1)
-        for update, own in zip(updates, keys, strict=False):
-            phi = update(phi, z[learnt], own)
-        root, middle, alpha = given(phi)
-        drawn = middle + jnp.einsum("bji,bj->bi", root, jax.random.normal(keys[-1], middle.shape))
-        covariance = root.mT @ root
-        variance = spread_out(jnp.diagonal(covariance, axis1=1, axis2=2))
-        on = (k >= BURN) * 1.0
-        slot = jnp.maximum(k - BURN, 0) // EVERY
-        sums = (
-            count + on, mean + on * middle,
-            second + on * (covariance + middle[:, :, None] * middle[:, None, :]),
-            gamma + on * jnp.clip(1.0 - alpha * variance, 0.0, 1.0),
-            means.at[slot].set(spread_out(middle)), sds.at[slot].set(jnp.sqrt(variance)),
-        )  # fmt: skip
-        return (BlockChain(spread_out(drawn), phi), sums), None
-
-    B, p = members.shape
-    blank = (
-        jnp.zeros(()), jnp.zeros((B, p)), jnp.zeros((B, p, p)), jnp.zeros(M), jnp.zeros((KEPT, M)), jnp.zeros((KEPT, M))
-    )  # fmt: skip
-    (chain, sums), _ = jax.lax.scan(one, (chain, blank), jnp.arange(BURN + EVERY * KEPT))
-    count, mean, second, gamma, means, sds = sums
-    mean = mean / count
-    covariance = second / count - mean[:, :, None] * mean[:, None, :]
-    return chain, BlocksSwept(mean, covariance, gamma / count, means, sds)
-
-
-@dataclass(eq=False)
-class Propagation:
-    """Expectation propagation around a sparse Gaussian likelihood, with a Gaussian site for the priors of each block.
-
-    A block is the biases of one sensor, which its own data tell apart worst: what is left open between a place and an
-    offset has several answers under a sparse prior, and its moments are found by sweeps within the block.
-    """
+@dataclass(frozen=True, eq=False)
+class SparseLikelihood:
+    """The likelihood of a sparse system as a propagation reads it."""
 
     model: Model
-    form: Form
-    first: Precision
     system: SparseSystem
-    sites: Blocks
-    members: np.ndarray  # (B, p) biases of each block, M of none
-    pairs: np.ndarray  # (B, p, p) where the entries of their covariances are, -1 of none
-    key: jax.Array
-    chain: BlockChain | None = None
-    swept: BlocksSwept | None = None
-    variance: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (n,) of all variables
+    pairs: np.ndarray  # (B, p, p) where the entries of the pairs of the blocks are, -1 of none
 
     @property
-    def entries(self) -> np.ndarray:
-        """Entries of the joint precision with the sites."""
-        whole, p = self.system.entries.copy(), self.members.shape[1]
+    def z(self) -> np.ndarray:
+        """Biases (M,) of the point."""
+        return np.asarray(self.system.point.z)
+
+    def entries(self, sites: Blocks) -> np.ndarray:
+        """Entries of the joint precision with sites."""
+        whole, p = self.system.entries.copy(), self.pairs.shape[1]
         upper = np.triu(np.ones((p, p), bool))[None] & (self.pairs >= 0)
-        np.add.at(whole, self.pairs[upper], self.sites.precision[upper])
+        np.add.at(whole, self.pairs[upper], sites.precision[upper])
         return whole
 
-    def factor(self) -> Factor:
-        """The joint precision with the sites, factorised."""
-        return self.system.joint.factor(self.entries, np.zeros(self.form.biases))
-
-    def of_blocks(self, values: np.ndarray) -> np.ndarray:
-        """Values (B, p) of the members as (M,)."""
-        found = np.zeros(self.form.biases + 1)
-        found[self.members] = values
-        return found[:-1]
-
-    def round(self, turn: int) -> float:
-        """Renew all sites; the root mean square of how far the means moved, in sds."""
-        joint, M, z = self.system.joint, self.form.biases, np.asarray(self.system.point.z)
-        factor = self.factor()
+    def marginals(self, members: np.ndarray, sites: Blocks) -> BlockMarginals:
+        """Marginals of the blocks by the selected inverse, and the variances (n,) of all variables."""
+        joint, M = self.system.joint, len(self.z)
+        factor = joint.factor(self.entries(sites), np.zeros(M))
         entries = factor.inverse_entries()
-        self.variance = entries[joint.places.diagonal]
-        none = self.members == M
-        eye = np.eye(self.members.shape[1])[None]
-        covariance = np.where(self.pairs >= 0, entries[self.pairs], eye * none[:, None])
-        inner = np.append(z, 0.0)[self.members]
-        right = self.of_blocks(self.sites.pull - np.einsum("bij,bj->bi", self.sites.precision, inner))
-        mean = z + factor.solve(joint.of_biases(self.system.pull + right))[joint.states :]
-        precision = np.linalg.inv(covariance)
-        middle = np.append(mean, 0.0)[self.members]
-        cavity = Blocks(
-            _positive(precision - self.sites.precision), np.einsum("bij,bj->bi", precision, middle) - self.sites.pull
-        )
-        if self.chain is None:
-            self.chain = BlockChain(jnp.asarray(mean), self.form.hierarchy.begin(jax.random.fold_in(self.key, 0)))
-        own = jax.random.fold_in(self.key, 1 + turn)
-        self.chain, swept = sweep_blocks(self.form, self.first, self.members, cavity, self.chain, own)
-        self.swept = swept = jax.device_get(swept)
-        tilted = np.linalg.inv(swept.covariance)
-        new = Blocks(tilted - cavity.precision, np.einsum("bij,bj->bi", tilted, swept.mean) - cavity.pull)
-        floor = -MINUS * cavity.precision  # what is left of a cavity stays positive
-        new = new._replace(precision=_positive(new.precision - floor) + floor)
-        share = min(DAMPING, 1.0 / max(turn - SURE, 1))  # later rounds are averaged: sweeps are noisy
-        self.sites = Blocks(*(share * a + (1 - share) * b for a, b in zip(new, self.sites, strict=True)))
-        off = self.of_blocks((swept.mean - middle) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
-        return float(np.sqrt(np.mean(off**2)))
+        eye = np.eye(members.shape[1])[None] * (members == M)[:, None]
+        covariance = np.where(self.pairs >= 0, entries[self.pairs], eye)
+        right, inner = np.zeros(M + 1), np.append(self.z, 0.0)[members]
+        right[members] = sites.pull - np.einsum("bij,bj->bi", sites.precision, inner)
+        mean = self.z + factor.solve(joint.of_biases(self.system.pull + right[:M]))[joint.states :]
+        return BlockMarginals(mean, covariance, entries[joint.places.diagonal])
 
-    def run(self, told: Callable[[int, float], Any]) -> bool:
-        """Rounds until the means move by less than `CLOSE` sds in the root mean square; whether that was reached.
-
-        Between rounds the likelihood is taken anew at the mean.
-        """
-        for turn in range(ROUNDS):
-            off = self.round(turn)
-            told(turn, off)
-            assert self.swept is not None
-            moved = self.of_blocks(self.swept.mean) - np.asarray(self.system.point.z)
-            far = np.sqrt(np.mean(moved**2 / self.variance[self.system.joint.states :]))
-            if turn >= SURE and off < CLOSE and far < NEAR:
-                return True
-            if turn + 1 < ROUNDS and far >= AGAIN:
-                point = self.system.moved(self.model, moved)
-                self.system = system_at(self.model, self.system.joint, point)
-        return False
-
-
-def _positive(matrices: np.ndarray) -> np.ndarray:
-    """Symmetric matrices (B, p, p) with eigenvalues that are not negative."""
-    values, vectors = np.linalg.eigh(0.5 * (matrices + matrices.transpose(0, 2, 1)))
-    return np.einsum("bik,bk,bjk->bij", vectors, np.maximum(values, LEAST), vectors)
+    def at(self, z: np.ndarray) -> SparseLikelihood:
+        """The system at other biases (M,), every track following."""
+        moved = self.system.moved(self.model, z - self.z)
+        return replace(self, system=system_at(self.model, self.system.joint, moved))
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,20 +235,20 @@ def _integrated(
     form = Form(problem.model.biases, hierarchy_of(prior, problem))
     if not form.hierarchy.learnt:  # every bias has a survey
         return _gaussian(problem, prior, mode, evidence, np.asarray(first.alpha)), True
-    members, pairs = mode.system.joint.blocks(problem.model)
-    eye = np.eye(members.shape[1])[None] * (members < form.biases)[:, :, None]
-    sites = Blocks(np.broadcast_to(eye, pairs.shape).copy(), np.zeros(members.shape))
-    work = Propagation(problem.model, form, first, mode.system, sites, members, pairs, key)
-    settled = work.run(told)
-    return _mixture(problem, prior, work, evidence), settled
+    members = blocks_of(problem.model)
+    likelihood = SparseLikelihood(problem.model, mode.system, mode.system.joint.pairs(members))
+    work = Propagation.of(form, first, likelihood, members, key)
+    work.run(told)
+    return _mixture(problem, prior, work, evidence), work.settled
 
 
 def _mixture(problem: Problem, prior: Prior, work: Propagation, evidence: float) -> SparsePosterior:
     """The marginals where a propagation ended."""
-    swept, system = work.swept, work.system
+    swept, found, likelihood = work.swept, work.found, work.likelihood
     assert swept is not None
-    mean = work.of_blocks(swept.mean)
-    own = work.of_blocks(np.diagonal(swept.covariance, axis1=1, axis2=2))
+    assert found is not None
+    assert isinstance(likelihood, SparseLikelihood)
+    mean, own, system = work.mean, work.variance, likelihood.system
     tail, first = 0.5 * (1.0 - INTERVAL), np.asarray(work.first.alpha)
     lower, upper = (np.asarray(quantile(swept.means, swept.sds, share)) for share in (tail, 1.0 - tail))
     alpha = np.clip((1 - swept.gamma) / np.maximum(own, 1e-300), *PRECISION_BOUNDS)
@@ -398,4 +257,5 @@ def _mixture(problem: Problem, prior: Prior, work: Propagation, evidence: float)
         np.zeros(0), evidence, variance=own,
     )  # fmt: skip
     point = system.moved(problem.model, mean - np.asarray(system.point.z))
-    return SparsePosterior(problem, prior, point, summary, system, work.entries, np.zeros_like(first), work.variance)
+    entries = likelihood.entries(work.sites)
+    return SparsePosterior(problem, prior, point, summary, system, entries, np.zeros_like(first), found.whole)

@@ -27,6 +27,7 @@ from probcal.inference.run import (
     Method,
     State,
     check_method,
+    first_precision,
     first_state,
     given_of,
     kernel,
@@ -156,11 +157,16 @@ def _batch(
                     )
                 ]
                 how, climb = method.integration(chosen[0].problem, prior), method.climbs_under(prior)
-                solved = _solve(kernel(method), stacked[0], climb, method.iterations, *stacked[1:], how)
+                inside = how if how is not None and how.sweeps else None  # a propagation runs on the host
+                solved = _solve(kernel(method), stacked[0], climb, method.iterations, *stacked[1:], inside)
                 solved = jax.tree.map(np.asarray, solved)
                 for j, k in enumerate(members):
                     state, mixed, square, count = jax.tree.map(lambda leaf, j=j: leaf[j], solved)
                     problem = chosen[j].problem.with_mixing(state.mixing)
+                    if how is not None and inside is None:
+                        held = first_precision(problem, prior)
+                        mixed = integrate(how, problem.model, held, state.point, jax.random.key(SEED))
+                        square = mean_square(problem.model, mixed.point)
                     answer = conclude(problem, method, prior, state, NOTHING, float(square), int(count), how, mixed)
                     found.append({"run": runs[k].number, "method": name} | _record(chosen[j], answer))
         if stored:

@@ -106,34 +106,16 @@ class JointPrecision:
         whole[-len(alpha) :] += alpha  # the last entries are the diagonal of the biases
         return factorise(self.places, whole)
 
-    def blocks(self, model: Model) -> tuple[np.ndarray, np.ndarray]:
-        """Biases (B, p) of each sensor that no sensor before has, M of none, and the entries (B, p, p) of their pairs.
-
-        An entry of -1 stands where there is no pair.
-        """
-        M = model.biases
-        taken, members = np.zeros(M + 1, bool), list[np.ndarray]()
-        taken[M] = True
-        wide = max((data.bias.shape[1] for data in model.rows), default=1)
-        for data in model.rows:
-            own: np.ndarray = np.sort(np.asarray(data.bias), 1)
-            own = np.where(np.concatenate([np.zeros((len(own), 1), bool), own[:, 1:] == own[:, :-1]], 1), M, own)
-            values, first = np.unique(own, return_index=True)
-            mine: np.ndarray = np.full(own.size, M)
-            mine[first] = np.where(taken[values], M, values)
-            taken[values] = True
-            room = wide - own.shape[1]
-            members.append(np.pad(mine.reshape(own.shape), ((0, 0), (0, room)), constant_values=M))
-        found = np.concatenate([*members, np.zeros((0, wide), int)])
-        found = found[(found < M).any(1)]
+    def pairs(self, members: np.ndarray) -> np.ndarray:
+        """Where the entries (B, p, p) of pairs of biases (B, p) are, -1 where there is no pair; M is no bias."""
         keys = self.places.row.astype(np.int64) * self.places.size + self.places.column
         order = np.argsort(keys, kind="stable")
-        low = np.minimum(found[:, :, None], found[:, None, :]) + self.states
-        high = np.maximum(found[:, :, None], found[:, None, :]) + self.states
+        low = np.minimum(members[:, :, None], members[:, None, :]) + self.states
+        high = np.maximum(members[:, :, None], members[:, None, :]) + self.states
         wanted = low.astype(np.int64) * self.places.size + high
         at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
-        there = (high < self.states + M) & (keys[order][at] == wanted)
-        return found, np.where(there, order[at], -1)
+        there = (high < self.places.size) & (keys[order][at] == wanted)
+        return np.where(there, order[at], -1)
 
     def of_biases(self, pull: np.ndarray) -> np.ndarray:
         """A right-hand side (n,) with entries (M,) or (M, K) for the biases alone."""
