@@ -1,5 +1,6 @@
 """The sparse form beside the dense one: the same mode, variances, evidence and tracks; and what it refuses."""
 
+import sys
 from functools import cache
 
 import jax
@@ -10,11 +11,11 @@ import pytest
 import probcal as pc
 from probcal.errors import FitError, InputError
 from probcal.geometry import bearing, norm
-from probcal.inference.propagate import blocks_of
 from probcal.inference.sparse import takes_sparse
+from probcal.results.blocks import covariance_of
 from probcal.smoothing import cholesky
 from probcal.smoothing.cholesky import Cholmod, Entries, SuperLU
-from probcal.smoothing.joint import JointPrecision, missing
+from probcal.smoothing.joint import JointPrecision, blocks_of, missing
 from probcal.smoothing.linearised import linearise_rows
 from probcal.smoothing.mode import compress
 from probcal.smoothing.room import check_room
@@ -238,9 +239,40 @@ def test_what_has_no_sparse_form_is_named():
 
 def test_what_needs_the_whole_covariance_says_so():
     tree = fitted(pc.MAP(form="sparse"), pc.Gaussian())
-    for call in (lambda: pc.assess(drawn()[0], tree), lambda: pc.track(drawn()[0], tree)):
-        with pytest.raises(InputError, match="needs the covariance of all biases, which a fit in sparse form"):
-            call()
+    with pytest.raises(InputError, match="needs the covariance of all biases, which a fit in sparse form"):
+        pc.assess(drawn()[0], tree)
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_tracks_of_a_sparse_calibration_have_the_covariance_of_each_sensor(dense, many, monkeypatch):
+    """As the dense one with nothing between sensors, with all biases at once and by columns."""
+    sparse = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    apart = dense.copy(deep=True)
+    group = apart["calibration"].to_dataset()
+    owner = np.array(sparse["calibration"]["block"].values)
+    group["covariance"] = group["covariance"] * (owner[:, None] == owner[None])
+    apart["calibration"] = group
+    wanted = pc.track(drawn()[0], apart)
+    monkeypatch.setattr(sys.modules["probcal.inference.fit"], "prefers_sparse", lambda model: many)
+    found, whole = pc.track(drawn()[0], sparse), pc.track(drawn()[0], apart)
+    for name in ("car", "van", "mast"):
+        for column in ("mean", "sd", "before"):
+            for tree, close in ((found, 1e-3), (whole, 1e-6)):
+                np.testing.assert_allclose(
+                    tree[f"track/{name}"][column], wanted[f"track/{name}"][column], rtol=close, atol=close
+                )
+
+
+def test_the_covariance_of_each_sensor_is_that_of_the_dense_form(dense):
+    """Of any two biases of a sensor; what a drift and a picture of two biases read."""
+    sparse = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    group, whole = sparse["calibration"].to_dataset(), dense["calibration"]["covariance"]
+    labels = group["bias_label"].values.tolist()
+    assert sorted(np.bincount(group["block"].values)) == [1, 1, 4, 4, 5], "a radar also has the gain of its type"
+    for chosen in (labels, labels[::-2], ["c.heading", "b.position_x", "b.range_offset"]):
+        found, dims = covariance_of(group, chosen, "a test"), {"bias_label": chosen, "bias_label_other": chosen}
+        own = group["block"].sel(bias_label=chosen).values
+        np.testing.assert_allclose(found, whole.sel(dims) * (own[:, None] == own[None]), rtol=1e-5, atol=1e-9)
 
 
 def test_a_dense_form_that_fits_no_machine_is_refused(monkeypatch):

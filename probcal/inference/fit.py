@@ -31,16 +31,18 @@ from probcal.lazy import Later
 from probcal.particle.settings import Particles
 from probcal.priors import Prior
 from probcal.problem import Problem, check_linear
-from probcal.results.answer import Answer, tracks_of, uncalibrated
+from probcal.results.answer import Answer, Tracks, tracks_of, uncalibrated
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
 from probcal.results.objects import belief_group, disagreeing, object_groups
-from probcal.results.read import apply
+from probcal.results.read import Calibrated, apply
 from probcal.simulate import Key, as_key
-from probcal.smoothing.grid import track_mode
+from probcal.smoothing.grid import grid_start, track_mode
 from probcal.smoothing.information import at_levels
+from probcal.smoothing.joint import missing, prefers_sparse
 from probcal.smoothing.linearised import linearise
 from probcal.smoothing.mirrors import SAME, Mirrored
 from probcal.smoothing.mode import Point
+from probcal.smoothing.sparse_mode import settle_each, settled_variances
 from probcal.smoothing.tails import settle
 from probcal.starts import automatic_start
 from probcal.status import Status
@@ -303,7 +305,8 @@ def track(
 ) -> xr.DataTree:
     """Tracks of other data with a calibration applied: a tree with group `track` (mean, sd, before).
 
-    The biases are held at the calibrated means; the sd carries their covariance. Biases are matched by label. Without
+    The biases are held at the calibrated means; the sd carries their covariance, of a fit in sparse form that of each
+    sensor by itself. Biases are matched by label. Without
     a `smoother` each track is its mode and the Gaussian about it; `Particles(2000)` filters and smooths any motion, a
     road too, by draws that `key` seeds, and says in the attributes `status` and `message` whether some target's rows
     are explained by no path. Of detections that name no target the objects are found first (`track_objects`), as groups
@@ -324,12 +327,15 @@ def track(
         named = problem.assigned(objects.rows)
         return _with_objects(track(named, calibration, smoother=smoother, key=key), objects, problem, known.z)
     found = apply(problem, calibration)
-    problem, covariance = found.problem, jnp.asarray(found.covariance)
+    problem = found.problem
     if smoother is not None:
         if not isinstance(smoother, Particles):
             raise InputError(f"track(smoother={smoother!r}): give Particles(2000), or None for the Gaussian smoother")
         return track_by_particles(problem, smoother, found.z, found.covariance, found.levels, as_key(key))
     check_linear(problem)
+    if not missing(problem.model) and prefers_sparse(problem.model):
+        return build_tracks(problem, bands(*_many_tracks(problem, found)))
+    covariance = jnp.asarray(found.covariance)
     start = at_levels(problem.model, automatic_start(problem), jnp.asarray(found.levels))
     before = track_mode(problem, uncalibrated(start))
     after = track_mode(problem, start._replace(z=jnp.asarray(found.z)))
@@ -337,3 +343,12 @@ def track(
         _, before = settle(problem, before, jnp.zeros_like(covariance))
         problem, after = settle(problem, after, covariance)
     return build_tracks(problem, bands(tracks_of(linearise(problem.model, after), covariance), before))
+
+
+def _many_tracks(problem: Problem, found: Calibrated) -> tuple[list[Tracks], Point]:
+    """Tracks at a calibration where the response of all states to all biases does not fit, and those without it."""
+    z = jnp.asarray(found.z)
+    before = settle_each(problem.model, grid_start(problem, jnp.zeros_like(z), 30))
+    after = settle_each(problem.model, grid_start(problem, z, 30))
+    variances = settled_variances(problem.model, after, found.root)
+    return [Tracks(np.asarray(x), np.sqrt(own)) for x, own in zip(after.states, variances, strict=True)], before

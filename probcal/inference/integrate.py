@@ -18,10 +18,11 @@ from probcal import linalg
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Natural, activity, draw_given, prior_precision
-from probcal.inference.propagate import BlockMarginals, Blocks, Propagation, blocks_of
+from probcal.inference.propagate import BlockMarginals, Blocks, Propagation
 from probcal.model.model import Model
 from probcal.priors import Precision
 from probcal.results.schema import INTERVAL
+from probcal.smoothing.joint import blocks_of
 from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
 from probcal.smoothing.marginal import volume_slope
 from probcal.smoothing.mode import Eliminated, Point, smooth_tracks
@@ -266,7 +267,7 @@ def moments(form: Form, known: Natural, phi: Phi) -> Moments:
 
 
 def quantile(means: jax.Array, sds: jax.Array, share: float) -> jax.Array:
-    """Quantile (M,) of each mixture of Gaussians of means and sds (S, M), by halving a bracket; zero in an atom there."""
+    """Quantile (M,) of each mixture of Gaussians of means and sds (S, M), by halving a bracket; an atom counts."""
     width = 10.0 * jnp.max(sds, 0) + 1e-12
 
     def half(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

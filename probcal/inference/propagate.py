@@ -21,7 +21,6 @@ import numpy as np
 from probcal import linalg
 from probcal.inference.hierarchy import Phi, SpikeAndSlab
 from probcal.inference.posed import Form
-from probcal.model.model import Model
 from probcal.priors import Precision
 
 ROUNDS, SURE, CLOSE, DAMPING = 10, 2, 0.15, 0.7  # rounds, those not yet averaged, sds (rms) of a move, share of a site
@@ -76,27 +75,6 @@ class BiasLikelihood(Protocol):
 
     def at(self, z: np.ndarray) -> BiasLikelihood:
         """The likelihood taken at other biases (M,)."""
-
-
-def blocks_of(model: Model) -> np.ndarray:
-    """Biases (B, p) of each sensor that no sensor before has, M of none; those of no sensor by themselves."""
-    M = model.biases
-    taken, members = np.zeros(M + 1, bool), list[np.ndarray]()
-    taken[M] = True
-    wide = max((data.bias.shape[1] for data in model.rows), default=1)
-    for data in model.rows:
-        own: np.ndarray = np.sort(np.asarray(data.bias), 1)
-        own = np.where(np.concatenate([np.zeros((len(own), 1), bool), own[:, 1:] == own[:, :-1]], 1), M, own)
-        values, first = np.unique(own, return_index=True)
-        mine: np.ndarray = np.full(own.size, M)
-        mine[first] = np.where(taken[values], M, values)
-        taken[values] = True
-        room = wide - own.shape[1]
-        members.append(np.pad(mine.reshape(own.shape), ((0, 0), (0, room)), constant_values=M))
-    alone = np.flatnonzero(~taken)[:, None]
-    members.append(np.pad(alone, ((0, 0), (0, wide - 1)), constant_values=M))
-    found = np.concatenate(members)
-    return found[(found < M).any(1)]
 
 
 @partial(jax.jit, static_argnames="form")

@@ -20,15 +20,16 @@ from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.integrate import quantile
 from probcal.inference.posed import Form
 from probcal.inference.progress import Progress
-from probcal.inference.propagate import BlockMarginals, Blocks, Propagation, blocks_of
+from probcal.inference.propagate import BlockMarginals, Blocks, Propagation
 from probcal.model.model import Model
 from probcal.priors import PRECISION_BOUNDS, Flat, Gaussian, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import HALF, Answer, Draws, Posterior, Summary, Tracks
+from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
 from probcal.smoothing.cholesky import exact
 from probcal.smoothing.information import mean_square
-from probcal.smoothing.joint import JointPrecision, missing, prefers_sparse
+from probcal.smoothing.joint import JointPrecision, blocks_of, missing, prefers_sparse
 from probcal.smoothing.mode import Point
 from probcal.smoothing.sparse_mode import SparseMode, SparseSystem, find_sparse_mode, system_at
 
@@ -93,8 +94,7 @@ class SparseLikelihood:
         joint, M = self.system.joint, len(self.z)
         factor = joint.factor(self.entries(sites), np.zeros(M))
         entries = factor.inverse_entries()
-        eye = np.eye(members.shape[1])[None] * (members == M)[:, None]
-        covariance = np.where(self.pairs >= 0, entries[self.pairs], eye)
+        covariance = _of_pairs(entries, self.pairs, members == M)
         right, inner = np.zeros(M + 1), np.append(self.z, 0.0)[members]
         right[members] = sites.pull - np.einsum("bij,bj->bi", sites.precision, inner)
         mean = self.z + factor.solve(joint.of_biases(self.system.pull + right[:M]))[joint.states :]
@@ -208,16 +208,28 @@ def _evidence(mode: SparseMode, problem: Problem, alpha: np.ndarray) -> float:
 
 def _gaussian(problem: Problem, prior: Prior, mode: SparseMode, evidence: float, alpha: np.ndarray) -> SparsePosterior:
     """The Gaussian at a mode."""
-    variance, error = mode.factor.inverse_diagonal()
-    z, own = np.asarray(mode.system.point.z), variance[mode.system.joint.states :]
+    joint, z = mode.system.joint, np.asarray(mode.system.point.z)
+    if exact():
+        entries, members = mode.factor.inverse_entries(), blocks_of(problem.model)
+        blocks = SensorBlocks(len(z), members, _of_pairs(entries, joint.pairs(members), members == len(z)))
+        variance, error = entries[joint.places.diagonal], np.zeros(joint.places.size)
+    else:  # entries off the diagonal are not estimated
+        variance, error = mode.factor.inverse_diagonal()
+        blocks = SensorBlocks(len(z), np.arange(len(z))[:, None], variance[joint.states :, None, None])
+    own = variance[joint.states :]
     half = HALF * np.sqrt(own)
     gamma = np.clip(1.0 - alpha * own, 0.0, 1.0)
     summary = Summary(
         "Laplace", "given", z, None, z - half, z + half, gamma, alpha, None, np.zeros(0),
-        evidence if prior.proper else None, _errors(error, variance, mode.system), variance=own,
+        evidence if prior.proper else None, _errors(error, variance, mode.system), blocks=blocks,
     )  # fmt: skip
     at = mode.system
     return SparsePosterior(problem, prior, at.point, summary, at, at.entries, alpha, variance)
+
+
+def _of_pairs(entries: np.ndarray, pairs: np.ndarray, none: np.ndarray) -> np.ndarray:
+    """Entries of an inverse at pairs (B, p, p) of blocks, 1 on the diagonal where there is no bias (B, p)."""
+    return np.where(pairs >= 0, entries[pairs], np.eye(pairs.shape[1])[None] * none[:, None])
 
 
 def _errors(error: np.ndarray, variance: np.ndarray, system: SparseSystem) -> dict[str, np.ndarray]:
@@ -254,7 +266,7 @@ def _mixture(problem: Problem, prior: Prior, work: Propagation, evidence: float)
     alpha = np.clip((1 - swept.gamma) / np.maximum(own, 1e-300), *PRECISION_BOUNDS)
     summary = Summary(
         "mixture", "integrated", mean, None, lower, upper, swept.gamma, np.where(problem.surveyed, first, alpha), None,
-        np.zeros(0), evidence, variance=own,
+        np.zeros(0), evidence, blocks=SensorBlocks(len(mean), work.members, swept.covariance),
     )  # fmt: skip
     point = system.moved(problem.model, mean - np.asarray(system.point.z))
     entries = likelihood.entries(work.sites)

@@ -18,6 +18,7 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.priors import Prior
+from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL
 from probcal.smoothing.draws import draw, draw_biases, draws_a_chain
 from probcal.smoothing.grid import track_mode
@@ -77,7 +78,7 @@ class Summary:
     levels: np.ndarray  # (H,) log factors of the unknown noise levels
     evidence: float | None = None  # where the method has one
     columns: Mapping[str, np.ndarray] = field(default_factory=dict)  # further ones by name, (M,)
-    variance: np.ndarray | None = None  # (M,) where there is no covariance
+    blocks: SensorBlocks | None = None  # of the covariance, where there is none of all
 
     @property
     def whole(self) -> np.ndarray:
@@ -91,8 +92,8 @@ class Summary:
         """Standard deviation of each bias, (M,)."""
         if self.covariance is not None:
             return np.sqrt(np.diag(self.covariance))
-        assert self.variance is not None
-        return np.sqrt(self.variance)
+        assert self.blocks is not None
+        return np.sqrt(self.blocks.variance)
 
 
 @dataclass(frozen=True, eq=False)

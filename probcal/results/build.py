@@ -120,6 +120,7 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
     if answer.prior.correlation:
         matrices["coupling"] = np.asarray(answer.prior.precision(problem.labels, problem.surveyed).coupling)
     values: dict[str, Any] = {name: ("bias_label", column) for name, column in columns.items()}
+    values |= {} if found.blocks is None else found.blocks.columns(scales)
     values |= {name: (("bias_label", "bias_label_other"), matrix) for name, matrix in matrices.items()}
     coords = bias_coords(problem) | ({"bias_label_other": labels} if matrices else {})
     return xr.Dataset(values, coords=coords)

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from probcal.labels import step_of
-from probcal.results.schema import matrix_of
+from probcal.results.blocks import covariance_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -50,7 +50,6 @@ def drift_table(tree: xr.DataTree) -> pd.DataFrame:
             members = [labels.index(label) for label in so_far if label in units]
             held = sum(fixed.get(label, 0.0) for label in so_far)
             lower, upper = held + np.quantile(draws[..., members].sum(-1), [tail, 1 - tail])
-            covariance = matrix_of(group, "covariance", "drift_table").values
-            sd = np.sqrt(covariance[np.ix_(members, members)].sum())
+            sd = np.sqrt(covariance_of(group, [labels[m] for m in members], "drift_table").sum())
             table.append((name, units[known[0]], since, held + mean[members].sum(), sd, lower, upper))
     return pd.DataFrame(table, columns=columns)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.results.schema import MORE, SUMMARY, matrix_of
+from probcal.results.blocks import SensorBlocks, covariance_of
+from probcal.results.schema import MORE, SUMMARY
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -103,8 +104,21 @@ class Calibrated:
 
     problem: Problem
     z: np.ndarray  # (M,)
-    covariance: np.ndarray  # (M, M)
     levels: np.ndarray  # (H,) log factors
+    spread: np.ndarray | SensorBlocks  # covariance (M, M), or what a fit in sparse form has of it
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance (M, M) of z."""
+        return self.spread.matrix() if isinstance(self.spread, SensorBlocks) else self.spread
+
+    @property
+    def root(self) -> Any:
+        """A root (M, R) of the covariance, sparse where sensors are independent."""
+        if isinstance(self.spread, SensorBlocks):
+            return self.spread.root()
+        values, vectors = np.linalg.eigh(self.spread)
+        return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
@@ -123,9 +137,11 @@ def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
         if label not in known:
             raise InputError(f'the calibration has no bias "{label}"; fit the same network, or fix that bias')
     mean = group["mean"].sel(bias_label=labels).values
-    spread = matrix_of(group, "covariance", "a calibration").sel(bias_label=labels, bias_label_other=labels).values
     levels = np.zeros(len(problem.levels))
     if problem.levels and "level" in calibration.children:
         found = calibration["level"].to_dataset()["std"].to_series()
         levels = np.array([np.log(found.get(r.label, r.guess) / r.guess) for r in problem.levels])
-    return Calibrated(problem, mean / problem.scales, spread / np.outer(problem.scales, problem.scales), levels)
+    if "block" in group:
+        return Calibrated(problem, mean / problem.scales, levels, SensorBlocks.read(group, labels, problem.scales))
+    spread = covariance_of(group, labels, "a calibration") / np.outer(problem.scales, problem.scales)
+    return Calibrated(problem, mean / problem.scales, levels, spread)

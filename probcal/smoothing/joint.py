@@ -117,6 +117,23 @@ class JointPrecision:
         there = (high < self.places.size) & (keys[order][at] == wanted)
         return np.where(there, order[at], -1)
 
+    def states_alone(self, values: np.ndarray) -> Factor:
+        """Factorise the precision of the states at held biases."""
+        own = self.places.column < self.states
+        where = np.cumsum(own) - 1
+        places = Entries(
+            self.places.row[own], self.places.column[own], self.states, where[self.places.diagonal[: self.states]]
+        )
+        return factorise(places, values[own])
+
+    def across(self, values: np.ndarray) -> Any:
+        """The part (states, M) of the precision between states and biases, sparse."""
+        from scipy.sparse import coo_array  # loaded where it is used
+
+        own = (self.places.row < self.states) & (self.places.column >= self.states)
+        shape = (self.states, self.places.size - self.states)
+        return coo_array((values[own], (self.places.row[own], self.places.column[own] - self.states)), shape).tocsr()
+
     def of_biases(self, pull: np.ndarray) -> np.ndarray:
         """A right-hand side (n,) with entries (M,) or (M, K) for the biases alone."""
         return np.concatenate([np.zeros((self.states, *pull.shape[1:])), pull])
@@ -133,6 +150,27 @@ class JointPrecision:
             if own.any():
                 total += 2.0 * float(np.sum(np.linalg.slogdet(np.asarray(factors(part, levels))[own])[1]))
         return total
+
+
+def blocks_of(model: Model) -> np.ndarray:
+    """Biases (B, p) of each sensor that no sensor before has, M of none; those of no sensor by themselves."""
+    M = model.biases
+    taken, members = np.zeros(M + 1, bool), list[np.ndarray]()
+    taken[M] = True
+    wide = max((data.bias.shape[1] for data in model.rows), default=1)
+    for data in model.rows:
+        own: np.ndarray = np.sort(np.asarray(data.bias), 1)
+        own = np.where(np.concatenate([np.zeros((len(own), 1), bool), own[:, 1:] == own[:, :-1]], 1), M, own)
+        values, first = np.unique(own, return_index=True)
+        mine: np.ndarray = np.full(own.size, M)
+        mine[first] = np.where(taken[values], M, values)
+        taken[values] = True
+        room = wide - own.shape[1]
+        members.append(np.pad(mine.reshape(own.shape), ((0, 0), (0, room)), constant_values=M))
+    alone = np.flatnonzero(~taken)[:, None]
+    members.append(np.pad(alone, ((0, 0), (0, wide - 1)), constant_values=M))
+    found = np.concatenate(members)
+    return found[(found < M).any(1)]
 
 
 def _entries(

@@ -25,6 +25,7 @@ from probcal.smoothing.marginal import ENOUGH, HALVINGS, LEAST_CURVED, SETTLED, 
 from probcal.smoothing.mode import Eliminated, Point, cost, eliminate, eliminate_rows, factors, follow
 
 KEPT = 8  # secants
+COLUMNS = 256  # of a root of the covariance at once
 SMALL = 1e-9  # of the density: what a step that promises less cannot show
 
 
@@ -155,6 +156,22 @@ def _informed(model: Model, rows: tuple[Linearised, ...], solved: Eliminated, z:
         moved = jnp.einsum("ncp,nc->np", lin.bias, lin.weight * own[:, :, 0])
         g = g.at[data.bias].add(jax.ops.segment_sum(moved, data.sensor, data.bias.shape[0]))
     return g[: model.biases]
+
+
+def settled_variances(model: Model, point: Point, root: Any) -> list[np.ndarray]:
+    """Variances (E, n) of the states of each recursion at settled tracks, the biases of covariance root root' (M, R).
+
+    What each column of the root moves is found for some columns at a time. Raises `numpy.linalg.LinAlgError` where a
+    track is open.
+    """
+    joint = JointPrecision.of(model)
+    entries = joint.values(model, linearise_rows(model, point), point.levels)
+    factor, across = joint.states_alone(entries), joint.across(entries)
+    variance, _ = factor.inverse_diagonal()
+    for start in range(0, root.shape[1], COLUMNS):
+        pulled = across @ root[:, start : start + COLUMNS]
+        variance += np.sum(factor.solve(pulled if isinstance(pulled, np.ndarray) else pulled.toarray()) ** 2, 1)
+    return joint.state_values(variance)
 
 
 class SparseMode(NamedTuple):

@@ -1,0 +1,86 @@
+"""Covariances of the biases of each sensor by themselves, where there is no room for one of all biases."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from probcal.results.schema import matrix_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class SensorBlocks(NamedTuple):
+    """What a fit in sparse form knows of the covariance of M biases; those of two sensors count as independent."""
+
+    biases: int  # M
+    members: np.ndarray  # (B, p) biases of each block, M of none
+    covariance: np.ndarray  # (B, p, p); 1 on the diagonal where a block has fewer
+
+    @property
+    def variance(self) -> np.ndarray:
+        """Variance of each bias, (M,)."""
+        return self.of_biases(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    def of_biases(self, values: np.ndarray) -> np.ndarray:
+        """Values (B, p) of the members as (M,)."""
+        found = np.zeros(self.biases + 1, values.dtype)
+        found[self.members] = values
+        return found[:-1]
+
+    def columns(self, scales: np.ndarray) -> dict[str, Any]:
+        """Variables of the group `calibration`: the block of each bias, and its covariance with the members of that."""
+        own, p = np.append(scales, 0.0)[self.members], self.members.shape[1]
+        rows = self.covariance * own[:, :, None] * own[:, None, :]
+        number = np.broadcast_to(np.arange(len(self.members))[:, None], self.members.shape)
+        place = np.broadcast_to(np.arange(p), self.members.shape)
+        spread = np.stack([self.of_biases(rows[:, :, j]) for j in range(p)], 1)
+        return {
+            "block": ("bias_label", self.of_biases(number)), "block_place": ("bias_label", self.of_biases(place)),
+            "block_covariance": (("bias_label", "place"), spread),
+        }  # fmt: skip
+
+    @classmethod
+    def read(cls, group: xr.Dataset, labels: Sequence[str], scales: np.ndarray) -> SensorBlocks:
+        """Those of some biases, z over the scales (M,), as a group `calibration` has them."""
+        own = group[["block", "block_place", "block_covariance"]].sel(bias_label=list(labels))
+        number = np.unique(own["block"].values, return_inverse=True)[1]
+        place, M, p = own["block_place"].values, len(labels), group.sizes["place"]
+        members: np.ndarray = np.full((number.max(initial=-1) + 1, p), M)
+        members[number, place] = np.arange(M)
+        covariance = np.zeros((*members.shape, p))
+        covariance[number, place] = own["block_covariance"].values
+        over, there = 1.0 / np.append(scales, 1.0)[members], members < M
+        covariance *= over[:, :, None] * over[:, None, :] * (there[:, :, None] & there[:, None, :])
+        return cls(M, members, covariance + np.eye(p)[None] * ~there[:, :, None])
+
+    def matrix(self) -> np.ndarray:
+        """The covariance (M, M)."""
+        found = np.zeros((self.biases + 1, self.biases + 1))
+        found[self.members[:, :, None], self.members[:, None, :]] = self.covariance
+        return found[:-1, :-1]
+
+    def root(self) -> Any:
+        """A sparse root (M, B p) of the covariance."""
+        from scipy.sparse import csc_array  # loaded where it is used
+
+        B, p = self.members.shape
+        row = np.broadcast_to(self.members[:, :, None], (B, p, p))
+        column = np.broadcast_to((p * np.arange(B)[:, None] + np.arange(p))[:, None, :], (B, p, p))
+        there = (row < self.biases) & (self.members < self.biases)[:, None, :]
+        values = np.linalg.cholesky(self.covariance)
+        return csc_array((values[there], (row[there], column[there])), (self.biases, B * p))
+
+
+def covariance_of(group: xr.Dataset, labels: Sequence[str], whose: str) -> np.ndarray:
+    """The covariance of some biases in their units, from a group `calibration`; in sparse form by sensor.
+
+    Raises `InputError` where the group holds neither.
+    """
+    if "block" in group:
+        return SensorBlocks.read(group, labels, np.ones(len(labels))).matrix()
+    matrix = matrix_of(group, "covariance", whose).sel(bias_label=list(labels), bias_label_other=list(labels))
+    return np.asarray(matrix.values)
