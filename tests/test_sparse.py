@@ -281,3 +281,46 @@ def test_a_dense_form_that_fits_no_machine_is_refused(monkeypatch):
         check_room(drawn()[0].model)
     with jax.enable_x64(True), pytest.raises(InputError, match="in sparse form"):
         compress(drawn()[0].model, linearise_rows(drawn()[0].model, automatic_start(drawn()[0])))
+
+
+def test_what_the_data_leave_open_is_named_as_in_the_dense_form(dense):
+    """Combinations of single sensors by their information; those of all by the variance of their sum."""
+    sparse = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    a, b = (tree["direction"].to_dataset().sortby("information") for tree in (dense, sparse))
+    assert a["direction"].values.tolist() == b["direction"].values.tolist()
+    np.testing.assert_allclose(b["information"], a["information"], rtol=0.03)
+    assert sparse.attrs["weak"] == len(b["direction"])
+
+
+@cache
+def unanchored():
+    """Four radars whose common place and heading no row tells; each is displaced."""
+    nodes = [
+        pc.Node(name, place, scale={"position": 5.0, "heading": 0.05})
+        for name, place in zip("abcd", [(0.0, 0.0), (400.0, 0.0), (0.0, 400.0), (400.0, 400.0)], strict=True)
+    ]
+    network = pc.Network([radar.on(node) for node in nodes])
+    way = np.stack([np.linspace(50, 350, len(TIME)), 120 + 60 * np.sin(TIME / 5)], 1)
+    run = pc.simulate(network, MOTION["car"], TIME, key=3, tracks={"car": way}, biases={})
+    return network, run.table
+
+
+def test_what_all_sensors_share_is_open_in_both_forms():
+    """A translation and a rotation of all nodes, one with the information the dense form has."""
+    problem = pc.Problem(unanchored()[0], MOTION["car"], unanchored()[1])
+    dense, sparse = (pc.fit(problem, pc.MAP(form=form), prior=pc.Gaussian()) for form in ("dense", "sparse"))
+    names = [set(tree["direction"]["direction"].values.tolist()) for tree in (dense, sparse)]
+    assert {name for name in names[0] if "all nodes" in name} == {name for name in names[1] if "all nodes" in name}
+    assert {f"translation of all nodes along {axis}" for axis in "xy"} <= names[1] & names[0]
+    assert "translation of all nodes along x" in sparse.attrs["message"]
+
+
+def test_a_network_that_ran_along_what_no_row_tells_is_no_answer():
+    """All rows a mile off to one side: translated in both forms, and invalid in both."""
+    network, table = unanchored()
+    motion = pc.Target(pc.ConstantVelocity(1.0), start={"position": ((-150.0, 120.0), 1.0)})
+    problem = pc.Problem(network, motion, table)
+    for form in ("dense", "sparse"):
+        tree = pc.fit(problem, pc.MAP(form=form), prior=pc.Gaussian())
+        assert tree.attrs["status"] == "along a gauge", form
+        assert "along translation of all nodes along x, which no row fixes: it is invalid" in tree.attrs["message"]

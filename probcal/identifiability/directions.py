@@ -152,20 +152,77 @@ class _Naming:
         return [name for name, size in most.items() if size > max(ALONG * largest, 0.5 * max(most.values()))]
 
     def _combination(self, vector: np.ndarray) -> Pattern:
-        """A direction without a pattern, in words: its largest bias against the next ones."""
-        problem, labels = self.problem, involved(self.labels, vector, np.abs(vector).max())
-        first = labels[0]
-        alone = tuple((label,) for label in labels)
-        placed = any(
-            name_without_owner(label).startswith("position_") or name_without_owner(label) == "heading"
-            for label in labels[:3]
-        )
-        cause = self.cause if placed else ""
-        if len(labels) == 1:
-            return Pattern(f"{in_words(first)} alone", f"the data hardly depend on it{cause}", vector, "", alone)
-        one = len({owner_of(label) for label in labels[:3]}) == 1
-        others = " and ".join(name_without_owner(label) if one else in_words(label) for label in labels[1:3])
-        more = f" and {len(labels) - 3} more" if len(labels) > 3 else ""
-        amounts = ", ".join(amount(problem, label, vector[self.labels.index(label)]) for label in labels[:3])
-        name = f"{in_words(first)} against {'its ' if one else ''}{others}{more}"
-        return Pattern(name, f"{amounts} together hardly change the data{cause}", vector, "", alone)
+        return combination(self.problem, self.labels, vector, self.cause)
+
+
+def combination(problem: Problem, labels: list[str], vector: np.ndarray, why: str) -> Pattern:
+    """A direction (F,) of biases with these labels, without a pattern, in words: its largest bias against the next.
+
+    `why` is added where it moves a place.
+    """
+    most = involved(labels, vector, np.abs(vector).max())
+    alone = tuple((label,) for label in most)
+    placed = any(
+        name_without_owner(label).startswith("position_") or name_without_owner(label) == "heading"
+        for label in most[:3]
+    )
+    why = why if placed else ""
+    if len(most) == 1:
+        return Pattern(f"{in_words(most[0])} alone", f"the data hardly depend on it{why}", vector, "", alone)
+    one = len({owner_of(label) for label in most[:3]}) == 1
+    others = " and ".join(name_without_owner(label) if one else in_words(label) for label in most[1:3])
+    more = f" and {len(most) - 3} more" if len(most) > 3 else ""
+    amounts = ", ".join(amount(problem, label, vector[labels.index(label)]) for label in most[:3])
+    name = f"{in_words(most[0])} against {'its ' if one else ''}{others}{more}"
+    return Pattern(name, f"{amounts} together hardly change the data{why}", vector, "", alone)
+
+
+def open_together(problem: Problem, point: Point, times: Callable[[np.ndarray], np.ndarray]) -> tuple[Direction, ...]:
+    """Rigid motions and common shifts that the data leave to the prior, for biases too many for a matrix (M, M).
+
+    `times` multiplies columns (M, K) by the covariance that a prior of the declared scales leaves. The information
+    about a combination is one over its variance, less that of the prior; what moves along is what the data cannot tell
+    from it. Remedies are not verified.
+    """
+    patterns = list[tuple[Pattern, np.ndarray]]()
+    for pattern in (*rigid_motions(problem, np.asarray(point.z)), *common_shifts(problem)):
+        vector = np.where(problem.surveyed, 0.0, pattern.vector)
+        if np.count_nonzero(vector) > 1:
+            patterns.append((pattern, vector / np.linalg.norm(vector)))
+    if not patterns:
+        return ()
+    columns = np.stack([vector for _, vector in patterns], 1)
+    moved, found = times(columns), list[Direction]()
+    for (pattern, vector), along in zip(patterns, moved.T, strict=True):
+        information = max(1.0 / float(vector @ along) - 1.0, 0.0)
+        if information < WEAK:
+            unit = along / np.linalg.norm(along)
+            found.append(Direction(pattern.name, pattern.words, "weak", information, unit, (), pattern.remedy))
+    return tuple(found)
+
+
+def open_alone(
+    problem: Problem, point: Point, members: np.ndarray, covariance: np.ndarray, most: int
+) -> tuple[tuple[Direction, ...], int]:
+    """Combinations of the biases of single sensors that the data leave to the prior, the weakest first, and how many.
+
+    `covariance` (B, p, p) is what a prior of the declared scales leaves of the biases (B, p) of each, M of none; at
+    most `most` are named. Remedies are not verified.
+    """
+    M = len(problem.labels)
+    free = np.append(~problem.surveyed, False)[members]
+    values, vectors = np.linalg.eigh(np.where(free[:, :, None] & free[:, None, :], covariance, 0.0))
+    information = 1.0 / np.maximum(values, 1e-300) - 1.0
+    weak = np.argwhere(information < WEAK)
+    weak = weak[np.argsort(information[tuple(weak.T)], kind="stable")]
+    found, why = list[Direction](), cause(problem, point) if len(weak) else ""
+    for b, k in weak[:most]:
+        own = members[b][free[b]]
+        part = vectors[b, free[b], k]
+        vector = np.zeros(M)
+        vector[own] = part
+        pattern = combination(problem, [problem.labels[m] for m in own], part, why)
+        strength = max(float(information[b, k]), 0.0)
+        remedy = f"fix or survey {pattern.anchors[0][0]} (not verified)"
+        found.append(Direction(pattern.name, pattern.words, "weak", strength, vector, (), remedy))
+    return tuple(found), len(weak)

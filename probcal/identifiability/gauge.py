@@ -4,6 +4,7 @@ The rule of rank is free of scales: a direction is a gauge where freeing the sta
 information that known states would give about it.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -57,10 +58,10 @@ def free_states(model: Model, point: Point, hold: tuple[jax.Array, ...]) -> Free
 def within(model: Model, point: Point, hold: tuple[jax.Array, ...], basis: jax.Array) -> jax.Array:
     """Information (k, k) of combinations (M, k) with free states, from the residuals of rows: no cancellation."""
     lins = model.linearise(point, expected=True)
-    compressed = compress(model, lins)
+    pulled = tuple(lin.weight[:, :, None] * own for lin, own in zip(lins, model.by_bias(lins, basis), strict=True))
     moved = [
-        linalg.semi_solve(J + jax.vmap(jnp.diag)(precision), cross @ basis)
-        for (J, _), cross, precision in zip(compressed.states, compressed.crosses, hold, strict=True)
+        linalg.semi_solve(J + jax.vmap(jnp.diag)(precision), column)
+        for (J, _), column, precision in zip(model.of_states(lins), model.onto_states(lins, pulled), hold, strict=True)
     ]
     total = jnp.zeros((basis.shape[1], basis.shape[1]))
     for lin, left in zip(lins, model.responses(lins, [-x for x in moved], basis), strict=True):
@@ -108,14 +109,40 @@ def gauge(problem: Problem, point: Point) -> Gauge:
     exact = np.asarray(within(model, point, hold, jnp.asarray(near))) + near.T @ (survey[:, None] * near)
     values, turned = np.linalg.eigh(0.5 * (exact + exact.T))
     basis, _ = np.linalg.qr(near @ turned[:, values < NULL])
-    return Gauge(basis, _countable(problem, free))
+    return Gauge(basis, _countable(problem, free.ranks))
 
 
-def _countable(problem: Problem, free: FreeStates) -> bool:
+@jax.jit
+def beside_free_states(
+    model: Model, point: Point, hold: tuple[jax.Array, ...], basis: jax.Array
+) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    """Information (k,) of combinations (M, k) with the states known, and the ranks of `FreeStates`."""
+    lins = model.linearise(point, expected=True)
+    known = jnp.zeros(basis.shape[1])
+    for lin, own in zip(lins, model.by_bias(lins, basis), strict=True):
+        known = known + jnp.einsum("nck,nc,nck->k", own, lin.weight, own)
+    ranks = []
+    for (J, _), precision in zip(model.of_states(lins), hold, strict=True):
+        root = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision))
+        ranks.append(jnp.sum((jnp.diagonal(root, axis1=1, axis2=2) > 0) & (precision < HELD), 1))
+    return known, tuple(ranks)
+
+
+def unfixed(problem: Problem, point: Point, vectors: np.ndarray) -> np.ndarray:
+    """Which of some combinations (M, k) no row fixes: each by itself, where the biases are too many for `gauge`."""
+    hold, basis = held_states(problem), jnp.asarray(vectors)
+    known, ranks = beside_free_states(problem.model, point, hold, basis)
+    survey = (problem.surveyed[:, None] * vectors**2).sum(0)
+    left = np.diagonal(np.asarray(within(problem.model, point, hold, basis))) + survey
+    share = left / np.maximum(np.asarray(known) + survey, np.finfo(float).tiny)
+    return (share < CLOSE) & _countable(problem, ranks)
+
+
+def _countable(problem: Problem, ranks: Sequence[jax.Array]) -> bool:
     """Whether at least half of the data stand in epochs with more data than unknowns."""
     inside = total = 0.0
     counts = variants.counts(problem.model, lambda mask: mask.sum(1))
-    for count, rank in zip(counts, free.ranks, strict=True):
+    for count, rank in zip(counts, ranks, strict=True):
         inside += count[count > np.asarray(rank)].sum()
         total += count.sum()
     return inside >= ENOUGH * total

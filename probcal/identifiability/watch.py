@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probcal.identifiability.gauge import gauge
+from probcal.identifiability.gauge import gauge, unfixed
 from probcal.identifiability.patterns import common_shifts, rigid_motions
 from probcal.motion import as_motion
 from probcal.problem import Problem
@@ -25,10 +25,10 @@ class Run(NamedTuple):
     gauge: bool  # whether no row fixes it
 
 
-def runs(problem: Problem, point: Point) -> list[Run]:
+def runs(problem: Problem, point: Point, *, many: bool = False) -> list[Run]:
     """Rigid motions and common shifts along which the biases of a point lie far from the stated network.
 
-    Whether no row fixes them is looked up only where there are such.
+    Whether no row fixes them is looked up only where there are such, each by itself where biases are `many`.
     """
     z, free = np.asarray(point.z), ~problem.surveyed
     found = []
@@ -41,6 +41,9 @@ def runs(problem: Problem, point: Point) -> list[Run]:
                 found.append((pattern.name, abs(float(vector @ z)), vector))
     if not found:
         return []
+    if many:
+        free = unfixed(problem, point, np.stack([vector for _, _, vector in found], 1))
+        return [Run(name, far, bool(own)) for (name, far, _), own in zip(found, free, strict=True)]
     null = gauge(problem, point)
     return [
         Run(name, far, null.countable and float(np.linalg.norm(null.basis.T @ vector)) > INSIDE)

@@ -25,6 +25,7 @@ from probcal.inference.rates import of_calibration
 from probcal.inference.run import Context, Method
 from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.solve import solve
+from probcal.inference.sparse import SparsePosterior
 from probcal.inference.storage import Storage
 from probcal.inference.weighted import track_by_particles
 from probcal.lazy import Later
@@ -210,6 +211,8 @@ def _with_objects(tree: xr.DataTree, objects: Objects, problem: Problem, z: Any)
 def _directions(answer: Answer) -> tuple[Direction, ...]:
     """What the data leave open where the answer stands."""
     information = answer.posterior.summary.information
+    if isinstance(answer.posterior, SparsePosterior):
+        return answer.posterior.open
     if information is None or not linear_form(answer) or not np.isfinite(information).all():
         return ()
     return weak_directions(answer.problem, information, answer.posterior.point)
@@ -227,6 +230,8 @@ def _advised(answer: Answer, directions: Sequence[Direction]) -> str:
     if not directions or answer.status is Status.MISFIT:
         return answer.message
     listed = "; ".join(direction.sentence for direction in directions[:NAMED])
+    count = answer.posterior.weak if isinstance(answer.posterior, SparsePosterior) else len(directions)
+    listed += f"; and {count - NAMED} more" if count > NAMED else ""
     about = "Weakly determined by the data" if answer.status.settled else "The data do not fix"
     return f"{answer.message} {about}: {listed}.".strip()
 
@@ -237,7 +242,7 @@ def _watched(answer: Answer) -> Answer:
     if not linear_form(answer) or not answer.status.valid or not np.isfinite(np.asarray(point.z)).all():
         return answer
     found, status = [answer.message] if answer.message else [], answer.status
-    for run in runs(problem, point):
+    for run in runs(problem, point, many=isinstance(answer.posterior, SparsePosterior)):
         if run.gauge:
             status = Status.GAUGE
             found.append(

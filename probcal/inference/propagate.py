@@ -178,6 +178,7 @@ class Propagation:
     chain: BlockChain | None = None
     swept: BlocksSwept | None = None
     found: BlockMarginals | None = None
+    begun: BlockMarginals | None = None  # that of the first round, under the declared scales
     settled: bool = False  # whether the means came to rest
 
     @classmethod
@@ -215,6 +216,7 @@ class Propagation:
     def round(self, turn: int) -> float:
         """Renew all sites; the root mean square of how far the means moved, in sds."""
         self.found = found = self._marginals()
+        self.begun = found if self.begun is None else self.begun
         precision = np.linalg.inv(found.covariance)
         middle = np.append(found.mean, 0.0)[self.members]
         cavity = Blocks(

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
+from probcal.identifiability.directions import open_alone, open_together
+from probcal.identifiability.remedies import Direction
 from probcal.inference.ending import conclude_at
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.integrate import quantile
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 
 CHAINS, NUMBERS, MOST = 4, 400_000, 250  # of the draws of all biases that a tree holds, and draws of a chain
 STEPS = 60  # of the climb
+NAMED = 20  # combinations of single sensors that are named
 FORMS = ("auto", "dense", "sparse")
 
 
@@ -114,6 +117,8 @@ class SparsePosterior(Posterior):
     entries: np.ndarray  # of the joint precision, those of sites in it
     alpha: np.ndarray  # (M,) what a prior adds to them
     variance: np.ndarray  # (n,) of all variables
+    open: tuple[Direction, ...]  # combinations that the data leave to the prior, those of many sensors first
+    weak: int  # how many there are; some have no name
 
     chained: ClassVar[bool] = False
     held: ClassVar[bool] = True
@@ -162,7 +167,7 @@ class SparsePosterior(Posterior):
     @property
     def attrs(self) -> Mapping[str, float]:
         """The limit of inclusion."""
-        return {"rope": ROPE, "sparse": 1.0}
+        return {"rope": ROPE, "sparse": 1.0, "weak": float(self.weak)}
 
 
 def sparse_answer(method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
@@ -219,12 +224,35 @@ def _gaussian(problem: Problem, prior: Prior, mode: SparseMode, evidence: float,
     own = variance[joint.states :]
     half = HALF * np.sqrt(own)
     gamma = np.clip(1.0 - alpha * own, 0.0, 1.0)
+    declared = blocks if prior.proper else blocks.under_scales()
     summary = Summary(
         "Laplace", "given", z, None, z - half, z + half, gamma, alpha, None, np.zeros(0),
-        evidence if prior.proper else None, _errors(error, variance, mode.system), blocks=blocks,
+        evidence if prior.proper else None, _told(declared) | _errors(error, variance, mode.system), blocks=blocks,
     )  # fmt: skip
     at = mode.system
-    return SparsePosterior(problem, prior, at.point, summary, at, at.entries, alpha, variance)
+    found = _open(problem, at.point, declared, _together(problem, mode) if prior.proper else ())
+    return SparsePosterior(problem, prior, at.point, summary, at, at.entries, alpha, variance, *found)
+
+
+def _together(problem: Problem, mode: SparseMode) -> tuple[Direction, ...]:
+    """Rigid motions and common shifts that the data leave to the prior of a mode."""
+    joint = mode.system.joint
+    return open_together(
+        problem, mode.system.point, lambda columns: mode.factor.solve(joint.of_biases(columns))[joint.states :]
+    )
+
+
+def _open(
+    problem: Problem, point: Point, declared: SensorBlocks, together: tuple[Direction, ...]
+) -> tuple[tuple[Direction, ...], int]:
+    """All that the data leave to the prior: of many sensors first, then of each; and how many there are."""
+    alone, count = open_alone(problem, point, declared.members, declared.covariance, NAMED)
+    return (*together, *alone), len(together) + count
+
+
+def _told(declared: SensorBlocks) -> dict[str, np.ndarray]:
+    """A column with the share that data narrow each bias, of its declared scale."""
+    return {"contraction": np.clip(1.0 - declared.variance, 0.0, 1.0)}
 
 
 def _of_pairs(entries: np.ndarray, pairs: np.ndarray, none: np.ndarray) -> np.ndarray:
@@ -249,25 +277,32 @@ def _integrated(
         return _gaussian(problem, prior, mode, evidence, np.asarray(first.alpha)), True
     members = blocks_of(problem.model)
     likelihood = SparseLikelihood(problem.model, mode.system, mode.system.joint.pairs(members))
+    together = _together(problem, mode)
     work = Propagation.of(form, first, likelihood, members, key)
     work.run(told)
-    return _mixture(problem, prior, work, evidence), work.settled
+    return _mixture(problem, prior, work, evidence, together), work.settled
 
 
-def _mixture(problem: Problem, prior: Prior, work: Propagation, evidence: float) -> SparsePosterior:
+def _mixture(
+    problem: Problem, prior: Prior, work: Propagation, evidence: float, together: tuple[Direction, ...]
+) -> SparsePosterior:
     """The marginals where a propagation ended."""
-    swept, found, likelihood = work.swept, work.found, work.likelihood
+    swept, found, begun, likelihood = work.swept, work.found, work.begun, work.likelihood
     assert swept is not None
     assert found is not None
+    assert begun is not None
     assert isinstance(likelihood, SparseLikelihood)
     mean, own, system = work.mean, work.variance, likelihood.system
+    declared = SensorBlocks(len(mean), work.members, begun.covariance)
     tail, first = 0.5 * (1.0 - INTERVAL), np.asarray(work.first.alpha)
     lower, upper = (np.asarray(quantile(swept.means, swept.sds, share)) for share in (tail, 1.0 - tail))
     alpha = np.clip((1 - swept.gamma) / np.maximum(own, 1e-300), *PRECISION_BOUNDS)
     summary = Summary(
         "mixture", "integrated", mean, None, lower, upper, swept.gamma, np.where(problem.surveyed, first, alpha), None,
-        np.zeros(0), evidence, blocks=SensorBlocks(len(mean), work.members, swept.covariance),
+        np.zeros(0), evidence, _told(declared), SensorBlocks(len(mean), work.members, swept.covariance),
     )  # fmt: skip
     point = system.moved(problem.model, mean - np.asarray(system.point.z))
-    entries = likelihood.entries(work.sites)
-    return SparsePosterior(problem, prior, point, summary, system, entries, np.zeros_like(first), found.whole)
+    return SparsePosterior(
+        problem, prior, point, summary, system, likelihood.entries(work.sites), np.zeros_like(first), found.whole,
+        *_open(problem, point, declared, together),
+    )  # fmt: skip

@@ -63,6 +63,11 @@ class SensorBlocks(NamedTuple):
         found[self.members[:, :, None], self.members[:, None, :]] = self.covariance
         return found[:-1, :-1]
 
+    def under_scales(self) -> SensorBlocks:
+        """What a prior of one scale a bias makes of those of a flat prior."""
+        eye = np.eye(self.members.shape[1])[None]
+        return self._replace(covariance=np.linalg.inv(np.linalg.inv(self.covariance) + eye))
+
     def root(self) -> Any:
         """A sparse root (M, B p) of the covariance."""
         from scipy.sparse import csc_array  # loaded where it is used
