@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 import probcal as pc
+from probcal.analysis.nees import of_biases
 from probcal.errors import FitError, InputError
 from probcal.geometry import bearing, norm
 from probcal.inference.sparse import takes_sparse
@@ -240,7 +241,42 @@ def test_what_has_no_sparse_form_is_named():
 def test_what_needs_the_whole_covariance_says_so():
     tree = fitted(pc.MAP(form="sparse"), pc.Gaussian())
     with pytest.raises(InputError, match="needs the covariance of all biases, which a fit in sparse form"):
-        pc.assess(drawn()[0], tree)
+        of_biases(tree, drawn()[1], 0.01)
+
+
+def test_a_sparse_fit_is_assessed_as_a_dense_one(dense):
+    """The same innovations, contractions and verdicts; sums of squares over about the same degrees of freedom."""
+    problem = drawn()[0]
+    sparse = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    wanted, found = (pc.assess(problem, tree) for tree in (dense, sparse))
+    np.testing.assert_allclose(found["datum_check"]["innovation"], wanted["datum_check"]["innovation"], atol=2e-3)
+    assert found["datum_check"].attrs["used"] == pytest.approx(wanted["datum_check"].attrs["used"], rel=0.2)
+    for name in ("sensor", "target"):
+        a, b = (tree[f"{name}_check"].to_dataset() for tree in (wanted, found))
+        np.testing.assert_allclose(b["nis"], a["nis"], rtol=0.1)
+    a, b = (tree["channel_check"].to_dataset() for tree in (wanted, found))
+    np.testing.assert_allclose(b["white"], a["white"], atol=0.02)
+    a, b = (tree["verdict"].to_dataset() for tree in (wanted, found))
+    np.testing.assert_allclose(b["contraction"], a["contraction"], atol=1e-4)
+    assert b["verdict"].values.tolist() == a["verdict"].values.tolist()
+
+
+def test_data_that_scatter_more_than_declared_widen_a_sparse_fit():
+    """By what the innovations call for: sd, interval, covariance of each sensor and draws together."""
+    problem = drawn()[0]
+    table = problem.measurements.table.frame.copy()
+    table["range"] += np.random.default_rng(0).normal(0.0, 5.0, len(table))
+    noisy = pc.Problem(problem.network, MOTION, table)
+    dense, sparse = (pc.fit(noisy, pc.MAP(form=form), prior=pc.Gaussian()) for form in ("dense", "sparse"))
+    wanted, found = pc.assess(noisy, dense), pc.assess(noisy, sparse)
+    assert "innovations reject the model" in found.attrs["message"]
+    before, a, b = (tree["calibration"].to_dataset() for tree in (sparse, wanted, found))
+    assert b["widened"].values.max() > 1.3
+    np.testing.assert_allclose(b["widened"], a["widened"], rtol=0.25)  # there on innovations after changes
+    np.testing.assert_allclose(b["sd"], before["sd"] * b["widened"])
+    np.testing.assert_allclose(np.diag(covariance_of(b, b["bias_label"].values, "a test")), b["sd"] ** 2, rtol=1e-9)
+    drawn_sd = [tree["posterior"]["bias"].std(("chain", "draw")).values for tree in (sparse, found)]
+    np.testing.assert_allclose(drawn_sd[1], drawn_sd[0] * b["widened"].values)
 
 
 @pytest.mark.parametrize("many", [False, True])

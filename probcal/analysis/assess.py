@@ -11,6 +11,7 @@ import xarray as xr
 from probcal.analysis import checks, leave, nees, pieces, predictive, process, residuals, scaling, shape, verdict
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted, take_up
+from probcal.analysis.large import assess_large
 from probcal.analysis.pieces import Change, Pieces
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.analysis.widen import rejection, widened
@@ -51,12 +52,16 @@ def assess(
 
     Limits have a false-alarm rate of 1 %: of one epoch in `epoch_check`, else of all comparisons of a kind together.
     Refits of large networks are one step from the fit (attribute `refits` of the group). Of a misfit nothing is left
-    out and no halves are compared. Raises `InputError` where the tree is no fit of the problem.
+    out and no halves are compared. A fit in sparse form is judged by its innovations and by how much the data narrow
+    each bias (`probcal.analysis.large`). Raises `InputError` where the tree is no fit of the problem.
 
     >>> checked = assess(problem, tree)
     >>> checked["verdict"]["verdict"].sel(bias_label="sonar_1.range_offset").item()
     'determined'
     """
+    if tree.attrs.get("sparse", 0):
+        with np.errstate(all="ignore" if _absurd(tree) else None):
+            return assess_large(problem, tree, answer)
     fit = take_up(problem, tree, answer)
     with np.errstate(all="ignore" if _absurd(tree) else None):  # squares of absurd residuals overflow
         return _assessed(fit, tree, truth, as_key(key))

@@ -9,7 +9,7 @@ from scipy import special
 
 from probcal.analysis import leave, predictive, residuals
 from probcal.analysis.findings import LAGGED, NAMES, NOTABLE, PRACTICAL, Finding
-from probcal.analysis.fitted import Fitted
+from probcal.analysis.fitted import Fitted, Judged
 from probcal.analysis.verdict import RATE
 from probcal.results.groups import by_target
 
@@ -42,7 +42,7 @@ def _beyond(names: list[str], part: residuals.Squares) -> list[Finding]:
     return found
 
 
-def squares_by(fit: Fitted, found: residuals.Innovations, name: str) -> tuple[xr.Dataset, list[Finding]]:
+def squares_by(fit: Judged, found: residuals.Innovations, name: str) -> tuple[xr.Dataset, list[Finding]]:
     """NIS by "sensor" or "target"."""
     group, labels = codes(fit.data, [name])
     names = labels[name].tolist()
@@ -53,9 +53,11 @@ def squares_by(fit: Fitted, found: residuals.Innovations, name: str) -> tuple[xr
 
 
 def by_channel(
-    fit: Fitted, found: residuals.Innovations, replicas: predictive.Predictive
+    fit: Judged, found: residuals.Innovations, replicas: predictive.Predictive | None
 ) -> tuple[xr.Dataset, list[Finding]]:
     """NIS, mean, correlation in time and predictive p-values of every sensor's channels, dimension `part`.
+
+    The p-values are left out where there are no replicas.
 
     `white` is the Ljung-Box p-value; below 20 data (of a yes-or-no channel: events) nothing can be told, the
     correlation stays 0 and `white` 1.
@@ -66,12 +68,12 @@ def by_channel(
     values: dict[str, Any] = residuals.squares(found, group, count, RATE / count)._asdict()
     target, time = data["target"].to_numpy(str), data["time"].to_numpy()
     extra = np.zeros((count, 3))
-    for k, (sensor, channel) in enumerate(labels.itertuples(index=False)):
-        mine = group == k
+    members = np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
+    for k, ((sensor, channel), mine) in enumerate(zip(labels.itertuples(index=False), members, strict=True)):
         judged = residuals.enough(found.kurtosis[mine])
         white = residuals.whiteness(found.value[mine], target[mine], time[mine]) if judged else None
         extra[k] = (0.0, float(np.mean(found.value[mine])), 1.0) if white is None else white
-        name, mean, limit = f"{sensor}.{channel}", extra[k, 1], -special.ndtri(RATE / (2 * count)) / np.sqrt(mine.sum())
+        name, mean, limit = f"{sensor}.{channel}", extra[k, 1], -special.ndtri(RATE / (2 * count)) / np.sqrt(len(mine))
         if judged and abs(mean) > max(limit, NOTABLE):
             text = f"{name}: innovations have mean {mean:.2f} noise std (limit {limit:.2f}): a bias is left"
             text += ", or targets keep turning"
@@ -84,11 +86,13 @@ def by_channel(
         order = red[np.argsort(-np.abs(r[red]))]
         text = f"innovations are correlated from one to the next: {_listed(names, r, order)}"
         findings.append(Finding("whiteness", names[order[0]], text))
-    first = np.unique(group, return_index=True)[1]
+    coords = {name: ("part", labels[name].to_numpy(str)) for name in labels}
+    first = np.array([mine[0] for mine in members], int)
+    if replicas is None:
+        return xr.Dataset({name: ("part", value) for name, value in values.items()}, coords), findings
     for kind, of in (("misfit", replicas.misfit), ("mean", replicas.mean)):
         values[f"p_{kind}"] = of[first]
         findings += _unlike_replicas(kind, names, of[first], replicas.draws)
-    coords = {name: ("part", labels[name].to_numpy(str)) for name in labels}
     return xr.Dataset({name: ("part", value) for name, value in values.items()}, coords), findings
 
 
@@ -109,7 +113,7 @@ def _unlike_replicas(kind: str, names: list[str], p: np.ndarray, draws: int) -> 
     return found
 
 
-def by_epoch(fit: Fitted, found: residuals.Innovations) -> dict[str, xr.Dataset]:
+def by_epoch(fit: Judged, found: residuals.Innovations) -> dict[str, xr.Dataset]:
     """NIS of every epoch with data, its number of data and limits (false-alarm rate 1 % of each epoch), by target."""
     parts, kept = list[residuals.Squares](), list[np.ndarray]()
     model = fit.problem.model
@@ -130,7 +134,7 @@ def by_epoch(fit: Fitted, found: residuals.Innovations) -> dict[str, xr.Dataset]
     return {f"epoch_check/{name}": group for name, group in groups.items()}
 
 
-def by_datum(fit: Fitted, found: residuals.Innovations, tree: xr.DataTree) -> tuple[xr.Dataset, list[Finding]]:
+def by_datum(fit: Judged, found: residuals.Innovations, tree: xr.DataTree) -> tuple[xr.Dataset, list[Finding]]:
     """Innovation of every datum, and PSIS-LOO of its row where the tree holds the log-likelihood."""
     data = fit.data
     values: dict[str, Any] = {"innovation": found.value}

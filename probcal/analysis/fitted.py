@@ -1,7 +1,8 @@
 """A fit taken up again: the problem at the point where a DataTree says that its fit ended, linearised there."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,28 +21,19 @@ from probcal.results.schema import matrix_of
 from probcal.smoothing.grid import follow_states, track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import Linearisation, linearise
-from probcal.smoothing.mode import Point
+from probcal.smoothing.mode import Eliminated, Point
 
 
-class Fitted(NamedTuple):
-    """A problem linearised where its fit ended, and the prior with the precisions that the fit ended with."""
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What every check of a fit reads: its problem, where it ended, and its rows linearised there."""
 
     problem: Problem
-    at: Linearisation
-    prior: Precision
-    covariance: np.ndarray  # (M, M) of z
+    point: Point
+    lins: Sequence[Linearised]  # with the expected information
+    solved: Eliminated
     picks: list[Any]  # where each block keeps its data
     data: pd.DataFrame  # sensor, channel, target, time, row of every datum
-
-    @property
-    def point(self) -> Point:
-        """Where the fit ended."""
-        return self.at.point
-
-    @property
-    def lins(self) -> Sequence[Linearised]:
-        """Rows linearised there, with the expected information."""
-        return self.at.rows
 
     def flat(self, parts: Any) -> np.ndarray:
         """Arrays (..., N, C) of the blocks as one (..., data)."""
@@ -66,12 +58,30 @@ class Fitted(NamedTuple):
         return found.reshape(M + 1, count)[:M]
 
 
+@dataclass(frozen=True, eq=False)
+class Fitted(Judged):
+    """A problem linearised where its fit ended, and the prior with the precisions that the fit ended with."""
+
+    at: Linearisation
+    prior: Precision
+    covariance: np.ndarray  # (M, M) of z
+
+
 def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) -> Fitted:
     """The fit of a problem from its tree, and from the answer behind it where that is at hand.
 
     Biases, precisions and levels are those of the tree; without an answer the trajectories are brought to their mode
     again and the problem is linearised anew. Raises `InputError` where the tree is no fit of this problem.
     """
+    problem, datum, picks = identified(problem, fit, answer)
+    group = fit["calibration"].to_dataset()
+    covariance = matrix_of(group, "covariance", "assess").values / np.outer(problem.scales, problem.scales)
+    at = linearise(problem.model, point_of(problem, fit)) if answer is None else answer.posterior.linearised
+    return Fitted(problem, at.point, at.rows, at.solved, picks, datum, at, _prior(group), covariance)
+
+
+def identified(problem: Problem, fit: xr.DataTree, answer: Answer | None) -> tuple[Problem, pd.DataFrame, list[Any]]:
+    """The problem as it was fitted, and its data; raises `InputError` where the tree is no fit of this problem."""
     if "calibration" not in fit.children or "track" not in fit.children:
         raise InputError("assess: the tree is no fit; give the problem and the DataTree that fit() returned for it")
     if fit.attrs.get("motion") == "left out":
@@ -83,10 +93,7 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
     datum, picks = datum_of(problem)
     if not np.array_equal(datum["y"], fit["observed_data"].to_dataset()["y"].values):
         raise InputError("assess: the tree was fitted to other data; give the problem as it was fitted")
-    covariance = matrix_of(group, "covariance", "assess").values / np.outer(problem.scales, problem.scales)
-    at = linearise(problem.model, _point(problem, fit)) if answer is None else answer.posterior.linearised
-    data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
-    return Fitted(problem, at, _prior(group), covariance, picks, data)
+    return problem, pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()}), picks
 
 
 def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
@@ -111,7 +118,7 @@ def _saved(epochs: Epochs, tracked: dict[str, xr.Dataset], name: str, what: str)
     return np.concatenate(parts)
 
 
-def _point(problem: Problem, fit: xr.DataTree) -> Point:
+def point_of(problem: Problem, fit: xr.DataTree) -> Point:
     """Biases and levels of the tree, trajectories at their mode, searched from the saved ones."""
     tracked = dict(each_track(fit))
     saved = [_saved(epochs, tracked, "mean", "targets") for epochs in problem.epochs]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal.analysis.fitted import Fitted
+from probcal.analysis.fitted import Fitted, Judged
 from probcal.model.model import At, Model
 from probcal.model.rows import standardised
 from probcal.noise import Bernoulli, Normal
@@ -76,10 +76,10 @@ def _discrepancies(
     return found, [power / total for power in fourth]
 
 
-def check_replicas(fit: Fitted, drawn: FitDraws, key: jax.Array) -> Predictive:
+def check_replicas(fit: Judged, drawn: FitDraws, key: jax.Array) -> Predictive:
     """P-values by sensor and channel, and kurtosis, at draws of a fit."""
     problem = fit.problem
-    gaussian = all(isinstance(noise, Normal) for noises in problem.model.noises for noise in noises)
+    gaussian = all_gaussian(problem.model)
     sensors = tuple(jnp.asarray(problem.measurements.sensor[index]) for index in problem.row_index)
     count = len(problem.network.sensors)
     found, fourth = _discrepancies(problem.model, fit.point.levels, drawn, sensors, count, key)
@@ -92,7 +92,12 @@ def check_replicas(fit: Fitted, drawn: FitDraws, key: jax.Array) -> Predictive:
     return Predictive(fit.flat(parts[0]), fit.flat(parts[1]), kurtosis, drawn.z.shape[0])
 
 
-def _exact(fit: Fitted, kurtosis: np.ndarray) -> np.ndarray:
+def all_gaussian(model: Model) -> bool:
+    """Whether the noise of every channel is Gaussian."""
+    return all(isinstance(noise, Normal) for noises in model.noises for noise in noises)
+
+
+def _exact(fit: Judged, kurtosis: np.ndarray) -> np.ndarray:
     """Excess kurtosis (D,), that of yes-or-no data in closed form, 1 / (p q) - 6: replicas may lack a rare event."""
     answers = [
         np.broadcast_to([isinstance(noise, Bernoulli) for noise in noises], lin.weight.shape)

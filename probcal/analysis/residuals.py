@@ -15,7 +15,7 @@ import numpy as np
 from scipy import special
 
 from probcal import linalg
-from probcal.analysis.fitted import Fitted
+from probcal.analysis.fitted import Fitted, Judged
 from probcal.model.model import Data, Model
 from probcal.model.rows import Linearised, standardised
 from probcal.smoothing import recursion as rec
@@ -102,6 +102,15 @@ def _innovations(
     return [(c[:, :, 0], jnp.sum(c[:, :, 1:] ** 2, 2), k) for c, k in zip(white, kept, strict=True)]
 
 
+def innovations_at(
+    model: Model, point: Point, lins: Sequence[Linearised], filters: list[Filter], shift: list[jax.Array]
+) -> list[tuple[jax.Array, jax.Array]]:
+    """Of each block the innovations with the biases of every row moved by `shift` (N, p), and the share of itself that
+    S^-1/2 leaves a datum; each (N, C)."""
+    found = _innovations(model, point, lins, filters, shift, jnp.zeros((model.biases, 0)))
+    return [(value, kept) for value, _, kept in found]
+
+
 class Filtered(NamedTuple):
     """The filters of a fit, its innovations, and the bias directions (M, K) behind their degrees of freedom."""
 
@@ -117,7 +126,7 @@ def innovations(fit: Fitted, kurtosis: np.ndarray) -> Filtered:
     over a share of them the trace of B (G + A)^-1 B', B their responses to the biases.
     """
     model = fit.problem.model
-    filters = prepare(fit.at.solved)
+    filters = prepare(fit.solved)
     values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(fit.covariance)))
     root = vectors * np.sqrt(np.maximum(values, 0.0))  # that of few draws is singular
     chunk = min(COLUMNS, model.biases)
@@ -230,7 +239,7 @@ FAR = 2 * np.pi / 3  # rad beyond which a wrapped residual may belong to the nex
 SHARE = 0.01  # of a channel's data beyond which its residuals are
 
 
-def wrapping(fit: Fitted, innovation: np.ndarray, std: np.ndarray) -> list[tuple[str, str]]:
+def wrapping(fit: Judged, innovation: np.ndarray, std: np.ndarray) -> list[tuple[str, str]]:
     """Sentences (subject, sentence) on angles: residuals (D,) a turn off without `wrap`, or too wide with it."""
     found = []
     for kind in fit.problem.network.types:

@@ -7,6 +7,7 @@ import xarray as xr
 
 from probcal.analysis import residuals
 from probcal.analysis.findings import LAGGED, NOTABLE, PRACTICAL, Finding
+from probcal.results.blocks import SensorBlocks
 from probcal.status import Status
 
 REJECTED = 1e-3  # probability of the NIS of all data, or of the whiteness of any channel, of a model that is wrong
@@ -43,12 +44,16 @@ def widened(tree: xr.DataTree, inflation: np.ndarray, reason: str) -> tuple[xr.D
     mean = group["mean"].values
     ends = {name: mean + wide * (group[name].values - mean) for name in ("lower", "upper")}
     columns = {"sd": group["sd"].values * wide, **ends, "widened": wide}
-    matrix = group["covariance"].values * np.outer(wide, wide)
+    if "block" in group:
+        scales = np.ones(len(wide))
+        spread = SensorBlocks.read(group, group["bias_label"].values.tolist(), scales).widened(wide).columns(scales)
+    else:
+        spread = {"covariance": (group["covariance"].dims, group["covariance"].values * np.outer(wide, wide))}
     group = group.assign({name: ("bias_label", values) for name, values in columns.items()})
-    result["calibration"] = xr.DataTree(group.assign(covariance=(group["covariance"].dims, matrix)))
+    result["calibration"] = xr.DataTree(group.assign(spread))
     draws = tree["posterior"].to_dataset()
-    spread = (draws["bias"] - draws["bias"].mean(("chain", "draw"))) * xr.DataArray(wide - 1.0, dims="bias_label")
-    result["posterior"] = xr.DataTree(draws.assign(bias=draws["bias"] + spread))
+    drawn = (draws["bias"] - draws["bias"].mean(("chain", "draw"))) * xr.DataArray(wide - 1.0, dims="bias_label")
+    result["posterior"] = xr.DataTree(draws.assign(bias=draws["bias"] + drawn))
     text = (
         f"the innovations reject the model: {reason}; the sd of the biases are widened by up to {wide.max():.2g}"
         f" ({group['bias_label'].values[int(wide.argmax())]})"

@@ -77,7 +77,7 @@ def calibrated(
         problem, value, prior=chosen, key=seed, starts=starts, progress=progress, save=kept, store=store,
         resume=resume, overwrite=overwrite,
     )  # fmt: skip
-    if assessed and linear_form(answer) and answer.posterior.summary.covariance is not None:
+    if assessed and linear_form(answer):
         from probcal.analysis import assess
 
         with _safe(tree, outputs, time.perf_counter() - began > LONG):

@@ -226,3 +226,27 @@ def open_alone(
         remedy = f"fix or survey {pattern.anchors[0][0]} (not verified)"
         found.append(Direction(pattern.name, pattern.words, "weak", strength, vector, (), remedy))
     return tuple(found), len(weak)
+
+
+def shared_in_blocks(
+    problem: Problem, point: Point, members: np.ndarray, covariance: np.ndarray, limit: float
+) -> dict[int, str]:
+    """The combination within a sensor that the data leave open and that would put a bias more than `limit` sd off.
+
+    By name. Where the truth lies c v along a combination v, its largest part one scale, an estimate under the declared
+    scales, of covariance C, is off by c C v.
+    """
+    free = np.append(~problem.surveyed, False)[members]
+    known = np.where(free[:, :, None] & free[:, None, :], covariance, 0.0)
+    values, vectors = np.linalg.eigh(known)
+    sd = np.sqrt(np.maximum(np.diagonal(known, axis1=1, axis2=2), 1e-300))[:, :, None]
+    off = np.abs(known @ vectors) / sd / np.maximum(np.abs(vectors).max(1, keepdims=True), 1e-300)
+    information = 1.0 / np.maximum(values, 1e-300) - 1.0
+    off = np.where((information < WEAK)[:, None, :] & free[:, :, None], off, 0.0)
+    found, why = dict[int, str](), ""
+    for b, j in np.argwhere(off.max(2, initial=0.0) > limit):
+        why = why or cause(problem, point)
+        own, k = members[b][free[b]], int(off[b, j].argmax())
+        named = combination(problem, [problem.labels[m] for m in own], vectors[b, free[b], k], why)
+        found[int(members[b, j])] = f"{named.name} (information {max(information[b, k], 0.0):.2g})"
+    return found

@@ -117,6 +117,7 @@ class SparsePosterior(Posterior):
     entries: np.ndarray  # of the joint precision, those of sites in it
     alpha: np.ndarray  # (M,) what a prior adds to them
     variance: np.ndarray  # (n,) of all variables
+    declared: SensorBlocks  # what a prior of the declared scales leaves
     open: tuple[Direction, ...]  # combinations that the data leave to the prior, those of many sensors first
     weak: int  # how many there are; some have no name
 
@@ -231,7 +232,7 @@ def _gaussian(problem: Problem, prior: Prior, mode: SparseMode, evidence: float,
     )  # fmt: skip
     at = mode.system
     found = _open(problem, at.point, declared, _together(problem, mode) if prior.proper else ())
-    return SparsePosterior(problem, prior, at.point, summary, at, at.entries, alpha, variance, *found)
+    return SparsePosterior(problem, prior, at.point, summary, at, at.entries, alpha, variance, declared, *found)
 
 
 def _together(problem: Problem, mode: SparseMode) -> tuple[Direction, ...]:
@@ -240,6 +241,16 @@ def _together(problem: Problem, mode: SparseMode) -> tuple[Direction, ...]:
     return open_together(
         problem, mode.system.point, lambda columns: mode.factor.solve(joint.of_biases(columns))[joint.states :]
     )
+
+
+def declared_blocks(problem: Problem, system: SparseSystem) -> SensorBlocks:
+    """What a prior of the declared scales leaves of the biases of each sensor, at a system."""
+    M, joint, members = problem.model.biases, system.joint, blocks_of(problem.model)
+    factor = system.factor(np.ones(M))
+    if exact():
+        return SensorBlocks(M, members, _of_pairs(factor.inverse_entries(), joint.pairs(members), members == M))
+    variance, _ = factor.inverse_diagonal()  # entries off the diagonal are not estimated
+    return SensorBlocks(M, np.arange(M)[:, None], variance[joint.states :, None, None])
 
 
 def _open(
@@ -304,5 +315,5 @@ def _mixture(
     point = system.moved(problem.model, mean - np.asarray(system.point.z))
     return SparsePosterior(
         problem, prior, point, summary, system, likelihood.entries(work.sites), np.zeros_like(first), found.whole,
-        *_open(problem, point, declared, together),
+        declared, *_open(problem, point, declared, together),
     )  # fmt: skip

@@ -31,16 +31,19 @@ class SensorBlocks(NamedTuple):
         found[self.members] = values
         return found[:-1]
 
+    def located(self) -> tuple[np.ndarray, np.ndarray]:
+        """Block (M,) of each bias, and its place (M,) there."""
+        number = np.broadcast_to(np.arange(len(self.members))[:, None], self.members.shape)
+        place = np.broadcast_to(np.arange(self.members.shape[1]), self.members.shape)
+        return self.of_biases(number), self.of_biases(place)
+
     def columns(self, scales: np.ndarray) -> dict[str, Any]:
         """Variables of the group `calibration`: the block of each bias, and its covariance with the members of that."""
-        own, p = np.append(scales, 0.0)[self.members], self.members.shape[1]
+        own, (number, place) = np.append(scales, 0.0)[self.members], self.located()
         rows = self.covariance * own[:, :, None] * own[:, None, :]
-        number = np.broadcast_to(np.arange(len(self.members))[:, None], self.members.shape)
-        place = np.broadcast_to(np.arange(p), self.members.shape)
-        spread = np.stack([self.of_biases(rows[:, :, j]) for j in range(p)], 1)
         return {
-            "block": ("bias_label", self.of_biases(number)), "block_place": ("bias_label", self.of_biases(place)),
-            "block_covariance": (("bias_label", "place"), spread),
+            "block": ("bias_label", number), "block_place": ("bias_label", place),
+            "block_covariance": (("bias_label", "place"), rows[number, place]),
         }  # fmt: skip
 
     @classmethod
@@ -56,6 +59,11 @@ class SensorBlocks(NamedTuple):
         over, there = 1.0 / np.append(scales, 1.0)[members], members < M
         covariance *= over[:, :, None] * over[:, None, :] * (there[:, :, None] & there[:, None, :])
         return cls(M, members, covariance + np.eye(p)[None] * ~there[:, :, None])
+
+    def widened(self, wide: np.ndarray) -> SensorBlocks:
+        """With the sd of each bias times `wide` (M,)."""
+        own = np.append(wide, 1.0)[self.members]
+        return self._replace(covariance=self.covariance * own[:, :, None] * own[:, None, :])
 
     def matrix(self) -> np.ndarray:
         """The covariance (M, M)."""
