@@ -360,3 +360,22 @@ def test_a_network_that_ran_along_what_no_row_tells_is_no_answer():
         tree = pc.fit(problem, pc.MAP(form=form), prior=pc.Gaussian())
         assert tree.attrs["status"] == "along a gauge", form
         assert "along translation of all nodes along x, which no row fixes: it is invalid" in tree.attrs["message"]
+
+
+def test_observability_of_many_biases_is_that_of_few(monkeypatch):
+    """Shares, sds, leverages, tracks and what is open, without a matrix of all biases."""
+    pytest.importorskip("sparsax", reason="sparsax is an extra")
+    problem = drawn()[0]
+    with jax.enable_x64(True):
+        point = automatic_start(problem)
+    wanted = pc.observability(problem, point=point)
+    monkeypatch.setattr(sys.modules["probcal.analysis.observability"], "prefers_sparse", lambda model: True)
+    found = pc.observability(problem, point=point)
+    for group, names in {"bias": ("share", "sd"), "datum": ("leverage",), "sensor": ("leverage",)}.items():
+        for name in names:
+            np.testing.assert_allclose(found[group][name], wanted[group][name], rtol=1e-5, atol=1e-7)
+    assert found["bias"]["verdict"].values.tolist() == wanted["bias"]["verdict"].values.tolist()
+    assert found["target"].attrs["motion"] == pytest.approx(wanted["target"].attrs["motion"], abs=1e-5)
+    np.testing.assert_allclose(found["track/mast"]["sd"], wanted["track/mast"]["sd"], rtol=1e-6)
+    assert found.attrs["status"] == wanted.attrs["status"]
+    assert set(found["direction"]["direction"].values) == set(wanted["direction"]["direction"].values)

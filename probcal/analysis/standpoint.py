@@ -10,9 +10,12 @@ from probcal.errors import InputError, nearest
 from probcal.problem import Problem, check_linear
 from probcal.simulate import Truth, on_tracks
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.grid import track_mode
+from probcal.smoothing.grid import grid_start, track_mode
+from probcal.smoothing.joint import missing, prefers_sparse
 from probcal.smoothing.mode import Point, factors
 from probcal.starts import automatic_start
+
+START_STEPS = 30  # of a track of a network that is large
 
 
 def check_free(problem: Problem) -> None:
@@ -25,6 +28,8 @@ def check_free(problem: Problem) -> None:
 def standpoint(problem: Problem, point: Point | None, truth: Truth | None) -> Point:
     """The point where a problem is looked at: a given one, that of a truth, else the automatic start."""
     if point is not None or truth is None:
+        if point is None and prefers_sparse(problem.model) and not missing(problem.model):
+            return grid_start(problem, jnp.zeros(problem.model.biases), START_STEPS)
         return automatic_start(problem) if point is None else point
     z, states = true_point(problem, truth)
     one = tuple(x[0] for x in states)

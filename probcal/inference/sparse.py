@@ -97,7 +97,7 @@ class SparseLikelihood:
         joint, M = self.system.joint, len(self.z)
         factor = joint.factor(self.entries(sites), np.zeros(M))
         entries = factor.inverse_entries()
-        covariance = _of_pairs(entries, self.pairs, members == M)
+        covariance = joint.block_values(members, self.pairs, entries)
         right, inner = np.zeros(M + 1), np.append(self.z, 0.0)[members]
         right[members] = sites.pull - np.einsum("bij,bj->bi", sites.precision, inner)
         mean = self.z + factor.solve(joint.of_biases(self.system.pull + right[:M]))[joint.states :]
@@ -217,7 +217,7 @@ def _gaussian(problem: Problem, prior: Prior, mode: SparseMode, evidence: float,
     joint, z = mode.system.joint, np.asarray(mode.system.point.z)
     if exact():
         entries, members = mode.factor.inverse_entries(), blocks_of(problem.model)
-        blocks = SensorBlocks(len(z), members, _of_pairs(entries, joint.pairs(members), members == len(z)))
+        blocks = SensorBlocks(len(z), members, joint.block_values(members, joint.pairs(members), entries))
         variance, error = entries[joint.places.diagonal], np.zeros(joint.places.size)
     else:  # entries off the diagonal are not estimated
         variance, error = mode.factor.inverse_diagonal()
@@ -248,7 +248,7 @@ def declared_blocks(problem: Problem, system: SparseSystem) -> SensorBlocks:
     M, joint, members = problem.model.biases, system.joint, blocks_of(problem.model)
     factor = system.factor(np.ones(M))
     if exact():
-        return SensorBlocks(M, members, _of_pairs(factor.inverse_entries(), joint.pairs(members), members == M))
+        return SensorBlocks(M, members, joint.block_values(members, joint.pairs(members), factor.inverse_entries()))
     variance, _ = factor.inverse_diagonal()  # entries off the diagonal are not estimated
     return SensorBlocks(M, np.arange(M)[:, None], variance[joint.states :, None, None])
 
@@ -264,11 +264,6 @@ def _open(
 def _told(declared: SensorBlocks) -> dict[str, np.ndarray]:
     """A column with the share that data narrow each bias, of its declared scale."""
     return {"contraction": np.clip(1.0 - declared.variance, 0.0, 1.0)}
-
-
-def _of_pairs(entries: np.ndarray, pairs: np.ndarray, none: np.ndarray) -> np.ndarray:
-    """Entries of an inverse at pairs (B, p, p) of blocks, 1 on the diagonal where there is no bias (B, p)."""
-    return np.where(pairs >= 0, entries[pairs], np.eye(pairs.shape[1])[None] * none[:, None])
 
 
 def _errors(error: np.ndarray, variance: np.ndarray, system: SparseSystem) -> dict[str, np.ndarray]:

@@ -70,6 +70,7 @@ class JointPrecision:
     slots: tuple[np.ndarray, ...]  # (E, n) variable of each entry of the states of each recursion
     driven: tuple[np.ndarray, ...]  # (E,) whether an epoch has variables of its own
     states: int  # number of variables that are states
+    count: int  # of all values of `_values`
 
     @classmethod
     def of(cls, model: Model) -> JointPrecision:
@@ -93,7 +94,7 @@ class JointPrecision:
         on = np.flatnonzero(low == high)
         diagonal[low[on]] = on
         places = Entries(low.astype(np.int32), high.astype(np.int32), size, diagonal)
-        return cls(places, kept, times[kept], tuple(slots), tuple(driven), start)
+        return cls(places, kept, times[kept], tuple(slots), tuple(driven), start, len(rows))
 
     def values(self, model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> np.ndarray:
         """Entries (entries,) of the precision of data and motion, the biases without prior."""
@@ -106,6 +107,11 @@ class JointPrecision:
         whole[-len(alpha) :] += alpha  # the last entries are the diagonal of the biases
         return factorise(self.places, whole)
 
+    def block_values(self, members: np.ndarray, pairs: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+        """Covariances (B, p, p) of biases (B, p), of their `pairs` in the inverse at the places of the entries."""
+        none = members == self.places.size - self.states
+        return np.where(pairs >= 0, inverse[pairs], np.eye(members.shape[1])[None] * none[:, None])
+
     def pairs(self, members: np.ndarray) -> np.ndarray:
         """Where the entries (B, p, p) of pairs of biases (B, p) are, -1 where there is no pair; M is no bias."""
         keys = self.places.row.astype(np.int64) * self.places.size + self.places.column
@@ -116,6 +122,31 @@ class JointPrecision:
         at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
         there = (high < self.places.size) & (keys[order][at] == wanted)
         return np.where(there, order[at], -1)
+
+    def predicted_variances(self, model: Model, lins: tuple[Linearised, ...], inverse: np.ndarray) -> list[np.ndarray]:
+        """Variance (N, C) of each predicted value of each block, from the inverse at the places of the entries."""
+        whole, at = np.zeros(self.count), 0
+        whole[self.kept] = inverse
+        states = []
+        for part in model.recursions:
+            E, n = part.drift.shape
+            half = n * (n + 1) // 2
+            states.append(_symmetric(whole[at : at + E * half].reshape(E, half), n))
+            at += E * (2 * half + n * n)
+        found = []
+        for block, data, lin, r in zip(model.blocks, model.rows, lins, model.recursion, strict=True):
+            (N, p), u, S = (len(data.epoch), data.bias.shape[1]), len(block.used), len(data.bias)
+            both = whole[at : at + N * p * u].reshape(N, p, u)
+            at += N * p * u
+            half = p * (p + 1) // 2
+            biases = _symmetric(whole[at : at + S * half].reshape(S, half), p)[np.asarray(data.sensor)]
+            at += S * half
+            used = list(block.used)
+            own = states[r][np.asarray(data.epoch)][:, used][:, :, used]
+            H, B = np.asarray(lin.state), np.asarray(lin.bias)
+            total = np.sum((H @ own) * H, 2) + np.sum((B @ biases) * B, 2)
+            found.append(total + 2.0 * np.sum((B @ both) * H, 2))
+        return found
 
     def states_alone(self, values: np.ndarray) -> Factor:
         """Factorise the precision of the states at held biases."""
@@ -150,6 +181,14 @@ class JointPrecision:
             if own.any():
                 total += 2.0 * float(np.sum(np.linalg.slogdet(np.asarray(factors(part, levels))[own])[1]))
         return total
+
+
+def _symmetric(upper: np.ndarray, n: int) -> np.ndarray:
+    """Symmetric matrices (K, n, n) of their upper triangles (K, n (n + 1) / 2)."""
+    found = np.zeros((len(upper), n, n))
+    i, j = np.triu_indices(n)
+    found[:, i, j] = found[:, j, i] = upper
+    return found
 
 
 def blocks_of(model: Model) -> np.ndarray:
