@@ -15,8 +15,8 @@ from probcal.errors import InputError
 from probcal.geometry import bearing
 from probcal.priors import Precision
 from probcal.smoothing.linearised import laplace
-from probcal.smoothing.marginal import find_marginal_mode, volume_slope
-from probcal.smoothing.mode import cost, eliminate, find_mode
+from probcal.smoothing.marginal import _damped, find_marginal_mode, volume_slope
+from probcal.smoothing.mode import DAMPING, cost, eliminate, find_mode
 from probcal.starts import automatic_start
 
 STEP = 3e-4  # of z in the differences
@@ -141,3 +141,15 @@ def test_a_fit_of_the_marginal_says_what_it_is():
     assert size["marginal"] > size["joint"] + 0.01, "the joint mode prefers a smaller scene"
     assert trees["marginal"].attrs["log_evidence"] > trees["joint"].attrs["log_evidence"]
     assert "trajectory='marginal'" in trees["marginal"].attrs["settings"]
+
+
+def test_a_matrix_that_is_not_positive_is_damped_before_a_step_is_tried():
+    with jax.enable_x64(True):
+        matrix, score = np.diag([2.0, -0.5]), np.ones(2)
+        solve = jax.jit(_damped)
+        step, damping, grown = solve(matrix, score, np.zeros(()))
+        assert (float(damping), int(grown)) == (pytest.approx(1.0), 4)
+        np.testing.assert_allclose(step, [1 / 3, 2.0])
+        step, damping, _ = solve(matrix, np.full(2, np.nan), np.zeros(()))
+        assert float(damping) > DAMPING
+        assert not np.isfinite(step).any(), "no damping helps: the search ends"

@@ -13,6 +13,7 @@ from probcal import EA, EMEA, MAP, Flat, load_study, study
 from probcal.cli.options import parse_values
 from probcal.diagnostics import study_table
 from probcal.errors import InputError
+from probcal.inference.fit import calibrate
 from probcal.plots import plot_study
 from probcal.status import Status
 
@@ -61,6 +62,25 @@ def test_c1_at_one_share_reproduces_the_trial_and_equals_single_fits():
     assert list(table["method"]) == ["ml", "em-ea", "ea", "oracle"]
     assert table["runs"].tolist() == [8] * 4
     assert (table[[str(status) for status in Status]].sum(axis=1) == 8).all()
+
+
+@pytest.mark.ci
+def test_each_fit_of_a_study_is_that_of_fit_alone():
+    """Of run 7 a bias lies beyond ten scales on the way and comes back; of runs 0 and 8 maximum likelihood diverges."""
+    methods = {"ml": (MAP(), Flat()), "map": MAP(), "ea-printed": EA.as_printed()}
+    found = study(radars.setting, {"scenario": ["C2"]}, methods, runs=[0, 7, 8]).sel(scenario="C2")
+    assert found["status"].sel(estimator="ml").values.tolist() == ["diverged", "converged", "diverged"]
+    for run in found["run"].values:
+        problem, _ = radars.setting(run, scenario="C2")
+        for name, value in methods.items():
+            method, prior = value if isinstance(value, tuple) else (value, None)
+            answer = calibrate(problem, method, prior=prior)[1]
+            one, alone = found.sel(estimator=name, run=run), answer.posterior.summary
+            np.testing.assert_allclose(
+                one["error"] + one["true"], alone.mean, atol=1e-6 * max(1, abs(alone.mean).max())
+            )
+            np.testing.assert_allclose(one["sd"], alone.sd, rtol=1e-6)
+            assert (str(one["status"].values), int(one["iterations"])) == (str(answer.status), answer.iterations)
 
 
 def test_values_of_settings():

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.inference.ending import astray
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.integrate import Integration, likelihood
 from probcal.inference.posed import Form
@@ -94,6 +95,7 @@ def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode,
     nothing = still & (mode.gained < given.tolerance)
     learns = prior.learns or mode.point.levels.shape[0] or model.tailed
     done = nothing | (mode.converged & still if learns else mode.converged)
+    done = done | jnp.any(astray(prior, mode.point.z, given.surveyed))  # it diverged: no further step helps
     refused = state.refused & mode.refused
     state = state._replace(point=mode.point, found=found, objective=objective, refused=refused, done=done)
     return valued(prior, given, state)
@@ -264,7 +266,9 @@ class MAP(Maximiser):
     """Mode under a given prior with its Laplace covariance: of the marginal, or of trajectories and biases jointly.
 
     `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood; `trajectory` "marginal" or "joint", as
-    in `EA`, places on rings included. `form` as in `EA`. Raises `InputError` for another trajectory or form.
+    in `EA`, places on rings included. `form` as in `EA`. Under `Flat` a climb of which a bias still lies more than ten
+    scales from its stated value after thirty steps has diverged and ends there. Raises `InputError` for another
+    trajectory or form.
     """
 
     iterations: int = 500

@@ -90,11 +90,16 @@ def _bias_status(problem: Problem, summary: Summary, low: np.ndarray, far: np.nd
 def low_and_far(prior: Prior, summary: Summary, surveyed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which biases (M,) stand at the bound that their precision sets, and which ran away without a prior."""
     none, mean = np.zeros(len(surveyed), bool), np.nan_to_num(summary.mean, nan=np.inf)
-    far = (np.abs(mean) > FAR) & ~surveyed if isinstance(prior, Flat) else none
+    far = astray(prior, mean, surveyed)
     if summary.precisions == "integrated":
         return (np.abs(mean) > FAR) & ~surveyed, far
     low = (summary.precision <= PRECISION_BOUNDS[0] * (1 + 1e-9)) & ~surveyed if isinstance(prior, ARD) else none
     return low, far
+
+
+def astray(prior: Prior, mean: Any, surveyed: Any) -> Any:
+    """Which biases (M,) of these means, over their scales, ran away: only a prior without scales lets them."""
+    return (abs(mean) > FAR) & ~surveyed & isinstance(prior, Flat)
 
 
 def fallen(prior: Prior, levels: int, best: Any, worth: Any) -> float:

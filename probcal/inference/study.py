@@ -97,6 +97,7 @@ class _Run(NamedTuple):
     truth: Truth
     start: Point | None  # None where a motion has no linear form
     number: int
+    places: list[np.ndarray]  # true positions (E, d) of each recursion, NaN where unknown
 
 
 def _given(method: Maximiser, prior: Prior, run: _Run, oracle: bool) -> Given:
@@ -111,10 +112,8 @@ def _given(method: Maximiser, prior: Prior, run: _Run, oracle: bool) -> Given:
 def _position_rmse(run: _Run, states: Sequence[np.ndarray]) -> float:
     """Root mean square position error in m over the epochs that the truth covers, NaN if it covers none."""
     squares = []
-    d = run.problem.network.dimension
-    for epochs, x in zip(run.problem.epochs, states, strict=True):
+    for epochs, x, true in zip(run.problem.epochs, states, run.places, strict=True):
         span = slice(*epochs.position)
-        true = run.truth.positions(epochs.time, epochs.target, d)
         known = np.isfinite(true).all(1)
         squares.append(((x[:, span] - true)[known] ** 2).sum(1))
     joined = np.concatenate(squares)
@@ -149,7 +148,7 @@ def _batch(
             for members in groups.values():
                 chosen = [runs[k] for k in members]
                 stacked = [
-                    jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
+                    jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
                     for parts in (
                         [run.problem.model for run in chosen],
                         [_given(method, prior, run, name == ORACLE) for run in chosen],
@@ -183,7 +182,9 @@ def _number(problem: Problem, truth: Truth) -> int:
 def _simulated(setting: Setting, point: dict[str, Any], number: int, linear: bool) -> _Run:
     """One problem with its start; raises `InputError` where a setting does not return what a study needs."""
     problem, truth = _made(setting, point, number, linear)
-    return _Run(problem, truth, automatic_start(problem) if linear else None, number)
+    d = problem.network.dimension
+    places = [truth.positions(epochs.time, epochs.target, d) for epochs in problem.epochs]
+    return _Run(problem, truth, automatic_start(problem) if linear else None, number, places)
 
 
 def _needs_linear(methods: Mapping[str, tuple[Method, Prior]]) -> bool:

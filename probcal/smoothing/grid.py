@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.model import rows as waist
 from probcal.model import variants
 from probcal.model.model import At, Model, Recursion
-from probcal.model.rows import Linearised
+from probcal.model.rows import Linearised, Rows
 from probcal.problem import Problem
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Point, cost, factors, smooth_tracks
@@ -30,6 +31,7 @@ NEAR = 0.05  # error of a position found on the grid, in extents
 WINDOW_ROWS = 60  # rows of a window that are looked at, where there are more
 BEAM = 200  # candidates a window that the path may pass
 ROBUST = 4.0  # degrees of freedom of the start's Student-t loss
+apart = jax.lax.optimization_barrier  # what is wanted several times, which XLA would else compute anew each time
 
 
 def candidates(problem: Problem) -> np.ndarray:
@@ -61,8 +63,8 @@ def _widened(lin: Linearised) -> Linearised:
 def _misfit(lin: Linearised) -> jax.Array:
     """Robust misfit (N, C) of every datum, with the prior spread of the biases added to its noise."""
     residual = lin.score / jnp.maximum(lin.weight, 1e-300) * (lin.weight > 0)
-    each = 0.5 * (ROBUST + 1) * jnp.log1p(_widened(lin).weight * residual**2 / ROBUST)
-    return jnp.where(jnp.isfinite(each), each, 1e6)
+    square = apart(_widened(lin).weight * residual**2 / ROBUST)
+    return jnp.where(jnp.isfinite(square), 0.5 * (ROBUST + 1) * jnp.log1p(square), 1e6)
 
 
 @partial(jax.jit, static_argnames=("r", "span"))
@@ -93,12 +95,67 @@ def profile(model: Model, r: int, span: tuple[int, int], z: jax.Array, place: ja
     return loss, states
 
 
+def _losses(problem: Problem, r: int, z: jax.Array, places: np.ndarray) -> np.ndarray:
+    """Loss of every candidate at every epoch, (candidates, E), of rows enough for a place."""
+    model, span = _thinned(problem, r), problem.epochs[r].position
+    alike = _alike(problem, model, r)
+    return np.asarray(
+        _profiled(model, r, span, z, places) if alike is None else _seen(model, r, span, z, places, alike)
+    )
+
+
 @partial(jax.jit, static_argnames=("r", "span"))
-def _losses(model: Model, r: int, span: tuple[int, int], z: jax.Array, places: jax.Array) -> jax.Array:
-    """Loss of every candidate at every epoch, (candidates, E)."""
+def _profiled(model: Model, r: int, span: tuple[int, int], z: jax.Array, places: jax.Array) -> jax.Array:
+    """Loss (candidates, E) with all else than the place profiled."""
     E = model.recursions[r].drift.shape[0]
     width = span[1] - span[0]
     return jax.lax.map(lambda c: profile(model, r, span, z, jnp.broadcast_to(c, (E, width)))[0], places)
+
+
+def _alike(problem: Problem, model: Model, r: int) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
+    """Of each block of recursion r one row a sensor, and which of them each row equals but for what was measured.
+
+    None where a sensor moves or looks at more than the place, where more is profiled, and where few rows are alike.
+    """
+    span, found = set(range(*problem.epochs[r].position)), []
+    if not {name for name, *_ in problem.epochs[r].layout} <= {"position", "velocity", "acceleration"}:
+        return None
+    for block, data, own in zip(model.blocks, model.rows, model.recursion, strict=True):
+        if own == r:
+            pose = np.asarray(data.pose)
+            _, first, alike = np.unique(np.asarray(data.sensor), return_index=True, return_inverse=True)
+            if not set(block.used) <= span or 2 * len(first) > len(alike) or (pose[first[alike]] != pose).any():
+                return None
+            found.append((first, alike))
+    return tuple(found)
+
+
+@partial(jax.jit, static_argnames=("r", "span"))
+def _seen(
+    model: Model, r: int, span: tuple[int, int], z: jax.Array, places: jax.Array,
+    alike: tuple[tuple[jax.Array, jax.Array], ...],
+) -> jax.Array:  # fmt: skip
+    """Loss (candidates, E) where rows alike see the same at a place."""
+    mine, n = variants.part(model, r), model.recursions[r].drift.shape[1]
+    levels = jnp.zeros(model.level_spread.shape)
+    some: list[Rows] = []
+    for data, (first, _) in zip(mine.rows, alike, strict=True):
+        chosen: dict[str, Any] = {name: getattr(data, name)[first] for name in variants.BY_ROW}
+        some.append(data._replace(**chosen | {"epoch": jnp.zeros_like(first)}))
+    stds = [waist.noise_std(data, levels) for data in mine.rows]
+
+    def loss(place: jax.Array) -> jax.Array:
+        state, misfits = jnp.zeros((1, n)).at[0, span[0] : span[1]].set(place), []
+        for block, data, few, (_, own), std in zip(mine.blocks, mine.rows, some, alike, stds, strict=True):
+            lin = waist.linearise_biases(block, few, state, z, levels, expected=False)
+            spread = jnp.sqrt(jnp.sum(lin.bias**2, -1, keepdims=True))
+            looked = apart((waist.predict(block, few, state, z), spread))
+            predicted, spread = apart(jax.tree.map(lambda part, own=own: part[own], looked))
+            score, weight = waist.weigh(block, data, predicted, std, expected=False)
+            misfits.append(_misfit(Linearised(score, weight, jnp.zeros((*score.shape, 0)), spread)))
+        return mine.by_epoch(misfits)[0]
+
+    return jax.lax.map(loss, places)
 
 
 def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -110,11 +167,10 @@ def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndar
     kept = np.argpartition(loss, beam - 1, axis=1)[:, :beam]
     total, back = loss[0, kept[0]], []
     for k in range(1, len(loss)):
-        a, b = places[kept[k - 1]], places[kept[k]]
-        squared = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
-        through = total[:, None] + 0.5 * squared / steps[k - 1] ** 2
-        best = through.argmin(0)
-        total = through[best, np.arange(beam)] + loss[k, kept[k]]
+        a, b = (places[kept[j]] / steps[k - 1] for j in (k - 1, k))
+        through = total + 0.5 * (a**2).sum(1) - b @ a.T  # (to, from), but for what they share
+        best = through.argmin(1)
+        total = through[np.arange(beam), best] + 0.5 * (b**2).sum(1) + loss[k, kept[k]]
         back.append(best)
     path = [int(total.argmin())]
     for best in reversed(back):
@@ -197,7 +253,7 @@ def grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
         path, known = known_places(problem, r, span)
         unknown = [name for name in dict.fromkeys(epochs.target) if not known[epochs.target == name].all()]
         if unknown:
-            loss = np.asarray(_losses(_thinned(problem, r), r, span, z, places))
+            loss = _losses(problem, r, z, places)
         for name in unknown:
             mine = epochs.target == name
             path[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)

@@ -195,6 +195,26 @@ def _valued(
     return value, better | (s.iteration == 0)
 
 
+def _damped(matrix: jax.Array, score: jax.Array, damping: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The damped step (M,), its damping and how often that grew first: until the matrix is positive definite."""
+
+    def solved(damping: jax.Array) -> jax.Array:
+        return Dense.of(matrix + damping * jnp.eye(len(score))).solve(score)
+
+    def more(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        damping = _grown(state[1])
+        return solved(damping), damping, state[2] + 1
+
+    def on(state: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        return ~jnp.all(jnp.isfinite(state[0])) & (state[1] <= DAMPING)
+
+    return jax.lax.while_loop(on, more, (solved(damping), damping, jnp.zeros((), int)))
+
+
+def _grown(damping: jax.Array) -> jax.Array:
+    return jnp.maximum(damping * 10.0, 1e-3)
+
+
 @jax.jit
 def _turned(
     s: _Search, point: Point, solved: Eliminated, value: jax.Array, volume: jax.Array, prior: Precision, tolerance: Any
@@ -203,15 +223,14 @@ def _turned(
     score = solved.score - prior.pull(point.z) - 0.5 * volume
     matrix = solved.information + prior.matrix()
     bent = s.bent + _secant(matrix + s.bent, point.z - s.point.z, s.score - score)
-    damping = jnp.where(s.share >= SHORT, s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
-    damping = jnp.where(damping < 1e-6, 0.0, damping)
-    step = Dense.of(matrix + bent + damping * jnp.eye(len(score))).solve(score)
+    damping = jnp.where(s.share >= SHORT, s.damping * 0.1, _grown(s.damping))
+    step, damping, grown = _damped(matrix + bent, score, jnp.where(damping < 1e-6, 0.0, damping))
     promised = 0.5 * score @ step
     found = (promised <= tolerance) & (damping <= 1.0) & jnp.isfinite(value)
     first = s.iteration == 0
     return _Search(
         point, solved, value, jnp.where(first, value, s.begun), score, bent, step, promised, jnp.ones(()), damping,
-        s.moved | ~first, s.iteration + 1, found, found | ~jnp.isfinite(value),
+        s.moved | ~first, s.iteration + 1 + grown, found, found | ~jnp.isfinite(value + promised),
     )  # fmt: skip
 
 
@@ -224,12 +243,11 @@ def _shorter(s: _Search, prior: Precision) -> _Search:
     """
     spent = s.share <= 0.5**HALVINGS
     found = (s.promised <= jnp.where(spent, NOTHING, ROUNDING * jnp.abs(s.value))) & (s.damping <= 1.0)
-    damping = jnp.where(spent, jnp.maximum(s.damping * 10.0, 1e-3), s.damping)
-    matrix = s.solved.information + prior.matrix() + s.bent + damping * jnp.eye(len(s.score))
-    step = jnp.where(spent, Dense.of(matrix).solve(s.score), s.step)
+    step, damping, grown = _damped(s.solved.information + prior.matrix() + s.bent, s.score, _grown(s.damping))
+    step, damping = jnp.where(spent, step, s.step), jnp.where(spent, damping, s.damping)
     return s._replace(
         step=step, promised=0.5 * s.score @ step, share=jnp.where(spent, 1.0, 0.5 * s.share), damping=damping,
-        iteration=s.iteration + spent, converged=found, done=found | (damping > DAMPING),
+        iteration=s.iteration + jnp.where(spent, 1 + grown, 0), converged=found, done=found | (damping > DAMPING),
     )  # fmt: skip
 
 

@@ -172,7 +172,7 @@ def eliminate_compressed(
         gain = rec.gains(part.F, L, J, used)
         if joint and used:
             columns = jnp.concatenate([pull[:, :, None], cross], 2)
-            drift = jnp.zeros_like(columns).at[:, :, 0].set(-(L @ u[:, :, None])[:, :, 0])
+            drift = -(L @ u[:, :, None])
             alone, new = (c.reshape(-1, c.shape[2]) for c in rec.innovate(part.F, gain, columns, drift))
             rows_ = jnp.concatenate([alone, new])
             signed = jnp.concatenate([-alone, new])

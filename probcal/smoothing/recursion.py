@@ -73,7 +73,7 @@ class Predicted(NamedTuple):
 
 
 def predict(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array | None = None, *, free: bool = False) -> Predicted:
-    """Filter columns b (E, n, m) with drifts c (E, n, m) (zero if None), and predict every epoch from those before.
+    """Filter columns b (E, n, m) with drifts c (E, n, q) of the first q (zero if None), predicting from what is before.
 
     Where b is `free` it need not be made of data, G y: what lies beside them is a force on the states.
     """
@@ -81,7 +81,7 @@ def predict(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array | None = None,
     force = gain.updated @ (gain.updated.mT @ (b - gain.data @ alone)) if free else jnp.zeros_like(b)
     source = gain.gain @ alone + force
     if c is not None:
-        source = source + gain.keep @ c
+        source = source.at[:, :, : c.shape[2]].add(gain.keep @ c)
 
     def step(x, epoch):
         T_k, s_k = epoch
@@ -92,7 +92,7 @@ def predict(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array | None = None,
     _, filtered = jax.lax.scan(step, carry, (gain.keep @ F, source))
     states = F @ jnp.concatenate([carry[None], filtered[:-1]])
     if c is not None:
-        states = states + c
+        states = states.at[:, :, : c.shape[2]].add(c)
     innovation = alone - gain.data.mT @ states
     return Predicted(states, alone, innovation, gain.gain @ innovation + force)
 
@@ -120,7 +120,7 @@ def _next(parts: jax.Array) -> jax.Array:
 
 
 def innovate(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Columns b (E, n, m) with drifts c (E, n, m) as unit-noise data: alone, and as innovations, both (E, u, m).
+    """Columns b (E, n, m), q of them with drifts c (E, n, q), as unit-noise data: alone, and as innovations (E, u, m).
 
     `alone` solves G alone = b, and the innovation alone - G' x against the predicted x is whitened by its covariance
     I + G'PG. The sum of squares of the innovations, less that of `alone`, is -b'W^-1 b, W the precision of the whole
