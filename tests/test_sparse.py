@@ -2,6 +2,7 @@
 
 import sys
 from functools import cache
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 
 import probcal as pc
 from probcal.analysis.nees import of_biases
+from probcal.cli import check
 from probcal.errors import FitError, InputError
+from probcal.files import Outputs
 from probcal.geometry import bearing, norm
 from probcal.inference.sparse import takes_sparse
 from probcal.results.blocks import covariance_of
@@ -261,6 +264,7 @@ def test_a_sparse_fit_is_assessed_as_a_dense_one(dense):
     assert b["verdict"].values.tolist() == a["verdict"].values.tolist()
 
 
+@pytest.mark.ci
 def test_data_that_scatter_more_than_declared_widen_a_sparse_fit():
     """By what the innovations call for: sd, interval, covariance of each sensor and draws together."""
     problem = drawn()[0]
@@ -289,7 +293,7 @@ def test_tracks_of_a_sparse_calibration_have_the_covariance_of_each_sensor(dense
     group["covariance"] = group["covariance"] * (owner[:, None] == owner[None])
     apart["calibration"] = group
     wanted = pc.track(drawn()[0], apart)
-    monkeypatch.setattr(sys.modules["probcal.inference.fit"], "prefers_sparse", lambda model: many)
+    monkeypatch.setattr(sys.modules["probcal.inference.fit"], "too_large", lambda model: many)
     found, whole = pc.track(drawn()[0], sparse), pc.track(drawn()[0], apart)
     for name in ("car", "van", "mast"):
         for column in ("mean", "sd", "before"):
@@ -341,6 +345,7 @@ def unanchored():
     return network, run.table
 
 
+@pytest.mark.ci
 def test_what_all_sensors_share_is_open_in_both_forms():
     """A translation and a rotation of all nodes, one with the information the dense form has."""
     problem = pc.Problem(unanchored()[0], MOTION["car"], unanchored()[1])
@@ -351,6 +356,7 @@ def test_what_all_sensors_share_is_open_in_both_forms():
     assert "translation of all nodes along x" in sparse.attrs["message"]
 
 
+@pytest.mark.ci
 def test_a_network_that_ran_along_what_no_row_tells_is_no_answer():
     """All rows a mile off to one side: translated in both forms, and invalid in both."""
     network, table = unanchored()
@@ -369,7 +375,7 @@ def test_observability_of_many_biases_is_that_of_few(monkeypatch):
     with jax.enable_x64(True):
         point = automatic_start(problem)
     wanted = pc.observability(problem, point=point)
-    monkeypatch.setattr(sys.modules["probcal.analysis.observability"], "prefers_sparse", lambda model: True)
+    monkeypatch.setattr(sys.modules["probcal.analysis.observability"], "too_large", lambda model: True)
     found = pc.observability(problem, point=point)
     for group, names in {"bias": ("share", "sd"), "datum": ("leverage",), "sensor": ("leverage",)}.items():
         for name in names:
@@ -379,3 +385,21 @@ def test_observability_of_many_biases_is_that_of_few(monkeypatch):
     np.testing.assert_allclose(found["track/mast"]["sd"], wanted["track/mast"]["sd"], rtol=1e-6)
     assert found.attrs["status"] == wanted.attrs["status"]
     assert set(found["direction"]["direction"].values) == set(wanted["direction"]["direction"].values)
+
+
+def test_check_of_a_large_network_says_what_is_open(monkeypatch, capsys, tmp_path):
+    """The command line with the sparse form: biases that the data tell least of, directions, status, files."""
+    pytest.importorskip("sparsax", reason="sparsax is an extra")
+    for name in ("probcal.analysis.observability", "probcal.cli.check", "probcal.analysis.standpoint"):
+        monkeypatch.setattr(sys.modules[name], "too_large", lambda model: True)
+    monkeypatch.setattr("probcal.cli.check.MANY", 10)
+    monkeypatch.setattr("probcal.cli.check.SHOWN", 5)
+    given = {"side": 3, "targets": 1, "epochs": 40}
+    outputs = Outputs(tmp_path, ("check.nc", "check.csv"))
+    ended = check.run(Path(__file__).parents[1] / "models" / "large_network.py", None, (), given, outputs)
+    said = capsys.readouterr().out
+    assert ended == 1
+    assert "biases, those that the data tell least of" in said
+    assert "translation of all nodes along x (gauge" in said
+    assert "what to measure next is not computed for a network of this size" in said
+    assert {path.name for path in tmp_path.iterdir()} >= {"check.nc", "check.csv"}

@@ -21,7 +21,7 @@ from probcal.results.build import bands
 from probcal.results.groups import bias_coords, constant_group, datum_of, direction_group, gather, track_groups
 from probcal.simulate import Truth
 from probcal.smoothing.cholesky import exact
-from probcal.smoothing.joint import JointPrecision, blocks_of, missing, prefers_sparse
+from probcal.smoothing.joint import JointPrecision, blocks_of, too_large
 from probcal.smoothing.linearised import Linearisation, linearise, linearise_rows
 from probcal.smoothing.mode import Point
 from probcal.types import float64
@@ -53,7 +53,7 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     """
     check_free(problem)
     point = standpoint(problem, point, truth)
-    if prefers_sparse(problem.model) and not missing(problem.model):
+    if too_large(problem.model):
         return _of_many(problem, point)
     at = linearise(problem.model.by_information(), point)
     found = _information(at)

@@ -11,7 +11,7 @@ from probcal.problem import Problem, check_linear
 from probcal.simulate import Truth, on_tracks
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.grid import grid_start, track_mode
-from probcal.smoothing.joint import missing, prefers_sparse
+from probcal.smoothing.joint import too_large
 from probcal.smoothing.mode import Point, factors
 from probcal.starts import automatic_start
 
@@ -28,7 +28,7 @@ def check_free(problem: Problem) -> None:
 def standpoint(problem: Problem, point: Point | None, truth: Truth | None) -> Point:
     """The point where a problem is looked at: a given one, that of a truth, else the automatic start."""
     if point is not None or truth is None:
-        if point is None and prefers_sparse(problem.model) and not missing(problem.model):
+        if point is None and too_large(problem.model):
             return grid_start(problem, jnp.zeros(problem.model.biases), START_STEPS)
         return automatic_start(problem) if point is None else point
     z, states = true_point(problem, truth)

@@ -16,8 +16,10 @@ from probcal.cli.progress import line
 from probcal.files import Outputs
 from probcal.problem import Problem
 from probcal.results.io import save
+from probcal.smoothing.joint import too_large
 from probcal.starts import automatic_start
 
+MANY, SHOWN, LISTED = 400, 40, 12  # biases up to which all are printed, of more so many; directions of many
 MAP_CELLS = 60  # of a bound map an axis
 STATUS = {
     "determined": "status: determined",
@@ -30,6 +32,8 @@ def run(model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, 
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
     keep_kernels()
     _, problem = load_problem(model, data, fix, given)
+    if too_large(problem.model):
+        return _check_many(problem, model, outputs)
     with line():
         start = automatic_start(problem)
         tree = observability(problem, point=start)
@@ -43,21 +47,22 @@ def run(model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, 
     return 1 if tree.attrs["status"] == "open" else 0
 
 
+def _check_many(problem: Problem, model: Path, outputs: Outputs | None) -> int:
+    """The check of a network too large for matrices of all biases: nothing of what to measure next."""
+    with line():
+        tree = observability(problem)
+    tree.attrs["model"] = model.stem
+    _print_known(problem, tree)
+    print("what to measure next is not computed for a network of this size: take a part of it")
+    print(STATUS[tree.attrs["status"]])
+    if outputs is not None:
+        with outputs.writing():
+            say_written(_write_tables(tree, outputs.folder))
+    return 1 if tree.attrs["status"] == "open" else 0
+
+
 def _print_check(problem: Problem, tree: xr.DataTree, plans: tuple[xr.Dataset, xr.Dataset, xr.Dataset]) -> None:
-    data = problem.measurements
-    print(
-        f"{data.table.source}: {len(data.time)} rows of {len(set(data.sensor))} sensors, {len(data.target_names)} "
-        f"target(s), {sum(len(e.time) for e in problem.epochs)} epochs over {np.ptp(data.time):g} s"
-    )
-    for name in problem.silent:
-        print(f'sensor "{name}" has no row: a fit refuses it; add rows or take it out of the network')
-    print(check_table(tree).to_string(index=False, justify="right"))
-    print("share: how much of the answer the data give under a prior of one scale; sd: the bound that goes with it")
-    sensors = tree["sensor"].to_dataset().to_dataframe().sort_values("leverage")
-    print("biases that the rows of each sensor determine: " + _listed(sensors["leverage"]))
-    targets = tree["target"].to_dataset()["leverage"].to_series().sort_values()
-    print(f"of each target: {_listed(targets)}; of the motion: {tree['target'].attrs['motion']:.2f}")
-    print(_directions_text(tree))
+    _print_known(problem, tree)
     passes, anchors, sensors_ = plans
     print(f"weak directions now: {passes.attrs['weak_before']}. What would tell most (nats; weak directions left):")
     path = passes["path"].values[0]
@@ -72,15 +77,40 @@ def _print_check(problem: Problem, tree: xr.DataTree, plans: tuple[xr.Dataset, x
     print(STATUS[tree.attrs["status"]])
 
 
+def _print_known(problem: Problem, tree: xr.DataTree) -> None:
+    """Data, biases (of many those that the data tell least of), sensors, targets and what is open."""
+    data = problem.measurements
+    print(
+        f"{data.table.source}: {len(data.time)} rows of {len(set(data.sensor))} sensors, {len(data.target_names)} "
+        f"target(s), {sum(len(e.time) for e in problem.epochs)} epochs over {np.ptp(data.time):g} s"
+    )
+    for name in problem.silent:
+        print(f'sensor "{name}" has no row: a fit refuses it; add rows or take it out of the network')
+    table = check_table(tree)
+    if len(table) > MANY:
+        table = table.iloc[np.argsort(tree["bias"].to_dataset()["share"].values, kind="stable")[:SHOWN]]
+    print(table.to_string(index=False, justify="right"))
+    if len(table) < tree["bias"].sizes["bias_label"]:
+        print(f"{len(table)} of {tree['bias'].sizes['bias_label']} biases, those that the data tell least of")
+    print("share: how much of the answer the data give under a prior of one scale; sd: the bound that goes with it")
+    sensors = tree["sensor"].to_dataset().to_dataframe().sort_values("leverage")
+    print("biases that the rows of each sensor determine: " + _listed(sensors["leverage"]))
+    targets = tree["target"].to_dataset()["leverage"].to_series().sort_values()
+    print(f"of each target: {_listed(targets)}; of the motion: {tree['target'].attrs['motion']:.2f}")
+    print(_directions_text(tree))
+
+
 def _directions_text(tree: xr.DataTree) -> str:
     """The directions that the data leave open, in words, each with its remedy."""
     if "direction" not in tree.children:
         surveyed = "survey" in tree["bias"].to_dataset()["kind"].values.tolist()
         return f"the data determine every direction of the biases{' without a survey' if surveyed else ''}"
     group = tree["direction"].to_dataset()
-    count = group.sizes["direction"]
+    count = max(group.sizes["direction"], int(tree.attrs["weak"]))
     lines = [f"{count} direction{'s' * (count > 1)} of the biases that the data hardly determine; remedies add up:"]
-    for k in range(group.sizes["direction"]):
+    if count > group.sizes["direction"]:
+        lines = [f"{count} directions of the biases that the data hardly determine, {LISTED} of them:"]
+    for k in range(min(group.sizes["direction"], LISTED if count > group.sizes["direction"] else count)):
         kind, share, words = (group[name].values[k] for name in ("kind", "share", "words"))
         lines.append(f"  {k + 1}. {group['direction'].values[k]} ({kind}, the data give {share:.2g} of the answer)")
         lines += [f"     {words}", f"     {group['remedy'].values[k]}"]
@@ -102,12 +132,17 @@ def check_table(tree: xr.DataTree) -> pd.DataFrame:
     return frame.assign(**{name: [form.format(v) for v in frame[name]] for name, form in shown.items()})
 
 
-def _write(problem: Problem, tree: xr.DataTree, passes: xr.Dataset, out: Path) -> None:
+def _write_tables(tree: xr.DataTree, out: Path) -> list[Path]:
     files = [out / "check.nc", out / "check.csv"]
     save(tree, files[0])
     columns = ["unit", "scale", "kind", "sd", "share", "verdict"]
     frame = tree["bias"].to_dataset()[columns].to_dataframe().reset_index().rename(columns={"bias_label": "bias"})
     write_csv(frame[["bias", *columns]], files[1])
+    return files
+
+
+def _write(problem: Problem, tree: xr.DataTree, passes: xr.Dataset, out: Path) -> None:
+    files = _write_tables(tree, out)
     if can_plot():
         from probcal.plots import draw_check  # the plot packages are an extra
 

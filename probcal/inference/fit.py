@@ -39,7 +39,7 @@ from probcal.results.read import Calibrated, apply
 from probcal.simulate import Key, as_key
 from probcal.smoothing.grid import grid_start, track_mode
 from probcal.smoothing.information import at_levels
-from probcal.smoothing.joint import missing, prefers_sparse
+from probcal.smoothing.joint import too_large
 from probcal.smoothing.linearised import linearise
 from probcal.smoothing.mirrors import SAME, Mirrored
 from probcal.smoothing.mode import Point
@@ -338,7 +338,7 @@ def track(
             raise InputError(f"track(smoother={smoother!r}): give Particles(2000), or None for the Gaussian smoother")
         return track_by_particles(problem, smoother, found.z, found.covariance, found.levels, as_key(key))
     check_linear(problem)
-    if not missing(problem.model) and prefers_sparse(problem.model):
+    if too_large(problem.model):
         return build_tracks(problem, bands(*_many_tracks(problem, found)))
     covariance = jnp.asarray(found.covariance)
     start = at_levels(problem.model, automatic_start(problem), jnp.asarray(found.levels))

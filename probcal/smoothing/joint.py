@@ -26,6 +26,11 @@ def prefers_sparse(model: Model) -> bool:
     return dense_numbers(model) > ROOM
 
 
+def too_large(model: Model) -> bool:
+    """Whether a model has a sparse form and the dense one takes more than 240 MB."""
+    return prefers_sparse(model) and not missing(model)
+
+
 def missing(model: Model) -> str:
     """What a model has that the sparse form does not take, in words; empty where it takes the model."""
     if model.level_spread.shape[0]:
