@@ -28,6 +28,8 @@ class Mutation(NamedTuple):
 
 MUTATIONS = [
     # smoothing/recursion.py
+    Mutation("smoothing/scans.py", "moved @ (below.mT @ first.A)", "0 * moved @ (below.mT @ first.A)", "test_scans.py"),
+    Mutation("smoothing/scans.py", "[first.A.mT @ rest, first.Z]", "[rest, first.Z]", "test_scans.py"),
     Mutation("smoothing/recursion.py", "alone - gain.data.mT @ states", "alone + gain.data.mT @ states", "test_exact.py"),
     Mutation("smoothing/recursion.py", "own = square((eye - back @ _next(F)) @ gain.updated,", "own = square(gain.updated,", "test_exact.py"),
     Mutation("smoothing/recursion.py", "Smoothed(found.states + moved", "Smoothed(found.states - moved", "test_exact.py"),
@@ -35,7 +37,7 @@ MUTATIONS = [
     Mutation("smoothing/recursion.py", "source = source.at[:, :, : c.shape[2]].add(gain.keep @ c)", "source = source.at[:, :, : c.shape[2]].add(c)", "test_exact.py"),
     Mutation("smoothing/recursion.py", "noises + gain.drive @ states @ gain.drive.mT", "noises", "test_formulas.py"),
     Mutation("smoothing/recursion.py", "gain.gain @ innovation + force", "gain.gain @ innovation", "test_diffuse.py"),
-    Mutation("smoothing/recursion.py", "return states @ earlier + later", "return states @ b + later", "test_diffuse.py"),
+    Mutation("smoothing/recursion.py", "return states @ earlier + back", "return states @ b + back", "test_diffuse.py"),
     # analysis/shape.py
     Mutation("analysis/shape.py", "if not fall > MOST:", "if fall > MOST:", "test_guards.py"),
     # inference/hierarchy.py, orbits.py: scales of their own that move along

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from probcal.linalg import forward, multiply, observe, regress_rows, semi_cholesky, tria
+from probcal.linalg import forward, regress_rows, semi_cholesky
+from probcal.smoothing.scans import filter_roots, inverse_root, recur, recur_squared
 
 
 class Gains(NamedTuple):
@@ -45,15 +46,8 @@ def gains(F: jax.Array, L: jax.Array, J: jax.Array, used: tuple[int, ...]) -> Ga
     everywhere = jnp.broadcast_to(eye, root.shape)
     data = jnp.zeros((E, n, len(entries)), F.dtype).at[:, entries].set(root)
     solve = jnp.zeros((E, len(entries), n), F.dtype).at[:, :, entries].set(forward(root, everywhere))
-
-    def step(root, epoch):
-        F_k, L_k, G_k = epoch
-        predicted = tria(jnp.concatenate([multiply(F_k, root), L_k], 1))
-        updated, gain, std = observe(predicted, G_k)
-        return updated, (predicted, updated, gain, std)
-
-    _, (predicted, updated, gain, std) = jax.lax.scan(step, jnp.zeros((n, n), F.dtype), (F, L, data))
-    whiten = forward(jnp.tril(data.mT @ gain, -1) + std[:, :, None] * eye[None], everywhere)
+    predicted, updated, gain, std = filter_roots(F, L, data)
+    whiten = inverse_root(data, gain, std)
     gain = gain @ whiten
     keep = jnp.eye(n, dtype=F.dtype)[None] - gain @ data.mT
     before = jnp.concatenate([jnp.zeros_like(updated[:1]), updated[:-1]])
@@ -82,15 +76,8 @@ def predict(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array | None = None,
     source = gain.gain @ alone + force
     if c is not None:
         source = source.at[:, :, : c.shape[2]].add(gain.keep @ c)
-
-    def step(x, epoch):
-        T_k, s_k = epoch
-        x = multiply(T_k, x) + s_k
-        return x, x
-
-    carry = jnp.zeros_like(b[0])
-    _, filtered = jax.lax.scan(step, carry, (gain.keep @ F, source))
-    states = F @ jnp.concatenate([carry[None], filtered[:-1]])
+    filtered = recur(gain.keep @ F, source)
+    states = F @ jnp.concatenate([jnp.zeros_like(filtered[:1]), filtered[:-1]])
     if c is not None:
         states = states.at[:, :, : c.shape[2]].add(c)
     innovation = alone - gain.data.mT @ states
@@ -104,13 +91,7 @@ def smooth(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array | None = None, 
     prediction: d_k = filtered - predicted + back_k+1 d_k+1, u_k = drive_k d_k.
     """
     found = predict(F, gain, b, c, free=free)
-
-    def backward(following, epoch):
-        T_k, g_k = epoch
-        moved = multiply(T_k, following) + g_k
-        return moved, moved
-
-    _, moved = jax.lax.scan(backward, jnp.zeros_like(b[0]), (_next(gain.back), found.moved), reverse=True)
+    moved = recur(_next(gain.back), found.moved, reverse=True)
     return Smoothed(found.states + moved, gain.drive @ moved)
 
 
@@ -139,14 +120,9 @@ def covariances(F: jax.Array, L: jax.Array, gain: Gains) -> tuple[jax.Array, jax
         columns = jnp.concatenate(roots, 2)
         return columns @ columns.mT
 
-    def backward(following, epoch):
-        T_k, own = epoch
-        covariance = multiply(T_k, multiply(following, T_k.T)) + own
-        return covariance, covariance
-
     back = _next(gain.back)
     own = square((eye - back @ _next(F)) @ gain.updated, back @ _next(L))
-    _, states = jax.lax.scan(backward, jnp.zeros_like(own[0]), (back, own), reverse=True)
+    states = recur_squared(back, own, reverse=True)
     before = jnp.concatenate([jnp.zeros_like(gain.updated[:1]), gain.updated[:-1]])
     noises = square(gain.drive @ (F @ before), eye - gain.drive @ L)
     return states, noises + gain.drive @ states @ gain.drive.mT
@@ -158,30 +134,11 @@ def respond(gain: Gains, states: jax.Array, b: jax.Array) -> jax.Array:
     The covariance of two epochs is that of the later one, regressed back. What `smooth` gives for a `free` b, but for
     what a difference of large numbers loses there.
     """
-
-    def forward(carry, epoch):
-        T_k, b_k = epoch
-        carry = multiply(T_k.T, carry) + b_k
-        return carry, carry
-
-    def backward(carry, epoch):
-        T_k, own = epoch
-        carry = multiply(T_k, carry)
-        return carry + own, carry
-
-    start = jnp.zeros_like(b[0])
-    _, earlier = jax.lax.scan(forward, start, (gain.back, b))
-    _, later = jax.lax.scan(backward, start, (_next(gain.back), states @ b), reverse=True)
-    return states @ earlier + later
+    own, back = states @ b, _next(gain.back)
+    earlier = recur(gain.back.mT, b)
+    return states @ earlier + back @ _next(recur(back, own, reverse=True))
 
 
 def trajectory(F: jax.Array, L: jax.Array, c: jax.Array, noises: jax.Array) -> jax.Array:
     """States (E, n, m) of whitened noises (E, n, m) and drifts (E, n, m) (or (E, n, 1))."""
-
-    def step(x, epoch):
-        F_k, s_k = epoch
-        x = multiply(F_k, x) + s_k
-        return x, x
-
-    source = L @ noises + c
-    return jax.lax.scan(step, jnp.zeros_like(source[0]), (F, source))[1]
+    return recur(F, L @ noises + c)
