@@ -53,7 +53,7 @@ def recur_squared(T: jax.Array, own: jax.Array, *, reverse: bool = False) -> jax
     return jax.lax.scan(step, jnp.zeros_like(own[0]), (T, own), reverse=reverse)[1]
 
 
-class Filtered(NamedTuple):
+class FilterPass(NamedTuple):
     """The covariance pass of a filter, epoch by epoch."""
 
     predicted: jax.Array  # (E, n, n) root of the predicted covariance
@@ -62,20 +62,20 @@ class Filtered(NamedTuple):
     std: jax.Array  # (E, u) std of that innovation
 
 
-def filter_roots(F: jax.Array, L: jax.Array, data: jax.Array) -> Filtered:
+def filter_roots(F: jax.Array, L: jax.Array, data: jax.Array) -> FilterPass:
     """The covariance pass for transitions F and noise factors L (E, n, n), and unit-noise data `data`' x (E, n, u)."""
     n = F.shape[1]
     if in_parallel():
         before = _updated(F, L, data)
         before = jnp.concatenate([jnp.zeros_like(before[:1]), before[:-1]])
         predicted = jax.vmap(tria)(jnp.concatenate([F @ before, L], 2))
-        return Filtered(predicted, *jax.vmap(observe)(predicted, data))
+        return FilterPass(predicted, *jax.vmap(observe)(predicted, data))
 
-    def step(root: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, Filtered]:
+    def step(root: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, FilterPass]:
         F_k, L_k, G_k = epoch
         predicted = tria(jnp.concatenate([multiply(F_k, root), L_k], 1))
         updated, gain, std = observe(predicted, G_k)
-        return updated, Filtered(predicted, updated, gain, std)
+        return updated, FilterPass(predicted, updated, gain, std)
 
     return jax.lax.scan(step, jnp.zeros((n, n), F.dtype), (F, L, data))[1]
 
