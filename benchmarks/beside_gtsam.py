@@ -76,8 +76,8 @@ def best(run: Callable[[], object], times: int) -> float:
     return min(found)
 
 
-def here(places, path, velocity, ranges, azimuths, times, loose):
-    """Mode (N, 3), sds (N, 3), seconds of the mode and of the covariance, and of compiling both."""
+def built(places, path, velocity, ranges, azimuths):
+    """The problem, and the point whose trajectory is the true one."""
     K, N = ranges.shape
     scale = {"position": PLACE, "heading": AZIMUTH}
     network = pc.Network([radar.on(pc.Node(f"s{n}", place, scale=scale)) for n, place in enumerate(places)])
@@ -86,11 +86,18 @@ def here(places, path, velocity, ranges, azimuths, times, loose):
     table = pd.DataFrame({"time": epoch.astype(float), "sensor": [f"s{n}" for n in sensor], "target": "t"})
     table["range"], table["azimuth"] = ranges.ravel(), azimuths.ravel()
     problem = pc.Problem(network, pc.Target(Walking(), start=start), table)
+    order = [name for name, *_ in problem.epochs[0].layout]
+    states = np.concatenate([{"position": path, "velocity": velocity}[name] for name in order], 1)
+    with jax.enable_x64(True):
+        return problem, follow_states(problem, [states])
+
+
+def here(places, path, velocity, ranges, azimuths, times, loose):
+    """Mode (N, 3), sds (N, 3), seconds of the mode and of the covariance, and of compiling both."""
+    N = len(places)
+    problem, point = built(places, path, velocity, ranges, azimuths)
     with jax.enable_x64(True):
         model, prior = problem.model, pc.Gaussian().precision(problem.labels, problem.surveyed)
-        order = [name for name, *_ in problem.epochs[0].layout]
-        states = np.concatenate([{"position": path, "velocity": velocity}[name] for name in order], 1)
-        point = follow_states(problem, [states])
         tolerance = TOLERANCE * float(cost(model, point, prior)) if loose else TOLERANCE
         begun = time.perf_counter()
         mode = jax.block_until_ready(find_mode(model, point, prior, 100, tolerance))
