@@ -148,7 +148,7 @@ def pose_vector(node: Node, extras: tuple[str, ...], time: np.ndarray) -> np.nda
     return np.concatenate(columns, 1).astype(float)
 
 
-def _local(block: Block, rows: Rows, z: jax.Array) -> jax.Array:
+def read_biases(block: Block, rows: Rows, z: jax.Array) -> jax.Array:
     """Biases of each row, in their units, shape (N, p)."""
     padded = jnp.concatenate([z, jnp.zeros(1, z.dtype)])
     return (rows.base + rows.scale * padded[rows.bias])[rows.sensor]
@@ -184,7 +184,7 @@ def _scene(block: Block, pose: jax.Array, local: jax.Array) -> tuple[list[PoseVi
 
 def look(block: Block, rows: Rows, states: jax.Array, z: jax.Array, seen: Callable[..., Any]) -> jax.Array:
     """A function of target and pose(s), such as a field of view, at every row: (N, ...)."""
-    local = _local(block, rows, z)
+    local = read_biases(block, rows, z)
 
     def one(state: jax.Array, pose: jax.Array, b: jax.Array) -> jax.Array:
         poses, _ = _scene(block, pose, b)
@@ -195,8 +195,12 @@ def look(block: Block, rows: Rows, states: jax.Array, z: jax.Array, seen: Callab
 
 def predict(block: Block, rows: Rows, states: jax.Array, z: jax.Array) -> jax.Array:
     """Predicted values (N, C) from the states of all epochs (E, n) and the biases z (M,)."""
-    local = _local(block, rows, z)
-    return jax.vmap(lambda x, pose, b: _one(block, x, pose, b))(states[rows.epoch], rows.pose, local)
+    return predict_local(block, rows, states[rows.epoch], read_biases(block, rows, z))
+
+
+def predict_local(block: Block, rows: Rows, states: jax.Array, biases: jax.Array) -> jax.Array:
+    """Predicted values (N, C) from the state (N, n) and the biases (N, p), in their units, of every row."""
+    return jax.vmap(lambda x, pose, b: _one(block, x, pose, b))(states, rows.pose, biases)
 
 
 def noise_std(rows: Rows, levels: jax.Array) -> jax.Array:
@@ -255,7 +259,7 @@ def linearise(
     block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: bool
 ) -> Linearised:
     """Score, weight and Jacobians at one point; `expected` takes the information instead of the step weight."""
-    local = _local(block, rows, z)
+    local = read_biases(block, rows, z)
     used = np.asarray(block.used, int)
     reached = states[rows.epoch]
 
@@ -274,7 +278,7 @@ def linearise_biases(
     block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: bool
 ) -> Linearised:
     """Score, weight and the Jacobian by the biases alone: what needs no derivative by the states."""
-    local, reached = _local(block, rows, z), states[rows.epoch]
+    local, reached = read_biases(block, rows, z), states[rows.epoch]
 
     def one(state: jax.Array, pose: jax.Array, b: jax.Array) -> jax.Array:
         return _one(block, state, pose, b)
@@ -289,7 +293,7 @@ def linearise_biases(
 
 def curvature(block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array) -> jax.Array:
     """Minus the second derivative (N, p, p) of each row's log density by the biases z that it reads."""
-    std, local, scale = noise_std(rows, levels), _local(block, rows, z), rows.scale[rows.sensor]
+    std, local, scale = noise_std(rows, levels), read_biases(block, rows, z), rows.scale[rows.sensor]
 
     def density(b: jax.Array, state: jax.Array, pose: jax.Array, y: jax.Array, mask: jax.Array, s: jax.Array) -> Any:
         predicted = _one(block, state, pose, b)

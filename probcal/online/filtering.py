@@ -1,0 +1,120 @@
+"""The filter epoch by epoch: what an epoch makes of a belief, and what it leaves for the smoother."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from probcal.model.epochs import Epoch
+from probcal.model.model import Model
+from probcal.model.sigma import cubature, unscented
+from probcal.online.belief import Belief, Kept, Row, Slots, moved, not_estimated, one, put, seen, walked
+from probcal.online.linearising import About, centre, linearised, regressed
+
+RULES = {"extended": None, "unscented": unscented, "cubature": cubature}  # names of the linearisations
+
+
+@dataclass(frozen=True)
+class Form:
+    """The static part: what kernels are compiled for."""
+
+    by: str = "extended"
+    walks: bool = False  # whether some biases walk
+    considers: bool = False  # whether some are not estimated
+
+
+class Given(NamedTuple):
+    """What stays the same over a stream."""
+
+    levels: jax.Array  # (H,) log factors of the noise levels
+    walk: jax.Array  # (M,) standard deviation of the step of each bias over a second
+    considered: jax.Array  # (M,) whether a bias is not estimated
+
+
+class Points(NamedTuple):
+    """Where the rows of epochs are linearised: at these points, or, where there are none, at the belief."""
+
+    x: tuple[jax.Array, ...]  # (n,) of each recursion
+    z: jax.Array  # (M,)
+    there: jax.Array  # ()
+
+
+class Step(NamedTuple):
+    """What one epoch leaves, of each recursion; where it belongs to another one all is zero."""
+
+    x: tuple[jax.Array, ...]  # (n,) filtered mean of its target
+    sd: tuple[jax.Array, ...]  # (n,)
+    before: tuple[Slots, ...]  # its target carried to this epoch, before its rows
+    kept: tuple[Kept, ...]  # (D,) of each of its data, one block after another
+
+
+def step(
+    form: Form, model: Model, given: Given, belief: Belief, epoch: Epoch, elapsed: jax.Array, points: Points
+) -> tuple[Belief, Step]:
+    """Belief after an epoch, `elapsed` s after the one before; one that pads a stack (recursion -1) changes nothing."""
+    if form.walks:
+        std = given.walk * jnp.sqrt(jnp.maximum(elapsed, 0.0))
+        belief = jax.lax.cond(elapsed > 0, lambda b: walked(b, std), lambda b: b, belief)
+    parts = []
+    for r in range(len(belief.slots)):
+
+        def own(b: Belief, r: int = r) -> tuple[Belief, Any]:
+            return _epoch(form, model, given, b, epoch, r, points)
+
+        belief, part = either(epoch.recursion == r, own, belief)
+        parts.append(part)
+    return belief, Step(*(tuple(column) for column in zip(*parts, strict=True)))
+
+
+def either(there: jax.Array, function: Any, belief: Belief) -> tuple[Belief, Any]:
+    """What a function makes of a belief where it is to be called, else the belief and zeros."""
+    shapes = jax.eval_shape(lambda b: function(b)[1], belief)
+    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    return jax.lax.cond(there, function, lambda b: (b, nothing), belief)
+
+
+def _epoch(
+    form: Form, model: Model, given: Given, belief: Belief, epoch: Epoch, r: int, points: Points
+) -> tuple[Belief, tuple[jax.Array, jax.Array, Slots, Kept]]:
+    """An epoch of recursion r."""
+    target, rule = epoch.target[r], RULES[form.by]
+    before = moved(one(belief.slots[r], target), epoch.move[r])
+    middle = centre(belief, before)
+    at = About(jnp.where(points.there, points.x[r], middle.x), jnp.where(points.there, points.z, middle.z))
+
+    def by_derivatives() -> list[Row]:
+        return linearised(model, epoch, r, at, given.levels, expected=True)
+
+    blocks = by_derivatives() if rule is None else jax.lax.cond(
+        points.there, by_derivatives, lambda: regressed(model, epoch, r, belief, before, given.levels, rule)
+    )  # fmt: skip
+    belief = _with(belief, r, target, before)
+
+    def use(b: Belief, row: Row) -> tuple[Belief, Kept]:
+        after, mine, kept = seen(b, one(b.slots[r], target), row)
+        after = _with(after, r, target, mine)
+        return (not_estimated(after, kept, given.considered) if form.considers else after), kept
+
+    def each(b: Belief, row: Row) -> tuple[Belief, Kept]:
+        return either(jnp.any(row.hx != 0) | jnp.any(row.hz != 0), lambda old: use(old, row), b)
+
+    belief, kept = jax.lax.scan(each, belief, jax.tree.map(lambda *parts: jnp.concatenate(parts), *blocks))
+    mine = one(belief.slots[r], target)
+    reach = mine.B @ belief.root
+    sd = jnp.sqrt(jnp.sum(mine.R**2, 1) + jnp.sum(reach**2, 1))
+    return belief, (mine.m + mine.B @ belief.mean, sd, before._replace(shift=before.shift[:, :0]), kept)
+
+
+def _with(belief: Belief, r: int, target: jax.Array, own: Slots) -> Belief:
+    slots = tuple(put(s, target, own) if k == r else s for k, s in enumerate(belief.slots))
+    return belief._replace(slots=slots)
+
+
+def log_evidence(kept: tuple[Kept, ...]) -> jax.Array:
+    """Log density of all data given those before, up to the constants of their noises."""
+    total = jnp.zeros(())
+    for own in kept:
+        used = own.variance > 0
+        total -= 0.5 * jnp.sum(jnp.where(used, own.innovation**2 + jnp.log(jnp.where(used, own.variance, 1.0)), 0.0))
+    return total

@@ -1,0 +1,167 @@
+"""A window of epochs that is linearised again until it rests, and its smoothed states: fixed-lag smoothing.
+
+Forward the filter, backward the smoother of Bryson and Frazier in the form that needs no inverse of a covariance
+(Bierman 1977, X): given the biases each target is smoothed alone, in the dimension of its state. Over a window that
+holds all epochs this is Gauss-Newton on the joint density of states and biases, so that the filter ends where the
+batch fit does.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from probcal.model.epochs import Epoch
+from probcal.model.model import Model
+from probcal.online.belief import Belief
+from probcal.online.filtering import Form, Given, Points, Step, log_evidence, step
+
+HALVE = 6  # passes after which a point goes half of its way only
+
+
+class Window(NamedTuple):
+    """Epochs of a window (W leading, those that pad it last), the seconds before each, and points that are known."""
+
+    epochs: Epoch
+    elapsed: jax.Array  # (W,)
+    points: Points  # (W,) leading
+
+
+class Smoothed(NamedTuple):
+    """States of a window given all of its rows."""
+
+    x: tuple[jax.Array, ...]  # (W, n) of each recursion
+    sd: tuple[jax.Array, ...]  # (W, n)
+
+
+class Passed(NamedTuple):
+    """What a window leaves."""
+
+    beliefs: Belief  # at the end of each segment, leading
+    smoothed: Smoothed
+    points: Points  # (W,) leading: where the rows were linearised
+    innovation: tuple[jax.Array, ...]  # (W, D) standardised, of each recursion
+    log_evidence: jax.Array  # (S,) of each segment
+    passes: jax.Array  # ()
+    moved: jax.Array  # () by how many sd a point moved in the last pass
+
+
+def forward(
+    form: Form, model: Model, given: Given, belief: Belief, window: Window, segments: int
+) -> tuple[Belief, Step]:
+    """Beliefs at the end of each segment (S leading) and what each epoch leaves (W leading)."""
+
+    def one(b: Belief, inputs: tuple) -> tuple[Belief, Step]:
+        return step(form, model, given, b, *inputs)
+
+    def segment(b: Belief, inputs: tuple) -> tuple[Belief, tuple[Belief, Step]]:
+        after, left = jax.lax.scan(one, b, inputs)
+        return after, (after, left)
+
+    W = window.elapsed.shape[0]
+    parts = jax.tree.map(lambda leaf: leaf.reshape(segments, W // segments, *leaf.shape[1:]), tuple(window))
+    _, (beliefs, left) = jax.lax.scan(segment, belief, parts)
+    return beliefs, jax.tree.map(lambda leaf: leaf.reshape(W, *leaf.shape[2:]), left)
+
+
+def last(beliefs: Belief) -> Belief:
+    """The belief at the end of the last segment."""
+    return jax.tree.map(lambda leaf: leaf[-1], beliefs)
+
+
+def smooth(window: Window, steps: Step, end: Belief) -> Smoothed:
+    """States given all rows of a window, the biases as they stand at its end."""
+    xs, sds = [], []
+    for r, slots in enumerate(end.slots):
+        T, n, M = slots.B.shape
+
+        def back(carry: tuple, inputs: tuple, r: int = r) -> tuple:
+            epoch, before, kept = inputs
+            adjoint, weight = carry
+            target, mine = epoch.target[r], epoch.recursion == r
+            lam, big = adjoint[target], weight[target]  # (n, 1 + M), (n, n)
+
+            def row(carry: tuple, own: tuple) -> tuple:
+                lam, big = carry
+                hx, gain, c, g = own
+                lam = lam - hx[:, None] * (gain @ lam)[None, :]
+                lam = lam + hx[:, None] * jnp.concatenate([-c[None], g])[None, :]
+                turned = big - hx[:, None] * (gain @ big)[None, :]
+                big = turned - (turned @ gain)[:, None] * hx[None, :] + hx[:, None] * hx[None, :]
+                return (lam, big), None
+
+            (lam, big), _ = jax.lax.scan(row, (lam, big), (kept.hx, kept.gain, kept.c, kept.g), reverse=True)
+            P = before.R @ before.R.T
+            line = jnp.concatenate([before.m[:, None], before.B], 1) - P @ lam
+            x = line[:, 0] + line[:, 1:] @ end.mean
+            own = jnp.maximum(jnp.diagonal(P - P @ big @ P), 0.0)
+            sd = jnp.sqrt(own + jnp.sum((line[:, 1:] @ end.root) ** 2, 1))
+            F = epoch.move[r].F
+            adjoint = jnp.where(mine, adjoint.at[target].set(F.T @ lam), adjoint)
+            weight = jnp.where(mine, weight.at[target].set(F.T @ big @ F), weight)
+            return (adjoint, weight), (jnp.where(mine, x, 0.0), jnp.where(mine, sd, 0.0))
+
+        start = jnp.zeros((T, n, 1 + M)), jnp.zeros((T, n, n))
+        _, (x, sd) = jax.lax.scan(back, start, (window.epochs, steps.before[r], steps.kept[r]), reverse=True)
+        xs.append(x)
+        sds.append(sd)
+    return Smoothed(tuple(xs), tuple(sds))
+
+
+@partial(jax.jit, static_argnames=("form", "segments"))
+def run_window(
+    form: Form, model: Model, given: Given, belief: Belief, window: Window, most: int, tolerance: float, segments: int
+) -> Passed:
+    """Filter and smooth a window, linearised again about what it found until no point moves by `tolerance` sd.
+
+    At most `most` passes; with one the filter is the plain one, and nothing is linearised again.
+    """
+    there = window.epochs.recursion >= 0
+
+    def passed(points: Points) -> tuple[Belief, Step, Smoothed]:
+        beliefs, steps = forward(form, model, given, belief, window._replace(points=points), segments)
+        return beliefs, steps, smooth(window, steps, last(beliefs))
+
+    def body(carry: tuple) -> tuple:
+        k, points, _, _ = carry
+        beliefs, steps, found = passed(points)
+        end = last(beliefs)
+        spread = jnp.sqrt(jnp.sum(end.root**2, 1))
+        share = jnp.where(k < HALVE, 1.0, 0.5)
+        known = points.there
+        z = jnp.where(known[:, None], points.z + share * (end.mean - points.z), end.mean)
+        moves = [jnp.max(jnp.where(known[:, None], jnp.abs(end.mean - points.z) / spread, 0.0), initial=0.0)]
+        xs = []
+        for old, new, sd in zip(points.x, found.x, found.sd, strict=True):
+            xs.append(jnp.where(known[:, None], old + share * (new - old), new))
+            off = jnp.abs(new - old) / jnp.where(sd > 0, sd, 1.0)
+            moves.append(jnp.max(jnp.where(known[:, None] & (sd > 0), off, 0.0), initial=0.0))
+        fresh = jnp.any(there & ~known)
+        moved = jnp.where(fresh, jnp.inf, jnp.max(jnp.stack(moves)))
+        left = (beliefs, found, tuple(kept.innovation for kept in steps.kept), _evidence(steps, segments))
+        return k + 1, Points(tuple(xs), z, there), moved, left
+
+    shapes = jax.eval_shape(lambda points: body((0, points, 0.0, None))[3], window.points)
+    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    first = (jnp.zeros((), int), window.points, jnp.full((), jnp.inf), nothing)
+    count, points, moved, left = jax.lax.while_loop(lambda c: (c[0] < most) & (c[2] > tolerance), body, first)
+    return Passed(left[0], left[1], points, left[2], left[3], count, moved)
+
+
+def _evidence(steps: Step, segments: int) -> jax.Array:
+    W = steps.x[0].shape[0]
+    parts = jax.tree.map(lambda leaf: leaf.reshape(segments, W // segments, *leaf.shape[1:]), steps.kept)
+    return jax.vmap(log_evidence)(parts)
+
+
+@partial(jax.jit, static_argnames="form")
+def run_filter(form: Form, model: Model, given: Given, belief: Belief, window: Window) -> tuple[Belief, Step]:
+    """The plain filter over a stack of epochs; of each epoch mean and sd of its target and the innovations."""
+
+    def one(b: Belief, inputs: tuple) -> tuple[Belief, Step]:
+        after, left = step(form, model, given, b, *inputs)
+        kept = tuple(own._replace(hx=own.hx[:, :0], gain=own.gain[:, :0], g=own.g[:, :0]) for own in left.kept)
+        return after, left._replace(before=(), kept=kept)
+
+    return jax.lax.scan(one, belief, tuple(window))

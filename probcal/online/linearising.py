@@ -1,0 +1,128 @@
+"""The rows of one epoch linearised about a belief: by derivatives, or by sigma points of state and biases together."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.model import rows as waist
+from probcal.model.epochs import Epoch
+from probcal.model.model import Model
+from probcal.model.rows import Block, Linearised, Rows
+from probcal.model.sigma import Rule
+from probcal.online.belief import Belief, Row, Slots
+
+FLOOR = 1e-10  # least variance along an axis of the sigma points
+
+
+class About(NamedTuple):
+    """Where rows are linearised: a state and the biases."""
+
+    x: jax.Array  # (n,)
+    z: jax.Array  # (M,)
+
+
+def centre(belief: Belief, own: Slots) -> About:
+    """The means of a belief."""
+    return About(own.m + own.B @ belief.mean, belief.mean)
+
+
+def here(model: Model, epoch: Epoch, r: int) -> list[tuple[int, Block, Rows]]:
+    """Blocks that see recursion r, with their rows at an epoch."""
+    found = []
+    for b, (block, data, own, seen) in enumerate(
+        zip(model.blocks, model.rows, model.recursion, epoch.rows, strict=True)
+    ):
+        if own == r:
+            found.append((b, block, data._replace(epoch=jnp.zeros_like(seen.sensor), **seen._asdict())))
+    return found
+
+
+def linearised(model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array, *, expected: bool) -> list[Row]:
+    """The data of an epoch of recursion r about a point, (P C,) of each block: by derivatives."""
+    found = []
+    for _, block, data in here(model, epoch, r):
+        lin = waist.linearise(block, data, at.x[None], at.z, levels, expected=expected)
+        found.append(_rows(block, data, lin, at))
+    return found
+
+
+def regressed(
+    model: Model, epoch: Epoch, r: int, belief: Belief, own: Slots, levels: jax.Array, rule: Rule
+) -> list[Row]:
+    """The data of an epoch of recursion r regressed on state and biases over a belief, (P C,) of each block.
+
+    Statistical linearisation (Arasaratnam, Haykin 2009; Julier, Uhlmann 2004) by points that move what each row
+    reads alone, so that their number does not grow with the network.
+    """
+    at = centre(belief, own)
+    reach = own.B @ belief.root
+    state = own.R @ own.R.T + reach @ reach.T
+    cross = reach @ belief.root.T
+    biases = belief.root @ belief.root.T
+    found = []
+    for _, block, data in here(model, epoch, r):
+        used = np.asarray(block.used, int)
+        read = data.bias[data.sensor]  # (P, p), M where fixed
+        free = read < at.z.shape[0]
+        which = jnp.minimum(read, at.z.shape[0] - 1)
+        P, p, u = read.shape[0], read.shape[1], len(used)
+        own_x = jnp.broadcast_to(state[used[:, None], used[None, :]], (P, u, u))
+        own_xz = jnp.where(free[:, None, :], cross[used][:, which].transpose(1, 0, 2), 0.0)
+        own_z = jnp.where(
+            free[:, :, None] & free[:, None, :], biases[which[:, :, None], which[:, None, :]], 0.0
+        )
+        whole = jnp.concatenate(
+            [jnp.concatenate([own_x, own_xz], 2), jnp.concatenate([own_xz.mT, own_z], 2)], 1
+        )
+        found.append(_rows(block, data, _regress(block, data, at, whole, rule, levels), at))
+    return found
+
+
+def _regress(block: Block, data: Rows, at: About, covariance: jax.Array, rule: Rule, levels: jax.Array) -> Linearised:
+    """Rows regressed over what they read: covariance (P, u + p, u + p)."""
+    used, size = np.asarray(block.used, int), covariance.shape[1]
+    kappa = rule(size)
+    axes = np.concatenate([np.eye(size), -np.eye(size)]) * np.sqrt(size + kappa)
+    unit = np.concatenate([np.zeros((1, size)), axes]) if kappa else axes
+    middle = [kappa / (size + kappa)] if kappa else []
+    weight = jnp.asarray(np.concatenate([middle, np.full(2 * size, 0.5 / (size + kappa))]))
+    values, vectors = linalg.spectrum(covariance)
+    root = jnp.sqrt(jnp.maximum(values, FLOOR))
+    shift = jnp.einsum("puv,pv,sv->spu", vectors, root, jnp.asarray(unit))
+    base = waist.read_biases(block, data, at.z)  # (P, p) in their units
+    scale = data.scale[data.sensor]
+
+    def value(move: jax.Array) -> jax.Array:
+        x = jnp.broadcast_to(at.x, (base.shape[0], at.x.shape[0]))
+        x = x.at[:, used].add(move[:, : len(used)]) if len(used) else x
+        return waist.predict_local(block, data, x, base + scale * move[:, len(used) :])
+
+    reference = value(jnp.zeros_like(shift[0]))
+    moved = waist.difference(block, jax.lax.map(value, shift), reference[None])
+    mean = jnp.einsum("s,spc->pc", weight, moved)
+    slope = jnp.einsum("s,spc,su->pcu", weight, moved - mean[None], jnp.asarray(unit))
+    left = jnp.einsum("s,spc->pc", weight, (moved - mean[None]) ** 2) - jnp.sum(slope**2, -1)
+    std = jnp.sqrt(waist.noise_std(data, levels) ** 2 + jnp.maximum(left, 0.0))
+    score, information = waist.weigh(block, data, reference + mean, std, expected=True)
+    by = jnp.einsum("pcu,puv->pcv", slope, vectors.mT / root[:, :, None])
+    return Linearised(score, information, by[:, :, : len(used)], by[:, :, len(used) :])
+
+
+def _rows(block: Block, data: Rows, lin: Linearised, at: About) -> Row:
+    """Whitened data (P C,) of a block linearised about a point; zero where nothing was measured."""
+    there = (data.mask > 0) & (lin.weight > 0)
+    weight = jnp.where(there, lin.weight, 1.0)
+    root = jnp.where(there, jnp.sqrt(weight), 0.0)
+    state = jnp.where(there[:, :, None], lin.state, 0.0)
+    bias = jnp.where(there[:, :, None], lin.bias, 0.0)
+    P, C, M = *there.shape, at.z.shape[0]
+    hx = jnp.zeros((P, C, at.x.shape[0])).at[:, :, np.asarray(block.used, int)].set(state)
+    read = data.bias[data.sensor]
+    hz = jnp.zeros((P, C, M + 1)).at[jnp.arange(P)[:, None, None], jnp.arange(C)[None, :, None], read[:, None, :]]
+    hz = hz.add(bias)[:, :, :M]
+    value = jnp.where(there, lin.score / weight, 0.0) + hx @ at.x + hz @ at.z
+    scaled = Row(root * value, root[:, :, None] * hx, root[:, :, None] * hz)
+    return jax.tree.map(lambda leaf: leaf.reshape(P * C, *leaf.shape[2:]), scaled)
