@@ -79,6 +79,14 @@ class _Gathered(NamedTuple):
     columns: tuple[str, ...]  # channels
 
 
+class Arrived(NamedTuple):
+    """Rows that came later, in the form of a problem before them."""
+
+    model: Model
+    rows: list[np.ndarray]  # (N,) which rows of their table each block has
+    target: list[np.ndarray]  # (E,) target of each epoch of each recursion
+
+
 class Problem:
     """A network, the motion of its targets and a table of rows, compiled to arrays.
 
@@ -327,19 +335,41 @@ class Problem:
                 f"{measured.table.where(n)}: time {measured.time[n]:g} is not after the last epoch of its target, at"
                 f" {before[n]:g}"
             )
-        other._compile(last)
-        names = [list(dict.fromkeys(e.target)) for e in self.epochs]
-        forms = [list(zip((e.layout for e in p.epochs), p.model.sampled, strict=True)) for p in (self, other)]
-        own = {form: (r, list(dict.fromkeys(other.epochs[r].target))) for r, form in enumerate(forms[1])}
-        pairs = [own.get(form) for form in forms[0]]
-        targets = [[mine.index(n) for n in pair[1]] if pair else [] for mine, pair in zip(names, pairs, strict=True)]
-        found = aligned(self.model, other.model, [pair[0] if pair else None for pair in pairs], targets)
-        return merged(found, self.model.rows, self.model.sizes if sizes is None else sizes)
+        other._compile(last, further=True)
+        slots = {n: k for e in self.epochs for k, n in enumerate(dict.fromkeys(e.target))}
+        return merged(self._aligned(other, slots)[0], self.model.rows, self.model.sizes if sizes is None else sizes)
 
-    def _compile(self, begun: Mapping[str, float] = MappingProxyType({})) -> None:
-        """Arrays of the rows; the targets in `begun` go on from an earlier epoch at that time."""
-        levels = Levels(self.levels if begun else ())
-        self.longest = self._longest(begun)
+    def arrived(self, data: Measurements, begun: Mapping[str, float], slots: Mapping[str, int]) -> Arrived:
+        """Measured rows compiled as this problem would, in its form, for filters that go on.
+
+        Targets in `begun` go on from an epoch at that time, which they may still see; the others begin, from the start
+        that is declared. `slots` says which target of its recursion each is. Every sensor type and every form of a
+        motion that the rows have must be in this problem. Raises `InputError` as `Problem`.
+        """
+        other = copy(self)
+        other.measurements = self._at_epochs(data)
+        other.silent = ()
+        other._compile(begun, further=True)
+        model, pairs = self._aligned(other, slots)
+        own = zip(other.model.blocks, other.model.recursion, other.row_index, strict=True)
+        found = {(block, r): rows for block, r, rows in own}
+        none = np.zeros(0, int)
+        rows = [found.get((block, pairs[r]), none) for block, r in zip(model.blocks, model.recursion, strict=True)]
+        names = [np.zeros(0, str) if r is None else other.epochs[r].target for r in pairs]
+        return Arrived(model, rows, names)
+
+    def _aligned(self, other: Problem, slots: Mapping[str, int]) -> tuple[Model, list[int | None]]:
+        """The model of rows that came later in the form of this one, and which recursion of it each here is."""
+        forms = [list(zip((e.layout for e in p.epochs), p.model.sampled, strict=True)) for p in (self, other)]
+        own = {form: r for r, form in enumerate(forms[1])}
+        pairs = [own.get(form) for form in forms[0]]
+        targets = [[] if r is None else [slots[n] for n in dict.fromkeys(other.epochs[r].target)] for r in pairs]
+        return aligned(self.model, other.model, pairs, targets), pairs
+
+    def _compile(self, begun: Mapping[str, float] = MappingProxyType({}), *, further: bool = False) -> None:
+        """Arrays of the rows; with `further` after others, where targets in `begun` go on from an epoch at that time."""
+        levels = Levels(self.levels if further else ())
+        self.longest = self._longest(begun, further)
         forms = self._forms(levels)
         chained = [self._chained(layout, names, levels, begun) for (layout, _), names in forms.items()]
         self.epochs = [own.epochs for own in chained]
@@ -375,13 +405,13 @@ class Problem:
             may_alias=False,
         )
 
-    def _longest(self, begun: Mapping[str, float]) -> float:
+    def _longest(self, begun: Mapping[str, float], further: bool) -> float:
         """The longest time in s between two epochs of a target; of rows that come later, what it was before them."""
         data, longest = self.measurements, 0.0
         for n, name in enumerate(data.target_names):
             times = np.unique(data.time[data.target == n])
             longest = max(longest, float(np.diff(times, prepend=begun.get(name, times[0])).max()))
-        if not begun:
+        if not further:
             return longest or 1.0
         beyond = any(as_motion(self.target(name).motion).split[1] for name in data.target_names)
         if beyond and longest > self.longest * (1 + 1e-9):

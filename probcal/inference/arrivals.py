@@ -1,0 +1,317 @@
+"""Rows of a stream on their way to a filter: order, late and repeated ones, targets that come and go, arrays."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from probcal.errors import InputError
+from probcal.labels import AXES
+from probcal.lazy import Later
+from probcal.model.epochs import Epoch, merged
+from probcal.model.motions import linear_of, start_of
+from probcal.motion import Target, as_motion
+from probcal.network import Network
+from probcal.problem import Problem, check_linear
+from probcal.table import Table, header, measure, name_as_text
+
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = Later("pandas")
+
+ONLY = "target"  # the target of a table that names none
+KEY = ("time", "sensor", "target", "cells")  # what makes two rows one
+
+
+class Batch(NamedTuple):
+    """Epochs in time order (K leading, as NumPy), and what they are of."""
+
+    epochs: Epoch
+    time: np.ndarray  # (K,)
+    target: np.ndarray  # (K,) names
+    row: np.ndarray  # (rows,) of the frame: the epoch of each
+
+
+@dataclass
+class Known:
+    """A target that the filter carries: its slot, the time up to which it was filtered, and what was seen then."""
+
+    recursion: int
+    slot: int
+    time: float
+    keys: tuple[tuple[str, str], ...] = ()  # (sensor, cells) of the rows at that time
+
+
+@dataclass
+class Arrivals:
+    """What turns rows into epochs.
+
+    A row that is earlier than the time up to which its target was filtered is late, one that repeats time, sensor,
+    target and channels of another is a duplicate; both are left out and counted. Rows of one call, and those that are
+    still in the window, are brought into order. A new target takes a free slot, or that of the target that has been
+    silent for longest.
+    """
+
+    network: Network
+    motion: Any
+    fixed: Mapping[str, float]
+    most: int  # targets that are carried at once
+    counts: Counter[str] = field(default_factory=Counter)
+    targets: dict[str, Known] = field(default_factory=dict)
+    origin: str = ""  # the date of time 0, where times are dates
+    samples: pd.DataFrame | None = None  # a row of each form: what the template is made of
+    starts: dict[str, dict[str, tuple[Any, float]]] = field(default_factory=dict)
+    template: Problem | None = None
+    sizes: tuple[int, ...] = ()  # rows of an epoch of each block, padded
+
+    def admit(self, table: Table, pending: pd.DataFrame | None) -> pd.DataFrame:
+        """Rows of a table behind those pending, in order, without late and repeated ones.
+
+        Raises `InputError` for a column that is missing or not understood.
+        """
+        names, units = header(table)
+        for column in ("time", "sensor"):
+            if column not in names:
+                raise InputError(f'{table.source} has no column "{column}"; a stream needs time and sensor')
+        frame = self._in_seconds(table, names, units)
+        frame["sensor"] = [name_as_text(value) for value in frame["sensor"]]
+        if "target" in frame:
+            blank = frame["target"].isna()
+            if blank.any():
+                raise InputError(
+                    f'{table.where(int(np.flatnonzero(blank)[0]))} column "target" is blank; an online filter takes'
+                    " rows that name their target: track_objects(...) finds those of detections"
+                )
+            frame["target"] = [name_as_text(value) for value in frame["target"]]
+        else:
+            frame["target"] = ONLY
+        data = [c for c in frame.columns if c not in ("time", "sensor", "target")]
+        filled = frame[data].notna().to_numpy()
+        frame["cells"] = filled @ (1 << np.arange(len(data)).astype(object)) if len(data) else 0
+        frame["cells"] = frame["cells"].astype(str)
+        frame["line"] = table.lines
+        last = frame["target"].map(lambda name: self.targets[name].time if name in self.targets else -np.inf)
+        late = frame["time"].to_numpy() < last.to_numpy()
+        again = np.zeros(len(frame), bool)
+        for n in np.flatnonzero(frame["time"].to_numpy() == last.to_numpy()):
+            row = frame.iloc[n]
+            again[n] = (row["sensor"], row["cells"]) in self.targets[row["target"]].keys
+        frame = frame[~late & ~again]
+        whole = frame if pending is None or pending.empty else pd.concat([pending, frame], ignore_index=True)
+        twice = whole.duplicated(list(KEY)).to_numpy()
+        self.counts["rows"] += len(table.frame)
+        self.counts["late"] += int(late.sum())
+        self.counts["duplicates"] += int(again.sum() + twice.sum())
+        return whole[~twice].sort_values("time", kind="stable", ignore_index=True)
+
+    def _in_seconds(self, table: Table, names: list[str], units: Mapping[str, str | None]) -> pd.DataFrame:
+        """The frame with time in seconds: as they are, or since the first date of the stream."""
+        frame = table.frame.copy()
+        k = names.index("time")
+        column = frame.iloc[:, k]
+        found = pd.to_numeric(column, errors="coerce") if column.dtype.kind not in "mM" else None
+        if found is not None and not found.isna().any():
+            unit = units["time"] or "s"
+            factor = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}.get(unit)
+            if factor is None:
+                raise InputError(f'{table.source} column "time": unit "{unit}" is not a time; use s, ms, us, ns, min or h')
+            seconds = found.to_numpy(float) * factor
+        else:
+            stamps = pd.to_datetime(column, errors="coerce", utc=True, format=None if found is None else "ISO8601")
+            if stamps.isna().any():
+                row = int(np.flatnonzero(stamps.isna())[0])
+                raise InputError(
+                    f'{table.where(row)} column "time": {column.iloc[row]} is not a finite time; give seconds or ISO dates'
+                )
+            self.origin = self.origin or stamps.min().isoformat()
+            seconds = (stamps - pd.Timestamp(self.origin)).dt.total_seconds().to_numpy(float)
+        if not np.isfinite(seconds).all():
+            row = int(np.flatnonzero(~np.isfinite(seconds))[0])
+            raise InputError(f'{table.where(row)} column "time": the time is infinite; give seconds or ISO dates')
+        frame.isetitem(k, seconds)
+        return frame.rename(columns={frame.columns[k]: "time", **{
+            frame.columns[names.index(own)]: own for own in ("sensor", "target") if own in names
+        }})  # fmt: skip
+
+    def compiled(self, frame: pd.DataFrame, source: str) -> Batch:
+        """Rows in order as epochs; raises `InputError` naming a row that cannot be taken."""
+        own = frame.drop(columns=["cells", "line"])
+        table = Table(own, source, frame["line"].to_numpy())
+        network = self.network if self.template is None else self.template.network
+        data = measure(table, network)
+        if data.detection.any():
+            raise InputError(f"{source}: an online filter takes rows that name their target, no detections")
+        if not data.measured.any():
+            return self._nothing(len(frame))
+        self._provide(own, data, source)
+        template = self.template
+        assert template is not None
+        self._seat(template, data.target_names)
+        begun = {name: known.time for name, known in self.targets.items() if np.isfinite(known.time)}
+        found = template.arrived(data, begun, {name: self.targets[name].slot for name in data.target_names})
+        model = found.model
+        counts = [np.bincount(np.asarray(d.epoch)).max(initial=0) for d in model.rows]
+        old = self.sizes if len(self.sizes) == len(counts) else (1,) * len(counts)
+        self.sizes = tuple(max(a, 1 << max(int(b) - 1, 0).bit_length()) for a, b in zip(old, counts, strict=True))
+        time = np.concatenate([np.asarray(part.time) for part in model.recursions])
+        order = np.argsort(time, kind="stable")
+        place = np.empty(len(time), int)
+        place[order] = np.arange(len(time))
+        starts = np.cumsum([0, *(len(part.time) for part in model.recursions)])
+        row = np.full(len(frame), -1)
+        for block_rows, block, r in zip(found.rows, model.rows, model.recursion, strict=True):
+            row[block_rows] = place[starts[r] + np.asarray(block.epoch)]
+        epochs = _held(Epoch(*map(_numpy, merged(model, template.model.rows, self.sizes))))
+        return Batch(epochs, time[order], np.concatenate(found.target)[order], row)
+
+    def _nothing(self, rows: int) -> Batch:
+        raise InputError(f"{rows} rows have no measured value; fill the channel columns")
+
+    def _provide(self, frame: pd.DataFrame, data: Any, source: str) -> None:
+        """A template with every sensor type and every form of a motion that the rows have."""
+        kinds = np.array([s.type.name for s in self.network.sensors])[data.sensor]
+        groups = np.array([self._group(name) for name in data.target_names])[data.target]
+        pairs = pd.DataFrame({"kind": kinds, "group": groups})[data.measured.any(1)]
+        known = set() if self.samples is None else set(zip(self.samples["_kind"], self.samples["_group"], strict=True))
+        fresh = pairs[[p not in known for p in zip(pairs["kind"], pairs["group"], strict=True)]].drop_duplicates()
+        if fresh.empty:
+            return
+        if self.template is None:
+            self._freeze(Problem(self.network, self.motion, Table(frame, source, np.arange(len(frame))), fix=self.fixed))
+        for name in data.target_names:
+            self._start(name)
+        rows = frame.loc[fresh.index].assign(_kind=fresh["kind"], _group=fresh["group"])
+        self.samples = rows if self.samples is None else pd.concat([self.samples, rows], ignore_index=True)
+        self._rebuild()
+
+    def _rebuild(self) -> None:
+        """The template from its samples: one row of each sensor type that sees each form of a motion."""
+        assert self.samples is not None
+        kept = self.samples.drop(columns=["_kind", "_group"])
+        template = Problem(self.network, self._motions(kept["target"]), kept, fix=self.fixed)
+        check_linear(template)
+        self.template, self.sizes = template, ()
+
+    def _group(self, name: str) -> str:
+        """What targets have in common whose motion is declared once."""
+        return str(name) if isinstance(self.motion, Mapping) else ""
+
+    def _freeze(self, problem: Problem) -> None:
+        """Keep where targets start of which nothing is stated, as the first rows have it."""
+        self.network = problem.network
+        self.area = problem.area
+        self.duration = float(np.ptp(problem.measurements.time)) or 1.0
+        self.declared = problem
+
+    def _start(self, name: str) -> None:
+        group = self._group(name)
+        if group in self.starts:
+            return
+        target = self.declared.target(name)
+        found: dict[str, tuple[Any, float]] = {}
+        for component in linear_of(as_motion(target.motion)):
+            if component.memoryless:
+                continue
+            mean, std = start_of(name, component, target, np.array([0.0, self.duration]), self.area)
+            row = 0
+            for part, per_axis in component.names():
+                width = self.network.dimension if per_axis else 1
+                found[part] = (tuple(mean[row : row + width].tolist()), float(std[row]))
+                row += width
+        self.starts[group] = {k: (m if len(m) > 1 else m[0], s) for k, (m, s) in found.items()} | dict(target.start)
+
+    def _motions(self, names: Iterable[Any]) -> dict[str, Target]:
+        """The motion of each target, with its start."""
+        return {str(n): Target(self.declared.target(str(n)).motion, self.starts[self._group(str(n))]) for n in names}
+
+    def _seat(self, template: Problem, names: Iterable[str]) -> None:
+        """A slot for each new target, free or of the one that has been silent for longest; sets their motions."""
+        names = [str(name) for name in names]
+        for name in names:
+            self._start(name)
+        template.motion = self._motions([*names, *template.measurements.target_names])
+        for name in names:
+            if name in self.targets:
+                continue
+            r = self._recursion(template, name)
+            taken = {own.slot: other for other, own in self.targets.items() if own.recursion == r}
+            free = next((k for k in range(self.most) if k not in taken), None)
+            if free is None:
+                silent = [(self.targets[other].time, k) for k, other in taken.items() if other not in names]
+                if not silent:
+                    raise InputError(
+                        f"more than {self.most} targets are seen at once; give more slots, Online(..., targets=...)"
+                    )
+                free = min(silent)[1]
+                self.counts["retired"] += 1
+                del self.targets[taken[free]]
+            self.targets[name] = Known(r, free, -np.inf)
+
+    def _recursion(self, template: Problem, name: str) -> int:
+        """Which recursion a target belongs to: that of a sample with the same motion."""
+        mine = self._group(name)
+        assert self.samples is not None
+        like = str(self.samples.loc[self.samples["_group"] == mine, "target"].iloc[0])
+        return next(r for r, epochs in enumerate(template.epochs) if like in epochs.target)
+
+    def settled(self, batch: Batch, frame: pd.DataFrame, count: int) -> None:
+        """The first `count` epochs of a batch were filtered and will not be looked at again."""
+        for k in range(count):
+            own = self.targets[str(batch.target[k])]
+            own.time = float(batch.time[k])
+        last = {str(batch.target[k]): k for k in range(count)}
+        for name, k in last.items():
+            rows = frame[batch.row == k]
+            self.targets[name].keys = tuple(zip(rows["sensor"], rows["cells"], strict=True))
+
+    def components(self, r: int) -> list[str]:
+        """Names of the state components of a recursion."""
+        assert self.template is not None
+        return list(self.template.epochs[r].components)
+
+    def axes(self) -> list[str]:
+        """Names of the axes."""
+        return list(AXES[: self.network.dimension])
+
+
+def _numpy(leaf: Any) -> Any:
+    import jax
+
+    return jax.tree.map(np.array, leaf)
+
+
+def _held(epochs: Epoch) -> Epoch:
+    """Epochs of which those that go on at the same time leave the state as it is."""
+    again = (epochs.dt == 0) & ~epochs.first
+    if not again.any():
+        return epochs
+    moves = []
+    for r, move in enumerate(epochs.move):
+        mine = again & (epochs.recursion == r)
+        n = move.F.shape[1]
+        moves.append(
+            move._replace(
+                F=np.where(mine[:, None, None], np.eye(n)[None], move.F),
+                L=np.where(mine[:, None, None], 0.0, move.L),
+                drift=np.where(mine[:, None], 0.0, move.drift),
+            )
+        )
+    return epochs._replace(move=tuple(moves))
+
+
+def padded(epochs: Epoch, count: int) -> Epoch:
+    """Epochs with some behind them that change nothing, up to a count."""
+    import jax
+
+    K = len(epochs.time)
+    if count == K:
+        return epochs
+    index = np.minimum(np.arange(count), max(K - 1, 0))
+    more: Epoch = jax.tree.map(lambda leaf: leaf[index], epochs)
+    recursion = np.where(np.arange(count) < K, more.recursion, -1)
+    return more._replace(recursion=recursion)

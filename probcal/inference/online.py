@@ -1,0 +1,517 @@
+"""Calibration of a stream: rows in, biases and tracks out, with memory that does not grow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.errors import InputError, nearest
+from probcal.inference.arrivals import Arrivals, Batch, padded
+from probcal.lazy import Later
+from probcal.network import Network
+from probcal.online import belief as beliefs
+from probcal.online.belief import Belief
+from probcal.online.filtering import RULES, Form, Given, Points
+from probcal.online.lag import Window, run_filter, run_window
+from probcal.online.starts import FIRST, places
+from probcal.priors import Gaussian, Prior
+from probcal.problem import Problem
+from probcal.results.answer import HALF
+from probcal.smoothing.grid import candidates
+from probcal.table import read_table
+from probcal.types import float64
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+else:
+    pd = Later("pandas")
+    xr = Later("xarray")
+
+LIVE, BULK = 1, 16  # lags of a window beside the one that stays, of few rows and of many
+PLAIN = (1, 32, 512)  # epochs of a call of the plain filter
+MANY = 3000  # biases beyond which the dense covariance of the filter is no use
+SEGMENTS = 4  # parts of a lag, at the ends of which a window may be left
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """Detection of biases that jump, by a test of each bias from each of some times on (Willsky and Jones 1976).
+
+    A jump has the prior N(0, (`scale` declared scales)^2); a bias has jumped where the odds for it exceed a bound that
+    a stream without jumps exceeds at most `false_alarms` times in an hour (Ville 1939, over all biases and starting
+    times). `starts` starting times are kept over the last `within` s. Raises `InputError` for numbers that are not
+    positive.
+
+    >>> Jumps(within=30.0).starts
+    8
+    """
+
+    false_alarms: float = 0.1
+    within: float = 60.0
+    scale: float = 1.0
+    starts: int = 8
+
+    def __post_init__(self):
+        for name in ("false_alarms", "within", "scale", "starts"):
+            value = getattr(self, name)
+            if not (isinstance(value, (int, float)) and np.isfinite(value) and value > 0):
+                raise InputError(f"Jumps({name}={value!r}): give a positive number")
+
+    def bound(self, biases: int) -> float:
+        """Log odds at which a bias is said to have jumped."""
+        tests = biases * self.starts * 3600.0 / self.within  # that begin in an hour
+        return float(np.log(tests / self.false_alarms))
+
+
+@dataclass(frozen=True)
+class AugmentedFilter:
+    """The augmented-state filter: states of all targets and biases together (thesis 4.3), by square roots.
+
+    `by` "extended", "unscented" or "cubature" says how rows are linearised when they arrive. `lag` epochs stay in a
+    window that is linearised again until no point moves by `tolerance` sd, at most `passes` times: over a window that
+    holds the whole recording this ends at the batch answer. 0 is the plain filter. `walk` gives biases, by label or
+    pattern, the std of a random walk over one second, in their unit; others are constant. Those in `consider` are not
+    estimated: their uncertainty counts, their value stays (Schmidt 1966). `jumps` finds biases that jump. Raises
+    `InputError` for a setting that is none.
+
+    >>> AugmentedFilter(lag=0, walk={"*.heading": 1e-4}).by
+    'extended'
+    """
+
+    by: str = "extended"
+    lag: int = 32
+    walk: Any = ()
+    consider: Any = ()
+    jumps: Jumps | None = None
+    passes: int = 10
+    tolerance: float = 0.02
+
+    def __post_init__(self):
+        if self.by not in RULES:
+            raise InputError(f'AugmentedFilter(by="{self.by}"): give one of {", ".join(RULES)}{nearest(self.by, RULES)}')
+        if not (isinstance(self.lag, int) and self.lag >= 0 and self.lag % SEGMENTS == 0):
+            raise InputError(f"AugmentedFilter(lag={self.lag!r}): give 0 or a number of epochs that 4 divides")
+        if not (isinstance(self.passes, int) and self.passes > 0):
+            raise InputError(f"AugmentedFilter(passes={self.passes!r}): give 1 or more")
+        if self.jumps is not None and self.consider:
+            raise InputError("AugmentedFilter: biases that are only considered cannot be tested for jumps; drop one of both")
+        given = self.walk.items() if isinstance(self.walk, Mapping) else self.walk
+        walk = tuple((str(pattern), float(std)) for pattern, std in given)
+        for pattern, std in walk:
+            if not (np.isfinite(std) and std > 0):
+                raise InputError(f'AugmentedFilter: walk of "{pattern}" is {std:g}; give a positive std for one second')
+        consider = (self.consider,) if isinstance(self.consider, str) else tuple(map(str, self.consider))
+        object.__setattr__(self, "walk", walk)
+        object.__setattr__(self, "consider", consider)
+
+
+class Jump(NamedTuple):
+    """A bias that jumped."""
+
+    label: str
+    since: float  # s, the starting time that explains the data best
+    found: float  # s, of the epoch up to which the data were used
+    size: float  # in the unit of the bias
+    sd: float
+    log_odds: float
+    bound: float  # s after `since` at which a jump of this size can be expected to be found, at the soonest
+
+
+class Update(NamedTuple):
+    """What rows made known."""
+
+    time: float  # s, of the last epoch
+    epochs: int  # that were filtered for good
+    tracks: pd.DataFrame  # time, target, each state component and its sd, of those epochs
+    jumps: tuple[Jump, ...]
+    passes: int  # most times that a window was linearised again
+    settled: bool  # whether all windows came to rest
+
+
+class Online:
+    """Calibrates a network from a stream of rows: `update` takes some, `biases` and `tracks` say what is known.
+
+    `motion` is one motion for all targets, or a mapping by name, as in `Problem`; a target of which no start is
+    declared starts where the first rows let it. The prior of the biases is Gaussian, of the declared scales, or
+    `calibration`, a tree of an earlier fit. `targets` are carried at once; of a new one beyond them that which has
+    been silent for longest is given up. Unknown noise levels are held at their guess, or at what `calibration` has.
+    Raises `InputError` for what cannot be calibrated online.
+
+    >>> online = Online(network, motion, AugmentedFilter(lag=0))
+    >>> news = online.update(run.table)
+    >>> online.counts["rows"] == len(run.table)
+    True
+    """
+
+    @float64
+    def __init__(
+        self,
+        network: Network,
+        motion: Any,
+        method: AugmentedFilter | None = None,
+        *,
+        prior: Prior | None = None,
+        calibration: xr.DataTree | None = None,
+        fix: Any = (),
+        targets: int = 16,
+    ):
+        self.method = AugmentedFilter() if method is None else method
+        if not isinstance(self.method, AugmentedFilter):
+            raise InputError(f"Online(method={method!r}): give AugmentedFilter(...)")
+        if not (isinstance(targets, int) and targets > 0):
+            raise InputError(f"Online(targets={targets!r}): give 1 or more")
+        self.prior = Gaussian() if prior is None else prior
+        if not isinstance(self.prior, Gaussian):
+            raise InputError(
+                f"Online(prior={type(self.prior).__name__}()): the filter takes Gaussian(); sparse priors are laid on"
+                " what it found, online.integrated(Horseshoe())"
+            )
+        self.arrivals = Arrivals(network, motion, fix, targets)
+        self.calibration = calibration
+        self.pending: pd.DataFrame | None = None
+        self.points: dict[tuple[float, str], tuple[np.ndarray, np.ndarray]] = {}
+        self.belief: Belief | None = None
+        self.log_evidence = 0.0
+        self.time = -np.inf
+        self.walked = -np.inf
+        self.since: list[float] = []
+        self.jumps: list[Jump] = []
+        self.frames: list[Any] = []
+
+    # what is known
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Rows that came, and how many of them were late or repeated; targets that were given up."""
+        return {name: self.arrivals.counts[name] for name in ("rows", "late", "duplicates", "retired")}
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the biases that are estimated."""
+        return self._problem.labels
+
+    @property
+    def _problem(self) -> Problem:
+        if self.arrivals.template is None:
+            raise InputError("nothing is known before the first rows; call update(rows)")
+        return self.arrivals.template
+
+    @property
+    @float64
+    def biases(self) -> pd.DataFrame:
+        """Each bias as all rows so far have it, those in the window too: label, unit, mean, sd, interval, gamma."""
+        problem, end = self._problem, self.end
+        z, root = np.asarray(end.mean), np.asarray(end.root)
+        sd = np.sqrt((root**2).sum(1))
+        before = np.sqrt(np.diag(np.linalg.inv(np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix()))))
+        scales = problem.scales
+        return pd.DataFrame(
+            {
+                "unit": [bias.unit for bias in problem.biases],
+                "mean": z * scales,
+                "sd": sd * scales,
+                "lower": (z - HALF * sd) * scales,
+                "upper": (z + HALF * sd) * scales,
+                "gamma": np.clip(1.0 - (sd / before) ** 2, 0.0, 1.0),
+                "scale": scales,
+            },
+            index=pd.Index(problem.labels, name="bias"),
+        )
+
+    # rows in
+
+    def run(self, chunks: Iterable[Any]) -> Iterator[Update]:
+        """Updates of one table of rows after another; what is still in the window at the end stays there."""
+        for rows in chunks:
+            yield self.update(rows)
+
+    @float64
+    def update(self, rows: Any) -> Update:
+        """Filter a table of rows: a path, a DataFrame, in any order.
+
+        Raises `InputError` naming a row that cannot be taken; nothing of the table is used then.
+        """
+        table = read_table(rows)
+        counts = self.arrivals.counts.copy()
+        try:
+            frame = self.arrivals.admit(table, self.pending)
+            if frame.empty:
+                return Update(self.time, 0, self._tracks([]), (), 0, True)
+            batch = self.arrivals.compiled(frame, table.source)
+        except InputError:
+            self.arrivals.counts = counts
+            raise
+        self._ready()
+        return self._filter(frame, batch, everything=False)
+
+    @float64
+    def finish(self) -> Update:
+        """Filter for good what is still in the window: the stream has ended, or the lag is not to be waited for."""
+        if self.pending is None or self.pending.empty:
+            return Update(self.time, 0, self._tracks([]), (), 0, True)
+        batch = self.arrivals.compiled(self.pending, "the window")
+        return self._filter(self.pending, batch, everything=True)
+
+    def _ready(self) -> None:
+        """The belief before the first rows, and what stays the same."""
+        problem = self._problem
+        M = problem.model.biases
+        if M > MANY:
+            raise InputError(f"{M} biases are too many for an online filter, which takes {MANY}; fix some, or fit a batch")
+        levels = np.zeros(len(problem.levels))
+        if self.belief is None:
+            z, root = self._first(problem)
+            bias = np.tile(np.arange(M), self._starts)
+            self.since = [-np.inf] * self._starts
+            self.belief = beliefs.empty(z, root, (), jnp.asarray(bias, int))
+        if self.calibration is not None:
+            from probcal.results.read import apply
+
+            levels = apply(problem, self.calibration).levels
+        held = len(self.belief.slots)
+        shapes = [(self.arrivals.most, p.drift.shape[1]) for p in problem.model.recursions[held:]]
+        fresh = beliefs.empty(self.belief.mean, self.belief.root, tuple(shapes), self.belief.candidates.bias)
+        self.belief = self.belief._replace(slots=self.belief.slots + fresh.slots)
+        walk, considered = np.zeros(M), np.zeros(M, bool)
+        for pattern, std in self.method.walk:
+            chosen = _chosen(problem.labels, pattern, "walk")
+            walk[chosen] = std / problem.scales[chosen]
+        for pattern in self.method.consider:
+            considered[_chosen(problem.labels, pattern, "consider")] = True
+        self.given = Given(jnp.asarray(levels), jnp.asarray(walk), jnp.asarray(considered))
+        self.form = Form(self.method.by, bool(walk.any()), bool(considered.any()))
+
+    @property
+    def _starts(self) -> int:
+        return 0 if self.method.jumps is None else self.method.jumps.starts
+
+    def _first(self, problem: Problem) -> tuple[jax.Array, jax.Array]:
+        """Mean and root of the biases before the stream."""
+        if self.calibration is not None:
+            from probcal.results.read import apply
+
+            known = apply(problem, self.calibration)
+            return jnp.asarray(known.z), jnp.asarray(np.linalg.cholesky(_positive(known.covariance)))
+        matrix = np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix())
+        root = np.linalg.cholesky(_positive(np.linalg.inv(matrix)))
+        return jnp.zeros(problem.model.biases), jnp.asarray(root)
+
+    # epochs through the filter
+
+    def _filter(self, frame: pd.DataFrame, batch: Batch, *, everything: bool) -> Update:
+        problem = self._problem
+        K, begun, jumps, frames = len(batch.time), 0, list[Jump](), []
+        points = self._points(batch)
+        elapsed = np.diff(batch.time, prepend=self.walked if np.isfinite(self.walked) else batch.time[0])
+        most, settled = 0, True
+        while begun < K:
+            left = K - begun
+            count, size, segments = self._window(left)
+            window = Window(
+                padded(_part(batch.epochs, begun, begun + count), size),
+                _long(elapsed[begun : begun + count], size),
+                jax.tree.map(lambda leaf, a=begun, b=begun + count, n=size: _long(leaf[a:b], n), points),
+            )
+            model = problem.model
+            if self.method.lag == 0:
+                ends, left_over = run_filter(self.form, model, self.given, self.belief, window)
+                stack = jax.tree.map(lambda leaf: leaf[None], ends)
+                xs, sds, done = left_over.x, left_over.sd, np.array([count])
+                evidence = np.array([_evidence(left_over.kept)])
+            else:
+                passed = run_window(
+                    self.form, model, self.given, self.belief, window, self.method.passes, self.method.tolerance,
+                    segments,
+                )  # fmt: skip
+                stack, xs, sds = passed.beliefs, passed.smoothed.x, passed.smoothed.sd
+                points = jax.tree.map(lambda old, new, a=begun, n=count: _over(old, new, a, n), points, passed.points)
+                done = np.minimum(np.arange(1, segments + 1) * (size // segments), count)
+                evidence = np.asarray(passed.log_evidence)
+                most = max(most, int(passed.passes))
+                settled &= bool(passed.moved <= self.method.tolerance)
+            lag = 0 if everything and count == left else self.method.lag
+            jump = self._jump(stack, done, batch.time[begun : begun + count])
+            leaving = jump[0] if jump is not None else int(np.searchsorted(done, count - lag, side="right")) - 1
+            if leaving < 0:
+                break
+            self.belief = jax.tree.map(lambda leaf, s=leaving: leaf[s], stack)
+            if not bool(jnp.all(jnp.isfinite(self.belief.mean))):
+                raise InputError(
+                    f"the filter left the finite numbers at time {batch.time[begun]:g}; state the starts of the targets,"
+                    " or take a lag"
+                )
+            if jump is not None:
+                self.belief = beliefs.jumped(self.belief, jnp.asarray(jump[1]), jump[3], jump[4])
+                jumps.append(jump[2])
+                self.since = [float(batch.time[begun + int(done[leaving]) - 1])] * self._starts
+            taken = int(done[leaving])
+            self.log_evidence += float(evidence[: leaving + 1].sum())
+            frames.append(self._rows_of(batch, begun, taken, xs, sds))
+            self.walked = float(batch.time[begun + taken - 1])
+            begun += taken
+            self._renew()
+            if count == left and jump is None:
+                break
+        self.arrivals.settled(batch, frame, begun)
+        self.pending = frame[batch.row >= begun].reset_index(drop=True)
+        self._keep(batch, points, begun)
+        self.time = max(self.time, float(batch.time[-1]))
+        self.end = self.belief if begun == K else jax.tree.map(lambda leaf: leaf[-1], stack)
+        self.jumps += jumps
+        return Update(self.time, begun, self._tracks(frames), tuple(jumps), most, settled)
+
+    def _window(self, left: int) -> tuple[int, int, int]:
+        """Epochs of the next call, what they are padded to, and into how many parts it falls."""
+        lag = self.method.lag
+        if not lag:
+            few = PLAIN[:-1] if self.method.jumps is not None else PLAIN
+            size = next((size for size in few if size >= left), few[-1])
+            return min(left, size), size, 1
+        many = LIVE if left <= (1 + LIVE) * lag or self.method.jumps is not None else BULK
+        size = (1 + many) * lag
+        return min(left, size), size, (1 + many) * SEGMENTS
+
+    def _points(self, batch: Batch) -> Points:
+        """Where the epochs of a batch were linearised last, and where new targets may be."""
+        problem, belief = self._problem, self.belief
+        assert belief is not None
+        K, M = len(batch.time), problem.model.biases
+        xs = [np.zeros((K, p.drift.shape[1])) for p in problem.model.recursions]
+        z, there = np.zeros((K, M)), np.zeros(K, bool)
+        recursion, first = np.asarray(batch.epochs.recursion), np.asarray(batch.epochs.first)
+        for k in range(K) if self.points else ():
+            old = self.points.get((float(batch.time[k]), str(batch.target[k])))
+            if old is not None:
+                xs[recursion[k]][k], z[k], there[k] = old[0], old[1], True
+        for k in np.flatnonzero(first & ~there):
+            r, name = int(recursion[k]), batch.target[k]
+            mine = np.flatnonzero((batch.target == name) & (np.arange(K) >= k))[: FIRST]
+            few = padded(jax.tree.map(lambda leaf, mine=mine: leaf[mine], batch.epochs), FIRST)
+            span = problem.epochs[r].position
+            x = places(problem.model, self.given, belief, few, r, span, self._tried())
+            if self.method.lag:
+                xs[r][mine], z[mine], there[mine] = np.asarray(x), np.asarray(belief.mean), True
+            elif "position" not in self.arrivals.declared.target(str(name)).start:
+                batch.epochs.move[r].drift[k] = np.asarray(x)  # of a start that is wide: what is linearised first
+        return Points(tuple(xs), z, there)
+
+    def _tried(self) -> np.ndarray:
+        """Places that are tried for a new target."""
+        return candidates(self.arrivals.declared)
+
+    def _keep(self, batch: Batch, points: Points, begun: int) -> None:
+        """Points of the epochs that stay in the window."""
+        recursion = np.asarray(batch.epochs.recursion)
+        self.points = {
+            (float(batch.time[k]), str(batch.target[k])): (points.x[recursion[k]][k], points.z[k])
+            for k in range(begun, len(batch.time))
+            if points.there[k]
+        }
+
+    def _renew(self) -> None:
+        """Let the oldest candidates begin anew where it is time."""
+        if self.method.jumps is None:
+            return
+        every = self.method.jumps.within / self.method.jumps.starts
+        if self.walked - max(self.since) >= every:
+            oldest = int(np.argmin(self.since))
+            M = self._problem.model.biases
+            columns = np.repeat(np.arange(self._starts) == oldest, M)
+            self.belief = beliefs.renewed(self.belief, jnp.asarray(columns))
+            self.since[oldest] = self.walked
+
+    def _jump(self, stack: Belief, done: np.ndarray, times: np.ndarray) -> Any:
+        """The first end of a part at which some candidate exceeds the bound: part, candidate, `Jump`, size, variance."""
+        jumps = self.method.jumps
+        if jumps is None:
+            return None
+        problem, told = self._problem, stack.candidates
+        M = problem.model.biases
+        information, score = np.asarray(told.information), np.asarray(told.score)
+        since = np.repeat(self.since, M)
+        precision = information + jumps.scale**-2
+        odds = 0.5 * score**2 / precision - 0.5 * np.log1p(jumps.scale**2 * information)
+        odds = np.where(np.isfinite(since)[None], odds, -np.inf)
+        bound = jumps.bound(M)
+        found = np.flatnonzero(odds.max(1) > bound)
+        if not len(found):
+            return None
+        part = int(found[0])
+        which = int(np.argmax(odds[part]))
+        m, size = which % M, score[part, which] / precision[part, which]
+        scale, end = problem.scales[m], float(times[int(done[part]) - 1])
+        started = since[which] if np.isfinite(since[which]) else float(times[0])
+        needed = 2.0 * bound / size**2
+        share = needed / max(information[part, which], 1e-300)
+        own = Jump(
+            problem.labels[m], float(started), end, float(size * scale),
+            float(scale / np.sqrt(precision[part, which])), float(odds[part, which]),
+            float(min(share, 1.0) * (end - started)),
+        )  # fmt: skip
+        return part, which, own, jnp.asarray(size), jnp.asarray(1.0 / precision[part, which])
+
+    # what is known
+
+    def _rows_of(self, batch: Batch, begun: int, taken: int, xs: Sequence[Any], sds: Sequence[Any]) -> Any:
+        recursion = np.asarray(batch.epochs.recursion)[begun : begun + taken]
+        parts = []
+        for r, (x, sd) in enumerate(zip(xs, sds, strict=True)):
+            mine = np.flatnonzero(recursion == r)
+            names = self.arrivals.components(r)
+            frame = pd.DataFrame({"time": batch.time[begun + mine], "target": batch.target[begun + mine]})
+            values, stds = np.asarray(x)[mine], np.asarray(sd)[mine]
+            for j, name in enumerate(names):
+                frame[name], frame[f"{name}_sd"] = values[:, j], stds[:, j]
+            parts.append(frame)
+        return pd.concat(parts, ignore_index=True) if len(parts) > 1 else parts[0]
+
+    def _tracks(self, frames: Sequence[Any]) -> pd.DataFrame:
+        if not frames:
+            return pd.DataFrame({"time": np.zeros(0), "target": np.zeros(0, str)})
+        return pd.concat(frames, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)
+
+
+def _chosen(labels: Sequence[str], pattern: str, what: str) -> np.ndarray:
+    """Numbers of the biases that a pattern matches; raises `InputError` where it matches none."""
+    found = [m for m, label in enumerate(labels) if label == pattern or fnmatchcase(label, pattern)]
+    if not found:
+        raise InputError(f'AugmentedFilter: {what} "{pattern}" matches no bias{nearest(pattern, labels)}')
+    return np.array(found)
+
+
+def _positive(matrix: np.ndarray) -> np.ndarray:
+    """A covariance that has a Cholesky factor, biases that are known exactly given a variance of rounding."""
+    return matrix + 1e-12 * np.eye(len(matrix))
+
+
+def _part(epochs: Any, start: int, stop: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[start:stop], epochs)
+
+
+def _long(array: np.ndarray, size: int) -> np.ndarray:
+    """An array with zeros behind it up to a size."""
+    more = size - len(array)
+    return np.concatenate([array, np.zeros((more, *array.shape[1:]), array.dtype)]) if more else array
+
+
+def _over(old: np.ndarray, new: jax.Array, begun: int, count: int) -> np.ndarray:
+    """An array with some of it replaced."""
+    after = old.copy()
+    after[begun : begun + count] = np.asarray(new)[:count]
+    return after
+
+
+def _evidence(kept: Any) -> float:
+    total = 0.0
+    for own in kept:
+        variance, innovation = np.asarray(own.variance), np.asarray(own.innovation)
+        used = variance > 0
+        total -= 0.5 * float((innovation[used] ** 2 + np.log(variance[used])).sum())
+    return total
