@@ -21,7 +21,7 @@ FLOORS = {
     6: ("identifiability", "results"),
     7: ("inference",),
     8: ("analysis",),
-    9: ("cli", "report", "plots", "diagnostics"),
+    9: ("adapters", "cli", "report", "plots", "diagnostics"),
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
 METHODS = tuple(

@@ -1,0 +1,37 @@
+"""From and to what users have: Stone Soup, ROS bags, AIS, ADS-B and GeoJSON; each ends in the long table.
+
+Angles are mathematical, in radians (0 east, counter-clockwise): nautical courses and headings are converted. What a
+reader returns says in `.attrs["start"]` which instant its time 0 is.
+"""
+
+from typing import TYPE_CHECKING
+
+from probcal.lazy import lazy
+
+if TYPE_CHECKING:
+    from probcal.adapters.adsb import read_adsb
+    from probcal.adapters.ais import read_ais
+    from probcal.adapters.geojson import read_geojson, write_geojson
+    from probcal.adapters.ros import FromField, Topic, read_bag
+    from probcal.adapters.stone_soup import (
+        by_time,
+        from_detections,
+        from_tracks,
+        measurement_model,
+        to_detections,
+        to_sensors,
+        to_tracks,
+    )
+
+__all__ = lazy(
+    __name__,
+    {
+        "probcal.adapters.adsb": "read_adsb",
+        "probcal.adapters.ais": "read_ais",
+        "probcal.adapters.geojson": "read_geojson write_geojson",
+        "probcal.adapters.ros": "FromField Topic read_bag",
+        "probcal.adapters.stone_soup": (
+            "by_time from_detections from_tracks measurement_model to_detections to_sensors to_tracks"
+        ),
+    },
+)
