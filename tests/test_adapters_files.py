@@ -1,6 +1,8 @@
 """AIS, ADS-B and GeoJSON: read into the table, and GeoJSON written from a fit and read back."""
 
 import json
+import subprocess
+import sys
 import warnings
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -242,6 +244,34 @@ def test_an_extra_that_is_missing_is_named():
         InputError, match=r'reading ghosts needs the package no_such_thing: pip install "probcal\[ghosts\]"'
     ):
         shared.extra("no_such_thing.part", "reading ghosts", "ghosts")
+
+
+@pytest.mark.parametrize(
+    ("package", "extra", "call"),
+    [
+        ("pyais", "ais", lambda path: adapters.read_ais([], KIEL)),
+        ("rosbags", "ros", lambda path: adapters.read_bag(path, {"/a": adapters.Topic("a", {"range": "range"})})),
+        ("stonesoup", "stonesoup", lambda path: adapters.to_sensors(GPS)),
+    ],
+)
+def test_each_adapter_names_its_extra(package, extra, call, monkeypatch, tmp_path):
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=rf'needs the package {package}: pip install "probcal\[{extra}\]"$'):
+        call(tmp_path)
+
+
+def test_adapters_load_nothing_before_they_are_used():
+    code = (
+        "import sys, probcal.adapters as adapters\n"
+        "print([dir(adapters) and name for name in adapters.__all__ if getattr(adapters, name).__module__])\n"
+        "print([name for name in ('stonesoup', 'rosbags', 'pyais', 'pandas', 'pyproj') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
+    names, loaded = done.stdout.splitlines()
+    assert names == str(sorted(adapters.__all__))
+    assert loaded == "[]"
 
 
 def lines_of(count):

@@ -13,7 +13,7 @@ import pytest
 import probcal
 from probcal import Bias, Censored, Channel, Detection, InputError, Network, Node, sensor, sensors
 from probcal import Path as Course
-from probcal.adapters.declared import SensorFunction, StateMapping, channel_stds
+from probcal.adapters.stone_soup.function import SensorFunction, StateMapping, channel_stds
 from probcal.cli.models import load_model
 from probcal.geometry import norm
 

@@ -13,15 +13,10 @@ if TYPE_CHECKING:
     from probcal.adapters.ais import read_ais
     from probcal.adapters.geojson import read_geojson, write_geojson
     from probcal.adapters.ros import FromField, Topic, read_bag
-    from probcal.adapters.stone_soup import (
-        by_time,
-        from_detections,
-        from_tracks,
-        measurement_model,
-        to_detections,
-        to_sensors,
-        to_tracks,
-    )
+    from probcal.adapters.stone_soup.detections import by_time, from_detections, to_detections
+    from probcal.adapters.stone_soup.measurement import measurement_model
+    from probcal.adapters.stone_soup.sensors import to_sensors
+    from probcal.adapters.stone_soup.tracks import from_tracks, to_tracks
 
 __all__ = lazy(
     __name__,
@@ -30,8 +25,9 @@ __all__ = lazy(
         "probcal.adapters.ais": "read_ais",
         "probcal.adapters.geojson": "read_geojson write_geojson",
         "probcal.adapters.ros": "FromField Topic read_bag",
-        "probcal.adapters.stone_soup": (
-            "by_time from_detections from_tracks measurement_model to_detections to_sensors to_tracks"
-        ),
+        "probcal.adapters.stone_soup.detections": "by_time from_detections to_detections",
+        "probcal.adapters.stone_soup.measurement": "measurement_model",
+        "probcal.adapters.stone_soup.sensors": "to_sensors",
+        "probcal.adapters.stone_soup.tracks": "from_tracks to_tracks",
     },
 )

@@ -16,6 +16,7 @@ from probcal.files import write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place
 from probcal.labels import AXES
 from probcal.lazy import Later
+from probcal.results.read import each_track
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -254,8 +255,6 @@ def _ellipse(centre: np.ndarray, covariance: np.ndarray, deviations: float) -> n
 
 
 def _track_features(tree: xr.DataTree, frame: LocalFrame, start: Any) -> list[dict[str, Any]]:
-    from probcal.results.read import each_track
-
     zero = 0 if start is None else instant(start, "start")
     features = []
     for target, group in each_track(tree):

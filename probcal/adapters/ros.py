@@ -40,7 +40,7 @@ STANDARD = {  # units of the fields of common messages, by type and the beginnin
 
 @dataclass(frozen=True)
 class FromField:
-    """The path of a field of a message that names the sensor or the target of its row, as in `FromField("anchor_id")`."""
+    """The path of a field of a message that names the sensor or target of its row: `FromField("anchor_id")`."""
 
     path: str
 

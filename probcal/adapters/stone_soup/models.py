@@ -15,7 +15,7 @@ from stonesoup.sensor.sensor import SimpleSensor
 from stonesoup.types.angle import Bearing
 from stonesoup.types.array import CovarianceMatrix, StateVector, StateVectors
 
-from probcal.adapters.declared import SensorFunction
+from probcal.adapters.stone_soup.function import SensorFunction
 from probcal.errors import InputError
 
 
