@@ -51,7 +51,8 @@ class Known:
 class Arrivals:
     """What turns rows into epochs.
 
-    A row that is earlier than the time up to which its target was filtered is late, one that repeats time, sensor,
+    A row that is earlier than the time up to which its target was filtered is late (where biases move, than that of any
+    target), one that repeats time, sensor,
     target and channels of another is a duplicate; both are left out and counted. Rows of one call, and those that are
     still in the window, are brought into order. A new target takes a free slot, or that of the target that has been
     silent for longest.
@@ -69,8 +70,8 @@ class Arrivals:
     template: Problem | None = None
     sizes: tuple[int, ...] = ()  # rows of an epoch of each block, padded
 
-    def admit(self, table: Table, pending: pd.DataFrame | None) -> pd.DataFrame:
-        """Rows of a table behind those pending, in order, without late and repeated ones.
+    def admit(self, table: Table, pending: pd.DataFrame | None, since: float) -> pd.DataFrame:
+        """Rows of a table behind those pending, in order, without repeated ones and those before a time.
 
         Raises `InputError` for a column that is missing or not understood.
         """
@@ -96,7 +97,7 @@ class Arrivals:
         frame["cells"] = frame["cells"].astype(str)
         frame["line"] = table.lines
         last = frame["target"].map(lambda name: self.targets[name].time if name in self.targets else -np.inf)
-        late = frame["time"].to_numpy() < last.to_numpy()
+        late = frame["time"].to_numpy() < np.maximum(last.to_numpy(), since)
         again = np.zeros(len(frame), bool)
         for n in np.flatnonzero(frame["time"].to_numpy() == last.to_numpy()):
             row = frame.iloc[n]

@@ -50,13 +50,13 @@ class Jumps:
     positive.
 
     >>> Jumps(within=30.0).starts
-    8
+    12
     """
 
     false_alarms: float = 0.1
     within: float = 60.0
     scale: float = 1.0
-    starts: int = 8
+    starts: int = 12
 
     def __post_init__(self):
         for name in ("false_alarms", "within", "scale", "starts"):
@@ -180,6 +180,7 @@ class Online:
         self.belief: Belief | None = None
         self.log_evidence = 0.0
         self.time = -np.inf
+        self.ready: Problem | None = None  # the template that `given` belongs to
         self.walked = -np.inf
         self.since: list[float] = []
         self.jumps: list[Jump] = []
@@ -241,7 +242,7 @@ class Online:
         table = read_table(rows)
         counts = self.arrivals.counts.copy()
         try:
-            frame = self.arrivals.admit(table, self.pending)
+            frame = self.arrivals.admit(table, self.pending, self.walked if self._moves else -np.inf)
             if frame.empty:
                 return Update(self.time, 0, self._tracks([]), (), 0, True)
             batch = self.arrivals.compiled(frame, table.source)
@@ -259,9 +260,17 @@ class Online:
         batch = self.arrivals.compiled(self.pending, "the window")
         return self._filter(self.pending, batch, everything=True)
 
+    @property
+    def _moves(self) -> bool:
+        """Whether biases may move, so that the order of rows of different targets matters."""
+        return bool(self.method.walk) or self.method.jumps is not None
+
     def _ready(self) -> None:
         """The belief before the first rows, and what stays the same."""
         problem = self._problem
+        if self.belief is not None and problem is self.ready:
+            return
+        self.ready = problem
         M = problem.model.biases
         if M > MANY:
             raise InputError(f"{M} biases are too many for an online filter, which takes {MANY}; fix some, or fit a batch")
@@ -322,7 +331,7 @@ class Online:
             model = problem.model
             if self.method.lag == 0:
                 ends, left_over = run_filter(self.form, model, self.given, self.belief, window)
-                stack = jax.tree.map(lambda leaf: leaf[None], ends)
+                stack = jax.tree.map(lambda leaf: np.asarray(leaf)[None], ends)
                 xs, sds, done = left_over.x, left_over.sd, np.array([count])
                 evidence = np.array([_evidence(left_over.kept)])
             else:
@@ -330,7 +339,7 @@ class Online:
                     self.form, model, self.given, self.belief, window, self.method.passes, self.method.tolerance,
                     segments,
                 )  # fmt: skip
-                stack, xs, sds = passed.beliefs, passed.smoothed.x, passed.smoothed.sd
+                stack, xs, sds = jax.tree.map(np.asarray, passed.beliefs), passed.smoothed.x, passed.smoothed.sd
                 points = jax.tree.map(lambda old, new, a=begun, n=count: _over(old, new, a, n), points, passed.points)
                 done = np.minimum(np.arange(1, segments + 1) * (size // segments), count)
                 evidence = np.asarray(passed.log_evidence)
@@ -342,7 +351,7 @@ class Online:
             if leaving < 0:
                 break
             self.belief = jax.tree.map(lambda leaf, s=leaving: leaf[s], stack)
-            if not bool(jnp.all(jnp.isfinite(self.belief.mean))):
+            if not np.isfinite(self.belief.mean).all():
                 raise InputError(
                     f"the filter left the finite numbers at time {batch.time[begun]:g}; state the starts of the targets,"
                     " or take a lag"
@@ -448,14 +457,16 @@ class Online:
         m, size = which % M, score[part, which] / precision[part, which]
         scale, end = problem.scales[m], float(times[int(done[part]) - 1])
         started = since[which] if np.isfinite(since[which]) else float(times[0])
-        needed = 2.0 * bound / size**2
-        share = needed / max(information[part, which], 1e-300)
+        later = [own for own in self.since if own > started]
+        gap = min([*later, end]) - started  # it may have begun so much later, and then is larger
+        undated = size * gap / max(end - started, 1e-9)
+        variance = 1.0 / precision[part, which] + undated**2
+        share = 2.0 * bound / size**2 / max(information[part, which], 1e-300)
         own = Jump(
-            problem.labels[m], float(started), end, float(size * scale),
-            float(scale / np.sqrt(precision[part, which])), float(odds[part, which]),
-            float(min(share, 1.0) * (end - started)),
+            problem.labels[m], float(started), end, float(size * scale), float(scale * np.sqrt(variance)),
+            float(odds[part, which]), float(min(share, 1.0) * (end - started)),
         )  # fmt: skip
-        return part, which, own, jnp.asarray(size), jnp.asarray(1.0 / precision[part, which])
+        return part, which, own, jnp.asarray(size), jnp.asarray(variance)
 
     # what is known
 
