@@ -277,6 +277,7 @@ def test_headers_without_time_and_topics_without_values(tmp_path):
         name, message = made.range(-BEGIN, 1.0)
         yield "/range", 0.0, (name, message)
         yield "/far", 0.0, made.range(0.0, np.inf)
+        yield "/lost", 0.0, made.fix(0.0, 148.1, 11.6, 500.0)
 
     path = write(tmp_path, "sqlite3", unset)
     topics = {"/range": Topic("a", {"range": "range"})}
@@ -284,8 +285,12 @@ def test_headers_without_time_and_topics_without_values(tmp_path):
         adapters.read_bag(path, topics)
     received = adapters.read_bag(path, {"/range": Topic("a", {"range": "range"}, time="received")})
     assert received["time"].tolist() == [0.0]
+    both = {"/far": Topic("b", {"far": "range"}), "/range": Topic("a", {"near": "range"}, time="received")}
+    assert adapters.read_bag(path, both).columns.tolist() == ["time", "sensor", "far [m]", "near [m]"]
     with pytest.raises(InputError, match="sqlite3: its topics /far hold no value that can be read"):
         adapters.read_bag(path, {"/far": Topic("a", {"range": "range"})})
+    with pytest.raises(InputError, match=r'topic "/lost": LocalFrame\.to_local: latitude must lie between'):
+        adapters.read_bag(path, {"/lost": Topic("a", {"x": "local_x"})}, frame=HOME)
     with pytest.raises(InputError, match=r"Topic: channels is \{\}; map columns to fields"):
         Topic("a", {})
     with pytest.raises(InputError, match='Topic: time is \'stamp\'; give "header" or "received"'):

@@ -51,9 +51,10 @@ class Topic:
 
     `channels` maps the columns of the table to fields of the message, `{"range": "range"}`, with dots and indices
     (`pose.pose.position.x`, `ranges[0]`). A column may state the unit of its field, `"azimuth [deg]"`; those of common
-    messages are known. A quaternion has yaw, pitch (nose up) and roll in rad besides; a NavSatFix `local_x`, `local_y`
-    and `local_z` in m of the frame. `sensor` and `target` are names, or a `FromField` of the message. With a `frame_id`
-    every header must have it. `time` is "header", or "received" for when the bag got the message.
+    messages are known, and converted to the unit of the column. A quaternion has yaw, pitch (nose up) and roll in rad
+    besides; a NavSatFix `local_x`, `local_y` and `local_z` in m of the frame. `sensor` and `target` are names, or a
+    `FromField` of the message. With a `frame_id` every header must have it. `time` is "header", or "received" for when
+    the bag got the message.
 
     >>> Topic("anchor_0", {"range": "range"}, target="rover").time
     'header'
@@ -120,7 +121,7 @@ def read_bag(
     table = pd.DataFrame(rows)
     time, zero = since(table.pop("stamp").to_numpy(np.int64), start)
     first = [name for name in ("sensor", "target") if name in table]
-    table = table[[*first, *reading.columns]]
+    table = table.reindex(columns=[*first, *reading.columns])
     table.insert(0, "time", time)
     table = table.sort_values("time", kind="stable").reset_index(drop=True)
     table.attrs = {"start": zero, "left_out": reading.left}
@@ -142,16 +143,21 @@ def _opened(path: Path, types: Mapping[str, str] | None, distribution: str | Non
         for name, text in (types or {}).items():
             store.register(typesys.get_types_from_msg(text, _full(name)))
     except Exception as error:  # a parser of grammars says what it likes
-        raise InputError(f"read_bag: types of {name} is no text of a .msg file: {error}") from None
+        raise InputError(f"read_bag: types of {name} is no text of a .msg file: {_said(error)}") from None
     try:
         bag = highlevel.AnyReader([path], default_typestore=store)
         bag.open()
     except Exception as error:  # rosbags, sqlite3, yaml and struct on foreign bytes
-        raise InputError(f"{path.name} is no ROS bag that can be read: {error}") from None
+        raise InputError(f"{path.name} is no ROS bag that can be read: {_said(error)}") from None
     try:
         yield bag
     finally:
         bag.close()
+
+
+def _said(error: Exception) -> str:
+    """What an error says, or what it is where it says nothing."""
+    return str(error) or type(error).__name__
 
 
 def _full(name: str) -> str:
@@ -165,7 +171,7 @@ def _messages(bag: Any, connections: list[Any], path: Path) -> Iterator[tuple[An
     except InputError:
         raise
     except Exception as error:  # as above, in the middle of a file
-        raise InputError(f"{path.name} is damaged: {error}") from None
+        raise InputError(f"{path.name} is damaged: {_said(error)}") from None
 
 
 def _deserialised(bag: Any, raw: bytes, connection: Any, path: Path) -> Any:
@@ -173,8 +179,8 @@ def _deserialised(bag: Any, raw: bytes, connection: Any, path: Path) -> Any:
         return bag.deserialize(raw, connection.msgtype)
     except Exception as error:
         raise InputError(
-            f'{path.name} topic "{connection.topic}": {connection.msgtype} cannot be decoded ({error}); give types='
-            " with the text of its .msg file"
+            f'{path.name} topic "{connection.topic}": {connection.msgtype} cannot be decoded ({_said(error)}); give'
+            " types= with the text of its .msg file"
         ) from None
 
 
@@ -192,7 +198,12 @@ class _Reading:
     @property
     def columns(self) -> list[str]:
         """Columns of the channels, with their units."""
-        return [name if unit is None else f"{name} [{unit}]" for name, unit in self.units.items()]
+        named = [split_header(column)[0] for topic in self.topics.values() for column in topic.channels]
+        return [self._header(name) for name in dict.fromkeys(named) if name in self.units]
+
+    def _header(self, name: str) -> str:
+        unit = self.units[name]
+        return name if unit is None else f"{name} [{unit}]"
 
     def row(self, name: str, kind: str, message: Any, received: int) -> list[dict[str, Any]]:
         """The row of a message, none where it holds no value."""
@@ -209,9 +220,8 @@ class _Reading:
         for column, path in topic.channels.items():
             value = self._value(name, kind, message, path)
             label, _ = split_header(column)
-            unit = self.units[label]
             if np.isfinite(value):
-                values[label if unit is None else f"{label} [{unit}]"] = value * self.factors[name, column]
+                values[self._header(label)] = value * self.factors[name, column]
         if not values:
             self.left["without a value"] += 1
             return []
@@ -286,13 +296,14 @@ class _Reading:
         """Position in the frame of a fix, NaN where it has none."""
         if self.frame is None:
             raise InputError(f'topic "{name}": local_x, local_y and local_z need frame=LocalFrame(latitude, longitude)')
-        place = [float(message.latitude), float(message.longitude), float(message.altitude)]
-        if message.status.status < 0 or not np.isfinite(place[:2]).all():
+        flat = "local_z" not in self.topics[name].channels.values()
+        place = [float(message.latitude), float(message.longitude), *([] if flat else [float(message.altitude)])]
+        if message.status.status < 0 or not np.isfinite(place).all():
             return [np.nan] * 3
-        flat = not any(path == "local_z" for path in self.topics[name].channels.values())
-        if flat or not np.isfinite(place[2]):
-            return [*([np.nan] * 2 if not flat else self.frame.to_local(*place[:2]).tolist()), np.nan]
-        return self.frame.to_local(*place).tolist()
+        try:
+            return [*self.frame.to_local(*place).tolist(), np.nan][:3]
+        except InputError as error:
+            raise InputError(f'topic "{name}": {error}') from None
 
 
 def _standard(kind: str, path: str) -> str | None:
