@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from probcal.errors import InputError
+from probcal.errors import InputError, nearest
 from probcal.labels import AXES
 from probcal.lazy import Later
 from probcal.model.epochs import Epoch, merged
-from probcal.model.motions import linear_of, start_of
+from probcal.model.motions import Area, linear_of, start_of
 from probcal.motion import Target, as_motion
 from probcal.network import Network
 from probcal.problem import Problem, check_linear
+from probcal.smoothing.grid import candidates
 from probcal.table import Table, header, measure, name_as_text
 
 if TYPE_CHECKING:
@@ -67,6 +68,9 @@ class Arrivals:
     origin: str = ""  # the date of time 0, where times are dates
     samples: pd.DataFrame | None = None  # a row of each form: what the template is made of
     starts: dict[str, dict[str, tuple[Any, float]]] = field(default_factory=dict)
+    area: Area | None = None  # where a target starts of which nothing is stated, as the first rows have it
+    duration: float = 1.0  # s, of the first rows
+    tried: np.ndarray | None = None  # (places, d) that are tried for a new target
     template: Problem | None = None
     sizes: tuple[int, ...] = ()  # rows of an epoch of each block, padded
 
@@ -188,15 +192,24 @@ class Arrivals:
             self._start(name)
         rows = frame.loc[fresh.index].assign(_kind=fresh["kind"], _group=fresh["group"])
         self.samples = rows if self.samples is None else pd.concat([self.samples, rows], ignore_index=True)
-        self._rebuild()
+        self.rebuild()
 
-    def _rebuild(self) -> None:
+    def rebuild(self) -> None:
         """The template from its samples: one row of each sensor type that sees each form of a motion."""
         assert self.samples is not None
         kept = self.samples.drop(columns=["_kind", "_group"])
-        template = Problem(self.network, self._motions(kept["target"]), kept, fix=self.fixed)
+        template = Problem(self.network, self.motions(kept["target"]), kept, fix=self.fixed)
         check_linear(template)
         self.template, self.sizes = template, ()
+
+    def target(self, name: str) -> Target:
+        """Motion and start of a target as they are declared; raises `InputError` where it has none."""
+        declared = self.motion
+        if isinstance(declared, Mapping):
+            if name not in declared:
+                raise InputError(f'target "{name}" has no motion{nearest(name, declared)}')
+            declared = declared[name]
+        return declared if isinstance(declared, Target) else Target(declared)
 
     def _group(self, name: str) -> str:
         """What targets have in common whose motion is declared once."""
@@ -205,15 +218,15 @@ class Arrivals:
     def _freeze(self, problem: Problem) -> None:
         """Keep where targets start of which nothing is stated, as the first rows have it."""
         self.network = problem.network
-        self.area = problem.area
+        self.area, self.tried = problem.area, candidates(problem)
         self.duration = float(np.ptp(problem.measurements.time)) or 1.0
-        self.declared = problem
 
     def _start(self, name: str) -> None:
         group = self._group(name)
         if group in self.starts:
             return
-        target = self.declared.target(name)
+        target = self.target(name)
+        assert self.area is not None
         found: dict[str, tuple[Any, float]] = {}
         for component in linear_of(as_motion(target.motion)):
             if component.memoryless:
@@ -226,16 +239,16 @@ class Arrivals:
                 row += width
         self.starts[group] = {k: (m if len(m) > 1 else m[0], s) for k, (m, s) in found.items()} | dict(target.start)
 
-    def _motions(self, names: Iterable[Any]) -> dict[str, Target]:
+    def motions(self, names: Iterable[Any]) -> dict[str, Target]:
         """The motion of each target, with its start."""
-        return {str(n): Target(self.declared.target(str(n)).motion, self.starts[self._group(str(n))]) for n in names}
+        return {str(n): Target(self.target(str(n)).motion, self.starts[self._group(str(n))]) for n in names}
 
     def _seat(self, template: Problem, names: Iterable[str]) -> None:
         """A slot for each new target, free or of the one that has been silent for longest; sets their motions."""
         names = [str(name) for name in names]
         for name in names:
             self._start(name)
-        template.motion = self._motions([*names, *template.measurements.target_names])
+        template.motion = self.motions([*names, *template.measurements.target_names])
         for name in names:
             if name in self.targets:
                 continue

@@ -23,7 +23,7 @@ from probcal.online.starts import FIRST, places
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import HALF
-from probcal.smoothing.grid import candidates
+from probcal.results.read import apply
 from probcal.table import read_table
 from probcal.types import float64
 
@@ -36,6 +36,7 @@ else:
 
 LIVE, BULK = 1, 16  # lags of a window beside the one that stays, of few rows and of many
 PLAIN = (1, 32, 512)  # epochs of a call of the plain filter
+RECENT = 300  # rows that are kept for the tree
 MANY = 3000  # biases beyond which the dense covariance of the filter is no use
 SEGMENTS = 4  # parts of a lag, at the ends of which a window may be left
 
@@ -176,6 +177,7 @@ class Online:
         self.arrivals = Arrivals(network, motion, fix, targets)
         self.calibration = calibration
         self.pending: pd.DataFrame | None = None
+        self.recent: pd.DataFrame | None = None
         self.points: dict[tuple[float, str], tuple[np.ndarray, np.ndarray]] = {}
         self.belief: Belief | None = None
         self.log_evidence = 0.0
@@ -226,6 +228,40 @@ class Online:
             index=pd.Index(problem.labels, name="bias"),
         )
 
+    @float64
+    def under(self, prior: Prior, *, key: int = 0) -> pd.DataFrame:
+        """`biases` under a sparse prior in the place of the declared scales: online evidence approximation.
+
+        What the rows say of the biases is a Gaussian likelihood, whatever the prior: a hierarchical one is integrated
+        over its precisions as `EA` does, `ARD()` takes those of largest evidence (Paper B 24-25). Raises `InputError`
+        where biases walk, jumped or are only considered, or the stream began from an earlier calibration: there is no
+        prior of them that could be replaced.
+        """
+        from probcal.inference.relearnt import relearnt
+
+        if self.method.walk or self.method.consider or self.jumps or self.calibration is not None:
+            raise InputError(
+                "under(prior): biases that walk, jumped, are only considered or come from an earlier calibration have"
+                " no prior that could be replaced; fit the rows as a batch"
+            )
+        problem = self._problem
+        precision = self.prior.precision(problem.labels, problem.surveyed)
+        moments = relearnt(problem, prior, precision, np.asarray(self.end.mean), np.asarray(self.end.root), key)
+        scales, sd = problem.scales, np.sqrt(np.diag(moments.covariance))
+        return self.biases.assign(
+            mean=moments.mean * scales, sd=sd * scales, lower=moments.lower * scales, upper=moments.upper * scales,
+            gamma=moments.gamma,
+        )  # fmt: skip
+
+    def tree(self) -> xr.DataTree:
+        """The calibration as a fit leaves it, for `track`, `save` and `Online(calibration=...)`; of its data the last.
+
+        Raises `InputError` before the first rows.
+        """
+        from probcal.inference.watched import calibration_tree
+
+        return calibration_tree(self)
+
     # rows in
 
     def run(self, chunks: Iterable[Any]) -> Iterator[Update]:
@@ -274,16 +310,12 @@ class Online:
         M = problem.model.biases
         if M > MANY:
             raise InputError(f"{M} biases are too many for an online filter, which takes {MANY}; fix some, or fit a batch")
-        levels = np.zeros(len(problem.levels))
         if self.belief is None:
             z, root = self._first(problem)
             bias = np.tile(np.arange(M), self._starts)
             self.since = [-np.inf] * self._starts
             self.belief = beliefs.empty(z, root, (), jnp.asarray(bias, int))
-        if self.calibration is not None:
-            from probcal.results.read import apply
-
-            levels = apply(problem, self.calibration).levels
+        levels = self.levels(problem)
         held = len(self.belief.slots)
         shapes = [(self.arrivals.most, p.drift.shape[1]) for p in problem.model.recursions[held:]]
         fresh = beliefs.empty(self.belief.mean, self.belief.root, tuple(shapes), self.belief.candidates.bias)
@@ -297,6 +329,12 @@ class Online:
         self.given = Given(jnp.asarray(levels), jnp.asarray(walk), jnp.asarray(considered))
         self.form = Form(self.method.by, bool(walk.any()), bool(considered.any()))
 
+    def levels(self, problem: Problem) -> np.ndarray:
+        """Log factors (H,) of the unknown noise levels: as the calibration has them, else those of their guesses."""
+        if self.calibration is None:
+            return np.zeros(len(problem.levels))
+        return apply(problem, self.calibration).levels
+
     @property
     def _starts(self) -> int:
         return 0 if self.method.jumps is None else self.method.jumps.starts
@@ -304,8 +342,6 @@ class Online:
     def _first(self, problem: Problem) -> tuple[jax.Array, jax.Array]:
         """Mean and root of the biases before the stream."""
         if self.calibration is not None:
-            from probcal.results.read import apply
-
             known = apply(problem, self.calibration)
             return jnp.asarray(known.z), jnp.asarray(np.linalg.cholesky(_positive(known.covariance)))
         matrix = np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix())
@@ -370,6 +406,7 @@ class Online:
                 break
         self.arrivals.settled(batch, frame, begun)
         self.pending = frame[batch.row >= begun].reset_index(drop=True)
+        self.recent = frame.tail(RECENT).reset_index(drop=True)
         self._keep(batch, points, begun)
         self.time = max(self.time, float(batch.time[-1]))
         self.end = self.belief if begun == K else jax.tree.map(lambda leaf: leaf[-1], stack)
@@ -404,16 +441,12 @@ class Online:
             mine = np.flatnonzero((batch.target == name) & (np.arange(K) >= k))[: FIRST]
             few = padded(jax.tree.map(lambda leaf, mine=mine: leaf[mine], batch.epochs), FIRST)
             span = problem.epochs[r].position
-            x = places(problem.model, self.given, belief, few, r, span, self._tried())
+            x = places(problem.model, self.given, belief, few, r, span, self.arrivals.tried)
             if self.method.lag:
                 xs[r][mine], z[mine], there[mine] = np.asarray(x), np.asarray(belief.mean), True
-            elif "position" not in self.arrivals.declared.target(str(name)).start:
+            elif "position" not in self.arrivals.target(str(name)).start:
                 batch.epochs.move[r].drift[k] = np.asarray(x)  # of a start that is wide: what is linearised first
         return Points(tuple(xs), z, there)
-
-    def _tried(self) -> np.ndarray:
-        """Places that are tried for a new target."""
-        return candidates(self.arrivals.declared)
 
     def _keep(self, batch: Batch, points: Points, begun: int) -> None:
         """Points of the epochs that stay in the window."""
