@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -91,27 +92,41 @@ def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
     if not isinstance(source, (str, PathLike)):
         raise InputError(f"data must be a path or a DataFrame, got {type(source).__name__}")
     path = Path(source)
-    form: dict[str, Any] = dict(index_col=False, skip_blank_lines=False, encoding="utf-8-sig", low_memory=False)
     try:
-        first = pd.read_csv(path, header=None, nrows=1, dtype=str, keep_default_na=False, **form)
+        return _parsed(path, path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+def read_lines(header: bytes, lines: bytes, name: str, first: int) -> Table:
+    """Lines of a CSV file under its header line, the first of them of number `first`; raises `InputError`."""
+    return _parsed(Path(name), header.rstrip(b"\r\n") + b"\n" + lines, first)
+
+
+def _parsed(path: Path, content: Path | bytes, number: int = 2) -> Table:
+    form: dict[str, Any] = dict(index_col=False, skip_blank_lines=False, encoding="utf-8-sig", low_memory=False)
+
+    def source() -> Any:
+        return io.BytesIO(content) if isinstance(content, bytes) else content
+
+    try:
+        first = pd.read_csv(source(), header=None, nrows=1, dtype=str, keep_default_na=False, **form)
         _check_separator(path, first.iloc[0].tolist())
         columns = _once(path, first.iloc[0].tolist())
         text = [column for column in columns if split_header(column)[0] in NAMES]
         form |= {"na_values": dict.fromkeys(columns, BLANK) | dict.fromkeys(text, ("",)), "keep_default_na": False}
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
-            frame = pd.read_csv(path, names=columns, header=0, dtype=dict.fromkeys(text, str), **form)
-    except InputError:
+            frame = pd.read_csv(source(), names=columns, header=0, dtype=dict.fromkeys(text, str), **form)
+    except (InputError, OSError):
         raise
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
     except pd.errors.ParserWarning:
         raise InputError(f"{path.name} has rows with more cells than its header; give every column a name") from None
     except Exception as error:  # whatever pandas and the packages that unpack files say of foreign bytes
         raise InputError(f"{path.name} is not a CSV table with a header line: {error}") from None
-    lines = np.arange(2, len(frame) + 2)
+    lines = np.arange(number, len(frame) + number)
     filled = frame.notna().any(axis=1).to_numpy()
     return Table(frame[filled].reset_index(drop=True), path.name, lines[filled])
 

@@ -10,6 +10,7 @@ from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.cli import files, options, outputs
 from probcal.cli.names import METHODS, ORACLE, PRIORS
 from probcal.errors import FitError, InputError, nearest
+from probcal.files import Lock
 
 app = typer.Typer(
     help="Bayesian calibration of sensor networks from targets of opportunity.",
@@ -25,6 +26,7 @@ Given = Annotated[
 ]
 LARGEST_SEED = 2**62
 SMOOTHERS = ("gaussian", "particles")
+KEPT = ("tracks", "rows")  # tables of a watch besides its history
 Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="seed of everything random")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace the run in --out: the files that probcal wrote")]
 Scheduler = Annotated[
@@ -183,6 +185,57 @@ def track_command(
     raise typer.Exit(track.run(
         model, data, arguments, calibration, results, smoother=smoother, particles=particles, seed=seed
     ))  # fmt: skip
+
+
+@app.command(name="watch")
+def watch_command(
+    model: Model,
+    data: Annotated[Path | None, typer.Argument(help="table of rows (CSV) that may grow; standard input if left out")] = None,
+    follow: Annotated[bool, typer.Option("--follow", help="wait for more rows at the end of the file")] = False,
+    calibration: Annotated[Path | None, typer.Option(help="folder (or fit.nc) of a fit to start from")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for the state, the history of biases and fit.nc")] = None,
+    by: Annotated[str, typer.Option(help="extended | unscented | cubature")] = "extended",
+    lag: Annotated[int, typer.Option(min=0, help="epochs that are linearised again; 0 is the plain filter")] = 32,
+    walk: Annotated[list[str] | None, typer.Option(help="biases that walk: PATTERN=STD over one second (repeat)")] = None,
+    consider: Annotated[list[str] | None, typer.Option(help="biases that are not estimated, by pattern (repeat)")] = None,
+    jumps: Annotated[float | None, typer.Option(help="find biases that jump, with so many false alarms an hour")] = None,
+    within: Annotated[float, typer.Option(help="s within which a jump must be found")] = 60.0,
+    targets: Annotated[int, typer.Option(min=1, help="targets that are carried at once")] = 16,
+    every: Annotated[float, typer.Option(min=0.0, help="s between two states that are stored")] = 1.0,
+    keep: Annotated[str, typer.Option(help="tables to write besides: tracks,rows")] = "",
+    fix: Fix = None,
+    given: Given = None,
+) -> None:
+    """Calibrate a stream as it comes: a live table of biases, their history, and a state that survives a kill.
+
+    With --out a run that was stopped or killed goes on where it was: every row of a file counts once. A row that comes
+    later than what was filtered of its target is left out and counted, as are duplicates.
+    """
+    options.check_files(model, data)
+    if calibration is not None:
+        options.check_fit(calibration)
+    kept = [name.strip() for name in keep.split(",") if name.strip()]
+    for name in kept:
+        if name not in KEPT:
+            raise InputError(f'--keep "{name}" is not known; give tracks, rows or both, separated by a comma')
+    if kept and out is None:
+        raise InputError("--keep needs --out, the folder of the tables")
+    arguments, walks = options.given(given or ()), options.walks(walk or ())
+    results = None if out is None else outputs.replaceable(out, outputs.WATCH)
+    lock = None if out is None else Lock(out, 0.0)
+    try:
+        from probcal.cli import watch
+        from probcal.inference.online import Jumps
+
+        found = None if jumps is None else Jumps(false_alarms=jumps, within=within)
+        method = {"by": by, "lag": lag, "walk": walks, "consider": tuple(consider or ()), "jumps": found}
+        raise typer.Exit(watch.run(
+            model, data, fix or (), arguments, method, calibration=calibration, targets=targets, follow=follow,
+            outputs=results, every=every, kept=kept,
+        ))  # fmt: skip
+    finally:
+        if lock is not None:
+            lock.release()
 
 
 @app.command(name="study")

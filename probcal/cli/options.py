@@ -75,6 +75,18 @@ def chain_sizes(method: str, sizes: Mapping[str, int | None]) -> dict[str, int]:
     return given
 
 
+def walks(texts: Sequence[str]) -> dict[str, float]:
+    """`PATTERN=STD` of biases that walk; raises `InputError` for what is no such pair."""
+    found = {}
+    for text in texts:
+        pattern, equals, value = text.rpartition("=")
+        number = _number(value) if equals and pattern else None
+        if not isinstance(number, (int, float)):
+            raise InputError(f'--walk "{text}": write PATTERN=STD, the standard deviation over one second')
+        found[pattern] = float(number)
+    return found
+
+
 def saved_names(text: str) -> list[str]:
     """Names of the draws that a fit shall save, separated by commas."""
     names = [name.strip() for name in text.split(",") if name.strip()]

@@ -237,7 +237,7 @@ class Arrivals:
                 width = self.network.dimension if per_axis else 1
                 found[part] = (tuple(mean[row : row + width].tolist()), float(std[row]))
                 row += width
-        self.starts[group] = {k: (m if len(m) > 1 else m[0], s) for k, (m, s) in found.items()} | dict(target.start)
+        self.starts[group] = {k: (m if len(m) > 1 else m[0], s) for k, (m, s) in found.items()}
 
     def motions(self, names: Iterable[Any]) -> dict[str, Target]:
         """The motion of each target, with its start."""

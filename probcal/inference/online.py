@@ -285,7 +285,7 @@ class Online:
         except InputError:
             self.arrivals.counts = counts
             raise
-        self._ready()
+        self.prepare()
         return self._filter(frame, batch, everything=False)
 
     @float64
@@ -301,7 +301,7 @@ class Online:
         """Whether biases may move, so that the order of rows of different targets matters."""
         return bool(self.method.walk) or self.method.jumps is not None
 
-    def _ready(self) -> None:
+    def prepare(self) -> None:
         """The belief before the first rows, and what stays the same."""
         problem = self._problem
         if self.belief is not None and problem is self.ready:

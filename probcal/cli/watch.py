@@ -1,0 +1,330 @@
+"""`watch`: a stream calibrated as it comes, with a live table, a history on disk and a state that survives a kill."""
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table as Shown
+
+from probcal.cli.kernels import keep_kernels
+from probcal.cli.models import load_problem
+from probcal.errors import InputError
+from probcal.files import Outputs, write_whole
+from probcal.inference.checkpoint import restore, snapshot
+from probcal.inference.online import AugmentedFilter, Online, Update
+from probcal.results.io import load, save
+from probcal.results.schema import ROPE
+from probcal.status import INVALID
+from probcal.table import Table, read_lines
+
+BLOCK = 1 << 18  # bytes that are read at once
+REST = 0.2  # s between two looks at a file that does not grow
+LISTED = 40  # biases of the live table; of more those that are largest in their sds
+EVERY = 60.0  # s between two lines where the output is no terminal
+STATE, HISTORY, JUMPS, TRACKS, REFUSED, ROWS, FIT = (
+    "watch.npz", "biases.csv", "jumps.csv", "tracks.csv", "refused.csv", "rows.csv", "fit.nc"
+)  # fmt: skip
+
+
+
+@dataclass
+class Source:
+    """The lines of a table that grows: header, bytes that were taken, and the number of the next line."""
+
+    name: str
+    offset: int = 0
+    header: bytes = b""
+    line: int = 2
+    rest: bytes = b""  # of a line that has not ended
+    ended: bool = False
+
+    def take(self, file: Any) -> bytes:
+        """Whole lines that have come, at most a block of them."""
+        block = file.read1(BLOCK) if hasattr(file, "read1") else file.read(BLOCK)
+        self.ended = not block
+        whole, cut, self.rest = (self.rest + block).rpartition(b"\n")
+        lines = whole + cut
+        if not self.header and lines:
+            self.header, _, lines = lines.partition(b"\n")
+            self.offset += len(self.header) + 1
+        return lines
+
+    def last(self) -> bytes:
+        """What stands behind the last line end, where no more will come."""
+        rest, self.rest = self.rest, b""
+        return rest + b"\n" if rest.strip() else b""
+
+    def taken(self, lines: bytes) -> None:
+        """These lines were filtered."""
+        self.offset += len(lines)
+        self.line += lines.count(b"\n")
+
+
+@dataclass
+class Appended:
+    """Tables of a folder to which rows are added, cut back to where the last state stood."""
+
+    folder: Path
+    length: dict[str, int] = field(default_factory=dict)
+
+    def open(self) -> None:
+        """Take away what was written after the last state, of a run that was killed."""
+        for name in (HISTORY, JUMPS, TRACKS, REFUSED, ROWS):
+            path = self.folder / name
+            if path.exists() and path.stat().st_size > self.length.get(name, 0):
+                os.truncate(path, self.length.get(name, 0))
+
+    def add(self, name: str, frame: pd.DataFrame) -> None:
+        """Rows at the end of a table."""
+        if frame.empty:
+            return
+        self.write(name, frame.to_csv(index=False, header=not self.length.get(name)).encode())
+
+    def write(self, name: str, content: bytes) -> None:
+        """Bytes at the end of a file."""
+        with (self.folder / name).open("ab") as file:
+            file.write(content)
+        self.length[name] = self.length.get(name, 0) + len(content)
+
+
+def run(
+    model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, Any], method: Mapping[str, Any], *,
+    calibration: Path | None, targets: int, follow: bool, outputs: Outputs | None, every: float, kept: Sequence[str],
+) -> int:  # fmt: skip
+    """Filter the rows of a file, or of standard input, until they end or the process is told to end."""
+    keep_kernels()
+    known = None if calibration is None else load(calibration)
+    if known is not None and known.attrs.get("status") in INVALID:
+        raise InputError(
+            f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first"
+        )
+    _, problem = load_problem(model, None, fix, given)
+    online = Online(
+        problem.network, problem.motion, AugmentedFilter(**method), calibration=known, fix=problem.fixed,
+        targets=targets,
+    )  # fmt: skip
+    source = Source("standard input" if data is None else data.name)
+    tables = None if outputs is None else Appended(outputs.folder)
+    if outputs is not None:
+        assert tables is not None
+        state = outputs.folder / STATE
+        if state.exists():
+            beside = restore(online, state.read_bytes(), str(state))
+            tables.length = beside["length"]
+            if data is not None:
+                source.offset, source.line, source.header = beside["offset"], beside["line"], beside["header"].encode()
+        outputs.begin()
+        tables.open()
+    watching = Watching(online, source, tables, every, kept)
+    with _input(data, source) as file, _told_to_end(), watching.shown() as show:
+        try:
+            watching.follow(file, follow and data is not None, show)
+        except KeyboardInterrupt:
+            watching.ending = True
+    watching.store()
+    print(watching.said())
+    if online.arrivals.template is None:
+        raise InputError(f"{source.name} has no rows that could be taken")
+    if outputs is not None:
+        save(online.tree(), outputs.folder / FIT)
+        with outputs.writing():
+            pass
+        print(f"written: {', '.join(str(outputs.folder / name) for name in outputs.there)}")
+    else:
+        with pd.option_context("display.max_rows", None, "display.width", 160):
+            print(judged(online).to_string(float_format=lambda value: f"{value:.4g}"))
+    return 0
+
+
+@dataclass
+class Watching:
+    """One run: what comes in is filtered, shown and stored."""
+
+    online: Online
+    source: Source
+    tables: Appended | None
+    every: float  # s between two states
+    kept: Sequence[str]  # "tracks", "rows"
+    refused: int = 0
+    used: int = 0
+    stored: float = field(default_factory=time.monotonic)
+    begun: float = field(default_factory=time.monotonic)
+    ending: bool = False
+    unstored: bool = False
+
+    def follow(self, file: Any, grows: bool, show: Callable[[], None]) -> None:
+        """Take lines until there are no more, or for as long as the file may grow."""
+        while True:
+            lines = self.source.take(file)
+            if lines:
+                self.filter(lines)
+                show()
+            elif self.source.ended and grows:
+                self.checkpoint()
+                time.sleep(REST)
+            elif self.source.ended:
+                break
+            self.checkpoint()
+        if lines := self.source.last():
+            self.filter(lines)
+        if self.online.arrivals.template is not None:
+            self.note(self.online.finish())
+        show()
+
+    def filter(self, lines: bytes) -> None:
+        """Filter some lines; those that cannot be taken are put aside."""
+        if self.tables is not None and "rows" in self.kept:
+            head = b"" if self.tables.length.get(ROWS) else self.source.header.rstrip(b"\r") + b"\n"
+            self.tables.write(ROWS, head + lines)
+        table = read_lines(self.source.header, lines, self.source.name, self.source.line)
+        before = self.refused
+        if len(table.frame):
+            self._take(table)
+        if self.refused - before == len(table.frame) > 0 and self.online.arrivals.template is None:
+            raise InputError(self._why)
+        self.source.taken(lines)
+        self.unstored = True
+
+    def _take(self, table: Table) -> None:
+        try:
+            update = self.online.update(table)
+        except InputError as error:
+            rows = len(table.frame)
+            if rows == 1:
+                self._refuse(table, str(error))
+                return
+            for some in (slice(0, rows // 2), slice(rows // 2, rows)):
+                part = Table(table.frame.iloc[some].reset_index(drop=True), table.source, table.lines[some], table.word)
+                self._take(part)
+            return
+        self.note(update)
+
+    def _refuse(self, table: Table, why: str) -> None:
+        self.refused += 1
+        self._why = why
+        if self.tables is not None:
+            self.tables.add(REFUSED, pd.DataFrame({"line": table.lines, "reason": why}))
+        elif self.refused <= 3:
+            print(f"left out: {why}", file=sys.stderr)
+
+    def note(self, update: Update) -> None:
+        """Add what an update made known to the tables."""
+        self.used = self.online.counts["rows"]
+        if self.tables is None:
+            return
+        if "tracks" in self.kept:
+            self.tables.add(TRACKS, update.tracks)
+        if update.jumps:
+            self.tables.add(JUMPS, pd.DataFrame(update.jumps))
+        self._since = True
+
+    def checkpoint(self) -> None:
+        """Store the state where it is time."""
+        if self.unstored and time.monotonic() - self.stored >= self.every:
+            self.store()
+
+    def store(self) -> None:
+        """History first, then the state that says how long it is."""
+        self.stored, self.unstored = time.monotonic(), False
+        if self.tables is None or self.online.arrivals.template is None:
+            return
+        biases = self.online.biases.reset_index()
+        self.tables.add(HISTORY, biases.assign(time=self.online.time, rows=self.online.counts["rows"])[
+            ["time", "rows", "bias", "unit", "mean", "sd", "lower", "upper", "gamma"]
+        ])  # fmt: skip
+        beside = {
+            "length": self.tables.length, "offset": self.source.offset, "line": self.source.line,
+            "header": self.source.header.decode(),
+        }  # fmt: skip
+        write_whole(self.tables.folder / STATE, snapshot(self.online, beside))
+
+    def said(self) -> str:
+        """One line on where it stands."""
+        counts = self.online.counts
+        parts = [f"{counts['rows']:,} rows up to time {self.online.time:g} s"]
+        parts += [f"{counts[name]:,} {name}" for name in ("late", "duplicates") if counts[name]]
+        if self.refused:
+            parts.append(f"{self.refused:,} left out" + ("" if self.tables is None else f" (see {REFUSED})"))
+        if self.online.jumps:
+            last = self.online.jumps[-1]
+            parts.append(f"{len(self.online.jumps)} jumps, the last of {last.label} at {last.since:g} s")
+        return ", ".join(parts)
+
+    @contextmanager
+    def shown(self) -> Iterator[Callable[[], None]]:
+        """A live table on a terminal; in a file a line now and then."""
+        console = Console()
+        if not console.is_terminal:
+            last = [time.monotonic()]
+
+            def line() -> None:
+                if time.monotonic() - last[0] >= EVERY:
+                    last[0] = time.monotonic()
+                    print(self.said(), flush=True)
+
+            yield line
+            return
+        with Live(console=console, refresh_per_second=4, transient=True) as live:
+            yield lambda: live.update(_table(self)) if self.online.arrivals.template is not None else None
+
+
+def judged(online: Online) -> pd.DataFrame:
+    """The biases with a verdict: biased, zero (within a tenth of a scale), open, or not known yet."""
+    frame = online.biases
+    away = (frame["lower"] > 0) | (frame["upper"] < 0)
+    near = (frame["lower"] > -ROPE * frame["scale"]) & (frame["upper"] < ROPE * frame["scale"])
+    words = np.select([frame["gamma"] < 0.5, away, near], ["not known yet", "biased", "zero"], "open")
+    return frame.drop(columns="scale").assign(verdict=words)
+
+
+def _table(watching: Watching) -> Shown:
+    frame = judged(watching.online)
+    if len(frame) > LISTED:
+        frame = frame.loc[(frame["mean"].abs() / frame["sd"]).nlargest(LISTED).index]
+    shown = Shown(title=watching.said())
+    for name in ("bias", "unit", "mean", "89 % interval", "known by data", "verdict"):
+        shown.add_column(name)
+    for label, row in frame.iterrows():
+        interval = f"{row['lower']:.4g} to {row['upper']:.4g}"
+        shown.add_row(str(label), row["unit"], f"{row['mean']:.4g}", interval, f"{row['gamma']:.0%}", row["verdict"])
+    return shown
+
+
+@contextmanager
+def _input(data: Path | None, source: Source) -> Iterator[Any]:
+    if data is None:
+        yield sys.stdin.buffer
+        return
+    try:
+        file = data.open("rb")
+    except OSError as error:
+        raise InputError(f"{data}: cannot be read ({error.strerror or error})") from None
+    with file:
+        if source.offset > os.fstat(file.fileno()).st_size:
+            raise InputError(f"{data} is shorter than what was read of it; it is another file: give another --out")
+        file.seek(source.offset)
+        yield file
+
+
+@contextmanager
+def _told_to_end() -> Iterator[None]:
+    """SIGTERM ends a watch as Ctrl-C does: what is known is stored."""
+
+    def end(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
