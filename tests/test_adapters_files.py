@@ -95,23 +95,30 @@ def test_ais_positions_come_with_speed_and_course_in_the_frame(tmp_path):
 
 
 def test_ais_counts_what_it_leaves_out():
-    good, away = position_report(), position_report(lat=91.0, lon=181.0)[0]
+    good, away = position_report(), [position_report(**none)[0] for none in ({"lat": 91.0}, {"lon": 181.0})]
     bad = good[0][:-2] + ("00" if good[0][-2:] != "00" else "11")
     whole = halves(sentences(type=19, lat=54.32, lon=10.13, speed=3.0, course=180.0)[0])
     name = sentences(type=5, shipname="KATHARINA")
     assert len(name) == 2  # static data come in two parts
     lone = halves(good[0], sequence=7)[1:]
-    lines = [*good, *good, bad, away, *whole, *name, *lone, "!AIVDM,garbage"]
+    lines = [*good, *good, bad, *away, *whole, *name, *lone, "!AIVDM,garbage"]
     times = [datetime(2024, 5, 1, 12, 0, k, tzinfo=UTC) for k in (0, 0, *range(1, len(lines) - 1))]
     frame = adapters.read_ais([*map(str, lines)], KIEL, times=times)
-    assert frame["time"].tolist() == [0.0, 3.0]  # the time of a message is that of its first part
+    assert frame["time"].tolist() == [0.0, 4.0]  # the time of a message is that of its first part
     assert frame["target"].tolist() == ["211234560", "211234560"]
     np.testing.assert_allclose(
         frame.loc[1, ["position_x", "position_y"]].to_list(), KIEL.to_local(54.32, 10.13), atol=0.2
     )
     assert frame.loc[1, "speed"] == pytest.approx(3 * KNOT)
-    counts = {"bad checksum": 1, "incomplete": 1, "unreadable": 1, "without a position": 1, "other messages": 1}
+    counts = {"bad checksum": 1, "incomplete": 1, "unreadable": 1, "without a position": 2, "other messages": 1}
     assert frame.attrs["left_out"] == counts | {"without a time": 0, "repeated": 1}
+
+
+def test_ships_report_at_one_time():
+    lines = [f"1700000000 {position_report(mmsi=mmsi)[0]}" for mmsi in (211234560, 211234561, 211234560)]
+    frame = adapters.read_ais(lines, KIEL)
+    assert frame["target"].tolist() == ["211234560", "211234561"]
+    assert frame.attrs["left_out"]["repeated"] == 1
 
 
 def test_reports_are_rows_of_a_problem_and_known_paths():

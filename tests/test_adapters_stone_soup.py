@@ -112,6 +112,10 @@ def test_stds_units_compass_and_unnamed_targets_go_there_and_back():
     north = detections[0].state_vector[0]
     assert isinstance(north, Bearing)
     assert float(north) == pytest.approx(np.deg2rad(100.0))  # 10 degrees west of north, from east
+    model, place = detections[0].measurement_model, state(-30.0, 0.0, 40.0, 0.0)
+    np.testing.assert_allclose(np.diag(model.covar()), [np.deg2rad(2.0) ** 2, 0.25])  # Stone Soup has radians
+    np.testing.assert_allclose(np.asarray(model.function(place), float)[:, 0], [np.arctan2(40.0, -30.0), -50.0])
+    np.testing.assert_allclose(model.jacobian(place), [[-40 / 2500, 0, -30 / 2500, 0], [0.6, 0, -0.8, 0]], atol=1e-9)
     assert detections[0].timestamp == datetime(1970, 1, 1)
     assert "target" not in detections[0].metadata
     back = adapters.from_detections(detections, network)
@@ -165,8 +169,8 @@ def test_updates_are_those_of_stone_soups_own_model(radars, updater, kind, withi
 
 def test_particles_are_weighed_around_the_circle(radars):
     model = adapters.measurement_model("west", radars, channels=["azimuth"])
-    behind = state(10.0 - np.cos(0.3), 0.0, -5.0 - np.sin(0.3), 0.0)  # seen at pi
-    found = model.logpdf(State(StateVector([Bearing(-np.pi + 1e-3)])), behind)
+    behind = state(10.0 - np.cos(0.3), 0.0, -5.0 - np.sin(0.3), 0.0)  # seen at -pi
+    found = model.logpdf(State(StateVector([Bearing(np.pi - 1e-3)])), behind)
     std = np.deg2rad(10.0)
     assert found == pytest.approx(-0.5 * (1e-3 / std) ** 2 - 0.5 * np.log(2 * np.pi * std**2), abs=1e-9)
     several = model.logpdf(State(StateVector([Bearing(3.0)])), State(StateVectors(np.tile(behind.state_vector, 3))))

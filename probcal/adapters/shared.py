@@ -118,7 +118,7 @@ def reports(
         else:
             found[name] = speed if name == "speed" else np.arctan2(along[:, 1], along[:, 0])
     table = pd.DataFrame(found).sort_values("time", kind="stable")
-    again = table.duplicated(["time"])
+    again = table.duplicated(["time", "target"])
     table = table[~again].reset_index(drop=True)
     table.attrs = {"start": zero, "left_out": {**left_out, "repeated": int(again.sum())}}
     return table
