@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 
 import probcal as pc
-from probcal.inference.sparse import takes_sparse
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import large_network
@@ -52,7 +51,7 @@ def main():
         true = np.array([truth.biases[label] for label in problem.labels])
         held = np.mean((group["lower"].values <= true) & (true <= group["upper"].values))
         z = np.sqrt(np.mean(((group["mean"].values - true) / group["sd"].values) ** 2))
-        rows, form = len(problem.measurements.time), "sparse" if takes_sparse(method, problem) else "dense"
+        rows, form = len(problem.measurements.time), "sparse" if "block" in group else "dense"
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
         print(
             f"{side} x {side}: {rows} rows, {len(true)} biases, {form}: built {built:.1f} s, fit {took:.1f} s,"

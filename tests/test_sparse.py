@@ -15,7 +15,7 @@ from probcal.cli import check
 from probcal.errors import FitError, InputError
 from probcal.files import Outputs
 from probcal.geometry import bearing, norm
-from probcal.inference.sparse import takes_sparse
+from probcal.inference.sparse import gains_by_sparse, takes_sparse
 from probcal.results.blocks import covariance_of
 from probcal.smoothing import cholesky
 from probcal.smoothing.cholesky import Cholmod, Entries, SuperLU
@@ -403,3 +403,17 @@ def test_check_of_a_large_network_says_what_is_open(monkeypatch, capsys, tmp_pat
     assert "translation of all nodes along x (gauge" in said
     assert "what to measure next is not computed for a network of this size" in said
     assert {path.name for path in tmp_path.iterdir()} >= {"check.nc", "check.csv"}
+
+
+def test_few_of_many_biases_at_an_epoch_take_the_sparse_form(monkeypatch):
+    problem = drawn()[0]
+    settings = (pc.MAP(), problem, pc.Gaussian(), 1)
+    assert not gains_by_sparse(*settings)
+    monkeypatch.setattr("probcal.smoothing.joint.MANY", 5)
+    monkeypatch.setattr("probcal.smoothing.joint.THIN", 1.1)
+    assert gains_by_sparse(*settings)
+    assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(), 2)
+    assert not gains_by_sparse(pc.MAP(form="dense"), problem, pc.Gaussian(), 1)
+    assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(correlation={"*": 0.1}), 1)
+    monkeypatch.setattr("probcal.smoothing.joint.THIN", 1e-6)
+    assert not gains_by_sparse(*settings)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 
 from probcal.inference.methods import MAP
 from probcal.inference.run import Context, Maximiser, Method
-from probcal.inference.sparse import check_sparse, takes_sparse
+from probcal.inference.sparse import check_sparse, gains_by_sparse, takes_sparse
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -38,7 +39,8 @@ def solve(
         return _by_particles(problem, method, prior, context, start, starts)
     given, problem = problem, method.prepare(problem)
     used = problem is given
-    if _sparsely(problem, method, prior, starts):
+    if (sparse := _sparsely(problem, method, prior, starts)) is not None:
+        method = sparse
         first = grid_start(problem, jnp.zeros(problem.model.biases), 30) if start is None else start
         return method.answer(problem, prior, first, context)
     points = [o.point for o in optima_of(problem)] if start is None else [_suited(given, problem, start)]
@@ -60,13 +62,16 @@ def solve(
     return replace(beside, mirrors=(*beside.mirrors, *_beside_optima(beside, (found, *found.optima))))
 
 
-def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> bool:
-    """Whether a problem is solved in sparse form; raises `InputError` where it must be, and is not taken."""
+def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> Maximiser | None:
+    """The method where it solves a problem in sparse form; raises `InputError` where it must, and does not take it."""
     if isinstance(method, Maximiser) and takes_sparse(method, problem):
         check_sparse(method, prior, starts)
-        return True
+        return method
+    if isinstance(method, Maximiser) and gains_by_sparse(method, problem, prior, starts):
+        sparse: Any = method  # of those that have a form
+        return replace(sparse, form="sparse")
     check_room(problem.model)
-    return False
+    return None
 
 
 def _by_particles(

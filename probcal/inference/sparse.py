@@ -1,6 +1,7 @@
 """Fits whose dense form does not fit: the marginal mode by sparse factors, precisions integrated by propagation.
 
-`EA()` and `MAP()` come here by themselves (`form="auto"`): where the matrices of the dense form take more than 240 MB.
+`EA()` and `MAP()` come here by themselves (`form="auto"`): where the matrices of the dense form take more than 240 MB,
+and where there are more than 500 biases of which an epoch sees few, which is faster.
 What needs the whole covariance of the biases is not there; variances and gamma of each are.
 """
 
@@ -31,7 +32,7 @@ from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
 from probcal.smoothing.cholesky import exact
 from probcal.smoothing.information import mean_square
-from probcal.smoothing.joint import JointPrecision, blocks_of, missing, prefers_sparse
+from probcal.smoothing.joint import JointPrecision, blocks_of, is_thin, missing, prefers_sparse
 from probcal.smoothing.mode import Point
 from probcal.smoothing.sparse_mode import SparseMode, SparseSystem, find_sparse_mode, system_at
 
@@ -53,8 +54,20 @@ def takes_sparse(method: Maximiser, problem: Problem) -> bool:
     return bool(form == "sparse" or (form == "auto" and not lacks and prefers_sparse(problem.model)))
 
 
+def gains_by_sparse(method: Maximiser, problem: Problem, prior: Prior, starts: int) -> bool:
+    """Whether a fit that may take either form is faster in the sparse one, and loses nothing that was asked."""
+    either = getattr(method, "form", "dense") == "auto" and not missing(problem.model)
+    return either and is_thin(problem.model) and not _lacking(method, prior, starts)
+
+
 def check_sparse(method: Maximiser, prior: Prior, starts: int) -> None:
     """Raise `InputError` naming what a sparse fit does not do."""
+    if wrong := _lacking(method, prior, starts):
+        raise InputError(f"{method.name} on a network of this size is solved in sparse form, which takes {wrong}")
+
+
+def _lacking(method: Maximiser, prior: Prior, starts: int) -> str:
+    """What a sparse fit takes in the place of what was asked; empty where it does that."""
     wrong = ""
     if getattr(method, "trajectory", "") != "marginal":
         wrong = 'trajectory="marginal" alone'
@@ -68,8 +81,7 @@ def check_sparse(method: Maximiser, prior: Prior, starts: int) -> None:
         wrong = "one start"
     elif not (exact() or isinstance(prior, (Gaussian, Flat))):
         wrong = "exact variances, of sparsax, to integrate precisions: install probcal[sparse], or take MAP()"
-    if wrong:
-        raise InputError(f"{method.name} on a network of this size is solved in sparse form, which takes {wrong}")
+    return wrong
 
 
 @dataclass(frozen=True, eq=False)

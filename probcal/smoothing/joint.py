@@ -20,10 +20,21 @@ from probcal.smoothing.cholesky import Entries, Factor, factorise
 from probcal.smoothing.mode import factors
 from probcal.smoothing.room import ROOM, dense_numbers
 
+MANY, THIN = 500, 0.1  # biases, and the share of them that an epoch sees, from which the sparse form is the faster
+
 
 def prefers_sparse(model: Model) -> bool:
     """Whether the matrices of the dense form take more than 240 MB."""
     return dense_numbers(model) > ROOM
+
+
+def is_thin(model: Model) -> bool:
+    """Whether an epoch sees few of many biases: more than 500, less than a tenth of them."""
+    if model.biases <= MANY:
+        return False
+    seen = sum(int(np.sum(np.asarray(data.bias)[np.asarray(data.sensor)] < model.biases)) for data in model.rows)
+    epochs = sum(part.drift.shape[0] for part in model.recursions)
+    return seen < THIN * epochs * model.biases
 
 
 def too_large(model: Model) -> bool:
