@@ -410,7 +410,7 @@ def test_few_of_many_biases_at_an_epoch_take_the_sparse_form(monkeypatch):
     settings = (pc.MAP(), problem, pc.Gaussian(), 1)
     assert not gains_by_sparse(*settings)
     monkeypatch.setattr("probcal.smoothing.joint.MANY", 5)
-    monkeypatch.setattr("probcal.smoothing.joint.THIN", 1.1)
+    monkeypatch.setattr("probcal.smoothing.joint.THIN", 100.0)
     assert gains_by_sparse(*settings)
     assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(), 2)
     assert not gains_by_sparse(pc.MAP(form="dense"), problem, pc.Gaussian(), 1)
