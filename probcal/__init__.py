@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         track,
     )
     from probcal.inference.associations import sample_associations
+    from probcal.inference.online import AugmentedFilter, Jumps, Online, ParticleFilter
     from probcal.motion import (
         ConstantAcceleration,
         ConstantVelocity,
@@ -103,6 +104,7 @@ __all__ = lazy(
             "Unscented coverage_table fit load_study log_evidence numpyro_model particle_filter sbc study track"
         ),
         "probcal.inference.associations": "sample_associations",
+        "probcal.inference.online": "AugmentedFilter Jumps Online ParticleFilter",
         "probcal.motion": (
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"
         ),

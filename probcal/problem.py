@@ -367,7 +367,7 @@ class Problem:
         return aligned(self.model, other.model, pairs, targets), pairs
 
     def _compile(self, begun: Mapping[str, float] = MappingProxyType({}), *, further: bool = False) -> None:
-        """Arrays of the rows; with `further` after others, where targets in `begun` go on from an epoch at that time."""
+        """Arrays of the rows; with `further`, after others: targets in `begun` go on from an epoch at that time."""
         levels = Levels(self.levels if further else ())
         self.longest = self._longest(begun, further)
         forms = self._forms(levels)

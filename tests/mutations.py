@@ -141,7 +141,7 @@ MUTATIONS = [
     Mutation("model/motions.py", "pace, wander = area.wide * extent / duration", "pace, wander = area.wide * extent", "test_formulas.py test_model.py"),
     Mutation("model/motions.py", "\"position\": (area.centre, area.wide * extent)", "\"position\": (area.centre, extent)", "test_formulas.py test_model.py"),
     # table.py
-    Mutation("table.py", "np.arange(2, len(frame) + 2)", "np.arange(1, len(frame) + 1)", "test_table.py test_cli.py"),
+    Mutation("table.py", "np.arange(number, len(frame) + number)", "np.arange(1, len(frame) + 1)", "test_table.py test_cli.py"),
     Mutation("table.py", "in ((name, value), (f\"{name}_std\", std)):", "in ((name, value),):", "test_table.py"),
     Mutation("table.py", "(\"length\", 1852.0)", "(\"length\", 1853.0)", "test_table.py"),
     Mutation("table.py", "(\"length\", 1609.344)", "(\"length\", 1609.0)", "test_table.py"),

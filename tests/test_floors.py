@@ -17,7 +17,7 @@ FLOORS = {
     2: ("sensors",),
     3: ("geodesy", "network", "table", "nodes", "plausible", "roads"),
     4: ("model", "problem", "scans", "simulate"),
-    5: ("smoothing", "particle", "doa", "starts", "rss", "association"),
+    5: ("smoothing", "particle", "doa", "starts", "rss", "association", "online"),
     6: ("identifiability", "results"),
     7: ("inference",),
     8: ("analysis",),

@@ -190,15 +190,23 @@ def track_command(
 @app.command(name="watch")
 def watch_command(
     model: Model,
-    data: Annotated[Path | None, typer.Argument(help="table of rows (CSV) that may grow; standard input if left out")] = None,
+    data: Annotated[
+        Path | None, typer.Argument(help="table of rows (CSV) that may grow; standard input if left out")
+    ] = None,
     follow: Annotated[bool, typer.Option("--follow", help="wait for more rows at the end of the file")] = False,
     calibration: Annotated[Path | None, typer.Option(help="folder (or fit.nc) of a fit to start from")] = None,
     out: Annotated[Path | None, typer.Option(help="folder for the state, the history of biases and fit.nc")] = None,
     by: Annotated[str, typer.Option(help="extended | unscented | cubature")] = "extended",
     lag: Annotated[int, typer.Option(min=0, help="epochs that are linearised again; 0 is the plain filter")] = 32,
-    walk: Annotated[list[str] | None, typer.Option(help="biases that walk: PATTERN=STD over one second (repeat)")] = None,
-    consider: Annotated[list[str] | None, typer.Option(help="biases that are not estimated, by pattern (repeat)")] = None,
-    jumps: Annotated[float | None, typer.Option(help="find biases that jump, with so many false alarms an hour")] = None,
+    walk: Annotated[
+        list[str] | None, typer.Option(help="biases that walk: PATTERN=STD over one second (repeat)")
+    ] = None,
+    consider: Annotated[
+        list[str] | None, typer.Option(help="biases that are not estimated, by pattern (repeat)")
+    ] = None,
+    jumps: Annotated[
+        float | None, typer.Option(help="find biases that jump, with so many false alarms an hour")
+    ] = None,
     within: Annotated[float, typer.Option(help="s within which a jump must be found")] = 60.0,
     targets: Annotated[int, typer.Option(min=1, help="targets that are carried at once")] = 16,
     every: Annotated[float, typer.Option(min=0.0, help="s between two states that are stored")] = 1.0,

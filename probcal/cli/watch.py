@@ -20,7 +20,7 @@ from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem
 from probcal.errors import InputError
 from probcal.files import Outputs, write_whole
-from probcal.inference.checkpoint import restore, snapshot
+from probcal.inference.checkpoint import pack_state, unpack_state
 from probcal.inference.online import AugmentedFilter, Online, Update
 from probcal.results.io import load, save
 from probcal.results.schema import ROPE
@@ -34,7 +34,6 @@ EVERY = 60.0  # s between two lines where the output is no terminal
 STATE, HISTORY, JUMPS, TRACKS, REFUSED, ROWS, FIT = (
     "watch.npz", "biases.csv", "jumps.csv", "tracks.csv", "refused.csv", "rows.csv", "fit.nc"
 )  # fmt: skip
-
 
 
 @dataclass
@@ -119,7 +118,7 @@ def run(
         assert tables is not None
         state = outputs.folder / STATE
         if state.exists():
-            beside = restore(online, state.read_bytes(), str(state))
+            beside = unpack_state(online, state.read_bytes(), str(state))
             tables.length = beside["length"]
             if data is not None:
                 source.offset, source.line, source.header = beside["offset"], beside["line"], beside["header"].encode()
@@ -246,7 +245,7 @@ class Watching:
             "length": self.tables.length, "offset": self.source.offset, "line": self.source.line,
             "header": self.source.header.decode(),
         }  # fmt: skip
-        write_whole(self.tables.folder / STATE, snapshot(self.online, beside))
+        write_whole(self.tables.folder / STATE, pack_state(self.online, beside))
 
     def said(self) -> str:
         """One line on where it stands."""

@@ -39,7 +39,7 @@ class Batch(NamedTuple):
 
 
 @dataclass
-class Known:
+class CarriedTarget:
     """A target that the filter carries: its slot, the time up to which it was filtered, and what was seen then."""
 
     recursion: int
@@ -63,8 +63,9 @@ class Arrivals:
     motion: Any
     fixed: Mapping[str, float]
     most: int  # targets that are carried at once
+    linear: bool = True  # whether every motion must have a linear form
     counts: Counter[str] = field(default_factory=Counter)
-    targets: dict[str, Known] = field(default_factory=dict)
+    targets: dict[str, CarriedTarget] = field(default_factory=dict)
     origin: str = ""  # the date of time 0, where times are dates
     samples: pd.DataFrame | None = None  # a row of each form: what the template is made of
     starts: dict[str, dict[str, tuple[Any, float]]] = field(default_factory=dict)
@@ -124,14 +125,17 @@ class Arrivals:
             unit = units["time"] or "s"
             factor = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}.get(unit)
             if factor is None:
-                raise InputError(f'{table.source} column "time": unit "{unit}" is not a time; use s, ms, us, ns, min or h')
-            seconds = found.to_numpy(float) * factor
+                raise InputError(
+                    f'{table.source} column "time": unit "{unit}" is not a time; use s, ms, us, ns, min or h'
+                )
+            seconds: np.ndarray = found.to_numpy(float) * factor
         else:
             stamps = pd.to_datetime(column, errors="coerce", utc=True, format=None if found is None else "ISO8601")
             if stamps.isna().any():
                 row = int(np.flatnonzero(stamps.isna())[0])
                 raise InputError(
-                    f'{table.where(row)} column "time": {column.iloc[row]} is not a finite time; give seconds or ISO dates'
+                    f'{table.where(row)} column "time": {column.iloc[row]} is not a finite time;'
+                    " give seconds or ISO dates"
                 )
             self.origin = self.origin or stamps.min().isoformat()
             seconds = (stamps - pd.Timestamp(self.origin)).dt.total_seconds().to_numpy(float)
@@ -187,7 +191,9 @@ class Arrivals:
         if fresh.empty:
             return
         if self.template is None:
-            self._freeze(Problem(self.network, self.motion, Table(frame, source, np.arange(len(frame))), fix=self.fixed))
+            self._freeze(
+                Problem(self.network, self.motion, Table(frame, source, np.arange(len(frame))), fix=self.fixed)
+            )
         for name in data.target_names:
             self._start(name)
         rows = frame.loc[fresh.index].assign(_kind=fresh["kind"], _group=fresh["group"])
@@ -199,7 +205,8 @@ class Arrivals:
         assert self.samples is not None
         kept = self.samples.drop(columns=["_kind", "_group"])
         template = Problem(self.network, self.motions(kept["target"]), kept, fix=self.fixed)
-        check_linear(template)
+        if self.linear:
+            check_linear(template)
         self.template, self.sizes = template, ()
 
     def target(self, name: str) -> Target:
@@ -264,7 +271,7 @@ class Arrivals:
                 free = min(silent)[1]
                 self.counts["retired"] += 1
                 del self.targets[taken[free]]
-            self.targets[name] = Known(r, free, -np.inf)
+            self.targets[name] = CarriedTarget(r, free, -np.inf)
 
     def _recursion(self, template: Problem, name: str) -> int:
         """Which recursion a target belongs to: that of a sample with the same motion."""
@@ -299,12 +306,12 @@ def _numpy(leaf: Any) -> Any:
     return jax.tree.map(np.array, leaf)
 
 
-def _held(epochs: Epoch) -> Epoch:
+def _held(epochs: Any) -> Epoch:
     """Epochs of which those that go on at the same time leave the state as it is."""
     again = (epochs.dt == 0) & ~epochs.first
     if not again.any():
         return epochs
-    moves = []
+    moves: list[Any] = []
     for r, move in enumerate(epochs.move):
         mine = again & (epochs.recursion == r)
         n = move.F.shape[1]
@@ -318,7 +325,7 @@ def _held(epochs: Epoch) -> Epoch:
     return epochs._replace(move=tuple(moves))
 
 
-def padded(epochs: Epoch, count: int) -> Epoch:
+def padded(epochs: Any, count: int) -> Epoch:
     """Epochs with some behind them that change nothing, up to a count."""
     import jax
 
@@ -326,6 +333,6 @@ def padded(epochs: Epoch, count: int) -> Epoch:
     if count == K:
         return epochs
     index = np.minimum(np.arange(count), max(K - 1, 0))
-    more: Epoch = jax.tree.map(lambda leaf: leaf[index], epochs)
+    more: Any = jax.tree.map(lambda leaf: leaf[index], epochs)
     recursion = np.where(np.arange(count) < K, more.recursion, -1)
     return more._replace(recursion=recursion)

@@ -7,14 +7,15 @@ import json
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.arrivals import Known
+from probcal.inference.arrivals import CarriedTarget
 from probcal.inference.online import Jump, Online
 from probcal.lazy import Later
 from probcal.model.motions import Area
-from probcal.online.belief import Belief, Candidates, Slots
+from probcal.online.belief import Augmented, JumpCandidates, Slots
 from probcal.types import float64
 
 if TYPE_CHECKING:
@@ -26,14 +27,16 @@ VERSION = 1
 TEXT = {"sensor": str, "target": str, "cells": str, "_kind": str, "_group": str}
 
 
-def snapshot(online: Online, beside: dict[str, Any]) -> bytes:
+def pack_state(online: Online, beside: dict[str, Any]) -> bytes:
     """Everything that a filter knows, and what the caller keeps beside it (JSON)."""
-    arrivals, arrays = online.arrivals, dict[str, np.ndarray]()
+    arrivals, arrays = online.arrivals, dict[str, Any]()
     for name in ("belief", "end"):
         found = getattr(online, name, None)
         if found is not None:
             leaves = [found.mean, found.root, *found.candidates, *(leaf for own in found.slots for leaf in own)]
             arrays |= {f"{name}_{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
+    if online.cloud is not None:
+        arrays |= {f"cloud_{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(online.cloud))}
     if arrivals.tried is not None:
         arrays["tried"] = arrivals.tried
     area = arrivals.area
@@ -50,6 +53,7 @@ def snapshot(online: Online, beside: dict[str, Any]) -> bytes:
         "frames": {n: _text(f) for n, f in _frames(online).items()},
         "points": [[t, n, x.tolist(), z.tolist()] for (t, n), (x, z) in online.points.items()],
         "log_evidence": online.log_evidence,
+        "epochs": online.epochs,
         "time": online.time,
         "walked": online.walked,
         "since": online.since,
@@ -62,7 +66,7 @@ def snapshot(online: Online, beside: dict[str, Any]) -> bytes:
 
 
 @float64
-def restore(online: Online, content: bytes, source: str) -> dict[str, Any]:
+def unpack_state(online: Online, content: bytes, source: str) -> dict[str, Any]:
     """Bring a fresh filter of the same network and settings to a snapshot; what was kept beside it.
 
     Raises `InputError` where the snapshot is damaged, or of another network or other settings.
@@ -81,7 +85,8 @@ def restore(online: Online, content: bytes, source: str) -> dict[str, Any]:
     arrivals = online.arrivals
     arrivals.counts, arrivals.origin = Counter(said["counts"]), said["origin"]
     arrivals.targets = {
-        n: Known(r, slot, time, tuple((a, b) for a, b in keys)) for n, (r, slot, time, keys) in said["targets"].items()
+        n: CarriedTarget(r, slot, time, tuple((a, b) for a, b in keys))
+        for n, (r, slot, time, keys) in said["targets"].items()
     }
     arrivals.starts = {
         g: {part: (tuple(m) if isinstance(m, list) else m, sd) for part, (m, sd) in own.items()}
@@ -100,9 +105,13 @@ def restore(online: Online, content: bytes, source: str) -> dict[str, Any]:
         online.belief, online.end = _belief(arrays, "belief"), _belief(arrays, "end")
     online.points = {(t, n): (np.array(x), np.array(z)) for t, n, x, z in said["points"]}
     online.log_evidence, online.time, online.walked = said["log_evidence"], said["time"], said["walked"]
+    online.epochs = said["epochs"]
     online.since, online.jumps = said["since"], [Jump(*own) for own in said["jumps"]]
     if online.belief is not None:
         online.prepare()
+    if online.cloud is not None:
+        leaves = [arrays[f"cloud_{k}"] for k in range(sum(key.startswith("cloud_") for key in arrays))]
+        online.cloud = jax.tree.unflatten(jax.tree.structure(online.cloud), leaves)
     return said["beside"]
 
 
@@ -118,7 +127,7 @@ def _frame(text: str) -> pd.DataFrame:
     return pd.read_csv(io.StringIO(text), dtype=TEXT, float_precision="round_trip", keep_default_na=True)
 
 
-def _belief(arrays: dict[str, np.ndarray], name: str) -> Belief:
-    leaves = [arrays[f"{name}_{k}"] for k in range(sum(key.startswith(f"{name}_") for key in arrays))]
+def _belief(arrays: dict[str, Any], name: str) -> Augmented:
+    leaves: list[Any] = [arrays[f"{name}_{k}"] for k in range(sum(key.startswith(f"{name}_") for key in arrays))]
     slots = tuple(Slots(*leaves[k : k + 4]) for k in range(6, len(leaves), 4))
-    return Belief(leaves[0], leaves[1], slots, Candidates(*leaves[2:6]))
+    return Augmented(leaves[0], leaves[1], slots, JumpCandidates(*leaves[2:6]))

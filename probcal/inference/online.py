@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +17,12 @@ from probcal.inference.arrivals import Arrivals, Batch, padded
 from probcal.lazy import Later
 from probcal.network import Network
 from probcal.online import belief as beliefs
-from probcal.online.belief import Belief
-from probcal.online.filtering import RULES, Form, Given, Points
-from probcal.online.lag import Window, run_filter, run_window
-from probcal.online.starts import FIRST, places
+from probcal.online import particles
+from probcal.online.belief import Augmented
+from probcal.online.filtering import RULES, FilterForm, FilterGiven, RowPoints
+from probcal.online.lag import Window, run_plain, run_window
+from probcal.online.particles import Cloud
+from probcal.online.starts import FIRST, place_new
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import HALF
@@ -36,6 +39,7 @@ else:
 
 LIVE, BULK = 1, 16  # lags of a window beside the one that stays, of few rows and of many
 PLAIN = (1, 32, 512)  # epochs of a call of the plain filter
+ANCESTORS = 50  # particles of the start of which some must be left for intervals to be worth what they say
 RECENT = 300  # rows that are kept for the tree
 MANY = 3000  # biases beyond which the dense covariance of the filter is no use
 SEGMENTS = 4  # parts of a lag, at the ends of which a window may be left
@@ -96,21 +100,52 @@ class AugmentedFilter:
 
     def __post_init__(self):
         if self.by not in RULES:
-            raise InputError(f'AugmentedFilter(by="{self.by}"): give one of {", ".join(RULES)}{nearest(self.by, RULES)}')
+            raise InputError(
+                f'AugmentedFilter(by="{self.by}"): give one of {", ".join(RULES)}{nearest(self.by, RULES)}'
+            )
         if not (isinstance(self.lag, int) and self.lag >= 0 and self.lag % SEGMENTS == 0):
             raise InputError(f"AugmentedFilter(lag={self.lag!r}): give 0 or a number of epochs that 4 divides")
         if not (isinstance(self.passes, int) and self.passes > 0):
             raise InputError(f"AugmentedFilter(passes={self.passes!r}): give 1 or more")
         if self.jumps is not None and self.consider:
-            raise InputError("AugmentedFilter: biases that are only considered cannot be tested for jumps; drop one of both")
-        given = self.walk.items() if isinstance(self.walk, Mapping) else self.walk
-        walk = tuple((str(pattern), float(std)) for pattern, std in given)
-        for pattern, std in walk:
-            if not (np.isfinite(std) and std > 0):
-                raise InputError(f'AugmentedFilter: walk of "{pattern}" is {std:g}; give a positive std for one second')
+            raise InputError(
+                "AugmentedFilter: biases that are only considered cannot be tested for jumps; drop one of both"
+            )
         consider = (self.consider,) if isinstance(self.consider, str) else tuple(map(str, self.consider))
-        object.__setattr__(self, "walk", walk)
+        object.__setattr__(self, "walk", _walks("AugmentedFilter", self.walk))
         object.__setattr__(self, "consider", consider)
+
+
+@dataclass(frozen=True)
+class ParticleFilter:
+    """The Rao-Blackwellised particle filter: `count` paths are drawn, the biases given each are Gaussian.
+
+    For any motion, roads too, and states that are far from Gaussian; biases should enter nearly linearly. `walk` is
+    that of `AugmentedFilter`. Particles are resampled where the effective number of them falls below `threshold` of
+    them; `seed` seeds all draws. The biases of a long stream rest on ever fewer of the first particles, so that its
+    intervals get too narrow: where fewer than 50 are left `Update.settled` is false. `AugmentedFilter` has no such
+    limit. Raises `InputError` for a setting that is none.
+
+    >>> ParticleFilter(500).threshold
+    0.5
+    """
+
+    count: int = 1000
+    walk: Any = ()
+    threshold: float = 0.5
+    seed: int = 0
+
+    lag: ClassVar[int] = 0
+    by: ClassVar[str] = "extended"
+    consider: ClassVar[tuple[str, ...]] = ()
+    jumps: ClassVar[Jumps | None] = None
+
+    def __post_init__(self):
+        if not (isinstance(self.count, int) and self.count > 1):
+            raise InputError(f"ParticleFilter(count={self.count!r}): give 2 or more, some hundred as a rule")
+        if not (isinstance(self.threshold, (int, float)) and 0 <= self.threshold <= 1):
+            raise InputError(f"ParticleFilter(threshold={self.threshold!r}): give a share of the particles, 0 to 1")
+        object.__setattr__(self, "walk", _walks("ParticleFilter", self.walk))
 
 
 class Jump(NamedTuple):
@@ -133,7 +168,7 @@ class Update(NamedTuple):
     tracks: pd.DataFrame  # time, target, each state component and its sd, of those epochs
     jumps: tuple[Jump, ...]
     passes: int  # most times that a window was linearised again
-    settled: bool  # whether all windows came to rest
+    settled: bool  # whether all windows came to rest; of particles, whether enough of the first ones are left
 
 
 class Online:
@@ -156,7 +191,7 @@ class Online:
         self,
         network: Network,
         motion: Any,
-        method: AugmentedFilter | None = None,
+        method: AugmentedFilter | ParticleFilter | None = None,
         *,
         prior: Prior | None = None,
         calibration: xr.DataTree | None = None,
@@ -164,8 +199,8 @@ class Online:
         targets: int = 16,
     ):
         self.method = AugmentedFilter() if method is None else method
-        if not isinstance(self.method, AugmentedFilter):
-            raise InputError(f"Online(method={method!r}): give AugmentedFilter(...)")
+        if not isinstance(self.method, (AugmentedFilter, ParticleFilter)):
+            raise InputError(f"Online(method={method!r}): give AugmentedFilter(...) or ParticleFilter(...)")
         if not (isinstance(targets, int) and targets > 0):
             raise InputError(f"Online(targets={targets!r}): give 1 or more")
         self.prior = Gaussian() if prior is None else prior
@@ -174,19 +209,21 @@ class Online:
                 f"Online(prior={type(self.prior).__name__}()): the filter takes Gaussian(); sparse priors are laid on"
                 " what it found, online.integrated(Horseshoe())"
             )
-        self.arrivals = Arrivals(network, motion, fix, targets)
+        self.arrivals = Arrivals(network, motion, fix, targets, isinstance(self.method, AugmentedFilter))
         self.calibration = calibration
         self.pending: pd.DataFrame | None = None
+        self.cloud: Cloud | None = None
         self.recent: pd.DataFrame | None = None
-        self.points: dict[tuple[float, str], tuple[np.ndarray, np.ndarray]] = {}
-        self.belief: Belief | None = None
+        self.points: dict[tuple[float, str], tuple[Any, Any]] = {}
+        self.belief: Any = None  # `Augmented` up to the rows that were filtered for good
+        self.end: Any = None  # `Augmented` with those in the window
         self.log_evidence = 0.0
+        self.epochs = 0  # that particles have seen
         self.time = -np.inf
         self.ready: Problem | None = None  # the template that `given` belongs to
         self.walked = -np.inf
         self.since: list[float] = []
         self.jumps: list[Jump] = []
-        self.frames: list[Any] = []
 
     # what is known
 
@@ -213,7 +250,9 @@ class Online:
         problem, end = self._problem, self.end
         z, root = np.asarray(end.mean), np.asarray(end.root)
         sd = np.sqrt((root**2).sum(1))
-        before = np.sqrt(np.diag(np.linalg.inv(np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix()))))
+        before = np.sqrt(
+            np.diag(np.linalg.inv(np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix())))
+        )
         scales = problem.scales
         return pd.DataFrame(
             {
@@ -309,13 +348,17 @@ class Online:
         self.ready = problem
         M = problem.model.biases
         if M > MANY:
-            raise InputError(f"{M} biases are too many for an online filter, which takes {MANY}; fix some, or fit a batch")
+            raise InputError(
+                f"{M} biases are too many for an online filter, which takes {MANY}; fix some, or fit a batch"
+            )
         if self.belief is None:
             z, root = self._first(problem)
             bias = np.tile(np.arange(M), self._starts)
             self.since = [-np.inf] * self._starts
             self.belief = beliefs.empty(z, root, (), jnp.asarray(bias, int))
         levels = self.levels(problem)
+        if isinstance(self.method, ParticleFilter):
+            self._populate(problem, self.method)
         held = len(self.belief.slots)
         shapes = [(self.arrivals.most, p.drift.shape[1]) for p in problem.model.recursions[held:]]
         fresh = beliefs.empty(self.belief.mean, self.belief.root, tuple(shapes), self.belief.candidates.bias)
@@ -326,8 +369,8 @@ class Online:
             walk[chosen] = std / problem.scales[chosen]
         for pattern in self.method.consider:
             considered[_chosen(problem.labels, pattern, "consider")] = True
-        self.given = Given(jnp.asarray(levels), jnp.asarray(walk), jnp.asarray(considered))
-        self.form = Form(self.method.by, bool(walk.any()), bool(considered.any()))
+        self.given = FilterGiven(jnp.asarray(levels), jnp.asarray(walk), jnp.asarray(considered))
+        self.form = FilterForm(self.method.by, bool(walk.any()), bool(considered.any()))
 
     def levels(self, problem: Problem) -> np.ndarray:
         """Log factors (H,) of the unknown noise levels: as the calibration has them, else those of their guesses."""
@@ -351,6 +394,8 @@ class Online:
     # epochs through the filter
 
     def _filter(self, frame: pd.DataFrame, batch: Batch, *, everything: bool) -> Update:
+        if isinstance(self.method, ParticleFilter):
+            return self._by_particles(frame, batch, self.method)
         problem = self._problem
         K, begun, jumps, frames = len(batch.time), 0, list[Jump](), []
         points = self._points(batch)
@@ -366,7 +411,7 @@ class Online:
             )
             model = problem.model
             if self.method.lag == 0:
-                ends, left_over = run_filter(self.form, model, self.given, self.belief, window)
+                ends, left_over = run_plain(self.form, model, self.given, self.belief, window)
                 stack = jax.tree.map(lambda leaf: np.asarray(leaf)[None], ends)
                 xs, sds, done = left_over.x, left_over.sd, np.array([count])
                 evidence = np.array([_evidence(left_over.kept)])
@@ -389,7 +434,7 @@ class Online:
             self.belief = jax.tree.map(lambda leaf, s=leaving: leaf[s], stack)
             if not np.isfinite(self.belief.mean).all():
                 raise InputError(
-                    f"the filter left the finite numbers at time {batch.time[begun]:g}; state the starts of the targets,"
+                    f"the filter left the finite numbers at time {batch.time[begun]:g}; state where the targets start,"
                     " or take a lag"
                 )
             if jump is not None:
@@ -413,6 +458,46 @@ class Online:
         self.jumps += jumps
         return Update(self.time, begun, self._tracks(frames), tuple(jumps), most, settled)
 
+    def _populate(self, problem: Problem, method: ParticleFilter) -> None:
+        """Particles with the slots of every form of a motion."""
+        slots = dataclasses.replace(problem.model, targets=(self.arrivals.most,) * len(problem.model.recursions))
+        fresh = particles.first_cloud(slots.initial(), self.belief.mean, self.belief.root, method.count)
+        if self.cloud is not None:
+            states = (*self.cloud.states, *fresh.states[len(self.cloud.states) :])
+            fresh = self.cloud._replace(states=states)
+        self.cloud = fresh
+
+    def _by_particles(self, frame: pd.DataFrame, batch: Batch, method: ParticleFilter) -> Update:
+        """Filter epochs by particles."""
+        assert self.cloud is not None
+        K, begun, frames = len(batch.time), 0, []
+        elapsed = np.diff(batch.time, prepend=self.walked if np.isfinite(self.walked) else batch.time[0])
+        while begun < K:
+            count, size, _ = self._window(K - begun)
+            key = jax.random.fold_in(jax.random.key(method.seed), self.epochs)
+            cloud, left = particles.run_particles(
+                self._problem.model, self.given, self.cloud, padded(_part(batch.epochs, begun, begun + count), size),
+                _long(elapsed[begun : begun + count], size), key, walks=bool(method.walk), threshold=method.threshold,
+            )  # fmt: skip
+            evidence = np.asarray(left.log_evidence)[:count]
+            if not np.isfinite(evidence).all():
+                when = batch.time[begun + int(np.flatnonzero(~np.isfinite(evidence))[0])]
+                raise InputError(
+                    f"no particle explains the rows at time {when:g}; take more, or state where the targets start"
+                )
+            self.cloud = cloud
+            self.log_evidence += float(evidence.sum())
+            frames.append(self._rows_of(batch, begun, count, left.x, left.sd))
+            begun, self.epochs = begun + count, self.epochs + count
+        mean, covariance = particles.bias_moments(self.cloud)
+        root = np.linalg.cholesky(_positive(np.asarray(covariance)))
+        self.belief = self.end = self.belief._replace(mean=np.asarray(mean), root=root)
+        self.walked = self.time = max(self.time, float(batch.time[-1]))
+        self.arrivals.settled(batch, frame, K)
+        self.pending, self.recent = frame.iloc[:0], frame.tail(RECENT).reset_index(drop=True)
+        ancestors = len(np.unique(np.asarray(self.cloud.origin)))
+        return Update(self.time, K, self._tracks(frames), (), 0, ancestors >= ANCESTORS)
+
     def _window(self, left: int) -> tuple[int, int, int]:
         """Epochs of the next call, what they are padded to, and into how many parts it falls."""
         lag = self.method.lag
@@ -424,10 +509,9 @@ class Online:
         size = (1 + many) * lag
         return min(left, size), size, (1 + many) * SEGMENTS
 
-    def _points(self, batch: Batch) -> Points:
+    def _points(self, batch: Batch) -> RowPoints:
         """Where the epochs of a batch were linearised last, and where new targets may be."""
         problem, belief = self._problem, self.belief
-        assert belief is not None
         K, M = len(batch.time), problem.model.biases
         xs = [np.zeros((K, p.drift.shape[1])) for p in problem.model.recursions]
         z, there = np.zeros((K, M)), np.zeros(K, bool)
@@ -436,19 +520,20 @@ class Online:
             old = self.points.get((float(batch.time[k]), str(batch.target[k])))
             if old is not None:
                 xs[recursion[k]][k], z[k], there[k] = old[0], old[1], True
-        for k in np.flatnonzero(first & ~there):
+        for k in np.flatnonzero(first & ~there).tolist():
             r, name = int(recursion[k]), batch.target[k]
-            mine = np.flatnonzero((batch.target == name) & (np.arange(K) >= k))[: FIRST]
+            mine = np.flatnonzero((batch.target == name) & (np.arange(K) >= k))[:FIRST]
             few = padded(jax.tree.map(lambda leaf, mine=mine: leaf[mine], batch.epochs), FIRST)
             span = problem.epochs[r].position
-            x = places(problem.model, self.given, belief, few, r, span, self.arrivals.tried)
+            x = place_new(problem.model, self.given, belief, few, r, span, self.arrivals.tried)
             if self.method.lag:
                 xs[r][mine], z[mine], there[mine] = np.asarray(x), np.asarray(belief.mean), True
             elif "position" not in self.arrivals.target(str(name)).start:
                 batch.epochs.move[r].drift[k] = np.asarray(x)  # of a start that is wide: what is linearised first
-        return Points(tuple(xs), z, there)
+        found: Any = RowPoints(tuple(xs), z, there)  # type: ignore[arg-type]
+        return found
 
-    def _keep(self, batch: Batch, points: Points, begun: int) -> None:
+    def _keep(self, batch: Batch, points: RowPoints, begun: int) -> None:
         """Points of the epochs that stay in the window."""
         recursion = np.asarray(batch.epochs.recursion)
         self.points = {
@@ -469,8 +554,8 @@ class Online:
             self.belief = beliefs.renewed(self.belief, jnp.asarray(columns))
             self.since[oldest] = self.walked
 
-    def _jump(self, stack: Belief, done: np.ndarray, times: np.ndarray) -> Any:
-        """The first end of a part at which some candidate exceeds the bound: part, candidate, `Jump`, size, variance."""
+    def _jump(self, stack: Augmented, done: np.ndarray, times: np.ndarray) -> Any:
+        """The first part at the end of which some candidate exceeds the bound, it, the `Jump`, size and variance."""
         jumps = self.method.jumps
         if jumps is None:
             return None
@@ -522,6 +607,16 @@ class Online:
         return pd.concat(frames, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)
 
 
+def _walks(name: str, given: Any) -> tuple[tuple[str, float], ...]:
+    """Patterns of biases and the standard deviation of their walk; raises `InputError` for one that is not positive."""
+    pairs = given.items() if isinstance(given, Mapping) else given
+    walk = tuple((str(pattern), float(std)) for pattern, std in pairs)
+    for pattern, std in walk:
+        if not (np.isfinite(std) and std > 0):
+            raise InputError(f'{name}: walk of "{pattern}" is {std:g}; give a positive std for one second')
+    return walk
+
+
 def _chosen(labels: Sequence[str], pattern: str, what: str) -> np.ndarray:
     """Numbers of the biases that a pattern matches; raises `InputError` where it matches none."""
     found = [m for m, label in enumerate(labels) if label == pattern or fnmatchcase(label, pattern)]
@@ -539,7 +634,7 @@ def _part(epochs: Any, start: int, stop: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[start:stop], epochs)
 
 
-def _long(array: np.ndarray, size: int) -> np.ndarray:
+def _long(array: np.ndarray, size: int) -> Any:
     """An array with zeros behind it up to a size."""
     more = size - len(array)
     return np.concatenate([array, np.zeros((more, *array.shape[1:]), array.dtype)]) if more else array

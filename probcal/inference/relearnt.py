@@ -18,9 +18,7 @@ SWEEPS = 500  # most updates of maximised precisions
 STILL = 1e-4  # change of a log precision at which they rest
 
 
-def relearnt(
-    problem: Problem, prior: Prior, held: Precision, mean: np.ndarray, root: np.ndarray, key: int
-) -> Moments:
+def relearnt(problem: Problem, prior: Prior, held: Precision, mean: np.ndarray, root: np.ndarray, key: int) -> Moments:
     """Moments of the biases z (M,) under a prior, from N(mean, root root') which they have under the precision `held`.
 
     Raises `InputError` for a prior that has no precisions.
@@ -48,7 +46,7 @@ def _maximised(problem: Problem, prior: ARD, first: Precision, information: np.n
         covariance = np.linalg.inv(information + coupling + np.diag(alpha))
         mean, variance = covariance @ pull, np.diag(covariance)
         gamma = np.clip(1.0 - alpha * variance, 0.0, 1.0)
-        learnt = prior.learn(*(jnp.asarray(part) for part in (gamma, variance, mean, group)), "mackay")
+        learnt = prior.learn(jnp.asarray(gamma), jnp.asarray(variance), jnp.asarray(mean), jnp.asarray(group), "mackay")
         after = np.where(surveyed, alpha, np.clip(np.asarray(learnt), *PRECISION_BOUNDS))
         change = np.abs(np.log(after / alpha)).max(initial=0.0)
         alpha = after

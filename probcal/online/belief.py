@@ -1,10 +1,10 @@
 """What is known of biases and targets at a moment: the augmented Gaussian in separated form, by square roots.
 
-Given the biases z the targets are independent, so that the joint Gaussian of z and all states is that of z, N(mean,
-root root'), and of each target a line in z with a covariance of its own: x | z ~ N(m + B z, R R') (Friedland 1969). It
-is the augmented-state filter (thesis 4.3) exactly, but an epoch touches one target and z alone: its cost does not grow
-with the number of targets. Where the biases move, targets get correlations beyond those through z, which are dropped;
-with one target there are none.
+Given the biases z the targets are independent, so that the joint Gaussian of z and all states is that of z,
+N(mean, root root'), and of each target a line in z with a covariance of its own: x | z ~ N(m + B z, R R') (Friedland
+1969). It is the augmented-state filter (thesis 4.3) exactly, but an epoch touches one target and z alone: its cost does
+not grow with the number of targets. Where the biases move, targets get correlations beyond those through z, which are
+dropped; with one target there are none.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ class Slots(NamedTuple):
     shift: jax.Array  # (T, n, C) of x | z by each candidate jump of unit size
 
 
-class Candidates(NamedTuple):
+class JumpCandidates(NamedTuple):
     """Jumps that may have begun some time ago: what data since say of each (Willsky, Jones 1976)."""
 
     bias: jax.Array  # (C,) which bias jumps
@@ -34,16 +34,16 @@ class Candidates(NamedTuple):
     score: jax.Array  # (C,)
 
 
-class Belief(NamedTuple):
+class Augmented(NamedTuple):
     """Biases and targets at a moment."""
 
     mean: jax.Array  # (M,) of z
     root: jax.Array  # (M, M) of its covariance, root root'
     slots: tuple[Slots, ...]  # of each recursion
-    candidates: Candidates
+    candidates: JumpCandidates
 
 
-class Row(NamedTuple):
+class WhiteRow(NamedTuple):
     """One datum as a filter takes it: value = x'hx + z'hz + e, e ~ N(0, 1)."""
 
     value: jax.Array  # ()
@@ -51,7 +51,7 @@ class Row(NamedTuple):
     hz: jax.Array  # (M,)
 
 
-class Kept(NamedTuple):
+class KeptDatum(NamedTuple):
     """What the smoother needs of one datum: c = g'z + e given the states before."""
 
     hx: jax.Array  # (n,) over the std of the datum given z
@@ -63,13 +63,13 @@ class Kept(NamedTuple):
     moved: jax.Array  # (M,) by how much the mean of z moved
 
 
-def empty(z: jax.Array, root: jax.Array, sizes: tuple[tuple[int, int], ...], bias: jax.Array) -> Belief:
+def empty(z: jax.Array, root: jax.Array, sizes: tuple[tuple[int, int], ...], bias: jax.Array) -> Augmented:
     """Biases N(z, root root') before any target, `sizes` (T, n) of each recursion, candidates (C,) by their bias."""
     M, C = z.shape[0], bias.shape[0]
     slots = tuple(
         Slots(jnp.zeros((T, n)), jnp.zeros((T, n, M)), jnp.zeros((T, n, n)), jnp.zeros((T, n, C))) for T, n in sizes
     )
-    return Belief(z, root, slots, Candidates(bias, jnp.zeros((M, C)), jnp.zeros(C), jnp.zeros(C)))
+    return Augmented(z, root, slots, JumpCandidates(bias, jnp.zeros((M, C)), jnp.zeros(C), jnp.zeros(C)))
 
 
 def one(slots: Slots, target: jax.Array) -> Slots:
@@ -82,7 +82,7 @@ def put(slots: Slots, target: jax.Array, new: Slots) -> Slots:
     return Slots(*(leaf.at[target].set(own) for leaf, own in zip(slots, new, strict=True)))
 
 
-def moved(own: Slots, move: Move) -> Slots:
+def carried(own: Slots, move: Move) -> Slots:
     """A target carried to its next epoch; at its first F is zero and nothing of the target before it is left."""
     F = move.F
     root = linalg.tria(jnp.concatenate([linalg.multiply(F, own.R), move.L], 1))
@@ -90,7 +90,7 @@ def moved(own: Slots, move: Move) -> Slots:
     return Slots(F @ own.m + move.drift, B, root, shift)
 
 
-def seen(belief: Belief, own: Slots, row: Row) -> tuple[Belief, Slots, Kept]:
+def seen(belief: Augmented, own: Slots, row: WhiteRow) -> tuple[Augmented, Slots, KeptDatum]:
     """Belief and target after a datum of it: both updates by Potter's square root (Bierman 1977, II.7)."""
     v = row.hx @ own.R
     std = jnp.sqrt(1.0 + jnp.sum(v**2))
@@ -116,11 +116,11 @@ def seen(belief: Belief, own: Slots, row: Row) -> tuple[Belief, Slots, Kept]:
         own.R - gain[:, None] * (v / (1.0 + std))[None, :],
         own.shift - gain[:, None] * shift[None, :],
     )
-    kept = Kept(row.hx / std, gain, c, g, innovation / jnp.sqrt(variance), variance * std**2, pull * innovation)
-    return Belief(belief.mean + pull * innovation, root, belief.slots, candidates), after, kept
+    kept = KeptDatum(row.hx / std, gain, c, g, innovation / jnp.sqrt(variance), variance * std**2, pull * innovation)
+    return Augmented(belief.mean + pull * innovation, root, belief.slots, candidates), after, kept
 
 
-def not_estimated(belief: Belief, kept: Kept, considered: jax.Array) -> Belief:
+def not_estimated(belief: Augmented, kept: KeptDatum, considered: jax.Array) -> Augmented:
     """The belief after a datum by which the biases in `considered` (M,) were not to be estimated.
 
     They get back mean and covariance; their correlation with all else is that of the datum (Schmidt 1966).
@@ -132,8 +132,8 @@ def not_estimated(belief: Belief, kept: Kept, considered: jax.Array) -> Belief:
 
 
 def dispersed(
-    belief: Belief, slots: tuple[Slots, ...], columns: jax.Array, back: jax.Array | None = None
-) -> tuple[Belief, tuple[Slots, ...]]:
+    belief: Augmented, slots: tuple[Slots, ...], columns: jax.Array, back: jax.Array | None = None
+) -> tuple[Augmented, tuple[Slots, ...]]:
     """Biases that moved by a step of covariance columns columns' (M, q), the targets being where they are.
 
     `back` (M,) is taken from the mean of z alone.
@@ -156,13 +156,13 @@ def dispersed(
     return belief._replace(mean=mean, root=root), found
 
 
-def walked(belief: Belief, std: jax.Array) -> Belief:
+def walked(belief: Augmented, std: jax.Array) -> Augmented:
     """Biases that each moved by a step of a standard deviation (M,), 0 where one stays."""
     after, slots = dispersed(belief, belief.slots, jnp.diag(std))
     return after._replace(slots=slots)
 
 
-def jumped(belief: Belief, which: jax.Array, size: jax.Array, variance: jax.Array) -> Belief:
+def jumped(belief: Augmented, which: jax.Array, size: jax.Array, variance: jax.Array) -> Augmented:
     """The belief where candidate `which` did jump, by a size of mean and variance given by its data.
 
     All candidates begin anew.
@@ -190,10 +190,10 @@ def jumped(belief: Belief, which: jax.Array, size: jax.Array, variance: jax.Arra
         information=jnp.zeros_like(told.information),
         score=jnp.zeros_like(told.score),
     )
-    return Belief(mean, root, tuple(slots), fresh)
+    return Augmented(mean, root, tuple(slots), fresh)
 
 
-def renewed(belief: Belief, columns: jax.Array) -> Belief:
+def renewed(belief: Augmented, columns: jax.Array) -> Augmented:
     """Candidates of some columns (C,) begin at this moment."""
     told = belief.candidates
     kept = ~columns
@@ -204,7 +204,7 @@ def renewed(belief: Belief, columns: jax.Array) -> Belief:
     return belief._replace(slots=slots, candidates=fresh)
 
 
-def sharpened(belief: Belief, bias: jax.Array, precision: jax.Array) -> Belief:
+def sharpened(belief: Augmented, bias: jax.Array, precision: jax.Array) -> Augmented:
     """The belief with a precision added to the prior of one bias about zero, or taken from it where negative."""
     v = belief.root[bias]
     square = jnp.sum(v**2)
@@ -214,7 +214,7 @@ def sharpened(belief: Belief, bias: jax.Array, precision: jax.Array) -> Belief:
     return belief._replace(mean=mean, root=belief.root - turn * (belief.root @ v)[:, None] * v[None, :])
 
 
-def states(belief: Belief) -> tuple[tuple[jax.Array, jax.Array], ...]:
+def states(belief: Augmented) -> tuple[tuple[jax.Array, jax.Array], ...]:
     """Mean (T, n) and standard deviation (T, n) of the states of each recursion, biases uncertain."""
     found = []
     for own in belief.slots:

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
 from probcal.model.sigma import cubature, unscented
-from probcal.online.belief import Belief, Kept, Row, Slots, moved, not_estimated, one, put, seen, walked
+from probcal.online.belief import Augmented, KeptDatum, Slots, WhiteRow, carried, not_estimated, one, put, seen, walked
 from probcal.online.linearising import About, centre, linearised, regressed
 
 RULES = {"extended": None, "unscented": unscented, "cubature": cubature}  # names of the linearisations
 
 
 @dataclass(frozen=True)
-class Form:
+class FilterForm:
     """The static part: what kernels are compiled for."""
 
     by: str = "extended"
@@ -24,7 +24,7 @@ class Form:
     considers: bool = False  # whether some are not estimated
 
 
-class Given(NamedTuple):
+class FilterGiven(NamedTuple):
     """What stays the same over a stream."""
 
     levels: jax.Array  # (H,) log factors of the noise levels
@@ -32,7 +32,7 @@ class Given(NamedTuple):
     considered: jax.Array  # (M,) whether a bias is not estimated
 
 
-class Points(NamedTuple):
+class RowPoints(NamedTuple):
     """Where the rows of epochs are linearised: at these points, or, where there are none, at the belief."""
 
     x: tuple[jax.Array, ...]  # (n,) of each recursion
@@ -40,18 +40,24 @@ class Points(NamedTuple):
     there: jax.Array  # ()
 
 
-class Step(NamedTuple):
+class EpochStep(NamedTuple):
     """What one epoch leaves, of each recursion; where it belongs to another one all is zero."""
 
     x: tuple[jax.Array, ...]  # (n,) filtered mean of its target
     sd: tuple[jax.Array, ...]  # (n,)
     before: tuple[Slots, ...]  # its target carried to this epoch, before its rows
-    kept: tuple[Kept, ...]  # (D,) of each of its data, one block after another
+    kept: tuple[KeptDatum, ...]  # (D,) of each of its data, one block after another
 
 
-def step(
-    form: Form, model: Model, given: Given, belief: Belief, epoch: Epoch, elapsed: jax.Array, points: Points
-) -> tuple[Belief, Step]:
+def epoch_step(
+    form: FilterForm,
+    model: Model,
+    given: FilterGiven,
+    belief: Augmented,
+    epoch: Epoch,
+    elapsed: jax.Array,
+    points: RowPoints,
+) -> tuple[Augmented, EpochStep]:
     """Belief after an epoch, `elapsed` s after the one before; one that pads a stack (recursion -1) changes nothing."""
     if form.walks:
         std = given.walk * jnp.sqrt(jnp.maximum(elapsed, 0.0))
@@ -59,15 +65,15 @@ def step(
     parts = []
     for r in range(len(belief.slots)):
 
-        def own(b: Belief, r: int = r) -> tuple[Belief, Any]:
+        def own(b: Augmented, r: int = r) -> tuple[Augmented, Any]:
             return _epoch(form, model, given, b, epoch, r, points)
 
         belief, part = either(epoch.recursion == r, own, belief)
         parts.append(part)
-    return belief, Step(*(tuple(column) for column in zip(*parts, strict=True)))
+    return belief, EpochStep(*(tuple(column) for column in zip(*parts, strict=True)))
 
 
-def either(there: jax.Array, function: Any, belief: Belief) -> tuple[Belief, Any]:
+def either(there: jax.Array, function: Any, belief: Augmented) -> tuple[Augmented, Any]:
     """What a function makes of a belief where it is to be called, else the belief and zeros."""
     shapes = jax.eval_shape(lambda b: function(b)[1], belief)
     nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
@@ -75,15 +81,15 @@ def either(there: jax.Array, function: Any, belief: Belief) -> tuple[Belief, Any
 
 
 def _epoch(
-    form: Form, model: Model, given: Given, belief: Belief, epoch: Epoch, r: int, points: Points
-) -> tuple[Belief, tuple[jax.Array, jax.Array, Slots, Kept]]:
+    form: FilterForm, model: Model, given: FilterGiven, belief: Augmented, epoch: Epoch, r: int, points: RowPoints
+) -> tuple[Augmented, tuple[jax.Array, jax.Array, Slots, KeptDatum]]:
     """An epoch of recursion r."""
     target, rule = epoch.target[r], RULES[form.by]
-    before = moved(one(belief.slots[r], target), epoch.move[r])
+    before = carried(one(belief.slots[r], target), epoch.move[r])
     middle = centre(belief, before)
     at = About(jnp.where(points.there, points.x[r], middle.x), jnp.where(points.there, points.z, middle.z))
 
-    def by_derivatives() -> list[Row]:
+    def by_derivatives() -> list[WhiteRow]:
         return linearised(model, epoch, r, at, given.levels, expected=True)
 
     blocks = by_derivatives() if rule is None else jax.lax.cond(
@@ -91,12 +97,12 @@ def _epoch(
     )  # fmt: skip
     belief = _with(belief, r, target, before)
 
-    def use(b: Belief, row: Row) -> tuple[Belief, Kept]:
+    def use(b: Augmented, row: WhiteRow) -> tuple[Augmented, KeptDatum]:
         after, mine, kept = seen(b, one(b.slots[r], target), row)
         after = _with(after, r, target, mine)
         return (not_estimated(after, kept, given.considered) if form.considers else after), kept
 
-    def each(b: Belief, row: Row) -> tuple[Belief, Kept]:
+    def each(b: Augmented, row: WhiteRow) -> tuple[Augmented, KeptDatum]:
         return either(jnp.any(row.hx != 0) | jnp.any(row.hz != 0), lambda old: use(old, row), b)
 
     belief, kept = jax.lax.scan(each, belief, jax.tree.map(lambda *parts: jnp.concatenate(parts), *blocks))
@@ -106,12 +112,12 @@ def _epoch(
     return belief, (mine.m + mine.B @ belief.mean, sd, before._replace(shift=before.shift[:, :0]), kept)
 
 
-def _with(belief: Belief, r: int, target: jax.Array, own: Slots) -> Belief:
+def _with(belief: Augmented, r: int, target: jax.Array, own: Slots) -> Augmented:
     slots = tuple(put(s, target, own) if k == r else s for k, s in enumerate(belief.slots))
     return belief._replace(slots=slots)
 
 
-def log_evidence(kept: tuple[Kept, ...]) -> jax.Array:
+def window_evidence(kept: tuple[KeptDatum, ...]) -> jax.Array:
     """Log density of all data given those before, up to the constants of their noises."""
     total = jnp.zeros(())
     for own in kept:

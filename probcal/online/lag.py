@@ -14,8 +14,8 @@ import jax.numpy as jnp
 
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
-from probcal.online.belief import Belief
-from probcal.online.filtering import Form, Given, Points, Step, log_evidence, step
+from probcal.online.belief import Augmented
+from probcal.online.filtering import EpochStep, FilterForm, FilterGiven, RowPoints, epoch_step, window_evidence
 
 HALVE = 6  # passes after which a point goes half of its way only
 
@@ -25,37 +25,37 @@ class Window(NamedTuple):
 
     epochs: Epoch
     elapsed: jax.Array  # (W,)
-    points: Points  # (W,) leading
+    points: RowPoints  # (W,) leading
 
 
-class Smoothed(NamedTuple):
+class SmoothedStates(NamedTuple):
     """States of a window given all of its rows."""
 
     x: tuple[jax.Array, ...]  # (W, n) of each recursion
     sd: tuple[jax.Array, ...]  # (W, n)
 
 
-class Passed(NamedTuple):
+class WindowPass(NamedTuple):
     """What a window leaves."""
 
-    beliefs: Belief  # at the end of each segment, leading
-    smoothed: Smoothed
-    points: Points  # (W,) leading: where the rows were linearised
+    beliefs: Augmented  # at the end of each segment, leading
+    smoothed: SmoothedStates
+    points: RowPoints  # (W,) leading: where the rows were linearised
     innovation: tuple[jax.Array, ...]  # (W, D) standardised, of each recursion
     log_evidence: jax.Array  # (S,) of each segment
     passes: jax.Array  # ()
     moved: jax.Array  # () by how many sd a point moved in the last pass
 
 
-def forward(
-    form: Form, model: Model, given: Given, belief: Belief, window: Window, segments: int
-) -> tuple[Belief, Step]:
+def run_forward(
+    form: FilterForm, model: Model, given: FilterGiven, belief: Augmented, window: Window, segments: int
+) -> tuple[Augmented, EpochStep]:
     """Beliefs at the end of each segment (S leading) and what each epoch leaves (W leading)."""
 
-    def one(b: Belief, inputs: tuple) -> tuple[Belief, Step]:
-        return step(form, model, given, b, *inputs)
+    def one(b: Augmented, inputs: tuple) -> tuple[Augmented, EpochStep]:
+        return epoch_step(form, model, given, b, *inputs)
 
-    def segment(b: Belief, inputs: tuple) -> tuple[Belief, tuple[Belief, Step]]:
+    def segment(b: Augmented, inputs: tuple) -> tuple[Augmented, tuple[Augmented, EpochStep]]:
         after, left = jax.lax.scan(one, b, inputs)
         return after, (after, left)
 
@@ -65,14 +65,15 @@ def forward(
     return beliefs, jax.tree.map(lambda leaf: leaf.reshape(W, *leaf.shape[2:]), left)
 
 
-def last(beliefs: Belief) -> Belief:
+def last(beliefs: Augmented) -> Augmented:
     """The belief at the end of the last segment."""
     return jax.tree.map(lambda leaf: leaf[-1], beliefs)
 
 
-def smooth(window: Window, steps: Step, end: Belief) -> Smoothed:
+def smooth_window(window: Window, steps: EpochStep, end: Augmented) -> SmoothedStates:
     """States given all rows of a window, the biases as they stand at its end."""
-    xs, sds = [], []
+    xs: list[jax.Array] = []
+    sds: list[jax.Array] = []
     for r, slots in enumerate(end.slots):
         T, n, M = slots.B.shape
 
@@ -103,25 +104,34 @@ def smooth(window: Window, steps: Step, end: Belief) -> Smoothed:
             return (adjoint, weight), (jnp.where(mine, x, 0.0), jnp.where(mine, sd, 0.0))
 
         start = jnp.zeros((T, n, 1 + M)), jnp.zeros((T, n, n))
+        x: jax.Array
+        sd: jax.Array
         _, (x, sd) = jax.lax.scan(back, start, (window.epochs, steps.before[r], steps.kept[r]), reverse=True)
         xs.append(x)
         sds.append(sd)
-    return Smoothed(tuple(xs), tuple(sds))
+    return SmoothedStates(tuple(xs), tuple(sds))
 
 
 @partial(jax.jit, static_argnames=("form", "segments"))
 def run_window(
-    form: Form, model: Model, given: Given, belief: Belief, window: Window, most: int, tolerance: float, segments: int
-) -> Passed:
+    form: FilterForm,
+    model: Model,
+    given: FilterGiven,
+    belief: Augmented,
+    window: Window,
+    most: int,
+    tolerance: float,
+    segments: int,
+) -> WindowPass:
     """Filter and smooth a window, linearised again about what it found until no point moves by `tolerance` sd.
 
     At most `most` passes; with one the filter is the plain one, and nothing is linearised again.
     """
     there = window.epochs.recursion >= 0
 
-    def passed(points: Points) -> tuple[Belief, Step, Smoothed]:
-        beliefs, steps = forward(form, model, given, belief, window._replace(points=points), segments)
-        return beliefs, steps, smooth(window, steps, last(beliefs))
+    def passed(points: RowPoints) -> tuple[Augmented, EpochStep, SmoothedStates]:
+        beliefs, steps = run_forward(form, model, given, belief, window._replace(points=points), segments)
+        return beliefs, steps, smooth_window(window, steps, last(beliefs))
 
     def body(carry: tuple) -> tuple:
         k, points, _, _ = carry
@@ -140,27 +150,29 @@ def run_window(
         fresh = jnp.any(there & ~known)
         moved = jnp.where(fresh, jnp.inf, jnp.max(jnp.stack(moves)))
         left = (beliefs, found, tuple(kept.innovation for kept in steps.kept), _evidence(steps, segments))
-        return k + 1, Points(tuple(xs), z, there), moved, left
+        return k + 1, RowPoints(tuple(xs), z, there), moved, left
 
     shapes = jax.eval_shape(lambda points: body((0, points, 0.0, None))[3], window.points)
     nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
     first = (jnp.zeros((), int), window.points, jnp.full((), jnp.inf), nothing)
     count, points, moved, left = jax.lax.while_loop(lambda c: (c[0] < most) & (c[2] > tolerance), body, first)
-    return Passed(left[0], left[1], points, left[2], left[3], count, moved)
+    return WindowPass(left[0], left[1], points, left[2], left[3], count, moved)
 
 
-def _evidence(steps: Step, segments: int) -> jax.Array:
+def _evidence(steps: EpochStep, segments: int) -> jax.Array:
     W = steps.x[0].shape[0]
     parts = jax.tree.map(lambda leaf: leaf.reshape(segments, W // segments, *leaf.shape[1:]), steps.kept)
-    return jax.vmap(log_evidence)(parts)
+    return jax.vmap(window_evidence)(parts)
 
 
 @partial(jax.jit, static_argnames="form")
-def run_filter(form: Form, model: Model, given: Given, belief: Belief, window: Window) -> tuple[Belief, Step]:
+def run_plain(
+    form: FilterForm, model: Model, given: FilterGiven, belief: Augmented, window: Window
+) -> tuple[Augmented, EpochStep]:
     """The plain filter over a stack of epochs; of each epoch mean and sd of its target and the innovations."""
 
-    def one(b: Belief, inputs: tuple) -> tuple[Belief, Step]:
-        after, left = step(form, model, given, b, *inputs)
+    def one(b: Augmented, inputs: tuple) -> tuple[Augmented, EpochStep]:
+        after, left = epoch_step(form, model, given, b, *inputs)
         kept = tuple(own._replace(hx=own.hx[:, :0], gain=own.gain[:, :0], g=own.g[:, :0]) for own in left.kept)
         return after, left._replace(before=(), kept=kept)
 

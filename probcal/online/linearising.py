@@ -12,7 +12,7 @@ from probcal.model.epochs import Epoch
 from probcal.model.model import Model
 from probcal.model.rows import Block, Linearised, Rows
 from probcal.model.sigma import Rule
-from probcal.online.belief import Belief, Row, Slots
+from probcal.online.belief import Augmented, Slots, WhiteRow
 
 FLOOR = 1e-10  # least variance along an axis of the sigma points
 
@@ -24,7 +24,7 @@ class About(NamedTuple):
     z: jax.Array  # (M,)
 
 
-def centre(belief: Belief, own: Slots) -> About:
+def centre(belief: Augmented, own: Slots) -> About:
     """The means of a belief."""
     return About(own.m + own.B @ belief.mean, belief.mean)
 
@@ -40,7 +40,7 @@ def here(model: Model, epoch: Epoch, r: int) -> list[tuple[int, Block, Rows]]:
     return found
 
 
-def linearised(model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array, *, expected: bool) -> list[Row]:
+def linearised(model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array, *, expected: bool) -> list[WhiteRow]:
     """The data of an epoch of recursion r about a point, (P C,) of each block: by derivatives."""
     found = []
     for _, block, data in here(model, epoch, r):
@@ -50,8 +50,8 @@ def linearised(model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array,
 
 
 def regressed(
-    model: Model, epoch: Epoch, r: int, belief: Belief, own: Slots, levels: jax.Array, rule: Rule
-) -> list[Row]:
+    model: Model, epoch: Epoch, r: int, belief: Augmented, own: Slots, levels: jax.Array, rule: Rule
+) -> list[WhiteRow]:
     """The data of an epoch of recursion r regressed on state and biases over a belief, (P C,) of each block.
 
     Statistical linearisation (Arasaratnam, Haykin 2009; Julier, Uhlmann 2004) by points that move what each row
@@ -68,15 +68,11 @@ def regressed(
         read = data.bias[data.sensor]  # (P, p), M where fixed
         free = read < at.z.shape[0]
         which = jnp.minimum(read, at.z.shape[0] - 1)
-        P, p, u = read.shape[0], read.shape[1], len(used)
+        P, u = read.shape[0], len(used)
         own_x = jnp.broadcast_to(state[used[:, None], used[None, :]], (P, u, u))
         own_xz = jnp.where(free[:, None, :], cross[used][:, which].transpose(1, 0, 2), 0.0)
-        own_z = jnp.where(
-            free[:, :, None] & free[:, None, :], biases[which[:, :, None], which[:, None, :]], 0.0
-        )
-        whole = jnp.concatenate(
-            [jnp.concatenate([own_x, own_xz], 2), jnp.concatenate([own_xz.mT, own_z], 2)], 1
-        )
+        own_z = jnp.where(free[:, :, None] & free[:, None, :], biases[which[:, :, None], which[:, None, :]], 0.0)
+        whole = jnp.concatenate([jnp.concatenate([own_x, own_xz], 2), jnp.concatenate([own_xz.mT, own_z], 2)], 1)
         found.append(_rows(block, data, _regress(block, data, at, whole, rule, levels), at))
     return found
 
@@ -111,7 +107,7 @@ def _regress(block: Block, data: Rows, at: About, covariance: jax.Array, rule: R
     return Linearised(score, information, by[:, :, : len(used)], by[:, :, len(used) :])
 
 
-def _rows(block: Block, data: Rows, lin: Linearised, at: About) -> Row:
+def _rows(block: Block, data: Rows, lin: Linearised, at: About) -> WhiteRow:
     """Whitened data (P C,) of a block linearised about a point; zero where nothing was measured."""
     there = (data.mask > 0) & (lin.weight > 0)
     weight = jnp.where(there, lin.weight, 1.0)
@@ -121,8 +117,8 @@ def _rows(block: Block, data: Rows, lin: Linearised, at: About) -> Row:
     P, C, M = *there.shape, at.z.shape[0]
     hx = jnp.zeros((P, C, at.x.shape[0])).at[:, :, np.asarray(block.used, int)].set(state)
     read = data.bias[data.sensor]
-    hz = jnp.zeros((P, C, M + 1)).at[jnp.arange(P)[:, None, None], jnp.arange(C)[None, :, None], read[:, None, :]]
-    hz = hz.add(bias)[:, :, :M]
+    place = jnp.arange(P)[:, None, None], jnp.arange(C)[None, :, None], read[:, None, :]
+    hz = jnp.zeros((P, C, M + 1)).at[place].add(bias)[:, :, :M]
     value = jnp.where(there, lin.score / weight, 0.0) + hx @ at.x + hz @ at.z
-    scaled = Row(root * value, root[:, :, None] * hx, root[:, :, None] * hz)
+    scaled = WhiteRow(root * value, root[:, :, None] * hx, root[:, :, None] * hz)
     return jax.tree.map(lambda leaf: leaf.reshape(P * C, *leaf.shape[2:]), scaled)

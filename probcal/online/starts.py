@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from probcal import linalg
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
-from probcal.online.belief import Belief
-from probcal.online.filtering import Given
+from probcal.online.belief import Augmented
+from probcal.online.filtering import FilterGiven
 from probcal.online.linearising import About, linearised
 from probcal.smoothing.grid import ROBUST
 
@@ -23,8 +23,8 @@ REFINED = 12  # damped steps from the best of them
 
 
 @partial(jax.jit, static_argnames=("r", "span"))
-def places(
-    model: Model, given: Given, belief: Belief, epochs: Epoch, r: int, span: tuple[int, int], tried: jax.Array
+def place_new(
+    model: Model, given: FilterGiven, belief: Augmented, epochs: Epoch, r: int, span: tuple[int, int], tried: jax.Array
 ) -> jax.Array:
     """State (n,) whose place explains the epochs (FIRST leading) of a target best; the first has its start."""
     move = jax.tree.map(lambda leaf: leaf[0], epochs.move[r])
@@ -64,7 +64,11 @@ def places(
         after = place + linalg.solve_positive(damped, pull)
         lower = loss(after)
         good = lower < value
-        state = jnp.where(good, after, place), jnp.where(good, lower, value), jnp.where(good, damping / 10, damping * 10)
+        state = (
+            jnp.where(good, after, place),
+            jnp.where(good, lower, value),
+            jnp.where(good, damping / 10, damping * 10),
+        )
         return state, None
 
     tried = jnp.concatenate([tried, resting[entries][None]])
