@@ -94,6 +94,8 @@ class Arrivals:
                     " rows that name their target: track_objects(...) finds those of detections"
                 )
             frame["target"] = [name_as_text(value) for value in frame["target"]]
+        elif any(placed.detection is not None for placed in self.network.sensors):
+            raise InputError(f"{table.source}: an online filter takes rows that name their target, no detections")
         else:
             frame["target"] = ONLY
         data = [c for c in frame.columns if c not in ("time", "sensor", "target")]
@@ -153,8 +155,6 @@ class Arrivals:
         table = Table(own, source, frame["line"].to_numpy())
         network = self.network if self.template is None else self.template.network
         data = measure(table, network)
-        if data.detection.any():
-            raise InputError(f"{source}: an online filter takes rows that name their target, no detections")
         if not data.measured.any():
             return self._nothing(len(frame))
         self._provide(own, data, source)

@@ -24,7 +24,6 @@ else:
     pd = Later("pandas")
 
 VERSION = 1
-TEXT = {"sensor": str, "target": str, "cells": str, "_kind": str, "_group": str}
 
 
 def pack_state(online: Online, beside: dict[str, Any]) -> bytes:
@@ -50,7 +49,7 @@ def pack_state(online: Online, beside: dict[str, Any]) -> bytes:
         "starts": arrivals.starts,
         "area": None if area is None else [area.dimension, area.centre.tolist(), area.extent, area.wide],
         "duration": arrivals.duration,
-        "frames": {n: _text(f) for n, f in _frames(online).items()},
+        "frames": {n: _columns(f) for n, f in _frames(online).items()},
         "points": [[t, n, x.tolist(), z.tolist()] for (t, n), (x, z) in online.points.items()],
         "log_evidence": online.log_evidence,
         "epochs": online.epochs,
@@ -96,7 +95,7 @@ def unpack_state(online: Online, content: bytes, source: str) -> dict[str, Any]:
         d, middle, extent, wide = said["area"]
         arrivals.area, arrivals.duration = Area(d, np.array(middle), extent, wide), said["duration"]
         arrivals.tried = arrays.pop("tried")
-    frames = {n: None if text is None else _frame(text) for n, text in said["frames"].items()}
+    frames = {n: None if own is None else pd.DataFrame(own) for n, own in said["frames"].items()}
     arrivals.samples, online.pending, online.recent = frames["samples"], frames["pending"], frames["recent"]
     if arrivals.samples is not None:
         arrivals.rebuild()
@@ -119,12 +118,8 @@ def _frames(online: Online) -> dict[str, pd.DataFrame | None]:
     return {"samples": online.arrivals.samples, "pending": online.pending, "recent": online.recent}
 
 
-def _text(frame: pd.DataFrame | None) -> str | None:
-    return None if frame is None else frame.to_csv(index=False)
-
-
-def _frame(text: str) -> pd.DataFrame:
-    return pd.read_csv(io.StringIO(text), dtype=TEXT, float_precision="round_trip", keep_default_na=True)
+def _columns(frame: pd.DataFrame | None) -> dict[str, list[Any]] | None:
+    return None if frame is None else {str(name): frame[name].tolist() for name in frame}
 
 
 def _belief(arrays: dict[str, Any], name: str) -> Augmented:

@@ -140,8 +140,9 @@ def run_window(
         spread = jnp.sqrt(jnp.sum(end.root**2, 1))
         share = jnp.where(k < HALVE, 1.0, 0.5)
         known = points.there
-        z = jnp.where(known[:, None], points.z + share * (end.mean - points.z), end.mean)
-        moves = [jnp.max(jnp.where(known[:, None], jnp.abs(end.mean - points.z) / spread, 0.0), initial=0.0)]
+        off = end.mean[None, :] - points.z
+        z = points.z + jnp.where(known[:, None], share, 1.0) * off
+        moves = [jnp.max(jnp.where(known[:, None], jnp.abs(off) / spread[None, :], 0.0), initial=0.0)]
         xs = []
         for old, new, sd in zip(points.x, found.x, found.sd, strict=True):
             xs.append(jnp.where(known[:, None], old + share * (new - old), new))

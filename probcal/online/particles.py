@@ -57,7 +57,7 @@ def bias_moments(cloud: Cloud) -> tuple[jax.Array, jax.Array]:
     mean = weight @ cloud.mean
     away = cloud.mean - mean[None]
     within = jnp.einsum("p,pij,pkj->ik", weight, cloud.root, cloud.root)
-    return mean, within + (away.T * weight) @ away
+    return mean, within + (away.T * weight[None, :]) @ away
 
 
 def _drawn(
@@ -76,7 +76,7 @@ def _drawn(
     for row in linearised(model, epoch, r, About(mean, z), given.levels, expected=True):
         by = row.hx @ L
         wide = 1.0 + jnp.sum((row.hz @ root) ** 2, 1)
-        J = J + (by.T / wide) @ by
+        J = J + (by.T / wide[None, :]) @ by
         pull = pull + by.T @ ((row.value - row.hx @ mean - row.hz @ z) / wide)
     lower, inverse = linalg.factor_and_inverse(J)
     white = jax.random.normal(key, pull.shape)

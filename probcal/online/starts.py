@@ -58,7 +58,7 @@ def place_new(
         place, value, damping = carry
         off, slope = terms(place)
         weight = (ROBUST + 1) / (ROBUST + off**2)
-        information = (slope.T * weight) @ slope + jnp.diag(spread**-2)
+        information = (slope.T * weight[None, :]) @ slope + jnp.diag(spread**-2)
         pull = slope.T @ (weight * off) - (place - resting[entries]) / spread**2
         damped = information + damping * jnp.diag(jnp.diagonal(information))
         after = place + linalg.solve_positive(damped, pull)

@@ -1,0 +1,430 @@
+"""Filters of a stream against a naive filter in NumPy, the batch answer, and themselves in other order."""
+
+import copy
+import sys
+from functools import cache
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+
+import probcal as pc
+from probcal.errors import InputError
+from probcal.inference.checkpoint import pack_state, unpack_state
+
+
+@pc.sensor(east=pc.Channel("m", 1.0), north=pc.Channel("m", 2.0))
+def plain(target, pose, *, shift=pc.Bias("m", 2.0), lift=pc.Bias("m", 1.0)):
+    """Linear in state and biases."""
+    place = target.position - pose.position
+    return {"east": place[0] + shift, "north": place[1] + 0.5 * place[0] + lift}
+
+
+@pc.sensor(range=pc.Channel("m", 1.0))
+def tape(target, pose):
+    return {"range": ((target.position - pose.position) ** 2).sum() ** 0.5}
+
+
+MOTION = {
+    name: pc.Target(pc.ConstantVelocity(0.5), {"position": ((x, 0.0), 5.0), "velocity": ((1.0, 0.0), 1.0)})
+    for name, x in (("a", 0.0), ("b", 50.0))
+}
+
+
+def network():
+    return pc.Network([plain.on(pc.Node(f"n{k}", (10.0 * k, 5.0))) for k in range(3)])
+
+
+@cache
+def rows(names="ab", missing=0.3):
+    found = pc.simulate(network(), {n: MOTION[n] for n in names}, np.arange(12.0), key=3, missing=missing)
+    return found.table.dropna(how="all", subset=["east", "north"]).sort_values("time", kind="stable", ignore_index=True)
+
+
+def filtered(method, frame=None, chunk=7, **settings):
+    frame = rows() if frame is None else frame
+    online = pc.Online(network(), MOTION, method, targets=3, **settings)
+    for k in range(0, len(frame), chunk):
+        online.update(frame.iloc[k : k + chunk])
+    return online
+
+
+def naive(frame, walk=None, considered=None, jump=None):
+    """The augmented filter with one covariance of everything: mean and covariance of biases, then of the targets.
+
+    `jump` is (bias, time): a further state that this bias has from then on.
+    """
+    problem = pc.Problem(network(), MOTION, frame)
+    names, labels, scales = sorted(set(frame["target"])), list(problem.labels), problem.scales
+    M = len(labels)
+    D = M + 4 * len(names) + (jump is not None)
+    mean, P, last, now = np.zeros(D), np.zeros((D, D)), {}, None
+    P[:M, :M] = np.diag(scales**2)
+    if jump is not None:
+        P[-1, -1] = scales[jump[0]] ** 2
+    for time, group in frame.groupby("time"):
+        if walk is not None and now is not None:
+            P[:M, :M] += np.diag(walk**2 * (time - now))
+        now = time
+        for name in [n for n in dict.fromkeys(frame["target"]) if n in set(group["target"])]:
+            own = slice(M + 4 * names.index(name), M + 4 * names.index(name) + 4)
+            if name not in last:
+                start = MOTION[name].start
+                mean[own] = [*start["position"][0], *start["velocity"][0]]
+                P[own, own] = np.diag([25.0, 25.0, 1.0, 1.0])
+            else:
+                dt = time - last[name]
+                F = np.eye(D)
+                F[own, own] = np.kron([[1, dt], [0, 1]], np.eye(2))
+                Q = np.zeros((D, D))
+                Q[own, own] = 0.25 * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
+                mean, P = F @ mean, F @ P @ F.T + Q
+            last[name] = time
+            for _, row in group[group["target"] == name].iterrows():
+                place = np.array([10.0 * int(row["sensor"][1]), 5.0])
+                for channel, std in (("east", 1.0), ("north", 2.0)):
+                    if np.isnan(row[channel]):
+                        continue
+                    h, fixed = np.zeros(D), 0.0
+                    h[own] = [1, 0, 0, 0] if channel == "east" else [0.5, 1, 0, 0]
+                    fixed = -place[0] if channel == "east" else -place[1] - 0.5 * place[0]
+                    m = labels.index(f"{row['sensor']}.{'shift' if channel == 'east' else 'lift'}")
+                    h[m] = 1.0
+                    if jump is not None and m == jump[0] and time >= jump[1]:
+                        h[-1] = 1.0
+                    S = h @ P @ h + std**2
+                    K = P @ h / S
+                    if considered is not None:
+                        K = np.where(np.append(considered, np.zeros(D - M, bool)), 0.0, K)
+                    mean = mean + K * (row[channel] - fixed - h @ mean)
+                    away = np.eye(D) - np.outer(K, h)
+                    P = away @ P @ away.T + np.outer(K, K) * std**2
+    return mean, P, M
+
+
+def compare(online, mean, P, M, tolerance=1e-8):
+    scales = online.biases["scale"].to_numpy()
+    np.testing.assert_allclose(online.biases["mean"] / scales, mean[:M] / scales, atol=tolerance)
+    np.testing.assert_allclose(online.biases["sd"], np.sqrt(np.diag(P)[:M]), rtol=tolerance)
+
+
+@pytest.mark.parametrize("by", ["extended", "unscented", "cubature"])
+def test_a_linear_network_has_the_exact_filter(by):
+    online = filtered(pc.AugmentedFilter(by, lag=0))
+    mean, P, M = naive(rows())
+    compare(online, mean, P, M, 1e-7)
+    covariance = online.end.root @ online.end.root.T * np.outer(*2 * [online.biases["scale"].to_numpy()])
+    np.testing.assert_allclose(covariance, P[:M, :M], atol=1e-6)
+
+
+def test_tracks_are_those_of_the_exact_filter_and_smoother():
+    whole = pc.Problem(network(), MOTION, rows())
+    batch = pc.fit(whole, pc.MAP(trajectory="joint"), prior=pc.Gaussian())
+    online = filtered(pc.AugmentedFilter(lag=32), chunk=100)
+    tracks = online.finish().tracks
+    for name in "ab":
+        truth, own = batch[f"track/{name}"].to_dataset(), tracks[tracks["target"] == name]
+        np.testing.assert_allclose(own["position_x"], truth["mean"].sel(component="position_x"), atol=1e-6)
+        np.testing.assert_allclose(own["velocity_y_sd"], truth["sd"].sel(component="velocity_y"), rtol=1e-6)
+
+
+def test_walking_biases_of_one_target_are_exact():
+    one = rows("a")
+    walk = np.tile([0.3, 0.0], 3)
+    online = filtered(pc.AugmentedFilter(lag=0, walk={"*.shift": 0.3}), one)
+    compare(online, *naive(one, walk=walk))
+
+
+def test_considered_biases_are_those_of_schmidt():
+    one = rows("a")
+    considered = np.tile([False, True], 3)
+    online = filtered(pc.AugmentedFilter(lag=0, consider="*.lift"), one)
+    mean, P, M = naive(one, considered=considered)
+    compare(online, mean, P, M)
+    kept = online.biases[considered]
+    np.testing.assert_allclose(kept["mean"], 0.0, atol=1e-12)
+    np.testing.assert_allclose(kept["sd"], kept["scale"], rtol=1e-9)
+
+
+@pytest.mark.parametrize("lag", [0, 8])
+def test_the_size_of_a_chunk_changes_nothing(lag):
+    whole, pieces = (filtered(pc.AugmentedFilter(lag=lag), chunk=n).biases for n in (1000, 5))
+    np.testing.assert_allclose(whole["mean"], pieces["mean"], atol=1e-7)
+    np.testing.assert_allclose(whole["sd"], pieces["sd"], rtol=1e-7)
+
+
+def test_rows_within_the_lag_may_come_in_any_order():
+    frame = rows()
+    mixed = frame.copy()
+    for k in range(0, len(frame), 10):
+        some = frame.iloc[k : k + 10].sample(frac=1.0, random_state=k)
+        mixed.iloc[k : k + 10] = some.to_numpy()
+    mixed = mixed.astype(frame.dtypes.to_dict())
+    ordered, other = (filtered(pc.AugmentedFilter(lag=32), own, chunk=3) for own in (frame, mixed))
+    assert other.counts["late"] == 0
+    np.testing.assert_allclose(ordered.biases["mean"], other.biases["mean"], atol=1e-7)
+
+
+def test_late_and_repeated_rows_are_counted_and_left_out():
+    frame = rows()
+    clean = filtered(pc.AugmentedFilter(lag=0))
+    online = filtered(pc.AugmentedFilter(lag=0))
+    online.update(frame.iloc[:4])
+    online.update(frame.iloc[[-1]])
+    twice = pd.concat([frame.iloc[[-1]].assign(time=20.0)] * 2)
+    online.update(twice)
+    clean.update(twice.iloc[:1])
+    assert online.counts == {"rows": len(frame) + 7, "late": 4, "duplicates": 2, "retired": 0}
+    np.testing.assert_allclose(clean.biases["mean"], online.biases["mean"], atol=1e-12)
+
+
+def test_rows_of_one_time_may_come_one_by_one():
+    together, alone = (filtered(pc.AugmentedFilter(lag=0), chunk=n) for n in (1000, 1))
+    assert alone.counts["late"] == alone.counts["duplicates"] == 0
+    np.testing.assert_allclose(together.biases["sd"], alone.biases["sd"], rtol=1e-9)
+
+
+def test_dates_are_seconds_since_the_first():
+    frame = rows()
+    dated = frame.assign(time=pd.Timestamp("2026-01-01T00:00Z") + pd.to_timedelta(frame["time"], unit="s"))
+    text = dated.assign(time=dated["time"].map(lambda stamp: stamp.isoformat()))
+    for own in (dated, text, frame.rename(columns={"time": "time [ms]"}).assign(**{"time [ms]": frame["time"] * 1e3})):
+        found = filtered(pc.AugmentedFilter(lag=0), own)
+        np.testing.assert_allclose(found.biases["mean"], filtered(pc.AugmentedFilter(lag=0)).biases["mean"], atol=1e-9)
+
+
+def test_a_target_that_is_silent_gives_up_its_slot():
+    frame = rows("a", 0.0)
+    frames = [frame.assign(target=name, time=frame["time"] + 20.0 * k) for k, name in enumerate("abcd")]
+    online = pc.Online(network(), MOTION["a"], pc.AugmentedFilter(lag=0), targets=2)
+    for own in frames:
+        online.update(own)
+    assert online.counts["retired"] == 2
+    assert set(online.arrivals.targets) == {"c", "d"}
+    more = pc.Online(network(), MOTION["a"], pc.AugmentedFilter(lag=0), targets=4)
+    for own in frames:
+        more.update(own)
+    np.testing.assert_allclose(online.biases["mean"], more.biases["mean"], atol=1e-10)
+    with pytest.raises(InputError, match="more than 2 targets are seen at once"):
+        online.update(pd.concat([frame.assign(target=name, time=frame["time"] + 100.0) for name in "efg"]))
+
+
+def test_a_jump_is_what_a_further_state_of_the_filter_says():
+    one = rows("a", 0.0)
+    online = filtered(pc.AugmentedFilter(lag=0, jumps=pc.Jumps(within=1e4, starts=1, false_alarms=1e-9)), one[:15], 15)
+    online.since = [5.0]
+    later = one[15:]
+    online.update(later)
+    told, problem = jax.tree.map(np.asarray, online.belief.candidates), online._problem
+    for m in range(6):
+        mean, P, _ = naive(one, jump=(m, float(one["time"].iloc[15])))
+        precision = told.information[m] + 1.0
+        scale = problem.scales[m]
+        assert told.score[m] / precision == pytest.approx(mean[-1] / scale, abs=1e-7)
+        assert precision**-0.5 == pytest.approx(P[-1, -1] ** 0.5 / scale, rel=1e-7)
+        with jax.enable_x64(True):
+            from probcal.online.belief import jumped
+
+            after = jumped(online.belief, np.asarray(m), told.score[m] / precision, 1.0 / precision)
+        present = mean[:6] + mean[-1] * (np.arange(6) == m)
+        turn = np.eye(len(mean))
+        turn[m, -1] = 1.0
+        np.testing.assert_allclose(after.mean * problem.scales, present, atol=1e-6)
+        covariance = after.root @ after.root.T * np.outer(problem.scales, problem.scales)
+        np.testing.assert_allclose(covariance, (turn @ P @ turn.T)[:6, :6], atol=1e-6)
+        own = after.slots[0]
+        state = own.m[0] + own.B[0] @ after.mean
+        np.testing.assert_allclose(state, mean[6:10], atol=1e-6)
+        reach = own.B[0] @ after.root
+        np.testing.assert_allclose(own.R[0] @ own.R[0].T + reach @ reach.T, P[6:10, 6:10], atol=1e-6)
+
+
+def jumping(size):
+    frame = pc.simulate(network(), MOTION, np.arange(120.0), key=5).table.sort_values("time", kind="stable")
+    later = (frame["sensor"] == "n1") & (frame["time"] >= 60.0)
+    return frame.assign(east=frame["east"] + np.where(later, size, 0.0))
+
+
+@pytest.mark.parametrize("lag", [0, 8])
+def test_a_jump_is_found_soon_and_none_where_there_is_none(lag):
+    method = pc.AugmentedFilter(lag=lag, jumps=pc.Jumps(within=40.0))
+    still = filtered(method, jumping(0.0), 30)
+    assert still.jumps == []
+    online = filtered(method, jumping(6.0), 30)
+    (jump,) = online.jumps
+    assert jump.label == "n1.shift"
+    assert 50.0 <= jump.since <= 60.0 < jump.found <= 80.0
+    assert abs(jump.size - 6.0) < 3 * jump.sd
+    assert 0.0 < jump.bound <= jump.found - jump.since
+    moved = online.biases["mean"]["n1.shift"] - still.biases["mean"]["n1.shift"]
+    assert moved == pytest.approx(6.0, abs=3 * online.biases["sd"]["n1.shift"])
+
+
+def test_a_window_of_everything_ends_at_the_batch_answer():
+    network_ = pc.Network(
+        [tape.on(pc.Node(f"n{k}", place, scale=3.0)) for k, place in enumerate(((0, 0), (60, 5), (20, 70)))]
+    )
+    motion = pc.Target(pc.ConstantVelocity(0.3), {"position": ((5.0, 30.0), 5.0), "velocity": ((2.0, 0.0), 1.0)})
+    frame = pc.simulate(network_, motion, np.arange(20.0), key=1).table
+    batch = pc.fit(pc.Problem(network_, motion, frame), pc.MAP(trajectory="joint"), prior=pc.Gaussian())
+    group = batch["calibration"].to_dataset()
+    online = pc.Online(network_, motion, pc.AugmentedFilter(lag=32, tolerance=1e-4, passes=30))
+    for k in range(0, len(frame), 15):
+        assert online.update(frame.iloc[k : k + 15]).settled
+    assert (np.abs(online.biases["mean"] - group["mean"].values) < 0.002 * group["sd"].values).all()
+    np.testing.assert_allclose(online.biases["sd"], group["sd"].values, rtol=2e-3)
+
+
+def test_a_target_without_a_start_is_placed_by_its_first_rows():
+    places = ((0.0, 0.0), (400.0, 20.0), (100.0, 500.0), (450.0, 480.0))
+    network_ = pc.Network([tape.on(pc.Node(f"n{k}", place, scale=0.5)) for k, place in enumerate(places)])
+    motion = pc.Target(pc.ConstantVelocity(0.3), {"position": ((300.0, 150.0), 1.0), "velocity": ((2.0, 1.0), 1.0)})
+    run = pc.simulate(network_, motion, np.arange(12.0), key=1)
+    for lag in (0, 16):
+        online = pc.Online(network_, pc.ConstantVelocity(0.3), pc.AugmentedFilter(lag=lag))
+        online.update(run.table)
+        tracks = pd.concat([online.finish().tracks]) if lag else None
+        last = online.end.slots[0].m[0] + online.end.slots[0].B[0] @ online.end.mean
+        truth = run.truth.tracks.iloc[-1]
+        assert np.hypot(last[0] - truth["position_x"], last[1] - truth["position_y"]) < 4.0
+        assert lag == 0 or len(tracks) == 12
+
+
+def test_a_killed_filter_goes_on_as_if_it_had_not_been():
+    frame = rows()
+    for method in (pc.AugmentedFilter(lag=8), pc.ParticleFilter(50), pc.AugmentedFilter(lag=0, jumps=pc.Jumps())):
+        whole, first = filtered(method, chunk=6), filtered(method, frame[:24], chunk=6)
+        second = pc.Online(network(), MOTION, method, targets=3)
+        assert unpack_state(second, pack_state(first, {"offset": 5}), "state") == {"offset": 5}
+        for k in range(24, len(frame), 6):
+            second.update(frame.iloc[k : k + 6])
+        pd.testing.assert_frame_equal(whole.biases, second.biases, rtol=1e-9)
+        assert whole.counts == second.counts
+        assert whole.log_evidence == pytest.approx(second.log_evidence, rel=1e-9)
+
+
+def test_a_state_of_something_else_is_refused():
+    online = filtered(pc.AugmentedFilter(lag=0))
+    state = pack_state(online, {})
+    with pytest.raises(InputError, match="is no checkpoint of probcal watch"):
+        unpack_state(pc.Online(network(), MOTION), b"nothing", "x")
+    with pytest.raises(InputError, match="is the checkpoint of other settings"):
+        unpack_state(pc.Online(network(), MOTION), state, "x")
+    other = pc.Online(network(), MOTION, pc.AugmentedFilter(lag=0), fix="n0.shift")
+    with pytest.raises(InputError, match="is the checkpoint of a network with other biases; give another --out"):
+        unpack_state(other, state, "x")
+
+
+def test_sparse_priors_are_laid_on_what_was_filtered():
+    whole = pc.Problem(network(), MOTION, rows())
+    online = filtered(pc.AugmentedFilter(lag=0))
+    for prior, method in ((pc.Horseshoe(), pc.EA()), (pc.ARD(), pc.EA(precisions="maximised"))):
+        batch = pc.fit(whole, method, prior=prior)["calibration"].to_dataset()
+        found = online.under(prior)
+        np.testing.assert_allclose(found["mean"] / found["scale"], batch["mean"] / batch["scale"], atol=0.1)
+        np.testing.assert_allclose(found["sd"] / found["scale"], batch["sd"] / batch["scale"], atol=0.05)
+    with pytest.raises(InputError, match="give a prior with precisions, Horseshoe"):
+        online.under(pc.Gaussian())
+    walking = filtered(pc.AugmentedFilter(lag=0, walk={"*.shift": 0.1}))
+    with pytest.raises(InputError, match="have no prior that could be replaced; fit the rows as a batch"):
+        walking.under(pc.Horseshoe())
+
+
+def test_the_tree_serves_track_and_a_further_stream(tmp_path):
+    online = filtered(pc.AugmentedFilter(lag=0))
+    tree = pc.load(pc.save(online.tree(), tmp_path / "fit.nc"))
+    group = tree["calibration"].to_dataset()
+    np.testing.assert_allclose(group["mean"], online.biases["mean"], atol=1e-9)
+    assert tree.attrs["stream_rows"] == len(rows())
+    assert "a" in pc.track(pc.Problem(network(), MOTION, rows()), tree)["track"].children
+    further = pc.Online(network(), MOTION, pc.AugmentedFilter(lag=0), calibration=tree)
+    later = rows().assign(time=rows()["time"] + 100.0)
+    further.update(later)
+    assert (further.biases["sd"] < online.biases["sd"]).all()
+
+
+def test_particles_approach_the_exact_filter():
+    one = rows("a")[:9]
+    exact = filtered(pc.AugmentedFilter(lag=0), one).biases
+    online = filtered(pc.ParticleFilter(4000), one)
+    assert (np.abs(online.biases["mean"] - exact["mean"]) < 0.15 * exact["sd"]).all()
+    np.testing.assert_allclose(online.biases["sd"], exact["sd"], rtol=0.1)
+    update = online.update(rows("a")[9:12])
+    assert update.settled
+    assert not filtered(pc.ParticleFilter(10), one).update(rows("a")[9:12]).settled
+
+
+@pytest.mark.ci
+def test_intervals_hold_as_often_as_they_say():
+    held, count = [], 40
+    for seed in range(count):
+        run = pc.simulate(network(), MOTION, np.arange(12.0), key=100 + seed, missing=0.3)
+        frame = run.table.dropna(how="all", subset=["east", "north"]).sort_values("time", kind="stable")
+        found = filtered(pc.AugmentedFilter(lag=8), frame, 40).biases
+        true = np.array([run.truth.biases[label] for label in found.index])
+        held.append(((found["lower"] <= true) & (true <= found["upper"])).mean())
+    assert abs(np.mean(held) - 0.89) < 3.5 * np.std(held) / count**0.5
+
+
+WRONG = {
+    'by="middle"\\): give one of': lambda: pc.AugmentedFilter("middle"),
+    "give 0 or a number of epochs that 4 divides": lambda: pc.AugmentedFilter(lag=3),
+    r"AugmentedFilter\(passes=0": lambda: pc.AugmentedFilter(passes=0),
+    "cannot be tested for jumps; drop one of both": lambda: pc.AugmentedFilter(jumps=pc.Jumps(), consider="a"),
+    "give a positive std for one second": lambda: pc.AugmentedFilter(walk={"a": 0.0}),
+    r"Jumps\(within=-1\): give a positive number": lambda: pc.Jumps(within=-1),
+    "give 2 or more, some hundred as a rule": lambda: pc.ParticleFilter(1),
+    r"give a share of the particles, 0 to 1": lambda: pc.ParticleFilter(threshold=2.0),
+    r"give AugmentedFilter\(...\) or ParticleFilter": lambda: pc.Online(network(), MOTION, pc.EA()),
+    r"Online\(targets=0": lambda: pc.Online(network(), MOTION, targets=0),
+    r"the filter takes Gaussian\(\); sparse priors are laid on": lambda: pc.Online(network(), MOTION, prior=pc.ARD()),
+    "nothing is known before the first rows": lambda: pc.Online(network(), MOTION).biases,
+    "matches no bias": lambda: filtered(pc.AugmentedFilter(lag=0, walk={"x.*": 1.0})),
+    'has no column "sensor"; a stream needs time and sensor': lambda: filtered(None, rows().drop(columns="sensor")),
+    'column "target" is blank; an online filter takes': lambda: filtered(None, rows().assign(target=None)),
+    'unit "m" is not a time; use s, ms': lambda: filtered(None, rows().rename(columns={"time": "time [m]"})),
+    "is not a finite time; give seconds or ISO dates": lambda: filtered(None, rows().assign(time="noon")),
+    "the time is infinite; give seconds or ISO dates": lambda: filtered(None, rows().assign(time=np.inf)),
+    'target "q" has no motion': lambda: filtered(None, rows("a").assign(target="q")),
+    "rows have no measured value; fill the channel columns": lambda: filtered(None, rows()[["time", "sensor", "target"]].assign(east=None)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("said", WRONG)
+def test_what_is_wrong_is_said_in_one_sentence(said):
+    with pytest.raises(InputError, match=said):
+        WRONG[said]()
+
+
+def test_a_table_that_is_refused_leaves_nothing_behind():
+    online = filtered(pc.AugmentedFilter(lag=0))
+    before = copy.deepcopy(online.biases)
+    with pytest.raises(InputError, match='sensor "q" is not in the network'):
+        online.update(rows().assign(time=rows()["time"] + 50.0, sensor="q"))
+    pd.testing.assert_frame_equal(before, online.biases)
+    assert online.counts["rows"] == len(rows())
+
+
+def test_detections_without_a_name_are_refused():
+    seen = pc.Network([plain.on(pc.Node("n0", (0.0, 0.0)), detection=pc.Detection(0.9, clutter=1.0))])
+    online = pc.Online(seen, MOTION["a"])
+    with pytest.raises(InputError, match="an online filter takes rows that name their target, no detections"):
+        online.update(rows("a")[rows("a")["sensor"] == "n0"].drop(columns="target", errors="ignore"))
+
+
+def test_too_many_biases_are_refused(monkeypatch):
+    monkeypatch.setattr(sys.modules["probcal.inference.online"], "MANY", 3)
+    with pytest.raises(InputError, match="6 biases are too many for an online filter, which takes 3"):
+        filtered(pc.AugmentedFilter(lag=0))
+
+
+def test_a_filter_that_leaves_the_numbers_says_when(monkeypatch):
+    online = filtered(pc.AugmentedFilter(lag=0))
+    online.belief = online.belief._replace(mean=np.full(6, np.nan))
+    with pytest.raises(InputError, match="state where the targets start, or take a lag"):
+        online.update(rows().assign(time=rows()["time"] + 50.0))
+    lost = filtered(pc.ParticleFilter(20), rows()[:6])
+    lost.cloud = lost.cloud._replace(mean=np.full((20, 6), np.nan))
+    with pytest.raises(InputError, match="no particle explains the rows at time 50"):
+        lost.update(rows()[:6].assign(time=50.0))
