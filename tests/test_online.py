@@ -227,6 +227,7 @@ def test_a_jump_is_what_a_further_state_of_the_filter_says():
             from probcal.online.belief import jumped
 
             after = jumped(online.belief, np.asarray(m), told.score[m] / precision, 1.0 / precision)
+        after = jax.tree.map(np.asarray, after)
         present = mean[:6] + mean[-1] * (np.arange(6) == m)
         turn = np.eye(len(mean))
         turn[m, -1] = 1.0
@@ -387,7 +388,9 @@ WRONG = {
     "is not a finite time; give seconds or ISO dates": lambda: filtered(None, rows().assign(time="noon")),
     "the time is infinite; give seconds or ISO dates": lambda: filtered(None, rows().assign(time=np.inf)),
     'target "q" has no motion': lambda: filtered(None, rows("a").assign(target="q")),
-    "rows have no measured value; fill the channel columns": lambda: filtered(None, rows()[["time", "sensor", "target"]].assign(east=None)),
+    "rows have no measured value; fill the channel columns": lambda: filtered(
+        None, rows()[["time", "sensor", "target"]].assign(east=None)
+    ),
 }  # fmt: skip
 
 

@@ -1,115 +1,174 @@
-"""What a fit ran along, starts that strain it, and intervals widened where the innovations reject the model."""
+"""`probcal watch`: files that grow, standard input, rows that cannot be taken, and processes that are killed."""
 
-from dataclasses import replace
+import io
+import signal
+import subprocess
+import sys
+import time
 
-import committed
 import numpy as np
+import pandas as pd
 import pytest
-from contracts import only
-from worlds import linear, resting
+from terminal import call
 
-import probcal
-from probcal import Channel, ConstantVelocity, Network, Node, Problem, simulate
-from probcal.analysis.residuals import Innovations
-from probcal.analysis.widen import rejection, widened
-from probcal.identifiability.watch import runs, strained_starts
-from probcal.sensors import doa
+import probcal as pc
 
+MODEL = """
+from probcal import Bias, Channel, ConstantVelocity, Network, Node, Problem, Target, sensor
 
-def anchored():
-    """Five bearings-only nodes, the first one known: only the motion tells the size of the scene."""
-    places, free = [(0, 0), (200, 0), (200, 150), (0, 150), (100, -40)], {"position": 30.0, "heading": np.deg2rad(3)}
-    network = Network([doa.on(Node(f"d{k}", place, scale=free if k else None)) for k, place in enumerate(places)])
-    biases = dict.fromkeys(network.labels, 0.0) | {"d1.heading": 0.07, "d2.position_x": 15.0, "d4.position_y": -9.0}
-    time = np.arange(80.0)
-    path = np.stack([100 + 80 * np.cos(time / 12), 75 + 50 * np.sin(time / 7)], 1)
-    drawn = simulate(network, ConstantVelocity(0.5), time, key=0, biases=biases, tracks={"target": path})
-    return Problem(network, ConstantVelocity(0.5), drawn.table)
+@sensor(east=Channel("m", std=1.0), north=Channel("m", std=1.0))
+def plain(target, pose, *, shift=Bias("m", 2.0)):
+    place = target.position - pose.position
+    return dict(east=place[0] + shift, north=place[1])
+
+def problem(data=None):
+    network = Network([plain.on(Node(f"n{k}", (10.0 * k, 0.0))) for k in range(2)])
+    motion = Target(ConstantVelocity(0.5), {"position": ((0.0, 0.0), 5.0), "velocity": ((1.0, 0.0), 1.0)})
+    return Problem(network, motion, data)
+"""
 
 
-@pytest.mark.ci
-def test_an_estimate_that_ran_along_a_gauge_is_none_and_names_it():
-    """The path is smoother than its motion allows, so that a smaller scene fits better; no bias is determined."""
-    problem = anchored()
-    tree = probcal.fit(problem)
-    assert tree.attrs["status"] == "along a gauge"
-    assert "prior sd along dilation" in tree.attrs["message"]
-    assert "determined" not in probcal.assess(problem, tree)["verdict"]["verdict"].values
-    found = probcal.observability(problem)
-    assert found.attrs["gauge"] > 0
-    assert found.attrs["status"] != "determined"
+def lines(count=40):
+    rng, found = np.random.default_rng(0), ["time,sensor,east,north\n"]
+    for k in range(count):
+        for n in range(2):
+            east, north = k - 10.0 * n + 1.5 * n + rng.normal(), rng.normal()
+            found.append(f"{k},n{n},{east:.6f},{north:.6f}\n")
+    return found
 
 
-def test_a_stated_network_ran_nowhere():
-    problem, _ = linear("plane")
-    start = resting(problem)
-    assert runs(problem, start) == []
-    assert strained_starts(problem, start) == []
+@pytest.fixture
+def model(tmp_path):
+    path = tmp_path / "small.py"
+    path.write_text(MODEL)
+    return path
 
 
-def far_away(std, distance):
-    """Four direction finders 20 m apart, three of unknown heading, and a target far beyond them."""
-    places, kind = (
-        [(0, 0), (20, 0), (20, 20), (0, 20)],
-        replace(doa, channels={"azimuth": Channel("rad", std=std, wrap=True)}),
+@pytest.fixture
+def table(tmp_path):
+    path = tmp_path / "rows.csv"
+    path.write_text("".join(lines()))
+    return path
+
+
+def last(folder):
+    history = pd.read_csv(folder / "biases.csv")
+    return history[history["time"] == history["time"].max()].drop_duplicates("bias", keep="last").set_index("bias")
+
+
+def test_a_file_is_watched_to_its_end(model, table, tmp_path):
+    out = tmp_path / "out"
+    code, printed, _ = call("watch", model, table, "--out", out, "--keep", "tracks,rows", "--lag", "8")
+    assert code == 0
+    assert "80 rows up to time 39 s" in printed
+    assert (out / "rows.csv").read_text() == table.read_text()
+    assert len(pd.read_csv(out / "tracks.csv")) == 40
+    tree = pc.load(out)
+    assert tree["calibration"]["mean"].sel(bias_label="n1.shift") == pytest.approx(last(out)["mean"]["n1.shift"])
+    assert last(out)["rows"].eq(80).all()
+    code, printed, _ = call("watch", model, table, "--out", out, "--lag", "8")
+    assert code == 0
+    assert "80 rows up to time 39 s" in printed
+    code, _, said = call("watch", model, table, "--out", out, "--lag", "16")
+    assert code == 2
+    assert "is the checkpoint of other settings" in said
+    table.write_text("".join(lines()[:5]))
+    code, _, said = call("watch", model, table, "--out", out, "--lag", "8")
+    assert code == 2
+    assert "is shorter than what was read of it; it is another file: give another --out" in said
+
+
+def test_a_file_that_grows_is_read_on(model, table, tmp_path):
+    whole, pieces, text = tmp_path / "whole", tmp_path / "pieces", lines()
+    assert call("watch", model, table, "--out", whole, "--lag", "0")[0] == 0
+    for count in (7, 33, len(text)):
+        table.write_text("".join(text[:count])[: None if count == len(text) else -3])  # a line may be half there
+        assert call("watch", model, table, "--out", pieces, "--lag", "0")[0] == 0
+    one, other = last(whole), last(pieces)
+    np.testing.assert_allclose(one["sd"], other["sd"], rtol=1e-2)
+
+
+def test_standard_input_is_watched(model, monkeypatch):
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("".join(lines()).encode())))
+    code, printed, _ = call("watch", model, "--lag", "0")
+    assert code == 0
+    assert "n1.shift" in printed
+    assert "80 rows up to time 39 s" in printed
+
+
+def test_rows_that_cannot_be_taken_are_put_aside(model, table, tmp_path):
+    text, out = lines(), tmp_path / "out"
+    bad = [*text[:20], "9,n7,1.0,2.0\n", *text[20:30], "nonsense,n1,1.0,2.0\n", *text[30:], text[-1]]
+    table.write_text("".join(bad))
+    code, printed, _ = call("watch", model, table, "--out", out, "--lag", "0")
+    assert code == 0
+    refused = pd.read_csv(out / "refused.csv")
+    assert refused["line"].tolist() == [21, 32]
+    assert 'sensor "n7" is not in the network' in refused["reason"][0]
+    assert "1 duplicates, 2 left out (see refused.csv)" in printed
+
+
+def test_what_is_wrong_is_said(model, table, tmp_path):
+    wrong = {
+        ("--keep", "x", "--out", tmp_path): 'keep "x" is not known; give tracks, rows or both, separated by a comma',
+        ("--keep", "rows"): "--keep needs --out, the folder of the tables",
+        ("--walk", "n0.shift"): 'walk "n0.shift": write PATTERN=STD, the standard deviation over one second',
+        ("--calibration", tmp_path / "none"): "is not a fit written by probcal",
+    }
+    for options, said in wrong.items():
+        code, _, printed = call("watch", model, table, *options)
+        assert code == 2
+        assert said in printed
+    table.write_text("time,sensor,west\n1,n0,2\n")
+    code, _, printed = call("watch", model, table)
+    assert code == 2
+    assert "west" in printed
+    good = tmp_path / "good.py"
+    good.write_text(MODEL.replace("motion, data)", "motion, " + repr(str(tmp_path / "own.csv")) + ")"))
+    (tmp_path / "own.csv").write_text("".join(lines()))
+    table.write_text("time,sensor,east,north\n")
+    code, _, printed = call("watch", good, table)
+    assert code == 2
+    assert "rows.csv has no rows that could be taken" in printed
+
+
+def started(*arguments):
+    return subprocess.Popen(
+        [sys.executable, "-m", "probcal.cli", "watch", *map(str, arguments)], stdout=subprocess.PIPE, text=True
     )
-    network = Network(
-        [kind.on(Node(f"d{k}", place, scale={"heading": 0.02} if k else None)) for k, place in enumerate(places)]
-    )
-    time = np.arange(60.0)
-    path = np.stack([distance + 20 * time, 0.3 * distance + 5 * time], 1)
-    drawn = simulate(network, ConstantVelocity(0.1), time, key=0, share=1.0, tracks={"target": path})
-    return Problem(network, ConstantVelocity(0.1), drawn.table), path
+
+
+def wait_for(path, least=1):
+    for _ in range(600):
+        if path.exists() and path.stat().st_size >= least:
+            return
+        time.sleep(0.1)
+    raise AssertionError(f"{path} did not come")
 
 
 @pytest.mark.ci
-def test_an_undeclared_start_of_a_small_array_reaches_far():
-    """A target at 1 km, 50 arrays away: the track holds it within 3 sd, as with a start that is declared."""
-    problem, path = far_away(0.0175, 1000.0)
-    track = only(probcal.fit(problem))
-    off = np.abs(track["mean"].values[:, :2] - path) / track["sd"].values[:, :2]
-    assert off.max() < 3.0
-
-
-@pytest.mark.ci
-def test_a_start_that_was_never_declared_and_strains_the_fit_is_named():
-    problem, _ = far_away(1e-5, 60_000.0)
-    assert "was never declared and strains the fit" in probcal.fit(problem).attrs["message"]
-
-
-def channels(white=1.0, autocorrelation=0.0):
-    """Whiteness of two channels as `assess` writes it."""
-    import xarray as xr
-
-    values = {"white": [white, 1.0], "autocorrelation": [autocorrelation, 0.0], "data": [100, 100]}
-    names = {"sensor": ("part", ["a", "b"]), "channel": ("part", ["range", "range"])}
-    return xr.Dataset({name: ("part", value) for name, value in values.items()}, names)
-
-
-def test_a_test_that_rejects_says_which():
-    random = np.random.default_rng(0)
-    value, none = random.normal(size=500), np.zeros(500)
-    assert rejection(Innovations(value, none, none), channels()) == ""
-    assert "mean square is" in rejection(Innovations(1.5 * value, none, none), channels())
-    assert rejection(Innovations(0.5 * value, none, none), channels()) == "", "noise declared too large widens nothing"
-    assert "a.range follow each other (0.40)" in rejection(Innovations(value, none, none), channels(1e-5, 0.4))
-
-
-def test_widening_takes_the_share_that_the_data_gave():
-    tree = committed.tree("ea")
-    tree.attrs.pop("widened", None)
-    tree.attrs["status"] = "converged"
-    before, M = tree["calibration"].to_dataset(), tree["calibration"].sizes["bias_label"]
-    result, findings = widened(tree, np.full(M, 4.0), "their mean square is 4")
-    after = result["calibration"].to_dataset()
-    wide = np.sqrt(1 + 3 * before["gamma"].values)
-    np.testing.assert_allclose(after["sd"], before["sd"] * wide, rtol=1e-12)
-    np.testing.assert_allclose(after["covariance"], before["covariance"] * np.outer(wide, wide), rtol=1e-12)
-    np.testing.assert_allclose(after["upper"] - after["mean"], wide * (before["upper"] - before["mean"]), rtol=1e-9)
-    np.testing.assert_array_equal(after["mean"], before["mean"])
-    spread = [t["posterior"]["bias"].std(("chain", "draw")).values for t in (result, tree)]
-    np.testing.assert_allclose(spread[0], spread[1] * wide, rtol=1e-9)
-    assert "widened by up to" in findings[0].sentence
-    again, nothing = widened(result, np.full(M, 4.0), "their mean square is 4")
-    assert not nothing
-    np.testing.assert_array_equal(again["calibration"]["sd"], after["sd"])
+def test_a_killed_watch_goes_on_and_counts_every_row_once(model, table, tmp_path):
+    out, text = tmp_path / "out", lines()
+    options = (model, table, "--out", out, "--lag", "8", "--every", "0")
+    assert call("watch", model, table, "--out", tmp_path / "whole", "--lag", "8")[0] == 0
+    table.write_text("".join(text[:30]))
+    process = started(*options, "--follow")
+    wait_for(out / "watch.npz")
+    for count in (45, 60):
+        before = (out / "biases.csv").stat().st_size
+        table.write_text("".join(text[:count]))
+        wait_for(out / "biases.csv", before + 1)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process = started(*options, "--follow")
+    table.write_text("".join(text))
+    for _ in range(600):
+        if last(out)["rows"].max() == 80:
+            break
+        time.sleep(0.1)
+    process.send_signal(signal.SIGTERM)
+    printed, _ = process.communicate(timeout=120)
+    assert process.returncode == 0
+    assert "80 rows up to time 39 s" in printed
+    assert "duplicates" not in printed
+    np.testing.assert_allclose(last(out)["mean"], last(tmp_path / "whole")["mean"], atol=0.02)

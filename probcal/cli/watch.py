@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,12 +23,14 @@ from probcal.errors import InputError
 from probcal.files import Outputs, write_whole
 from probcal.inference.checkpoint import pack_state, unpack_state
 from probcal.inference.online import AugmentedFilter, Online, Update
+from probcal.problem import Problem
 from probcal.results.io import load, save
 from probcal.results.schema import ROPE
 from probcal.status import INVALID
 from probcal.table import Table, read_lines
 
 BLOCK = 1 << 18  # bytes that are read at once
+TRIED = 50  # first lines of which a model is made that has no data of its own
 REST = 0.2  # s between two looks at a file that does not grow
 LISTED = 40  # biases of the live table; of more those that are largest in their sds
 EVERY = 60.0  # s between two lines where the output is no terminal
@@ -49,14 +52,20 @@ class Source:
 
     def take(self, file: Any) -> bytes:
         """Whole lines that have come, at most a block of them."""
-        block = file.read1(BLOCK) if hasattr(file, "read1") else file.read(BLOCK)
-        self.ended = not block
+        block = b"" if b"\n" in self.rest else file.read1(BLOCK)
+        self.ended = not block and b"\n" not in self.rest
         whole, cut, self.rest = (self.rest + block).rpartition(b"\n")
         lines = whole + cut
         if not self.header and lines:
             self.header, _, lines = lines.partition(b"\n")
             self.offset += len(self.header) + 1
         return lines
+
+    def peek(self, file: Any) -> bytes:
+        """The first whole lines, header and rows, which stay to be taken; nothing where there is no row yet."""
+        while self.rest.count(b"\n") < 2 and (block := file.read1(BLOCK)):
+            self.rest += block
+        return self.rest.rpartition(b"\n")[0] + b"\n" if self.rest.count(b"\n") > 1 else b""
 
     def last(self) -> bytes:
         """What stands behind the last line end, where no more will come."""
@@ -107,12 +116,12 @@ def run(
         raise InputError(
             f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first"
         )
-    _, problem = load_problem(model, None, fix, given)
+    source = Source("standard input" if data is None else data.name)
+    problem = _declared(model, data, fix, given, source, follow)
     online = Online(
         problem.network, problem.motion, AugmentedFilter(**method), calibration=known, fix=problem.fixed,
         targets=targets,
     )  # fmt: skip
-    source = Source("standard input" if data is None else data.name)
     tables = None if outputs is None else Appended(outputs.folder)
     if outputs is not None:
         assert tables is not None
@@ -297,6 +306,29 @@ def _table(watching: Watching) -> Shown:
         interval = f"{row['lower']:.4g} to {row['upper']:.4g}"
         shown.add_row(str(label), row["unit"], f"{row['mean']:.4g}", interval, f"{row['gamma']:.0%}", row["verdict"])
     return shown
+
+
+def _declared(
+    model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, Any], source: Source, follow: bool
+) -> Problem:
+    """The problem of a model, for its network and motion: of its own data, or, where it has none, of a first line."""
+    try:
+        return load_problem(model, None, fix, given)[1]
+    except InputError as error:
+        why = error
+    first = source if data is None else Source(source.name)
+    with tempfile.TemporaryDirectory() as folder, _input(data, first) as file:
+        while not (head := first.peek(file)) and follow:
+            time.sleep(REST)
+        header, *lines = head.splitlines(keepends=True) or [b""]
+        for line in lines[:TRIED]:
+            rows = Path(folder) / source.name
+            rows.write_bytes(header + line)
+            try:
+                return load_problem(model, rows, fix, given)[1]
+            except InputError as error:
+                why = error
+    raise why
 
 
 @contextmanager
