@@ -159,7 +159,7 @@ def test_a_killed_watch_goes_on_and_counts_every_row_once(model, table, tmp_path
         table.write_text("".join(text[:count]))
         wait_for(out / "biases.csv", before + 1)
         process.send_signal(signal.SIGKILL)
-        process.wait()
+        process.communicate()
         process = started(*options, "--follow")
     table.write_text("".join(text))
     for _ in range(600):
