@@ -369,14 +369,14 @@ def test_intervals_hold_as_often_as_they_say():
 
 
 WRONG = {
-    'by="middle"\\): give one of': lambda: pc.AugmentedFilter("middle"),
+    r'AugmentedFilter\(by="middle"\): give one of': lambda: pc.AugmentedFilter("middle"),
     "give 0 or a number of epochs that 4 divides": lambda: pc.AugmentedFilter(lag=3),
     r"AugmentedFilter\(passes=0": lambda: pc.AugmentedFilter(passes=0),
     "cannot be tested for jumps; drop one of both": lambda: pc.AugmentedFilter(jumps=pc.Jumps(), consider="a"),
     "give a positive std for one second": lambda: pc.AugmentedFilter(walk={"a": 0.0}),
     r"Jumps\(within=-1\): give a positive number": lambda: pc.Jumps(within=-1),
     "give 2 or more, some hundred as a rule": lambda: pc.ParticleFilter(1),
-    r"give a share of the particles, 0 to 1": lambda: pc.ParticleFilter(threshold=2.0),
+    r"ParticleFilter\(threshold=2.0\): give a share of the particles, 0 to 1": lambda: pc.ParticleFilter(threshold=2.0),
     r"give AugmentedFilter\(...\) or ParticleFilter": lambda: pc.Online(network(), MOTION, pc.EA()),
     r"Online\(targets=0": lambda: pc.Online(network(), MOTION, targets=0),
     r"the filter takes Gaussian\(\); sparse priors are laid on": lambda: pc.Online(network(), MOTION, prior=pc.ARD()),

@@ -82,7 +82,7 @@ def put(slots: Slots, target: jax.Array, new: Slots) -> Slots:
     return Slots(*(leaf.at[target].set(own) for leaf, own in zip(slots, new, strict=True)))
 
 
-def carried(own: Slots, move: Move) -> Slots:
+def moved_on(own: Slots, move: Move) -> Slots:
     """A target carried to its next epoch; at its first F is zero and nothing of the target before it is left."""
     F = move.F
     root = linalg.tria(jnp.concatenate([linalg.multiply(F, own.R), move.L], 1))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
 from probcal.model.sigma import cubature, unscented
-from probcal.online.belief import Augmented, KeptDatum, Slots, WhiteRow, carried, not_estimated, one, put, seen, walked
+from probcal.online.belief import Augmented, KeptDatum, Slots, WhiteRow, moved_on, not_estimated, one, put, seen, walked
 from probcal.online.linearising import About, centre, linearised, regressed
 
 RULES = {"extended": None, "unscented": unscented, "cubature": cubature}  # names of the linearisations
@@ -85,7 +85,7 @@ def _epoch(
 ) -> tuple[Augmented, tuple[jax.Array, jax.Array, Slots, KeptDatum]]:
     """An epoch of recursion r."""
     target, rule = epoch.target[r], RULES[form.by]
-    before = carried(one(belief.slots[r], target), epoch.move[r])
+    before = moved_on(one(belief.slots[r], target), epoch.move[r])
     middle = centre(belief, before)
     at = About(jnp.where(points.there, points.x[r], middle.x), jnp.where(points.there, points.z, middle.z))
 
