@@ -431,3 +431,23 @@ def test_a_filter_that_leaves_the_numbers_says_when(monkeypatch):
     lost.cloud = lost.cloud._replace(mean=np.full((20, 6), np.nan))
     with pytest.raises(InputError, match="no particle explains the rows at time 50"):
         lost.update(rows()[:6].assign(time=50.0))
+
+
+@pc.sensor(east=pc.Channel("m", 1.0, noise=pc.StudentT(4.0)), north=pc.Channel("m", 2.0, noise=pc.StudentT(4.0)))
+def robust(target, pose, *, shift=pc.Bias("m", 2.0)):
+    place = target.position - pose.position
+    return {"east": place[0] + shift, "north": place[1]}
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("lag", [0, 16])
+def test_rows_that_lie_far_off_do_not_throw_a_robust_filter_off(lag):
+    network_ = pc.Network([robust.on(pc.Node(f"n{k}", (10.0 * k, 5.0))) for k in range(3)])
+    for seed in range(4):
+        run = pc.simulate(network_, MOTION["a"], np.arange(60.0), key=seed, outliers=0.05, outlier_scale=50.0)
+        online = pc.Online(network_, MOTION["a"], pc.AugmentedFilter(lag=lag))
+        tracks = [online.update(run.table.iloc[k : k + 30]).tracks for k in range(0, len(run.table), 30)]
+        both = pd.concat([*tracks, online.finish().tracks]).merge(run.truth.tracks, on="time", suffixes=("", "_true"))
+        away = np.hypot(both["position_x"] - both["position_x_true"], both["position_y"] - both["position_y_true"])
+        assert len(both) == 60
+        assert away.max() < 8.0

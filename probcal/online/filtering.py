@@ -90,7 +90,7 @@ def _epoch(
     at = About(jnp.where(points.there, points.x[r], middle.x), jnp.where(points.there, points.z, middle.z))
 
     def by_derivatives() -> list[WhiteRow]:
-        return linearised(model, epoch, r, at, given.levels, expected=True)
+        return linearised(model, epoch, r, at, given.levels)
 
     blocks = by_derivatives() if rule is None else jax.lax.cond(
         points.there, by_derivatives, lambda: regressed(model, epoch, r, belief, before, given.levels, rule)

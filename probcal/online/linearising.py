@@ -40,12 +40,18 @@ def here(model: Model, epoch: Epoch, r: int) -> list[tuple[int, Block, Rows]]:
     return found
 
 
-def linearised(model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array, *, expected: bool) -> list[WhiteRow]:
-    """The data of an epoch of recursion r about a point, (P C,) of each block: by derivatives."""
+def linearised(model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array) -> list[WhiteRow]:
+    """The data of an epoch of recursion r about a point, (P C,) of each block: by derivatives.
+
+    A datum has the expected information, or the step weight of its noise family where that is less: one that lies far
+    off says little, and does not make the filter sure of where it is.
+    """
     found = []
     for _, block, data in here(model, epoch, r):
-        lin = waist.linearise(block, data, at.x[None], at.z, levels, expected=expected)
-        found.append(_rows(block, data, lin, at))
+        lin = waist.linearise(block, data, at.x[None], at.z, levels, expected=True)
+        predicted = waist.predict(block, data, at.x[None], at.z)
+        _, step = waist.weigh(block, data, predicted, waist.noise_std(data, levels), expected=False)
+        found.append(_rows(block, data, lin._replace(weight=jnp.minimum(lin.weight, step)), at))
     return found
 
 
@@ -103,6 +109,7 @@ def _regress(block: Block, data: Rows, at: About, covariance: jax.Array, rule: R
     left = jnp.einsum("s,spc->pc", weight, (moved - mean[None]) ** 2) - jnp.sum(slope**2, -1)
     std = jnp.sqrt(waist.noise_std(data, levels) ** 2 + jnp.maximum(left, 0.0))
     score, information = waist.weigh(block, data, reference + mean, std, expected=True)
+    information = jnp.minimum(information, waist.weigh(block, data, reference + mean, std, expected=False)[1])
     by = jnp.einsum("pcu,puv->pcv", slope, vectors.mT / root[:, :, None])
     return Linearised(score, information, by[:, :, : len(used)], by[:, :, len(used) :])
 

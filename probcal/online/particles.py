@@ -73,7 +73,7 @@ def _drawn(
     level = jnp.concatenate([jnp.exp(given.levels), jnp.ones(1)])[move.level]
     mean, L = move.F @ x[r][target] + move.drift, move.L * level[None, :]
     J, pull = jnp.eye(L.shape[1]), jnp.zeros(L.shape[1])
-    for row in linearised(model, epoch, r, About(mean, z), given.levels, expected=True):
+    for row in linearised(model, epoch, r, About(mean, z), given.levels):
         by = row.hx @ L
         wide = 1.0 + jnp.sum((row.hz @ root) ** 2, 1)
         J = J + (by.T / wide[None, :]) @ by
@@ -95,7 +95,7 @@ def _weighed(
     seen = model.vectors(r, mine)
     values, slopes = [], []
     for _, block, data in here(model, epoch, r):
-        lin = waist.linearise_biases(block, data, seen, z, given.levels, expected=True)
+        lin = waist.linearise_biases(block, data, seen, z, given.levels)
         there = (data.mask > 0) & (lin.weight > 0)
         weight = jnp.where(there, lin.weight, 1.0)
         scale = jnp.where(there, jnp.sqrt(weight), 0.0)

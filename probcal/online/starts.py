@@ -35,7 +35,7 @@ def place_new(
         x = resting.at[entries].set(place)
 
         def of(epoch: Epoch) -> tuple[jax.Array, jax.Array]:
-            rows = linearised(model, epoch, r, About(x, belief.mean), given.levels, expected=True)
+            rows = linearised(model, epoch, r, About(x, belief.mean), given.levels)
             parts = []
             for row in rows:
                 wide = jnp.sqrt(1.0 + jnp.sum((row.hz @ belief.root) ** 2, 1))
