@@ -8,7 +8,7 @@ import pytest
 
 import probcal
 
-MODULES = ("probcal", "probcal.plots", "probcal.results")
+MODULES = ("probcal", "probcal.adapters", "probcal.plots", "probcal.results")
 
 
 class Links(html.parser.HTMLParser):

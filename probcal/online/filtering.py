@@ -45,7 +45,7 @@ class EpochStep(NamedTuple):
 
     x: tuple[jax.Array, ...]  # (n,) filtered mean of its target
     sd: tuple[jax.Array, ...]  # (n,)
-    before: tuple[Slots, ...]  # its target carried to this epoch, before its rows
+    after: tuple[Slots, ...]  # its target after the rows of this epoch
     kept: tuple[KeptDatum, ...]  # (D,) of each of its data, one block after another
 
 
@@ -109,7 +109,7 @@ def _epoch(
     mine = one(belief.slots[r], target)
     reach = mine.B @ belief.root
     sd = jnp.sqrt(jnp.sum(mine.R**2, 1) + jnp.sum(reach**2, 1))
-    return belief, (mine.m + mine.B @ belief.mean, sd, before._replace(shift=before.shift[:, :0]), kept)
+    return belief, (mine.m + mine.B @ belief.mean, sd, mine._replace(shift=mine.shift[:, :0]), kept)
 
 
 def _with(belief: Augmented, r: int, target: jax.Array, own: Slots) -> Augmented:

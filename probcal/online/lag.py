@@ -78,10 +78,15 @@ def smooth_window(window: Window, steps: EpochStep, end: Augmented) -> SmoothedS
         T, n, M = slots.B.shape
 
         def back(carry: tuple, inputs: tuple, r: int = r) -> tuple:
-            epoch, before, kept = inputs
+            epoch, after, kept = inputs
             adjoint, weight = carry
             target, mine = epoch.target[r], epoch.recursion == r
-            lam, big = adjoint[target], weight[target]  # (n, 1 + M), (n, n)
+            lam, big = adjoint[target], weight[target]  # (n, 1 + M), (n, n) of the rows that come later
+            P = after.R @ after.R.T
+            line = jnp.concatenate([after.m[:, None], after.B], 1) - P @ lam
+            x = line[:, 0] + line[:, 1:] @ end.mean
+            own = jnp.maximum(jnp.diagonal(P - P @ big @ P), 0.0)
+            sd = jnp.sqrt(own + jnp.sum((line[:, 1:] @ end.root) ** 2, 1))
 
             def row(carry: tuple, own: tuple) -> tuple:
                 lam, big = carry
@@ -93,11 +98,6 @@ def smooth_window(window: Window, steps: EpochStep, end: Augmented) -> SmoothedS
                 return (lam, big), None
 
             (lam, big), _ = jax.lax.scan(row, (lam, big), (kept.hx, kept.gain, kept.c, kept.g), reverse=True)
-            P = before.R @ before.R.T
-            line = jnp.concatenate([before.m[:, None], before.B], 1) - P @ lam
-            x = line[:, 0] + line[:, 1:] @ end.mean
-            own = jnp.maximum(jnp.diagonal(P - P @ big @ P), 0.0)
-            sd = jnp.sqrt(own + jnp.sum((line[:, 1:] @ end.root) ** 2, 1))
             F = epoch.move[r].F
             adjoint = jnp.where(mine, adjoint.at[target].set(F.T @ lam), adjoint)
             weight = jnp.where(mine, weight.at[target].set(F.T @ big @ F), weight)
@@ -106,7 +106,7 @@ def smooth_window(window: Window, steps: EpochStep, end: Augmented) -> SmoothedS
         start = jnp.zeros((T, n, 1 + M)), jnp.zeros((T, n, n))
         x: jax.Array
         sd: jax.Array
-        _, (x, sd) = jax.lax.scan(back, start, (window.epochs, steps.before[r], steps.kept[r]), reverse=True)
+        _, (x, sd) = jax.lax.scan(back, start, (window.epochs, steps.after[r], steps.kept[r]), reverse=True)
         xs.append(x)
         sds.append(sd)
     return SmoothedStates(tuple(xs), tuple(sds))
@@ -175,6 +175,6 @@ def run_plain(
     def one(b: Augmented, inputs: tuple) -> tuple[Augmented, EpochStep]:
         after, left = epoch_step(form, model, given, b, *inputs)
         kept = tuple(own._replace(hx=own.hx[:, :0], gain=own.gain[:, :0], g=own.g[:, :0]) for own in left.kept)
-        return after, left._replace(before=(), kept=kept)
+        return after, left._replace(after=(), kept=kept)
 
     return jax.lax.scan(one, belief, tuple(window))
