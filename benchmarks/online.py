@@ -325,12 +325,13 @@ def _held(z: np.ndarray) -> str:
 def jumps(chosen: argparse.Namespace) -> None:
     """Jumps that are found, when, and false alarms in an hour, for two lags."""
     for lag in chosen.lags:
-        method = AugmentedFilter(lag=lag, jumps=Jumps(chosen.alarms))
+        method = AugmentedFilter(chosen.by, lag, jumps=Jumps(chosen.alarms))
         found = [_jumping(chosen, method, run) for run in range(chosen.runs)]
         right = [own for own in found if own[0] is not None]
         held = [abs(j.size - size) < HALF * j.sd for j, _, size, _ in right]
-        print(f"lag {lag}, {chosen.runs} jumps by two scales, updates of {chosen.step} s:")
-        print(f"  found {len(right) / len(found):.1%}; others said to jump {sum(own[3] for own in found)}")
+        print(f"lag {lag}, {chosen.by}, {chosen.runs} jumps by two scales, updates of {chosen.step:g} s:")
+        before, after = np.sum([own[3:] for own in found], 0)
+        print(f"  found {len(right) / len(found):.1%}; said to jump besides: {before} before it, {after} after it")
         if right:
             late, bound = np.array([[j.found - at, j.bound] for j, at, *_ in right]).T
             began = np.array([j.since - at for j, at, *_ in right])
@@ -351,15 +352,16 @@ def _stream(chosen: argparse.Namespace, method: AugmentedFilter, table: pd.DataF
     return online
 
 
-def _jumping(chosen: argparse.Namespace, method: AugmentedFilter, run: int) -> tuple[Any, float, float, int]:
-    """The jump that was found of the one that is there, or None; when it was, its size, and how many others."""
+def _jumping(chosen: argparse.Namespace, method: AugmentedFilter, run: int) -> tuple[Any, float, float, int, int]:
+    """The jump that was found of the one that is there, or None; when it was, its size, others before and after it."""
     T = chosen.seconds
     stream, at, size = drawn(5, T, ("a", "b"), run), T / 2 - 0.5, 2 * HEADING
     mine = (stream.table["sensor"] == "r2") & (stream.table["time"] > at)
     turned = stream.table["azimuth"] - size * mine
     online = _stream(chosen, method, stream.table.assign(azimuth=(turned + np.pi) % (2 * np.pi) - np.pi))
     right = [j for j in online.jumps if j.label == "r2.heading" and j.found > at]
-    return (right[0] if right else None), at, size, len(online.jumps) - min(len(right), 1)
+    early = sum(j.found < at for j in online.jumps)
+    return (right[0] if right else None), at, size, early, len(online.jumps) - early - min(len(right), 1)
 
 
 def end(chosen: argparse.Namespace) -> None:
@@ -403,6 +405,7 @@ def main() -> None:
     own.add_argument("radars", nargs="*", type=int, default=[5])
     own = verb(jumps, runs=100, seconds=240, step=2.0, alarms=0.1, streams=20, quiet=600)
     own.add_argument("--lags", nargs="*", type=int, default=[0, 32])
+    own.add_argument("--by", default="extended", help="linearisation")
     verb(end)
     chosen = parser.parse_args()
     chosen.run(chosen)

@@ -95,7 +95,7 @@ def _weighed(
     seen = model.vectors(r, mine)
     values, slopes = [], []
     for _, block, data in here(model, epoch, r):
-        lin = waist.linearise_biases(block, data, seen, z, given.levels)
+        lin = waist.linearise_biases(block, data, seen, z, given.levels, expected=True)
         there = (data.mask > 0) & (lin.weight > 0)
         weight = jnp.where(there, lin.weight, 1.0)
         scale = jnp.where(there, jnp.sqrt(weight), 0.0)
