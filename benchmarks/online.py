@@ -258,14 +258,18 @@ def _beside(lag: int, best: dict[Any, float], ends: dict[Any, tuple[np.ndarray, 
 
 
 def delays(N: int, table: pd.DataFrame, lag: int, rows: int) -> str:
-    """Milliseconds of `update` with one row: the first, median and 95 % of the later half."""
-    online, took = Online(ring(N), target(), AugmentedFilter(lag=lag)), []
+    """Milliseconds of `update` with one row: the first, median and 95 % of the later half, and of the processor."""
+    online, took, busy = Online(ring(N), target(), AugmentedFilter(lag=lag)), [], []
     for part in chunks(table.iloc[:rows], 1):
-        begun = time.perf_counter()
+        begun, worked = time.perf_counter(), time.process_time()
         online.update(part)
         took.append(1e3 * (time.perf_counter() - begun))
-    late = took[rows // 2 :]
-    return f"median {np.median(late):.1f} ms, 95 % below {np.quantile(late, 0.95):.1f} ms (the first {took[0]:.0f} ms)"
+        busy.append(1e3 * (time.process_time() - worked))
+    late, alone = took[rows // 2 :], np.median(busy[rows // 2 :])
+    return (
+        f"median {np.median(late):.1f} ms ({alone:.1f} ms of the processor), 95 % below"
+        f" {np.quantile(late, 0.95):.1f} ms, the first {took[0]:.0f} ms"
+    )
 
 
 def walking(run: pc.Simulation, N: int, seed: int) -> tuple[pd.DataFrame, dict[str, float]]:
@@ -328,7 +332,7 @@ def jumps(chosen: argparse.Namespace) -> None:
         method = AugmentedFilter(chosen.by, lag, jumps=Jumps(chosen.alarms))
         found = [_jumping(chosen, method, run) for run in range(chosen.runs)]
         right = [own for own in found if own[0] is not None]
-        held = [abs(j.size - size) < HALF * j.sd for j, _, size, _ in right]
+        held = [abs(j.size - size) < HALF * j.sd for j, _, size, *_ in right]
         print(f"lag {lag}, {chosen.by}, {chosen.runs} jumps by two scales, updates of {chosen.step:g} s:")
         before, after = np.sum([own[3:] for own in found], 0)
         print(f"  found {len(right) / len(found):.1%}; said to jump besides: {before} before it, {after} after it")
