@@ -9,9 +9,11 @@ import time
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib import image
 from terminal import call
 
 import probcal as pc
+from probcal.plots import plot_history
 
 MODEL = """
 from probcal import Bias, Channel, ConstantVelocity, Network, Node, Problem, Target, sensor
@@ -62,6 +64,7 @@ def test_a_file_is_watched_to_its_end(model, table, tmp_path):
     assert code == 0
     assert "80 rows up to time 39 s" in printed
     assert (out / "rows.csv").read_text() == table.read_text()
+    assert image.imread(out / "biases.png").std() > 0.02
     assert len(pd.read_csv(out / "tracks.csv")) == 40
     tree = pc.load(out)
     assert tree["calibration"]["mean"].sel(bias_label="n1.shift") == pytest.approx(last(out)["mean"]["n1.shift"])
@@ -172,3 +175,19 @@ def test_a_killed_watch_goes_on_and_counts_every_row_once(model, table, tmp_path
     assert "80 rows up to time 39 s" in printed
     assert "duplicates" not in printed
     np.testing.assert_allclose(last(out)["mean"], last(tmp_path / "whole")["mean"], atol=0.02)
+
+
+def test_a_history_is_drawn_with_its_jumps():
+    times = np.arange(5.0)
+    row = {"unit": "rad", "sd": 0.1, "lower": 0.0, "upper": 0.2}
+    history = pd.DataFrame([row | {"time": t, "bias": b, "mean": 0.1} for t in times for b in ("a.x", "b.x")])
+    jumps = pd.DataFrame([{"label": "b.x", "since": 2.0, "found": 3.0}])
+    first, second = plot_history(history, jumps=jumps).axes
+    assert len(first.lines) == 2
+    assert [line.get_xdata()[0] for line in second.lines[2:]] == [2.0, 3.0]
+    assert second.lines[1].get_ydata() == pytest.approx(np.rad2deg(np.full(5, 0.1)))
+    assert len(plot_history(history, ["a.x"]).axes) == 1
+    with pytest.raises(pc.InputError, match=r'plot_history: no bias is called "c\.x"'):
+        plot_history(history, ["c.x"])
+    with pytest.raises(pc.InputError, match='plot_history: the history has no column "sd"'):
+        plot_history(history.drop(columns="sd"))

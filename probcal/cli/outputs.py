@@ -14,7 +14,7 @@ STUDY = ("study.nc", "study.csv", "study.png")
 CHECK = ("check.nc", "check.csv", "check.png")
 RECORDINGS = ("fits.csv",)
 COMPARE = ("compare.nc", "compare.csv", "compare.png")
-WATCH = ("watch.npz", "biases.csv", "jumps.csv", "tracks.csv", "refused.csv", "rows.csv", "fit.nc")
+WATCH = ("watch.npz", "biases.csv", "jumps.csv", "tracks.csv", "refused.csv", "rows.csv", "biases.png", "fit.nc")
 CHANGES = ("changes.nc", "changes.csv", "changes.png")
 
 

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table as Shown
 
+from probcal.cli.files import can_plot
 from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem
 from probcal.errors import InputError
@@ -34,6 +35,8 @@ TRIED = 50  # first lines of which a model is made that has no data of its own
 REST = 0.2  # s between two looks at a file that does not grow
 LISTED = 40  # biases of the live table; of more those that are largest in their sds
 EVERY = 60.0  # s between two lines where the output is no terminal
+DRAWN = 1000  # times of a history that is drawn
+PICTURE = "biases.png"
 STATE, HISTORY, JUMPS, TRACKS, REFUSED, ROWS, FIT = (
     "watch.npz", "biases.csv", "jumps.csv", "tracks.csv", "refused.csv", "rows.csv", "fit.nc"
 )  # fmt: skip
@@ -145,6 +148,8 @@ def run(
         raise InputError(f"{source.name} has no rows that could be taken")
     if outputs is not None:
         save(online.tree(), outputs.folder / FIT)
+        if can_plot():
+            _draw(outputs.folder)
         with outputs.writing():
             pass
         print(f"written: {', '.join(str(outputs.folder / name) for name in outputs.there)}")
@@ -306,6 +311,21 @@ def _table(watching: Watching) -> Shown:
         interval = f"{row['lower']:.4g} to {row['upper']:.4g}"
         shown.add_row(str(label), row["unit"], f"{row['mean']:.4g}", interval, f"{row['gamma']:.0%}", row["verdict"])
     return shown
+
+
+def _draw(folder: Path) -> None:
+    """The picture of the history."""
+    from probcal.plots import draw_history  # the plot packages are an extra
+
+    jumps = folder / JUMPS
+    history = pd.read_csv(folder / HISTORY)
+    draw_history(_thinned(history), pd.read_csv(jumps) if jumps.exists() else None, folder / PICTURE)
+
+
+def _thinned(history: pd.DataFrame) -> pd.DataFrame:
+    """A history of at most `DRAWN` times."""
+    times = history["time"].unique()
+    return history[history["time"].isin(times[:: -(-len(times) // DRAWN)])] if len(times) > DRAWN else history
 
 
 def _declared(

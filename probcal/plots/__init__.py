@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         plot_outliers,
         plot_residuals,
     )
+    from probcal.plots.history import draw_history, plot_history
     from probcal.plots.interactive import interactive_map
     from probcal.plots.map import plot_map
     from probcal.plots.objects import plot_objects
@@ -33,6 +34,7 @@ __all__ = lazy(
         "probcal.plots.bounds": "plot_bound_map plot_sensitivity",
         "probcal.plots.compare": "draw_compare plot_gammas plot_methods plot_pair",
         "probcal.plots.fit": "plot_biases plot_drift plot_gamma plot_objective plot_outliers plot_residuals",
+        "probcal.plots.history": "draw_history plot_history",
         "probcal.plots.interactive": "interactive_map",
         "probcal.plots.map": "plot_map",
         "probcal.plots.objects": "plot_objects",
