@@ -294,11 +294,22 @@ def name_as_text(value: Any) -> str:
     return whole if rest and not rest.strip("0") and whole.lstrip("-").isdigit() else text
 
 
+def names_as_text(column: pd.Series) -> np.ndarray:
+    """`name_as_text` of every cell (N,), each kind of cell looked at once."""
+    alike = column.dtype.kind in "iuf" or pd.api.types.infer_dtype(column, skipna=False) == "string"
+    if not alike:
+        return np.array([name_as_text(value) for value in column], dtype=object)
+    codes, kinds = pd.factorize(column, use_na_sentinel=False)
+    return np.array([name_as_text(value) for value in kinds], dtype=object)[codes]
+
+
 def _sensors(table: Table, column: pd.Series, network: Network) -> np.ndarray:
     number = {name_as_text(placed.name): k for k, placed in enumerate(network.sensors)}
-    text = [name_as_text(value) for value in column]
+    text = names_as_text(column)
+    codes, kinds = pd.factorize(text)
+    found = np.array([number.get(name, -1) for name in kinds], int)[codes]
     blank = column.isna().to_numpy()
-    found = np.array([-1 if gone else number.get(name, -1) for name, gone in zip(text, blank, strict=True)], int)
+    found[blank] = -1
     unknown = np.flatnonzero(found < 0)
     if len(unknown):
         row = unknown[0]
@@ -317,7 +328,7 @@ def _targets(
     if column is None:
         text, unnamed = pd.Series(np.where(detecting, OBJECT, "target"), dtype=object), detecting
     else:
-        text = pd.Series([name_as_text(value) for value in column], dtype=object)
+        text = pd.Series(names_as_text(column), dtype=object)
         blank = column.isna().to_numpy() | (text == "").to_numpy()
         wrong = np.flatnonzero(blank & ~detecting)
         if len(wrong):

@@ -55,7 +55,8 @@ class Source:
 
     def take(self, file: Any) -> bytes:
         """Whole lines that have come, at most a block of them."""
-        block = b"" if b"\n" in self.rest else file.read1(BLOCK)
+        at = self.offset + len(self.rest)  # blocks end where they would have in a run that nothing stopped
+        block = b"" if b"\n" in self.rest else file.read1(BLOCK - at % BLOCK)
         self.ended = not block and b"\n" not in self.rest
         whole, cut, self.rest = (self.rest + block).rpartition(b"\n")
         lines = whole + cut

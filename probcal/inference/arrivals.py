@@ -18,7 +18,7 @@ from probcal.motion import Target, as_motion
 from probcal.network import Network
 from probcal.problem import Problem, check_linear
 from probcal.smoothing.grid import candidates
-from probcal.table import Table, header, measure, name_as_text
+from probcal.table import Table, header, measure, names_as_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,7 +45,7 @@ class CarriedTarget:
     recursion: int
     slot: int
     time: float
-    keys: tuple[tuple[str, str], ...] = ()  # (sensor, cells) of the rows at that time
+    keys: tuple[tuple[str, int], ...] = ()  # (sensor, cells) of the rows at that time
 
 
 @dataclass
@@ -85,7 +85,7 @@ class Arrivals:
             if column not in names:
                 raise InputError(f'{table.source} has no column "{column}"; a stream needs time and sensor')
         frame = self._in_seconds(table, names, units)
-        frame["sensor"] = [name_as_text(value) for value in frame["sensor"]]
+        frame["sensor"] = names_as_text(frame["sensor"])
         if "target" in frame:
             blank = frame["target"].isna()
             if blank.any():
@@ -93,22 +93,24 @@ class Arrivals:
                     f'{table.where(int(np.flatnonzero(blank)[0]))} column "target" is blank; an online filter takes'
                     " rows that name their target: track_objects(...) finds those of detections"
                 )
-            frame["target"] = [name_as_text(value) for value in frame["target"]]
+            frame["target"] = names_as_text(frame["target"])
         elif any(placed.detection is not None for placed in self.network.sensors):
             raise InputError(f"{table.source}: an online filter takes rows that name their target, no detections")
         else:
             frame["target"] = ONLY
         data = [c for c in frame.columns if c not in ("time", "sensor", "target")]
         filled = frame[data].notna().to_numpy()
-        frame["cells"] = filled @ (1 << np.arange(len(data)).astype(object)) if len(data) else 0
-        frame["cells"] = frame["cells"].astype(str)
+        power = np.int64(1) << (np.arange(len(data), dtype=np.int64) % 63)
+        frame["cells"] = filled @ power  # which are filled, as a number
         frame["line"] = table.lines
-        last = frame["target"].map(lambda name: self.targets[name].time if name in self.targets else -np.inf)
-        late = frame["time"].to_numpy() < np.maximum(last.to_numpy(), since)
+        codes, kinds = pd.factorize(frame["target"])
+        known = [self.targets[name].time if name in self.targets else -np.inf for name in kinds]
+        last = np.array(known, float)[codes]
+        late = frame["time"].to_numpy() < np.maximum(last, since)
         again = np.zeros(len(frame), bool)
-        for n in np.flatnonzero(frame["time"].to_numpy() == last.to_numpy()):
+        for n in np.flatnonzero(frame["time"].to_numpy() == last):
             row = frame.iloc[n]
-            again[n] = (row["sensor"], row["cells"]) in self.targets[row["target"]].keys
+            again[n] = (row["sensor"], int(row["cells"])) in self.targets[row["target"]].keys
         frame = frame[~late & ~again]
         whole = frame if pending is None or pending.empty else pd.concat([pending, frame], ignore_index=True)
         twice = whole.duplicated(list(KEY)).to_numpy()
@@ -282,13 +284,11 @@ class Arrivals:
 
     def settled(self, batch: Batch, frame: pd.DataFrame, count: int) -> None:
         """The first `count` epochs of a batch were filtered and will not be looked at again."""
-        for k in range(count):
-            own = self.targets[str(batch.target[k])]
-            own.time = float(batch.time[k])
-        last = {str(batch.target[k]): k for k in range(count)}
+        last = {str(name): k for k, name in enumerate(batch.target[:count].tolist())}
         for name, k in last.items():
             rows = frame[batch.row == k]
-            self.targets[name].keys = tuple(zip(rows["sensor"], rows["cells"], strict=True))
+            own = self.targets[name]
+            own.time, own.keys = float(batch.time[k]), tuple(zip(rows["sensor"], rows["cells"].tolist(), strict=True))
 
     def components(self, r: int) -> list[str]:
         """Names of the state components of a recursion."""

@@ -522,7 +522,7 @@ class Online:
                 xs[recursion[k]][k], z[k], there[k] = old[0], old[1], True
         for k in np.flatnonzero(first & ~there).tolist():
             r, name = int(recursion[k]), batch.target[k]
-            mine = np.flatnonzero((batch.target == name) & (np.arange(K) >= k))[:FIRST]
+            mine = np.flatnonzero((batch.target == name) & (np.arange(K) >= k))[: self._looked_at(batch, k)]
             few = padded(jax.tree.map(lambda leaf, mine=mine: leaf[mine], batch.epochs), FIRST)
             span = problem.epochs[r].position
             x = place_new(problem.model, self.given, belief, few, r, span, self.arrivals.tried)
@@ -530,8 +530,15 @@ class Online:
                 xs[r][mine], z[mine], there[mine] = np.asarray(x), np.asarray(belief.mean), True
             elif "position" not in self.arrivals.target(str(name)).start:
                 batch.epochs.move[r].drift[k] = np.asarray(x)  # of a start that is wide: what is linearised first
+            else:
+                xs[r][k], z[k], there[k] = np.asarray(x), np.asarray(belief.mean), True
         found: Any = RowPoints(tuple(xs), z, there)  # type: ignore[arg-type]
         return found
+
+    def _looked_at(self, batch: Batch, k: int) -> int:
+        """Epochs by which a new target is placed: a plain filter takes its first where that has data enough."""
+        data = sum(int((np.asarray(seen.mask[k]) > 0).sum()) for seen in batch.epochs.rows)
+        return 1 if not self.method.lag and data >= self._problem.network.dimension else FIRST
 
     def _keep(self, batch: Batch, points: RowPoints, begun: int) -> None:
         """Points of the epochs that stay in the window."""
