@@ -292,6 +292,20 @@ def test_a_target_without_a_start_is_placed_by_its_first_rows():
         assert lag == 0 or len(tracks) == 12
 
 
+def test_a_plain_filter_says_where_a_target_was_not_placed():
+    network_ = pc.Network(
+        [tape.on(pc.Node(f"n{k}", place, scale=0.5)) for k, place in enumerate(((0, 0), (60, 5), (9, 70)))]
+    )
+    first = pd.DataFrame({"time": [0.0], "sensor": ["n0"], "range": [40.0]})
+    near = pc.Target(pc.ConstantVelocity(0.3), {"position": ((30.0, 20.0), 1.0), "velocity": ((1.0, 0.0), 1.0)})
+    for motion, lag, settled in (
+        (pc.ConstantVelocity(0.3), 0, False),
+        (near, 0, True),
+        (pc.ConstantVelocity(0.3), 8, True),
+    ):
+        assert pc.Online(network_, motion, pc.AugmentedFilter(lag=lag)).update(first).settled is settled
+
+
 def test_a_killed_filter_goes_on_as_if_it_had_not_been():
     frame = rows()
     for method in (pc.AugmentedFilter(lag=8), pc.ParticleFilter(50), pc.AugmentedFilter(lag=0, jumps=pc.Jumps())):

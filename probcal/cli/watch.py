@@ -271,7 +271,8 @@ class Watching:
             parts.append(f"{self.refused:,} left out" + ("" if self.tables is None else f" (see {REFUSED})"))
         if self.online.jumps:
             last = self.online.jumps[-1]
-            parts.append(f"{len(self.online.jumps)} jumps, the last of {last.label} at {last.since:g} s")
+            number = len(self.online.jumps)
+            parts.append(f"{number} jump{'s' * (number > 1)}, the last of {last.label} at {last.since:g} s")
         return ", ".join(parts)
 
     @contextmanager

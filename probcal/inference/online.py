@@ -27,6 +27,7 @@ from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import HALF
 from probcal.results.read import apply
+from probcal.smoothing.grid import NEAR
 from probcal.table import read_table
 from probcal.types import float64
 
@@ -81,7 +82,9 @@ class AugmentedFilter:
 
     `by` "extended", "unscented" or "cubature" says how rows are linearised when they arrive. `lag` epochs stay in a
     window that is linearised again until no point moves by `tolerance` sd, at most `passes` times: over a window that
-    holds the whole recording this ends at the batch answer. 0 is the plain filter. `walk` gives biases, by label or
+    holds the whole recording this ends at the batch answer. 0 is the plain filter, which cannot mend how it began: it
+    wants targets whose start is declared or whose first rows give their place, and says with `Update.settled` where one
+    had neither. `walk` gives biases, by label or
     pattern, the std of a random walk over one second, in their unit; others are constant. Those in `consider` are not
     estimated: their uncertainty counts, their value stays (Schmidt 1966). `jumps` finds biases that jump. Raises
     `InputError` for a setting that is none.
@@ -168,7 +171,7 @@ class Update(NamedTuple):
     tracks: pd.DataFrame  # time, target, each state component and its sd, of those epochs
     jumps: tuple[Jump, ...]
     passes: int  # most times that a window was linearised again
-    settled: bool  # whether all windows came to rest; of particles, whether enough of the first ones are left
+    settled: bool  # all windows came to rest; each new target was placed; enough of the first particles are left
 
 
 class Online:
@@ -370,7 +373,7 @@ class Online:
         for pattern in self.method.consider:
             considered[_chosen(problem.labels, pattern, "consider")] = True
         self.given = FilterGiven(jnp.asarray(levels), jnp.asarray(walk), jnp.asarray(considered))
-        self.form = FilterForm(self.method.by, bool(walk.any()), bool(considered.any()))
+        self.form = FilterForm(self.method.by, bool(walk.any()), bool(considered.any()), not self.method.lag)
 
     def levels(self, problem: Problem) -> np.ndarray:
         """Log factors (H,) of the unknown noise levels: as the calibration has them, else those of their guesses."""
@@ -404,6 +407,7 @@ class Online:
         while begun < K:
             left = K - begun
             count, size, segments = self._window(left)
+            settled &= self._place(batch, points, begun, count)
             window = Window(
                 padded(_part(batch.epochs, begun, begun + count), size),
                 _long(elapsed[begun : begun + count], size),
@@ -511,16 +515,28 @@ class Online:
 
     def _points(self, batch: Batch) -> RowPoints:
         """Where the epochs of a batch were linearised last, and where new targets may be."""
-        problem, belief = self._problem, self.belief
+        problem = self._problem
         K, M = len(batch.time), problem.model.biases
         xs = [np.zeros((K, p.drift.shape[1])) for p in problem.model.recursions]
         z, there = np.zeros((K, M)), np.zeros(K, bool)
-        recursion, first = np.asarray(batch.epochs.recursion), np.asarray(batch.epochs.first)
+        recursion = np.asarray(batch.epochs.recursion)
         for k in range(K) if self.points else ():
             old = self.points.get((float(batch.time[k]), str(batch.target[k])))
             if old is not None:
                 xs[recursion[k]][k], z[k], there[k] = old[0], old[1], True
-        for k in np.flatnonzero(first & ~there).tolist():
+        found: Any = RowPoints(tuple(xs), z, there)  # type: ignore[arg-type]
+        return found
+
+    def _place(self, batch: Batch, points: Any, begun: int, count: int) -> bool:
+        """Points of the targets that begin among `count` epochs, in place, as the biases are known before them.
+
+        Whether a plain filter can begin there: the first rows of each give its place, or a start does.
+        """
+        known = True
+        problem, belief, K = self._problem, self.belief, len(batch.time)
+        xs, z, there = points
+        recursion, first = np.asarray(batch.epochs.recursion), np.asarray(batch.epochs.first)
+        for k in (begun + np.flatnonzero((first & ~there)[begun : begun + count])).tolist():
             r, name = int(recursion[k]), batch.target[k]
             mine = np.flatnonzero((batch.target == name) & (np.arange(K) >= k))[: self._looked_at(batch, k)]
             few = padded(jax.tree.map(lambda leaf, mine=mine: leaf[mine], batch.epochs), FIRST)
@@ -532,8 +548,12 @@ class Online:
                 batch.epochs.move[r].drift[k] = np.asarray(x)  # of a start that is wide: what is linearised first
             else:
                 xs[r][k], z[k], there[k] = np.asarray(x), np.asarray(belief.mean), True
-        found: Any = RowPoints(tuple(xs), z, there)  # type: ignore[arg-type]
-        return found
+            if not self.method.lag and self._looked_at(batch, k) > 1:
+                wide = np.sqrt((batch.epochs.move[r].L[k] ** 2).sum(1))[slice(*span)].max()
+                area = self.arrivals.area
+                assert area is not None
+                known &= bool(wide <= NEAR * area.extent)
+        return known
 
     def _looked_at(self, batch: Batch, k: int) -> int:
         """Epochs by which a new target is placed: a plain filter takes its first where that has data enough."""

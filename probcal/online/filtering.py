@@ -22,6 +22,7 @@ class FilterForm:
     by: str = "extended"
     walks: bool = False  # whether some biases walk
     considers: bool = False  # whether some are not estimated
+    plain: bool = False  # whether points are known of states alone: rows are linearised at the biases of the belief
 
 
 class FilterGiven(NamedTuple):
@@ -73,7 +74,7 @@ def epoch_step(
     return belief, EpochStep(*(tuple(column) for column in zip(*parts, strict=True)))
 
 
-def either(there: jax.Array, function: Any, belief: Augmented) -> tuple[Augmented, Any]:
+def either(there: jax.Array, function: Any, belief: Any) -> tuple[Any, Any]:
     """What a function makes of a belief where it is to be called, else the belief and zeros."""
     shapes = jax.eval_shape(lambda b: function(b)[1], belief)
     nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
@@ -87,7 +88,8 @@ def _epoch(
     target, rule = epoch.target[r], RULES[form.by]
     before = moved_on(one(belief.slots[r], target), epoch.move[r])
     middle = centre(belief, before)
-    at = About(jnp.where(points.there, points.x[r], middle.x), jnp.where(points.there, points.z, middle.z))
+    z = middle.z if form.plain else jnp.where(points.there, points.z, middle.z)
+    at = About(jnp.where(points.there, points.x[r], middle.x), z)
 
     def by_derivatives() -> list[WhiteRow]:
         return linearised(model, epoch, r, at, given.levels)
@@ -95,21 +97,42 @@ def _epoch(
     blocks = by_derivatives() if rule is None else jax.lax.cond(
         points.there, by_derivatives, lambda: regressed(model, epoch, r, belief, before, given.levels, rule)
     )  # fmt: skip
-    belief = _with(belief, r, target, before)
+    rows = jax.tree.map(lambda *parts: jnp.concatenate(parts), *blocks)
+    if form.considers:
+        belief, kept = _considering(given, _with(belief, r, target, before), rows, r, target)
+        mine = one(belief.slots[r], target)
+    else:
 
-    def use(b: Augmented, row: WhiteRow) -> tuple[Augmented, KeptDatum]:
-        after, mine, kept = seen(b, one(b.slots[r], target), row)
-        after = _with(after, r, target, mine)
-        return (not_estimated(after, kept, given.considered) if form.considers else after), kept
+        def use(carry: tuple[Augmented, Slots], row: WhiteRow) -> tuple[tuple[Augmented, Slots], KeptDatum]:
+            after, own, kept = seen(*carry, row)
+            return (after, own), kept
 
-    def each(b: Augmented, row: WhiteRow) -> tuple[Augmented, KeptDatum]:
-        return either(jnp.any(row.hx != 0) | jnp.any(row.hz != 0), lambda old: use(old, row), b)
-
-    belief, kept = jax.lax.scan(each, belief, jax.tree.map(lambda *parts: jnp.concatenate(parts), *blocks))
-    mine = one(belief.slots[r], target)
+        (core, mine), kept = _scanned(use, (belief._replace(slots=()), before), rows)
+        belief = _with(core._replace(slots=belief.slots), r, target, mine)
     reach = mine.B @ belief.root
     sd = jnp.sqrt(jnp.sum(mine.R**2, 1) + jnp.sum(reach**2, 1))
     return belief, (mine.m + mine.B @ belief.mean, sd, mine._replace(shift=mine.shift[:, :0]), kept)
+
+
+def _scanned(use: Any, carry: Any, rows: WhiteRow) -> tuple[Any, KeptDatum]:
+    """What the data of an epoch make of a carry, one after another; those that are missing change nothing."""
+
+    def each(carry: Any, row: WhiteRow) -> tuple[Any, KeptDatum]:
+        return either(jnp.any(row.hx != 0) | jnp.any(row.hz != 0), lambda old: use(old, row), carry)
+
+    return jax.lax.scan(each, carry, rows)
+
+
+def _considering(
+    given: FilterGiven, belief: Augmented, rows: WhiteRow, r: int, target: jax.Array
+) -> tuple[Augmented, KeptDatum]:
+    """The belief after the data of an epoch where some biases are not estimated: it touches every target."""
+
+    def use(b: Augmented, row: WhiteRow) -> tuple[Augmented, KeptDatum]:
+        after, mine, kept = seen(b, one(b.slots[r], target), row)
+        return not_estimated(_with(after, r, target, mine), kept, given.considered), kept
+
+    return _scanned(use, belief, rows)
 
 
 def _with(belief: Augmented, r: int, target: jax.Array, own: Slots) -> Augmented:
