@@ -2,6 +2,7 @@
 
     uv run python benchmarks/large.py --side 25 50 100
     uv run python benchmarks/large.py --side 32 --targets 1 --reach 1e5     (every radar sees every epoch)
+    uv run python benchmarks/large.py --side 3 --targets 1 --epochs 111112 --reach 1e5 --save fit.nc   (few, many rows)
 
 Radars of `models/large_network.py` on a square of so many along each edge, one line each: rows, biases, form, seconds
 of building and of the fit (compiled anew), share of biases that 89 % intervals hold, rms z, the most memory of the
@@ -34,6 +35,7 @@ def main():
     parser.add_argument("--reach", type=float, default=large_network.REACH)
     parser.add_argument("--method", choices=METHODS, default="ea")
     parser.add_argument("--form", default="auto")
+    parser.add_argument("--save", type=Path, help="write the fit, to say how large its file is")
     chosen = parser.parse_args()
     kind, prior = METHODS[chosen.method]
     method, found = kind(form=chosen.form), []
@@ -58,6 +60,8 @@ def main():
             f" {tree.attrs['status']}; 89 % hold {held:.3f}, rms z {z:.2f}; {peak:.1f} GB",
             flush=True,
         )
+        if chosen.save:
+            print(f"{pc.save(tree, chosen.save).stat().st_size / 1e6:.1f} MB of fit.nc", flush=True)
         found.append((rows, took))
     if len(found) > 1:
         (few, short), (many, long) = found[0], found[-1]
