@@ -107,6 +107,16 @@ def test_the_slope_is_that_of_the_height():
 
 
 @pytest.mark.ci
+def test_an_integral_that_is_lost_adds_nothing(monkeypatch):
+    """A number that is not finite leaves Laplace's formula, and no message of LAPACK."""
+    problem = pc.Problem(*tags(3, hears=[1, 2, 3]))
+    monkeypatch.setattr("probcal.smoothing.places._gain", lambda *_: (0.0, np.zeros(1), np.full((1, 1), np.nan)))
+    with jax.enable_x64(True):
+        here = consistent(problem)
+        assert tilt_of(problem.model, here, places_of(problem.model, here)) is None
+
+
+@pytest.mark.ci
 def test_a_linear_problem_gains_nothing():
     """Where the places are Gaussian what is added is zero, and so are its slope and its curvature."""
 

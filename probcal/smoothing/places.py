@@ -64,7 +64,10 @@ def tilt_of(model: Model, point: Point, still: tuple[Still, ...]) -> Tilt | None
     slope = slope + 0.5 * np.asarray(volume)
     curvature = np.zeros((M, M))
     if information is not None:
-        curvature = _bounded(np.asarray(solved.information), information + np.asarray(_schur(model, point, still)))
+        laplace, exact = np.asarray(solved.information), information + np.asarray(_schur(model, point, still))
+        if not (np.isfinite(laplace).all() and np.isfinite(exact).all()):
+            return None
+        curvature = _bounded(laplace, exact)
     if not (bool(sound) and np.isfinite(height) and np.isfinite(slope).all() and np.isfinite(curvature).all()):
         return None
     return Tilt(np.asarray(point.z), np.asarray(height), slope, curvature)
