@@ -60,10 +60,11 @@ def last(folder):
 
 def test_a_file_is_watched_to_its_end(model, table, tmp_path):
     out = tmp_path / "out"
-    code, printed, _ = call("watch", model, table, "--out", out, "--keep", "tracks,rows", "--lag", "8")
+    code, printed, said = call("watch", model, table, "--out", out, "--keep", "tracks,rows", "--lag", "8")
     assert code == 0
     assert "80 rows up to time 39 s" in printed
     assert (out / "rows.csv").read_text() == table.read_text()
+    assert "rows are filtered at their own times" not in said
     assert image.imread(out / "biases.png").std() > 0.02
     assert len(pd.read_csv(out / "tracks.csv")) == 40
     tree = pc.load(out)
@@ -109,6 +110,13 @@ def test_rows_that_cannot_be_taken_are_put_aside(model, table, tmp_path):
     assert refused["line"].tolist() == [21, 32]
     assert 'sensor "n7" is not in the network' in refused["reason"][0]
     assert "1 duplicates, 2 left out (see refused.csv)" in printed
+
+
+def test_common_epochs_are_not_taken_over(model, table):
+    model.write_text(MODEL.replace("motion, data)", "motion, data, epoch=0.5)"))
+    code, _, said = call("watch", model, table, "--lag", "8")
+    assert code == 0
+    assert "rows are filtered at their own times, not at epochs of 0.5 s" in said
 
 
 def test_what_is_wrong_is_said(model, table, tmp_path):
