@@ -26,7 +26,6 @@ else:
     pd = Later("pandas")
 
 ONLY = "target"  # the target of a table that names none
-KEY = ("time", "sensor", "target", "cells")  # what makes two rows one
 
 
 class Batch(NamedTuple):
@@ -113,7 +112,8 @@ class Arrivals:
             again[n] = (row["sensor"], int(row["cells"])) in self.targets[row["target"]].keys
         frame = frame[~late & ~again]
         whole = frame if pending is None or pending.empty else pd.concat([pending, frame], ignore_index=True)
-        twice = whole.duplicated(list(KEY)).to_numpy()
+        key = whole[["time", "cells"]].assign(**{name: pd.factorize(whole[name])[0] for name in ("sensor", "target")})
+        twice = key.duplicated().to_numpy()
         self.counts["rows"] += len(table.frame)
         self.counts["late"] += int(late.sum())
         self.counts["duplicates"] += int(again.sum() + twice.sum())
@@ -185,9 +185,12 @@ class Arrivals:
 
     def _provide(self, frame: pd.DataFrame, data: Any, source: str) -> None:
         """A template with every sensor type and every form of a motion that the rows have."""
-        kinds = np.array([s.type.name for s in self.network.sensors])[data.sensor]
-        groups = np.array([self._group(name) for name in data.target_names])[data.target]
-        pairs = pd.DataFrame({"kind": kinds, "group": groups})[data.measured.any(1)]
+        kinds = np.array([s.type.name for s in self.network.sensors])
+        groups = [self._group(name) for name in data.target_names]
+        measured = np.flatnonzero(data.measured.any(1))
+        _, places = np.unique(data.sensor[measured] * len(groups) + data.target[measured], return_index=True)
+        some = measured[places]  # a row of each sensor with each target
+        pairs = pd.DataFrame({"kind": kinds[data.sensor[some]], "group": [groups[k] for k in data.target[some]]}, some)
         known = set() if self.samples is None else set(zip(self.samples["_kind"], self.samples["_group"], strict=True))
         fresh = pairs[[p not in known for p in zip(pairs["kind"], pairs["group"], strict=True)]].drop_duplicates()
         if fresh.empty:
