@@ -1,7 +1,7 @@
 """Everything that is measured by one command: runs the listed benchmarks one after the other and writes the page.
 
     uv run --with gtsam python benchmarks/page.py
-    uv run --with gtsam python benchmarks/page.py --quick --out /tmp/page.md
+    uv run --with gtsam python benchmarks/page.py --quick --out page.md
 
 Writes the machine, the commit and what each benchmark printed, with its seconds and the most memory that it took,
 between two marker lines of `benchmarks/README.md`; what stands outside them stays. One that fails, or takes too long,

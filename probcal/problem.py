@@ -271,12 +271,7 @@ class Problem:
 
     def target(self, name: str) -> Target:
         """Motion and start of a target by name."""
-        declared = self.motion
-        if isinstance(declared, Mapping):
-            if name not in declared:
-                raise InputError(f'target "{name}" has no motion{nearest(name, declared)}')
-            declared = declared[name]
-        return declared if isinstance(declared, Target) else Target(declared)
+        return declared_target(self.motion, name)
 
     def with_tilt(self, tilt: Tilt) -> Problem:
         """The same problem with a term of the log-likelihood of its biases beside that of the rows."""
@@ -567,6 +562,15 @@ def _tails(drives: list[tuple[Any, int]], epochs: int) -> tuple[Tail, ...]:
         whole[first : first + len(on)] = on
     found: list[Any] = [(*key, on, np.ones(epochs)) for key, on in joined.items()]
     return tuple(Tail(*own) for own in found)
+
+
+def declared_target(motion: Any, name: str) -> Target:
+    """Motion and start of a target, of one motion for all or of a mapping by name; raises `InputError`."""
+    if isinstance(motion, Mapping):
+        if name not in motion:
+            raise InputError(f'target "{name}" has no motion{nearest(name, motion)}')
+        motion = motion[name]
+    return motion if isinstance(motion, Target) else Target(motion)
 
 
 def check_linear(problem: Problem) -> None:

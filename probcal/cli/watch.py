@@ -147,7 +147,7 @@ def run(
             watching.ending = True
     watching.store()
     print(watching.said())
-    if online.arrivals.template is None:
+    if online.end is None:
         raise InputError(f"{source.name} has no rows that could be taken")
     if outputs is not None:
         save(online.tree(), outputs.folder / FIT)
@@ -193,7 +193,7 @@ class Watching:
             self.checkpoint()
         if lines := self.source.last():
             self.filter(lines)
-        if self.online.arrivals.template is not None:
+        if self.online.end is not None:
             self.note(self.online.finish())
         show()
 
@@ -206,7 +206,7 @@ class Watching:
         before = self.refused
         if len(table.frame):
             self._take(table)
-        if self.refused - before == len(table.frame) > 0 and self.online.arrivals.template is None:
+        if self.refused - before == len(table.frame) > 0 and self.online.end is None:
             raise InputError(self._why)
         self.source.taken(lines)
         self.unstored = True
@@ -252,7 +252,7 @@ class Watching:
     def store(self) -> None:
         """History first, then the state that says how long it is."""
         self.stored, self.unstored = time.monotonic(), False
-        if self.tables is None or self.online.arrivals.template is None:
+        if self.tables is None or self.online.end is None:
             return
         biases = self.online.biases.reset_index()
         self.tables.add(HISTORY, biases.assign(time=self.online.time, rows=self.online.counts["rows"])[
@@ -292,7 +292,7 @@ class Watching:
             yield line
             return
         with Live(console=console, refresh_per_second=4, transient=True) as live:
-            yield lambda: live.update(_table(self)) if self.online.arrivals.template is not None else None
+            yield lambda: live.update(_table(self)) if self.online.end is not None else None
 
 
 def judged(online: Online) -> pd.DataFrame:

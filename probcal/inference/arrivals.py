@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError
 from probcal.labels import AXES
 from probcal.lazy import Later
 from probcal.model.epochs import Epoch, merged
 from probcal.model.motions import Area, linear_of, start_of
 from probcal.motion import Target, as_motion
 from probcal.network import Network
-from probcal.problem import Problem, check_linear
+from probcal.problem import Problem, check_linear, declared_target
 from probcal.smoothing.grid import candidates
 from probcal.table import Table, header, measure, names_as_text
 
@@ -216,12 +216,7 @@ class Arrivals:
 
     def target(self, name: str) -> Target:
         """Motion and start of a target as they are declared; raises `InputError` where it has none."""
-        declared = self.motion
-        if isinstance(declared, Mapping):
-            if name not in declared:
-                raise InputError(f'target "{name}" has no motion{nearest(name, declared)}')
-            declared = declared[name]
-        return declared if isinstance(declared, Target) else Target(declared)
+        return declared_target(self.motion, name)
 
     def _group(self, name: str) -> str:
         """What targets have in common whose motion is declared once."""

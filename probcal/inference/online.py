@@ -210,8 +210,11 @@ class Online:
         if not isinstance(self.prior, Gaussian):
             raise InputError(
                 f"Online(prior={type(self.prior).__name__}()): the filter takes Gaussian(); sparse priors are laid on"
-                " what it found, online.integrated(Horseshoe())"
+                " what it found, online.under(Horseshoe())"
             )
+        for what, patterns in (("walk", dict(self.method.walk)), ("consider", self.method.consider)):
+            for pattern in patterns:
+                _chosen(network.labels, pattern, what)
         self.arrivals = Arrivals(network, motion, fix, targets, isinstance(self.method, AugmentedFilter))
         self.calibration = calibration
         self.pending: pd.DataFrame | None = None
