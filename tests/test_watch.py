@@ -197,7 +197,7 @@ def test_a_history_is_drawn_with_its_jumps():
     assert [line.get_xdata()[0] for line in second.lines[2:]] == [2.0, 3.0]
     assert second.lines[1].get_ydata() == pytest.approx(np.rad2deg(np.full(5, 0.1)))
     assert len(plot_history(history, ["a.x"]).axes) == 1
-    (alone,) = plot_history(history[:1]).axes
+    (alone,) = plot_history(pd.concat([history[:1], history[:1]])).axes
     assert alone.lines[1].get_marker() == "o"
     with pytest.raises(pc.InputError, match=r'plot_history: no bias is called "c\.x"'):
         plot_history(history, ["c.x"])

@@ -52,7 +52,7 @@ def plot_history(
         size, unit = (np.rad2deg(1.0), "deg") if own["unit"].iloc[0] == "rad" else (1.0, str(own["unit"].iloc[0]))
         ax.axhline(0.0, color=BEFORE, linewidth=0.8)
         ax.fill_between(time, own["lower"] * size, own["upper"] * size, color=colour(k), alpha=0.25, linewidth=0)
-        alone = len(time) == 1  # of one time no line is seen
+        alone = np.ptp(time) == 0  # of one time no line is seen
         if alone:
             ax.vlines(time, own["lower"] * size, own["upper"] * size, color=colour(k), alpha=0.5, linewidth=3.0)
         ax.plot(time, own["mean"] * size, "o" if alone else "-", color=colour(k), linewidth=1.2)
