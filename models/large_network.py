@@ -46,21 +46,17 @@ def network(side, heard):
 
 
 def drive(edge, epochs, rng):
-    """Places (epochs, 2) of a vehicle that turns back at the edges."""
-    velocity = rng.uniform(5.0, 15.0) * _unit(rng.uniform(0, 2 * np.pi))
-    pushes = DRIVE * np.sqrt(STEP) * rng.standard_normal((epochs, 2))
-    place, path = rng.uniform(0, edge, 2), np.empty((epochs, 2))
+    """Places (epochs, 2) of a vehicle that a spring, weak beside the pushes of its motion, holds in the square."""
+    held = (DRIVE / (edge / 4)) ** (2 / 3) / 2 ** (1 / 3)  # 1/s: damped by half, an sd of a quarter of the edge
+    place = edge / 2 + edge / 4 * rng.standard_normal(2)
+    velocity = DRIVE / np.sqrt(2 * held) * rng.standard_normal(2)
+    pushes, path = DRIVE * np.sqrt(STEP) * rng.standard_normal((epochs, 2)), np.empty((epochs, 2))
     for k in range(epochs):
         path[k] = place
-        before, velocity = velocity, velocity + pushes[k]
+        before = velocity
+        velocity = before + pushes[k] - STEP * held * (held * (place - edge / 2) + before)
         place = place + 0.5 * STEP * (before + velocity)
-        out = (place < 0) | (place > edge)
-        velocity, place = np.where(out, -velocity, velocity), np.clip(place, 0, edge)
     return path
-
-
-def _unit(angle):
-    return np.array([np.cos(angle), np.sin(angle)])
 
 
 class Scenario(NamedTuple):

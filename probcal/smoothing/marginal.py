@@ -35,6 +35,7 @@ ROUNDS, EXACT = 30, 1e-14  # of an adjoint solve at most, and the share of its f
 ENOUGH = 0.1  # share of the promised rise that a step must bring: along what motion noise alone fixes, half a step does
 SMALL = 1e-6  # share of its first square from which on an adjoint solve is good enough
 LEAST_CURVED = 0.05  # share of its curvature so far that a secant must show
+LEAST_DAMPED = 0.25  # part of a damped step that is tried at least: more damping shortens it too
 SHORT = 0.25  # part of a step above which the damping falls again
 TRACK_STEPS = 30  # of Gauss-Newton after every step of the biases
 SETTLED = 1e-10  # nats at which they end: log det W moves with the trajectories to first order
@@ -236,12 +237,12 @@ def _turned(
 
 @jax.jit
 def _shorter(s: _Search, prior: Precision) -> _Search:
-    """The search with half the step, or with more damping where that was tried often enough.
+    """The search with half the step, or with more damping where that was tried often enough, soon where it is damped.
 
     A step that promised less than the rounding of the density, and shows nothing, is the end; one that promised
     `NOTHING` is where no part of it shows anything.
     """
-    spent = s.share <= 0.5**HALVINGS
+    spent = s.share <= jnp.where(s.damping > 0, LEAST_DAMPED, 0.5**HALVINGS)
     found = (s.promised <= jnp.where(spent, NOTHING, ROUNDING * jnp.abs(s.value))) & (s.damping <= 1.0)
     step, damping, grown = _damped(s.solved.information + prior.matrix() + s.bent, s.score, _grown(s.damping))
     step, damping = jnp.where(spent, step, s.step), jnp.where(spent, damping, s.damping)
