@@ -85,8 +85,8 @@ def scenario(key=0, side=50, targets=6, epochs=500, reach=REACH):
         line = path[epoch] - stated[k] - biases[k, :2]
         azimuth = np.arctan2(line[:, 1], line[:, 0]) - biases[k, 2] + NOISE["azimuth"] * rng.standard_normal(len(k))
         measured = {
-            "range": np.hypot(*line.T) + biases[k, 3] + NOISE["range"] * rng.standard_normal(len(k)),
-            "azimuth": np.angle(np.exp(1j * azimuth)),
+            "range": np.round(np.hypot(*line.T) + biases[k, 3] + NOISE["range"] * rng.standard_normal(len(k)), 3),
+            "azimuth": np.round(np.angle(np.exp(1j * azimuth)), 5),
         }
         names = np.char.add("radar_", k.astype(str))
         rows.append(pd.DataFrame({"time": STEP * epoch, "target": f"vehicle_{t}", "sensor": names, **measured}))

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
+import worlds
 
 import probcal as pc
 from probcal.analysis.nees import of_biases
@@ -417,3 +418,30 @@ def test_few_of_many_biases_at_an_epoch_take_the_sparse_form(monkeypatch):
     assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(correlation={"*": 0.1}), 1)
     monkeypatch.setattr("probcal.smoothing.joint.THIN", 1e-6)
     assert not gains_by_sparse(*settings)
+
+
+def test_a_fit_of_many_data_keeps_what_a_mail_holds(monkeypatch, tmp_path):
+    """Above `LARGE` data: the log-likelihood in sum, residuals and tracks to a small part of noise and sd."""
+    problem = worlds.small()
+    small = pc.fit(problem, pc.MAP(), prior=pc.Gaussian())
+    monkeypatch.setattr(sys.modules["probcal.results.build"], "LARGE", 3)
+    large = pc.fit(problem, pc.MAP(), prior=pc.Gaussian())
+    assert "log_likelihood" not in large.children
+    sums = small["log_likelihood"]["y"].sum("datum").values
+    # a log-likelihood by datum is rounded to 1/256 of its spread
+    np.testing.assert_allclose(large["log_likelihood_sum"]["y"].values, sums, atol=0.05)
+    for name in ("before", "after"):
+        whole, coarse = small["residual"][name].values, large["residual"][name].values
+        std = small["residual"]["std"].values
+        assert 0 < np.max(np.abs(whole - coarse) / std) <= 1 / 256
+    for node in small["track"].children:
+        whole, coarse = (tree["track"][node].to_dataset() for tree in (small, large))
+        for name in ("mean", "sd", "before"):
+            assert np.all(np.abs(whole[name] - coarse[name]) <= whole["sd"] / 256)
+    judged = pc.assess(problem, large)
+    assert any("keeps the log-likelihood of all" in text for text in judged["finding"]["sentence"].values)
+    assert "sensitivity" in judged.children
+    again = pc.load(pc.save(large, tmp_path / "fit.nc"))
+    assert again["log_likelihood_sum"].equals(large["log_likelihood_sum"])
+    both = pc.compare({"small": small, "large": large})
+    assert any("too many for a fit to keep it" in text for text in both["finding"]["sentence"].values)

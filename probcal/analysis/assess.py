@@ -106,7 +106,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
         )
         kept = [f for f in findings if f.kind == "wrapping" or (f.kind == "nis" and _absurd(tree))]  # likely causes
         findings = [Finding("status", "fit", text), *kept]
-    scaled = scaling.power_scaling(tree) if leave.tailed(tree) else None
+    scaled = scaling.power_scaling(tree) if leave.weighable(tree) else None
     if scaled is not None:
         groups["sensitivity"] = scaled
     if truth is not None:

@@ -143,6 +143,9 @@ def by_datum(fit: Judged, found: residuals.Innovations, tree: xr.DataTree) -> tu
     if "log_likelihood" in tree.children and not leave.tailed(tree):
         text = f"PSIS-LOO and power scaling are left out: they need {leave.TAILED} draws at least, take more"
         findings.append(Finding("loo", "rows", text))
+    if "log_likelihood_sum" in tree.children:
+        text = f"PSIS-LOO is left out: of {len(data)} data a fit keeps the log-likelihood of all, not of each"
+        findings.append(Finding("loo", "rows", text))
     if leave.tailed(tree):
         group, labels = codes(data, ["row", "sensor", "target", "time"])
         row = leave.psis(tree, group, len(labels))

@@ -122,7 +122,10 @@ def _prediction(methods: dict[str, xr.Dataset]) -> list[Finding]:
     found = list[Finding]()
     known = {name: method.attrs for name, method in methods.items() if "elpd" in method.attrs}
     if missing := [name for name in methods if name not in known]:
-        text = "no elpd, it has no finite log_likelihood of every draw; a row has probability zero at some draw"
+        text = (
+            "no elpd, it has no finite log_likelihood of every datum and draw: a row has probability zero at some draw,"
+            " or the data are too many for a fit to keep it"
+        )
         found.append(Finding("elpd", missing[0], f"{', '.join(missing)}: {text}"))
     for name, at in known.items():
         if at["bad_k"] > BAD:

@@ -25,6 +25,7 @@ from probcal.model import variants
 from probcal.model.model import Model, scaled
 from probcal.model.rows import Linearised, standardised
 from probcal.priors import Precision
+from probcal.results.read import summed_log_likelihood
 from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
 from probcal.smoothing.mode import Eliminated, Point, cost, find_mode, follow
 
@@ -177,11 +178,14 @@ def psis(tree: xr.DataTree, group: np.ndarray, count: int) -> Pointwise:
 
 
 def tailed(tree: xr.DataTree) -> bool:
-    """Whether a tree has a log-likelihood, of draws enough for a Pareto tail, and is no misfit."""
-    if "log_likelihood" not in tree.children or tree.attrs["status"] == "misfit":
-        return False
-    sizes = tree["log_likelihood"].to_dataset().sizes
-    return sizes["chain"] * sizes["draw"] >= TAILED
+    """Whether a tree has a log-likelihood of every datum, of draws enough for a Pareto tail, and is no misfit."""
+    return "log_likelihood" in tree.children and weighable(tree)
+
+
+def weighable(tree: xr.DataTree) -> bool:
+    """Whether a tree has the log-likelihood of draws enough for a Pareto tail, and is no misfit."""
+    summed = summed_log_likelihood(tree)
+    return summed is not None and tree.attrs["status"] != "misfit" and summed.size >= TAILED
 
 
 def good_k(tree: xr.DataTree) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.lazy import Later
+from probcal.results.read import summed_log_likelihood
 
 if TYPE_CHECKING:
     import arviz_stats
@@ -27,12 +28,11 @@ def power_scaling(tree: xr.DataTree) -> xr.Dataset | None:
     biases: with the log-likelihood of thousands of data it may exceed ArviZ's threshold of 0.05, and what stays
     below it tells nothing.
     """
-    if not {"log_prior", "log_likelihood"} <= set(tree.children):
+    summed = summed_log_likelihood(tree)
+    if summed is None or "log_prior" not in tree.children:
         return None
-    kept = {name: tree[name].to_dataset() for name in ("posterior", "log_prior", "log_likelihood")}
-    by_datum = kept["log_likelihood"]["draw"]  # of large data some of the draws only
-    kept |= {name: kept[name][["bias"]].sel(draw=by_datum) for name in ("posterior", "log_prior")}
-    summed = kept["log_likelihood"]["y"].sum("datum")
+    by_datum = summed["draw"]  # of large data some of the draws only
+    kept = {name: tree[name].to_dataset()[["bias"]].sel(draw=by_datum) for name in ("posterior", "log_prior")}
     kept["log_likelihood"] = xr.Dataset({"y": summed.expand_dims(datum=1, axis=-1)})
     shuffled = dict(kept)
     order = np.random.default_rng(0).permutation(summed.size)

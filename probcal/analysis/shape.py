@@ -6,11 +6,11 @@ fall without limit: bearings of an array that is small beside the distance tell 
 """
 
 import jax
-import numpy as np
 import xarray as xr
 
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted
+from probcal.results.read import summed_log_likelihood
 from probcal.smoothing import mode
 
 LINEAR, MOST = 0.5, 0.75  # nats a datum: at most of a linear model, and from which it is a finding
@@ -21,10 +21,10 @@ _log_likelihood = jax.jit(mode.log_likelihood)
 
 def check_shape(fit: Fitted, tree: xr.DataTree) -> Finding | None:
     """A finding where the draws of a Gaussian answer fit the data far worse than its mode."""
-    if tree.attrs["approximate"] not in GAUSSIAN or "log_likelihood" not in tree.children:
+    drawn = summed_log_likelihood(tree)
+    if tree.attrs["approximate"] not in GAUSSIAN or drawn is None:
         return None
-    drawn = tree["log_likelihood"].to_dataset()["y"].values  # (chain, draw, data)
-    fall = (float(_log_likelihood(fit.problem.model, fit.point)) - float(np.median(drawn.sum(2)))) / drawn.shape[2]
+    fall = (float(_log_likelihood(fit.problem.model, fit.point)) - float(drawn.median())) / len(fit.data)
     if not fall > MOST:
         return None
     text = (

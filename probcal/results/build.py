@@ -38,6 +38,7 @@ else:
 
 SHARP = 256  # steps to which the spread of a log-likelihood over the draws is rounded, so that its file is small
 AT_ONCE = 10_000  # data that are rounded at once
+LARGE = 500_000  # data above which a file holds no log-likelihood by datum, and nothing finer than noise or sd tell
 SAMPLE = ("chain", "draw")
 
 
@@ -51,12 +52,14 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
     draws = posterior.draws(key, keep)
     before = posterior.before
     tracks = bands(posterior.tracks(), before)
+    large = sum(int(mask.sum()) for mask in problem.model.measured) > LARGE
+    tracks = [_coarse(own) for own in tracks] if large else tracks
     groups = {
         "posterior": _posterior_group(answer, draws),
         "calibration": _calibration_group(answer),
         **track_groups(problem, tracks, draws.states, _sample(draws) if len(draws.states) else None),
         "constant_data": constant_group(problem, posterior.point),
-        **_data_groups(answer, draws, before),
+        **_data_groups(answer, draws, before, large),
     }
     if answer.trace is not None:
         steps = {} if answer.steps is None else {"bias": (("iteration", "bias_label"), answer.steps * problem.scales)}
@@ -64,6 +67,10 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
         groups["optimisation"] = xr.Dataset({"objective": ("iteration", answer.trace), **steps}, coords=coords)
     if posterior.stats:
         groups["sample_stats"] = xr.Dataset({k: (SAMPLE, v) for k, v in posterior.stats.items()}, coords=_sample(draws))
+    if large and len(draws.log_likelihood):
+        summed = sum(np.asarray(part).sum((2, 3)) for part in draws.log_likelihood)
+        coords = {**_sample(draws), "draw": draws.kept}
+        groups["log_likelihood_sum"] = xr.Dataset({"y": (SAMPLE, summed)}, coords=coords)
     if (log_prior := posterior.log_prior(draws)) is not None:
         coords = {**_sample(draws), "bias_label": list(problem.labels)}
         groups["log_prior"] = xr.Dataset({"bias": ((*SAMPLE, "bias_label"), log_prior)}, coords=coords)
@@ -126,21 +133,29 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
     return xr.Dataset(values, coords=coords)
 
 
-def _data_groups(answer: Answer, draws: Draws, before: Point) -> dict[str, xr.Dataset]:
-    """The data, what is left of them without and with calibration, and what the draws say of each."""
+def _coarse(band: Band) -> Band:
+    """Tracks to a small part of their sd: what is finer says nothing, and does not compress."""
+    return Band(stepped(band.mean, band.sd), stepped(band.sd, band.sd), stepped(band.before, band.sd))
+
+
+def _data_groups(answer: Answer, draws: Draws, before: Point, large: bool) -> dict[str, xr.Dataset]:
+    """The data, what is left of them without and with calibration, and what the draws say of each, unless `large`."""
     problem = answer.problem
     datum, picks = datum_of(problem)
     coords = datum["coords"]
     old, new = residuals(problem.model, before), residuals(problem.model, answer.posterior.point)
     parts = {"before": old.innovation, "after": new.innovation, "std": new.std, "weight": new.reliance}
-    residual = {name: ("datum", gather([np.asarray(part) for part in own], picks)) for name, own in parts.items()}
+    left = {name: gather([np.asarray(part) for part in own], picks) for name, own in parts.items()}
+    if large:
+        left |= {name: stepped(left[name], left["std"]) for name in ("before", "after")}
+    residual = {name: ("datum", values) for name, values in left.items()}
     groups = {
         "observed_data": xr.Dataset({"y": ("datum", datum["y"])}, coords=coords),
         "residual": xr.Dataset(residual, coords=coords),
     }
     kept = {"chain": np.arange(draws.z.shape[0]), "draw": draws.kept, **coords}
     for name, own in (("log_likelihood", draws.log_likelihood), ("posterior_predictive", draws.replicas)):
-        if len(own):
+        if len(own) and not (large and name == "log_likelihood"):
             values = gather(own, picks)
             rounded = _rounded(values) if name == "log_likelihood" else values
             groups[name] = xr.Dataset({"y": ((*SAMPLE, "datum"), rounded)}, coords=kept)
@@ -178,10 +193,15 @@ def _rounded(log_likelihood: np.ndarray) -> np.ndarray:
         part = log_likelihood[:, :, start : start + AT_ONCE]
         with np.errstate(invalid="ignore"):  # a row of probability zero
             spread = part.std((0, 1))
-        sure = np.isfinite(spread) & (spread > 1e-9)
-        step = np.exp2(np.floor(np.log2(spread[sure] / SHARP)))
-        part[:, :, sure] = np.rint(part[:, :, sure] / step) * step
+        log_likelihood[:, :, start : start + AT_ONCE] = stepped(part, spread)
     return log_likelihood
+
+
+def stepped(values: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Values (..., n) rounded to 1/256 of their spread (..., n), a power of two; as they are where it is too small."""
+    sure = np.isfinite(spread) & (spread > 1e-9)
+    step = np.exp2(np.floor(np.log2(np.where(sure, spread, 1.0) / SHARP)))
+    return np.where(sure, np.rint(values / step) * step, values)
 
 
 def build_tracks(problem: Problem, tracks: Sequence[Band]) -> xr.DataTree:

@@ -36,6 +36,16 @@ def summary(tree: xr.DataTree) -> Any:
     return frame.rename(columns={"bias_label": "bias"})[columns]
 
 
+def summed_log_likelihood(tree: xr.DataTree) -> xr.DataArray | None:
+    """Log-likelihood of all data at every draw (chain, draw) that has one; None where the tree holds none.
+
+    Of many data a tree holds the sum alone.
+    """
+    if "log_likelihood" in tree.children:
+        return tree["log_likelihood"].to_dataset()["y"].sum("datum")
+    return tree["log_likelihood_sum"].to_dataset()["y"] if "log_likelihood_sum" in tree.children else None
+
+
 def each_track(tree: xr.DataTree, group: str = "track") -> Iterator[tuple[str, xr.Dataset]]:
     """Name and dataset of every target of a tree, in the order of the problem; none where it has no such group."""
     if group in tree.children:
