@@ -10,6 +10,8 @@ The command line uses C1 at share 0.3 on the layout of run 0. The study of the p
     probcal study models/radars.py --set scenario=C1,C2 --set share=0:1:0.1 --runs 20 --out radars-study
 """
 
+from functools import cache
+
 import jax
 import numpy as np
 import pandas as pd
@@ -40,6 +42,7 @@ def path(scenario="C1"):
     return np.hstack([position, np.gradient(position, axis=0)])
 
 
+@cache
 @float64
 def layout(seed=0):
     """Stated positions of the radars (10, 2) in m."""
@@ -52,6 +55,7 @@ def network(positions):
     return Network([radar.on(Node(f"radar_{n}", place, scale=scale)) for n, place in enumerate(positions)])
 
 
+@cache
 @float64
 def target(scenario="C1", seed=0):
     """The target: constant velocity, q = 1 m s^-3/2, its start known as the papers say."""
@@ -61,17 +65,24 @@ def target(scenario="C1", seed=0):
     return Target(ConstantVelocity(1.0), {"position": (mean[:2], near), "velocity": (mean[2:], slow)})
 
 
+@cache
 @float64
+def draws(seed, scans):
+    """What a run draws whatever its share: which biases there are, their sizes, and the noise of all scans."""
+    _, choose, size, noise = jax.random.split(jax.random.PRNGKey(seed), 4)
+    chosen, sizes = jax.random.uniform(choose, (RADARS, 4)), jax.random.normal(size, (RADARS, 4))
+    return tuple(map(np.asarray, (chosen, sizes, jax.random.normal(noise, (scans, RADARS, 2)))))
+
+
 def recording(positions, seed=0, share=SHARE, scenario="C1"):
     """Table and truth of one run, with the draws of the trial behind its reference figures (seeds 0-7)."""
-    _, choose, size, noise = jax.random.split(jax.random.PRNGKey(seed), 4)
-    present = np.asarray(jax.random.uniform(choose, (RADARS, 4))) < share
-    biases = SIGNS * np.asarray(jax.random.normal(size, (RADARS, 4))) * present * np.array(list(SCALES.values()))
     states = path(scenario)
+    chosen, sizes, noise = draws(seed, len(states))
+    biases = SIGNS * sizes * (chosen < share) * np.array(list(SCALES.values()))
     line = states[:, None, :2] - (positions + biases[:, :2])[None]
     true = np.stack([np.hypot(line[..., 0], line[..., 1]), np.arctan2(line[..., 1], line[..., 0])], -1)
     true += np.stack([biases[:, 2], -biases[:, 3]], -1)
-    measured = true + NOISE * np.asarray(jax.random.normal(noise, true.shape))
+    measured = true + NOISE * noise
     scans, radars = np.meshgrid(np.arange(len(states)), np.arange(RADARS), indexing="ij")
     names = [f"radar_{n}" for n in radars.ravel()]
     table = pd.DataFrame({"time": scans.ravel(), "sensor": names})

@@ -37,6 +37,7 @@ from probcal.smoothing.mode import Eliminated, Mode, Point, cost, eliminate, fin
 RULES = ("mackay", "em")
 MODES = ("joint", "marginal")
 STEPS = 30  # between two updates of precisions or levels
+UNHELD = 15  # of a mode without a prior, after which one that went astray ends
 FEW = 2  # of the marginal mode, each of which costs several joint ones, where precisions are learnt
 MANY = 500  # biases beyond which precisions are integrated by expectation propagation in the place of sweeps
 BETTER, GAIN = 5, 0.1  # most times that a climb begins again from better precisions, and nats that make them so
@@ -60,13 +61,22 @@ def _learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -
 
 
 def _climb(
-    model: Model, start: Point, prior: Precision, steps: int, tolerance: jax.Array, trajectory: str
-) -> tuple[Mode, Eliminated]:
-    """The mode of the joint or of the marginal density, and the system eliminated there."""
+    model: Model, start: Point, prior: Precision, steps: int, tolerance: jax.Array, trajectory: str,
+    known: Eliminated | None = None,
+) -> tuple[Mode, Eliminated]:  # fmt: skip
+    """The mode of the joint or of the marginal density, and the system eliminated there.
+
+    Where that of the start is `known` a joint climb is a single step: each costs one elimination.
+    """
     if trajectory == "marginal":
         return find_marginal_mode(model, start, prior, steps, tolerance)
-    mode = find_mode(model, start, prior, steps, tolerance)
+    mode = find_mode(model, start, prior, steps, tolerance, once=known is not None, known=known)
     return mode, eliminate(model, mode.point, expected=True)
+
+
+@jax.jit
+def _eliminated(model: Model, point: Point) -> Eliminated:
+    return eliminate(model, point, expected=True)
 
 
 def _alone(model: Model, prior: Prior, trajectory: str) -> bool:
@@ -78,9 +88,11 @@ def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, 
     """New precisions and levels, then the mode and the evidence at that mode: all of one state belongs together."""
     model, state = _learnt(model, prior, given, state, rule)
     now = given.prior._replace(alpha=state.alpha)
-    steps = FEW if (prior.learns or model.tailed) and trajectory == "marginal" else STEPS
-    mode, solved = _climb(model, state.point, now, steps, 1e-2 * given.tolerance, trajectory)
-    return _settled(model, prior, given, state, mode, solved)
+    few = (prior.learns or model.tailed) and trajectory == "marginal"
+    steps = FEW if few else STEPS if prior.proper else UNHELD
+    known = state.carry or None
+    mode, solved = _climb(model, state.point, now, steps, 1e-2 * given.tolerance, trajectory, known)
+    return _settled(model, prior, given, state._replace(carry=() if known is None else solved), mode, solved)
 
 
 @partial(jax.jit, static_argnames="prior")
@@ -254,6 +266,15 @@ class EA(Maximiser):
         """Where the marginal mode is all that is climbed to: each iteration is then long."""
         return _alone(model, prior, self.trajectory)
 
+    def begin(self, model: Model, start: Point) -> Any:
+        """The system at the start, where climbs to the joint mode solve what they report: precisions then change with
+        every step.
+
+        With noise that is not Gaussian steps have other weights, and unknown levels change the system in between.
+        """
+        same = model.weighs_as_expected and not (model.level_spread.shape[0] or model.tailed)
+        return _eliminated(model, start) if self.trajectory == "joint" and same else ()
+
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Mode (or smoothed trajectory), evidence, new precisions."""
         if self.trajectory == "smoothed":
@@ -267,8 +288,8 @@ class MAP(Maximiser):
 
     `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood; `trajectory` "marginal" or "joint", as
     in `EA`, places on rings included. `form` as in `EA`. Under `Flat` a climb of which a bias still lies more than ten
-    scales from its stated value after thirty steps has diverged and ends there. Raises `InputError` for another
-    trajectory or form.
+    scales from its stated value after fifteen steps, or thirty, has diverged and ends there. Raises `InputError` for
+    another trajectory or form.
     """
 
     iterations: int = 500

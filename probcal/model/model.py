@@ -17,6 +17,7 @@ from probcal.model import rows as waist
 from probcal.model.epochs import Epoch, Stepwise, merged, most_rows
 from probcal.model.rows import Block, Linearised, Rows
 from probcal.model.sampled import SampledMotion
+from probcal.noise import Normal
 
 BATCH = 512  # rows whose responses to all biases are formed at once
 
@@ -367,6 +368,11 @@ class Model(Stepwise):
     def noises(self) -> tuple[tuple[Any, ...], ...]:
         """Noise family of each channel of each block."""
         return tuple(tuple(channel.noise for channel in block.channels) for block in self.blocks)
+
+    @property
+    def weighs_as_expected(self) -> bool:
+        """Whether step weights are the expected information: all noise of the data is Gaussian."""
+        return all(type(noise) is Normal for own in self.noises for noise in own)
 
     @property
     def linear(self) -> tuple[Recursion | None, ...]:

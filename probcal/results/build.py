@@ -38,6 +38,7 @@ else:
 
 SHARP = 256  # steps to which the spread of a log-likelihood over the draws is rounded, so that its file is small
 AT_ONCE = 10_000  # data that are rounded at once
+COARSE = 64  # the same of residuals by noise and of tracks by their sd, in the file of a large fit
 LARGE = 500_000  # data above which a file holds no log-likelihood by datum, and nothing finer than noise or sd tell
 SAMPLE = ("chain", "draw")
 
@@ -135,7 +136,7 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
 
 def _coarse(band: Band) -> Band:
     """Tracks to a small part of their sd: what is finer says nothing, and does not compress."""
-    return Band(stepped(band.mean, band.sd), stepped(band.sd, band.sd), stepped(band.before, band.sd))
+    return Band(*(stepped(values, band.sd, COARSE) for values in (band.mean, band.sd, band.before)))
 
 
 def _data_groups(answer: Answer, draws: Draws, before: Point, large: bool) -> dict[str, xr.Dataset]:
@@ -147,7 +148,7 @@ def _data_groups(answer: Answer, draws: Draws, before: Point, large: bool) -> di
     parts = {"before": old.innovation, "after": new.innovation, "std": new.std, "weight": new.reliance}
     left = {name: gather([np.asarray(part) for part in own], picks) for name, own in parts.items()}
     if large:
-        left |= {name: stepped(left[name], left["std"]) for name in ("before", "after")}
+        left |= {name: stepped(left[name], left["std"], COARSE) for name in ("before", "after")}
     residual = {name: ("datum", values) for name, values in left.items()}
     groups = {
         "observed_data": xr.Dataset({"y": ("datum", datum["y"])}, coords=coords),
@@ -193,14 +194,14 @@ def _rounded(log_likelihood: np.ndarray) -> np.ndarray:
         part = log_likelihood[:, :, start : start + AT_ONCE]
         with np.errstate(invalid="ignore"):  # a row of probability zero
             spread = part.std((0, 1))
-        log_likelihood[:, :, start : start + AT_ONCE] = stepped(part, spread)
+        log_likelihood[:, :, start : start + AT_ONCE] = stepped(part, spread, SHARP)
     return log_likelihood
 
 
-def stepped(values: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Values (..., n) rounded to 1/256 of their spread (..., n), a power of two; as they are where it is too small."""
+def stepped(values: np.ndarray, spread: np.ndarray, steps: int) -> np.ndarray:
+    """Values (..., n) rounded to a part of their spread (..., n), a power of two; as they are where it is too small."""
     sure = np.isfinite(spread) & (spread > 1e-9)
-    step = np.exp2(np.floor(np.log2(np.where(sure, spread, 1.0) / SHARP)))
+    step = np.exp2(np.floor(np.log2(np.where(sure, spread, 1.0) / steps)))
     return np.where(sure, np.rint(values / step) * step, values)
 
 

@@ -36,9 +36,9 @@ apart = jax.lax.optimization_barrier  # what is wanted several times, which XLA 
 
 def candidates(problem: Problem) -> np.ndarray:
     """Candidate positions, shape (candidates, d): a grid over the network and rings around it."""
-    nodes, d = problem.node_positions, problem.network.dimension
+    nodes, d, extent = problem.node_positions, problem.network.dimension, problem.extent
     low, high = nodes.min(0), nodes.max(0)
-    margin = 0.3 * np.linalg.norm(high - low) + 0.02 * problem.extent
+    margin = 0.3 * np.linalg.norm(high - low) + 0.02 * extent
     axes = [np.linspace(a - margin, b + margin, INNER[d]) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, d)
     k = np.arange(OUTER[d])
@@ -50,7 +50,7 @@ def candidates(problem: Problem) -> np.ndarray:
         angle = np.pi * (3 - np.sqrt(5)) * k
         radius = np.sqrt(1 - height**2)
         directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1)
-    rings = [nodes.mean(0) + factor * problem.extent * directions for factor in RINGS]
+    rings = [nodes.mean(0) + factor * extent * directions for factor in RINGS]
     return np.concatenate([grid, *rings])
 
 

@@ -24,7 +24,7 @@ from probcal.smoothing.mode import (
     cost,
     eliminate,
     factors,
-    find_mode,
+    find_tracks,
     follow,
     log_likelihood,
 )
@@ -271,10 +271,9 @@ def find_marginal_mode(
     Called from Python it goes from step to step by kernels that other parts of a fit use too; inside a compiled
     function it is a loop of that.
     """
-    flat = Precision.single(jnp.zeros_like(start.z))
 
     def look(s: _Search) -> tuple[Point, Eliminated, jax.Array, jax.Array]:
-        point = find_mode(model, _tried(model, s), flat, TRACK_STEPS, SETTLED, joint=False).point
+        point = find_tracks(model, _tried(model, s), TRACK_STEPS, SETTLED)
         _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
         return point, solved, *_valued(model, s, point, prior, solved)
 

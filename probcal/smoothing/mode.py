@@ -19,6 +19,7 @@ from probcal.smoothing import recursion as rec
 from probcal.smoothing.room import check_room
 from probcal.smoothing.solves import Dense
 
+CHORD = 0.1  # share of the last gain up to which what was eliminated serves on
 HALVINGS = 12  # step lengths tried before the damping grows
 DAMPING = 1e10  # damping at which the iteration gives up
 ROUNDING = 1e-12  # of the cost: what a step that promises less cannot show
@@ -184,9 +185,10 @@ def eliminate_compressed(
     return Eliminated(information, score, compressed.score, logdet, tuple(kept))
 
 
-def _proposal(model: Model, point: Point, prior: Precision, damping: jax.Array, joint: bool) -> tuple[Point, jax.Array]:
-    """Full Gauss-Newton step from a point, and the decrease of the cost that it promises."""
-    solved = eliminate(model, point, expected=False, joint=joint)
+def _proposal(
+    model: Model, point: Point, prior: Precision, damping: jax.Array, joint: bool, solved: Eliminated
+) -> tuple[Point, jax.Array]:
+    """Full Gauss-Newton step from a point eliminated there, and the decrease of the cost that it promises."""
     dz = jnp.zeros_like(point.z)
     if joint and model.biases:  # an arrowhead: the tip first, then the trajectories follow
         matrix = solved.information + prior.matrix() + damping * jnp.eye(model.biases)
@@ -221,6 +223,23 @@ def between(a: Point, b: Point, t: jax.Array) -> Point:
     return jax.tree.map(lambda p, q: p + t * (q - p), a, b)
 
 
+def _shortened(
+    model: Model, point: Point, proposal: Point, prior: Precision, bound: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The part of a step whose cost does not exceed a bound, halved until then; that cost, and how many were tried."""
+
+    def shorter(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        t, _, tries = state
+        t = jnp.where(tries == 0, 1.0, 0.5 * t)
+        return t, cost(model, between(point, proposal, t), prior), tries + 1
+
+    def worse(state: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        _, value, tries = state
+        return (tries == 0) | (~(value <= bound) & (tries < HALVINGS))
+
+    return jax.lax.while_loop(worse, shorter, (jnp.ones(()), bound, jnp.zeros((), int)))
+
+
 class _Search(NamedTuple):
     point: Point
     cost: jax.Array
@@ -244,30 +263,27 @@ class Mode(NamedTuple):
     volume: jax.Array  # 1/2 log det W of a marginal mode, which its cost counts; 0 of a joint one
 
 
-@partial(jax.jit, static_argnames="joint")
+@partial(jax.jit, static_argnames=("joint", "once"))
 def find_mode(
-    model: Model, start: Point, prior: Precision, iterations: int, tolerance: float, *, joint: bool = True
-) -> Mode:
+    model: Model, start: Point, prior: Precision, iterations: int, tolerance: float, *, joint: bool = True,
+    once: bool = False, known: Eliminated | None = None,
+) -> Mode:  # fmt: skip
     """Damped Gauss-Newton (iterated EKS, with the biases if `joint`) until the cost changes by less than `tolerance`.
 
     The start must be a consistent trajectory (states made of its whitened noises). A step that does not
     lower the cost, or reaches a non-finite one, is halved, then damped. It has converged too where no step lowers
-    the cost and the first promised less than `tolerance`, or than the rounding of the cost.
+    the cost and the first promised less than `tolerance`, or than the rounding of the cost. `once` ends with the
+    first step that lowers it; `known` is the system eliminated at the start with step weights, for who has it.
     """
 
+    def at(point: Point) -> Eliminated:
+        return eliminate(model, point, expected=False, joint=joint)
+
     def body(s: _Search) -> _Search:
-        proposal, promised = _proposal(model, s.point, prior, s.damping, joint)
+        solved = at(s.point) if known is None else jax.lax.cond(s.iteration == 0, lambda _: known, at, s.point)
+        proposal, promised = _proposal(model, s.point, prior, s.damping, joint, solved)
 
-        def shorter(state):
-            t, _, tries = state
-            t = jnp.where(tries == 0, 1.0, 0.5 * t)
-            return t, cost(model, between(s.point, proposal, t), prior), tries + 1
-
-        def worse(state):
-            _, value, tries = state
-            return (tries == 0) | (~(value <= s.cost) & (tries < HALVINGS))
-
-        t, value, tries = jax.lax.while_loop(worse, shorter, (jnp.ones(()), s.cost, 0))
+        t, value, tries = _shortened(model, s.point, proposal, prior, s.cost)
         better = value <= s.cost
         point = jax.tree.map(lambda new, old: jnp.where(better, new, old), between(s.point, proposal, t), s.point)
         damping = jnp.where(better & (tries <= 2), s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
@@ -289,13 +305,55 @@ def find_mode(
         jnp.zeros((), int),
         jnp.zeros((), bool),
     )
-    last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations), body, first)
+    last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations) & ~(once & s.moved), body, first)
     converged = last.done & ((last.change < tolerance) | last.still)
     gained = first.cost - last.cost
     return Mode(last.point, last.cost, last.iteration, converged, ~last.moved & ~converged, gained, jnp.zeros(()))
 
 
+class _Tracking(NamedTuple):
+    point: Point
+    cost: jax.Array
+    solved: Eliminated  # of some point on the way
+    renew: jax.Array  # eliminate anew at the next step
+    change: jax.Array
+    iteration: jax.Array
+    done: jax.Array
+
+
+@jax.jit
+def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -> Point:
+    """Trajectories at held biases until the cost changes by less than `tolerance`: iterated EKS by chords.
+
+    What was eliminated serves the next steps too while each gains a tenth of the one before or less (Kelley 1995, 5.4):
+    they need the score alone. A step that does not lower the cost is halved; where no part of it does, it ends.
+    """
+    flat = Precision.single(jnp.zeros_like(start.z))
+    still = jnp.zeros_like(start.z)
+    score = jax.grad(lambda states, at: log_likelihood(model, at._replace(states=states)))
+
+    def at(point: Point) -> Eliminated:
+        return eliminate(model, point, expected=False, joint=False)
+
+    def body(s: _Tracking) -> _Tracking:
+        solved = jax.lax.cond(s.renew, at, lambda _: s.solved, s.point)
+        pulls = score(s.point.states, s.point)
+        here = solved._replace(parts=tuple(k._replace(pull=p) for k, p in zip(solved.parts, pulls, strict=True)))
+        proposal = follow(model, s.point, here, still, free=True)
+        t, value, _ = _shortened(model, s.point, proposal, flat, s.cost)
+        better = value <= s.cost
+        point = jax.tree.map(lambda new, old: jnp.where(better, new, old), between(s.point, proposal, t), s.point)
+        change = jnp.where(better, s.cost - value, s.change)
+        renew = ~better | (change > CHORD * s.change)
+        done = (better & (change < tolerance)) | (~better & s.renew)
+        return _Tracking(point, jnp.where(better, value, s.cost), solved, renew, change, s.iteration + 1, done)
+
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(at, start))
+    yes, no = jnp.ones((), bool), jnp.zeros((), bool)
+    first = _Tracking(start, cost(model, start, flat), blank, yes, jnp.full((), jnp.inf), jnp.zeros((), int), no)
+    return jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations), body, first).point
+
+
 def smooth_tracks(model: Model, point: Point, iterations: int = 20) -> Point:
     """Trajectories at the point's biases: iterated EKS."""
-    flat = Precision.single(jnp.zeros_like(point.z))
-    return find_mode(model, point, flat, iterations, 1e-6, joint=False).point
+    return find_tracks(model, point, iterations, 1e-6)
