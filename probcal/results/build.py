@@ -70,8 +70,8 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
         groups["sample_stats"] = xr.Dataset({k: (SAMPLE, v) for k, v in posterior.stats.items()}, coords=_sample(draws))
     if large and len(draws.log_likelihood):
         summed = sum(np.asarray(part).sum((2, 3)) for part in draws.log_likelihood)
-        coords = {**_sample(draws), "draw": draws.kept}
-        groups["log_likelihood_sum"] = xr.Dataset({"y": (SAMPLE, summed)}, coords=coords)
+        where = {"chain": np.arange(draws.z.shape[0]), "draw": draws.kept}
+        groups["log_likelihood_sum"] = xr.Dataset({"y": (SAMPLE, summed)}, coords=where)
     if (log_prior := posterior.log_prior(draws)) is not None:
         coords = {**_sample(draws), "bias_label": list(problem.labels)}
         groups["log_prior"] = xr.Dataset({"bias": ((*SAMPLE, "bias_label"), log_prior)}, coords=coords)
