@@ -185,6 +185,26 @@ def test_rows_of_one_time_may_come_one_by_one():
     np.testing.assert_allclose(together.biases["sd"], alone.biases["sd"], rtol=1e-9)
 
 
+@pytest.mark.parametrize(("lag", "chunk"), [(0, 1), (0, 7), (8, 3)])
+def test_rows_at_common_epochs_are_those_of_their_times(lag, chunk):
+    frame = rows()
+    jitter = np.random.default_rng(0).uniform(-0.4, 0.4, len(frame))
+    moved = frame.assign(time=frame["time"] + jitter)
+    moved = moved.iloc[np.argsort(frame["time"] + 1e-3 * jitter, kind="stable")]  # in an epoch by their own times
+    method = pc.AugmentedFilter(lag=lag)
+    online = pc.Online(network(), MOTION, method, epoch=1.0)
+    for k in range(0, len(moved), chunk):
+        online.update(moved.iloc[k : k + chunk])
+    online.finish()
+    assert online.counts["late"] == online.counts["duplicates"] == 0
+    plain = filtered(method)
+    plain.finish()
+    np.testing.assert_allclose(online.biases["mean"], plain.biases["mean"], atol=1e-9)
+    np.testing.assert_allclose(online.biases["sd"], plain.biases["sd"], rtol=1e-9)
+    online.update(moved.iloc[-1:])
+    assert online.counts["duplicates"] == 1
+
+
 def test_dates_are_seconds_since_the_first():
     frame = rows()
     dated = frame.assign(time=pd.Timestamp("2026-01-01T00:00Z") + pd.to_timedelta(frame["time"], unit="s"))
@@ -392,6 +412,7 @@ WRONG = {
     "give 2 or more, some hundred as a rule": lambda: pc.ParticleFilter(1),
     r"ParticleFilter\(threshold=2.0\): give a share of the particles, 0 to 1": lambda: pc.ParticleFilter(threshold=2.0),
     r"give AugmentedFilter\(...\) or ParticleFilter": lambda: pc.Online(network(), MOTION, pc.EA()),
+    r"Online\(epoch=-1": lambda: pc.Online(network(), MOTION, epoch=-1.0),
     r"Online\(targets=0": lambda: pc.Online(network(), MOTION, targets=0),
     r"the filter takes Gaussian\(\); sparse priors are laid on": lambda: pc.Online(network(), MOTION, prior=pc.ARD()),
     "nothing is known before the first rows": lambda: pc.Online(network(), MOTION).biases,

@@ -112,11 +112,11 @@ def test_rows_that_cannot_be_taken_are_put_aside(model, table, tmp_path):
     assert "1 duplicates, 2 left out (see refused.csv)" in printed
 
 
-def test_common_epochs_are_not_taken_over(model, table):
-    model.write_text(MODEL.replace("motion, data)", "motion, data, epoch=0.5)"))
-    code, _, said = call("watch", model, table, "--lag", "8")
+def test_rows_are_filtered_at_common_epochs(model, table):
+    model.write_text(MODEL.replace("motion, data)", "motion, data, epoch=2.0)"))
+    code, printed, _ = call("watch", model, table, "--lag", "8")
     assert code == 0
-    assert "rows are filtered at their own times, not at epochs of 0.5 s" in said
+    assert "80 rows up to time 40 s" in printed
 
 
 def test_what_is_wrong_is_said(model, table, tmp_path):

@@ -122,11 +122,9 @@ def run(
         )
     source = Source("standard input" if data is None else data.name)
     problem = _declared(model, data, fix, given, source, follow)
-    if problem.epoch is not None:
-        print(f"rows are filtered at their own times, not at epochs of {problem.epoch:g} s", file=sys.stderr)
     online = Online(
         problem.network, problem.motion, AugmentedFilter(**method), calibration=known, fix=problem.fixed,
-        targets=targets,
+        epoch=problem.epoch, targets=targets,
     )  # fmt: skip
     tables = None if outputs is None else Appended(outputs.folder)
     if outputs is not None:

@@ -44,7 +44,7 @@ class CarriedTarget:
     recursion: int
     slot: int
     time: float
-    keys: tuple[tuple[str, int], ...] = ()  # (sensor, cells) of the rows at that time
+    keys: tuple[tuple[str, int, float], ...] = ()  # sensor, cells and own time of the rows at that time
 
 
 @dataclass
@@ -52,9 +52,9 @@ class Arrivals:
     """What turns rows into epochs.
 
     A row that is earlier than the time up to which its target was filtered is late (where biases move, than that of any
-    target), one that repeats time, sensor,
-    target and channels of another is a duplicate; both are left out and counted. Rows of one call, and those that are
-    still in the window, are brought into order. A new target takes a free slot, or that of the target that has been
+    target), one that repeats time, sensor, target and channels of another is a duplicate; both are left out and
+    counted. With an `epoch` (s) rows count as of the nearest multiple of it. Rows of one call, and those that are still
+    in the window, are brought into order. A new target takes a free slot, or that of the target that has been
     silent for longest.
     """
 
@@ -63,6 +63,7 @@ class Arrivals:
     fixed: Mapping[str, float]
     most: int  # targets that are carried at once
     linear: bool = True  # whether every motion must have a linear form
+    epoch: float | None = None  # s, length of common epochs; without it rows keep their times
     counts: Counter[str] = field(default_factory=Counter)
     targets: dict[str, CarriedTarget] = field(default_factory=dict)
     origin: str = ""  # the date of time 0, where times are dates
@@ -105,11 +106,13 @@ class Arrivals:
         codes, kinds = pd.factorize(frame["target"])
         known = [self.targets[name].time if name in self.targets else -np.inf for name in kinds]
         last = np.array(known, float)[codes]
-        late = frame["time"].to_numpy() < np.maximum(last, since)
+        own = frame["time"].to_numpy(float)
+        time = own if self.epoch is None else np.round(own / self.epoch) * self.epoch
+        late = time < np.maximum(last, since)
         again = np.zeros(len(frame), bool)
-        for n in np.flatnonzero(frame["time"].to_numpy() == last):
+        for n in np.flatnonzero(time == last):
             row = frame.iloc[n]
-            again[n] = (row["sensor"], int(row["cells"])) in self.targets[row["target"]].keys
+            again[n] = (row["sensor"], int(row["cells"]), float(row["time"])) in self.targets[row["target"]].keys
         frame = frame[~late & ~again]
         whole = frame if pending is None or pending.empty else pd.concat([pending, frame], ignore_index=True)
         key = whole[["time", "cells"]].assign(**{name: pd.factorize(whole[name])[0] for name in ("sensor", "target")})
@@ -197,8 +200,11 @@ class Arrivals:
             return
         if self.template is None:
             self._freeze(
-                Problem(self.network, self.motion, Table(frame, source, np.arange(len(frame))), fix=self.fixed)
-            )
+                Problem(
+                    self.network, self.motion, Table(frame, source, np.arange(len(frame))), fix=self.fixed,
+                    epoch=self.epoch,
+                )
+            )  # fmt: skip
         for name in data.target_names:
             self._start(name)
         rows = frame.loc[fresh.index].assign(_kind=fresh["kind"], _group=fresh["group"])
@@ -209,7 +215,7 @@ class Arrivals:
         """The template from its samples: one row of each sensor type that sees each form of a motion."""
         assert self.samples is not None
         kept = self.samples.drop(columns=["_kind", "_group"])
-        template = Problem(self.network, self.motions(kept["target"]), kept, fix=self.fixed)
+        template = Problem(self.network, self.motions(kept["target"]), kept, fix=self.fixed, epoch=self.epoch)
         if self.linear:
             check_linear(template)
         self.template, self.sizes = template, ()
@@ -286,7 +292,9 @@ class Arrivals:
         for name, k in last.items():
             rows = frame[batch.row == k]
             own = self.targets[name]
-            own.time, own.keys = float(batch.time[k]), tuple(zip(rows["sensor"], rows["cells"].tolist(), strict=True))
+            keys = zip(rows["sensor"], rows["cells"].tolist(), rows["time"].tolist(), strict=True)
+            same = own.keys if own.time == batch.time[k] else ()
+            own.time, own.keys = float(batch.time[k]), (*same, *keys)
 
     def components(self, r: int) -> list[str]:
         """Names of the state components of a recursion."""

@@ -84,7 +84,7 @@ def unpack_state(online: Online, content: bytes, source: str) -> dict[str, Any]:
     arrivals = online.arrivals
     arrivals.counts, arrivals.origin = Counter(said["counts"]), said["origin"]
     arrivals.targets = {
-        n: CarriedTarget(r, slot, time, tuple((a, b) for a, b in keys))
+        n: CarriedTarget(r, slot, time, tuple((a, b, c) for a, b, c in keys))
         for n, (r, slot, time, keys) in said["targets"].items()
     }
     arrivals.starts = {

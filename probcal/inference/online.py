@@ -179,7 +179,8 @@ class Online:
 
     `motion` is one motion for all targets, or a mapping by name, as in `Problem`; a target of which no start is
     declared starts where the first rows let it. The prior of the biases is Gaussian, of the declared scales, or
-    `calibration`, a tree of an earlier fit. `targets` are carried at once; of a new one beyond them that which has
+    `calibration`, a tree of an earlier fit. `epoch` puts rows at common epochs of that length in s, as in `Problem`.
+    `targets` are carried at once; of a new one beyond them that which has
     been silent for longest is given up. Unknown noise levels are held at their guess, or at what `calibration` has.
     Raises `InputError` for what cannot be calibrated online.
 
@@ -199,6 +200,7 @@ class Online:
         prior: Prior | None = None,
         calibration: xr.DataTree | None = None,
         fix: Any = (),
+        epoch: float | None = None,
         targets: int = 16,
     ):
         self.method = AugmentedFilter() if method is None else method
@@ -215,7 +217,9 @@ class Online:
         for what, patterns in (("walk", dict(self.method.walk)), ("consider", self.method.consider)):
             for pattern in patterns:
                 _chosen(network.labels, pattern, what)
-        self.arrivals = Arrivals(network, motion, fix, targets, isinstance(self.method, AugmentedFilter))
+        if epoch is not None and not (np.isfinite(epoch) and epoch > 0):
+            raise InputError(f"Online(epoch={epoch!r}): give the length of common epochs in s, or leave it out")
+        self.arrivals = Arrivals(network, motion, fix, targets, isinstance(self.method, AugmentedFilter), epoch)
         self.calibration = calibration
         self.pending: pd.DataFrame | None = None
         self.cloud: Cloud | None = None
