@@ -92,6 +92,28 @@ def test_a_file_that_grows_is_read_on(model, table, tmp_path):
     np.testing.assert_allclose(one["sd"], other["sd"], rtol=1e-2)
 
 
+def test_a_scan_in_two_blocks_is_one_state_of_its_target(model, table, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    monkeypatch.setattr(sys.modules["probcal.cli.watch"], "BLOCK", 53)
+    assert call("watch", model, table, "--out", out, "--keep", "tracks", "--lag", "0")[0] == 0
+    tracks = pd.read_csv(out / "tracks.csv")
+    assert tracks["time"].tolist() == list(range(40))
+    monkeypatch.undo()
+    assert call("watch", model, table, "--out", tmp_path / "whole", "--keep", "tracks", "--lag", "0")[0] == 0
+    whole = pd.read_csv(tmp_path / "whole" / "tracks.csv")
+    np.testing.assert_allclose(tracks["position_x"], whole["position_x"], atol=1e-9)
+
+
+def test_lines_are_counted_on_after_a_restart(model, table, tmp_path):
+    text, out = lines(), tmp_path / "out"
+    table.write_text("".join(text[:21]))
+    assert call("watch", model, table, "--out", out, "--lag", "0")[0] == 0
+    table.write_text("".join([*text[:31], "15,n7,1.0,2.0\n", *text[31:]]))
+    assert call("watch", model, table, "--out", out, "--lag", "0")[0] == 0
+    assert pd.read_csv(out / "refused.csv")["line"].tolist() == [32]
+    assert last(out)["rows"].eq(80).all()
+
+
 def test_standard_input_is_watched(model, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("".join(lines()).encode())))
     code, printed, _ = call("watch", model, "--lag", "0")

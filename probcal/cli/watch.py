@@ -126,18 +126,18 @@ def run(
         problem.network, problem.motion, AugmentedFilter(**method), calibration=known, fix=problem.fixed,
         epoch=problem.epoch, targets=targets,
     )  # fmt: skip
-    tables = None if outputs is None else Appended(outputs.folder)
+    tables, held = None if outputs is None else Appended(outputs.folder), pd.DataFrame()
     if outputs is not None:
         assert tables is not None
         state = outputs.folder / STATE
         if state.exists():
             beside = unpack_state(online, state.read_bytes(), str(state))
-            tables.length = beside["length"]
+            tables.length, held = beside["length"], pd.DataFrame(beside["held"])
             if data is not None:
                 source.offset, source.line, source.header = beside["offset"], beside["line"], beside["header"].encode()
         outputs.begin()
         tables.open()
-    watching = Watching(online, source, tables, every, kept)
+    watching = Watching(online, source, tables, every, kept, held)
     with _input(data, source) as file, _told_to_end(), watching.shown() as show:
         try:
             watching.follow(file, follow and data is not None, show)
@@ -169,6 +169,7 @@ class Watching:
     tables: Appended | None
     every: float  # s between two states
     kept: Sequence[str]  # "tracks", "rows"
+    held: pd.DataFrame  # tracks at the last time, of which more rows may come
     refused: int = 0
     used: int = 0
     stored: float = field(default_factory=time.monotonic)
@@ -193,6 +194,9 @@ class Watching:
             self.filter(lines)
         if self.online.end is not None:
             self.note(self.online.finish())
+        if self.tables is not None:
+            self.tables.add(TRACKS, self.held)
+            self.held = self.held.iloc[:0]
         show()
 
     def filter(self, lines: bytes) -> None:
@@ -236,8 +240,12 @@ class Watching:
         self.used = self.online.counts["rows"]
         if self.tables is None:
             return
-        if "tracks" in self.kept:
-            self.tables.add(TRACKS, update.tracks)
+        if "tracks" in self.kept and len(update.tracks):
+            tracks = pd.concat([self.held, update.tracks]) if len(self.held) else update.tracks
+            tracks = tracks.drop_duplicates(["time", "target"], keep="last")
+            last = tracks["time"] == tracks["time"].max()
+            self.tables.add(TRACKS, tracks[~last])
+            self.held = tracks[last]
         if update.jumps:
             self.tables.add(JUMPS, pd.DataFrame(update.jumps))
         self._since = True
@@ -258,7 +266,7 @@ class Watching:
         ])  # fmt: skip
         beside = {
             "length": self.tables.length, "offset": self.source.offset, "line": self.source.line,
-            "header": self.source.header.decode(),
+            "header": self.source.header.decode(), "held": {str(n): self.held[n].tolist() for n in self.held},
         }  # fmt: skip
         write_whole(self.tables.folder / STATE, pack_state(self.online, beside))
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 else:
     pd = Later("pandas")
 
-VERSION = 1
+VERSION = 2
 
 
 def pack_state(online: Online, beside: dict[str, Any]) -> bytes:
