@@ -332,7 +332,8 @@ class Problem:
             )
         other._compile(last, further=True)
         slots = {n: k for e in self.epochs for k, n in enumerate(dict.fromkeys(e.target))}
-        return merged(self._aligned(other, slots)[0], self.model.rows, self.model.sizes if sizes is None else sizes)
+        sizes = self.model.sizes if sizes is None else sizes
+        return jax.device_put(merged(self._aligned(other, slots)[0], self.model.rows, sizes))
 
     def arrived(self, data: Measurements, begun: Mapping[str, float], slots: Mapping[str, int]) -> Arrived:
         """Measured rows compiled as this problem would, in its form, for filters that go on.
@@ -382,23 +383,21 @@ class Problem:
         spread: Any = np.array([np.log(level.factor) for level in self.levels])
         counts = tuple(len(dict.fromkeys(epochs.target)) for epochs in self.epochs)
         rest = any(at_rest(part, T).any() for part, T in zip(recursions, counts, strict=True))
-        # put, not `asarray`: that compiles a copy for every new shape
-        self.model = jax.device_put(
-            Model(
-                tuple(own.block for own in gathered),
-                tuple(own.recursion for own in gathered),
-                len(self.biases),
-                driven,
-                counts,
-                all(bool((np.linalg.slogdet(part.L)[0] != 0).all()) for part in recursions),
-                sampled_of_each,
-                recursions,
-                rows,
-                spread,
-                Tilt.none(len(self.biases)) if rest and len(self.biases) <= TILTED else None,
-            ),
-            may_alias=False,
+        model = Model(
+            tuple(own.block for own in gathered),
+            tuple(own.recursion for own in gathered),
+            len(self.biases),
+            driven,
+            counts,
+            all(bool((np.linalg.slogdet(part.L)[0] != 0).all()) for part in recursions),
+            sampled_of_each,
+            recursions,
+            rows,
+            spread,
+            Tilt.none(len(self.biases)) if rest and len(self.biases) <= TILTED else None,
         )
+        # put, not `asarray`: that compiles a copy for every new shape; later rows are put when they are epochs
+        self.model = model if further else jax.device_put(model, may_alias=False)
 
     def _longest(self, begun: Mapping[str, float], further: bool) -> float:
         """The longest time in s between two epochs of a target; of rows that come later, what it was before them."""

@@ -327,7 +327,7 @@ def _states(problem: Problem, r: int, tracks: Mapping[str, Any], key: jax.Array)
     part, epochs = problem.model.recursions[r], problem.epochs[r]
     noise = np.asarray(problem.model.draw_noises(key, r, 1))[:, :, 0]
     F, L, drift = (np.asarray(a) for a in (part.F, part.L, part.drift))
-    states = np.zeros_like(noise)
+    states: Any = np.zeros_like(noise)
     previous = np.zeros(noise.shape[1])
     for e in range(len(noise)):
         previous = F[e] @ previous + drift[e] + L[e] @ noise[e]

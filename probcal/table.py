@@ -441,6 +441,11 @@ def unit_factor(table: Table, name: str, unit: str | None, wanted: str) -> float
 
 
 def _check_duplicates(data: Measurements, network: Network) -> None:
+    some = np.flatnonzero(data.measured.any(1) & ~data.detection)
+    keys = [column[some] for column in (data.target, data.sensor, data.time)]
+    order = np.lexsort(keys)
+    if len(some) < 2 or not np.all([np.diff(key[order]) == 0 for key in keys], 0).any():
+        return
     for j, name in enumerate(data.channels):
         rows = np.flatnonzero(data.measured[:, j] & ~data.detection)
         columns = (data.time[rows], data.sensor[rows], data.target[rows])

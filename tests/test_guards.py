@@ -44,7 +44,7 @@ from probcal.report.page import COLOURS
 from probcal.sensors import doa
 from probcal.smoothing.information import mean_square, squares_of
 from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import _proposal, find_mode
+from probcal.smoothing.mode import _proposal, eliminate, find_mode
 from probcal.starts import automatic_start
 from probcal.status import INVALID, Status
 
@@ -207,7 +207,7 @@ def test_the_promise_of_a_step_is_what_it_keeps_on_a_linear_problem():
         model, start = problem.model, resting(problem)
         prior = Precision.single(jnp.ones(len(problem.labels)))
         step = jax.jit(_proposal, static_argnums=4)
-        promised = step(model, start, prior, jnp.zeros(()), True)[1]
+        promised = step(model, start, prior, jnp.zeros(()), True, eliminate(model, start, expected=False))[1]
         first = find_mode(model, start, prior, 0, 1e-9).cost
         assert float(promised) == pytest.approx(float(first - find_mode(model, start, prior, 30, 1e-9).cost))
 

@@ -180,7 +180,7 @@ class Arrivals:
         row = np.full(len(frame), -1)
         for block_rows, block, r in zip(found.rows, model.rows, model.recursion, strict=True):
             row[block_rows] = place[starts[r] + np.asarray(block.epoch)]
-        epochs = _held(Epoch(*map(_numpy, merged(model, template.model.rows, self.sizes))))
+        epochs = _held(merged(model, template.model.rows, self.sizes))
         return Batch(epochs, time[order], np.concatenate(found.target)[order], row)
 
     def _nothing(self, rows: int) -> Batch:
@@ -304,12 +304,6 @@ class Arrivals:
     def axes(self) -> list[str]:
         """Names of the axes."""
         return list(AXES[: self.network.dimension])
-
-
-def _numpy(leaf: Any) -> Any:
-    import jax
-
-    return jax.tree.map(np.array, leaf)
 
 
 def _held(epochs: Any) -> Epoch:

@@ -249,7 +249,7 @@ def most_rows(model: Any) -> tuple[int, ...]:
 
 
 def merged(model: Any, fill: tuple[Rows, ...], sizes: tuple[int, ...]) -> Epoch:
-    """All epochs of a model in time order, stacked (K leading); rows of each block padded to `sizes`.
+    """All epochs of a model in time order, stacked (K leading), as NumPy; rows of each block padded to `sizes`.
 
     What is left over repeats the first row of `fill`, masked. At one time the targets follow in their order. Raises
     `InputError` where an epoch has more rows than its size.
@@ -282,8 +282,7 @@ def merged(model: Any, fill: tuple[Rows, ...], sizes: tuple[int, ...]) -> Epoch:
         moves.append(Move(*nothing)._replace(mixed=driving))
     for b, (data, r) in enumerate(zip(model.rows, model.recursion, strict=True)):
         rows.append(padded_rows(data, of[r][np.asarray(data.epoch)], K, sizes[b], fill[b], model.blocks[b]))
-    found: Any = Epoch(**shared, target=tuple(targets), move=tuple(moves), rows=tuple(rows))
-    return jax.device_put(found)
+    return Epoch(**shared, target=tuple(targets), move=tuple(moves), rows=tuple(rows))
 
 
 def padded_rows(data: Rows, epoch: np.ndarray, count: int, size: int, fill: Rows, block: Block) -> Seen:

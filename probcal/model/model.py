@@ -444,7 +444,7 @@ class Model(Stepwise):
         The rows of each block are padded to `sizes`, by default to the most that an epoch has. Raises `InputError`
         where an epoch has more.
         """
-        return merged(self, self.rows, self.sizes if sizes is None else sizes)
+        return jax.device_put(merged(self, self.rows, self.sizes if sizes is None else sizes))
 
     @property
     def sizes(self) -> tuple[int, ...]:

@@ -136,7 +136,7 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
 
 def _coarse(band: Band) -> Band:
     """Tracks to a small part of their sd: what is finer says nothing, and does not compress."""
-    return Band(*(stepped(values, band.sd, COARSE) for values in (band.mean, band.sd, band.before)))
+    return Band(*(_stepped(values, band.sd, COARSE) for values in (band.mean, band.sd, band.before)))
 
 
 def _data_groups(answer: Answer, draws: Draws, before: Point, large: bool) -> dict[str, xr.Dataset]:
@@ -148,7 +148,7 @@ def _data_groups(answer: Answer, draws: Draws, before: Point, large: bool) -> di
     parts = {"before": old.innovation, "after": new.innovation, "std": new.std, "weight": new.reliance}
     left = {name: gather([np.asarray(part) for part in own], picks) for name, own in parts.items()}
     if large:
-        left |= {name: stepped(left[name], left["std"], COARSE) for name in ("before", "after")}
+        left |= {name: _stepped(left[name], left["std"], COARSE) for name in ("before", "after")}
     residual = {name: ("datum", values) for name, values in left.items()}
     groups = {
         "observed_data": xr.Dataset({"y": ("datum", datum["y"])}, coords=coords),
@@ -194,11 +194,11 @@ def _rounded(log_likelihood: np.ndarray) -> np.ndarray:
         part = log_likelihood[:, :, start : start + AT_ONCE]
         with np.errstate(invalid="ignore"):  # a row of probability zero
             spread = part.std((0, 1))
-        log_likelihood[:, :, start : start + AT_ONCE] = stepped(part, spread, SHARP)
+        log_likelihood[:, :, start : start + AT_ONCE] = _stepped(part, spread, SHARP)
     return log_likelihood
 
 
-def stepped(values: np.ndarray, spread: np.ndarray, steps: int) -> np.ndarray:
+def _stepped(values: np.ndarray, spread: np.ndarray, steps: int) -> np.ndarray:
     """Values (..., n) rounded to a part of their spread (..., n), a power of two; as they are where it is too small."""
     sure = np.isfinite(spread) & (spread > 1e-9)
     step = np.exp2(np.floor(np.log2(np.where(sure, spread, 1.0) / steps)))

@@ -356,4 +356,4 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
 
 def smooth_tracks(model: Model, point: Point, iterations: int = 20) -> Point:
     """Trajectories at the point's biases: iterated EKS."""
-    return find_tracks(model, point, iterations, 1e-6)
+    return find_tracks(model, point, iterations, 1e-9)
