@@ -152,15 +152,14 @@ def semi_solve(matrices: jax.Array, right: jax.Array) -> jax.Array:
     return x
 
 
-def gram(rows: jax.Array, signed: jax.Array) -> jax.Array:
-    """Symmetric product signed' rows of (k, m) rows and the same rows with signs, by halves: one triangle is formed."""
+def gram(rows: jax.Array) -> jax.Array:
+    """Symmetric product rows' rows of (k, m) rows, by halves: one triangle is formed."""
     m = rows.shape[1]
     if m <= SYMMETRIC:
-        return signed.T @ rows
+        return rows.T @ rows
     h = m // 2
-    below = signed[:, h:].T @ rows[:, :h]
-    first, last = gram(rows[:, :h], signed[:, :h]), gram(rows[:, h:], signed[:, h:])
-    return jnp.block([[first, below.T], [below, last]])
+    below = rows[:, h:].T @ rows[:, :h]
+    return jnp.block([[gram(rows[:, :h]), below.T], [below, gram(rows[:, h:])]])
 
 
 def factor_and_inverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:

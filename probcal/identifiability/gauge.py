@@ -49,7 +49,7 @@ def free_states(model: Model, point: Point, hold: tuple[jax.Array, ...]) -> Free
     for (J, _), cross, precision in zip(compressed.states, compressed.crosses, hold, strict=True):
         root = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision))
         flat = linalg.forward(root, cross).reshape(-1, cross.shape[2])
-        information = information - linalg.gram(flat, flat)
+        information = information - linalg.gram(flat)
         ranks.append(jnp.sum((jnp.diagonal(root, axis1=1, axis2=2) > 0) & (precision < HELD), 1))
     return FreeStates(information, known, tuple(ranks))
 

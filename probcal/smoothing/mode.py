@@ -25,6 +25,9 @@ DAMPING = 1e10  # damping at which the iteration gives up
 ROUNDING = 1e-12  # of the cost: what a step that promises less cannot show
 
 
+apart = jax.lax.optimization_barrier
+
+
 class Point(NamedTuple):
     """Where the joint density is evaluated: states and whitened noises of each recursion, biases, log levels."""
 
@@ -136,10 +139,13 @@ def eliminate_rows(model: Model, point: Point, lins: Sequence[Linearised], *, jo
 
 def compress(model: Model, lins: Sequence[Linearised], *, joint: bool = True) -> Compressed:
     """Rows compressed onto states and biases; without `joint` the biases are held and have no columns."""
-    own = tuple(model.of_states(lins))
     if joint:
         check_room(model)
-        return Compressed(*model.of_biases(lins), own, tuple(model.of_both(lins)))
+        # one after the other: woven into one loop over the rows they take three times as long
+        lins, (information, score) = apart((tuple(lins), model.of_biases(tuple(lins))))
+        lins, states = apart((lins, tuple(model.of_states(lins))))
+        return Compressed(information, score, states, tuple(model.of_both(lins)))
+    own = tuple(model.of_states(lins))
     crosses = tuple(jnp.zeros((*part.drift.shape, 0)) for part in model.recursions)
     return Compressed(jnp.zeros((0, 0)), jnp.zeros(0), own, crosses)
 
@@ -175,10 +181,8 @@ def eliminate_compressed(
             columns = jnp.concatenate([pull[:, :, None], cross], 2)
             drift = -(L @ u[:, :, None])
             alone, new = (c.reshape(-1, c.shape[2]) for c in rec.innovate(part.F, gain, columns, drift))
-            rows_ = jnp.concatenate([alone, new])
-            signed = jnp.concatenate([-alone, new])
-            information = information + linalg.gram(rows_[:, 1:], signed[:, 1:])
-            score = score + signed[:, 1:].T @ rows_[:, 0]
+            information = information - linalg.gram(alone[:, 1:]) + linalg.gram(new[:, 1:])
+            score = score - alone[:, 1:].T @ alone[:, 0] + new[:, 1:].T @ new[:, 0]
         kept.append(Kept(J, pull, cross, gain))
         logdet = logdet + gain.logdet
     information = 0.5 * (information + information.T)
