@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
+import worlds
 
 import probcal as pc
 from probcal.errors import InputError
@@ -297,6 +298,23 @@ def test_a_window_of_everything_ends_at_the_batch_answer():
     np.testing.assert_allclose(online.biases["sd"], group["sd"].values, rtol=2e-3)
 
 
+@pytest.mark.parametrize("name", worlds.LINEAR)
+def test_every_linear_world_ends_at_its_exact_posterior(name):
+    """In 2-D and 3-D, with sensors of two nodes, moving nodes, drifts, targets of several motions, blank rows."""
+    world, motion, table, fixed = worlds.LINEAR[name]()
+    known, scales = worlds.exact(name), worlds.linear(name)[0].scales
+    table = table.sort_values("time", kind="stable")
+    for lag, chunk in ((0, 1000), (8, 4)):
+        online = pc.Online(world, motion, pc.AugmentedFilter(lag=lag), fix=fixed)
+        begun = int(np.flatnonzero(table.drop(columns=["time", "sensor", "target"]).notna().any(axis=1))[0]) + 1
+        for part in (table.iloc[:begun], *(table.iloc[k : k + chunk] for k in range(begun, len(table), chunk))):
+            online.update(part)
+        online.finish()
+        M = len(scales)
+        np.testing.assert_allclose(online.biases["mean"] / scales, known.mean[:M], atol=1e-9)
+        np.testing.assert_allclose(online.biases["sd"] / scales, np.sqrt(np.diag(known.covariance)[:M]), rtol=1e-9)
+
+
 def test_a_target_without_a_start_is_placed_by_its_first_rows():
     places = ((0.0, 0.0), (400.0, 20.0), (100.0, 500.0), (450.0, 480.0))
     network_ = pc.Network([tape.on(pc.Node(f"n{k}", place, scale=0.5)) for k, place in enumerate(places)])
@@ -433,6 +451,20 @@ WRONG = {
 def test_what_is_wrong_is_said_in_one_sentence(said):
     with pytest.raises(InputError, match=said):
         WRONG[said]()
+
+
+def test_blank_rows_are_no_rows():
+    online, frame = filtered(pc.AugmentedFilter(lag=0)), rows()
+    before = copy.deepcopy(online.biases)
+    channels = [name for name in frame if name not in ("time", "sensor", "target")]
+    blank = frame.assign(time=frame["time"] + 50.0, **dict.fromkeys(channels, np.nan))
+    assert online.update(blank).epochs == 0
+    fresh = frame.assign(time=frame["time"] + 100.0)
+    online.update(fresh)
+    other = filtered(pc.AugmentedFilter(lag=0))
+    pd.testing.assert_frame_equal(before, other.biases)
+    other.update(fresh)
+    pd.testing.assert_frame_equal(online.biases, other.biases)
 
 
 def test_a_table_that_is_refused_leaves_nothing_behind():

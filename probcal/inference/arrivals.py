@@ -154,14 +154,21 @@ class Arrivals:
             frame.columns[names.index(own)]: own for own in ("sensor", "target") if own in names
         }})  # fmt: skip
 
-    def compiled(self, frame: pd.DataFrame, source: str) -> Batch:
-        """Rows in order as epochs; raises `InputError` naming a row that cannot be taken."""
+    def compiled(self, frame: pd.DataFrame, source: str) -> Batch | None:
+        """Rows in order as epochs, None where all are blank; raises `InputError` naming a row that cannot be taken."""
         own = frame.drop(columns=["cells", "line"])
         table = Table(own, source, frame["line"].to_numpy())
         network = self.network if self.template is None else self.template.network
         data = measure(table, network)
         if not data.measured.any():
-            return self._nothing(len(frame))
+            if self.template is None:
+                raise InputError(f"{len(frame)} rows have no measured value; fill the channel columns")
+            return None
+        seen = np.isin(data.target, data.target[data.measured.any(1)])
+        if not seen.all():  # a target of which nothing was measured has no state
+            own = own[seen].reset_index(drop=True)
+            table = Table(own, source, table.lines[seen])
+            data = measure(table, network)
         self._provide(own, data, source)
         template = self.template
         assert template is not None
@@ -179,12 +186,9 @@ class Arrivals:
         starts = np.cumsum([0, *(len(part.time) for part in model.recursions)])
         row = np.full(len(frame), -1)
         for block_rows, block, r in zip(found.rows, model.rows, model.recursion, strict=True):
-            row[block_rows] = place[starts[r] + np.asarray(block.epoch)]
+            row[np.flatnonzero(seen)[block_rows]] = place[starts[r] + np.asarray(block.epoch)]
         epochs = _held(merged(model, template.model.rows, self.sizes))
         return Batch(epochs, time[order], np.concatenate(found.target)[order], row)
-
-    def _nothing(self, rows: int) -> Batch:
-        raise InputError(f"{rows} rows have no measured value; fill the channel columns")
 
     def _provide(self, frame: pd.DataFrame, data: Any, source: str) -> None:
         """A template with every sensor type and every form of a motion that the rows have."""

@@ -328,22 +328,27 @@ class Online:
         counts = self.arrivals.counts.copy()
         try:
             frame = self.arrivals.admit(table, self.pending, self.walked if self._moves else -np.inf)
-            if frame.empty:
-                return Update(self.time, 0, self._tracks([]), (), 0, True)
-            batch = self.arrivals.compiled(frame, table.source)
+            batch = None if frame.empty else self.arrivals.compiled(frame, table.source)
         except InputError:
             self.arrivals.counts = counts
             raise
+        if batch is None:
+            return self._nothing()
         self.prepare()
         return self._filter(frame, batch, everything=False)
 
     @float64
     def finish(self) -> Update:
         """Filter for good what is still in the window: the stream has ended, or the lag is not to be waited for."""
-        if self.pending is None or self.pending.empty:
-            return Update(self.time, 0, self._tracks([]), (), 0, True)
-        batch = self.arrivals.compiled(self.pending, "the window")
+        batch = None
+        if self.pending is not None and not self.pending.empty:
+            batch = self.arrivals.compiled(self.pending, "the window")
+        if batch is None or self.pending is None:
+            return self._nothing()
         return self._filter(self.pending, batch, everything=True)
+
+    def _nothing(self) -> Update:
+        return Update(self.time, 0, self._tracks([]), (), 0, True)
 
     @property
     def _moves(self) -> bool:
