@@ -217,7 +217,7 @@ class Online:
         for what, patterns in (("walk", dict(self.method.walk)), ("consider", self.method.consider)):
             for pattern in patterns:
                 _chosen(network.labels, pattern, what)
-        if epoch is not None and not (np.isfinite(epoch) and epoch > 0):
+        if epoch is not None and not (isinstance(epoch, (int, float)) and np.isfinite(epoch) and epoch > 0):
             raise InputError(f"Online(epoch={epoch!r}): give the length of common epochs in s, or leave it out")
         self.arrivals = Arrivals(network, motion, fix, targets, isinstance(self.method, AugmentedFilter), epoch)
         self.calibration = calibration

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg
-from probcal.model.epochs import Epoch, Move
+from probcal.model.epochs import Move
 
 
 class Slots(NamedTuple):
@@ -202,27 +202,3 @@ def renewed(belief: Augmented, columns: jax.Array) -> Augmented:
         response=told.response * kept[None, :], information=told.information * kept, score=told.score * kept
     )
     return belief._replace(slots=slots, candidates=fresh)
-
-
-def sharpened(belief: Augmented, bias: jax.Array, precision: jax.Array) -> Augmented:
-    """The belief with a precision added to the prior of one bias about zero, or taken from it where negative."""
-    v = belief.root[bias]
-    square = jnp.sum(v**2)
-    share = precision / (1.0 + precision * square)  # Sherman and Morrison
-    mean = belief.mean - belief.root @ v * share * belief.mean[bias]
-    turn = (1.0 - jnp.sqrt(jnp.maximum(1.0 - share * square, 0.0))) / jnp.maximum(square, 1e-300)
-    return belief._replace(mean=mean, root=belief.root - turn * (belief.root @ v)[:, None] * v[None, :])
-
-
-def states(belief: Augmented) -> tuple[tuple[jax.Array, jax.Array], ...]:
-    """Mean (T, n) and standard deviation (T, n) of the states of each recursion, biases uncertain."""
-    found = []
-    for own in belief.slots:
-        reach = own.B @ belief.root
-        found.append((own.m + own.B @ belief.mean, jnp.sqrt(jnp.sum(own.R**2, 2) + jnp.sum(reach**2, 2))))
-    return tuple(found)
-
-
-def moving(epoch: Epoch) -> jax.Array:
-    """Whether an epoch belongs to the stream: one that pads a stack has a negative recursion."""
-    return epoch.recursion >= 0

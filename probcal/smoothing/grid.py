@@ -20,7 +20,7 @@ from probcal.model.model import At, Model, Recursion
 from probcal.model.rows import Linearised, Rows
 from probcal.problem import Problem
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Point, cost, factors, smooth_tracks
+from probcal.smoothing.mode import Point, apart, cost, factors, smooth_tracks
 
 WINDOWS = 60  # at most so many windows a target
 INNER = {2: 24, 3: 10}  # grid points an axis inside the network
@@ -31,7 +31,6 @@ NEAR = 0.05  # error of a position found on the grid, in extents
 WINDOW_ROWS = 60  # rows of a window that are looked at, where there are more
 BEAM = 200  # candidates a window that the path may pass
 ROBUST = 4.0  # degrees of freedom of the start's Student-t loss
-apart = jax.lax.optimization_barrier  # what is wanted several times, which XLA would else compute anew each time
 
 
 def candidates(problem: Problem) -> np.ndarray:

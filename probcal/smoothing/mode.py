@@ -23,9 +23,7 @@ CHORD = 0.1  # share of the last gain up to which what was eliminated serves on
 HALVINGS = 12  # step lengths tried before the damping grows
 DAMPING = 1e10  # damping at which the iteration gives up
 ROUNDING = 1e-12  # of the cost: what a step that promises less cannot show
-
-
-apart = jax.lax.optimization_barrier
+apart = jax.lax.optimization_barrier  # keeps XLA from weaving two computations together, or doing one of them twice
 
 
 class Point(NamedTuple):
