@@ -93,7 +93,7 @@ def test_a_file_that_grows_is_read_on(model, table, tmp_path):
 
 def test_a_scan_in_two_blocks_is_one_state_of_its_target(model, table, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    monkeypatch.setattr(sys.modules["probcal.cli.watch"], "BLOCK", 53)
+    monkeypatch.setattr("probcal.cli.watch.BLOCK", 53)
     assert call("watch", model, table, "--out", out, "--keep", "tracks", "--lag", "0")[0] == 0
     tracks = pd.read_csv(out / "tracks.csv")
     assert tracks["time"].tolist() == list(range(40))
