@@ -476,6 +476,36 @@ def test_a_table_that_is_refused_leaves_nothing_behind():
     assert online.counts["rows"] == len(rows())
 
 
+@pytest.mark.parametrize("lag", [0, 4])
+def test_a_table_that_breaks_off_midway_leaves_nothing_behind(lag, monkeypatch):
+    """Some calls of the filter are over when it stops."""
+    method = pc.AugmentedFilter(lag=lag, jumps=pc.Jumps(within=5.0) if lag else None)
+    online, other = filtered(method), filtered(method)
+    fresh = rows().assign(time=rows()["time"] + 50.0)
+    later = pd.concat([fresh.assign(time=fresh["time"] + 20.0 * k) for k in range(4)], ignore_index=True)
+    run, calls = online._rows_of, []
+
+    def stops(*given):
+        calls.append(given)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return run(*given)
+
+    monkeypatch.setattr("probcal.inference.online.PLAIN", (1, 32))
+    monkeypatch.setattr("probcal.inference.online.BULK", 2)
+    with monkeypatch.context() as patched:
+        patched.setattr(online, "_rows_of", stops)
+        with pytest.raises(KeyboardInterrupt):
+            online.update(later)
+    assert online.walked == other.walked
+    assert online.counts == other.counts
+    for one in (online, other):
+        one.update(later)
+    pd.testing.assert_frame_equal(online.biases, other.biases)
+    assert online.log_evidence == other.log_evidence
+    assert online.since == other.since
+
+
 def test_detections_without_a_name_are_refused():
     seen = pc.Network([plain.on(pc.Node("n0", (0.0, 0.0)), detection=pc.Detection(0.9, clutter=1.0))])
     online = pc.Online(seen, MOTION["a"])

@@ -113,6 +113,53 @@ def test_lines_are_counted_on_after_a_restart(model, table, tmp_path):
     assert last(out)["rows"].eq(80).all()
 
 
+def test_particles_go_on_where_they_were(model, table, tmp_path):
+    text, options = lines(), ("--particles", "200", "--keep", "rows")
+    assert call("watch", model, table, "--out", tmp_path / "whole", *options)[0] == 0
+    out = tmp_path / "out"
+    for count in (41, len(text)):
+        table.write_text("".join(text[:count]))
+        code, printed, _ = call("watch", model, table, "--out", out, *options)
+        assert code == 0
+    assert "80 rows up to time 39 s" in printed
+    assert (out / "rows.csv").read_text() == table.read_text()
+    one, other = last(tmp_path / "whole"), last(out)
+    assert (np.abs(one["mean"] - other["mean"]) < 1.5 * one["sd"]).all()  # other draws
+    code, _, said = call("watch", model, table, "--particles", "50", "--lag", "8")
+    assert code == 2
+    assert "--particles filters without --lag; give one of the two" in said
+
+
+def test_who_cannot_be_sure_is_told(model, table, tmp_path):
+    out = tmp_path / "out"
+    code, printed, _ = call("watch", model, table, "--out", out, "--particles", "20")
+    assert code == 0
+    assert "of the first particles are left: take more" in printed
+    assert pc.load(out).attrs["status"] == "not converged"
+    assert "Intervals may be too narrow." in pc.load(out).attrs["message"]
+
+
+def test_rows_at_which_a_watch_is_told_to_end_are_taken_whole(model, table, tmp_path, monkeypatch):
+    out, update = tmp_path / "out", pc.Online.update
+
+    def told(self, rows):
+        signal.raise_signal(signal.SIGTERM)
+        return update(self, rows)
+
+    options = ("watch", model, table, "--out", out, "--lag", "0", "--keep", "rows")
+    monkeypatch.setattr("probcal.cli.watch.BLOCK", 200)
+    with monkeypatch.context() as patched:
+        patched.setattr(pc.Online, "update", told)
+        code, printed, _ = call(*options)
+    assert code == 0
+    assert "80 rows" not in printed
+    assert 0 < last(out)["rows"].max() < 80
+    code, printed, _ = call(*options)
+    assert "80 rows up to time 39 s" in printed
+    assert "late" not in printed
+    assert (out / "rows.csv").read_text() == table.read_text()
+
+
 def test_standard_input_is_watched(model, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("".join(lines()).encode())))
     code, printed, _ = call("watch", model, "--lag", "0")

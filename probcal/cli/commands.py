@@ -196,8 +196,14 @@ def watch_command(
     follow: Annotated[bool, typer.Option("--follow", help="wait for more rows at the end of the file")] = False,
     calibration: Annotated[Path | None, typer.Option(help="folder (or fit.nc) of a fit to start from")] = None,
     out: Annotated[Path | None, typer.Option(help="folder for the state, the history of biases and fit.nc")] = None,
-    by: Annotated[str, typer.Option(help="extended | unscented | cubature")] = "extended",
-    lag: Annotated[int, typer.Option(min=0, help="epochs that are linearised again; 0 is the plain filter")] = 32,
+    by: Annotated[str | None, typer.Option(help="extended (if left out) | unscented | cubature")] = None,
+    lag: Annotated[
+        int | None, typer.Option(min=0, help="epochs that are linearised again, 32 if left out; 0 is the plain filter")
+    ] = None,
+    particles: Annotated[
+        int | None,
+        typer.Option(min=2, help="filter by so many particles: for roads and other motions of no linear form"),
+    ] = None,
     walk: Annotated[
         list[str] | None, typer.Option(help="biases that walk: PATTERN=STD over one second (repeat)")
     ] = None,
@@ -233,10 +239,17 @@ def watch_command(
     lock = None if out is None else Lock(out, 0.0)
     try:
         from probcal.cli import watch
-        from probcal.inference.online import Jumps
+        from probcal.inference.online import AugmentedFilter, Jumps, ParticleFilter
 
         found = None if jumps is None else Jumps(false_alarms=jumps, within=within)
-        method = {"by": by, "lag": lag, "walk": walks, "consider": tuple(consider or ()), "jumps": found}
+        method: AugmentedFilter | ParticleFilter
+        if particles is None:
+            method = AugmentedFilter(by or "extended", 32 if lag is None else lag, walks, tuple(consider or ()), found)
+        else:
+            others = {"--by": by, "--lag": lag, "--consider": consider, "--jumps": jumps}
+            if other := next((name for name, value in others.items() if value is not None), None):
+                raise InputError(f"--particles filters without {other}; give one of the two")
+            method = ParticleFilter(particles, walks)
         raise typer.Exit(watch.run(
             model, data, fix or (), arguments, method, calibration=calibration, targets=targets, follow=follow,
             outputs=results, every=every, kept=kept,

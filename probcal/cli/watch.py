@@ -6,7 +6,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from probcal.cli.models import load_problem
 from probcal.errors import InputError
 from probcal.files import Outputs, write_whole
 from probcal.inference.checkpoint import pack_state, unpack_state
-from probcal.inference.online import AugmentedFilter, Online, Update
+from probcal.inference.online import AugmentedFilter, Online, ParticleFilter, Update
 from probcal.problem import Problem
 from probcal.results.io import load, save
 from probcal.results.schema import ROPE
@@ -110,8 +110,9 @@ class Appended:
 
 
 def run(
-    model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, Any], method: Mapping[str, Any], *,
-    calibration: Path | None, targets: int, follow: bool, outputs: Outputs | None, every: float, kept: Sequence[str],
+    model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, Any],
+    method: AugmentedFilter | ParticleFilter, *, calibration: Path | None, targets: int, follow: bool,
+    outputs: Outputs | None, every: float, kept: Sequence[str],
 ) -> int:  # fmt: skip
     """Filter the rows of a file, or of standard input, until they end or the process is told to end."""
     keep_kernels()
@@ -123,8 +124,8 @@ def run(
     source = Source("standard input" if data is None else data.name)
     problem = _declared(model, data, fix, given, source, follow)
     online = Online(
-        problem.network, problem.motion, AugmentedFilter(**method), calibration=known, fix=problem.fixed,
-        epoch=problem.epoch, targets=targets,
+        problem.network, problem.motion, method, calibration=known, fix=problem.fixed, epoch=problem.epoch,
+        targets=targets,
     )  # fmt: skip
     tables, held = None if outputs is None else Appended(outputs.folder), pd.DataFrame()
     if outputs is not None:
@@ -138,13 +139,12 @@ def run(
         outputs.begin()
         tables.open()
     watching = Watching(online, source, tables, every, kept, held)
-    with _input(data, source) as file, _told_to_end(), watching.shown() as show:
-        try:
-            watching.follow(file, follow and data is not None, show)
-        except KeyboardInterrupt:
-            watching.ending = True
+    with _input(data, source) as file, _told_to_end(watching), watching.shown() as show, suppress(KeyboardInterrupt):
+        watching.follow(file, follow and data is not None, show)
     watching.store()
     print(watching.said())
+    if online.message:
+        print(online.message)
     if online.end is None:
         raise InputError(f"{source.name} has no rows that could be taken")
     if outputs is not None:
@@ -174,6 +174,7 @@ class Watching:
     used: int = 0
     stored: float = field(default_factory=time.monotonic)
     begun: float = field(default_factory=time.monotonic)
+    busy: bool = False  # with rows, which are taken whole or not at all
     ending: bool = False
     unstored: bool = False
 
@@ -201,17 +202,20 @@ class Watching:
 
     def filter(self, lines: bytes) -> None:
         """Filter some lines; those that cannot be taken are put aside."""
-        if self.tables is not None and "rows" in self.kept:
-            head = b"" if self.tables.length.get(ROWS) else self.source.header.rstrip(b"\r") + b"\n"
-            self.tables.write(ROWS, head + lines)
+        self.busy = True
         table = read_lines(self.source.header, lines, self.source.name, self.source.line)
         before = self.refused
         if len(table.frame):
             self._take(table)
         if self.refused - before == len(table.frame) > 0 and self.online.end is None:
             raise InputError(self._why)
+        if self.tables is not None and "rows" in self.kept:
+            head = b"" if self.tables.length.get(ROWS) else self.source.header.rstrip(b"\r") + b"\n"
+            self.tables.write(ROWS, head + lines)
         self.source.taken(lines)
-        self.unstored = True
+        self.unstored, self.busy = True, False
+        if self.ending:
+            raise KeyboardInterrupt
 
     def _take(self, table: Table) -> None:
         try:
@@ -275,6 +279,8 @@ class Watching:
         counts = self.online.counts
         parts = [f"{counts['rows']:,} rows up to time {self.online.time:g} s"]
         parts += [f"{counts[name]:,} {name}" for name in ("late", "duplicates") if counts[name]]
+        if self.online.message:
+            parts.append("intervals may be too narrow")
         if self.refused:
             parts.append(f"{self.refused:,} left out" + ("" if self.tables is None else f" (see {REFUSED})"))
         if self.online.jumps:
@@ -378,14 +384,17 @@ def _input(data: Path | None, source: Source) -> Iterator[Any]:
 
 
 @contextmanager
-def _told_to_end() -> Iterator[None]:
-    """SIGTERM ends a watch as Ctrl-C does: what is known is stored."""
+def _told_to_end(watching: Watching) -> Iterator[None]:
+    """SIGTERM ends a watch as Ctrl-C does: what is known is stored, rows that are being filtered too."""
 
     def end(*_: Any) -> None:
-        raise KeyboardInterrupt
+        if not watching.busy or watching.ending:
+            raise KeyboardInterrupt
+        watching.ending = True
 
-    before = signal.signal(signal.SIGTERM, end)
+    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

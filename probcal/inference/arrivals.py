@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -74,6 +74,11 @@ class Arrivals:
     tried: np.ndarray | None = None  # (places, d) that are tried for a new target
     template: Problem | None = None
     sizes: tuple[int, ...] = ()  # rows of an epoch of each block, padded
+
+    def copy(self) -> Arrivals:
+        """As it stands now: what rows change is copied."""
+        targets = {name: replace(own) for name, own in self.targets.items()}
+        return replace(self, counts=self.counts.copy(), targets=targets, starts=dict(self.starts))
 
     def admit(self, table: Table, pending: pd.DataFrame | None, since: float) -> pd.DataFrame:
         """Rows of a table behind those pending, in order, without repeated ones and those before a time.

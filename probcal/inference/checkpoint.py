@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 else:
     pd = Later("pandas")
 
-VERSION = 2
+VERSION = 3
 
 
 def pack_state(online: Online, beside: dict[str, Any]) -> bytes:
@@ -44,6 +44,7 @@ def pack_state(online: Online, beside: dict[str, Any]) -> bytes:
         "labels": None if arrivals.template is None else list(arrivals.template.labels),
         "method": repr(online.method),
         "counts": dict(arrivals.counts),
+        "doubts": {name: int(count) for name, count in online.doubts.items()},
         "targets": {n: [k.recursion, k.slot, k.time, list(map(list, k.keys))] for n, k in arrivals.targets.items()},
         "origin": arrivals.origin,
         "starts": arrivals.starts,
@@ -83,6 +84,7 @@ def unpack_state(online: Online, content: bytes, source: str) -> dict[str, Any]:
         )
     arrivals = online.arrivals
     arrivals.counts, arrivals.origin = Counter(said["counts"]), said["origin"]
+    online.doubts = Counter(said["doubts"])
     arrivals.targets = {
         n: CarriedTarget(r, slot, time, tuple((a, b, c) for a, b, c in keys))
         for n, (r, slot, time, keys) in said["targets"].items()

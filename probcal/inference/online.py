@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -234,6 +236,7 @@ class Online:
         self.walked = -np.inf
         self.since: list[float] = []
         self.jumps: list[Jump] = []
+        self.doubts: Counter[str] = Counter()  # windows that did not rest, targets that began astray
 
     # what is known
 
@@ -241,6 +244,21 @@ class Online:
     def counts(self) -> dict[str, int]:
         """Rows that came, and how many of them were late or repeated; targets that were given up."""
         return {name: self.arrivals.counts[name] for name in ("rows", "late", "duplicates", "retired")}
+
+    @property
+    def message(self) -> str:
+        """Why intervals may be too narrow; empty where nothing speaks against them."""
+        found, windows, astray = [], self.doubts["windows"], self.doubts["targets"]
+        if windows:
+            found.append(f"{windows} window{'s' * (windows > 1)} did not come to rest: fit the rows as a batch.")
+        if astray:
+            found.append(
+                f"{astray} target{'s' * (astray > 1)} began where the first rows do not give a place: declare the"
+                " start, Target(motion, start={...}), or take a lag."
+            )
+        if self.cloud is not None and (left := particles.ancestors(self.cloud)) < ANCESTORS:
+            found.append(f"{left} of the first particles are left: take more, or AugmentedFilter() where it serves.")
+        return f"Intervals may be too narrow. {' '.join(found)}" if found else ""
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -325,17 +343,13 @@ class Online:
         Raises `InputError` naming a row that cannot be taken; nothing of the table is used then.
         """
         table = read_table(rows)
-        counts = self.arrivals.counts.copy()
-        try:
+        with self._unchanged_if_refused():
             frame = self.arrivals.admit(table, self.pending, self.walked if self._moves else -np.inf)
             batch = None if frame.empty else self.arrivals.compiled(frame, table.source)
-        except InputError:
-            self.arrivals.counts = counts
-            raise
-        if batch is None:
-            return self._nothing()
-        self.prepare()
-        return self._filter(frame, batch, everything=False)
+            if batch is None:
+                return self._nothing()
+            self.prepare()
+            return self._filter(frame, batch, everything=False)
 
     @float64
     def finish(self) -> Update:
@@ -345,7 +359,18 @@ class Online:
             batch = self.arrivals.compiled(self.pending, "the window")
         if batch is None or self.pending is None:
             return self._nothing()
-        return self._filter(self.pending, batch, everything=True)
+        with self._unchanged_if_refused():
+            return self._filter(self.pending, batch, everything=True)
+
+    @contextmanager
+    def _unchanged_if_refused(self) -> Iterator[None]:
+        """Where what is inside raises, or is broken off, the filter stays as it was: no row counts twice or by half."""
+        own, beside = self.__dict__ | {"doubts": self.doubts.copy()}, self.arrivals.copy()
+        try:
+            yield
+        except BaseException:
+            self.__dict__, self.arrivals = own, beside
+            raise
 
     def _nothing(self) -> Update:
         return Update(self.time, 0, self._tracks([]), (), 0, True)
@@ -415,11 +440,11 @@ class Online:
         K, begun, jumps, frames = len(batch.time), 0, list[Jump](), []
         points = self._points(batch)
         elapsed = np.diff(batch.time, prepend=self.walked if np.isfinite(self.walked) else batch.time[0])
-        most, settled = 0, True
+        most, doubts = 0, self.doubts.total()
         while begun < K:
             left = K - begun
             count, size, segments = self._window(left)
-            settled &= self._place(batch, points, begun, count)
+            self.doubts["targets"] += self._place(batch, points, begun, count)
             window = Window(
                 padded(_part(batch.epochs, begun, begun + count), size),
                 _long(elapsed[begun : begun + count], size),
@@ -441,7 +466,7 @@ class Online:
                 done = np.minimum(np.arange(1, segments + 1) * (size // segments), count)
                 evidence = np.asarray(passed.log_evidence)
                 most = max(most, int(passed.passes))
-                settled &= bool(passed.moved <= self.method.tolerance)
+                self.doubts["windows"] += not passed.moved <= self.method.tolerance
             lag = 0 if everything and count == left else self.method.lag
             jump = self._jump(stack, done, batch.time[begun : begun + count])
             leaving = jump[0] if jump is not None else int(np.searchsorted(done, count - lag, side="right")) - 1
@@ -471,8 +496,8 @@ class Online:
         self._keep(batch, points, begun)
         self.time = max(self.time, float(batch.time[-1]))
         self.end = self.belief if begun == K else jax.tree.map(lambda leaf: leaf[-1], stack)
-        self.jumps += jumps
-        return Update(self.time, begun, self._tracks(frames), tuple(jumps), most, settled)
+        self.jumps = [*self.jumps, *jumps]
+        return Update(self.time, begun, self._tracks(frames), tuple(jumps), most, self.doubts.total() == doubts)
 
     def _populate(self, problem: Problem, method: ParticleFilter) -> None:
         """Particles with the slots of every form of a motion."""
@@ -511,8 +536,7 @@ class Online:
         self.walked = self.time = max(self.time, float(batch.time[-1]))
         self.arrivals.settled(batch, frame, K)
         self.pending, self.recent = frame.iloc[:0], frame.tail(RECENT).reset_index(drop=True)
-        ancestors = len(np.unique(np.asarray(self.cloud.origin)))
-        return Update(self.time, K, self._tracks(frames), (), 0, ancestors >= ANCESTORS)
+        return Update(self.time, K, self._tracks(frames), (), 0, particles.ancestors(self.cloud) >= ANCESTORS)
 
     def _window(self, left: int) -> tuple[int, int, int]:
         """Epochs of the next call, what they are padded to, and into how many parts it falls."""
@@ -539,12 +563,12 @@ class Online:
         found: Any = RowPoints(tuple(xs), z, there)  # type: ignore[arg-type]
         return found
 
-    def _place(self, batch: Batch, points: Any, begun: int, count: int) -> bool:
+    def _place(self, batch: Batch, points: Any, begun: int, count: int) -> int:
         """Points of the targets that begin among `count` epochs, in place, as the biases are known before them.
 
-        Whether a plain filter can begin there: the first rows of each give its place, or a start does.
+        How many of them a plain filter cannot begin there: neither their first rows nor a start give their place.
         """
-        known = True
+        astray = 0
         problem, belief, K = self._problem, self.belief, len(batch.time)
         xs, z, there = points
         recursion, first = np.asarray(batch.epochs.recursion), np.asarray(batch.epochs.first)
@@ -564,8 +588,8 @@ class Online:
                 wide = np.sqrt((batch.epochs.move[r].L[k] ** 2).sum(1))[slice(*span)].max()
                 area = self.arrivals.area
                 assert area is not None
-                known &= bool(wide <= NEAR * area.extent)
-        return known
+                astray += not wide <= NEAR * area.extent
+        return astray
 
     def _looked_at(self, batch: Batch, k: int) -> int:
         """Epochs by which a new target is placed: a plain filter takes its first where that has data enough."""
@@ -591,7 +615,7 @@ class Online:
             M = self._problem.model.biases
             columns = np.repeat(np.arange(self._starts) == oldest, M)
             self.belief = beliefs.renewed(self.belief, jnp.asarray(columns))
-            self.since[oldest] = self.walked
+            self.since = [*self.since[:oldest], self.walked, *self.since[oldest + 1 :]]
 
     def _jump(self, stack: Augmented, done: np.ndarray, times: np.ndarray) -> Any:
         """The first part at the end of which some candidate exceeds the bound, it, the `Jump`, size and variance."""

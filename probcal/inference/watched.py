@@ -73,7 +73,8 @@ def calibration_tree(online: Online) -> xr.DataTree:
     posterior = StreamPosterior.of(problem, online.prior, point, found, alpha)
     method = Watched(online.method)
     answer = Answer(
-        problem, method, method, online.prior, posterior, Status.SPENT, "", ("",) * len(problem.labels),
+        problem, method, method, online.prior, posterior, Status.NOT_CONVERGED if online.message else Status.SPENT,
+        online.message, ("",) * len(problem.labels),
         online.counts["rows"],
     )  # fmt: skip
     tree = build(answer, (), jax.random.key(0), ())

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from probcal import linalg
 from probcal.model import rows as waist
@@ -49,6 +50,11 @@ def first_cloud(states: State, z: jax.Array, root: jax.Array, count: int) -> Clo
     return Cloud(
         jax.tree.map(many, states), many(z), many(root), jnp.full(count, -jnp.log(float(count))), jnp.arange(count)
     )
+
+
+def ancestors(cloud: Cloud) -> int:
+    """How many particles of the start have descendants."""
+    return len(np.unique(np.asarray(cloud.origin)))
 
 
 def bias_moments(cloud: Cloud) -> tuple[jax.Array, jax.Array]:

@@ -160,21 +160,29 @@ def _seen(
 def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Cheapest path: losses (windows, candidates), places (candidates, d), expected step between windows.
 
-    Only the `BEAM` best candidates of each window are tried.
+    Only the `BEAM` best candidates of each window are tried, and of these none that is by itself further above the
+    best of its window than all the steps of the path through the best cost: no cheaper path passes it.
     """
-    beam = min(BEAM, loss.shape[1])
-    kept = np.argpartition(loss, beam - 1, axis=1)[:, :beam]
+    best, rows = loss.argmin(1), np.arange(len(loss))
+    dearest = loss[rows, best] + _steps(np.diff(places[best], axis=0), steps).sum() * (1 + 1e-9) + 1e-9
+    kept = [np.flatnonzero(mine <= most) for mine, most in zip(loss, dearest, strict=True)]
+    kept = [k[np.argpartition(loss[j, k], BEAM - 1)[:BEAM]] if len(k) > BEAM else k for j, k in enumerate(kept)]
     total, back = loss[0, kept[0]], []
     for k in range(1, len(loss)):
-        a, b = (places[kept[j]] / steps[k - 1] for j in (k - 1, k))
-        through = total + 0.5 * (a**2).sum(1) - b @ a.T  # (to, from), but for what they share
-        best = through.argmin(1)
-        total = through[np.arange(beam), best] + 0.5 * (b**2).sum(1) + loss[k, kept[k]]
-        back.append(best)
+        a, b = places[kept[k - 1]], places[kept[k]]
+        through = total + _steps(b[:, None, :] - a[None, :, :], steps[k - 1])  # (to, from)
+        cheapest = through.argmin(1)
+        total = through[np.arange(len(b)), cheapest] + loss[k, kept[k]]
+        back.append(cheapest)
     path = [int(total.argmin())]
-    for best in reversed(back):
-        path.append(int(best[path[-1]]))
-    return kept[np.arange(len(loss)), path[::-1]]
+    for cheapest in reversed(back):
+        path.append(int(cheapest[path[-1]]))
+    return np.array([mine[at] for mine, at in zip(kept, path[::-1], strict=True)])
+
+
+def _steps(line: np.ndarray, steps: np.ndarray | float) -> np.ndarray:
+    """Cost of steps (..., d) where `steps` (...) are expected."""
+    return 0.5 * (line**2).sum(-1) / np.square(steps)
 
 
 def _thinned(problem: Problem, r: int) -> Model:
