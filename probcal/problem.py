@@ -579,7 +579,8 @@ def check_linear(problem: Problem) -> None:
             raise InputError(
                 f'target "{epochs.target[0]}" moves by {type(sampled.others[0]).__name__}, which has no linear form, as'
                 " Gaussian methods need it; take motions such as ConstantVelocity(std), or particles:"
-                " EM(Particles(200)), ParticleGibbs(), track(..., smoother=Particles(1000))"
+                " EM(Particles(200)), ParticleGibbs(), track(..., smoother=Particles(1000)), of a stream"
+                " ParticleFilter(1000) (--particles 1000)"
             )
 
 

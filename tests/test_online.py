@@ -506,6 +506,17 @@ def test_a_table_that_breaks_off_midway_leaves_nothing_behind(lag, monkeypatch):
     assert online.since == other.since
 
 
+def test_a_tree_has_the_tracks_of_the_last_rows_wherever_they_began():
+    found = pc.simulate(network(), {"a": MOTION["a"]}, np.arange(200.0), key=3).table.sort_values("time", kind="stable")
+    online = pc.Online(network(), {"a": MOTION["a"]}, pc.AugmentedFilter(lag=0))
+    for k in range(0, len(found), 60):
+        last = online.update(found.iloc[k : k + 60]).tracks
+    track = online.tree()["track/a"]
+    assert len(last) == len(track["time"]) == 20
+    away = track["mean"].sel(component=["position_x", "position_y"]).to_numpy() - last[["position_x", "position_y"]]
+    assert (np.abs(away.to_numpy()) < 4 * last[["position_x_sd", "position_y_sd"]].to_numpy()).all()
+
+
 def test_detections_without_a_name_are_refused():
     seen = pc.Network([plain.on(pc.Node("n0", (0.0, 0.0)), detection=pc.Detection(0.9, clutter=1.0))])
     online = pc.Online(seen, MOTION["a"])

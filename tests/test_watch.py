@@ -29,6 +29,12 @@ def problem(data=None):
     return Problem(network, motion, data)
 """
 
+ON_ROAD = "from probcal.roads import Road, RoadNetwork\n" + MODEL.replace(
+    'Target(ConstantVelocity(0.5), {"position": ((0.0, 0.0), 5.0), "velocity": ((1.0, 0.0), 1.0)})',
+    'Road(RoadNetwork.from_lines({"west": [(-9.0, 0.0), (20.0, 0.0)], "east": [(20.0, 0.0), (90.0, 0.0)],'
+    ' "north": [(20.0, 0.0), (20.0, 60.0)]}), 0.1, (1.0, 0.2), ((0.0, 0.0), 2.0), fastest=3.0)',
+)
+
 
 def lines(count=40):
     rng, found = np.random.default_rng(0), ["time,sensor,east,north\n"]
@@ -130,10 +136,14 @@ def test_particles_go_on_where_they_were(model, table, tmp_path):
     assert "--particles filters without --lag; give one of the two" in said
 
 
-def test_who_cannot_be_sure_is_told(model, table, tmp_path):
+def test_who_is_on_a_road_is_filtered_and_who_cannot_be_sure_is_told(model, table, tmp_path):
+    model.write_text(ON_ROAD)
     out = tmp_path / "out"
-    code, printed, _ = call("watch", model, table, "--out", out, "--particles", "20")
+    code, printed, _ = call("watch", model, table, "--out", out, "--particles", "300")
     assert code == 0
+    found = last(out)
+    assert found["mean"]["n1.shift"] - found["mean"]["n0.shift"] == pytest.approx(1.5, abs=1.0)
+    assert (found["gamma"] > 0.3).all()
     assert "of the first particles are left: take more" in printed
     assert pc.load(out).attrs["status"] == "not converged"
     assert "Intervals may be too narrow." in pc.load(out).attrs["message"]
@@ -200,6 +210,11 @@ def test_what_is_wrong_is_said(model, table, tmp_path):
         code, _, printed = call("watch", model, table, *options)
         assert code == 2
         assert said in printed
+    road = tmp_path / "road.py"
+    road.write_text(ON_ROAD)
+    code, _, printed = call("watch", road, table)
+    assert code == 2
+    assert "moves by Road, which has no linear form" in printed
     table.write_text("time,sensor,west\n1,n0,2\n")
     code, _, printed = call("watch", model, table)
     assert code == 2
@@ -207,6 +222,10 @@ def test_what_is_wrong_is_said(model, table, tmp_path):
     good = tmp_path / "good.py"
     good.write_text(MODEL.replace("motion, data)", "motion, " + repr(str(tmp_path / "own.csv")) + ")"))
     (tmp_path / "own.csv").write_text("".join(lines()))
+    table.write_text("time,sensor,east,north\n" + "1,n9,2.0,3.0\n" * 60)
+    code, _, printed = call("watch", good, table)
+    assert code == 2
+    assert 'the first 50 rows cannot be taken: rows.csv row 51: sensor "n9" is not in' in printed
     table.write_text("time,sensor,east,north\n")
     code, _, printed = call("watch", good, table)
     assert code == 2

@@ -24,14 +24,14 @@ from probcal.errors import InputError
 from probcal.files import Outputs, write_whole
 from probcal.inference.checkpoint import pack_state, unpack_state
 from probcal.inference.online import AugmentedFilter, Online, ParticleFilter, Update
-from probcal.problem import Problem
+from probcal.problem import Problem, check_linear
 from probcal.results.io import load, save
 from probcal.results.schema import ROPE
 from probcal.status import INVALID
 from probcal.table import Table, read_lines
 
 BLOCK = 1 << 18  # bytes that are read at once
-TRIED = 50  # first lines of which a model is made that has no data of its own
+TRIED = 50  # first lines of which a model is made that has no data of its own, and that may be refused
 REST = 0.2  # s between two looks at a file that does not grow
 LISTED = 40  # biases of the live table; of more those that are largest in their sds
 EVERY = 60.0  # s between two lines where the output is no terminal
@@ -123,6 +123,8 @@ def run(
         )
     source = Source("standard input" if data is None else data.name)
     problem = _declared(model, data, fix, given, source, follow)
+    if isinstance(method, AugmentedFilter):
+        check_linear(problem)
     online = Online(
         problem.network, problem.motion, method, calibration=known, fix=problem.fixed, epoch=problem.epoch,
         targets=targets,
@@ -234,6 +236,8 @@ class Watching:
     def _refuse(self, table: Table, why: str) -> None:
         self.refused += 1
         self._why = why
+        if self.refused == TRIED and self.online.end is None:
+            raise InputError(f"the first {TRIED} rows cannot be taken: {why}")
         if self.tables is not None:
             self.tables.add(REFUSED, pd.DataFrame({"line": table.lines, "reason": why}))
         elif self.refused <= 3:

@@ -98,7 +98,8 @@ def unpack_state(online: Online, content: bytes, source: str) -> dict[str, Any]:
         arrivals.area, arrivals.duration = Area(d, np.array(middle), extent, wide), said["duration"]
         arrivals.tried = arrays.pop("tried")
     frames = {n: None if own is None else pd.DataFrame(own) for n, own in said["frames"].items()}
-    arrivals.samples, online.pending, online.recent = frames["samples"], frames["pending"], frames["recent"]
+    arrivals.samples = frames["samples"]
+    online.pending, online.recent, online.lately = frames["pending"], frames["recent"], frames["lately"]
     if arrivals.samples is not None:
         arrivals.rebuild()
         if list(arrivals.template.labels) != said["labels"]:  # type: ignore[union-attr]
@@ -117,7 +118,8 @@ def unpack_state(online: Online, content: bytes, source: str) -> dict[str, Any]:
 
 
 def _frames(online: Online) -> dict[str, pd.DataFrame | None]:
-    return {"samples": online.arrivals.samples, "pending": online.pending, "recent": online.recent}
+    held = {name: getattr(online, name) for name in ("pending", "recent", "lately")}
+    return {"samples": online.arrivals.samples, **held}
 
 
 def _columns(frame: pd.DataFrame | None) -> dict[str, list[Any]] | None:

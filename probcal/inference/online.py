@@ -226,6 +226,7 @@ class Online:
         self.pending: pd.DataFrame | None = None
         self.cloud: Cloud | None = None
         self.recent: pd.DataFrame | None = None
+        self.lately: pd.DataFrame | None = None  # tracks of the last rows, by particles
         self.points: dict[tuple[float, str], tuple[Any, Any]] = {}
         self.belief: Any = None  # `Augmented` up to the rows that were filtered for good
         self.end: Any = None  # `Augmented` with those in the window
@@ -536,7 +537,8 @@ class Online:
         self.walked = self.time = max(self.time, float(batch.time[-1]))
         self.arrivals.settled(batch, frame, K)
         self.pending, self.recent = frame.iloc[:0], frame.tail(RECENT).reset_index(drop=True)
-        return Update(self.time, K, self._tracks(frames), (), 0, particles.ancestors(self.cloud) >= ANCESTORS)
+        self.lately = self._tracks(frames)
+        return Update(self.time, K, self.lately, (), 0, particles.ancestors(self.cloud) >= ANCESTORS)
 
     def _window(self, left: int) -> tuple[int, int, int]:
         """Epochs of the next call, what they are padded to, and into how many parts it falls."""

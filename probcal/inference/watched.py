@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.motion import Target
 from probcal.priors import Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, NormalPosterior
+from probcal.results.answer import CHAINS, Answer, Draws, NormalPosterior, Tracks
 from probcal.results.build import build
+from probcal.smoothing.draws import draw_biases, draws_a_chain
 from probcal.smoothing.grid import track_mode
 from probcal.smoothing.linearised import LaplaceApproximation
+from probcal.smoothing.mode import Point
 from probcal.starts import automatic_start
 from probcal.status import Status
 from probcal.table import Table
@@ -50,6 +55,29 @@ class StreamPosterior(NormalPosterior):
         return np.linalg.solve(self.summary.whole, self.summary.mean)
 
 
+@dataclass(frozen=True, eq=False)
+class FilteredPosterior(StreamPosterior):
+    """The same with the tracks that particles had of the last rows, whatever the motion."""
+
+    filtered: Sequence[Tracks] = ()
+
+    def tracks(self) -> Sequence[Tracks]:
+        """Mean and sd of all states, as filtered."""
+        return self.filtered
+
+    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
+        """Independent draws of the biases."""
+        shape = (CHAINS, draws_a_chain(self.problem.model.size, CHAINS))
+        z = draw_biases(self.point, self.found.covariance, key, shape[0] * shape[1])
+        levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
+        return Draws(np.asarray(z).reshape(*shape, -1), levels, [], np.arange(shape[1]), [], [])
+
+    @property
+    def before(self) -> Point:
+        """The point with all biases zero, on the same tracks."""
+        return self.point._replace(z=jnp.zeros_like(self.point.z))
+
+
 @float64
 def calibration_tree(online: Online) -> xr.DataTree:
     """The tree of what a filter knows."""
@@ -58,11 +86,19 @@ def calibration_tree(online: Online) -> xr.DataTree:
     assert frame is not None
     own = frame.drop(columns=["cells", "line"])
     motions = online.arrivals.motions(dict.fromkeys(own["target"]))
+    if online.counts["rows"] > len(frame):  # these do not begin where the targets did
+        motions = {name: Target(target.motion) for name, target in motions.items()}
     table = Table(own, "the last rows", frame["line"].to_numpy())
-    problem = Problem(template.network, motions, table, fix=template.fixed)
+    problem = Problem(template.network, motions, table, fix=template.fixed, epoch=template.epoch)
     z, root = np.asarray(online.end.mean), np.asarray(online.end.root)
-    point = automatic_start(problem)
-    point = track_mode(problem, point._replace(z=jnp.asarray(z), levels=jnp.asarray(online.levels(problem))))
+    levels = jnp.asarray(online.levels(problem))
+    sampled = any(form is not None for form in problem.model.sampled)
+    if sampled:
+        problem, tracks = problem.seen(), _filtered(online, problem)
+        states = tuple(jnp.asarray(track.mean) for track in tracks)
+        point = Point(states, tuple(x[:, :0] for x in states), jnp.asarray(z), levels)
+    else:
+        point = track_mode(problem, automatic_start(problem)._replace(z=jnp.asarray(z), levels=levels))
     covariance = root @ root.T
     before = np.asarray(online.prior.precision(problem.labels, problem.surveyed).matrix())
     alpha = np.diag(before)
@@ -70,7 +106,8 @@ def calibration_tree(online: Online) -> xr.DataTree:
         jnp.asarray(np.linalg.inv(covariance) - before), jnp.asarray(covariance),
         jnp.asarray(np.clip(1.0 - alpha * np.diag(covariance), 0.0, 1.0)), jnp.asarray(online.log_evidence),
     )  # fmt: skip
-    posterior = StreamPosterior.of(problem, online.prior, point, found, alpha)
+    posterior: Any = (FilteredPosterior if sampled else StreamPosterior).of(problem, online.prior, point, found, alpha)
+    posterior = replace(posterior, filtered=tracks) if sampled else posterior
     method = Watched(online.method)
     answer = Answer(
         problem, method, method, online.prior, posterior, Status.NOT_CONVERGED if online.message else Status.SPENT,
@@ -80,3 +117,15 @@ def calibration_tree(online: Online) -> xr.DataTree:
     tree = build(answer, (), jax.random.key(0), ())
     tree.attrs.update({f"stream_{name}": count for name, count in online.counts.items()}, seed=0)
     return tree
+
+
+def _filtered(online: Online, problem: Problem) -> list[Tracks]:
+    """Mean and sd of the states at the last rows, as they were filtered."""
+    assert online.lately is not None
+    known = online.lately.drop_duplicates(["time", "target"], keep="last").set_index(["time", "target"])
+    found = []
+    for epochs in problem.epochs:
+        names = list(epochs.components)
+        rows = known.loc[list(zip(epochs.time, map(str, epochs.target), strict=True))]
+        found.append(Tracks(rows[names].to_numpy(float), rows[[f"{name}_sd" for name in names]].to_numpy(float)))
+    return found
