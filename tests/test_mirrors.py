@@ -173,7 +173,7 @@ def test_a_reflected_track_is_made_of_its_noises_at_any_level():
     np.testing.assert_allclose(made[:, :, 0], across.states[0], atol=1e-6)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [probcal.Collapsed(draws=300), probcal.NUTS(warmup=200, draws=200)], ids=["collapsed", "nuts"]
 )

@@ -115,7 +115,7 @@ def made_volume(problem, made, theta, orbit, r):
     ("case", "prior", "runs"),
     [
         ((2, False, False), Horseshoe(), 1000),
-        pytest.param((3, False, True), Horseshoe(), 400, marks=pytest.mark.ci),
+        pytest.param((3, False, True), Horseshoe(), 400, marks=pytest.mark.slow),
         pytest.param((2, False, False), probcal.Gaussian(), 1000, marks=pytest.mark.ci),
         pytest.param((2, False, False), ARD(2.0, 2.0, by="node"), 1000, marks=pytest.mark.ci),
         pytest.param((2, False, False), Laplace(), 1000, marks=pytest.mark.slow),

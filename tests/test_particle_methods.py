@@ -313,8 +313,9 @@ def crossing(kind):
     return (road if kind == "road" else LeavingRoad(road, 0.5, 0.05, 0.05)) + RandomWalk("power", "dB", 0.5, (4.0, 2.0))
 
 
-@pytest.mark.ci
-@pytest.mark.parametrize("kind", ["road", "leaving"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("leaving", marks=pytest.mark.ci), pytest.param("road", marks=pytest.mark.slow)]
+)
 def test_a_network_is_calibrated_from_targets_on_roads(kind):
     """Two targets at times of their own; the places of two sensors, 3 sd about the truth (NEES below 3 in 1e-4)."""
     network = offsets()

@@ -8,8 +8,6 @@ import probcal as pc
 from probcal.errors import FitError
 from probcal.geometry import bearing, elevation, norm
 
-pytestmark = pytest.mark.ci
-
 TIME = np.arange(40.0)
 REPORT = pc.Detection(0.9, clutter=3.0, view=pc.Sector(range=3000.0))
 METHOD = pc.SelfConfiguration(pc.MAP(), start="beliefs")
@@ -71,6 +69,7 @@ def check(tree, biases):
         assert abs(mean - value) < 4 * sd, label
 
 
+@pytest.mark.ci
 def test_a_radar_turned_anyhow_and_far_from_where_it_is_stated():
     """Hundreds of metres off, its heading anywhere: the biases within four sds, in one round or two."""
     biases = {"east.position_x": -320.0, "east.position_y": 410.0, "east.heading": 2.4}
@@ -80,6 +79,7 @@ def test_a_radar_turned_anyhow_and_far_from_where_it_is_stated():
     assert tree.attrs["rounds"] <= 2
 
 
+@pytest.mark.slow
 def test_a_radar_in_space():
     biases = {"east.position_x": 120.0, "east.position_y": -80.0, "east.position_z": 60.0, "east.heading": 0.5}
     report = pc.Detection(0.9, 3.0, view=pc.Sector(range=3000.0), limits={"elevation": (-1.5, 1.5)})
@@ -87,12 +87,14 @@ def test_a_radar_in_space():
     check(fitted(whole, whole, biases, paths(2, 3), 2), biases)
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_declared_is_found():
     biases = {"east.position_x": 30.0, "east.heading": 0.05, "east.clock": 4.0}
     whole = network({"position": 50.0, "heading": 0.1}, late_radar)
     check(fitted(whole, whole, biases, paths(0), 0), biases)
 
 
+@pytest.mark.ci
 def test_a_clock_that_nobody_declared_is_a_misfit():
     """Objects that fit only with another clock run beside themselves: no confident answer."""
     scale = {"position": 50.0, "heading": 0.1}
@@ -102,6 +104,7 @@ def test_a_clock_that_nobody_declared_is_a_misfit():
     assert "the two differ by what no bias allows for" in tree.attrs["message"]
 
 
+@pytest.mark.ci
 def test_two_poses_that_explain_as_much_are_named():
     """Two objects that change places when the scene is turned by half about the second radar."""
     middle = np.array([1000.0, 0.0])
@@ -112,6 +115,7 @@ def test_two_poses_that_explain_as_much_are_named():
     assert "Several poses explain the detections as well (how many): east" in tree.attrs["message"]
 
 
+@pytest.mark.slow
 def test_one_sensor_of_three_that_reports_clutter_alone_is_named():
     """The radar that sees no object is not placed, and there is no fit with it; the other is found beside it."""
     biases = {"east.position_x": -120.0, "east.position_y": 150.0, "east.heading": 0.4}

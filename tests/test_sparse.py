@@ -114,8 +114,9 @@ def test_the_sparse_form_ends_where_the_dense_one_does(library, dense, monkeypat
         np.testing.assert_allclose(other["sd"], one["sd"], rtol=1e-5 if library is Cholmod else 0.3)
 
 
-@pytest.mark.ci
-@pytest.mark.parametrize("form", ["dense", "sparse"])
+@pytest.mark.parametrize(
+    "form", [pytest.param("dense", marks=pytest.mark.slow), pytest.param("sparse", marks=pytest.mark.ci)]
+)
 @pytest.mark.parametrize("prior", [pc.Horseshoe(), pc.BernoulliGaussian()], ids=lambda prior: type(prior).__name__)
 def test_propagation_agrees_with_sweeps_over_all_biases(prior, form, monkeypatch):
     """Within what the Monte Carlo error of both leaves: 0.4 sds, a third of an sd; most intervals hold the truth."""

@@ -167,7 +167,7 @@ def sampled(family, count=60_000):
     return centre, np.sqrt(share @ (variances + (means - centre) ** 2)), 1 / (share @ share)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [probcal.NUTS(chains=4, warmup=300, draws=500), probcal.Collapsed(chains=4, warmup=200, draws=1500)]
 )

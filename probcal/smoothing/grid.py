@@ -143,7 +143,7 @@ def _seen(
         some.append(data._replace(**chosen | {"epoch": jnp.zeros_like(first)}))
     stds = [waist.noise_std(data, levels) for data in mine.rows]
 
-    def loss(place: jax.Array) -> jax.Array:
+    def loss(place: jax.Array) -> list[jax.Array]:
         state, misfits = jnp.zeros((1, n)).at[0, span[0] : span[1]].set(place), []
         for block, data, few, (_, own), std in zip(mine.blocks, mine.rows, some, alike, stds, strict=True):
             lin = waist.linearise_biases(block, few, state, z, levels, expected=False)
@@ -151,10 +151,13 @@ def _seen(
             looked = apart((waist.predict(block, few, state, z), spread))
             predicted, spread = apart(jax.tree.map(lambda part, own=own: part[own], looked))
             score, weight = waist.weigh(block, data, predicted, std, expected=False)
-            misfits.append(_misfit(Linearised(score, weight, jnp.zeros((*score.shape, 0)), spread)))
-        return mine.by_epoch(misfits)[0]
+            misfits.append(_misfit(Linearised(score, weight, jnp.zeros((*score.shape, 0)), spread)).sum(1))
+        return misfits
 
-    return jax.lax.map(loss, places)
+    found = jnp.zeros((mine.recursions[0].drift.shape[0], len(places)))
+    for data, misfit in zip(mine.rows, jax.lax.map(loss, places), strict=True):
+        found = found.at[data.epoch].add(misfit.T)  # of all candidates at once
+    return found.T
 
 
 def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndarray:
