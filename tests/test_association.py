@@ -248,7 +248,7 @@ def test_a_row_with_a_name_is_not_assigned_again():
     assert set(both.measurements.target_names) == {"t0", "a"}
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.ci), pytest.param(3, marks=pytest.mark.ci)])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 def test_biases_are_found_with_the_objects(seed):
     """Two radars that share no names: each bias within 4 sds of the truth, no wider than twice the labelled fit."""
     own = problem(drawn(seed=seed).table)
