@@ -108,7 +108,8 @@ def main():
     for heading, entries in (("Notebooks", notebooks()), ("Models", models(given.fits, given.data, given.only))):
         parts.append(f"\n## {heading}\n")
         for title, link, text, picture in entries:
-            parts.append(f"\n### [{title}]({link})\n\n{text}\n\n![{title}]({picture})\n")
+            shown = f"\n![{title}]({picture})\n" if (ROOT / "notebooks" / picture).exists() else ""
+            parts.append(f"\n### [{title}]({link})\n\n{text}\n{shown}")
     (ROOT / "notebooks" / "README.md").write_text("".join(parts))
 
 
