@@ -467,6 +467,19 @@ def test_blank_rows_are_no_rows():
     pd.testing.assert_frame_equal(online.biases, other.biases)
 
 
+@pytest.mark.parametrize("method", [pc.AugmentedFilter(lag=0), pc.ParticleFilter(50)], ids=["augmented", "particles"])
+def test_the_last_rows_of_a_tree_are_those_that_say_something(method):
+    frame = rows()
+    channels = [name for name in frame if name not in ("time", "sensor", "target")]
+    b = frame["target"] == "b"
+    blank = frame[b].assign(time=frame["time"][b] + 50.0, **dict.fromkeys(channels, np.nan))
+    online = filtered(method)
+    online.update(pd.concat([frame[~b].assign(time=frame["time"][~b] + 50.0), blank], ignore_index=True))
+    tree = online.tree()
+    assert "a" in tree["track"]
+    assert "b" not in tree["track"]
+
+
 def test_a_table_that_is_refused_leaves_nothing_behind():
     online = filtered(pc.AugmentedFilter(lag=0))
     before = copy.deepcopy(online.biases)

@@ -176,7 +176,7 @@ class Watching:
     used: int = 0
     stored: float = field(default_factory=time.monotonic)
     begun: float = field(default_factory=time.monotonic)
-    busy: bool = False  # with rows, which are taken whole or not at all
+    busy: bool = False  # with rows or tables, which are taken and written whole
     ending: bool = False
     unstored: bool = False
 
@@ -185,7 +185,8 @@ class Watching:
         while True:
             lines = self.source.take(file)
             if lines:
-                self.filter(lines)
+                with self.undisturbed():
+                    self.filter(lines)
                 show()
             elif self.source.ended and grows:
                 self.checkpoint()
@@ -194,7 +195,8 @@ class Watching:
                 break
             self.checkpoint()
         if lines := self.source.last():
-            self.filter(lines)
+            with self.undisturbed():
+                self.filter(lines)
         if self.online.end is not None:
             self.note(self.online.finish())
         if self.tables is not None:
@@ -204,7 +206,6 @@ class Watching:
 
     def filter(self, lines: bytes) -> None:
         """Filter some lines; those that cannot be taken are put aside."""
-        self.busy = True
         table = read_lines(self.source.header, lines, self.source.name, self.source.line)
         before = self.refused
         if len(table.frame):
@@ -215,7 +216,14 @@ class Watching:
             head = b"" if self.tables.length.get(ROWS) else self.source.header.rstrip(b"\r") + b"\n"
             self.tables.write(ROWS, head + lines)
         self.source.taken(lines)
-        self.unstored, self.busy = True, False
+        self.unstored = True
+
+    @contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """What is inside comes to its end: who is told to end meanwhile ends behind it."""
+        self.busy = True
+        yield
+        self.busy = False
         if self.ending:
             raise KeyboardInterrupt
 
@@ -261,7 +269,8 @@ class Watching:
     def checkpoint(self) -> None:
         """Store the state where it is time."""
         if self.unstored and time.monotonic() - self.stored >= self.every:
-            self.store()
+            with self.undisturbed():
+                self.store()
 
     def store(self) -> None:
         """History first, then the state that says how long it is."""

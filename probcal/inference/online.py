@@ -493,7 +493,7 @@ class Online:
                 break
         self.arrivals.settled(batch, frame, begun)
         self.pending = frame[batch.row >= begun].reset_index(drop=True)
-        self.recent = frame.tail(RECENT).reset_index(drop=True)
+        self.recent = frame[batch.row >= 0].tail(RECENT).reset_index(drop=True)
         self._keep(batch, points, begun)
         self.time = max(self.time, float(batch.time[-1]))
         self.end = self.belief if begun == K else jax.tree.map(lambda leaf: leaf[-1], stack)
@@ -536,7 +536,8 @@ class Online:
         self.belief = self.end = self.belief._replace(mean=np.asarray(mean), root=root)
         self.walked = self.time = max(self.time, float(batch.time[-1]))
         self.arrivals.settled(batch, frame, K)
-        self.pending, self.recent = frame.iloc[:0], frame.tail(RECENT).reset_index(drop=True)
+        self.pending = frame.iloc[:0]
+        self.recent = frame[batch.row >= 0].tail(RECENT).reset_index(drop=True)
         self.lately = self._tracks(frames)
         return Update(self.time, K, self.lately, (), 0, particles.ancestors(self.cloud) >= ANCESTORS)
 

@@ -111,8 +111,7 @@ def calibration_tree(online: Online) -> xr.DataTree:
     method = Watched(online.method)
     answer = Answer(
         problem, method, method, online.prior, posterior, Status.NOT_CONVERGED if online.message else Status.SPENT,
-        online.message, ("",) * len(problem.labels),
-        online.counts["rows"],
+        online.message, ("",) * len(problem.labels), online.counts["rows"],
     )  # fmt: skip
     tree = build(answer, (), jax.random.key(0), ())
     tree.attrs.update({f"stream_{name}": count for name, count in online.counts.items()}, seed=0)
