@@ -13,7 +13,7 @@ TURNED = 1e-3  # by how much a rotation matrix may miss being one, of numbers th
 
 def norm(vector: Any) -> jax.Array:
     """Euclidean length of a vector, in its unit; the gradient at zero is zero."""
-    squared = jnp.sum(vector**2)
+    squared = sum(vector[i] ** 2 for i in range(len(vector)))  # XLA weaves it into what is around, a reduction not
     positive = squared > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 

@@ -75,11 +75,14 @@ class Truth:
         columns = [f"position_{axis}" for axis in AXES[:dimension]]
         if columns[-1] not in self.tracks:
             raise InputError(f'truth: the tracks have no column "{columns[-1]}", the network is {dimension}-D')
+        owners = self.tracks["target"].map(name_as_text).to_numpy() if "target" in self.tracks else None
+        known, places = self.tracks["time"].to_numpy(float), self.tracks[columns].to_numpy(float)
         for name in np.unique(target):
-            mine = target == name
-            track = self.track(name, time[mine])
-            if track is not None:
-                found[mine] = track[columns].to_numpy(float)
+            rows = slice(None) if owners is None else owners == name
+            at, own = known[rows], places[rows]
+            if len(at):
+                mine, order = target == name, np.argsort(at, kind="stable")
+                found[mine] = _interpolated(time[mine], at[order], own[order])
         return found
 
     def track(self, target: str, time: np.ndarray) -> pd.DataFrame | None:
@@ -98,11 +101,7 @@ class Truth:
         values = track.drop(columns=["time", "target"], errors="ignore").apply(pd.to_numeric, errors="coerce")
         values = values.dropna(axis=1)
         known = track["time"].to_numpy(float)
-        if len(known) == 1:
-            return values.loc[values.index.repeat(len(time))].reset_index(drop=True)
-        inside = (time >= known[0] - 1e-9) & (time <= known[-1] + 1e-9)
-        columns = {n: np.interp(time, known, column.to_numpy(float)) for n, column in values.items()}
-        return pd.DataFrame({n: np.where(inside, column, np.nan) for n, column in columns.items()})
+        return pd.DataFrame(_interpolated(time, known, values.to_numpy(float)), columns=values.columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +122,15 @@ class Simulation:
         for target, frame in tables:
             write_whole(target, frame.to_csv(index=False))
         return [target for target, _ in tables]
+
+
+def _interpolated(time: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (E, k) at times (E,) between those (K, k) at known ones (K,), NaN outside; one alone holds for ever."""
+    if len(known) == 1:
+        return np.repeat(values, len(time), 0)
+    inside = (time >= known[0] - 1e-9) & (time <= known[-1] + 1e-9)
+    found = np.stack([np.interp(time, known, column) for column in values.T], 1)
+    return np.where(inside[:, None], found, np.nan)
 
 
 def truth_beside(path: str | PathLike[str]) -> Truth | None:

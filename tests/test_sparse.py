@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import worlds
+import xarray as xr
 
 import probcal as pc
 from probcal.analysis.nees import of_biases
@@ -403,7 +404,7 @@ def test_check_of_a_large_network_says_what_is_open(monkeypatch, capsys, tmp_pat
     assert ended == 1
     assert "biases, those that the data tell least of" in said
     assert "translation of all nodes along x (gauge" in said
-    assert "what to measure next is not computed for a network of this size" in said
+    assert "What would tell most (nats), of surveys alone on a network of this size:\n  a survey of " in said
     assert {path.name for path in tmp_path.iterdir()} >= {"check.nc", "check.csv"}
 
 
@@ -446,3 +447,61 @@ def test_a_fit_of_many_data_keeps_what_a_mail_holds(monkeypatch, tmp_path):
     assert again["log_likelihood_sum"].equals(large["log_likelihood_sum"])
     both = pc.compare({"small": small, "large": large})
     assert any("too many for a fit to keep it" in text for text in both["finding"]["sentence"].values)
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+@pytest.mark.parametrize("kind", ["posterior", "hybrid", "parametric"])
+def test_bounds_by_sparse_factors_are_those_of_the_dense_form(kind, library, monkeypatch):
+    problem, truth = drawn()
+    wanted = pc.bounds(problem, kind=kind, truth=truth, draws=3)
+    monkeypatch.setattr("probcal.smoothing.joint.ROOM", 0)
+    found = pc.bounds(problem, kind=kind, truth=truth, draws=3)
+    close = 1e-6 if library is Cholmod else 0.15  # 512 draws tell a variance to 6 %
+    a, b = (tree["bias"].to_dataset() for tree in (wanted, found))
+    assert "covariance" in a
+    assert "covariance" not in b
+    np.testing.assert_allclose(b["sd"], a["sd"], rtol=close)
+    for name in MOTION:
+        one, other = (tree[f"track/{name}"]["position_rmse"] for tree in (wanted, found))
+        np.testing.assert_allclose(other, one, rtol=close)
+    assert ("Variances are estimated from 512 draws" in found.attrs["message"]) == (library is not Cholmod)
+
+
+@pc.sensor(azimuth=pc.Channel("rad", std=0.01, wrap=True))
+def turned_ear(target, pose, *, offset=pc.Bias("rad", 0.05)):
+    """Azimuth with an offset that no data tell from a heading."""
+    return dict(azimuth=bearing(pose.local(target.position)) + offset)
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+def test_what_has_no_bound_has_none_by_sparse_factors(library, monkeypatch):
+    problem, truth = drawn()
+    placed = [(turned_ear if s.type is ear else s.type).on(s.nodes[0]) for s in problem.network.sensors]
+    problem = pc.Problem(pc.Network(placed), MOTION, problem.measurements.table)
+    wanted = pc.bounds(problem, kind="parametric", truth=pc.Truth(truth.tracks))
+    monkeypatch.setattr("probcal.smoothing.joint.ROOM", 0)
+    found = pc.bounds(problem, kind="parametric", truth=pc.Truth(truth.tracks))
+    open_ = found["unbounded"]["bias_label"].values.tolist()
+    assert set(open_) == {"d.heading", "e.heading", *(f"{s.name}.offset" for s in problem.network.sensors[3:])}
+    assert open_ == wanted["unbounded"]["bias_label"].values.tolist()
+    close = 1e-4 if library is Cholmod else 0.15
+    np.testing.assert_allclose(found["bias"]["sd"], wanted["bias"]["sd"], rtol=close)
+
+
+def test_surveys_of_many_biases_tell_what_those_of_few_do(monkeypatch):
+    pytest.importorskip("sparsax", reason="sparsax is an extra")
+    problem, _ = drawn()
+    wanted = pc.next_anchors(problem)
+    monkeypatch.setattr("probcal.smoothing.joint.ROOM", 0)
+    point = automatic_start(problem)
+    found, same = pc.next_anchors(problem, point=point), wanted.drop_vars("weak")
+    xr.testing.assert_allclose(found.sortby("anchor"), same.sortby("anchor"), rtol=1e-6)
+    assert found.attrs["looked"] == len(wanted["anchor"])
+    monkeypatch.setattr("probcal.analysis.planning.LISTED", 1)
+    monkeypatch.setattr("probcal.analysis.planning.AT_ONCE", 1)
+    few = pc.next_anchors(problem, point=point)
+    assert few.attrs["looked"] < found.attrs["looked"]
+    assert few["anchor"].values[0] == found["anchor"].values[0]
+    monkeypatch.setattr("probcal.analysis.planning.exact", lambda: False)
+    with pytest.raises(InputError, match="next_anchors of 15 biases needs exact variances"):
+        pc.next_anchors(problem, point=point)

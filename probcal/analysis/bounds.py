@@ -6,6 +6,9 @@ bound of van Trees (1968, 2.4.3) for biases and whitened motion noise together, 
 Schultheiss 1987). Averages of eliminated systems would be no bound.
 """
 
+from collections.abc import Iterable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,13 +20,16 @@ from probcal.model.model import At, Model
 from probcal.problem import Problem
 from probcal.results.groups import bias_coords, by_target
 from probcal.simulate import Key, Truth, as_key
-from probcal.smoothing.linearised import Trajectory, state_variances, trajectories_of
+from probcal.smoothing import cholesky
+from probcal.smoothing.joint import JointPrecision, too_large
+from probcal.smoothing.linearised import Trajectory, linearise_rows, state_variances, trajectories_of
 from probcal.smoothing.mode import Compressed, compress, eliminate_compressed
 from probcal.types import float64
 
 KINDS = ("parametric", "posterior", "hybrid")
 LOST = 1e-12  # share of its information below which a direction has no bound
 INVOLVED = 1e-5  # entry of such a direction above which a bias has none
+FOLLOWS = 2.0  # times the variance with ten times the ridge, from which on there is no bound
 
 
 @float64
@@ -46,7 +52,8 @@ def bounds(
     by `time` and `component`, `position_rmse` in m). A bias has no bound where it takes part in a direction of which
     the elimination leaves less than 1e-12 of the information that its biases would have with all else known; such
     biases are left out of `bias`, listed in the group `unbounded` and named in the attribute `message`, which also
-    names those whose bound exceeds their scale.
+    names those whose bound exceeds their scale. Where the dense form takes more than 240 MB the bounds come from sparse
+    factors, and there is no `covariance`.
     Raises `InputError` for an unknown kind or label, tracks with gaps, and draws at which a sensor is not finite.
 
     >>> bounds(problem)["bias"]["sd"].sizes["bias_label"]
@@ -65,15 +72,47 @@ def bounds(
         states = on_tracks_of(problem, given, draw_states(problem, draws, keys[0]))
         z = jnp.broadcast_to(true_biases(problem, given), (draws, model.biases))
         z = jax.random.normal(keys[1], z.shape) if kind == "posterior" else z
-    compressed = average(model, levels, z, states)
-    if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(compressed)):
-        raise InputError("bounds: a sensor is not finite at the trajectories drawn; give truth=Truth(tracks)")
     prior = np.ones(model.biases) if kind == "posterior" else problem.surveyed.astype(float)
+    if too_large(problem.model):
+        variance, bounded, spread = _by_sparse(model, levels, z, states, prior)
+        return _tree(problem, kind, len(z), np.sqrt(variance), None, bounded, spread)
+    compressed = average(model, levels, z, states)
+    _check_finite(jax.tree.leaves(compressed))
     information, trajectories = _eliminated(model, levels, compressed)
     alone = np.diagonal(compressed.information) + prior
     covariance, bounded = invert(np.asarray(information) + np.diag(prior), alone)
     spread = [np.maximum(np.asarray(v), 0.0) for v in state_variances(trajectories, jnp.asarray(covariance))]
-    return _tree(problem, kind, len(z), covariance, bounded, spread)
+    return _tree(problem, kind, len(z), np.sqrt(np.diagonal(covariance)), covariance, bounded, spread)
+
+
+def _check_finite(leaves: Iterable[Any]) -> None:
+    if not all(bool(np.isfinite(leaf).all()) for leaf in leaves):
+        raise InputError("bounds: a sensor is not finite at the trajectories drawn; give truth=Truth(tracks)")
+
+
+def _by_sparse(
+    model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...], prior: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Variance (M,) of the biases, who is bounded (M,), and variances (E, n) of the states, by sparse factors.
+
+    A share `LOST` of the information that each bias would have with all else known is added where there is no prior.
+    A bias whose variance follows when ten times that is added has no bound.
+    """
+    joint = JointPrecision.of(model)
+    values = np.zeros(len(joint.kept))
+    for k in range(len(z)):
+        lins = linearise_rows(model, At(tuple(x[k] for x in states), z[k], levels))
+        values += joint.values(model, lins, levels) / len(z)
+    _check_finite([values])
+    on = joint.places.row == joint.places.column
+    alone = np.bincount(joint.places.row[on], values[on], joint.places.size)[joint.states :]
+    ridge = LOST * np.where(alone > 0, alone, 1.0) * (prior == 0)
+    variance, _ = joint.factor(values, prior + ridge).inverse_diagonal()
+    own, bounded = variance[joint.states :], np.ones(model.biases, bool)
+    if ridge.any():
+        loose, _ = joint.factor(values, prior + 10.0 * ridge).inverse_diagonal()
+        bounded = own < FOLLOWS * loose[joint.states :]
+    return own, bounded, joint.state_values(variance)
 
 
 @jax.jit
@@ -119,19 +158,24 @@ def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _tree(
-    problem: Problem, kind: str, count: int, covariance: np.ndarray, bounded: np.ndarray, variances: list[np.ndarray]
-) -> xr.DataTree:
-    labels = np.array(problem.labels, str)
-    covariance = (covariance * np.outer(problem.scales, problem.scales))[np.ix_(bounded, bounded)]
-    own = {"sd": np.sqrt(np.diag(covariance)), "scale": problem.scales[bounded]}
-    coords = {**bias_coords(problem, bounded), "bias_label_other": labels[bounded]}
-    bias = xr.Dataset({name: ("bias_label", value) for name, value in own.items()}, coords=coords)
-    bias["covariance"] = (("bias_label", "bias_label_other"), covariance)
+    problem: Problem, kind: str, count: int, sd: np.ndarray, covariance: np.ndarray | None, bounded: np.ndarray,
+    variances: list[np.ndarray],
+) -> xr.DataTree:  # fmt: skip
+    """The tree of standard deviations (M,) and a covariance (M, M) of z, and variances (E, n) of the states."""
+    labels, sd = np.array(problem.labels, str), (sd * problem.scales)[bounded]
+    own = {"sd": sd, "scale": problem.scales[bounded]}
+    bias = xr.Dataset({k: ("bias_label", value) for k, value in own.items()}, coords=bias_coords(problem, bounded))
+    if covariance is not None:
+        covariance = (covariance * np.outer(problem.scales, problem.scales))[np.ix_(bounded, bounded)]
+        bias = bias.assign_coords(bias_label_other=labels[bounded])
+        bias["covariance"] = (("bias_label", "bias_label_other"), covariance)
     place = [np.sqrt(v[:, slice(*epochs.position)].sum(1)) for epochs, v in zip(problem.epochs, variances, strict=True)]
     spread = (("time", "component"), [np.sqrt(v) for v in variances])
     tracks = by_target(problem, {"sd": spread, "position_rmse": (("time",), place)})
     groups = {"bias": bias, **{f"track/{name}": group for name, group in tracks.items()}}
-    message = _message(labels, bounded, np.sqrt(np.diag(covariance)) > problem.scales[bounded])
+    message = _message(labels, bounded, sd > problem.scales[bounded])
+    if covariance is None and not cholesky.exact():
+        message += f" Variances are estimated from {cholesky.PROBES} draws; install probcal[sparse] for exact ones."
     if not bounded.all():
         groups["unbounded"] = xr.Dataset(coords=bias_coords(problem, ~bounded))
     tree = xr.DataTree.from_dict(groups)

@@ -23,7 +23,9 @@ from probcal.network import Network, Node
 from probcal.problem import Epochs, Problem
 from probcal.sensor import SensorType
 from probcal.simulate import Truth
-from probcal.smoothing.linearised import marginal_information
+from probcal.smoothing.cholesky import exact
+from probcal.smoothing.joint import JointPrecision, too_large
+from probcal.smoothing.linearised import linearise_rows, marginal_information
 from probcal.smoothing.mode import Point
 from probcal.table import Table, header
 from probcal.types import float64
@@ -32,6 +34,7 @@ LONGEST = 300  # epochs of the pass that stands as a pattern
 HEADINGS, LANES = 8, (-0.5, 0.0, 0.5)  # candidate lines: directions, and distances from the centre in radii
 GRID = 5  # candidate places an axis
 SURVEY = 0.1  # std of a survey over the scale of its bias
+LOOKED, AT_ONCE, LISTED = 1024, 64, 40  # anchors of very many: at most so many, at once, and so many with all above
 MARGIN = 0.2  # of the area around nodes and tracks
 
 
@@ -75,7 +78,9 @@ def next_anchors(
 
     `survey` is its std over the scale of the bias, `std` the same in the unit of the bias. `gain` is what it tells of
     all other biases, `own` that and what it says of itself. Biases that have a survey are left out where others have
-    none. Best first. Raises `InputError` unless `survey` is positive.
+    none. Best first. On a network too large for matrices of all biases it looks at those whose `own` is largest, some
+    1,000 of them at most (attribute `looked`), and counts no weak directions.
+    Raises `InputError` unless `survey` is positive.
 
     >>> bool(next_anchors(problem)["gain"][0] > 0)
     True
@@ -84,6 +89,8 @@ def next_anchors(
         raise InputError(f"next_anchors: survey={survey} must be positive, a std over the scale of a bias")
     check_free(problem)
     point = standpoint(problem, point, truth)
+    if too_large(problem.model):
+        return _anchors_of_many(problem, point, survey)
     known = _information(problem, point)
     whole = known + np.eye(len(known))
     covariance, apart = np.linalg.inv(whole), np.linalg.inv(_less_one(problem, known))
@@ -97,14 +104,60 @@ def next_anchors(
         inner = np.linalg.eigvalsh(-eye - apart[np.ix_(g, g)] / survey**2)  # inertia of the sum (Haynsworth 1968)
         found.append((own - alone, own, before + int((inner < 0).sum()) - len(g), survey * problem.scales[g[0]]))
     gain, own, left, std = (np.array(column) for column in zip(*found, strict=True))
-    order = np.lexsort((-own, -gain))
     columns = {"gain": gain, "own": own, "weak": left, "std": std}
+    return _ranked(problem, groups, columns, {"survey": survey, "weak_before": before})
+
+
+def _ranked(
+    problem: Problem, groups: dict[str, list[int]], columns: dict[str, np.ndarray], attrs: dict[str, Any]
+) -> xr.Dataset:
+    """Anchors with what is known of each, the largest gain first."""
+    order = np.lexsort((-columns["own"], -columns["gain"]))
     return xr.Dataset(
         {name: ("anchor", column[order]) for name, column in columns.items()}
         | {"unit": ("anchor", np.array([problem.biases[g[0]].unit for g in groups.values()], str)[order])},
         coords={"anchor": np.array(list(groups))[order]},
-        attrs={"survey": survey, "weak_before": before},
+        attrs=attrs,
     )
+
+
+def _anchors_of_many(problem: Problem, point: Point, survey: float) -> xr.Dataset:
+    """The same where no matrix of all biases is made: `own` of all anchors by the selected inverse, the gain of those
+    that can have the largest, since none has more than its `own`, by solves with the trajectories.
+    """
+    model, M = problem.model.by_information(), problem.model.biases
+    if not exact():
+        raise InputError(f"next_anchors of {M} biases needs exact variances, of sparsax: install probcal[sparse]")
+    joint = JointPrecision.of(model)
+    entries = joint.values(model, linearise_rows(model, point), point.levels)
+    names, members = list(_anchors(problem)), _padded(list(_anchors(problem).values()), M)
+    there = (members < M)[:, :, None] & (members < M)[:, None, :]
+    inverse = joint.factor(entries, np.ones(M)).inverse_entries()
+    covariance = np.where(there, joint.block_values(members, joint.pairs(members), inverse), 0.0)
+    eye = np.eye(members.shape[1])
+    own = 0.5 * np.linalg.slogdet(eye + covariance / survey**2)[1]
+    held, across, inner = joint.states_alone(entries), joint.across(entries), joint.within(entries)
+    gain, looked = np.full(len(own), -np.inf), np.argsort(-own, kind="stable")[:LOOKED]
+    for mine in np.split(looked, np.arange(AT_ONCE, len(looked), AT_ONCE)):
+        if np.sort(gain)[-LISTED:][0] >= own[mine[0]]:  # no other can have more
+            break
+        index = np.unique(members[mine][members[mine] < M])
+        columns = across[:, index].toarray()
+        known = inner[index][:, index].toarray() + np.eye(len(index)) - columns.T @ held.solve(columns)
+        place = np.minimum(np.searchsorted(index, members[mine]), len(index) - 1)
+        known = np.where(there[mine], known[place[:, :, None], place[:, None, :]], eye)
+        alone = np.where(there[mine], np.linalg.inv(known), 0.0)  # the others known
+        gain[mine] = own[mine] - 0.5 * np.linalg.slogdet(eye + alone / survey**2)[1]
+    kept = np.flatnonzero(np.isfinite(gain))
+    columns = {"gain": gain[kept], "own": own[kept], "std": survey * problem.scales[members[kept, 0]]}
+    groups = {names[k]: members[k].tolist() for k in kept}
+    return _ranked(problem, groups, columns, {"survey": survey, "looked": len(kept)})
+
+
+def _padded(groups: list[list[int]], blank: int) -> np.ndarray:
+    """Groups (B, p) of numbers, filled up behind."""
+    width = max(map(len, groups))
+    return np.array([[*group, *[blank] * (width - len(group))] for group in groups])
 
 
 def _anchors(problem: Problem) -> dict[str, list[int]]:

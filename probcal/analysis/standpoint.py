@@ -52,7 +52,7 @@ def true_point(problem: Problem, truth: Truth | None) -> tuple[jax.Array, tuple[
     z, states = true_biases(problem, given), draw_states(problem, 1, None)
     missing = [np.isnan(true).all(1) for true in true_states(problem, given)]
     if any(gone.any() for gone in missing):
-        start = automatic_start(problem)
+        start = standpoint(problem, None, None)
         start = start if truth is None else track_mode(problem, start._replace(z=z))
         z = start.z
         states = tuple(

@@ -9,6 +9,7 @@ import pandas as pd
 import xarray as xr
 
 from probcal.analysis import bound_map, next_anchors, next_passes, next_sensors, observability
+from probcal.analysis.standpoint import standpoint
 from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem
@@ -48,12 +49,16 @@ def run(model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, 
 
 
 def _check_many(problem: Problem, model: Path, outputs: Outputs | None) -> int:
-    """The check of a network too large for matrices of all biases: nothing of what to measure next."""
+    """The check of a network too large for matrices of all biases: of what to measure next the surveys alone."""
     with line():
-        tree = observability(problem)
+        start = standpoint(problem, None, None)
+        tree, anchors = observability(problem, point=start), next_anchors(problem, point=start)
     tree.attrs["model"] = model.stem
     _print_known(problem, tree)
-    print("what to measure next is not computed for a network of this size: take a part of it")
+    print(
+        "What would tell most (nats), of surveys; passes and further sensors are not looked at on a network of this size:"
+    )
+    print(f"  {_survey_text(anchors)}")
     print(STATUS[tree.attrs["status"]])
     if outputs is not None:
         with outputs.writing():
@@ -69,12 +74,16 @@ def _print_check(problem: Problem, tree: xr.DataTree, plans: tuple[xr.Dataset, x
     ends = " to ".join("(" + ", ".join(f"{v:.4g}" for v in place) + ")" for place in path[[0, -1]][: len(path)])
     what = "another pass" if len(path) > 1 else "another target"
     print(f"  {what}, {ends} m: {passes['gain'].values[0]:.2f} ({passes['weak'].values[0]})")
-    label, unit, std = (anchors[name].values[0] for name in ("anchor", "unit", "std"))
-    survey = f"a survey of {label} to {std:.2g} {unit.strip('1')}".rstrip()
-    print(f"  {survey}: {anchors['gain'].values[0]:.2f} of the other biases ({anchors['weak'].values[0]})")
+    print(f"  {_survey_text(anchors)} ({anchors['weak'].values[0]})")
     place = ", ".join(f"{v:.4g}" for v in sensors_["place"].values[0])
     print(f"  one more {sensors_['type'].values[0]} at ({place}) m: {sensors_['gain'].values[0]:.2f}")
     print(STATUS[tree.attrs["status"]])
+
+
+def _survey_text(anchors: xr.Dataset) -> str:
+    """The survey that tells most of the other biases, in words."""
+    label, unit, std, gain = (anchors[name].values[0] for name in ("anchor", "unit", "std", "gain"))
+    return f"{f'a survey of {label} to {std:.2g} {unit.strip("1")}'.rstrip()}: {gain:.2f} of the other biases"
 
 
 def _print_known(problem: Problem, tree: xr.DataTree) -> None:

@@ -60,10 +60,16 @@ def _widened(lin: Linearised) -> Linearised:
 
 
 def _misfit(lin: Linearised) -> jax.Array:
-    """Robust misfit (N, C) of every datum, with the prior spread of the biases added to its noise."""
+    """Robust misfit (N,) of every row, with the prior spread of the biases added to its noise.
+
+    One logarithm of the product of its channels: most of the time of a start goes there.
+    """
     residual = lin.score / jnp.maximum(lin.weight, 1e-300) * (lin.weight > 0)
     square = apart(_widened(lin).weight * residual**2 / ROBUST)
-    return jnp.where(jnp.isfinite(square), 0.5 * (ROBUST + 1) * jnp.log1p(square), 1e6)
+    whole = jnp.ones(len(square))
+    for c in range(square.shape[1]):
+        whole = whole * (1.0 + square[:, c])
+    return jnp.where(jnp.isfinite(whole), 0.5 * (ROBUST + 1) * jnp.log(whole), 1e6)
 
 
 @partial(jax.jit, static_argnames=("r", "span"))
@@ -90,7 +96,7 @@ def profile(model: Model, r: int, span: tuple[int, int], z: jax.Array, place: ja
         A, b = A + J, b + score
         step = linalg.solve_batched(A[:, loose[:, None], loose[None, :]], b[:, loose])
         states = states.at[:, loose].add(step)
-    (loss,) = mine.by_epoch([_misfit(lin) for lin in mine.linearise(At((states,), z, levels), expected=False)])
+    (loss,) = mine.by_epoch([_misfit(lin)[:, None] for lin in mine.linearise(At((states,), z, levels), expected=False)])
     return loss, states
 
 
@@ -151,7 +157,7 @@ def _seen(
             looked = apart((waist.predict(block, few, state, z), spread))
             predicted, spread = apart(jax.tree.map(lambda part, own=own: part[own], looked))
             score, weight = waist.weigh(block, data, predicted, std, expected=False)
-            misfits.append(_misfit(Linearised(score, weight, jnp.zeros((*score.shape, 0)), spread)).sum(1))
+            misfits.append(_misfit(Linearised(score, weight, jnp.zeros((*score.shape, 0)), spread)))
         return misfits
 
     found = jnp.zeros((mine.recursions[0].drift.shape[0], len(places)))

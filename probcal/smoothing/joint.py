@@ -181,6 +181,17 @@ class JointPrecision:
         shape = (self.states, self.places.size - self.states)
         return coo_array((values[own], (self.places.row[own], self.places.column[own] - self.states)), shape).tocsr()
 
+    def within(self, values: np.ndarray) -> Any:
+        """The part (M, M) of the precision of the biases alone, sparse."""
+        from scipy.sparse import coo_array  # loaded where it is used
+
+        own = self.places.row >= self.states
+        row, column = self.places.row[own] - self.states, self.places.column[own] - self.states
+        M, off = self.places.size - self.states, row != column
+        whole = np.concatenate([values[own], values[own][off]])
+        places = np.concatenate([row, column[off]]), np.concatenate([column, row[off]])
+        return coo_array((whole, places), (M, M)).tocsr()
+
     def of_biases(self, pull: np.ndarray) -> np.ndarray:
         """A right-hand side (n,) with entries (M,) or (M, K) for the biases alone."""
         return np.concatenate([np.zeros((self.states, *pull.shape[1:])), pull])

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg
-from probcal.model.model import Data, Model
+from probcal.model.model import Data, Model, Where
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
 from probcal.smoothing import recursion as rec
@@ -137,7 +137,7 @@ class Linearisation(NamedTuple):
 
 
 @jax.jit
-def linearise_rows(model: Model, point: Point) -> tuple[Linearised, ...]:
+def linearise_rows(model: Model, point: Where) -> tuple[Linearised, ...]:
     """All rows linearised at a point with the expected information."""
     return model.linearise(point, expected=True)
 
