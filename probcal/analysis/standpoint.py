@@ -14,6 +14,7 @@ from probcal.smoothing.grid import grid_start, track_mode
 from probcal.smoothing.joint import too_large
 from probcal.smoothing.mode import Point, factors
 from probcal.starts import automatic_start
+from probcal.types import float64
 
 START_STEPS = 30  # of a track of a network that is large
 
@@ -25,6 +26,7 @@ def check_free(problem: Problem) -> None:
         raise InputError("every bias of the problem is fixed or none is declared; free one of them")
 
 
+@float64
 def standpoint(problem: Problem, point: Point | None, truth: Truth | None) -> Point:
     """The point where a problem is looked at: a given one, that of a truth, else the automatic start."""
     if point is not None or truth is None:

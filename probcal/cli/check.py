@@ -55,9 +55,7 @@ def _check_many(problem: Problem, model: Path, outputs: Outputs | None) -> int:
         tree, anchors = observability(problem, point=start), next_anchors(problem, point=start)
     tree.attrs["model"] = model.stem
     _print_known(problem, tree)
-    print(
-        "What would tell most (nats), of surveys; passes and further sensors are not looked at on a network of this size:"
-    )
+    print("What would tell most (nats), of surveys alone on a network of this size:")
     print(f"  {_survey_text(anchors)}")
     print(STATUS[tree.attrs["status"]])
     if outputs is not None:
