@@ -12,10 +12,10 @@ TURNED = 1e-3  # by how much a rotation matrix may miss being one, of numbers th
 
 
 def norm(vector: Any) -> jax.Array:
-    """Euclidean length of a vector, in its unit; the gradient at zero is zero."""
+    """Euclidean length of a vector (d,), in its unit; the gradient at zero is zero."""
     squared = sum(vector[i] ** 2 for i in range(len(vector)))  # XLA weaves it into what is around, a reduction not
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+    nothing = squared == 0
+    return jnp.where(nothing, 0.0, jnp.sqrt(jnp.where(nothing, 1.0, squared)))
 
 
 def bearing(line: Any) -> jax.Array:

@@ -8,7 +8,7 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 
 UNROLL = 12  # largest matrix whose factors are written out instead of calling LAPACK
-BASE = 16  # largest block that a dense factorisation hands to LAPACK
+BASE = 24  # largest block that a dense factorisation hands to LAPACK
 RANK = 1e-14  # share of its diagonal below which a pivot counts as zero
 LOST = 1e-12  # share of its length below which a row counts as dependent on those before it
 SYMMETRIC = 96  # widest symmetric product that is formed whole

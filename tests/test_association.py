@@ -207,7 +207,7 @@ def test_every_object_has_one_track_and_keeps_its_detections():
     assert found.rows.groupby("row")["weight"].sum().max() <= 1 + 1e-9
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_sensor_that_sees_nothing_in_common_is_named():
     """One radar in clutter: nothing places it, its bias stays as stated, and the fit says that it is not found."""
     table = drawn().table
@@ -286,7 +286,7 @@ def test_rates_by_counts_beside_their_prior():
         pc.Detection(pc.Unknown(1.0))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_rates_that_are_unknown_are_found():
     """Clutter 3 and a probability of 0.9, guessed 1 and 0.6: found within four sds, and taken to other data."""
     unknown = pc.Detection(pc.Unknown(0.6), clutter=pc.Unknown(1.0), view=pc.Sector(range=3000.0))

@@ -287,7 +287,7 @@ def test_a_prior_with_hyper_parameters_is_integrated():
     assert np.abs(errors(draws, mean, sd)).max() < SIGMAS
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_with_bent_sensors_draws_have_the_density_that_is_declared():
     """Range and azimuth with a view, Laplace's formula: frequencies against that density; false alarm 2e-5."""
 

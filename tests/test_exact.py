@@ -80,7 +80,7 @@ def test_evidence(name):
     assert tree.attrs["log_evidence"] == pytest.approx(exact.evidence, rel=TOLERANCE)
 
 
-@pytest.mark.parametrize("name", ["plane", pytest.param("mixed", marks=pytest.mark.ci)])
+@pytest.mark.parametrize("name", ["plane", pytest.param("mixed", marks=pytest.mark.slow)])
 def test_iterating_changes_nothing(name):
     """On a linear model one step reaches the mode and thirty leave it there: a datum counts once."""
     _, exact, problem, _ = solved(name)

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from probcal import InputError, Node
-from probcal.geometry import attitude
+from probcal.geometry import attitude, norm
 from probcal.network import Path
 from probcal.types import PoseView
 
@@ -65,3 +65,14 @@ def test_nodes_and_paths_take_an_attitude_by_name():
 def test_what_is_no_rotation_is_refused(given, says):
     with pytest.raises(InputError, match=says):
         attitude(given)
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 3])
+def test_a_length_has_a_slope_everywhere_and_hides_no_gap(dimension):
+    vector = np.random.default_rng(0).normal(size=dimension)
+    with jax.enable_x64(True):
+        assert norm(vector) == pytest.approx(np.linalg.norm(vector))
+        np.testing.assert_allclose(jax.jacfwd(norm)(vector), vector / np.linalg.norm(vector))
+        np.testing.assert_array_equal(jax.grad(norm)(np.zeros(dimension)), 0.0)
+        vector[-1] = np.nan
+        assert np.isnan(norm(vector))

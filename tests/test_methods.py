@@ -108,7 +108,7 @@ def test_group_ard_shares_a_precision_at_the_fixed_point(by):
     close(z, exact.z[0], 1e-8)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_mackay_and_em_updates_share_fixed_points():
     linear, _, fast = solve(EA(iterations=5000, tolerance=1e-12, precisions="maximised"))
     _, _, slow = solve(EA(iterations=5000, tolerance=1e-8, update="em", precisions="maximised"))

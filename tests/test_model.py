@@ -287,7 +287,7 @@ def test_a_start_takes_the_biases_of_a_fit():
     assert np.abs(found["noise"]).max() < 10.0
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_numpyros_kernels_and_guides_agree_with_the_samplers_from_a_start():
     """Rangers whose target has no declared start; ArviZ labels the draws, which agree within Monte Carlo error."""
     places = {"a": (0.0, 0.0), "b": (100.0, 10.0), "c": (90.0, 80.0), "d": (-10.0, 70.0)}

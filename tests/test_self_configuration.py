@@ -94,7 +94,7 @@ def test_a_clock_that_is_declared_is_found():
     check(fitted(whole, whole, biases, paths(0), 0), biases)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_clock_that_nobody_declared_is_a_misfit():
     """Objects that fit only with another clock run beside themselves: no confident answer."""
     scale = {"position": 50.0, "heading": 0.1}
@@ -104,7 +104,7 @@ def test_a_clock_that_nobody_declared_is_a_misfit():
     assert "the two differ by what no bias allows for" in tree.attrs["message"]
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_two_poses_that_explain_as_much_are_named():
     """Two objects that change places when the scene is turned by half about the second radar."""
     middle = np.array([1000.0, 0.0])

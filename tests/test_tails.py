@@ -309,7 +309,7 @@ def turning(noise, run=0):
     return Problem(network, ConstantVelocity(probcal.Unknown(0.5), noise=noise), drawn.table)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_heavy_tails_are_found_and_gone_where_they_are_declared():
     kinds = []
     for noise in (probcal.motion.base.GAUSSIAN, StudentT(3.0)):
