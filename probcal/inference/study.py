@@ -55,39 +55,55 @@ Setting = Callable[..., tuple[Problem, Truth]]
 
 
 class _Solved(NamedTuple):
-    """Where each run of a batch ended; leading dim (runs,)."""
+    """Where a run ended."""
 
     state: State
     mixed: Integrated | None  # where precisions are integrated after the climb
-    square: jax.Array  # (runs,) of what is left, a datum
-    iterations: jax.Array  # (runs,)
+    square: jax.Array  # () of what is left, a datum
+    iterations: jax.Array  # ()
 
 
-@partial(jax.jit, static_argnames=("method", "prior", "how"))
-def _solve(
-    method: Any, models: Model, prior: Prior, iterations: int, givens: Given, starts: Point, how: Integration | None
+def _climb(
+    method: Any, prior: Prior, how: Integration | None, iterations: int, model: Model, given: Given, start: Point
 ) -> _Solved:
-    """Run a method on many problems of one form: one after the other on a CPU, together on an accelerator."""
+    """Run a method on a problem."""
 
-    def one(pieces: tuple[Model, Given, Point]) -> _Solved:
-        model, given, start = pieces
+    def step(carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
+        state, count = carry
+        return stepped(method, model, prior, given, state), count + 1
 
-        def step(carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
-            state, count = carry
-            return stepped(method, model, prior, given, state), count + 1
+    def on(carry: tuple[State, jax.Array]) -> jax.Array:
+        return ~carry[0].done & (carry[1] < iterations)
 
-        def on(carry: tuple[State, jax.Array]) -> jax.Array:
-            return ~carry[0].done & (carry[1] < iterations)
+    first = first_state(given, model, start, method.begin(model, start), jax.random.key(SEED))
+    state, count = jax.lax.while_loop(on, step, (first, jnp.zeros((), int)))
+    model = model.with_mixing(state.mixing)
+    state = method.close(model, prior, given, state)._replace(seed=jnp.zeros(()), carry=())
+    mixed = None if how is None else integrate(how, model, given.prior, state.point, jax.random.key(SEED))
+    return _Solved(state, mixed, mean_square(model, state.point if mixed is None else mixed.point), count)
 
-        first = first_state(given, model, start, method.begin(model, start), jax.random.key(SEED))
-        state, count = jax.lax.while_loop(on, step, (first, jnp.zeros((), int)))
-        model = model.with_mixing(state.mixing)
-        state = method.close(model, prior, given, state)._replace(seed=jnp.zeros(()), carry=())
-        mixed = None if how is None else integrate(how, model, given.prior, state.point, jax.random.key(SEED))
-        return _Solved(state, mixed, mean_square(model, state.point if mixed is None else mixed.point), count)
 
-    pieces = (models, givens, starts)
-    return jax.lax.map(one, pieces) if jax.default_backend() == "cpu" else jax.vmap(one)(pieces)
+_alone = partial(jax.jit, static_argnums=(0, 1, 2))(_climb)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _together(
+    method: Any, prior: Prior, how: Integration | None, iterations: int, models: Model, givens: Given, starts: Point
+) -> _Solved:
+    """Run a method on many problems of one form, stacked."""
+    climb = partial(_climb, method, prior, how, iterations)
+    return jax.vmap(climb)(models, givens, starts)
+
+
+def _solve(
+    method: Any, prior: Prior, how: Integration | None, iterations: int, pieces: Sequence[tuple[Model, Given, Point]]
+) -> list[_Solved]:
+    """Run a method on problems of one form: one by one on a CPU, whose kernel serves any number; together elsewhere."""
+    if jax.default_backend() == "cpu":
+        return [jax.tree.map(np.asarray, _alone(method, prior, how, iterations, *own)) for own in pieces]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *pieces)
+    solved = jax.tree.map(np.asarray, _together(method, prior, how, iterations, *stacked))
+    return [jax.tree.map(lambda leaf, j=j: leaf[j], solved) for j in range(len(pieces))]
 
 
 class _Run(NamedTuple):
@@ -147,20 +163,12 @@ def _batch(
                 groups.setdefault(_form(run), []).append(k)
             for members in groups.values():
                 chosen = [runs[k] for k in members]
-                stacked = [
-                    jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
-                    for parts in (
-                        [run.problem.model for run in chosen],
-                        [_given(method, prior, run, name == ORACLE) for run in chosen],
-                        [run.start for run in chosen],
-                    )
-                ]
+                pieces = [(run.problem.model, _given(method, prior, run, name == ORACLE), run.start) for run in chosen]
                 how, climb = method.integration(chosen[0].problem, prior), method.climbs_under(prior)
                 inside = how if how is not None and how.sweeps else None  # a propagation runs on the host
-                solved = _solve(kernel(method), stacked[0], climb, method.iterations, *stacked[1:], inside)
-                solved = jax.tree.map(np.asarray, solved)
+                solved = _solve(kernel(method), climb, inside, method.iterations, pieces)
                 for j, k in enumerate(members):
-                    state, mixed, square, count = jax.tree.map(lambda leaf, j=j: leaf[j], solved)
+                    state, mixed, square, count = solved[j]
                     problem = chosen[j].problem.with_mixing(state.mixing)
                     if how is not None and inside is None:
                         held = first_precision(problem, prior)
