@@ -20,7 +20,7 @@ from probcal.smoothing.cholesky import Entries, Factor, factorise
 from probcal.smoothing.mode import factors
 from probcal.smoothing.room import ROOM, dense_numbers
 
-MANY, THIN = 500, 0.1  # biases, and the share of them that an epoch sees, from which the sparse form is the faster
+MANY, THIN = 500, 0.25  # biases, and the share of them that an epoch sees, from which the sparse form is the faster
 
 
 def prefers_sparse(model: Model) -> bool:
@@ -29,7 +29,7 @@ def prefers_sparse(model: Model) -> bool:
 
 
 def is_thin(model: Model) -> bool:
-    """Whether an epoch sees few of many biases: more than 500, less than a tenth of them."""
+    """Whether an epoch sees few of many biases: more than 500, less than a quarter of them."""
     if model.biases <= MANY:
         return False
     seen = sum(int(np.sum(np.asarray(data.bias)[np.asarray(data.sensor)] < model.biases)) for data in model.rows)
