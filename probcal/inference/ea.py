@@ -153,7 +153,7 @@ class EA(Maximiser):
     precisions maximised. `update` of maximised precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed
     points, slower). `tolerance` is the change of log evidence, in nats, at which it stops; `iterations` caps the outer
     loop. `form` "auto" takes the dense form where its matrices need up to 240 MB, unless an epoch sees less than a
-    quarter of more than 500 biases, the sparse one else (see `inference.sparse`); "dense" and "sparse" take one of them.
+    quarter of more than 500 biases, the sparse one else (see `inference.sparse`); "dense" and "sparse" take that one.
     Raises `InputError` for another update, trajectory, form or kind of precisions.
 
     >>> type(EA().first_prior()), type(EA.as_printed().first_prior())

@@ -96,7 +96,7 @@ def _together(
 
 
 def _solve(
-    method: Any, prior: Prior, how: Integration | None, iterations: int, pieces: Sequence[tuple[Model, Given, Point]]
+    method: Any, prior: Prior, how: Integration | None, iterations: int, pieces: Sequence[tuple[Model, Given, Any]]
 ) -> list[_Solved]:
     """Run a method on problems of one form: one by one on a CPU, whose kernel serves any number; together elsewhere."""
     if jax.default_backend() == "cpu":
