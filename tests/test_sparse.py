@@ -505,3 +505,18 @@ def test_surveys_of_many_biases_tell_what_those_of_few_do(monkeypatch):
     monkeypatch.setattr("probcal.analysis.planning.exact", lambda: False)
     with pytest.raises(InputError, match="next_anchors of 15 biases needs exact variances"):
         pc.next_anchors(problem, point=point)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        pytest.param(lambda p, method=method: pc.fit(p, method), id=method.name)
+        for method in (pc.EM(), pc.LeastSquares(), pc.Collapsed(), pc.NUTS(), pc.SVI())
+    ]
+    + [pytest.param(call, id=call.__name__) for call in (pc.next_passes, pc.next_sensors, pc.log_evidence)],
+)
+def test_what_needs_the_dense_form_says_so_where_there_is_no_room(asked, monkeypatch):
+    for name in ("joint", "room"):
+        monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+    with pytest.raises(InputError, match="the dense form of 15 biases .* for all else take fewer sensors"):
+        asked(drawn()[0])
