@@ -518,5 +518,5 @@ def test_surveys_of_many_biases_tell_what_those_of_few_do(monkeypatch):
 def test_what_needs_the_dense_form_says_so_where_there_is_no_room(asked, monkeypatch):
     for name in ("joint", "room"):
         monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
-    with pytest.raises(InputError, match="the dense form of 15 biases .* for all else take fewer sensors"):
+    with pytest.raises(InputError, match=r"the dense form of 15 biases .* for all else take fewer sensors"):
         asked(drawn()[0])
