@@ -6,6 +6,7 @@ Labels stay above; here are a static `Block` (what to compute) and a pytree `Row
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -204,6 +205,7 @@ def look(block: Block, rows: Rows, states: jax.Array, z: jax.Array, seen: Callab
     return jax.vmap(one)(states[rows.epoch], rows.pose, local)
 
 
+@partial(jax.jit, static_argnames="block")
 def predict(block: Block, rows: Rows, states: jax.Array, z: jax.Array) -> jax.Array:
     """Predicted values (N, C) from the states of all epochs (E, n) and the biases z (M,)."""
     return predict_local(block, rows, states[rows.epoch], read_biases(block, rows, z))
@@ -235,6 +237,7 @@ def innovation(block: Block, rows: Rows, predicted: jax.Array) -> jax.Array:
     return rows.mask * _by_channel(block, "innovation", rows.y, predicted)
 
 
+@partial(jax.jit, static_argnames="block")
 def log_likelihood(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
     """Log density of every datum, zero where missing, shape (N, C)."""
     return rows.mask * _by_channel(block, "log_likelihood", rows.y, predicted, noise_std(rows, levels))
@@ -266,6 +269,7 @@ def sample(
     return jnp.stack(drawn, 1)
 
 
+@partial(jax.jit, static_argnames=("block", "expected"))
 def linearise(
     block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: bool
 ) -> Linearised:
@@ -287,6 +291,7 @@ def linearise(
     return Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])
 
 
+@partial(jax.jit, static_argnames=("block", "expected"))
 def linearise_biases(
     block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: bool
 ) -> Linearised:

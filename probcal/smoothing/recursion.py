@@ -6,6 +6,7 @@ read as unit-noise data y of G'x where G y = b. Neither L_k nor J_k needs to hav
 itself before the end: of a start of 1e7 m and data of 1 cm seven digits are left, of their squares none would be.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -37,6 +38,7 @@ class Smoothed(NamedTuple):
     noises: jax.Array  # (E, n, m)
 
 
+@partial(jax.jit, static_argnames="used")
 def gains(F: jax.Array, L: jax.Array, J: jax.Array, used: tuple[int, ...]) -> Gains:
     """Covariance pass: transitions F, noise factors L and information J of the `used` state entries, all (E, n, n)."""
     E, n, _ = F.shape
@@ -66,6 +68,7 @@ class Predicted(NamedTuple):
     moved: jax.Array  # (E, n, m) filtered less predicted states
 
 
+@partial(jax.jit, static_argnames="free")
 def predict(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array | None = None, *, free: bool = False) -> Predicted:
     """Filter columns b (E, n, m) with drifts c (E, n, q) of the first q (zero if None), predicting from what is before.
 
@@ -84,6 +87,7 @@ def predict(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array | None = None,
     return Predicted(states, alone, innovation, gain.gain @ innovation + force)
 
 
+@partial(jax.jit, static_argnames="free")
 def smooth(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array | None = None, *, free: bool = False) -> Smoothed:
     """Smooth columns b (E, n, m) with drifts c (E, n, m) (see `predict`), forward and backward.
 
@@ -112,6 +116,7 @@ def innovate(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array) -> tuple[jax
     return found.alone, gain.whiten @ found.innovation
 
 
+@jax.jit
 def covariances(F: jax.Array, L: jax.Array, gain: Gains) -> tuple[jax.Array, jax.Array]:
     """Posterior covariances of every state and of every whitened noise, both (E, n, n), as sums of squares."""
     eye = jnp.eye(F.shape[-1], dtype=F.dtype)[None]
