@@ -520,3 +520,13 @@ def test_what_needs_the_dense_form_says_so_where_there_is_no_room(asked, monkeyp
         monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
     with pytest.raises(InputError, match=r"the dense form of 15 biases .* for all else take fewer sensors"):
         asked(drawn()[0])
+
+
+def test_bounds_that_rounding_hides_are_none(monkeypatch):
+    def singular(*_):
+        raise np.linalg.LinAlgError("not positive definite")
+
+    monkeypatch.setattr("probcal.smoothing.joint.ROOM", 0)
+    monkeypatch.setattr("probcal.smoothing.joint.JointPrecision.factor", singular)
+    with pytest.raises(InputError, match=r'rounding hides which biases of so many have none; .* take kind="posterior"'):
+        pc.bounds(drawn()[0], kind="hybrid", truth=drawn()[1], draws=1)

@@ -107,11 +107,15 @@ def _by_sparse(
     on = joint.places.row == joint.places.column
     alone = np.bincount(joint.places.row[on], values[on], joint.places.size)[joint.states :]
     ridge = LOST * np.where(alone > 0, alone, 1.0) * (prior == 0)
-    variance, _ = joint.factor(values, prior + ridge).inverse_diagonal()
-    own, bounded = variance[joint.states :], np.ones(model.biases, bool)
-    if ridge.any():
-        loose, _ = joint.factor(values, prior + 10.0 * ridge).inverse_diagonal()
-        bounded = own < FOLLOWS * loose[joint.states :]
+    try:
+        variance, _ = joint.factor(values, prior + ridge).inverse_diagonal()
+        loose = joint.factor(values, prior + 10.0 * ridge).inverse_diagonal()[0] if ridge.any() else variance
+    except np.linalg.LinAlgError:
+        raise InputError(
+            "bounds: rounding hides which biases of so many have none; survey or fix some of those that"
+            ' observability names, or take kind="posterior"'
+        ) from None
+    own, bounded = variance[joint.states :], variance[joint.states :] < FOLLOWS * loose[joint.states :]
     return own, bounded, joint.state_values(variance)
 
 
