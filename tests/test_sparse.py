@@ -502,9 +502,10 @@ def test_surveys_of_many_biases_tell_what_those_of_few_do(monkeypatch):
     few = pc.next_anchors(problem, point=point)
     assert few.attrs["looked"] < found.attrs["looked"]
     assert few["anchor"].values[0] == found["anchor"].values[0]
-    monkeypatch.setattr("probcal.analysis.planning.exact", lambda: False)
-    with pytest.raises(InputError, match="next_anchors of 15 biases needs exact variances"):
-        pc.next_anchors(problem, point=point)
+    for module, ask in (("planning", pc.next_anchors), ("observability", pc.observability)):
+        monkeypatch.setattr(sys.modules[f"probcal.analysis.{module}"], "exact", lambda: False)
+        with pytest.raises(InputError, match=r"15 biases needs exact variances, of sparsax: install probcal\[sparse\]"):
+            ask(problem, point=point)
 
 
 @pytest.mark.parametrize(
