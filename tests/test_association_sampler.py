@@ -246,8 +246,13 @@ def test_one_kernel_serves_every_association_and_recording_of_a_form():
     assert run_pass._cache_size() == size
 
 
-@pytest.mark.ci
-@pytest.mark.parametrize("kind", [ALL_SCANS, ONE_SCAN, SWAP, TRACK])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(ALL_SCANS, marks=pytest.mark.ci),
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in (ONE_SCAN, SWAP, TRACK)),
+    ],
+)
 def test_a_move_alone_leaves_exact_draws_as_they_are(kind):
     """200 chains begin at draws of the enumerated posterior and move 250 times; 5 errors of their means: 2e-5."""
     e, chains = enumerated("crossing"), 200
