@@ -27,6 +27,7 @@ from probcal.smoothing.cholesky import exact
 from probcal.smoothing.joint import JointPrecision, too_large
 from probcal.smoothing.linearised import linearise_rows, marginal_information
 from probcal.smoothing.mode import Point
+from probcal.smoothing.room import check_room
 from probcal.table import Table, header
 from probcal.types import float64
 
@@ -50,6 +51,7 @@ def next_passes(
     start, a `truth` or a `point`. Raises `InputError` for the shape.
     """
     check_free(problem)
+    check_room(problem.model)
     point = standpoint(problem, point, truth)
     name, part = _pattern(problem)
     epochs, start = part.epochs[0], np.asarray(_states_of(problem, point, name))[: len(part.epochs[0].time)]
@@ -188,6 +190,7 @@ def next_sensors(
     True
     """
     check_free(problem)
+    check_room(problem.model)
     point = standpoint(problem, point, truth)
     d = problem.network.dimension
     places = _grid(problem, point) if places is None else np.asarray(places, float)
