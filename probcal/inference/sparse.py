@@ -33,6 +33,7 @@ from probcal.results.schema import INTERVAL, ROPE
 from probcal.smoothing.cholesky import exact
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.joint import JointPrecision, blocks_of, is_thin, missing, prefers_sparse
+from probcal.smoothing.linearised import linearise_rows
 from probcal.smoothing.mode import Point
 from probcal.smoothing.sparse_mode import SparseMode, SparseSystem, find_sparse_mode, system_at
 
@@ -205,15 +206,21 @@ def sparse_answer(method: Maximiser, problem: Problem, prior: Prior, start: Poin
             else (_gaussian(problem, prior, mode, evidence, first), True)
         )  # fmt: skip
     except np.linalg.LinAlgError:
-        raise FitError(
-            "The fit diverged: the information matrix is singular; the estimate is invalid. Use a prior, or fix some"
-            " biases."
-        ) from None
+        silent = ", ".join(_untold(problem, joint, start, declared)[:NAMED])
+        why = f"no row tells {silent}" if silent else "the information matrix is singular"
+        raise FitError(f"The fit diverged: {why}; the estimate is invalid. Use a prior, or fix some biases.") from None
     square = float(mean_square(model, posterior.point))
     return conclude_at(
         problem, method, prior, posterior, mode.trace, square, len(mode.trace), converged=mode.converged and settled,
         refused=mode.refused, evidence=evidence,
     )  # fmt: skip
+
+
+def _untold(problem: Problem, joint: JointPrecision, point: Point, alpha: np.ndarray) -> list[str]:
+    """Labels of the biases of which neither a row at a point nor a prior of precisions alpha (M,) says anything."""
+    information = joint.within(joint.values(problem.model, linearise_rows(problem.model, point), point.levels))
+    nothing = np.flatnonzero(information.diagonal() + alpha == 0)
+    return [problem.labels[m] for m in nothing]
 
 
 def _evidence(mode: SparseMode, problem: Problem, alpha: np.ndarray) -> float:
