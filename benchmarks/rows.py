@@ -8,6 +8,7 @@ One line a sensor type: milliseconds of predicting, of `Model.linearise` (forwar
 
 import argparse
 import time
+from functools import partial
 
 import jax
 import numpy as np
@@ -45,7 +46,7 @@ def backwards(model, point):
     """Predicted values and their Jacobians by the states and the biases of each row, in reverse mode."""
     (block,), (data,) = model.blocks, model.rows
     reached, local = point.states[0][data.epoch], waist.read_biases(block, data, point.z)
-    one = lambda x, pose, b: waist._one(block, x, pose, b)  # noqa: E731
+    one = partial(waist._one, block)
     jacobians = jax.vmap(jax.jacrev(one, argnums=(0, 2)))(reached, data.pose, local)
     return jax.vmap(one)(reached, data.pose, local), jacobians
 

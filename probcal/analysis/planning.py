@@ -132,7 +132,8 @@ def _anchors_of_many(problem: Problem, point: Point, survey: float) -> xr.Datase
         raise InputError(f"next_anchors of {M} biases needs exact variances, of sparsax: install probcal[sparse]")
     joint = JointPrecision.of(model)
     entries = joint.values(model, linearise_rows(model, point), point.levels)
-    names, members = list(_anchors(problem)), _padded(list(_anchors(problem).values()), M)
+    anchors = _anchors(problem)
+    names, members = list(anchors), _padded(list(anchors.values()), M)
     there = (members < M)[:, :, None] & (members < M)[:, None, :]
     inverse = joint.factor(entries, np.ones(M)).inverse_entries()
     covariance = np.where(there, joint.block_values(members, joint.pairs(members), inverse), 0.0)

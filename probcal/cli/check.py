@@ -81,7 +81,8 @@ def _print_check(problem: Problem, tree: xr.DataTree, plans: tuple[xr.Dataset, x
 def _survey_text(anchors: xr.Dataset) -> str:
     """The survey that tells most of the other biases, in words."""
     label, unit, std, gain = (anchors[name].values[0] for name in ("anchor", "unit", "std", "gain"))
-    return f"{f'a survey of {label} to {std:.2g} {unit.strip("1")}'.rstrip()}: {gain:.2f} of the other biases"
+    survey = f"a survey of {label} to {std:.2g} {unit.strip('1')}".rstrip()
+    return f"{survey}: {gain:.2f} of the other biases"
 
 
 def _print_known(problem: Problem, tree: xr.DataTree) -> None:
