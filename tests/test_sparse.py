@@ -20,10 +20,11 @@ from probcal.geometry import bearing, norm
 from probcal.inference.sparse import gains_by_sparse, takes_sparse
 from probcal.results.blocks import covariance_of
 from probcal.smoothing import cholesky
-from probcal.smoothing.cholesky import Cholmod, Entries, SuperLU
+from probcal.smoothing.cholesky import Cholmod, Entries, SuperLU, factorise, symmetric
 from probcal.smoothing.joint import JointPrecision, blocks_of, missing
 from probcal.smoothing.linearised import linearise_rows
 from probcal.smoothing.mode import compress
+from probcal.smoothing.products import Products
 from probcal.smoothing.room import check_room
 from probcal.starts import automatic_start
 
@@ -171,13 +172,113 @@ def test_factors_solve_and_say_what_is_not_positive(library):
     factor = library(places, A[i, j])
     right = rng.normal(size=(7, 3))
     np.testing.assert_allclose(factor.solve(right), np.linalg.solve(A, right), atol=1e-12)
-    assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(A)[1])
+    assert factor.log_determinant() == (pytest.approx(np.linalg.slogdet(A)[1]), 0.0)
     value, error = factor.inverse_diagonal()
     assert (np.abs(value - np.diag(np.linalg.inv(A))) <= 5 * error + 1e-12).all()
     draws = factor.draw(rng, 20_000)
     np.testing.assert_allclose(np.cov(draws.T), np.linalg.inv(A), atol=0.05)
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
         library(places, (A - 50 * np.eye(7))[i, j])
+
+
+# by products alone
+
+
+def thing(states, sensors, rng, wide=3):
+    """A positive definite matrix of a chain of states and of sensors of three biases, some of which stand alone."""
+    n = states + wide * sensors
+    rows = 0.3 * rng.normal(size=(4 * n, n)) * (rng.random((4 * n, n)) < 0.05)
+    A = rows.T @ rows + np.diag(rng.uniform(0.5, 3.0, n))
+    A[:states, :states] = np.diag(np.diag(A)[:states]) - 0.1 * (np.eye(states, k=1) + np.eye(states, k=-1))
+    A += np.diag(np.maximum(0.0, 0.1 - np.linalg.eigvalsh(A)[0]) * np.ones(n))
+    members = np.arange(wide * sensors).reshape(sensors, wide)
+    alone, none = rng.random(members.shape) < 0.1, wide * sensors
+    single = np.full((np.sum(alone), wide), none)
+    single[:, 1] = members[alone]
+    return A, np.concatenate([np.where(alone, none, members), single])
+
+
+def by_products(A, states, members):
+    """Its products, and which entries of the matrix they know."""
+    i, j = np.triu_indices(len(A))
+    some = np.flatnonzero(A[i, j])
+    i, j = i[some].astype(np.int32), j[some].astype(np.int32)
+    places = Entries(i, j, len(A), np.flatnonzero(i == j))
+    own = j < states
+    held = factorise(Entries(i[own], j[own], states, np.flatnonzero((i == j)[own])), A[i, j][own])
+    return Products(held, symmetric(places, A[i, j]), states, members)
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+@pytest.mark.parametrize("seed", range(3))
+def test_products_do_what_a_factor_does(seed, library):
+    """Solves to 1e-8; log determinants and variances within 5 standard errors, which are small; draws in covariance."""
+    rng = np.random.default_rng(seed)
+    A, members = thing(40, 30, rng)
+    found, right = by_products(A, 40, members), rng.normal(size=(len(A), 3))
+    for given in (right, right[:, 0]):
+        np.testing.assert_allclose(found.solve(given), np.linalg.solve(A, given), atol=1e-8)
+    value, error = found.log_determinant()
+    assert abs(value - np.linalg.slogdet(A)[1]) < 5 * error
+    assert 0 < error < 1.0
+    true = np.diag(np.linalg.inv(A))
+    value, error = found.inverse_diagonal()
+    assert (np.abs(value - true) <= 5 * error + 1e-12).all()
+    assert 0.8 < np.std((value - true)[40:] / error[40:]) < 1.2
+    draws = found.draw(rng, 20_000)
+    white = np.linalg.cholesky(A).T @ draws.T
+    np.testing.assert_allclose(white @ white.T / 20_000, np.eye(len(A)), atol=0.05)
+    with pytest.raises(RuntimeError, match="products have no selected inverse"):
+        found.inverse_entries()
+
+
+def test_products_of_some_columns_are_those_of_each(monkeypatch):
+    """Where there is room for the bases of a few draws only, as many are made and as well."""
+    A, members = thing(20, 10, np.random.default_rng(0))
+    found = by_products(A, 20, members)
+    monkeypatch.setattr("probcal.smoothing.products.NUMBERS", 30 * 30 * 7)  # seven columns
+    draws = found.draw(np.random.default_rng(1), 3_000)
+    np.testing.assert_allclose(draws.T @ draws / 3_000, np.linalg.inv(A), atol=0.15)
+    value, error = found.log_determinant()
+    assert abs(value - np.linalg.slogdet(A)[1]) < 5 * error
+
+
+def test_products_that_are_not_positive_or_do_not_end_are_no_answer(monkeypatch):
+    A, members = thing(20, 10, np.random.default_rng(0))
+    least = np.linalg.eigvalsh(A)[0] + 0.01
+    worse = A.copy()
+    worse[20:, 20:] -= 5 * least * np.eye(30)
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        by_products(worse, 20, members).draw(np.random.default_rng(0), 1)
+    monkeypatch.setattr("probcal.smoothing.products.STEPS", 2)
+    with pytest.raises(FitError, match="conjugate gradients did not end within 2 steps"):
+        by_products(A, 20, members).solve(np.ones(50))
+    with pytest.raises(FitError, match="draws of the biases did not end within 2 steps"):
+        by_products(A, 20, members).draw(np.random.default_rng(0), 1)
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+def test_a_fit_without_factors_of_the_biases_ends_where_the_dense_one_does(library, dense):
+    """Means within 1e-4 sds, sds, gamma and evidence within 6 of their standard errors, which are small."""
+    free = fitted(pc.MAP(form="matrix-free"), pc.Gaussian())
+    a, b = (tree["calibration"].to_dataset() for tree in (dense, free))
+    assert free.attrs["status"] == "converged"
+    sd, error = a["sd"].values, b["sd_error"].values
+    np.testing.assert_allclose(b["mean"].values / sd, a["mean"].values / sd, atol=1e-4)
+    assert (np.abs(b["sd"].values / sd - 1.0) < 6 * error).all()
+    assert 0 < error.max() < 0.06
+    np.testing.assert_allclose(b["gamma"], a["gamma"], atol=0.1)
+    off = free.attrs["log_evidence"] - dense.attrs["log_evidence"]
+    assert abs(off) < 6 * free.attrs["log_evidence_error"]
+    assert 0 < free.attrs["log_evidence_error"] < 0.5
+    for name in ("car", "van", "mast"):
+        one, other = (tree[f"track/{name}"].to_dataset() for tree in (dense, free))
+        np.testing.assert_allclose(other["mean"], one["mean"], atol=1e-3)
+        np.testing.assert_allclose(other["sd"], one["sd"], rtol=0.3)
+    draws = free["posterior"]["bias"].values.reshape(-1, len(sd))
+    np.testing.assert_allclose(draws.std(0) / b["sd"].values, 1.0, atol=0.2)
+    judged = pc.assess(drawn()[0], free)["verdict"]["verdict"].values
+    assert (judged == pc.assess(drawn()[0], dense)["verdict"]["verdict"].values).mean() > 0.7
 
 
 # what is refused
@@ -210,13 +311,17 @@ def test_a_singular_matrix_is_no_fit(monkeypatch):
         (pc.EA(form="sparse", precisions="maximised"), None, {}, "precisions that are integrated or given"),
         (pc.MAP(form="sparse"), pc.Gaussian(), {"starts": 3}, "takes one start"),
         (pc.MAP(form="sparse"), pc.Gaussian(), {"save": ("states",)}, "keeps no draws of states or replicas"),
+        (pc.EA(form="matrix-free"), None, {}, "takes precisions that are given (MAP() with Gaussian() or Flat())"),
+        (pc.MAP(form="matrix-free"), pc.Gaussian(), {"starts": 3}, "takes one start"),
     ],
 )
 def test_what_a_sparse_fit_does_not_do_is_said(method, prior, settings, said):
     with pytest.raises(InputError) as error:
         pc.fit(drawn()[0], method, prior=prior, **settings)
     assert said in str(error.value)
-    if "save" not in settings:
+    if method.form == "matrix-free":
+        assert '(form="matrix-free") takes' in str(error.value)
+    elif "save" not in settings:
         assert "on a network of this size is solved in sparse form, which takes" in str(error.value)
 
 

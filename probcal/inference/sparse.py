@@ -43,16 +43,17 @@ if TYPE_CHECKING:
 CHAINS, NUMBERS, MOST = 4, 400_000, 250  # of the draws of all biases that a tree holds, and draws of a chain
 STEPS = 60  # of the climb
 NAMED = 20  # combinations of single sensors that are named
-FORMS = ("auto", "dense", "sparse")
+PRODUCTS = "matrix-free"
+FORMS = ("auto", "dense", "sparse", PRODUCTS)
 
 
 def takes_sparse(method: Maximiser, problem: Problem) -> bool:
     """Whether a method is to solve a problem in its sparse form; raises `InputError` where that was asked in vain."""
     form = getattr(method, "form", "dense")
     lacks = missing(problem.model)
-    if form == "sparse" and lacks:
-        raise InputError(f'{method.name}(form="sparse") does not take {lacks}: give form="dense"')
-    return bool(form == "sparse" or (form == "auto" and not lacks and prefers_sparse(problem.model)))
+    if form in FORMS[2:] and lacks:
+        raise InputError(f'{method.name}(form="{form}") does not take {lacks}: give form="dense"')
+    return bool(form in FORMS[2:] or (form == "auto" and not lacks and prefers_sparse(problem.model)))
 
 
 def gains_by_sparse(method: Maximiser, problem: Problem, prior: Prior, starts: int) -> bool:
@@ -64,6 +65,8 @@ def gains_by_sparse(method: Maximiser, problem: Problem, prior: Prior, starts: i
 def check_sparse(method: Maximiser, prior: Prior, starts: int) -> None:
     """Raise `InputError` naming what a sparse fit does not do."""
     if wrong := _lacking(method, prior, starts):
+        if getattr(method, "form", "") == PRODUCTS:
+            raise InputError(f'{method.name}(form="{PRODUCTS}") takes {wrong}')
         raise InputError(f"{method.name} on a network of this size is solved in sparse form, which takes {wrong}")
 
 
@@ -74,6 +77,8 @@ def _lacking(method: Maximiser, prior: Prior, starts: int) -> str:
         wrong = 'trajectory="marginal" alone'
     elif prior.correlation:
         wrong = "a prior without correlations"
+    elif getattr(method, "form", "") == PRODUCTS and not isinstance(prior, (Gaussian, Flat)):
+        wrong = "precisions that are given (MAP() with Gaussian() or Flat())"
     elif not (method.integrates(prior) if hasattr(method, "integrates") else isinstance(prior, (Gaussian, Flat))):
         wrong = (
             "precisions that are integrated or given (EA() with Horseshoe() or ARD(rate=0.5), MAP() with Gaussian())"
@@ -133,6 +138,7 @@ class SparsePosterior(Posterior):
     declared: SensorBlocks  # what a prior of the declared scales leaves
     open: tuple[Direction, ...]  # combinations that the data leave to the prior, those of many sensors first
     weak: int  # how many there are; some have no name
+    evidence_error: float = 0.0  # standard error of the log evidence, where that is estimated
 
     chained: ClassVar[bool] = False
     held: ClassVar[bool] = True
@@ -180,13 +186,15 @@ class SparsePosterior(Posterior):
 
     @property
     def attrs(self) -> Mapping[str, float]:
-        """The limit of inclusion."""
-        return {"rope": ROPE, "sparse": 1.0, "weak": float(self.weak)}
+        """The limit of inclusion, how many directions are weak, and the error of an evidence that is estimated."""
+        estimated = {"log_evidence_error": self.evidence_error} if self.evidence_error else {}
+        return {"rope": ROPE, "sparse": 1.0, "weak": float(self.weak)} | estimated
 
 
 def sparse_answer(method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
     """The answer of `EA` or `MAP` in sparse form; raises `FitError` where a flat prior leaves no interval."""
-    model, joint = problem.model, JointPrecision.of(problem.model)
+    model = problem.model
+    joint = JointPrecision.of(model, products=getattr(method, "form", "") == PRODUCTS)
     integrated = hasattr(method, "integrates") and method.integrates(prior)
     prior_first = prior.precision(problem.labels, problem.surveyed)
     first = np.asarray(prior_first.alpha)
@@ -200,10 +208,10 @@ def sparse_answer(method: Maximiser, problem: Problem, prior: Prior, start: Poin
         mode = find_sparse_mode(
             model, joint, start, declared, min(STEPS, method.iterations), 1e-2 * method.tolerance, told
         )
-        evidence = _evidence(mode, problem, declared)
+        evidence, error = _evidence(mode, problem, declared)
         posterior, settled = (
             _integrated(problem, prior, mode, evidence, prior_first, context.key, told) if integrated
-            else (_gaussian(problem, prior, mode, evidence, first), True)
+            else (replace(_gaussian(problem, prior, mode, evidence, first), evidence_error=error), True)
         )  # fmt: skip
     except np.linalg.LinAlgError:
         silent = ", ".join(_untold(problem, joint, start, declared)[:NAMED])
@@ -223,18 +231,22 @@ def _untold(problem: Problem, joint: JointPrecision, point: Point, alpha: np.nda
     return [problem.labels[m] for m in nothing]
 
 
-def _evidence(mode: SparseMode, problem: Problem, alpha: np.ndarray) -> float:
-    """Log evidence at a mode under precisions alpha (M,), trajectories and biases integrated by Laplace's formula."""
+def _evidence(mode: SparseMode, problem: Problem, alpha: np.ndarray) -> tuple[float, float]:
+    """Log evidence at a mode under precisions alpha (M,), trajectories and biases integrated by Laplace's formula.
+
+    And its standard error, 0 where the log determinant is exact.
+    """
     at, joint = mode.system, mode.system.joint
-    volume = mode.factor.log_determinant() - float(at.solved.logdet)
-    volume += joint.correction(problem.model, at.point.levels)
-    return -mode.value + 0.5 * float(np.sum(np.log(np.where(alpha > 0, alpha, 1.0)))) - 0.5 * volume
+    whole, error = mode.factor.log_determinant()
+    volume = whole - float(at.solved.logdet) + joint.correction(problem.model, at.point.levels)
+    log_prior = 0.5 * float(np.sum(np.log(np.where(alpha > 0, alpha, 1.0))))
+    return -mode.value + log_prior - 0.5 * volume, 0.5 * error
 
 
 def _gaussian(problem: Problem, prior: Prior, mode: SparseMode, evidence: float, alpha: np.ndarray) -> SparsePosterior:
     """The Gaussian at a mode."""
     joint, z = mode.system.joint, np.asarray(mode.system.point.z)
-    if exact():
+    if joint.exact:
         entries, members = mode.factor.inverse_entries(), blocks_of(problem.model)
         blocks = SensorBlocks(len(z), members, joint.block_values(members, joint.pairs(members), entries))
         variance, error = entries[joint.places.diagonal], np.zeros(joint.places.size)
@@ -266,7 +278,7 @@ def declared_blocks(problem: Problem, system: SparseSystem) -> SensorBlocks:
     """What a prior of the declared scales leaves of the biases of each sensor, at a system."""
     M, joint, members = problem.model.biases, system.joint, blocks_of(problem.model)
     factor = system.factor(np.ones(M))
-    if exact():
+    if joint.exact:
         return SensorBlocks(M, members, joint.block_values(members, joint.pairs(members), factor.inverse_entries()))
     variance, _ = factor.inverse_diagonal()  # entries off the diagonal are not estimated
     return SensorBlocks(M, np.arange(M)[:, None], variance[joint.states :, None, None])
@@ -287,7 +299,7 @@ def _told(declared: SensorBlocks) -> dict[str, np.ndarray]:
 
 def _errors(error: np.ndarray, variance: np.ndarray, system: SparseSystem) -> dict[str, np.ndarray]:
     """A column with the share of each sd by which it may be wrong, where variances are estimated."""
-    if exact():
+    if system.joint.exact:
         return {}
     states = system.joint.states
     return {"sd_error": 0.5 * error[states:] / variance[states:]}

@@ -6,6 +6,7 @@ Another library is another class with the members of `Factor`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from importlib.util import find_spec
 from typing import Any, NamedTuple, Protocol
@@ -33,8 +34,8 @@ class Factor(Protocol):
     def solve(self, right: np.ndarray) -> np.ndarray:
         """The inverse times right, (n,) or (n, K)."""
 
-    def log_determinant(self) -> float:
-        """Log determinant."""
+    def log_determinant(self) -> tuple[float, float]:
+        """Log determinant, and its standard error, 0 where it is exact."""
 
     def inverse_diagonal(self) -> tuple[np.ndarray, np.ndarray]:
         """Diagonal (n,) of the inverse, and the standard error (n,) of each entry, 0 where it is exact."""
@@ -85,10 +86,10 @@ class Cholmod:
         """The inverse times right, (n,) or (n, K)."""
         return self._apply(right, self._library.MODE_A)
 
-    def log_determinant(self) -> float:
-        """Log determinant."""
+    def log_determinant(self) -> tuple[float, float]:
+        """Log determinant, and no error."""
         with jax.enable_x64(True), _on_cpu():
-            return float(self._library.logdet_factor(self._token))
+            return float(self._library.logdet_factor(self._token)), 0.0
 
     def inverse_entries(self) -> np.ndarray:
         """The inverse at the place of each entry, exact: Takahashi's selected inverse, or all columns of a full one."""
@@ -120,13 +121,9 @@ class SuperLU:
     """SuperLU of SciPy without pivoting; the diagonal of the inverse is estimated by draws."""
 
     def __init__(self, places: Entries, values: np.ndarray):
-        from scipy.sparse import coo_matrix
         from scipy.sparse.linalg import splu
 
-        upper = coo_matrix((values, (places.row, places.column)), (places.size, places.size)).tocsc()
-        own = upper.diagonal()
-        whole = upper + upper.T
-        whole.setdiag(own)
+        whole = symmetric(places, values)
         options = {"SymmetricMode": True, "Equil": False}
         try:
             self._lu = splu(whole, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
@@ -144,22 +141,13 @@ class SuperLU:
         """The inverse times right, (n,) or (n, K)."""
         return np.asarray(self._lu.solve(np.asarray(right)))
 
-    def log_determinant(self) -> float:
-        """Log determinant."""
-        return float(np.sum(np.log(self._pivots)))
+    def log_determinant(self) -> tuple[float, float]:
+        """Log determinant, and no error."""
+        return float(np.sum(np.log(self._pivots))), 0.0
 
     def inverse_diagonal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Diagonal (n,) of the inverse from draws, the rest of each given (Siden and others 2018), and its error."""
-        rng, own = np.random.default_rng(0), self._whole.diagonal()
-        total, fourth = np.zeros(self._size), np.zeros(self._size)
-        for _ in range(PROBES // BLOCK):
-            drawn = self.draw(rng, BLOCK).T
-            middle = drawn - (self._whole @ drawn) / own[:, None]  # the mean of each given all others
-            total += np.sum(middle**2, 1)
-            fourth += np.sum(middle**4, 1)
-        mean = total / PROBES
-        error = np.sqrt(np.maximum(fourth / PROBES - mean**2, 0.0) / PROBES)
-        return 1.0 / own + mean, error
+        """Diagonal (n,) of the inverse from draws, and its standard error."""
+        return drawn_diagonal(self.draw, self._whole, PROBES)
 
     def inverse_entries(self) -> np.ndarray:
         """There is none."""
@@ -172,6 +160,35 @@ class SuperLU:
         normal = rng.standard_normal((self._size, count)) / np.sqrt(self._pivots)[:, None]
         moved = spsolve_triangular(self._lu.L.T.tocsr(), normal, lower=False, unit_diagonal=True)
         return np.asarray(moved)[self._lu.perm_c].T
+
+
+def symmetric(places: Entries, values: np.ndarray) -> Any:
+    """The whole matrix (n, n), sparse by columns."""
+    from scipy.sparse import coo_matrix
+
+    upper = coo_matrix((values, (places.row, places.column)), (places.size, places.size)).tocsc()
+    own = upper.diagonal()
+    whole = upper + upper.T
+    whole.setdiag(own)
+    return whole
+
+
+def drawn_diagonal(
+    draw: Callable[[np.random.Generator, int], np.ndarray], whole: Any, probes: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Diagonal (n,) of the inverse of a sparse matrix from draws, the rest of each given (Siden and others 2018).
+
+    Also the standard error of each entry.
+    """
+    rng, own = np.random.default_rng(0), whole.diagonal()
+    total, fourth = np.zeros(len(own)), np.zeros(len(own))
+    for _ in range(probes // BLOCK):
+        drawn = draw(rng, BLOCK).T
+        middle = drawn - (whole @ drawn) / own[:, None]  # the mean of each given all others
+        total += np.sum(middle**2, 1)
+        fourth += np.sum(middle**4, 1)
+    mean = total / probes
+    return 1.0 / own + mean, np.sqrt(np.maximum(fourth / probes - mean**2, 0.0) / probes)
 
 
 def _on_cpu() -> Any:

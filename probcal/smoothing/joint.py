@@ -16,8 +16,10 @@ import numpy as np
 from probcal import linalg
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
-from probcal.smoothing.cholesky import Entries, Factor, factorise
+from probcal.smoothing import cholesky
+from probcal.smoothing.cholesky import Entries, Factor, factorise, symmetric
 from probcal.smoothing.mode import factors
+from probcal.smoothing.products import Products
 from probcal.smoothing.room import ROOM, dense_numbers
 
 MANY, THIN = 500, 0.25  # biases, and the share of them that an epoch sees, from which the sparse form is the faster
@@ -87,10 +89,11 @@ class JointPrecision:
     driven: tuple[np.ndarray, ...]  # (E,) whether an epoch has variables of its own
     states: int  # number of variables that are states
     count: int  # of all values of `_values`
+    sensors: np.ndarray | None  # biases (B, p) of each sensor, where there is no factor of them
 
     @classmethod
-    def of(cls, model: Model) -> JointPrecision:
-        """The pattern of a model."""
+    def of(cls, model: Model, *, products: bool = False) -> JointPrecision:
+        """The pattern of a model, whose biases are factorised, or known by products alone."""
         slots, driven, start = [], [], 0
         for part in model.recursions:
             E, n = part.drift.shape
@@ -110,7 +113,13 @@ class JointPrecision:
         on = np.flatnonzero(low == high)
         diagonal[low[on]] = on
         places = Entries(low.astype(np.int32), high.astype(np.int32), size, diagonal)
-        return cls(places, kept, times[kept], tuple(slots), tuple(driven), start, len(rows))
+        sensors = blocks_of(model) if products else None
+        return cls(places, kept, times[kept], tuple(slots), tuple(driven), start, len(rows), sensors)
+
+    @property
+    def exact(self) -> bool:
+        """Whether entries of the inverse are exact."""
+        return self.sensors is None and cholesky.exact()
 
     def values(self, model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> np.ndarray:
         """Entries (entries,) of the precision of data and motion, the biases without prior."""
@@ -121,7 +130,9 @@ class JointPrecision:
         """Factorise the precision with prior precisions alpha (M,) of the biases."""
         whole = values.copy()
         whole[-len(alpha) :] += alpha  # the last entries are the diagonal of the biases
-        return factorise(self.places, whole)
+        if self.sensors is None:
+            return factorise(self.places, whole)
+        return Products(self.states_alone(whole), symmetric(self.places, whole), self.states, self.sensors)
 
     def block_values(self, members: np.ndarray, pairs: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Covariances (B, p, p) of biases (B, p), of their `pairs` in the inverse at the places of the entries."""

@@ -1,0 +1,176 @@
+"""The joint precision by its products alone, where no factor of the biases fits: conjugate gradients and Lanczos.
+
+Trajectories are banded and keep a factor of their own. Of what they leave to the M biases, S = C - B'W^-1 B, only
+products are formed; the blocks of the sensors in C precondition it. Solves are exact to a tolerance, variances and the
+log determinant are estimated and come with their standard errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from probcal.errors import FitError
+from probcal.smoothing.cholesky import BLOCK, Factor, drawn_diagonal
+
+TOLERANCE = 1e-9  # share of the first residual that ends a solve
+DRAWN = 1e-5  # share of a draw that the last vector of its basis may have
+STEPS = 2000  # of one solve
+FEW, MANY, PROBED = 128, 512, 500_000  # probes of an estimate: as many as make so many numbers, within bounds
+NUMBERS = 40_000_000  # of the bases that are held at once
+LOOK = 8  # steps between two looks at whether draws are done
+
+
+class Products:
+    """A precision (n, n), states before biases, with the members of `Factor`."""
+
+    def __init__(self, held: Factor, whole: Any, states: int, members: np.ndarray):
+        """`held` factorises the states, `whole` is the matrix (sparse); members (B, p) are the biases of each sensor.
+
+        Each bias stands in one of them; M is no bias. Raises `numpy.linalg.LinAlgError` where a bias has neither data nor prior.
+        """
+        self._held, self._whole, self._states = held, whole, states
+        self._across, self._within = whole[:states, states:].tocsr(), whole[states:, states:].tocsr()
+        self._back, self._members, self._size = self._across.T.tocsr(), members, whole.shape[0] - states
+        self._probes = BLOCK * (int(np.clip(PROBED // self._size, FEW, MANY)) // BLOCK)
+        self._lower = np.linalg.cholesky(self._blocks())
+        self._inverse = np.linalg.inv(self._lower)
+
+    def _blocks(self) -> np.ndarray:
+        """What the matrix has between the biases of each sensor (B, p, p), the tracks known."""
+        M, members = self._size, self._members
+        low, high = np.broadcast_arrays(members[:, :, None], members[:, None, :])
+        there = (low < M) & (high < M)
+        found = np.where(there, 0.0, np.eye(members.shape[1])[None])
+        found[there] = np.asarray(self._within[low[there], high[there]]).ravel()
+        return found
+
+    def _left(self, z: np.ndarray) -> np.ndarray:
+        """S times columns z (M, K)."""
+        return np.asarray(self._within @ z - self._back @ self._held.solve(self._across @ z))
+
+    def _blockwise(self, matrices: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Matrices (B, p, p) of the blocks times columns z (M, K)."""
+        padded = np.concatenate([z, np.zeros((1, z.shape[1]))])
+        found = np.empty_like(padded)
+        found[self._members] = matrices @ padded[self._members]
+        return found[:-1]
+
+    def _white(self, z: np.ndarray) -> np.ndarray:
+        """L^-1 S L^-T times columns z (M, K), L the Cholesky factor of the blocks."""
+        return self._blockwise(self._inverse, self._left(self._blockwise(self._inverse.mT, z)))
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """The inverse times right, (n,) or (n, K); raises `FitError` where conjugate gradients do not end."""
+        columns = right.reshape(len(right), -1)
+        first = self._held.solve(columns[: self._states])
+        z = self._gradients(columns[self._states :] - self._back @ first)
+        states = first - self._held.solve(self._across @ z)
+        return np.concatenate([states, z]).reshape(right.shape)
+
+    def _gradients(self, right: np.ndarray) -> np.ndarray:
+        """S^-1 right (M, K) by preconditioned conjugate gradients, all columns at once."""
+        precondition = self._inverse.mT @ self._inverse
+        x, r = np.zeros_like(right), right
+        p = y = self._blockwise(precondition, r)
+        left = np.sum(r * y, 0)
+        aim = TOLERANCE**2 * left
+        for _ in range(STEPS):
+            going = left > aim
+            if not going.any():
+                return x
+            image = self._left(p)
+            curved = np.sum(p * image, 0)
+            if not (curved[going] > 0).all():
+                raise np.linalg.LinAlgError("not positive definite")
+            length = np.where(going, left, 0.0) / np.where(going, curved, 1.0)
+            x, r = x + length * p, r - length * image
+            y = self._blockwise(precondition, r)
+            after = np.sum(r * y, 0)
+            p = np.where(going, y + after / np.where(going, left, 1.0) * p, 0.0)
+            left = np.where(going, after, 0.0)
+        raise FitError(
+            f"conjugate gradients did not end within {STEPS} steps: the data leave some directions of the biases to a"
+            ' prior that is much wider; hold them by surveys, or give form="sparse"'
+        )
+
+    def log_determinant(self) -> tuple[float, float]:
+        """Log determinant by Lanczos quadrature (Ubaru, Chen, Saad 2017), and its standard error."""
+        rng = np.random.default_rng(1)
+        whole, _ = self._held.log_determinant()
+        whole += 2.0 * float(np.sum(np.log(np.diagonal(self._lower, axis1=1, axis2=2))))
+        found = np.zeros(0)
+        while len(found) < self._probes:
+            signs = rng.choice([-1.0, 1.0], (self._size, self._probes - len(found)))
+            found = np.append(found, self._lanczos(signs, np.log)[1])
+        return whole + float(found.mean()), float(found.std(ddof=1) / np.sqrt(len(found)))
+
+    def inverse_diagonal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Diagonal (n,) of the inverse from draws, and its standard error."""
+        return drawn_diagonal(self.draw, self._whole, self._probes)
+
+    def inverse_entries(self) -> np.ndarray:
+        """There is none."""
+        raise RuntimeError("products have no selected inverse")
+
+    def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Draws (count, n) around zero with this precision (Chow, Saad 2014)."""
+        found = np.zeros((0, self._whole.shape[0]))
+        while len(found) < count:
+            normal = rng.standard_normal((self._size, count - len(found)))
+            white, _ = self._lanczos(normal, lambda values: values**-0.5)
+            z = self._blockwise(self._inverse.mT, white)
+            states = self._held.draw(rng, z.shape[1]).T - self._held.solve(self._across @ z)
+            found = np.concatenate([found, np.concatenate([states, z]).T])
+        return found
+
+    def _lanczos(
+        self, start: np.ndarray, function: Callable[[np.ndarray], np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A function of the whitened S times the first of some vectors (M, K), and the quadratic forms of these (K,).
+
+        As many of them as there is room for bases of 80 steps each; a basis is made orthogonal anew at every step.
+        """
+        M = len(start)
+        K = max(1, min(start.shape[1], NUMBERS // (M * min(M, 10 * LOOK))))
+        start = start[:, :K]
+        norm = np.sqrt(np.sum(start**2, 0))
+        basis, middle, beside = [start / norm], list[np.ndarray](), list[np.ndarray]()
+        while True:
+            w = self._white(basis[-1])
+            middle.append(np.sum(basis[-1] * w, 0))
+            w = w - middle[-1] * basis[-1] - (beside[-1] * basis[-2] if beside else 0.0)
+            for own in basis:
+                w -= own * np.einsum("mk,mk->k", own, w)
+            length = np.sqrt(np.sum(w**2, 0))
+            going = length > 1e-12 * np.abs(middle[0])
+            if len(middle) % LOOK == 0 or not going.any() or len(middle) == M:
+                share, form = _functions(np.array(middle).T, np.array(beside).reshape(-1, K).T, function)
+                rest = np.abs(share[:, -1]) <= DRAWN * np.sqrt(np.sum(share**2, 1))
+                if (rest | ~going).all() or len(middle) == M:
+                    return sum(own * c for own, c in zip(basis, (norm[:, None] * share).T, strict=True)), norm**2 * form
+            if len(middle) == STEPS:
+                raise FitError(f"draws of the biases did not end within {STEPS} steps: hold what the data leave open")
+            beside.append(np.where(going, length, 0.0))
+            basis.append(np.where(going, w / np.where(going, length, 1.0), 0.0))
+
+
+def _functions(
+    middle: np.ndarray, beside: np.ndarray, function: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """First columns (K, k) of a function of tridiagonal matrices, and their first entries (K,).
+
+    A basis that was complete goes on with zeros, which the first column does not reach.
+    """
+    K, k = middle.shape
+    matrices, at = np.zeros((K, k, k)), np.arange(k)
+    matrices[:, at, at] = np.where(middle == 0, middle[:, :1], middle)
+    matrices[:, at[1:], at[:-1]] = matrices[:, at[:-1], at[1:]] = beside
+    values, vectors = np.linalg.eigh(matrices)
+    if not (values[:, 0] > 1e-14 * values[:, -1]).all():
+        raise np.linalg.LinAlgError("not positive definite")
+    first = vectors[:, 0, :]
+    share = np.einsum("kij,kj->ki", vectors, function(values) * first)
+    return share, share[:, 0]
