@@ -303,6 +303,37 @@ def test_a_singular_matrix_is_no_fit(monkeypatch):
         fitted(pc.MAP(form="sparse"), pc.Flat())
 
 
+def test_a_factor_that_memory_does_not_hold_is_replaced_by_products_or_said(monkeypatch):
+    def full(places, values):
+        raise MemoryError("no room for a sparse factor")
+
+    kept = factorise
+    monkeypatch.setattr(
+        "probcal.smoothing.joint.factorise",
+        lambda places, values: full(places, values) if places.size > states else kept(places, values),
+    )
+    monkeypatch.setattr("probcal.smoothing.joint.ROOM", 100)
+    states = JointPrecision.of(drawn()[0].model).states
+    tree = fitted(pc.MAP(), pc.Gaussian())
+    assert tree.attrs["status"] == "converged"
+    assert "matrix-free" in tree.attrs["settings"]
+    for method in (pc.MAP(form="sparse"), pc.EA()):
+        with pytest.raises(FitError, match=r'does not fit in memory: MAP\(form="matrix-free"\) makes none'):
+            fitted(method)
+
+
+@pytest.mark.parametrize("said", ["std::bad_alloc", "cholmod_analyze failed (status -2)"])
+def test_a_library_that_has_no_room_says_so(said, monkeypatch):
+    sparsax = pytest.importorskip("sparsax", reason="sparsax is an extra")
+
+    def fails(*_):
+        raise RuntimeError(f"XLA FFI call failed: {said}")
+
+    monkeypatch.setattr(sparsax, "factor", fails)
+    with pytest.raises(MemoryError, match="no room for a sparse factor"):
+        Cholmod(Entries(np.zeros(1, np.int32), np.zeros(1, np.int32), 1, np.zeros(1, int)), np.ones(1))
+
+
 @pytest.mark.parametrize(
     ("method", "prior", "settings", "said"),
     [

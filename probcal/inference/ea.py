@@ -153,7 +153,8 @@ class EA(Maximiser):
     precisions maximised. `update` of maximised precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed
     points, slower). `tolerance` is the change of log evidence, in nats, at which it stops; `iterations` caps the outer
     loop. `form` "auto" takes the dense form where its matrices need up to 240 MB, unless an epoch sees less than a
-    quarter of more than 500 biases, the sparse one else (see `inference.sparse`); "dense" and "sparse" take that one.
+    quarter of more than 500 biases, the sparse one else (see `inference.sparse`); "dense" and "sparse" take that one,
+    "matrix-free" is for `MAP`.
     Raises `InputError` for another update, trajectory, form or kind of precisions.
 
     >>> type(EA().first_prior()), type(EA.as_printed().first_prior())
@@ -287,9 +288,11 @@ class MAP(Maximiser):
     """Mode under a given prior with its Laplace covariance: of the marginal, or of trajectories and biases jointly.
 
     `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood; `trajectory` "marginal" or "joint", as
-    in `EA`, places on rings included. `form` as in `EA`. Under `Flat` a climb of which a bias still lies more than ten
-    scales from its stated value after fifteen steps, or thirty, has diverged and ends there. Raises `InputError` for
-    another trajectory or form.
+    in `EA`, places on rings included. `form` as in `EA`; "matrix-free" makes no factor of the biases: steps by
+    conjugate gradients, sds (with their relative errors, `sd_error`) and the evidence by draws (see
+    `smoothing.products`). It needs the least memory, and "auto" goes on with it where that does not hold a sparse
+    factor. Under `Flat` a climb of which a bias still lies more than ten scales from its stated value after fifteen
+    steps, or thirty, has diverged and ends there. Raises `InputError` for another trajectory or form.
     """
 
     iterations: int = 500

@@ -1,7 +1,8 @@
 """Fits whose dense form does not fit: the marginal mode by sparse factors, precisions integrated by propagation.
 
 `EA()` and `MAP()` come here by themselves (`form="auto"`): where the matrices of the dense form take more than 240 MB,
-and where there are more than 500 biases of which an epoch sees few, which is faster.
+and where there are more than 500 biases of which an epoch sees few, which is faster. Where memory does not hold the
+factor either, `MAP` goes on by products alone (`form="matrix-free"`).
 What needs the whole covariance of the biases is not there; variances and gamma of each are.
 """
 
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -213,6 +214,13 @@ def sparse_answer(method: Maximiser, problem: Problem, prior: Prior, start: Poin
             _integrated(problem, prior, mode, evidence, prior_first, context.key, told) if integrated
             else (replace(_gaussian(problem, prior, mode, evidence, first), evidence_error=error), True)
         )  # fmt: skip
+    except MemoryError:
+        if getattr(method, "form", "") == "auto" and isinstance(prior, (Gaussian, Flat)):
+            return sparse_answer(replace(cast("Any", method), form=PRODUCTS), problem, prior, start, context)
+        raise FitError(
+            f"the sparse factor of {joint.states} state entries and {model.biases} biases does not fit in memory:"
+            f' MAP(form="{PRODUCTS}") makes none; or take fewer sensors or a shorter time'
+        ) from None
     except np.linalg.LinAlgError:
         silent = ", ".join(_untold(problem, joint, start, declared)[:NAMED])
         why = f"no row tells {silent}" if silent else "the information matrix is singular"

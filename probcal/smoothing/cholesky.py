@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 FULL, COLUMNS = 16, 256  # an entry of so many places of the matrix makes it full; columns solved at once
+NO_ROOM = ("bad_alloc", "status -2", "status -3", "RESOURCE_EXHAUSTED")  # of XLA and of CHOLMOD
 PROBES, BLOCK = 512, 64  # draws of a diagonal that is estimated, and of them at once
 
 
@@ -48,7 +49,10 @@ class Factor(Protocol):
 
 
 def factorise(places: Entries, values: np.ndarray) -> Factor:
-    """Factorise a matrix; raises `numpy.linalg.LinAlgError` where it is not positive definite."""
+    """Factorise a matrix.
+
+    Raises `numpy.linalg.LinAlgError` where it is not positive definite and `MemoryError` where there is no room.
+    """
     return Cholmod(places, values) if exact() else SuperLU(places, values)
 
 
@@ -71,7 +75,9 @@ class Cholmod:
             try:
                 self._token = jax.block_until_ready(sparsax.factor(*self._entries, places.size))
             except Exception as error:  # of XLA: what the library raised within
-                if "positive definite" not in str(error):  # no memory, or no such processor
+                if any(word in str(error) for word in NO_ROOM):
+                    raise MemoryError(f"no room for a sparse factor: {error}") from None
+                if "positive definite" not in str(error):  # no such processor
                     raise
                 raise np.linalg.LinAlgError(f"not positive definite: {error}") from None
 

@@ -29,7 +29,8 @@ class Products:
     def __init__(self, held: Factor, whole: Any, states: int, members: np.ndarray):
         """`held` factorises the states, `whole` is the matrix (sparse); members (B, p) are the biases of each sensor.
 
-        Each bias stands in one of them; M is no bias. Raises `numpy.linalg.LinAlgError` where a bias has neither data nor prior.
+        Each bias stands in one of them; M is no bias. Raises `numpy.linalg.LinAlgError` where a bias has neither data
+        nor prior.
         """
         self._held, self._whole, self._states = held, whole, states
         self._across, self._within = whole[:states, states:].tocsr(), whole[states:, states:].tocsr()
