@@ -412,6 +412,28 @@ def test_the_gain_of_an_anchor_has_a_closed_form():
 
 @float64
 @pytest.mark.ci
+def test_a_further_sensor_stands_where_it_is_tried_for_all_targets():
+    """Also where they are of several kinds: at rest and on their way."""
+    problem = problem_of([plain_range], 2, {"position": 10.0})
+    frame = problem.measurements.table.frame
+    rest = pd.DataFrame({"time": TIME, "sensor": "plain_range_0", "target": "mast", "range": 1.0})
+    both = pd.concat([frame.assign(target="car"), rest], ignore_index=True)
+    network, motion = problem.network, {"car": ConstantVelocity(3.0), "mast": Static()}
+    problem, place = Problem(network, motion, both), np.array([240.0, 60.0])
+    point = automatic_start(problem)
+    found = next_sensors(problem, point=point, places=[place])
+    further = Network([*network.sensors, plain_range.on(Node("further", place))])
+    seen = both.drop_duplicates(["time", "target"]).assign(sensor="further", range=1.0)
+    wider = Problem(further, motion, pd.concat([both, seen], ignore_index=True))
+    whole = spectrum(wider, point._replace(z=np.append(point.z, 0.0)))  # its offset is the last bias
+    after = whole[:-1, :-1] - np.outer(whole[:-1, -1], whole[:-1, -1]) / (whole[-1, -1] + 1.0)
+    before, eye = spectrum(problem, point), np.eye(15)
+    gain = 0.5 * (np.linalg.slogdet(after + eye)[1] - np.linalg.slogdet(before + eye)[1])
+    np.testing.assert_allclose(found["gain"].values, [gain], rtol=1e-8)
+
+
+@float64
+@pytest.mark.ci
 def test_the_gain_of_a_sensor_is_what_its_rows_tell():
     problem = problem_of([plain_range], 2, {"position": 10.0})
     point = truth_of(problem)

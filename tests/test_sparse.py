@@ -648,13 +648,73 @@ def test_surveys_of_many_biases_tell_what_those_of_few_do(monkeypatch):
             ask(problem, point=point)
 
 
+@cache
+def all_seen():
+    """The targets of `drawn` seen by every sensor at every instant, and a start."""
+    problem, truth = drawn()
+    tracks = {name: own.filter(like="position").to_numpy() for name, own in truth.tracks.groupby("target")}
+    run = pc.simulate(problem.network, MOTION, TIME, key=3, tracks=tracks, biases=truth.biases)
+    whole = pc.Problem(problem.network, MOTION, run.table)
+    with jax.enable_x64(True):
+        return whole, automatic_start(whole)
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+def test_passes_of_a_large_network_tell_what_those_of_a_small_one_do(library, monkeypatch):
+    """To 1e-6 where every sensor reaches; one that lies beyond their reach tells nothing."""
+    problem, point = all_seen()
+    lines = [[(0.0, 0.0), (300.0, 300.0)], [(100.0, 100.0), (250.0, 200.0)], [(9e5, 0.0), (9e5, 100.0)]]
+    wanted = pc.next_passes(problem, point=point, passes=lines[:2])
+    for name in ("joint", "room"):
+        monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+    monkeypatch.setattr("probcal.analysis.additions.REACHED", 2.0)
+    found = pc.next_passes(problem, point=point, passes=lines)
+    assert found["gain"].values[-1] == 0.0
+    assert (found["path"].values[-1, :, 0] == 9e5).all()
+    np.testing.assert_allclose(found["gain"].values[:2], wanted["gain"].values, rtol=1e-6)
+    np.testing.assert_allclose(found["path"].values[:2], wanted["path"].values)
+    assert found.attrs["pattern"] == wanted.attrs["pattern"]
+    assert 800 < found.attrs["reach"] < 1_300, "twice the farthest that was seen"
+    assert "weak" not in found
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+def test_a_pass_is_seen_by_the_sensors_that_it_comes_near_to(library, monkeypatch):
+    """Where sensors reach so far as they did, those beyond see nothing: as if they had no row."""
+    problem, point = all_seen()
+    for name in ("joint", "room"):
+        monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+    line = [[(0.0, 0.0), (300.0, 300.0)]]
+    gains = []
+    for reached in (0.3, 1.0, 2.0):
+        monkeypatch.setattr("probcal.analysis.additions.REACHED", reached)
+        gains.append(pc.next_passes(problem, point=point, passes=line)["gain"].item())
+    assert 0 < gains[0] < gains[1] < gains[2]
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+def test_sensors_of_a_large_network_tell_what_those_of_a_small_one_do(library, monkeypatch):
+    """To 1e-6, of both types, with a bias that all of a type share and biases of their own, targets at rest too."""
+    problem, point = all_seen()
+    places = [(100.0, 50.0), (200.0, 200.0), (0.0, 300.0)]
+    wanted = pc.next_sensors(problem, point=point, places=places)
+    for name in ("joint", "room"):
+        monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+    monkeypatch.setattr("probcal.analysis.additions.REACHED", 2.0)
+    found = pc.next_sensors(problem, point=point, places=[*places, (9e5, 0.0)])
+    assert found["gain"].values[-2:].tolist() == [0.0, 0.0]
+    np.testing.assert_allclose(found["gain"].values[:-2], wanted["gain"].values, rtol=1e-6)
+    assert found["type"].values[:-2].tolist() == wanted["type"].values.tolist()
+    np.testing.assert_allclose(found["place"].values[:-2], wanted["place"].values)
+
+
 @pytest.mark.parametrize(
     "asked",
     [
         pytest.param(lambda p, method=method: pc.fit(p, method), id=method.name)
         for method in (pc.EM(), pc.LeastSquares(), pc.Collapsed(), pc.NUTS(), pc.SVI())
     ]
-    + [pytest.param(call, id=call.__name__) for call in (pc.next_passes, pc.next_sensors, pc.log_evidence)],
+    + [pytest.param(pc.log_evidence, id="log_evidence")],
 )
 def test_what_needs_the_dense_form_says_so_where_there_is_no_room(asked, monkeypatch):
     for name in ("joint", "room"):

@@ -4,7 +4,6 @@ A gain is 1/2 log det of the information of all biases with the addition over th
 prior of one scale (or the survey), trajectories marginalised (Lindley 1956).
 """
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -13,6 +12,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from probcal.analysis.additions import Known, gains_of_passes, gains_of_sensors
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
 from probcal.identifiability.remedies import WEAK
@@ -48,27 +48,39 @@ def next_passes(
     A pass is seen by the sensors, at the instants and with the noise that saw the target with most rows (its first
     300 epochs). Candidates are `passes` (P, 2 or more, d), polylines in m travelled evenly, by default straight
     lines through the area in eight directions; places on a grid for static targets. All is taken at the automatic
-    start, a `truth` or a `point`. Raises `InputError` for the shape.
+    start, a `truth` or a `point`. On a network too large for matrices of all biases a pass is seen by the sensors that
+    it comes as near to as any of their type was to a target (attribute `reach`, m), and weak directions are not
+    counted. Raises `InputError` for the shape.
     """
     check_free(problem)
-    check_room(problem.model)
+    large = too_large(problem.model)
+    if not large:
+        check_room(problem.model)
     point = standpoint(problem, point, truth)
     name, part = _pattern(problem)
     epochs, start = part.epochs[0], np.asarray(_states_of(problem, point, name))[: len(part.epochs[0].time)]
     paths = _candidates(problem, point, start, len(epochs.time)) if passes is None else _travelled(passes, epochs.time)
     if paths.ndim != 3 or paths.shape[2] != problem.network.dimension:
         raise InputError(f"passes has shape {np.shape(passes)}; give (passes, points, {problem.network.dimension})")
-    states = jnp.asarray(np.stack([_state(epochs, start, path) for path in paths]))
-    added = np.asarray(_of_states(part.model, states, point.z, _levels(problem, part, point)))
-    known = _information(problem, point)
-    gains, left = _gains(problem, known, known + added)
+    states = np.stack([_state(epochs, start, path) for path in paths])
+    told: dict[str, Any] = {}
+    if large:
+        of_many = Known.of(problem, point)
+        gains = gains_of_passes(of_many, name, np.unique(part.measurements.time), states)
+        attrs: dict[str, Any] = {"pattern": name, "reach": max(of_many.reach.values())}
+    else:
+        added = np.asarray(_of_states(part.model, jnp.asarray(states), point.z, _levels(problem, part, point)))
+        known = _information(problem, point)
+        gains, left = _gains(problem, known, known + added)
+        attrs = {"pattern": name, "weak_before": _weak(problem, known)}
+        told["weak"] = left
     order = np.argsort(-gains, kind="stable")
     ends = np.linspace(0, paths.shape[1] - 1, min(paths.shape[1], 20)).round().astype(int)
     return xr.Dataset(
-        {"gain": ("pass", gains[order]), "weak": ("pass", left[order]),
-         "path": (("pass", "point", "axis"), paths[order][:, ends])},
+        {"gain": ("pass", gains[order])} | {name: ("pass", column[order]) for name, column in told.items()}
+        | {"path": (("pass", "point", "axis"), paths[order][:, ends])},
         coords={"pass": np.arange(len(order)), "axis": list(AXES[: paths.shape[2]])},
-        attrs={"pattern": name, "weak_before": _weak(problem, known)},
+        attrs=attrs,
     )  # fmt: skip
 
 
@@ -185,30 +197,26 @@ def next_sensors(
     """What one more sensor of each type, its pose known, would tell about the biases that there are: gain (nats).
 
     It sees every target at every epoch; its own biases are free. `places` (P, d) in m are by default a grid over the
-    area; the second node of a two-node type is that of its first sensor. Best first. Raises `InputError` for the shape.
+    area; the second node of a two-node type is that of its first sensor. Best first. On a network too large for
+    matrices of all biases it sees targets that are as near as any of its type saw one. Raises `InputError` for the
+    shape.
 
     >>> bool(next_sensors(problem, places=[(100.0, -50.0), (300.0, 80.0)])["gain"][0] > 0)
     True
     """
     check_free(problem)
-    check_room(problem.model)
+    large = too_large(problem.model)
+    if not large:
+        check_room(problem.model)
     point = standpoint(problem, point, truth)
     d = problem.network.dimension
     places = _grid(problem, point) if places is None else np.asarray(places, float)
     if places.ndim != 2 or places.shape[1] != d:
         raise InputError(f"places has shape {places.shape}; give (places, {d})")
-    known = _information(problem, point)
-    M = len(problem.labels)
+    known: Any = Known.of(problem, point) if large else _information(problem, point)
     found = []
     for kind in problem.network.types:
-        wider, block, mine = _with_sensor(problem, kind)
-        z = jnp.concatenate([point.z, jnp.zeros(len(wider.labels) - M)])
-        there = _levels(problem, wider, point)
-        moved = point._replace(z=z, levels=there)
-        matrices = np.asarray(_of_places(wider.model, moved, jnp.asarray(places), block, mine))
-        inner = matrices[:, M:, M:] + np.eye(matrices.shape[1] - M)
-        cross = matrices[:, M:, :M]
-        gains, _ = _gains(problem, known, matrices[:, :M, :M] - cross.mT @ np.linalg.solve(inner, cross))
+        gains = gains_of_sensors(known, kind, places) if large else _gains_at(problem, point, known, kind, places)
         found += [(kind.name, gain, place) for gain, place in zip(gains, places, strict=True)]
     found.sort(key=lambda row: -row[1])
     return xr.Dataset(
@@ -216,6 +224,17 @@ def next_sensors(
          "place": (("candidate", "axis"), np.stack([place for *_, place in found]))},
         coords={"axis": list(AXES[:d])},
     )  # fmt: skip
+
+
+def _gains_at(problem: Problem, point: Point, known: np.ndarray, kind: SensorType, places: np.ndarray) -> np.ndarray:
+    """Gains (P,) of one more sensor of a type at places (P, d)."""
+    wider, mine = _with_sensor(problem, kind)
+    M = len(known)
+    z = jnp.concatenate([point.z, jnp.zeros(len(wider.labels) - M)])
+    moved = point._replace(z=z, levels=_levels(problem, wider, point))
+    matrices = np.asarray(_of_places(wider.model, moved, jnp.asarray(places), mine))
+    inner, cross = matrices[:, M:, M:] + np.eye(matrices.shape[1] - M), matrices[:, M:, :M]
+    return _gains(problem, known, matrices[:, :M, :M] - cross.mT @ np.linalg.solve(inner, cross))[0]
 
 
 # Information
@@ -227,10 +246,10 @@ def _of_states(model: Model, states: jax.Array, z: jax.Array, levels: jax.Array)
     return jax.lax.map(lambda x: marginal_information(model, Point((x,), (jnp.zeros_like(x),), z, levels)), states)
 
 
-@partial(jax.jit, static_argnames="block")
-def _of_places(model: Model, point: Point, places: jax.Array, block: int, mine: jax.Array) -> jax.Array:
-    """Information (C, M, M) with the first node of the rows `mine` (N,) of a block at each of the places (C, d)."""
-    return jax.lax.map(lambda place: marginal_information(variants.placed(model, block, mine, place), point), places)
+@jax.jit
+def _of_places(model: Model, point: Point, places: jax.Array, mine: tuple[jax.Array, ...]) -> jax.Array:
+    """Information (C, M, M) with the first node of the rows `mine` (N,) of each block at each of the places (C, d)."""
+    return jax.lax.map(lambda place: marginal_information(variants.placed(model, mine, place), point), places)
 
 
 def _information(problem: Problem, point: Point) -> np.ndarray:
@@ -344,8 +363,8 @@ def _travelled(passes: Any, time: np.ndarray) -> np.ndarray:
     return np.stack(paths)
 
 
-def _with_sensor(problem: Problem, kind: SensorType) -> tuple[Problem, int, jax.Array]:
-    """The problem with one more sensor of a type that sees every epoch; its block, and which rows (N,) are its own."""
+def _with_sensor(problem: Problem, kind: SensorType) -> tuple[Problem, tuple[jax.Array, ...]]:
+    """The problem with one more sensor of a type that sees every epoch; which rows (N,) of each block are its own."""
     network, data = problem.network, problem.measurements
     like = next(placed for placed in network.sensors if placed.type == kind)
     taken = {placed.name for placed in network.sensors} | {node.name for node in network.nodes}
@@ -364,9 +383,5 @@ def _with_sensor(problem: Problem, kind: SensorType) -> tuple[Problem, int, jax.
         Network([*network.sensors, placed], frame=network.frame), problem.motion, table, fix=problem.fixed,
         epoch=problem.epoch,
     )  # fmt: skip
-    number = len(wider.network.sensors) - 1
-    for block, index in enumerate(wider.row_index):
-        mine = wider.measurements.sensor[index] == number
-        if mine.any():
-            return wider, block, jnp.asarray(mine)
-    raise KeyError(name)
+    number, read = len(wider.network.sensors) - 1, wider.measurements.sensor
+    return wider, tuple(jnp.asarray(read[index] == number) for index in wider.row_index)

@@ -95,12 +95,13 @@ def split(model: Model, piece: Sequence[np.ndarray], count: int) -> Model:
     return replace(model, biases=count * M, rows=tuple(rows), tilt=None)
 
 
-def placed(model: Model, block: int, mine: jax.Array, place: jax.Array) -> Model:
-    """The first node of the rows `mine` (N,) of one block moved to a place (d,)."""
-    data = model.rows[block]
-    first = jnp.where(mine[:, None], place[None], data.pose[:, 0, : len(place)])
-    moved = data._replace(pose=data.pose.at[:, 0, : len(place)].set(first))
-    return replace(model, rows=tuple(moved if b == block else other for b, other in enumerate(model.rows)))
+def placed(model: Model, mine: Sequence[jax.Array], place: jax.Array) -> Model:
+    """The first node of the rows `mine` (N,) of each block moved to a place (d,)."""
+    rows = []
+    for data, own in zip(model.rows, mine, strict=True):
+        first = jnp.where(own[:, None], place[None], data.pose[:, 0, : len(place)])
+        rows.append(data._replace(pose=data.pose.at[:, 0, : len(place)].set(first)))
+    return replace(model, rows=tuple(rows))
 
 
 def without(model: Model, held: np.ndarray) -> Model:
