@@ -11,7 +11,6 @@ import logging
 import os
 import signal
 import socket
-import sys
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -38,7 +37,6 @@ else:
 LOCAL = "local"  # a scheduler and workers of this machine, for as long as the call lasts
 TIMEOUT = 10.0  # s in which a scheduler must answer
 SENT = 500  # batches that are handed over at a time
-SWITCH = 5e-4  # s after which a thread lets another one on; in the 5 ms of Python kernels that ended wait
 KERNELS = (  # settings of jax, by which workers keep compiled kernels in the folder of this process
     "jax_compilation_cache_dir", "jax_compilation_cache_max_size", "jax_persistent_cache_min_compile_time_secs",
     "jax_persistent_cache_min_entry_size_bytes",
@@ -81,14 +79,12 @@ def check_scheduler(scheduler: Any) -> None:
 
 def _on_threads[B, R](work: Callable[[B], R], batches: Sequence[B], threads: int | None) -> Generator[tuple[int, R]]:
     yield 0, work(batches[0])
-    pool, before = ThreadPoolExecutor(threads or os.cpu_count()), sys.getswitchinterval()
-    sys.setswitchinterval(min(before, SWITCH))
+    pool = ThreadPoolExecutor(threads or os.cpu_count())
     try:
         waiting = {pool.submit(work, batch): k for k, batch in enumerate(batches[1:], 1)}
         for finished in as_completed(waiting):
             yield waiting[finished], finished.result()
     finally:
-        sys.setswitchinterval(before)
         pool.shutdown(cancel_futures=True)
 
 
