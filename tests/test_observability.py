@@ -460,9 +460,17 @@ def test_the_gain_of_a_sensor_is_what_its_rows_tell():
     ],
     ids=["3-D", "two nodes", "mixed", "static"],
 )
-def test_planning_works_for_every_kind(kinds, dimension, scale, motion):
+def test_planning_works_for_every_kind(kinds, dimension, scale, motion, monkeypatch):
+    """And without matrices of all biases, where all sensors reach everywhere, it says the same."""
     problem = problem_of(kinds, dimension, scale, motion)
     point = automatic_start(problem)
+    wanted = [plan(problem, point=point)["gain"].values for plan in (next_passes, next_sensors)]
+    with monkeypatch.context() as patch:
+        patch.setattr("probcal.analysis.additions.REACHED", 100.0)
+        for name in ("joint", "room"):
+            patch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+        for plan, gain in zip((next_passes, next_sensors), wanted, strict=True):
+            np.testing.assert_allclose(plan(problem, point=point)["gain"].values, gain, rtol=1e-5, atol=1e-6)
     for plan in (next_passes, next_anchors, next_sensors):
         found = plan(problem, point=point)
         gain = found["gain"].values
