@@ -1,5 +1,6 @@
 """The sparse form beside the dense one: the same mode, variances, evidence and tracks; and what it refuses."""
 
+import re
 import sys
 from functools import cache
 from pathlib import Path
@@ -530,8 +531,8 @@ def test_observability_of_many_biases_is_that_of_few(monkeypatch):
 def test_check_of_a_large_network_says_what_is_open(monkeypatch, capsys, tmp_path):
     """The command line with the sparse form: biases that the data tell least of, directions, status, files."""
     pytest.importorskip("sparsax", reason="sparsax is an extra")
-    for name in ("probcal.analysis.observability", "probcal.cli.check", "probcal.analysis.standpoint"):
-        monkeypatch.setattr(sys.modules[name], "too_large", lambda model: True)
+    for name in ("analysis.observability", "cli.check", "analysis.standpoint", "analysis.planning"):
+        monkeypatch.setattr(sys.modules[f"probcal.{name}"], "too_large", lambda model: True)
     monkeypatch.setattr("probcal.cli.check.MANY", 10)
     monkeypatch.setattr("probcal.cli.check.SHOWN", 5)
     given = {"side": 3, "targets": 1, "epochs": 40}
@@ -541,7 +542,9 @@ def test_check_of_a_large_network_says_what_is_open(monkeypatch, capsys, tmp_pat
     assert ended == 1
     assert "biases, those that the data tell least of" in said
     assert "translation of all nodes along x (gauge" in said
-    assert "What would tell most (nats), of surveys alone on a network of this size:\n  a survey of " in said
+    assert "What would tell most (nats):\n  another pass, (" in said
+    assert re.search(r"\n  a survey of radar_\d+\.position_\* to 0\.2 m: [\d.]+ of the other biases\n", said)
+    assert re.search(r"\n  one more radar at \([-\d., e+]+\) m: [\d.]+\n", said)
     assert {path.name for path in tmp_path.iterdir()} >= {"check.nc", "check.csv"}
 
 

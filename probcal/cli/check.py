@@ -18,6 +18,7 @@ from probcal.files import Outputs
 from probcal.problem import Problem
 from probcal.results.io import save
 from probcal.smoothing.joint import too_large
+from probcal.smoothing.mode import Point
 from probcal.starts import automatic_start
 
 MANY, SHOWN, LISTED = 400, 40, 12  # biases up to which all are printed, of more so many; directions of many
@@ -37,42 +38,48 @@ def run(model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, 
         return _check_many(problem, model, outputs)
     with line():
         start = automatic_start(problem)
-        tree = observability(problem, point=start)
-        passes = next_passes(problem, point=start)
-        plans = (passes, next_anchors(problem, point=start), next_sensors(problem, point=start))
+        tree, plans = observability(problem, point=start), _planned(problem, start)
     tree.attrs["model"] = model.stem
     _print_check(problem, tree, plans)
     if outputs is not None:
         with outputs.writing():
-            _write(problem, tree, passes, outputs.folder)
+            _write(problem, tree, plans[0], outputs.folder)
     return 1 if tree.attrs["status"] == "open" else 0
 
 
 def _check_many(problem: Problem, model: Path, outputs: Outputs | None) -> int:
-    """The check of a network too large for matrices of all biases: of what to measure next the surveys alone."""
+    """The check of a network too large for matrices of all biases: tables, and no pictures of bounds."""
     with line():
         start = standpoint(problem, None, None)
-        tree, anchors = observability(problem, point=start), next_anchors(problem, point=start)
+        tree, plans = observability(problem, point=start), _planned(problem, start)
     tree.attrs["model"] = model.stem
-    _print_known(problem, tree)
-    print("What would tell most (nats), of surveys alone on a network of this size:")
-    print(f"  {_survey_text(anchors)}")
-    print(STATUS[tree.attrs["status"]])
+    _print_check(problem, tree, plans)
     if outputs is not None:
         with outputs.writing():
             say_written(_write_tables(tree, outputs.folder))
     return 1 if tree.attrs["status"] == "open" else 0
 
 
+def _planned(problem: Problem, start: Point) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
+    """What another pass, a survey and a further sensor would tell."""
+    return (
+        next_passes(problem, point=start), next_anchors(problem, point=start), next_sensors(problem, point=start)
+    )  # fmt: skip
+
+
 def _print_check(problem: Problem, tree: xr.DataTree, plans: tuple[xr.Dataset, xr.Dataset, xr.Dataset]) -> None:
+    """What is known, and what to measure next; of many biases without how many directions would be left."""
     _print_known(problem, tree)
     passes, anchors, sensors_ = plans
-    print(f"weak directions now: {passes.attrs['weak_before']}. What would tell most (nats; weak directions left):")
+    counted = "weak" in passes
+    left = [f" ({plan['weak'].values[0]})" if counted else "" for plan in (passes, anchors)]
+    before = f"weak directions now: {passes.attrs['weak_before']}. " if counted else ""
+    print(f"{before}What would tell most (nats{'; weak directions left' if counted else ''}):")
     path = passes["path"].values[0]
     ends = " to ".join("(" + ", ".join(f"{v:.4g}" for v in place) + ")" for place in path[[0, -1]][: len(path)])
     what = "another pass" if len(path) > 1 else "another target"
-    print(f"  {what}, {ends} m: {passes['gain'].values[0]:.2f} ({passes['weak'].values[0]})")
-    print(f"  {_survey_text(anchors)} ({anchors['weak'].values[0]})")
+    print(f"  {what}, {ends} m: {passes['gain'].values[0]:.2f}{left[0]}")
+    print(f"  {_survey_text(anchors)}{left[1]}")
     place = ", ".join(f"{v:.4g}" for v in sensors_["place"].values[0])
     print(f"  one more {sensors_['type'].values[0]} at ({place}) m: {sensors_['gain'].values[0]:.2f}")
     print(STATUS[tree.attrs["status"]])
