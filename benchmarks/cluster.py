@@ -29,7 +29,7 @@ WORKER = (sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1"
 def client(out: Path, given: list[str], *more: str) -> subprocess.Popen[str]:
     """`probcal study` as a process of its own."""
     order = [sys.executable, "-m", "probcal.cli", "study", str(MODEL), *given, "--out", str(out), *more]
-    return subprocess.Popen(order, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    return subprocess.Popen(order, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, text=True)
 
 
 def finished(out: Path) -> int:
@@ -49,8 +49,7 @@ def wait(process: subprocess.Popen[str], out: Path, count: int) -> None:
 
 def ended(process: subprocess.Popen[str]) -> None:
     """Wait for a study to end well."""
-    process.communicate()
-    if process.returncode:
+    if process.wait():
         sys.exit(f"the study ended with {process.returncode}")
 
 
@@ -77,7 +76,7 @@ def killed(folder: Path, out: Path, given: list[str], total: int) -> int:
         start(*WORKER, address)
         wait(first, out, total // 2)
         first.send_signal(signal.SIGKILL)
-        first.communicate()
+        first.wait()
         kept = finished(out)
         ended(client(out, given, "--scheduler", address, "--resume"))
         return kept

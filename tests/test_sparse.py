@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -21,7 +22,7 @@ from probcal.geometry import bearing, norm
 from probcal.inference.sparse import gains_by_sparse, takes_sparse
 from probcal.results.blocks import covariance_of
 from probcal.smoothing import cholesky
-from probcal.smoothing.cholesky import Cholmod, Entries, SuperLU, factorise, symmetric
+from probcal.smoothing.cholesky import Cholmod, Entries, SuperLU, factorise, mirrored
 from probcal.smoothing.joint import JointPrecision, blocks_of, missing
 from probcal.smoothing.linearised import linearise_rows
 from probcal.smoothing.mode import compress
@@ -207,7 +208,7 @@ def by_products(A, states, members):
     places = Entries(i, j, len(A), np.flatnonzero(i == j))
     own = j < states
     held = factorise(Entries(i[own], j[own], states, np.flatnonzero((i == j)[own])), A[i, j][own])
-    return Products(held, symmetric(places, A[i, j]), states, members)
+    return Products(held, mirrored(places, A[i, j]), states, members)
 
 
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
@@ -245,12 +246,17 @@ def test_products_of_some_columns_are_those_of_each(monkeypatch):
 
 
 def test_products_that_are_not_positive_or_do_not_end_are_no_answer(monkeypatch):
+    """A block that is not positive; blocks and states that are, and take more away from each other than there is."""
     A, members = thing(20, 10, np.random.default_rng(0))
-    least = np.linalg.eigvalsh(A)[0] + 0.01
-    worse = A.copy()
-    worse[20:, 20:] -= 5 * least * np.eye(30)
+    worse, coupled = A.copy(), A.copy()
+    worse[20:, 20:] -= 5 * np.eye(30)
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
-        by_products(worse, 20, members).draw(np.random.default_rng(0), 1)
+        by_products(worse, 20, members)
+    coupled[0, 25] = coupled[25, 0] = 10.0
+    found = by_products(coupled, 20, members)
+    for ask in (lambda: found.solve(np.eye(50)[25]), lambda: found.draw(np.random.default_rng(0), 1)):
+        with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+            ask()
     monkeypatch.setattr("probcal.smoothing.products.STEPS", 2)
     with pytest.raises(FitError, match="conjugate gradients did not end within 2 steps"):
         by_products(A, 20, members).solve(np.ones(50))
@@ -258,8 +264,32 @@ def test_products_that_are_not_positive_or_do_not_end_are_no_answer(monkeypatch)
         by_products(A, 20, members).draw(np.random.default_rng(0), 1)
 
 
+@pytest.mark.parametrize("least", [1e-3, 1e-5, 1e-7])
+def test_draws_resolve_directions_that_data_leave_to_a_wide_prior(least, monkeypatch):
+    """Of a spectrum with a tail towards zero: a root to 0.1 %, a log determinant to 1e-4 nats, also in few columns.
+
+    The last entry of the first column is small long before the smallest eigenvalues are resolved.
+    """
+    A, members = thing(4, 200, np.random.default_rng(0))
+    found = by_products(A, 4, members)
+    spectrum = np.sort(np.append(np.linspace(0.3, 1.7, 560), np.geomspace(least, 0.1, 40)))
+    found._white = lambda z: spectrum[:, None] * z
+    start = np.random.default_rng(1).standard_normal((600, 6))
+    start[:, 0] = np.eye(600)[3]  # ends after one step
+    wanted = spectrum[:, None] ** -0.5 * start
+    for numbers, columns in ((10**9, 6), (600 * 100 * 6, 1)):  # where there is room for all, and for 600 steps of one
+        monkeypatch.setattr("probcal.smoothing.products.NUMBERS", numbers)
+        drawn, form = found._lanczos(start, lambda values: values**-0.5)
+        assert columns <= drawn.shape[1] == len(form) <= 6
+        off = np.linalg.norm(drawn - wanted[:, : len(form)], axis=0) / np.linalg.norm(wanted[:, : len(form)], axis=0)
+        assert off.max() < 1e-3
+        form = found._lanczos(start, np.log)[1]
+        true = np.sum(np.log(spectrum)[:, None] * start**2, 0)
+        np.testing.assert_allclose(form, true[: len(form)], atol=1e-4)
+
+
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
-def test_a_fit_without_factors_of_the_biases_ends_where_the_dense_one_does(library, dense):
+def test_a_fit_without_factors_of_the_biases_ends_where_the_dense_one_does(library, dense, monkeypatch):
     """Means within 1e-4 sds, sds, gamma and evidence within 6 of their standard errors, which are small."""
     free = fitted(pc.MAP(form="matrix-free"), pc.Gaussian())
     a, b = (tree["calibration"].to_dataset() for tree in (dense, free))
@@ -278,7 +308,11 @@ def test_a_fit_without_factors_of_the_biases_ends_where_the_dense_one_does(libra
         np.testing.assert_allclose(other["sd"], one["sd"], rtol=0.3)
     draws = free["posterior"]["bias"].values.reshape(-1, len(sd))
     np.testing.assert_allclose(draws.std(0) / b["sd"].values, 1.0, atol=0.2)
+    assert "No factor of the biases was made: sds and evidence are estimated" in free.attrs["message"]
+    refused = "an assessment makes no factor either"
+    monkeypatch.setattr("probcal.smoothing.joint.JointPrecision.factor", lambda *_: pytest.fail(refused))
     judged = pc.assess(drawn()[0], free)["verdict"]["verdict"].values
+    monkeypatch.undo()
     assert (judged == pc.assess(drawn()[0], dense)["verdict"]["verdict"].values).mean() > 0.7
 
 
@@ -321,6 +355,9 @@ def test_a_factor_that_memory_does_not_hold_is_replaced_by_products_or_said(monk
     for method in (pc.MAP(form="sparse"), pc.EA()):
         with pytest.raises(FitError, match=r'does not fit in memory: MAP\(form="matrix-free"\) makes none'):
             fitted(method)
+    monkeypatch.setattr("probcal.smoothing.joint.factorise", full)
+    with pytest.raises(FitError, match="not even without a factor: take fewer sensors or a shorter time"):
+        fitted(pc.MAP(), pc.Gaussian())
 
 
 @pytest.mark.parametrize("said", ["std::bad_alloc", "cholmod_analyze failed (status -2)"])
@@ -709,6 +746,76 @@ def test_sensors_of_a_large_network_tell_what_those_of_a_small_one_do(library, m
     np.testing.assert_allclose(found["gain"].values[:-2], wanted["gain"].values, rtol=1e-6)
     assert found["type"].values[:-2].tolist() == wanted["type"].values.tolist()
     np.testing.assert_allclose(found["place"].values[:-2], wanted["place"].values)
+
+
+@pc.sensor(delay=pc.Channel("m", std=1.0))
+def difference(target, pose, other, *, lag=pc.Bias("m", 3.0)):
+    """Difference of two distances."""
+    return dict(delay=norm(target.position - pose.position) - norm(target.position - other.position) + lag)
+
+
+@pc.sensor(range=pc.Channel("m", std=1.0))
+def naive(target, pose, *, offset=pc.Bias("m", 3.0)):
+    """Range without a derivative at zero."""
+    return dict(range=jnp.sqrt(jnp.sum((target.position - pose.position) ** 2)) + offset)
+
+
+def both_forms(problem, point, monkeypatch, reached=100.0, **asked):
+    """Gains of passes and sensors in the dense form, and in that of large networks."""
+    calls = [(pc.next_passes, asked.get("passes")), (pc.next_sensors, asked.get("places"))]
+    gains = [[call(problem, point=point, **{name: given})["gain"].values for (call, given), name in
+              zip(calls, ("passes", "places"), strict=True)]]  # fmt: skip
+    with monkeypatch.context() as patch:
+        patch.setattr("probcal.analysis.additions.REACHED", reached)
+        for name in ("joint", "room"):
+            patch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+        gains.append([call(problem, point=point, **{name: given})["gain"].values for (call, given), name in
+                      zip(calls, ("passes", "places"), strict=True)])  # fmt: skip
+    return gains
+
+
+def test_planning_takes_second_nodes_whose_spread_another_sensor_reads(monkeypatch):
+    """And nodes that move, biases that are fixed, a network small beside its ranges, a name that is taken."""
+    nodes = [pc.Node("new 0", (0.0, 0.0), scale={"position": 1.0}), pc.Node("b", (20.0, 0.0), scale={"heading": 0.05})]
+    moving = pc.Node("boat", path=pc.Path(TIME, np.stack([TIME, 10.0 + 0 * TIME], 1)), scale={"heading": 0.05})
+    network = pc.Network([difference.on(*nodes), ear.on(nodes[1], name="ears"), radar.on(moving)])
+    motion = pc.ConstantVelocity(1.0)
+    way = np.stack([3_000 + 10 * TIME, 2_000 + 0 * TIME], 1)
+    run = pc.simulate(network, motion, TIME, key=1, share=0.0, tracks={"target": way})
+    problem = pc.Problem(network, motion, run.table, fix="*.gain")
+    with jax.enable_x64(True):
+        point = automatic_start(problem)
+    lines, places = [[(2_000.0, 2_000.0), (3_000.0, 1_000.0)]], [(500.0, 300.0)]
+    wanted, found = both_forms(problem, point, monkeypatch, passes=lines, places=places)
+    for one, other in zip(wanted, found, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-4)
+
+
+def test_what_planning_of_a_large_network_cannot_say_it_says(monkeypatch):
+    network = pc.Network([naive.on(pc.Node(f"n{k}", (100.0 * k, 0.0))) for k in range(3)])
+    way = np.stack([10.0 * TIME, 50.0 + 0 * TIME], 1)
+    run = pc.simulate(network, pc.ConstantVelocity(1.0), TIME, key=1, tracks={"target": way})
+    problem = pc.Problem(network, pc.ConstantVelocity(1.0), run.table)
+    with jax.enable_x64(True):
+        point = automatic_start(problem)
+    for name in ("joint", "room"):
+        monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+    with pytest.raises(InputError, match="pass 0 runs over the place of a sensor that has no derivative there"):
+        pc.next_passes(problem, point=point, passes=[[(0.0, 0.0), (0.0, 0.0)]])
+    at = np.asarray(point.states[0])[3, slice(*problem.epochs[0].position)]
+    with pytest.raises(InputError, match=r"a further naive at \(.*\) m would stand where a target was seen, and has"):
+        pc.next_sensors(problem, point=point, places=[at])
+    there = point._replace(states=(jnp.zeros_like(point.states[0]),))
+    with pytest.raises(InputError, match="no finite derivatives at the point where they are looked at"):
+        pc.next_sensors(problem, point=there, places=[(5.0, 5.0)])
+    for call, name, given in (
+        (pc.next_passes, "passes", [[(0.0, np.nan), (1.0, 1.0)]]), (pc.next_sensors, "places", [(np.nan, 0.0)])
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=rf"^{name} has shape .* of finite numbers"):
+            call(problem, point=point, **{name: given})
+    monkeypatch.setattr("probcal.analysis.additions.TOUCHED", 2)
+    with pytest.raises(InputError, match="pass 0 would touch 3 biases and state entries, of which matrices are made"):
+        pc.next_passes(problem, point=point, passes=[[(0.0, 20.0), (100.0, 30.0)]])
 
 
 @pytest.mark.parametrize(

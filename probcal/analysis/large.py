@@ -79,8 +79,15 @@ def _taken_up(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> Jud
     posterior = None if answer is None else answer.posterior
     point = point_of(problem, tree) if posterior is None else posterior.point
     system = system_at(problem.model, JointPrecision.of(problem.model), point)
-    declared = posterior.declared if isinstance(posterior, SparsePosterior) else declared_blocks(problem, system)
-    blocks = SensorBlocks.read(tree["calibration"].to_dataset(), problem.labels, problem.scales)
+    told = tree["calibration"].to_dataset()
+    if isinstance(posterior, SparsePosterior):
+        declared = posterior.declared
+    elif "sd_error" in told:  # no factor was made, or none that has exact variances
+        apart = 1.0 - told["contraction"].values
+        declared = SensorBlocks(len(apart), np.arange(len(apart))[:, None], apart[:, None, None])
+    else:
+        declared = declared_blocks(problem, system)
+    blocks = SensorBlocks.read(told, problem.labels, problem.scales)
     return JudgedLarge(problem, system.point, system.rows, system.solved, picks, data, blocks, declared)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from probcal.analysis.additions import Known, gains_of_passes, gains_of_sensors
+from probcal.analysis.additions import Informed, gains_of_passes, gains_of_sensors, typical_values
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
 from probcal.identifiability.remedies import WEAK
@@ -28,7 +28,7 @@ from probcal.smoothing.joint import JointPrecision, too_large
 from probcal.smoothing.linearised import linearise_rows, marginal_information
 from probcal.smoothing.mode import Point
 from probcal.smoothing.room import check_room
-from probcal.table import Table, header
+from probcal.table import Table, header, unit_factor
 from probcal.types import float64
 
 LONGEST = 300  # epochs of the pass that stands as a pattern
@@ -49,8 +49,9 @@ def next_passes(
     300 epochs). Candidates are `passes` (P, 2 or more, d), polylines in m travelled evenly, by default straight
     lines through the area in eight directions; places on a grid for static targets. All is taken at the automatic
     start, a `truth` or a `point`. On a network too large for matrices of all biases a pass is seen by the sensors that
-    it comes as near to as any of their type was to a target (attribute `reach`, m), and weak directions are not
-    counted. Raises `InputError` for the shape.
+    it comes as near to as any of their type was to a target (attribute `reach`, m, the largest of all types), in every
+    channel and with the declared noise, and weak directions are not counted. Raises `InputError` for the shape, and for
+    a pass that meets more biases than matrices can be made of.
     """
     check_free(problem)
     large = too_large(problem.model)
@@ -60,12 +61,13 @@ def next_passes(
     name, part = _pattern(problem)
     epochs, start = part.epochs[0], np.asarray(_states_of(problem, point, name))[: len(part.epochs[0].time)]
     paths = _candidates(problem, point, start, len(epochs.time)) if passes is None else _travelled(passes, epochs.time)
-    if paths.ndim != 3 or paths.shape[2] != problem.network.dimension:
-        raise InputError(f"passes has shape {np.shape(passes)}; give (passes, points, {problem.network.dimension})")
+    if paths.ndim != 3 or paths.shape[2] != problem.network.dimension or not np.isfinite(paths).all():
+        shape = f"(passes, points, {problem.network.dimension})"
+        raise InputError(f"passes has shape {np.shape(passes)}; give {shape} of finite numbers")
     states = np.stack([_state(epochs, start, path) for path in paths])
     told: dict[str, Any] = {}
     if large:
-        of_many = Known.of(problem, point)
+        of_many = Informed.of(problem, point)
         gains = gains_of_passes(of_many, name, np.unique(part.measurements.time), states)
         attrs: dict[str, Any] = {"pattern": name, "reach": max(of_many.reach.values())}
     else:
@@ -211,12 +213,13 @@ def next_sensors(
     point = standpoint(problem, point, truth)
     d = problem.network.dimension
     places = _grid(problem, point) if places is None else np.asarray(places, float)
-    if places.ndim != 2 or places.shape[1] != d:
-        raise InputError(f"places has shape {places.shape}; give (places, {d})")
-    known: Any = Known.of(problem, point) if large else _information(problem, point)
+    if places.ndim != 2 or places.shape[1] != d or not np.isfinite(places).all():
+        raise InputError(f"places has shape {places.shape}; give (places, {d}) of finite numbers")
+    told = Informed.of(problem, point) if large else None
+    known = np.zeros((0, 0)) if large else _information(problem, point)
     found = []
     for kind in problem.network.types:
-        gains = gains_of_sensors(known, kind, places) if large else _gains_at(problem, point, known, kind, places)
+        gains = _gains_at(problem, point, known, kind, places) if told is None else gains_of_sensors(told, kind, places)
         found += [(kind.name, gain, place) for gain, place in zip(gains, places, strict=True)]
     found.sort(key=lambda row: -row[1])
     return xr.Dataset(
@@ -375,7 +378,11 @@ def _with_sensor(problem: Problem, kind: SensorType) -> tuple[Problem, tuple[jax
     frame = data.table.frame
     columns = dict(zip(header(data.table)[0], frame.columns, strict=True))
     seen = frame.drop_duplicates([columns[c] for c in ("time", "target") if c in columns])
-    own = {columns[c]: 0.0 for c, _ in kind.expand(network.dimension) if c in columns}
+    units, typical = header(data.table)[1], typical_values(problem, kind)
+    own = {
+        columns[c]: typical[c] / unit_factor(data.table, c, units[c], channel.unit)
+        for c, channel in kind.expand(network.dimension) if c in columns
+    }  # fmt: skip
     blank = {column: np.nan for c, column in columns.items() if c not in ("time", "target", "sensor")}
     rows = seen.assign(**blank).assign(**own, **{columns["sensor"]: name})
     table = Table(pd.concat([frame, rows], ignore_index=True), data.table.source, np.arange(len(frame) + len(rows)))

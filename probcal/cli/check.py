@@ -14,6 +14,7 @@ from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem
 from probcal.cli.progress import line
+from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.problem import Problem
 from probcal.results.io import save
@@ -40,7 +41,9 @@ def run(model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, 
         start = automatic_start(problem)
         tree, plans = observability(problem, point=start), _planned(problem, start)
     tree.attrs["model"] = model.stem
-    _print_check(problem, tree, plans)
+    _print_known(problem, tree)
+    _print_plans(plans)
+    print(STATUS[tree.attrs["status"]])
     if outputs is not None:
         with outputs.writing():
             _write(problem, tree, plans[0], outputs.folder)
@@ -51,9 +54,16 @@ def _check_many(problem: Problem, model: Path, outputs: Outputs | None) -> int:
     """The check of a network too large for matrices of all biases: tables, and no pictures of bounds."""
     with line():
         start = standpoint(problem, None, None)
-        tree, plans = observability(problem, point=start), _planned(problem, start)
+        tree = observability(problem, point=start)
     tree.attrs["model"] = model.stem
-    _print_check(problem, tree, plans)
+    _print_known(problem, tree)
+    try:
+        with line():
+            plans = _planned(problem, start)
+        _print_plans(plans)
+    except InputError as error:
+        print(f"What to measure next is not said: {error}")
+    print(STATUS[tree.attrs["status"]])
     if outputs is not None:
         with outputs.writing():
             say_written(_write_tables(tree, outputs.folder))
@@ -67,9 +77,8 @@ def _planned(problem: Problem, start: Point) -> tuple[xr.Dataset, xr.Dataset, xr
     )  # fmt: skip
 
 
-def _print_check(problem: Problem, tree: xr.DataTree, plans: tuple[xr.Dataset, xr.Dataset, xr.Dataset]) -> None:
-    """What is known, and what to measure next; of many biases without how many directions would be left."""
-    _print_known(problem, tree)
+def _print_plans(plans: tuple[xr.Dataset, xr.Dataset, xr.Dataset]) -> None:
+    """What to measure next; of many biases without how many directions would be left."""
     passes, anchors, sensors_ = plans
     counted = "weak" in passes
     left = [f" ({plan['weak'].values[0]})" if counted else "" for plan in (passes, anchors)]
@@ -82,7 +91,6 @@ def _print_check(problem: Problem, tree: xr.DataTree, plans: tuple[xr.Dataset, x
     print(f"  {_survey_text(anchors)}{left[1]}")
     place = ", ".join(f"{v:.4g}" for v in sensors_["place"].values[0])
     print(f"  one more {sensors_['type'].values[0]} at ({place}) m: {sensors_['gain'].values[0]:.2f}")
-    print(STATUS[tree.attrs["status"]])
 
 
 def _survey_text(anchors: xr.Dataset) -> str:

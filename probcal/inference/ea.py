@@ -25,7 +25,7 @@ from probcal.inference.run import (
     reweighted,
     valued,
 )
-from probcal.inference.sparse import FORMS
+from probcal.inference.sparse import FORMS, PRODUCTS
 from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
@@ -290,9 +290,10 @@ class MAP(Maximiser):
     `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood; `trajectory` "marginal" or "joint", as
     in `EA`, places on rings included. `form` as in `EA`; "matrix-free" makes no factor of the biases: steps by
     conjugate gradients, sds (with their relative errors, `sd_error`) and the evidence by draws (see
-    `smoothing.products`). It needs the least memory, and "auto" goes on with it where that does not hold a sparse
-    factor. Under `Flat` a climb of which a bias still lies more than ten scales from its stated value after fifteen
-    steps, or thirty, has diverged and ends there. Raises `InputError` for another trajectory or form.
+    `smoothing.products`). It is for what has no room for a sparse factor; "auto" goes on with it where making one is
+    refused for want of memory. Under `Flat` a climb of which a bias still lies more than ten scales from its stated
+    value after fifteen steps, or thirty, has diverged and ends there. Raises `InputError` for another trajectory or
+    form.
     """
 
     iterations: int = 500
@@ -309,6 +310,12 @@ class MAP(Maximiser):
             raise InputError(f'{self.name}(trajectory="{self.trajectory}"): give one of {", ".join(MODES)}')
         if self.form not in FORMS:
             raise InputError(f'{self.name}(form="{self.form}"): give one of {", ".join(FORMS)}')
+
+    def remark(self, prior: Prior) -> str:
+        """That sds are estimated where no factor of the biases was made."""
+        if self.form != PRODUCTS:
+            return ""
+        return "No factor of the biases was made: sds and evidence are estimated, each with its standard error."
 
     @property
     def integrates_places(self) -> bool:

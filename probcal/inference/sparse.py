@@ -45,16 +45,17 @@ CHAINS, NUMBERS, MOST = 4, 400_000, 250  # of the draws of all biases that a tre
 STEPS = 60  # of the climb
 NAMED = 20  # combinations of single sensors that are named
 PRODUCTS = "matrix-free"
-FORMS = ("auto", "dense", "sparse", PRODUCTS)
+SPARSE = ("sparse", PRODUCTS)
+FORMS = ("auto", "dense", *SPARSE)
 
 
 def takes_sparse(method: Maximiser, problem: Problem) -> bool:
     """Whether a method is to solve a problem in its sparse form; raises `InputError` where that was asked in vain."""
     form = getattr(method, "form", "dense")
     lacks = missing(problem.model)
-    if form in FORMS[2:] and lacks:
+    if form in SPARSE and lacks:
         raise InputError(f'{method.name}(form="{form}") does not take {lacks}: give form="dense"')
-    return bool(form in FORMS[2:] or (form == "auto" and not lacks and prefers_sparse(problem.model)))
+    return bool(form in SPARSE or (form == "auto" and not lacks and prefers_sparse(problem.model)))
 
 
 def gains_by_sparse(method: Maximiser, problem: Problem, prior: Prior, starts: int) -> bool:
@@ -139,7 +140,7 @@ class SparsePosterior(Posterior):
     declared: SensorBlocks  # what a prior of the declared scales leaves
     open: tuple[Direction, ...]  # combinations that the data leave to the prior, those of many sensors first
     weak: int  # how many there are; some have no name
-    evidence_error: float = 0.0  # standard error of the log evidence, where that is estimated
+    evidence_error: float | None = None  # standard error of the log evidence, where that is estimated
 
     chained: ClassVar[bool] = False
     held: ClassVar[bool] = True
@@ -188,7 +189,7 @@ class SparsePosterior(Posterior):
     @property
     def attrs(self) -> Mapping[str, float]:
         """The limit of inclusion, how many directions are weak, and the error of an evidence that is estimated."""
-        estimated = {"log_evidence_error": self.evidence_error} if self.evidence_error else {}
+        estimated = {} if self.evidence_error is None else {"log_evidence_error": self.evidence_error}
         return {"rope": ROPE, "sparse": 1.0, "weak": float(self.weak)} | estimated
 
 
@@ -212,9 +213,14 @@ def sparse_answer(method: Maximiser, problem: Problem, prior: Prior, start: Poin
         evidence, error = _evidence(mode, problem, declared)
         posterior, settled = (
             _integrated(problem, prior, mode, evidence, prior_first, context.key, told) if integrated
-            else (replace(_gaussian(problem, prior, mode, evidence, first), evidence_error=error), True)
+            else (_gaussian(problem, prior, mode, (evidence, error), first), True)
         )  # fmt: skip
     except MemoryError:
+        if joint.members is not None:
+            raise FitError(
+                f"memory does not hold {joint.states} state entries and {model.biases} biases, not even without a"
+                " factor: take fewer sensors or a shorter time"
+            ) from None
         if getattr(method, "form", "") == "auto" and isinstance(prior, (Gaussian, Flat)):
             return sparse_answer(replace(cast("Any", method), form=PRODUCTS), problem, prior, start, context)
         raise FitError(
@@ -251,8 +257,10 @@ def _evidence(mode: SparseMode, problem: Problem, alpha: np.ndarray) -> tuple[fl
     return -mode.value + log_prior - 0.5 * volume, 0.5 * error
 
 
-def _gaussian(problem: Problem, prior: Prior, mode: SparseMode, evidence: float, alpha: np.ndarray) -> SparsePosterior:
-    """The Gaussian at a mode."""
+def _gaussian(
+    problem: Problem, prior: Prior, mode: SparseMode, evidence: tuple[float, float], alpha: np.ndarray
+) -> SparsePosterior:
+    """The Gaussian at a mode; `evidence` is its logarithm and the standard error of that."""
     joint, z = mode.system.joint, np.asarray(mode.system.point.z)
     if joint.exact:
         entries, members = mode.factor.inverse_entries(), blocks_of(problem.model)
@@ -267,11 +275,14 @@ def _gaussian(problem: Problem, prior: Prior, mode: SparseMode, evidence: float,
     declared = blocks if prior.proper else blocks.under_scales()
     summary = Summary(
         "Laplace", "given", z, None, z - half, z + half, gamma, alpha, None, np.zeros(0),
-        evidence if prior.proper else None, _told(declared) | _errors(error, variance, mode.system), blocks=blocks,
+        evidence[0] if prior.proper else None, _told(declared) | _errors(error, variance, mode.system), blocks=blocks,
     )  # fmt: skip
     at = mode.system
     found = _open(problem, at.point, declared, _together(problem, mode) if prior.proper else ())
-    return SparsePosterior(problem, prior, at.point, summary, at, at.entries, alpha, variance, declared, *found)
+    estimated = evidence[1] if prior.proper and joint.members is not None else None
+    return SparsePosterior(
+        problem, prior, at.point, summary, at, at.entries, alpha, variance, declared, *found, estimated
+    )  # fmt: skip
 
 
 def _together(problem: Problem, mode: SparseMode) -> tuple[Direction, ...]:
@@ -319,7 +330,7 @@ def _integrated(
     """The marginals that a hierarchy makes of the likelihood, this taken anew at their mean."""
     form = Form(problem.model.biases, hierarchy_of(prior, problem))
     if not form.hierarchy.learnt:  # every bias has a survey
-        return _gaussian(problem, prior, mode, evidence, np.asarray(first.alpha)), True
+        return _gaussian(problem, prior, mode, (evidence, 0.0), np.asarray(first.alpha)), True
     members = blocks_of(problem.model)
     likelihood = SparseLikelihood(problem.model, mode.system, mode.system.joint.pairs(members))
     together = _together(problem, mode)

@@ -6,7 +6,8 @@ Another library is another class with the members of `Factor`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from importlib.util import find_spec
 from typing import Any, NamedTuple, Protocol
@@ -68,21 +69,14 @@ class Cholmod:
         import sparsax  # an extra
 
         self._library, self._places = sparsax, places
-        with jax.enable_x64(True), _on_cpu():
+        with _calling():
             sparsax.set_num_cache_size(1)  # one factor may be gigabytes
             sparsax.set_token_cache_size(1)
             self._entries = tuple(jnp.asarray(part) for part in (places.row, places.column, values))
-            try:
-                self._token = jax.block_until_ready(sparsax.factor(*self._entries, places.size))
-            except Exception as error:  # of XLA: what the library raised within
-                if any(word in str(error) for word in NO_ROOM):
-                    raise MemoryError(f"no room for a sparse factor: {error}") from None
-                if "positive definite" not in str(error):  # no such processor
-                    raise
-                raise np.linalg.LinAlgError(f"not positive definite: {error}") from None
+            self._token = jax.block_until_ready(sparsax.factor(*self._entries, places.size))
 
     def _apply(self, right: np.ndarray, *modes: Any) -> np.ndarray:
-        with jax.enable_x64(True), _on_cpu():
+        with _calling():
             found = jnp.asarray(right)
             for mode in modes:
                 found = self._library.solve_factor(self._token, found, mode)
@@ -94,7 +88,7 @@ class Cholmod:
 
     def log_determinant(self) -> tuple[float, float]:
         """Log determinant, and no error."""
-        with jax.enable_x64(True), _on_cpu():
+        with _calling():
             return float(self._library.logdet_factor(self._token)), 0.0
 
     def inverse_entries(self) -> np.ndarray:
@@ -109,7 +103,7 @@ class Cholmod:
                 eye[np.arange(start, stop), np.arange(stop - start)] = 1.0
                 found[mine] = self.solve(eye)[row[mine], column[mine] - start]
             return found
-        with jax.enable_x64(True), _on_cpu():
+        with _calling():
             return np.asarray(self._library.selinv(*self._entries, self._places.size))
 
     def inverse_diagonal(self) -> tuple[np.ndarray, np.ndarray]:
@@ -129,7 +123,7 @@ class SuperLU:
     def __init__(self, places: Entries, values: np.ndarray):
         from scipy.sparse.linalg import splu
 
-        whole = symmetric(places, values)
+        whole = mirrored(places, values)
         options = {"SymmetricMode": True, "Equil": False}
         try:
             self._lu = splu(whole, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
@@ -168,7 +162,7 @@ class SuperLU:
         return np.asarray(moved)[self._lu.perm_c].T
 
 
-def symmetric(places: Entries, values: np.ndarray) -> Any:
+def mirrored(places: Entries, values: np.ndarray) -> Any:
     """The whole matrix (n, n), sparse by columns."""
     from scipy.sparse import coo_matrix
 
@@ -197,5 +191,15 @@ def drawn_diagonal(
     return 1.0 / own + mean, np.sqrt(np.maximum(fourth / probes - mean**2, 0.0) / probes)
 
 
-def _on_cpu() -> Any:
-    return jax.default_device(jax.devices("cpu")[0])
+@contextmanager
+def _calling() -> Iterator[None]:
+    """In double precision on the CPU; what the library raised within is told apart."""
+    try:
+        with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
+            yield
+    except Exception as error:  # of XLA
+        if any(word in str(error) for word in NO_ROOM):
+            raise MemoryError(f"no room for a sparse factor: {error}") from None
+        if "positive definite" in str(error):
+            raise np.linalg.LinAlgError(f"not positive definite: {error}") from None
+        raise

@@ -6,6 +6,7 @@ entries few are not zero. One Cholesky factor solves what `eliminate` and a Schu
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ from probcal import linalg
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
 from probcal.smoothing import cholesky
-from probcal.smoothing.cholesky import Entries, Factor, factorise, symmetric
+from probcal.smoothing.cholesky import Entries, Factor, factorise, mirrored
 from probcal.smoothing.mode import factors
 from probcal.smoothing.products import Products
 from probcal.smoothing.room import ROOM, dense_numbers
@@ -89,7 +90,7 @@ class JointPrecision:
     driven: tuple[np.ndarray, ...]  # (E,) whether an epoch has variables of its own
     states: int  # number of variables that are states
     count: int  # of all values of `_values`
-    sensors: np.ndarray | None  # biases (B, p) of each sensor, where there is no factor of them
+    members: np.ndarray | None  # biases (B, p) of each sensor, where there is no factor of them
 
     @classmethod
     def of(cls, model: Model, *, products: bool = False) -> JointPrecision:
@@ -113,13 +114,13 @@ class JointPrecision:
         on = np.flatnonzero(low == high)
         diagonal[low[on]] = on
         places = Entries(low.astype(np.int32), high.astype(np.int32), size, diagonal)
-        sensors = blocks_of(model) if products else None
-        return cls(places, kept, times[kept], tuple(slots), tuple(driven), start, len(rows), sensors)
+        members = blocks_of(model) if products else None
+        return cls(places, kept, times[kept], tuple(slots), tuple(driven), start, len(rows), members)
 
     @property
     def exact(self) -> bool:
         """Whether entries of the inverse are exact."""
-        return self.sensors is None and cholesky.exact()
+        return self.members is None and cholesky.exact()
 
     def values(self, model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> np.ndarray:
         """Entries (entries,) of the precision of data and motion, the biases without prior."""
@@ -130,9 +131,9 @@ class JointPrecision:
         """Factorise the precision with prior precisions alpha (M,) of the biases."""
         whole = values.copy()
         whole[-len(alpha) :] += alpha  # the last entries are the diagonal of the biases
-        if self.sensors is None:
+        if self.members is None:
             return factorise(self.places, whole)
-        return Products(self.states_alone(whole), symmetric(self.places, whole), self.states, self.sensors)
+        return Products(self.states_alone(whole), mirrored(self.places, whole), self.states, self.members)
 
     def block_values(self, members: np.ndarray, pairs: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Covariances (B, p, p) of biases (B, p), of their `pairs` in the inverse at the places of the entries."""
@@ -175,14 +176,17 @@ class JointPrecision:
             found.append(total + 2.0 * np.sum((B @ both) * H, 2))
         return found
 
-    def states_alone(self, values: np.ndarray) -> Factor:
-        """Factorise the precision of the states at held biases."""
-        own = self.places.column < self.states
+    def states_alone(
+        self, values: np.ndarray, first: int = 0, stop: int | None = None,
+        library: Callable[[Entries, np.ndarray], Factor] | None = None,
+    ) -> Factor:  # fmt: skip
+        """Factorise the precision of the states at held biases, or of those from `first` to `stop` of whole tracks."""
+        stop = self.states if stop is None else stop
+        row, column = self.places.row, self.places.column
+        own = (row >= first) & (column < stop)
         where = np.cumsum(own) - 1
-        places = Entries(
-            self.places.row[own], self.places.column[own], self.states, where[self.places.diagonal[: self.states]]
-        )
-        return factorise(places, values[own])
+        places = Entries(row[own] - first, column[own] - first, stop - first, where[self.places.diagonal[first:stop]])
+        return (library or factorise)(places, values[own])
 
     def across(self, values: np.ndarray) -> Any:
         """The part (states, M) of the precision between states and biases, sparse."""

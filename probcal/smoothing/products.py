@@ -16,7 +16,7 @@ from probcal.errors import FitError
 from probcal.smoothing.cholesky import BLOCK, Factor, drawn_diagonal
 
 TOLERANCE = 1e-9  # share of the first residual that ends a solve
-DRAWN = 1e-5  # share of a draw that the last vector of its basis may have
+DRAWN = 1e-2  # share of a draw that its error may have: a bound, which errors stay far below
 STEPS = 2000  # of one solve
 FEW, MANY, PROBED = 128, 512, 500_000  # probes of an estimate: as many as make so many numbers, within bounds
 NUMBERS = 40_000_000  # of the bases that are held at once
@@ -94,7 +94,7 @@ class Products:
             left = np.where(going, after, 0.0)
         raise FitError(
             f"conjugate gradients did not end within {STEPS} steps: the data leave some directions of the biases to a"
-            ' prior that is much wider; hold them by surveys, or give form="sparse"'
+            " prior that is much wider; hold them by surveys"
         )
 
     def log_determinant(self) -> tuple[float, float]:
@@ -104,7 +104,7 @@ class Products:
         whole += 2.0 * float(np.sum(np.log(np.diagonal(self._lower, axis1=1, axis2=2))))
         found = np.zeros(0)
         while len(found) < self._probes:
-            signs = rng.choice([-1.0, 1.0], (self._size, self._probes - len(found)))
+            signs = rng.choice([-1.0, 1.0], (self._size, min(BLOCK, self._probes - len(found))))
             found = np.append(found, self._lanczos(signs, np.log)[1])
         return whole + float(found.mean()), float(found.std(ddof=1) / np.sqrt(len(found)))
 
@@ -120,7 +120,7 @@ class Products:
         """Draws (count, n) around zero with this precision (Chow, Saad 2014)."""
         found = np.zeros((0, self._whole.shape[0]))
         while len(found) < count:
-            normal = rng.standard_normal((self._size, count - len(found)))
+            normal = rng.standard_normal((self._size, min(BLOCK, count - len(found))))
             white, _ = self._lanczos(normal, lambda values: values**-0.5)
             z = self._blockwise(self._inverse.mT, white)
             states = self._held.draw(rng, z.shape[1]).T - self._held.solve(self._across @ z)
@@ -132,11 +132,12 @@ class Products:
     ) -> tuple[np.ndarray, np.ndarray]:
         """A function of the whitened S times the first of some vectors (M, K), and the quadratic forms of these (K,).
 
-        As many of them as there is room for bases of 80 steps each; a basis is made orthogonal anew at every step.
+        As many of them as there is room for: where their bases outgrow it the last half is dropped. A basis is made
+        orthogonal anew at every step. It ends by the residual of the linear system, which bounds the error of a root
+        and of a logarithm, integrals over shifted systems; the last entry alone ends it long before small eigenvalues
+        are resolved.
         """
-        M = len(start)
-        K = max(1, min(start.shape[1], NUMBERS // (M * min(M, 10 * LOOK))))
-        start = start[:, :K]
+        M, K = start.shape
         norm = np.sqrt(np.sum(start**2, 0))
         basis, middle, beside = [start / norm], list[np.ndarray](), list[np.ndarray]()
         while True:
@@ -147,31 +148,39 @@ class Products:
                 w -= own * np.einsum("mk,mk->k", own, w)
             length = np.sqrt(np.sum(w**2, 0))
             going = length > 1e-12 * np.abs(middle[0])
+            beside.append(np.where(going, length, 0.0))
             if len(middle) % LOOK == 0 or not going.any() or len(middle) == M:
-                share, form = _functions(np.array(middle).T, np.array(beside).reshape(-1, K).T, function)
-                rest = np.abs(share[:, -1]) <= DRAWN * np.sqrt(np.sum(share**2, 1))
-                if (rest | ~going).all() or len(middle) == M:
-                    return sum(own * c for own, c in zip(basis, (norm[:, None] * share).T, strict=True)), norm**2 * form
+                share, rest = _functions(np.array(middle).T, np.array(beside).T, function)
+                if (rest <= DRAWN).all() or len(middle) == M:
+                    drawn = sum(own * c for own, c in zip(basis, (norm[:, None] * share).T, strict=True))
+                    return drawn, norm**2 * share[:, 0]
             if len(middle) == STEPS:
                 raise FitError(f"draws of the biases did not end within {STEPS} steps: hold what the data leave open")
-            beside.append(np.where(going, length, 0.0))
             basis.append(np.where(going, w / np.where(going, length, 1.0), 0.0))
+            if len(basis) * M * K > NUMBERS and K > 1:
+                K //= 2
+                norm = norm[:K]
+                basis = [own[:, :K].copy() for own in basis]
+                middle, beside = [own[:K] for own in middle], [own[:K] for own in beside]
 
 
 def _functions(
     middle: np.ndarray, beside: np.ndarray, function: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """First columns (K, k) of a function of tridiagonal matrices, and their first entries (K,).
+    """First columns (K, k) of a function of tridiagonal matrices, and a bound (K,) of the error of a root, a share.
 
-    A basis that was complete goes on with zeros, which the first column does not reach.
+    `beside` (K, k) has with its last column what couples the next vector. A basis that was complete goes on with
+    zeros, which the first column does not reach.
     """
     K, k = middle.shape
     matrices, at = np.zeros((K, k, k)), np.arange(k)
     matrices[:, at, at] = np.where(middle == 0, middle[:, :1], middle)
-    matrices[:, at[1:], at[:-1]] = matrices[:, at[:-1], at[1:]] = beside
+    matrices[:, at[1:], at[:-1]] = matrices[:, at[:-1], at[1:]] = beside[:, :-1]
     values, vectors = np.linalg.eigh(matrices)
     if not (values[:, 0] > 1e-14 * values[:, -1]).all():
         raise np.linalg.LinAlgError("not positive definite")
     first = vectors[:, 0, :]
     share = np.einsum("kij,kj->ki", vectors, function(values) * first)
-    return share, share[:, 0]
+    residual = beside[:, -1] * np.abs(np.sum(vectors[:, -1, :] * first / values, 1))
+    root = np.sqrt(np.sum(first**2 / values, 1))  # the length of the root times the first vector
+    return share, residual / (np.sqrt(values[:, 0]) * root)

@@ -1,7 +1,7 @@
 """Solves with the precision of the biases: what an algorithm asks of it, and its dense form.
 
 A caller says `at.given(prior)` and asks; how the precision is held and factorised is no concern of its. Another form
-(sparse, matrix-free) is another class with the members of `Solves`.
+is another class with the members of `Solves`; those of the joint precision of states and biases are in `cholesky`.
 """
 
 from typing import NamedTuple, Protocol
