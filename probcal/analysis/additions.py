@@ -331,8 +331,8 @@ def _located(problem: Problem, target: np.ndarray, time: np.ndarray) -> list[tup
 
 
 def _added_by_rows(
-    what: str, told: Informed, model: Model, lins: tuple[Linearised, ...], rows: list[np.ndarray], slots: list[np.ndarray],
-    number: np.ndarray,
+    what: str, told: Informed, model: Model, lins: tuple[Linearised, ...], rows: list[np.ndarray],
+    slots: list[np.ndarray], number: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """What rows of every block add to the precision (k, k) of some variables (k,): their states, biases that there are.
 
