@@ -197,7 +197,7 @@ def _calling() -> Iterator[None]:
     try:
         with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
             yield
-    except Exception as error:  # of XLA
+    except (RuntimeError, ValueError) as error:  # what XLA makes of what the library raised
         if any(word in str(error) for word in NO_ROOM):
             raise MemoryError(f"no room for a sparse factor: {error}") from None
         if "positive definite" in str(error):
