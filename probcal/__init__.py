@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         Collapsed,
         Cubature,
         Extended,
+        Gibbs,
         LeastSquares,
         ParticleGibbs,
         SelfConfiguration,
@@ -100,7 +101,7 @@ __all__ = lazy(
         "probcal.errors": "FitError InputError",
         "probcal.geodesy": "LocalFrame",
         "probcal.inference": (
-            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended LeastSquares ParticleGibbs SelfConfiguration "
+            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended Gibbs LeastSquares ParticleGibbs SelfConfiguration "
             "Unscented coverage_table fit load_study log_evidence numpyro_model particle_filter sbc study track"
         ),
         "probcal.inference.associations": "sample_associations",

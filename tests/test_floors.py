@@ -25,7 +25,8 @@ FLOORS = {
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
 METHODS = tuple(
-    f"inference.{name}" for name in ("ea", "em", "collapsed", "nuts", "particle_gibbs", "selfconfig", "svi")
+    f"inference.{name}"
+    for name in ("ea", "em", "collapsed", "nuts", "particle_gibbs", "selfconfig", "sparse_gibbs", "svi")
 )  # algorithms
 SHARED = tuple(
     f"inference.{name}"

@@ -44,6 +44,7 @@ METHODS = {
     "collapsed": KnownMethod("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
     "collapsed-spike": KnownMethod("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
     "nuts": KnownMethod("NUTS", True, _SAMPLED),
+    "gibbs": KnownMethod("Gibbs", True, _SAMPLED),
     "particle-gibbs": KnownMethod("ParticleGibbs", True, _SAMPLED),
     "self-config": KnownMethod("self-configuration", False, _INTEGRATED),
     "self-config-beliefs": KnownMethod("self-configuration", False, _INTEGRATED),

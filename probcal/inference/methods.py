@@ -15,6 +15,7 @@ from probcal.inference.nuts import NUTS
 from probcal.inference.particle_gibbs import ParticleGibbs
 from probcal.inference.run import Method
 from probcal.inference.selfconfig import SelfConfiguration
+from probcal.inference.sparse_gibbs import Gibbs
 from probcal.inference.svi import SVI
 from probcal.lazy import Later
 from probcal.particle.settings import Particles
@@ -45,6 +46,7 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
     "collapsed": (Collapsed(), None),
     "collapsed-spike": (Collapsed(), BernoulliGaussian()),
     "nuts": (NUTS(), None),
+    "gibbs": (Gibbs(), None),
     "particle-gibbs": (ParticleGibbs(), None),
     "self-config": (SelfConfiguration(EA()), None),
     "self-config-beliefs": (SelfConfiguration(EA(), start="beliefs"), None),

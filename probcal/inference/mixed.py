@@ -38,8 +38,9 @@ def mixing(draws: np.ndarray) -> dict[str, np.ndarray]:
         )
         found["ess_tail"][m] = tail if np.isfinite(tail) else found["ess"][m]
         if "r_hat" in found:
-            found["r_hat"][m] = array_stats.rhat(draws[..., m])
-    return {name: np.nan_to_num(values, nan=whole[name]) for name, values in found.items()}
+            with np.errstate(divide="ignore"):  # chains of which each stands still
+                found["r_hat"][m] = array_stats.rhat(draws[..., m])
+    return {name: np.nan_to_num(values, nan=whole[name], posinf=np.inf) for name, values in found.items()}
 
 
 def _both_tails(draws: np.ndarray) -> bool:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.errors import InputError
 from probcal.inference.methods import MAP
 from probcal.inference.run import Context, Maximiser, Method
 from probcal.inference.sparse import check_sparse, gains_by_sparse, takes_sparse
@@ -62,8 +63,12 @@ def solve(
     return replace(beside, mirrors=(*beside.mirrors, *_beside_optima(beside, (found, *found.optima))))
 
 
-def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> Maximiser | None:
+def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> Method | None:
     """The method where it solves a problem in sparse form; raises `InputError` where it must, and does not take it."""
+    if method.sparsely:
+        if starts > 1:
+            raise InputError(f"{method.name} takes one start: its chains begin at different draws (chains=...)")
+        return method
     if isinstance(method, Maximiser) and takes_sparse(method, problem):
         check_sparse(method, prior, starts)
         return method

@@ -31,7 +31,7 @@ from probcal.problem import Problem
 from probcal.results.answer import HALF, Answer, Draws, Posterior, Summary, Tracks
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
-from probcal.smoothing.cholesky import exact
+from probcal.smoothing.cholesky import Factor, exact
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.joint import JointPrecision, blocks_of, is_thin, missing, prefers_sparse
 from probcal.smoothing.linearised import linearise_rows
@@ -162,11 +162,7 @@ class SparsePosterior(Posterior):
 
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """Draws of the biases from the Gaussian with their means, sds and correlations, few where they are many."""
-        if {"states", "replicas"} & set(keep):
-            raise InputError(
-                "fit(save=...): a fit in sparse form keeps no draws of states or replicas; leave save out, or give"
-                ' form="dense"'
-            )
+        self.check_kept(keep)
         count = CHAINS * int(np.clip(NUMBERS // (CHAINS * len(self.alpha)), 2, MOST))
         rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         drawn = self.system.joint.factor(self.entries, self.alpha).draw(rng, count)[:, self.system.joint.states :]
@@ -174,6 +170,14 @@ class SparsePosterior(Posterior):
         z = (self.summary.mean + self.summary.sd * normal).reshape(CHAINS, -1, drawn.shape[1])
         levels = np.zeros((*z.shape[:2], 0))
         return Draws(z, levels, [], np.arange(z.shape[1]), [], [])
+
+    def check_kept(self, keep: tuple[str, ...]) -> None:
+        """Raise `InputError` for draws of what would take too much room."""
+        if {"states", "replicas"} & set(keep):
+            raise InputError(
+                "fit(save=...): a fit in sparse form keeps no draws of states or replicas; leave save out, or give"
+                ' form="dense"'
+            )
 
     def log_prior(self, draws: Draws) -> np.ndarray | None:
         """None: it takes as much room as the draws."""
@@ -228,14 +232,19 @@ def sparse_answer(method: Maximiser, problem: Problem, prior: Prior, start: Poin
             f' MAP(form="{PRODUCTS}") makes none; or take fewer sensors or a shorter time'
         ) from None
     except np.linalg.LinAlgError:
-        silent = ", ".join(_untold(problem, joint, start, declared)[:NAMED])
-        why = f"no row tells {silent}" if silent else "the information matrix is singular"
-        raise FitError(f"The fit diverged: {why}; the estimate is invalid. Use a prior, or fix some biases.") from None
+        raise diverged(problem, joint, start, declared) from None
     square = float(mean_square(model, posterior.point))
     return conclude_at(
         problem, method, prior, posterior, mode.trace, square, len(mode.trace), converged=mode.converged and settled,
         refused=mode.refused, evidence=evidence,
     )  # fmt: skip
+
+
+def diverged(problem: Problem, joint: JointPrecision, point: Point, alpha: np.ndarray) -> FitError:
+    """What to say where the precision at a point, with prior precisions alpha (M,), is not positive definite."""
+    silent = ", ".join(_untold(problem, joint, point, alpha)[:NAMED])
+    why = f"no row tells {silent}" if silent else "the information matrix is singular"
+    return FitError(f"The fit diverged: {why}; the estimate is invalid. Use a prior, or fix some biases.")
 
 
 def _untold(problem: Problem, joint: JointPrecision, point: Point, alpha: np.ndarray) -> list[str]:
@@ -275,22 +284,23 @@ def _gaussian(
     declared = blocks if prior.proper else blocks.under_scales()
     summary = Summary(
         "Laplace", "given", z, None, z - half, z + half, gamma, alpha, None, np.zeros(0),
-        evidence[0] if prior.proper else None, _told(declared) | _errors(error, variance, mode.system), blocks=blocks,
+        evidence[0] if prior.proper else None, told_columns(declared) | _errors(error, variance, mode.system),
+        blocks=blocks,
     )  # fmt: skip
     at = mode.system
-    found = _open(problem, at.point, declared, _together(problem, mode) if prior.proper else ())
+    found = open_directions(
+        problem, at.point, declared, unheld_directions(problem, mode.system, mode.factor) if prior.proper else ()
+    )
     estimated = evidence[1] if prior.proper and joint.members is not None else None
     return SparsePosterior(
         problem, prior, at.point, summary, at, at.entries, alpha, variance, declared, *found, estimated
     )  # fmt: skip
 
 
-def _together(problem: Problem, mode: SparseMode) -> tuple[Direction, ...]:
-    """Rigid motions and common shifts that the data leave to the prior of a mode."""
-    joint = mode.system.joint
-    return open_together(
-        problem, mode.system.point, lambda columns: mode.factor.solve(joint.of_biases(columns))[joint.states :]
-    )
+def unheld_directions(problem: Problem, system: SparseSystem, factor: Factor) -> tuple[Direction, ...]:
+    """Rigid motions and common shifts that the data at a system leave to the prior in its factor."""
+    joint = system.joint
+    return open_together(problem, system.point, lambda columns: factor.solve(joint.of_biases(columns))[joint.states :])
 
 
 def declared_blocks(problem: Problem, system: SparseSystem) -> SensorBlocks:
@@ -303,7 +313,7 @@ def declared_blocks(problem: Problem, system: SparseSystem) -> SensorBlocks:
     return SensorBlocks(M, np.arange(M)[:, None], variance[joint.states :, None, None])
 
 
-def _open(
+def open_directions(
     problem: Problem, point: Point, declared: SensorBlocks, together: tuple[Direction, ...]
 ) -> tuple[tuple[Direction, ...], int]:
     """All that the data leave to the prior: of many sensors first, then of each; and how many there are."""
@@ -311,7 +321,7 @@ def _open(
     return (*together, *alone), len(together) + count
 
 
-def _told(declared: SensorBlocks) -> dict[str, np.ndarray]:
+def told_columns(declared: SensorBlocks) -> dict[str, np.ndarray]:
     """A column with the share that data narrow each bias, of its declared scale."""
     return {"contraction": np.clip(1.0 - declared.variance, 0.0, 1.0)}
 
@@ -333,7 +343,7 @@ def _integrated(
         return _gaussian(problem, prior, mode, (evidence, 0.0), np.asarray(first.alpha)), True
     members = blocks_of(problem.model)
     likelihood = SparseLikelihood(problem.model, mode.system, mode.system.joint.pairs(members))
-    together = _together(problem, mode)
+    together = unheld_directions(problem, mode.system, mode.factor)
     work = Propagation.of(form, first, likelihood, members, key)
     work.run(told)
     return _mixture(problem, prior, work, evidence, together), work.settled
@@ -355,10 +365,10 @@ def _mixture(
     alpha = np.clip((1 - swept.gamma) / np.maximum(own, 1e-300), *PRECISION_BOUNDS)
     summary = Summary(
         "mixture", "integrated", mean, None, lower, upper, swept.gamma, np.where(problem.surveyed, first, alpha), None,
-        np.zeros(0), evidence, _told(declared), SensorBlocks(len(mean), work.members, swept.covariance),
+        np.zeros(0), evidence, told_columns(declared), SensorBlocks(len(mean), work.members, swept.covariance),
     )  # fmt: skip
     point = system.moved(problem.model, mean - np.asarray(system.point.z))
     return SparsePosterior(
         problem, prior, point, summary, system, likelihood.entries(work.sites), np.zeros_like(first), found.whole,
-        declared, *_open(problem, point, declared, together),
+        declared, *open_directions(problem, point, declared, together),
     )  # fmt: skip

@@ -1,0 +1,104 @@
+"""The joint density of all states and biases as a function of the variables of the sparse form.
+
+Around a reference it is a Gaussian of sparse precision, what the rows and the motion tell linearised there, and the
+rest: what a sampler weighs its steps by.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.model.model import Model
+from probcal.smoothing.cholesky import mirrored
+from probcal.smoothing.joint import JointPrecision
+from probcal.smoothing.linearised import linearise_rows
+from probcal.smoothing.mode import Point, factors, log_density
+
+
+@dataclass(frozen=True, eq=False)
+class JointDensity:
+    """The log density of data and trajectories given the biases, at variables (n,), and its Gaussian at a reference."""
+
+    model: Model
+    joint: JointPrecision
+    point: Point  # whose known states and levels are those of every other point
+    at: np.ndarray  # (n,) variables of the reference
+    value: float  # log density there
+    slope: np.ndarray  # (n,) of it
+    entries: np.ndarray  # of the precision, the biases without prior
+    matrix: Any  # (n, n) the same, sparse
+
+    @classmethod
+    def of(cls, model: Model, joint: JointPrecision, point: Point, at: np.ndarray) -> JointDensity:
+        """Linearised at variables (n,), with the known states and the levels of a point."""
+        entries = joint.values(model, linearise_rows(model, place(model, joint, point, at)), point.levels)
+        blank = cls(model, joint, point, at, 0.0, np.zeros_like(at), entries, mirrored(joint.places, entries).tocsr())
+        value, slope = blank.looked(at)
+        return cls(model, joint, point, at, value, slope, entries, blank.matrix)
+
+    def looked(self, at: np.ndarray) -> tuple[float, np.ndarray]:
+        """Log density at variables (n,), and its slope (n,)."""
+        value, slope = _value_and_slope(self.model, self.point, *_pattern(self.joint), jnp.asarray(at))
+        return float(value), np.asarray(slope)
+
+    def rest(self, at: np.ndarray) -> tuple[float, np.ndarray]:
+        """Log density less that of the Gaussian at variables (n,), and the slope (n,) of the rest."""
+        value, slope = self.looked(at)
+        step = at - self.at
+        bent = self.matrix @ step
+        return value - self.value - float(step @ (self.slope - 0.5 * bent)), slope - self.slope + bent
+
+
+def variables_of(joint: JointPrecision, point: Point) -> np.ndarray:
+    """The variables (n,) of a point: states, then biases."""
+    found = np.zeros(joint.places.size)
+    for own, x in zip(joint.slots, point.states, strict=True):
+        there = own >= 0
+        found[own[there]] = np.asarray(x)[there]
+    found[joint.states :] = np.asarray(point.z)
+    return found
+
+
+def place(model: Model, joint: JointPrecision, point: Point, at: np.ndarray) -> Point:
+    """The point of variables (n,), with the known states and the levels of another."""
+    return _point(model, point, *_pattern(joint), jnp.asarray(at))
+
+
+def _pattern(joint: JointPrecision) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+    slots, driven = (tuple(jnp.asarray(own) for own in part) for part in (joint.slots, joint.driven))
+    return slots, driven
+
+
+def _placed(
+    model: Model, point: Point, slots: tuple[jax.Array, ...], driven: tuple[jax.Array, ...], at: jax.Array
+) -> Point:
+    states, noises = [], []
+    for part, own, drives, known in zip(model.recursions, slots, driven, point.states, strict=True):
+        n = known.shape[1]
+        x = jnp.where(own >= 0, at[own], known)
+        before = jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
+        left = x - jnp.einsum("eij,ej->ei", part.F, before) - part.drift
+        root = jnp.where(drives[:, None, None], factors(part, point.levels), jnp.eye(n)[None])
+        states.append(x)
+        noises.append(jnp.where(drives[:, None], jnp.einsum("eij,ej->ei", linalg.inverses(root), left), 0.0))
+    M = model.biases
+    return point._replace(states=tuple(states), noises=tuple(noises), z=at[at.shape[0] - M :])
+
+
+_point = jax.jit(_placed)
+
+
+@jax.jit
+def _value_and_slope(
+    model: Model, point: Point, slots: tuple[jax.Array, ...], driven: tuple[jax.Array, ...], at: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    def value(at: jax.Array) -> jax.Array:
+        return log_density(model, _placed(model, point, slots, driven, at))
+
+    return jax.value_and_grad(value)(at)

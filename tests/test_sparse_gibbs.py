@@ -1,0 +1,241 @@
+"""Gibbs sampling by sparse factors: exact on linear worlds, as the collapsed sampler elsewhere; and what it refuses."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+from test_sparse import LIBRARIES, drawn, ear, library, loud_ear
+
+import probcal as pc
+from probcal.errors import InputError
+from probcal.inference.sparse_gibbs import Gibbs, _Given, _SparseChains
+from probcal.smoothing.joint import JointPrecision
+from probcal.smoothing.joint_density import JointDensity, place, variables_of
+from probcal.smoothing.mode import log_density
+from probcal.starts import automatic_start
+
+__all__ = ["library"]  # a fixture
+SHORT = {"chains": 2, "warmup": 25, "draws": 50, "patience": 1}
+
+
+def density_of(problem, point):
+    joint = JointPrecision.of(problem.model)
+    return JointDensity.of(problem.model, joint, point, variables_of(joint, point))
+
+
+def test_the_joint_density_is_that_of_its_point_and_its_slope_that_of_differences():
+    """Of moving targets, one at rest, bent sensors: value to 1e-9, slope to 1e-5 of differences."""
+    problem = drawn()[0]
+    with jax.enable_x64(True):
+        point = automatic_start(problem)
+        density = density_of(problem, point)
+        rng = np.random.default_rng(0)
+        at = density.at + 0.1 * rng.standard_normal(len(density.at))
+        there = place(problem.model, density.joint, point, at)
+        np.testing.assert_allclose(variables_of(density.joint, there), at)
+        value, slope = density.looked(at)
+        assert value == pytest.approx(float(log_density(problem.model, there)), rel=1e-9)
+        for k in rng.integers(len(at), size=12):
+            eps = 1e-5 * np.eye(len(at))[k]
+            other = (density.looked(at + eps)[0] - density.looked(at - eps)[0]) / 2e-5
+            assert slope[k] == pytest.approx(other, rel=1e-5, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["plane", "extras", "drifting"])
+def test_nothing_is_beside_the_gaussian_of_a_linear_world(name):
+    """The rest is zero wherever one looks, and every turn is taken."""
+    problem, _ = worlds.linear(name)
+    with jax.enable_x64(True):
+        density = density_of(problem, jax.tree.map(jnp.asarray, worlds.resting(problem)))
+        given, rng = _Given.of(density, np.ones(problem.model.biases)), np.random.default_rng(1)
+        at = density.at
+        for kicks in (1, 3):
+            at, rest, rate, _ = given.turned(at, density.rest(at)[0], kicks, rng)
+            assert rest == pytest.approx(0.0, abs=1e-7 * abs(density.value))
+            assert rate == pytest.approx(1.0, abs=1e-5)
+        assert np.abs(density.rest(at)[1]).max() < 1e-6 * np.abs(density.matrix).max()
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+@pytest.mark.parametrize("name", ["plane", "drifting"])
+def test_draws_of_a_linear_world_have_its_exact_moments(name, library):
+    """Means within 5 standard errors of the dense joint Gaussian, sds within 5; gamma and tracks too."""
+    problem, _ = worlds.linear(name)
+    tree = pc.fit(problem, Gibbs(chains=4, warmup=0, draws=250), prior=pc.Gaussian(), start=worlds.resting(problem))
+    group, whole = tree["calibration"].to_dataset(), worlds.exact(name)
+    assert tree.attrs["status"] == "converged", tree.attrs["message"]
+    exact = worlds.fitted(name)["calibration"].to_dataset()
+    error = 1.1 / np.sqrt(1000)  # draws follow each other by cos(0.9 pi / 2) at most
+    sd = exact["sd"].values
+    np.testing.assert_allclose(np.asarray(whole.mean)[: len(sd)] * problem.scales, exact["mean"], atol=1e-6)
+    np.testing.assert_allclose((group["mean"].values - exact["mean"].values) / sd, 0.0, atol=5 * error)
+    np.testing.assert_allclose(group["sd"].values / sd, 1.0, atol=5 * error / np.sqrt(2))
+    np.testing.assert_allclose(group["gamma"], exact["gamma"], atol=5 * np.sqrt(2) * error)
+    assert (tree["sample_stats"]["acceptance_rate"] > 0.999).all()
+    for name_of in problem.measurements.target_names:
+        one, other = (t[f"track/{name_of}"].to_dataset() for t in (worlds.fitted(name), tree))
+        free = one["sd"].values > 1e-9
+        off = (other["mean"].values - one["mean"].values)[free] / one["sd"].values[free]
+        np.testing.assert_allclose(off, 0.0, atol=5 * error)
+        np.testing.assert_allclose(other["sd"].values[free] / one["sd"].values[free], 1.0, atol=5 * error)
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        pytest.param(pc.Horseshoe(), marks=pytest.mark.ci),
+        pytest.param(pc.ARD(rate=0.5), marks=pytest.mark.slow),
+        pytest.param(pc.Laplace(), marks=pytest.mark.slow),
+    ],
+    ids=lambda prior: type(prior).__name__,
+)
+def test_it_agrees_with_the_collapsed_sampler(prior):
+    """Bent sensors, targets at rest and shared biases: means within 0.35 sds, sds within a fifth, gamma within 0.1."""
+    problem, truth = drawn()
+    ours = pc.fit(problem, Gibbs(warmup=100, draws=500), prior=prior)
+    other = pc.fit(problem, pc.Collapsed(draws=500), prior=prior)
+    a, b = (tree["calibration"].to_dataset() for tree in (ours, other))
+    sd = b["sd"].values
+    np.testing.assert_allclose(a["mean"].values / sd, b["mean"].values / sd, atol=0.35)
+    np.testing.assert_allclose(np.log(a["sd"].values / sd), 0.0, atol=0.25)
+    np.testing.assert_allclose(a["gamma"], b["gamma"], atol=0.1)
+    np.testing.assert_allclose(
+        np.log(ours["posterior"]["global_scale"].mean() / other["posterior"]["global_scale"].mean())
+        if "global_scale" in ours["posterior"] else 0.0, 0.0, atol=0.4,
+    )  # fmt: skip
+    true = np.array([truth.biases[label] for label in a["bias_label"].values.tolist()])
+    assert np.mean((a["lower"].values <= true) & (true <= a["upper"].values)) > 0.75
+    for name in ("car", "van", "mast"):
+        one, two = (tree[f"track/{name}"].to_dataset() for tree in (ours, other))
+        np.testing.assert_allclose((one["mean"] - two["mean"]) / two["sd"], 0.0, atol=0.5)
+        np.testing.assert_allclose(np.log(one["sd"] / two["sd"]), 0.0, atol=0.4)
+
+
+def test_an_interrupted_run_goes_on_to_the_same_draws(tmp_path):
+    """Stopped after a chunk, resumed: every draw is that of a run without a stop, bit for bit."""
+    problem, method = worlds.linear("plane")[0], Gibbs(**SHORT)
+    start = worlds.resting(problem)
+    whole = pc.fit(problem, method, key=3, start=start)
+
+    def stop(progress):
+        if progress.done >= 50:
+            raise KeyboardInterrupt
+
+    cut = pc.fit(problem, method, key=3, start=start, store=tmp_path / "draws", progress=stop)
+    assert "Interrupted after 25 of 50 draws a chain" in cut.attrs["message"]
+    again = pc.fit(problem, method, key=3, start=start, store=tmp_path / "draws", resume=True)
+    for group in ("posterior", "sample_stats", "calibration"):
+        for name, values in whole[group].data_vars.items():
+            np.testing.assert_array_equal(again[group][name].values, values.values, err_msg=name)
+    np.testing.assert_array_equal(again["track/one"]["sd"].values, whole["track/one"]["sd"].values)
+
+
+def test_more_sweeps_a_draw_begin_the_sums_anew():
+    """Of draws two sweeps apart what is summed are the sweeps since, of all chains."""
+    problem = drawn()[0]
+    with jax.enable_x64(True):
+        joint, method = JointPrecision.of(problem.model), Gibbs(**SHORT)
+        runs = chains_of(problem, method, joint)
+        state = runs.first()
+        state, _ = runs.advance(state, 1, None)
+        assert int(state.summed) == 0, "the first 25 are warm-up"
+        state, first = runs.advance(state, 1, None)
+        assert int(state.summed) == 2 * 25
+        state, draws = runs.advance(state, 2, None)
+        assert (int(state.summed), int(state.made)) == (2 * 50, 100)
+        assert np.shape(draws.theta) == (2, 25, problem.model.biases)
+        assert not np.array_equal(draws.theta, first.theta)
+
+
+def chains_of(problem, method, joint):
+    from probcal.inference.hierarchy import hierarchy_of
+    from probcal.inference.posed import Form
+    from probcal.smoothing.sparse_mode import find_sparse_mode
+
+    prior = pc.Horseshoe()
+    mode = find_sparse_mode(problem.model, joint, automatic_start(problem), np.ones(problem.model.biases), 60, 1e-3)
+    form = Form(problem.model.biases, hierarchy_of(prior, problem))
+    first = prior.precision(problem.labels, problem.surveyed)
+    return _SparseChains(method, form, first, problem.model, joint, mode.system, jax.random.key(0))
+
+
+def test_draws_of_states_that_take_much_room_are_not_kept(monkeypatch):
+    """Their moments are, the same as with them; draws of states are refused in one sentence."""
+    problem = drawn()[0]
+    kept = pc.fit(problem, Gibbs(**SHORT), save=("states",))
+    assert kept["track/car"]["state"].shape[:2] == (2, 50)
+    monkeypatch.setattr("probcal.inference.sparse_gibbs.NUMBERS", 1000)
+    bare = pc.fit(problem, Gibbs(**SHORT))
+    assert "local_scale" in kept["posterior"]
+    assert "local_scale" not in bare["posterior"], "2 chains of 50 draws of 11 biases"
+    np.testing.assert_array_equal(bare["calibration"]["mean"], kept["calibration"]["mean"])
+    np.testing.assert_array_equal(bare["track/van"]["mean"], kept["track/van"]["mean"])
+    states = kept["track/van"]["state"].values.reshape(100, -1)
+    np.testing.assert_allclose(kept["track/van"]["mean"].values.ravel(), states.mean(0), atol=1e-9)
+    np.testing.assert_allclose(kept["track/van"]["sd"].values.ravel(), states.std(0), rtol=1e-6)
+    with pytest.raises(InputError, match="keeps no draws of states or replicas"):
+        pc.fit(problem, Gibbs(**SHORT), save=("states",))
+
+
+def test_chains_that_take_no_turn_are_no_answer(monkeypatch):
+    turned = _Given.turned
+
+    def stuck(self, at, rest, kicks, rng):
+        _, _, _, speed = turned(self, at, rest, kicks, rng)
+        return at, rest, 0.0, speed
+
+    monkeypatch.setattr(_Given, "turned", stuck)
+    problem = worlds.linear("plane")[0]
+    tree = pc.fit(problem, Gibbs(**SHORT), start=worlds.resting(problem))
+    assert tree.attrs["status"] == "not converged"
+    assert "A chain takes 0.0% of its turns" in tree.attrs["message"]
+
+
+def test_what_it_does_not_take_is_said():
+    problem = drawn()[0]
+    with pytest.raises(InputError, match="Gibbs takes one start: its chains begin at different draws"):
+        pc.fit(problem, Gibbs(), starts=2)
+    with pytest.raises(InputError, match=r"Gibbs\(\) takes a prior without correlations"):
+        pc.fit(problem, Gibbs(), prior=pc.Gaussian(correlation={"b.position_*": 0.5}))
+    with pytest.raises(InputError, match="Gibbs does not take the prior BernoulliGaussian"):
+        pc.fit(problem, Gibbs(), prior=pc.BernoulliGaussian())
+    with pytest.raises(InputError, match=r"Gibbs\(chains=0\): it must be at least 1"):
+        Gibbs(chains=0)
+    nodes = [pc.Node(name, place, scale={"heading": 0.05}) for name, place in (("p", (0.0, 0.0)), ("q", (300.0, 0.0)))]
+    for kind, motion, what in (
+        (loud_ear, pc.ConstantVelocity(1.0), "unknown noise levels"),
+        (ear, pc.ConstantVelocity(1.0, singular=True), "a motion whose noise reaches only a part of the state"),
+    ):
+        network = pc.Network([kind.on(node) for node in nodes])
+        run = pc.simulate(network, motion, np.arange(5.0), key=0)
+        with pytest.raises(InputError, match=rf"Gibbs\(\) does not take {what}: take Collapsed\(\) or NUTS\(\)"):
+            pc.fit(pc.Problem(network, motion, run.table), Gibbs())
+
+
+def test_memory_that_does_not_hold_a_factor_is_said(monkeypatch):
+    def refused(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("probcal.smoothing.joint.JointPrecision.factor", refused)
+    with pytest.raises(pc.FitError, match="does not fit in memory: take fewer sensors or a shorter time"):
+        pc.fit(drawn()[0], Gibbs(**SHORT))
+
+
+def test_a_flat_prior_on_what_no_row_tells_has_no_posterior():
+    problem = drawn()[0]
+    table = problem.measurements.table.frame.copy()
+    table.loc[table["sensor"] == "b", "azimuth"] = np.nan
+    with pytest.raises(pc.FitError, match=r"diverged: no row tells b\.heading"):
+        pc.fit(pc.Problem(problem.network, problem.motion, table), Gibbs(**SHORT), prior=pc.Flat())
+
+
+@pytest.mark.slow
+def test_ranks_of_truths_are_uniform():
+    """Simulation-based calibration of a small bent network: 60 runs from the prior, no quantity is off."""
+    problem = worlds.small(motion=pc.Target(pc.ConstantVelocity(0.5), {"position": ((30.0, 40.0), 5.0)}), scans=8)
+    tree = pc.sbc(problem, Gibbs(), prior=pc.Gaussian(), runs=60, key=1)
+    print(tree.attrs["message"], file=sys.stderr)
+    assert (tree["sbc"]["p"].values > 1e-3).all() if "p" in tree["sbc"] else True
