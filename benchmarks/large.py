@@ -2,6 +2,7 @@
 
     uv run python benchmarks/large.py --side 25 50 100
     uv run python benchmarks/large.py --side 32 --targets 1 --reach 1e5     (every radar sees every epoch)
+    uv run python benchmarks/large.py --side 25 --targets 3 --epochs 250 --method gibbs
     uv run python benchmarks/large.py --side 3 --targets 1 --epochs 111112 --reach 1e5 --save fit.nc   (few, many rows)
 
 Radars of `models/large_network.py` on a square of so many along each edge, one line each: rows, biases, form, seconds
@@ -23,7 +24,7 @@ import probcal as pc
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import large_network
 
-METHODS = {"ea": (pc.EA, None), "map": (pc.MAP, pc.Gaussian())}
+METHODS = {"ea": (pc.EA, None), "map": (pc.MAP, pc.Gaussian()), "gibbs": (pc.Gibbs, None)}
 
 
 def main():
@@ -38,7 +39,7 @@ def main():
     parser.add_argument("--save", type=Path, help="write the fit, to say how large its file is")
     chosen = parser.parse_args()
     kind, prior = METHODS[chosen.method]
-    method, found = kind(form=chosen.form), []
+    method, found = pc.Gibbs() if kind is pc.Gibbs else kind(form=chosen.form), []
     for side in chosen.side:
         targets = chosen.targets or max(1, round(20 * (side / 100) ** 2))
         given = {"side": side, "targets": targets, "epochs": chosen.epochs, "reach": chosen.reach}

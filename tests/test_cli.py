@@ -82,7 +82,7 @@ def test_a_fit_has_the_structure_of_the_committed_one(fitted):
     assert committed.structure(probcal.load(fitted[0])) == committed.structure(committed.tree("ea"))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_sampler_writes_the_structure_of_the_committed_one_and_says_what_its_chains_are_worth(tmp_path):
     sizes = ["--chains", "2", "--draws", "60", "--warmup", "50"]
     code, out, err = call("fit", MODEL, ROWS, "--method", "collapsed", *sizes, "--out", tmp_path / "fit")

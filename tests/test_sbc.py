@@ -30,6 +30,7 @@ from probcal import (
     FitError,
     Flat,
     Gaussian,
+    Gibbs,
     Horseshoe,
     InputError,
     Network,
@@ -312,6 +313,15 @@ def test_collapsed_with_a_spike_is_uniform():
     tree = quick(Collapsed(chains=2, warmup=50, draws=150), SPIKE)
     assert tree.attrs["status"] == "uniform", tree.attrs["verdict"]
     assert {"share", "biases not zero"} <= set(tree["sbc"]["quantity"].values)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("prior", [HORSESHOE, Gaussian()], ids=["horseshoe", "gaussian"])
+def test_gibbs_is_uniform(prior):
+    """40 simulations of three radars by sparse factors; a right sampler fails with probability 1 %."""
+    tree = quick(Gibbs(chains=2, warmup=50, draws=150), prior)
+    assert tree.attrs["status"] == "uniform", tree.attrs["verdict"]
+    assert "log joint" in tree["sbc"]["quantity"].values
 
 
 @pytest.mark.slow

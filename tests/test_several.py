@@ -73,7 +73,7 @@ def test_each_recording_is_fitted_as_alone_and_only_what_is_missing_again(model,
     assert table["status"].tolist()[-1] == "refused"
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_recordings_spread_over_workers_and_killed_give_the_same_fits(model, tmp_path):
     words = ["fit", model, *days(model, 0, 1, 2, 3), *METHOD, "--out", tmp_path / "out", "--resume"]
     order = [sys.executable, "-m", "probcal.cli", *map(str, words), "--scheduler", "local"]

@@ -38,8 +38,8 @@ def mixing(draws: np.ndarray) -> dict[str, np.ndarray]:
         )
         found["ess_tail"][m] = tail if np.isfinite(tail) else found["ess"][m]
         if "r_hat" in found:
-            with np.errstate(divide="ignore"):  # chains of which each stands still
-                found["r_hat"][m] = array_stats.rhat(draws[..., m])
+            moves = np.ptp(draws[..., m], axis=1).any()  # else chains stand still, at different values
+            found["r_hat"][m] = array_stats.rhat(draws[..., m]) if moves else np.inf
     return {name: np.nan_to_num(values, nan=whole[name], posinf=np.inf) for name, values in found.items()}
 
 
