@@ -22,6 +22,13 @@ def multiply(left: jax.Array, right: jax.Array) -> jax.Array:
     return jnp.sum(left[:, :, None] * right[None, :, :], 1)
 
 
+def multiply_rows(left: jax.Array, rows: list[jax.Array]) -> jax.Array:
+    """Product of a small (n, k) matrix and k rows (m,), one after the other: for many columns inside a scan."""
+    if len(rows) > 2 * UNROLL:
+        return left @ jnp.stack(rows)
+    return sum((left[:, j, None] * row[None, :] for j, row in enumerate(rows[1:], 1)), left[:, :1] * rows[0][None, :])
+
+
 def tria(columns: jax.Array) -> jax.Array:
     """Lower-triangular (n, n) L with L L' = columns columns', for columns (n, m), m >= n, of any rank.
 
@@ -160,6 +167,12 @@ def gram(rows: jax.Array) -> jax.Array:
     h = m // 2
     below = rows[:, h:].T @ rows[:, :h]
     return jnp.block([[gram(rows[:, :h]), below.T], [below, gram(rows[:, h:])]])
+
+
+def gram_less(rows: jax.Array, other: jax.Array) -> jax.Array:
+    """rows' rows - other' other of (k, m) rows, symmetric: the one product (rows - other)' (rows + other)."""
+    product = (rows - other).T @ (rows + other)
+    return 0.5 * (product + product.T)
 
 
 def factor_and_inverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:

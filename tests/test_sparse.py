@@ -2,6 +2,7 @@
 
 import re
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
@@ -181,6 +182,26 @@ def test_factors_solve_and_say_what_is_not_positive(library):
     np.testing.assert_allclose(np.cov(draws.T), np.linalg.inv(A), atol=0.05)
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
         library(places, (A - 50 * np.eye(7))[i, j])
+
+
+def test_a_factor_that_other_threads_pushed_out_is_made_again():
+    """Four threads that factorise in turn, and one factor that waited meanwhile: each gets the answers of its own."""
+    pytest.importorskip("sparsax", reason="sparsax is an extra")
+    places = Entries(np.arange(5, dtype=np.int32), np.arange(5, dtype=np.int32), 5, np.arange(5))
+    first = Cholmod(places, np.full(5, 100.0))
+
+    def several(k):
+        return [
+            Cholmod(places, np.full(5, k + 1.0 + j / 10)).solve(np.ones(5))[0] * (k + 1.0 + j / 10) for j in range(60)
+        ]
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(several, range(4)))
+    np.testing.assert_allclose(found, 1.0)
+    np.testing.assert_allclose(first.solve(np.ones(5)), 0.01)
+    for _ in range(3):
+        Cholmod(places, np.full(5, 2.0))
+    np.testing.assert_allclose(first.log_determinant()[0], 5 * np.log(100.0))
 
 
 # by products alone

@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from importlib.util import find_spec
-from typing import Any, NamedTuple, Protocol
+from threading import get_ident
+from typing import Any, ClassVar, NamedTuple, Protocol
+from weakref import WeakSet
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +20,7 @@ import numpy as np
 
 FULL, COLUMNS = 16, 256  # an entry of so many places of the matrix makes it full; columns solved at once
 NO_ROOM = ("bad_alloc", "status -2", "status -3", "RESOURCE_EXHAUSTED")  # of XLA and of CHOLMOD
+BESIDE = 8  # factors of each thread that are kept, where several threads have one
 PROBES, BLOCK = 512, 64  # draws of a diagonal that is estimated, and of them at once
 
 
@@ -62,25 +65,52 @@ def exact() -> bool:
     return find_spec("sparsax") is not None
 
 
+class _DroppedError(Exception):
+    """The library has dropped a factor."""
+
+
 class Cholmod:
-    """CHOLMOD by sparsax, whose analysis of a pattern is kept between factors; on the CPU."""
+    """CHOLMOD by sparsax, whose analysis of a pattern is kept between factors; on the CPU.
+
+    The library keeps the factors that were made last: one, since that may be gigabytes, and some more where several
+    threads have one. What it dropped is made again.
+    """
+
+    _live: ClassVar[WeakSet[Cholmod]] = WeakSet()
 
     def __init__(self, places: Entries, values: np.ndarray):
         import sparsax  # an extra
 
-        self._library, self._places = sparsax, places
+        self._library, self._places, self._thread = sparsax, places, get_ident()
         with _calling():
-            sparsax.set_num_cache_size(1)  # one factor may be gigabytes
-            sparsax.set_token_cache_size(1)
             self._entries = tuple(jnp.asarray(part) for part in (places.row, places.column, values))
-            self._token = jax.block_until_ready(sparsax.factor(*self._entries, places.size))
+        self._live.add(self)
+        self._make()
+
+    def _make(self) -> None:
+        threads = len({own._thread for own in list(self._live)})
+        with _calling():
+            self._library.set_num_cache_size(1)
+            self._library.set_token_cache_size(1 if threads == 1 else BESIDE * threads)
+            self._token = jax.block_until_ready(self._library.factor(*self._entries, self._places.size))
+
+    def _asked(self, ask: Callable[[Any], Any]) -> Any:
+        """What the factor says; it is made again where other threads made it go."""
+        while True:
+            try:
+                with _calling():
+                    return ask(self._token)
+            except _DroppedError:
+                self._make()
 
     def _apply(self, right: np.ndarray, *modes: Any) -> np.ndarray:
-        with _calling():
+        def ask(token: Any) -> np.ndarray:
             found = jnp.asarray(right)
             for mode in modes:
-                found = self._library.solve_factor(self._token, found, mode)
+                found = self._library.solve_factor(token, found, mode)
             return np.asarray(found)
+
+        return np.asarray(self._asked(ask))
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """The inverse times right, (n,) or (n, K)."""
@@ -88,8 +118,7 @@ class Cholmod:
 
     def log_determinant(self) -> tuple[float, float]:
         """Log determinant, and no error."""
-        with _calling():
-            return float(self._library.logdet_factor(self._token)), 0.0
+        return float(self._asked(self._library.logdet_factor)), 0.0
 
     def inverse_entries(self) -> np.ndarray:
         """The inverse at the place of each entry, exact: Takahashi's selected inverse, or all columns of a full one."""
@@ -200,6 +229,8 @@ def _calling() -> Iterator[None]:
     except (RuntimeError, ValueError) as error:  # what XLA makes of what the library raised
         if any(word in str(error) for word in NO_ROOM):
             raise MemoryError(f"no room for a sparse factor: {error}") from None
+        if "stale factor" in str(error):
+            raise _DroppedError from None
         if "positive definite" in str(error):
             raise np.linalg.LinAlgError(f"not positive definite: {error}") from None
         raise

@@ -176,15 +176,19 @@ def eliminate_compressed(
         used = model.entries(r)
         gain = rec.gains(part.F, L, J, used)
         if joint and used:
-            columns = jnp.concatenate([pull[:, :, None], cross], 2)
-            drift = -(L @ u[:, :, None])
-            alone, new = (c.reshape(-1, c.shape[2]) for c in rec.innovate(part.F, gain, columns, drift))
-            information = information - linalg.gram(alone[:, 1:]) + linalg.gram(new[:, 1:])
-            score = score - alone[:, 1:].T @ alone[:, 0] + new[:, 1:].T @ new[:, 0]
+            alone, new = _stacked(rec.innovate(part.F, gain, cross))
+            y, innovation = _stacked(rec.innovate(part.F, gain, pull[:, :, None], -(L @ u[:, :, None])))
+            information = information + linalg.gram_less(new, alone)
+            score = score + new.T @ innovation[:, 0] - alone.T @ y[:, 0]
         kept.append(Kept(J, pull, cross, gain))
         logdet = logdet + gain.logdet
     information = 0.5 * (information + information.T)
     return Eliminated(information, score, compressed.score, logdet, tuple(kept))
+
+
+def _stacked(columns: tuple[jax.Array, jax.Array]) -> list[jax.Array]:
+    """Columns (E, u, m) of all epochs below each other (E u, m)."""
+    return [own.reshape(-1, own.shape[2]) for own in columns]
 
 
 def _proposal(

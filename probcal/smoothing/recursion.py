@@ -12,8 +12,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from probcal.linalg import forward, regress_rows, semi_cholesky
-from probcal.smoothing.scans import filter_roots, inverse_root, recur, recur_squared
+from probcal.linalg import forward, multiply_rows, regress_rows, semi_cholesky
+from probcal.smoothing.scans import filter_roots, in_parallel, inverse_root, recur, recur_squared
 
 
 class Gains(NamedTuple):
@@ -104,7 +104,7 @@ def _next(parts: jax.Array) -> jax.Array:
     return jnp.concatenate([parts[1:], jnp.zeros_like(parts[:1])])
 
 
-def innovate(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array]:
+def innovate(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
     """Columns b (E, n, m), q of them with drifts c (E, n, q), as unit-noise data: alone, and as innovations (E, u, m).
 
     `alone` solves G alone = b, and the innovation alone - G' x against the predicted x is whitened by its covariance
@@ -112,8 +112,23 @@ def innovate(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array) -> tuple[jax
     trajectory: a forward pass is enough to eliminate it, and an error of x enters squared, so that a target grazing a
     sensor does no harm.
     """
+    if c is None and not in_parallel():
+        return _innovate_driftless(F, gain, b)
     found = predict(F, gain, b, c)
     return found.alone, gain.whiten @ found.innovation
+
+
+def _innovate_driftless(F: jax.Array, gain: Gains, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`innovate` without drifts, epoch by epoch: no state of a column is ever written."""
+    alone, n = gain.solve @ b, F.shape[1]
+    onward = jnp.concatenate([gain.keep @ F, gain.gain], 2)
+    seen = jnp.concatenate([-(gain.whiten @ (gain.data.mT @ F)), gain.whiten], 2)
+
+    def step(x: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        onward_k, seen_k, y = epoch
+        return multiply_rows(onward_k, [*x, *y]), multiply_rows(seen_k, [*x, *y])
+
+    return alone, jax.lax.scan(step, jnp.zeros((n, b.shape[2]), b.dtype), (onward, seen, alone))[1]
 
 
 @jax.jit
