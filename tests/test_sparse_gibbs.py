@@ -1,5 +1,7 @@
 """Gibbs sampling by sparse factors: exact on linear worlds, as the collapsed sampler elsewhere; and what it refuses."""
 
+from unittest.mock import patch
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -169,11 +171,13 @@ def test_more_sweeps_a_draw_begin_the_sums_anew():
         runs = chains_of(problem, method, joint)
         state = runs.first()
         state, _ = runs.advance(state, 1, None)
-        assert int(state.summed) == 0, "the first 25 are warm-up"
+        assert state.summed.tolist() == [0, 0], "the first 25 are warm-up"
         state, first = runs.advance(state, 1, None)
-        assert int(state.summed) == 2 * 25
+        assert state.summed.tolist() == [2 * 25, 0]
+        kept = state.total[0]
         state, draws = runs.advance(state, 2, None)
-        assert (int(state.summed), int(state.made)) == (2 * 50, 100)
+        assert (state.summed.tolist(), int(state.made)) == ([2 * 50, 2 * 25], 100)
+        np.testing.assert_array_equal(state.total[1], kept)
         assert np.shape(draws.theta) == (2, 25, problem.model.biases)
         assert not np.array_equal(draws.theta, first.theta)
 
@@ -204,8 +208,39 @@ def test_draws_of_states_that_take_much_room_are_not_kept(monkeypatch):
     states = kept["track/van"]["state"].values.reshape(100, -1)
     np.testing.assert_allclose(kept["track/van"]["mean"].values.ravel(), states.mean(0), atol=1e-9)
     np.testing.assert_allclose(kept["track/van"]["sd"].values.ravel(), states.std(0), rtol=1e-6)
-    with pytest.raises(InputError, match="keeps no draws of states or replicas"):
+    with pytest.raises(InputError, match="keeps draws of states up to 1,000 numbers, 2 x 50 draws"):
         pc.fit(problem, Gibbs(**SHORT), save=("states",))
+
+
+def test_an_interrupted_longer_run_leaves_the_draws_before_it():
+    """Stopped in the first longer chunk: draws, tracks and gamma are those of a run without patience."""
+    problem = worlds.linear("plane")[0]
+    start, method = worlds.resting(problem), Gibbs(chains=2, warmup=0, draws=150, patience=4)
+
+    def stop(progress):
+        if progress.done > 150:  # after the first chunk of 100 sweeps more
+            raise KeyboardInterrupt
+
+    short = pc.fit(problem, Gibbs(chains=2, warmup=0, draws=150, patience=1), key=3, start=start)
+    with patch("probcal.inference.sampling.settled", lambda *_: False):
+        cut = pc.fit(problem, method, key=3, start=start, progress=stop)
+    assert "Interrupted" in cut.attrs["message"]
+    assert cut.attrs["thin"] == 1
+    for name in ("mean", "sd", "gamma", "precision"):
+        np.testing.assert_array_equal(cut["calibration"][name].values, short["calibration"][name].values)
+    np.testing.assert_array_equal(cut["track/one"]["sd"].values, short["track/one"]["sd"].values)
+
+
+def test_a_chain_leaves_where_the_model_has_no_density():
+    """From a place of density zero the first one with a density is taken."""
+    problem = worlds.linear("plane")[0]
+    with jax.enable_x64(True):
+        density = density_of(problem, jax.tree.map(jnp.asarray, worlds.resting(problem)))
+        given = _Given.of(density, np.ones(problem.model.biases))
+        at, rest, rate, _ = given.turned(density.at, -np.inf, 1, np.random.default_rng(0))
+        assert rate == 1.0
+        assert np.isfinite(rest)
+        assert not np.array_equal(at, density.at)
 
 
 def test_chains_that_take_no_turn_are_no_answer(monkeypatch):

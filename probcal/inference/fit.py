@@ -116,6 +116,7 @@ def calibrate(
             resume=resume, overwrite=overwrite,
         )  # fmt: skip
     keep = _kept(save)
+    method.check_kept(problem, keep)
     if starts < 1:
         raise InputError(f"starts={starts}: at least one start is needed")
     if method.climbs:

@@ -124,7 +124,7 @@ def conclude_draws(problem: Problem, prior: Prior, run: SamplerRun, kind: type[C
     mixed = mixing(within_sides(np.asarray(run.draws.theta), run.side))
     posterior = kind.of(problem, prior, run, mixed)
     status, message = judge_chains(problem, prior, run, mixed, posterior.point)
-    ended = _bias_status(problem, mixed, run.form.biases)
+    ended = bias_status(problem, mixed, run.form.biases)
     return Answer(
         problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
         interrupted=run.interrupted, mirrors=_mirrors(run),
@@ -225,7 +225,8 @@ def _stats(run: SamplerRun) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in run.draws.stats.items()}
 
 
-def _bias_status(problem: Problem, mixed: Mapping[str, np.ndarray], M: int) -> tuple[str, ...]:
+def bias_status(problem: Problem, mixed: Mapping[str, np.ndarray], M: int) -> tuple[str, ...]:
+    """Of each bias what it was learnt from, or that its draws have not mixed."""
     lost = mixed["r_hat"][:M] > 1.05 if "r_hat" in mixed else np.zeros(M, bool)
     words = {"survey": "survey", "drift": "drift", "scale": "estimated"}
     return tuple("not mixed" if bad else words[b.kind] for b, bad in zip(problem.biases, lost, strict=True))

@@ -21,6 +21,7 @@ from probcal.inference.mixture import MixturePosterior
 from probcal.inference.posed import Form, Posed, log_prior
 from probcal.inference.posterior import Chains
 from probcal.inference.sampling import SamplerRun
+from probcal.inference.sparse_gibbs import SparseChains
 from probcal.inference.uniformity import NOMINAL, randomised_rank
 from probcal.lazy import Later
 from probcal.model.model import At, Model
@@ -82,7 +83,7 @@ def pool_of(answer: Answer, key: jax.Array) -> Pool:
     points = Points(flat(drawn.z), flat(drawn.levels), states)
     hyper = {name: flat(a) for name, a in posterior.hyper.items()}
     taken = answer.method != answer.requested
-    run = posterior.run if isinstance(posterior, Chains) else None
+    run = posterior.run if isinstance(posterior, Chains | SparseChains) else None
     hierarchy = (
         posterior.hierarchy if isinstance(posterior, MixturePosterior) else None if run is None else run.form.hierarchy
     )

@@ -111,6 +111,9 @@ class Method(ABC):
         """The problem that is solved in the place of the given one."""
         return problem
 
+    def check_kept(self, problem: Problem, keep: tuple[str, ...]) -> None:  # noqa: B027
+        """Raise `InputError` where an answer could not give the draws that are to be kept."""
+
 
 class Maximiser(Method, ABC):
     """A method that climbs to a point by a pure `iterate` and reports a Gaussian there."""

@@ -96,6 +96,7 @@ def sbc(
     check_scheduler(scheduler)
     prior = choose_prior(method, prior)
     check_problem(problem)
+    method.check_kept(problem, ("states",))
     key = as_key(key)
     engine = _Engine(problem, method, prior, simulate_from or prior, around, start, draws, fallback, key)
     identity = {} if store is None else engine.identity()

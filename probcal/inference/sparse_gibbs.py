@@ -23,7 +23,7 @@ from probcal.inference.chains import Draw, Sample
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.mixed import mixing
 from probcal.inference.posed import Form, Natural, Posed
-from probcal.inference.posterior import RARE, by_datum, judge_chains
+from probcal.inference.posterior import RARE, bias_status, by_datum, judge_chains
 from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
@@ -35,6 +35,7 @@ from probcal.inference.sparse import (
     told_columns,
     unheld_directions,
 )
+from probcal.model.model import Model
 from probcal.priors import PRECISION_BOUNDS, Horseshoe, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Summary
@@ -61,16 +62,16 @@ class SparseState(NamedTuple):
     phi: Any  # (C, ...) of each hyper-parameter
     made: Any  # () sweeps of a chain
     thin: Any  # () of them from one draw to the next
-    summed: Any  # () sweeps of all chains that the sums hold: those after the warm-up, with this thin
-    total: Any  # (S,) sum of the states
-    square: Any  # (S,) of their squares, both about the reference
-    gamma: Any  # (M,) sum of gamma
-    variance: Any  # (M,) sum of the variances of the biases given their hyper-parameters
+    summed: Any  # (2,) sweeps of all chains in the sums: of this thin after the warm-up, and of the one before
+    total: Any  # (2, S) sum of the states
+    square: Any  # (2, S) of their squares, both about the reference
+    gamma: Any  # (2, M) sum of gamma
+    variance: Any  # (2, M) sum of the variances of the biases given their hyper-parameters
     reference: Any  # (n,) where the Gaussian is taken
     kicks: Any  # () of a turn
 
 
-SUMS = ("total", "square", "gamma", "variance")
+SUMS = ("summed", "total", "square", "gamma", "variance")
 
 
 class _Chain(NamedTuple):
@@ -81,6 +82,7 @@ class _Chain(NamedTuple):
     at: np.ndarray  # (n,)
     phi: Any  # a `Phi`
     rest: float  # of the log density there, beside that of the Gaussian
+    rate: float  # of the last turn: how likely it was taken
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,11 @@ class Gibbs(Sampler):
                 " take fewer sensors or a shorter time"
             ) from None
         except np.linalg.LinAlgError:
+            if prior.proper:
+                raise FitError(
+                    "Gibbs: the precision under some draw of the hyper-parameters is singular in double precision; give"
+                    " biases that no row determines a survey, or fix them"
+                ) from None
             raise diverged(problem, joint, start, declared) from None
         found, weak = open_directions(problem, posterior.point, posterior.declared, together)
         posterior = replace(posterior, open=found, weak=weak)
@@ -139,12 +146,25 @@ class Gibbs(Sampler):
             status = Status.NOT_CONVERGED if status is Status.CONVERGED else status
             message = (
                 f"{message} A chain takes {rate:.1%} of its turns: the posterior is too far from the Gaussian of its"
-                " linearised rows; take fewer sensors, so that collapsed or nuts fit."
+                " linearised rows; take collapsed or nuts, of fewer sensors where these do not fit."
             ).strip()
-        ended = tuple("survey" if b.kind == "survey" else "estimated" for b in problem.biases)
+        ended = bias_status(problem, mixed, model.biases)
         return Answer(
             problem, self, self, prior, posterior, status, message, ended, run.z.shape[1], interrupted=interrupted
         )
+
+    def keeps_states(self, model: Model) -> bool:
+        """Whether draws of all states are few enough to be kept."""
+        return self.chains * self.draws * model.state_size <= NUMBERS
+
+    def check_kept(self, problem: Problem, keep: tuple[str, ...]) -> None:
+        """Raise `InputError` where draws of states are asked for that would take too much room."""
+        if {"states", "replicas"} & set(keep) and not self.keeps_states(problem.model):
+            raise InputError(
+                f"Gibbs() keeps draws of states up to {NUMBERS:,} numbers, {self.chains} x {self.draws} draws of"
+                f" {problem.model.state_size} states are more: take fewer draws, or leave save out (means and sds are"
+                " always there)"
+            )
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
         """Not asked: there is no frame."""
@@ -206,7 +226,7 @@ class _Given:
                 speed = speed + angle * self.factor.solve(self.density.rest(self.mean + step)[1])
         there, _ = self.density.rest(self.mean + step)
         gain = before - (self.energy(step, speed) - there)
-        rate = float(np.exp(min(gain, 0.0))) if np.isfinite(gain) else 0.0
+        rate = float(np.exp(min(gain, 0.0))) if np.isfinite(gain) else float(np.isfinite(there) > np.isfinite(rest))
         return (self.mean + step, there, rate, begun) if rng.random() < rate else (at, rest, rate, begun)
 
 
@@ -241,6 +261,7 @@ class _SparseChains:
         self.mode, self.key = mode, key
         self.state: SparseState | None = None  # where the chains stood last
         self._density: JointDensity | None = None
+        self._last: _Given | None = None
 
     def _rng(self, *which: int) -> np.random.Generator:
         return np.random.default_rng([*np.asarray(jax.random.key_data(self.key)).ravel().tolist(), *which])
@@ -252,7 +273,11 @@ class _SparseChains:
         return self._density
 
     def _given(self, density: JointDensity, phi: Phi) -> _Given:
-        return _Given.of(density, np.asarray(_precisions(self.form, phi, self.prior)))
+        """What hyper-parameters leave; factorised once where there are none."""
+        alpha, last = np.asarray(_precisions(self.form, phi, self.prior)), self._last
+        if last is None or last.density is not density or not np.array_equal(last.alpha, alpha):
+            self._last = last = _Given.of(density, alpha)
+        return last
 
     def first(self) -> SparseState:
         """Chains at draws under the declared scales; the reference at the mean of sweeps on the Gaussian."""
@@ -278,9 +303,13 @@ class _SparseChains:
         here = given.mean + given.factor.draw(rng, 1)[0]
         kicks = self._kicks(given, here, rng)
         stacked = {name: np.stack([np.asarray(phi[name]) for phi in phis]) for name in phis[0]}
+        return self._begun(at, stacked, density.at, kicks)
+
+    def _begun(self, at: np.ndarray, phi: Any, reference: np.ndarray, kicks: int) -> SparseState:
+        M, S = self.form.biases, self.joint.states
         return SparseState(
-            at, stacked, np.array(0), np.array(1), np.array(0), np.zeros(states), np.zeros(states), np.zeros(M),
-            np.zeros(M), density.at, np.array(kicks),
+            at, phi, np.array(0), np.array(1), np.zeros(2, int), np.zeros((2, S)), np.zeros((2, S)), np.zeros((2, M)),
+            np.zeros((2, M)), reference, np.array(kicks),
         )  # fmt: skip
 
     def _kicks(self, given: _Given, at: np.ndarray, rng: np.random.Generator) -> int:
@@ -297,71 +326,69 @@ class _SparseChains:
 
     def restored(self, leaves: list[np.ndarray]) -> SparseState:
         """The state of saved leaves; raises `InputError` where they are those of another."""
-        C, M, S = self.method.chains, self.form.biases, self.joint.states
-        n = self.joint.places.size
+        C, n = self.method.chains, self.joint.places.size
         phi = jax.eval_shape(self.form.hierarchy.begin, self.key)
-        stacked = {name: np.zeros((C, *leaf.shape)) for name, leaf in phi.items()}
-        blank = SparseState(
-            np.zeros((C, n)), stacked, np.array(0), np.array(1), np.array(0), np.zeros(S), np.zeros(S), np.zeros(M),
-            np.zeros(M), np.zeros(n), np.array(1),
-        )  # fmt: skip
+        stacked: Any = {name: np.zeros((C, *leaf.shape)) for name, leaf in phi.items()}
+        blank = self._begun(np.zeros((C, n)), stacked, np.zeros(n), 1)
         self.state = restored_as(blank, leaves)
         return self.state
 
     def advance(self, state: SparseState, thin: int, pool: ThreadPoolExecutor) -> tuple[SparseState, Draw]:
         """All chains one chunk further, every `thin`-th sweep kept."""
-        if int(state.thin) != thin:  # begun anew: what was before is warm-up
-            state = state._replace(summed=np.array(0), **{name: np.zeros_like(getattr(state, name)) for name in SUMS})
         density, sums = self._at(np.asarray(state.reference)), {name: np.array(getattr(state, name)) for name in SUMS}
-        ends, drawn, summed = [], [], int(state.summed)
+        if int(state.thin) != thin:  # begun anew: what was before is warm-up
+            sums = {name: np.stack([np.zeros_like(own[0]), own[0]]) for name, own in sums.items()}
+        ends, drawn = list[_Chain](), []
         for c in range(self.method.chains):
             at, phi = np.asarray(state.at[c]), {name: leaf[c] for name, leaf in state.phi.items()}
-            own = _Chain(c, int(state.made), at, phi, density.rest(at)[0])
+            own = _Chain(c, int(state.made), at, phi, density.rest(at)[0], 0.0)
             parts = []
             for _ in range(self.method.chunk):
                 for _ in range(thin):
-                    own, kept, moments = self._swept(density, own, int(state.kicks))
+                    own, moments = self._swept(density, own, int(state.kicks))
                     if thin > 1 or own.made > self.method.warmup:
-                        summed += 1
                         for name, value in moments.items():
-                            sums[name] += value
-                parts.append(kept)
+                            sums[name][0] += value
+                parts.append(self._draw(density, own))
             ends.append(own)
             drawn.append(jax.tree.map(lambda *leaves: np.stack(leaves), *parts))
         self.state = state._replace(
             at=np.stack([own.at for own in ends]), made=np.array(ends[0].made), thin=np.array(thin),
             phi={name: np.stack([np.asarray(own.phi[name]) for own in ends]) for name in state.phi},
-            summed=np.array(summed), **sums,
+            **sums,
         )  # fmt: skip
         return self.state, jax.tree.map(lambda *leaves: np.stack(leaves), *drawn)
 
     def _states(self, at: np.ndarray) -> tuple[np.ndarray, ...]:
         """States (E, n) of each recursion; nothing where the draws of all would take too much room."""
-        if self.method.chains * self.method.draws * self.joint.states > NUMBERS:
+        if not self.method.keeps_states(self.model):
             return ()
         known = self.mode.point.states
         return tuple(np.where(own >= 0, at[own], np.asarray(x)) for own, x in zip(self.joint.slots, known, strict=True))
 
-    def _swept(self, density: JointDensity, chain: _Chain, kicks: int) -> tuple[_Chain, Draw, dict[str, np.ndarray]]:
-        """One sweep of a chain, its draw, and what is summed over sweeps."""
+    def _swept(self, density: JointDensity, chain: _Chain, kicks: int) -> tuple[_Chain, dict[str, Any]]:
+        """One sweep of a chain, and what is summed over sweeps."""
         states = self.joint.states
         rng = self._rng(1, chain.number, chain.made)
         key = jax.random.fold_in(jax.random.fold_in(self.key, 2 + chain.number), chain.made)
         phi = _updated(self.form, chain.phi, jnp.asarray(chain.at[states:]), key)
         given = self._given(density, phi)
         at, rest, rate, speed = given.turned(chain.at, chain.rest, kicks, rng)
-        step, variance = at - density.at, _variances(given, speed)
-        value = density.value + rest + float(step @ (density.slope - 0.5 * (density.matrix @ step)))
-        value += _log_prior(self.form, phi, given.alpha, at[states:])
-        stats, none = {"acceptance_rate": np.array(rate)}, np.zeros(0)
-        hyper = {name: np.asarray(leaf) for name, leaf in phi.items()}
-        fields: dict[str, Any] = {"theta": at[states:], "phi": hyper, "gamma": none, "variance": none, "stats": stats}
-        kept = Draw(**fields | {"states": self._states(at), "density": np.array(value)})
-        moments = {
-            "total": step[:states], "square": step[:states] ** 2, "gamma": 1.0 - given.alpha * variance,
-            "variance": variance,
-        }  # fmt: skip
-        return _Chain(chain.number, chain.made + 1, at, phi, rest), kept, moments
+        step, variance = at[:states] - density.at[:states], _variances(given, speed)
+        gamma = 1.0 - given.alpha * variance
+        moments = {"summed": 1, "total": step, "square": step**2, "gamma": gamma, "variance": variance}
+        return _Chain(chain.number, chain.made + 1, at, phi, rest, rate), moments
+
+    def _draw(self, density: JointDensity, chain: _Chain) -> Draw:
+        """What is kept of a chain where it stands."""
+        at, z, none = chain.at, chain.at[self.joint.states :], np.zeros(0)
+        step = at - density.at
+        value = density.value + chain.rest + float(step @ (density.slope - 0.5 * (density.matrix @ step)))
+        value += _log_prior(self.form, chain.phi, np.asarray(_precisions(self.form, chain.phi, self.prior)), z)
+        most = NUMBERS / (self.method.chains * self.method.draws)
+        phi = {name: np.asarray(leaf) for name, leaf in chain.phi.items() if np.size(leaf) <= most}
+        fields: dict[str, Any] = {"theta": z, "phi": phi, "gamma": none, "variance": none, "density": np.array(value)}
+        return Draw(**fields | {"states": self._states(at), "stats": {"acceptance_rate": np.array(chain.rate)}})
 
 
 def _variances(given: _Given, drawn: np.ndarray) -> np.ndarray:
@@ -381,7 +408,7 @@ def _covariances(z: np.ndarray, members: np.ndarray, variance: np.ndarray) -> np
         found[b] = own[:, block].T @ own[:, block] / max(len(flat) - 1, 1)
     eye = np.eye(members.shape[1])[None]
     if len(flat) == 1:
-        found = eye * np.append(variance, 1.0)[members][:, None]
+        found = eye * np.append(variance, 0.0)[members][:, None]
     return found + eye * none[:, None]
 
 
@@ -402,11 +429,12 @@ class SparseChains(SparsePosterior):
         """The posterior of a run, what the data leave open not yet said."""
         z, model, M, state = run.z, problem.model, run.form.biases, runs.state
         assert state is not None
-        mean, count = z.mean((0, 1)), int(state.summed)
+        mean = z.mean((0, 1))
+        which = 0 if int(state.thin) == run.thin else 1  # a longer run that was interrupted leaves the draws before it
+        count, total, square, told, spread = (np.asarray(getattr(state, name))[which] for name in SUMS)
         members = blocks_of(model)
-        blocks = SensorBlocks(M, members, _covariances(z, members, np.asarray(state.variance) / count))
-        variance = np.asarray(state.square) / count - (np.asarray(state.total) / count) ** 2
-        gamma = np.clip(np.asarray(state.gamma) / count, 0.0, 1.0)
+        blocks = SensorBlocks(M, members, _covariances(z, members, spread / count))
+        variance, gamma = square / count - (total / count) ** 2, np.clip(told / count, 0.0, 1.0)
         tail = 50 * (1 - INTERVAL)
         lower, upper = np.percentile(z, [tail, 100 - tail], axis=(0, 1))
         alpha = np.clip((1 - gamma) / np.maximum(blocks.variance, 1e-300), *PRECISION_BOUNDS)
@@ -418,7 +446,7 @@ class SparseChains(SparsePosterior):
         summary = Summary(
             "exact", "sampled", mean, None, lower, upper, gamma, alpha, None, np.zeros(0), None, columns, blocks
         )
-        middle = np.asarray(state.reference)[: joint.states] + np.asarray(state.total) / count
+        middle = np.asarray(state.reference)[: joint.states] + total / count
         whole = np.concatenate([np.maximum(variance, 0.0), blocks.variance])
         states = [np.asarray(x) for x in place(model, joint, system.point, np.concatenate([middle, mean])).states]
         return cls(
@@ -435,7 +463,6 @@ class SparseChains(SparsePosterior):
         """The draws that were made, those of states where they are few."""
         run = self._run
         if not run.states:
-            self.check_kept(keep)
             return Draws(run.z, run.levels, [], np.arange(run.z.shape[1]), [], [])
         kept, likelihood, replicas = by_datum(self.problem, run, key, keep)
         return Draws(run.z, run.levels, run.states if "states" in keep else [], kept, likelihood, replicas)
@@ -448,8 +475,7 @@ class SparseChains(SparsePosterior):
     @property
     def variables(self) -> Mapping[str, Any]:
         """Hyper-parameters of every draw; those by bias where they are few."""
-        found = self._run.form.hierarchy.variables(self.problem.labels, self.hyper)
-        return {name: own for name, own in found.items() if np.size(own[1]) <= NUMBERS}
+        return self._run.form.hierarchy.variables(self.problem.labels, self.hyper)
 
     @property
     def hyper(self) -> Mapping[str, np.ndarray]:
@@ -464,5 +490,5 @@ class SparseChains(SparsePosterior):
 
     @property
     def attrs(self) -> Mapping[str, float]:
-        """Seconds beside what a sparse fit tells."""
-        return {**super().attrs, "seconds": self._run.seconds}
+        """Seconds, and steps from one draw to the next, beside what a sparse fit tells."""
+        return {**super().attrs, "seconds": self._run.seconds, "thin": float(self._run.thin)}

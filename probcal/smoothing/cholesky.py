@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from importlib.util import find_spec
-from threading import get_ident
+from threading import Lock, get_ident
 from typing import Any, ClassVar, NamedTuple, Protocol
 from weakref import WeakSet
 
@@ -77,6 +77,7 @@ class Cholmod:
     """
 
     _live: ClassVar[WeakSet[Cholmod]] = WeakSet()
+    _counting: ClassVar[Lock] = Lock()
 
     def __init__(self, places: Entries, values: np.ndarray):
         import sparsax  # an extra
@@ -84,11 +85,13 @@ class Cholmod:
         self._library, self._places, self._thread = sparsax, places, get_ident()
         with _calling():
             self._entries = tuple(jnp.asarray(part) for part in (places.row, places.column, values))
-        self._live.add(self)
+        with self._counting:
+            self._live.add(self)
         self._make()
 
     def _make(self) -> None:
-        threads = len({own._thread for own in list(self._live)})
+        with self._counting:
+            threads = len({own._thread for own in self._live})
         with _calling():
             self._library.set_num_cache_size(1)
             self._library.set_token_cache_size(1 if threads == 1 else BESIDE * threads)
@@ -118,7 +121,7 @@ class Cholmod:
 
     def log_determinant(self) -> tuple[float, float]:
         """Log determinant, and no error."""
-        return float(self._asked(self._library.logdet_factor)), 0.0
+        return float(self._asked(lambda token: float(self._library.logdet_factor(token)))), 0.0
 
     def inverse_entries(self) -> np.ndarray:
         """The inverse at the place of each entry, exact: Takahashi's selected inverse, or all columns of a full one."""

@@ -6,7 +6,7 @@ rest: what a sampler weighs its steps by.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -28,6 +28,7 @@ class JointDensity:
     model: Model
     joint: JointPrecision
     point: Point  # whose known states and levels are those of every other point
+    roots: tuple[jax.Array, ...]  # (E, n, n) inverse of those of the process noise of each recursion, 0 where none
     at: np.ndarray  # (n,) variables of the reference
     value: float  # log density there
     slope: np.ndarray  # (n,) of it
@@ -38,13 +39,23 @@ class JointDensity:
     def of(cls, model: Model, joint: JointPrecision, point: Point, at: np.ndarray) -> JointDensity:
         """Linearised at variables (n,), with the known states and the levels of a point."""
         entries = joint.values(model, linearise_rows(model, place(model, joint, point, at)), point.levels)
-        blank = cls(model, joint, point, at, 0.0, np.zeros_like(at), entries, mirrored(joint.places, entries).tocsr())
+        blank = cls(
+            model,
+            joint,
+            point,
+            _roots(model, joint, point),
+            at,
+            0.0,
+            np.zeros_like(at),
+            entries,
+            mirrored(joint.places, entries).tocsr(),
+        )
         value, slope = blank.looked(at)
-        return cls(model, joint, point, at, value, slope, entries, blank.matrix)
+        return replace(blank, value=value, slope=slope)
 
     def looked(self, at: np.ndarray) -> tuple[float, np.ndarray]:
         """Log density at variables (n,), and its slope (n,)."""
-        value, slope = _value_and_slope(self.model, self.point, *_pattern(self.joint), jnp.asarray(at))
+        value, slope = _value_and_slope(self.model, self.point, _slots(self.joint), self.roots, jnp.asarray(at))
         return float(value), np.asarray(slope)
 
     def rest(self, at: np.ndarray) -> tuple[float, np.ndarray]:
@@ -67,28 +78,33 @@ def variables_of(joint: JointPrecision, point: Point) -> np.ndarray:
 
 def place(model: Model, joint: JointPrecision, point: Point, at: np.ndarray) -> Point:
     """The point of variables (n,), with the known states and the levels of another."""
-    return _point(model, point, *_pattern(joint), jnp.asarray(at))
+    return _point(model, point, _slots(joint), _roots(model, joint, point), jnp.asarray(at))
 
 
-def _pattern(joint: JointPrecision) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
-    slots, driven = (tuple(jnp.asarray(own) for own in part) for part in (joint.slots, joint.driven))
-    return slots, driven
+def _slots(joint: JointPrecision) -> tuple[jax.Array, ...]:
+    return tuple(jnp.asarray(own) for own in joint.slots)
+
+
+def _roots(model: Model, joint: JointPrecision, point: Point) -> tuple[jax.Array, ...]:
+    """Inverse roots (E, n, n) of the process noise of each recursion, 0 where there is none."""
+    found = []
+    for part, drives in zip(model.recursions, joint.driven, strict=True):
+        root = jnp.where(drives[:, None, None], factors(part, point.levels), jnp.eye(part.F.shape[1])[None])
+        found.append(jnp.where(drives[:, None, None], linalg.inverses(root), 0.0))
+    return tuple(found)
 
 
 def _placed(
-    model: Model, point: Point, slots: tuple[jax.Array, ...], driven: tuple[jax.Array, ...], at: jax.Array
+    model: Model, point: Point, slots: tuple[jax.Array, ...], roots: tuple[jax.Array, ...], at: jax.Array
 ) -> Point:
     states, noises = [], []
-    for part, own, drives, known in zip(model.recursions, slots, driven, point.states, strict=True):
-        n = known.shape[1]
+    for part, own, root, known in zip(model.recursions, slots, roots, point.states, strict=True):
         x = jnp.where(own >= 0, at[own], known)
         before = jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
         left = x - jnp.einsum("eij,ej->ei", part.F, before) - part.drift
-        root = jnp.where(drives[:, None, None], factors(part, point.levels), jnp.eye(n)[None])
         states.append(x)
-        noises.append(jnp.where(drives[:, None], jnp.einsum("eij,ej->ei", linalg.inverses(root), left), 0.0))
-    M = model.biases
-    return point._replace(states=tuple(states), noises=tuple(noises), z=at[at.shape[0] - M :])
+        noises.append(jnp.einsum("eij,ej->ei", root, left))
+    return point._replace(states=tuple(states), noises=tuple(noises), z=at[at.shape[0] - model.biases :])
 
 
 _point = jax.jit(_placed)
@@ -96,9 +112,9 @@ _point = jax.jit(_placed)
 
 @jax.jit
 def _value_and_slope(
-    model: Model, point: Point, slots: tuple[jax.Array, ...], driven: tuple[jax.Array, ...], at: jax.Array
+    model: Model, point: Point, slots: tuple[jax.Array, ...], roots: tuple[jax.Array, ...], at: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     def value(at: jax.Array) -> jax.Array:
-        return log_density(model, _placed(model, point, slots, driven, at))
+        return log_density(model, _placed(model, point, slots, roots, at))
 
     return jax.value_and_grad(value)(at)
