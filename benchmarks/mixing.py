@@ -19,6 +19,7 @@ from probcal.inference.fit import calibrate
 from probcal.inference.methods import METHODS
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
+import large_network
 import microphones
 import networks
 import plaza
@@ -52,6 +53,7 @@ CASES = {"plaza": shipped(plaza), "plaza free": shipped(plaza_free)}
 CASES |= {name: (lambda name=name: (radars.setting(0, scenario=name, share=0.3)[0], None)) for name in ("C1", "C2")}
 CASES |= {name: network(name) for name in networks.NAMES}
 CASES |= {"corners, student": network("corners", tails="student")}
+CASES |= {"large": lambda: (large_network.problem(side=12, targets=2, epochs=100), None)}
 CASES |= {"thesis": shipped(thesis), "microphones": shipped(microphones)}
 CASES |= {
     "sflab": recorded(sflab, "sflab_mic_toa", "dataset_1_exp2.mat"),

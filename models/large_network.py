@@ -6,6 +6,7 @@ joint precision of all states and biases is sparse: one Cholesky factor fits it.
 
     probcal fit models/large_network.py --out large                                  (2500 radars)
     probcal fit models/large_network.py --set side=100 --set targets=20 --set epochs=1000 --out larger
+    probcal fit models/large_network.py --set side=25 --set targets=3 --set epochs=250 --method gibbs --out sampled
 """
 
 from functools import cache
