@@ -20,6 +20,8 @@ from hypothesis import settings
 from xdist.scheduler import LoadFileScheduling
 
 from probcal import kernels
+from probcal.smoothing import cholesky
+from probcal.smoothing.cholesky import Cholmod
 
 BUDGET = 7800  # kernels of a whole default run, all workers together (some 7000 to 7300 by which takes which file)
 MOST_MAPS = 20_000  # memory maps of a process, which may have 65530: past them XLA fails without a word
@@ -145,3 +147,12 @@ def few_maps():
 def kept_kernels(monkeypatch):
     """No kernel is dropped inside a test that counts them, however many this process has compiled before."""
     monkeypatch.setattr(kernels, "maps", lambda: 0)
+
+
+@pytest.fixture
+def library(request, monkeypatch):
+    """A library of factors in the place of the one that is chosen."""
+    if request.param is Cholmod:
+        pytest.importorskip("sparsax", reason="sparsax is an extra")
+    monkeypatch.setattr(cholesky, "exact", lambda: request.param is Cholmod)
+    return request.param

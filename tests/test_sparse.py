@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import worlds
 import xarray as xr
+from sparse_worlds import LIBRARIES, MOTION, TIME, drawn, ear, loud_ear, radar
 
 import probcal as pc
 from probcal.analysis.nees import of_biases
@@ -22,57 +23,13 @@ from probcal.files import Outputs
 from probcal.geometry import bearing, norm
 from probcal.inference.sparse import gains_by_sparse, takes_sparse
 from probcal.results.blocks import covariance_of
-from probcal.smoothing import cholesky
-from probcal.smoothing.cholesky import Cholmod, Entries, SuperLU, factorise, mirrored
+from probcal.smoothing.cholesky import Cholmod, Entries, factorise, mirrored
 from probcal.smoothing.joint import JointPrecision, blocks_of, missing
 from probcal.smoothing.linearised import linearise_rows
 from probcal.smoothing.mode import compress
 from probcal.smoothing.products import Products
 from probcal.smoothing.room import check_room
 from probcal.starts import automatic_start
-
-TIME = np.arange(30.0)
-MOTION = {"car": pc.ConstantVelocity(1.0), "van": pc.ConstantVelocity(1.0), "mast": pc.Static()}
-LIBRARIES = [pytest.param(kind, id=kind.__name__) for kind in (Cholmod, SuperLU)]
-
-
-@pc.sensor(range=pc.Channel("m", std=2.0), azimuth=pc.Channel("rad", std=0.02, wrap=True))
-def radar(target, pose, *, range_offset=pc.Bias("m", 3.0), gain=pc.Bias("1", 0.01, shared="type")):
-    """Range with an offset of its own and a gain of its type, and azimuth."""
-    line = pose.local(target.position)
-    return dict(range=(1 + gain) * norm(line) + range_offset, azimuth=bearing(line))
-
-
-@pc.sensor(azimuth=pc.Channel("rad", std=0.01, wrap=True))
-def ear(target, pose):
-    """Azimuth alone."""
-    return dict(azimuth=bearing(pose.local(target.position)))
-
-
-@pc.sensor(azimuth=pc.Channel("rad", std=pc.Unknown(0.02), wrap=True))
-def loud_ear(target, pose):
-    """Azimuth alone, of unknown noise."""
-    return dict(azimuth=bearing(pose.local(target.position)))
-
-
-@cache
-def drawn():
-    """Two moving targets and one at rest, seen by three radars, one surveyed, and two ears; some rows lost."""
-    turned = {"heading": 0.05}
-    nodes = [
-        pc.Node("a", (0.0, 0.0), survey={"position": 0.5}, scale=turned),
-        pc.Node("b", (400.0, 0.0), scale={"position": 5.0} | turned),
-        pc.Node("c", (0.0, 400.0), scale={"position": 5.0} | turned),
-        pc.Node("d", (400.0, 400.0), scale=turned),
-        pc.Node("e", (-200.0, 200.0), scale=turned),
-    ]
-    network = pc.Network([kind.on(node) for kind, node in zip((radar, radar, radar, ear, ear), nodes, strict=True)])
-    way = np.stack([np.linspace(50, 350, len(TIME)), 120 + 60 * np.sin(TIME / 5)], 1)
-    tracks = {"car": way, "van": way[::-1] + np.array([0.0, 100.0]), "mast": np.array([[150.0, 250.0]])}
-    biases = {"b.position_x": 6.0, "c.heading": 0.08, "radar.gain": 0.015, "b.range_offset": -4.0}
-    run = pc.simulate(network, MOTION, TIME, key=3, tracks=tracks, biases=biases)
-    table = run.table.sample(frac=0.67, random_state=0)
-    return pc.Problem(network, MOTION, table), run.truth
 
 
 def fitted(method, prior=None):
@@ -82,15 +39,6 @@ def fitted(method, prior=None):
 @pytest.fixture(scope="module")
 def dense():
     return fitted(pc.MAP(form="dense"), pc.Gaussian())
-
-
-@pytest.fixture
-def library(request, monkeypatch):
-    """A library of factors in the place of the one that is chosen."""
-    if request.param is Cholmod:
-        pytest.importorskip("sparsax", reason="sparsax is an extra")
-    monkeypatch.setattr(cholesky, "exact", lambda: request.param is Cholmod)
-    return request.param
 
 
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)

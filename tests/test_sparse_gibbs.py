@@ -8,18 +8,17 @@ import numpy as np
 import pandas as pd
 import pytest
 import worlds
-from test_sparse import LIBRARIES, drawn, ear, library, loud_ear
+from sparse_worlds import LIBRARIES, drawn, ear, loud_ear
 
 import probcal as pc
 from probcal.errors import InputError
 from probcal.geometry import norm
 from probcal.inference.sparse_gibbs import Gibbs, _Given, _SparseChains
 from probcal.smoothing.joint import JointPrecision
-from probcal.smoothing.joint_density import JointDensity, place, variables_of
+from probcal.smoothing.joint_density import JointDensity, point_of_variables, variables_of
 from probcal.smoothing.mode import log_density
 from probcal.starts import automatic_start
 
-__all__ = ["library"]  # a fixture
 SHORT = {"chains": 2, "warmup": 25, "draws": 50, "patience": 1}
 
 
@@ -36,7 +35,7 @@ def test_the_joint_density_is_that_of_its_point_and_its_slope_that_of_difference
         density = density_of(problem, point)
         rng = np.random.default_rng(0)
         at = density.at + 0.1 * rng.standard_normal(len(density.at))
-        there = place(problem.model, density.joint, point, at)
+        there = point_of_variables(problem.model, density.joint, point, at)
         np.testing.assert_allclose(variables_of(density.joint, there), at)
         value, slope = density.looked(at)
         assert value == pytest.approx(float(log_density(problem.model, there)), rel=1e-9)
@@ -285,6 +284,16 @@ def test_memory_that_does_not_hold_a_factor_is_said(monkeypatch):
     monkeypatch.setattr("probcal.smoothing.joint.JointPrecision.factor", refused)
     with pytest.raises(pc.FitError, match="does not fit in memory: take fewer sensors or a shorter time"):
         pc.fit(drawn()[0], Gibbs(**SHORT))
+
+
+def test_a_precision_lost_in_rounding_is_said(monkeypatch):
+    def lost(*_):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(_Given, "of", lost)
+    problem = worlds.linear("plane")[0]
+    with pytest.raises(pc.FitError, match="under some draw of the hyper-parameters is singular in double precision"):
+        pc.fit(problem, Gibbs(**SHORT), start=worlds.resting(problem))
 
 
 def test_a_flat_prior_on_what_no_row_tells_has_no_posterior():

@@ -80,7 +80,7 @@ class Chains(Posterior):
 
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """The draws that were made; of data that are many, values by datum at some of them."""
-        kept, likelihood, replicas = by_datum(self.problem, self.run, key, keep)
+        kept, likelihood, replicas = values_by_datum(self.problem, self.run, key, keep)
         states = self.run.states if "states" in keep else []
         return Draws(self.run.z, self.run.levels, states, kept, likelihood, replicas)
 
@@ -165,7 +165,7 @@ def mean_point(problem: Problem, run: SamplerRun) -> Point:
     return track_mode(problem, start._replace(z=jnp.asarray(run.z[mine].mean(0))))
 
 
-def by_datum(
+def values_by_datum(
     problem: Problem, run: SamplerRun, key: jax.Array, keep: tuple[str, ...]
 ) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
     """Which draws (kept,) of each chain have values by datum; log-likelihood and replicas (chain, kept, N, C) there."""

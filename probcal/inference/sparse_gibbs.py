@@ -23,7 +23,7 @@ from probcal.inference.chains import Draw, Sample
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.mixed import mixing
 from probcal.inference.posed import Form, Natural, Posed
-from probcal.inference.posterior import RARE, bias_status, by_datum, judge_chains
+from probcal.inference.posterior import RARE, bias_status, judge_chains, values_by_datum
 from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
@@ -43,7 +43,7 @@ from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
 from probcal.smoothing.cholesky import Factor
 from probcal.smoothing.joint import JointPrecision, blocks_of, missing
-from probcal.smoothing.joint_density import JointDensity, place, variables_of
+from probcal.smoothing.joint_density import JointDensity, point_of_variables, variables_of
 from probcal.smoothing.mode import Point
 from probcal.smoothing.sparse_mode import SparseSystem, find_sparse_mode, system_at
 from probcal.status import Status
@@ -135,8 +135,8 @@ class Gibbs(Sampler):
         except np.linalg.LinAlgError:
             if prior.proper:
                 raise FitError(
-                    "Gibbs: the precision under some draw of the hyper-parameters is singular in double precision; give"
-                    " biases that no row determines a survey, or fix them"
+                    "Gibbs: the precision under some draw of the hyper-parameters is singular in double precision:"
+                    " survey or fix what no row tells"
                 ) from None
             raise diverged(problem, joint, start, declared) from None
         found, weak = open_directions(problem, posterior.point, posterior.declared, together)
@@ -448,10 +448,12 @@ class SparseChains(SparsePosterior):
         )
         middle = np.asarray(state.reference)[: joint.states] + total / count
         whole = np.concatenate([np.maximum(variance, 0.0), blocks.variance])
-        states = [np.asarray(x) for x in place(model, joint, system.point, np.concatenate([middle, mean])).states]
+        states = [
+            np.asarray(x) for x in point_of_variables(model, joint, system.point, np.concatenate([middle, mean])).states
+        ]
         return cls(
             problem, prior, system.point, summary, system, system.entries, alpha, whole, declared, (), 0, None, run,
-            tuple(states),
+            tuple(np.asarray(x) for x in point.states),
         )  # fmt: skip
 
     @property
@@ -464,7 +466,7 @@ class SparseChains(SparsePosterior):
         run = self._run
         if not run.states:
             return Draws(run.z, run.levels, [], np.arange(run.z.shape[1]), [], [])
-        kept, likelihood, replicas = by_datum(self.problem, run, key, keep)
+        kept, likelihood, replicas = values_by_datum(self.problem, run, key, keep)
         return Draws(run.z, run.levels, run.states if "states" in keep else [], kept, likelihood, replicas)
 
     @property

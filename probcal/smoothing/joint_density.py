@@ -38,7 +38,7 @@ class JointDensity:
     @classmethod
     def of(cls, model: Model, joint: JointPrecision, point: Point, at: np.ndarray) -> JointDensity:
         """Linearised at variables (n,), with the known states and the levels of a point."""
-        entries = joint.values(model, linearise_rows(model, place(model, joint, point, at)), point.levels)
+        entries = joint.values(model, linearise_rows(model, point_of_variables(model, joint, point, at)), point.levels)
         blank = cls(
             model,
             joint,
@@ -76,7 +76,7 @@ def variables_of(joint: JointPrecision, point: Point) -> np.ndarray:
     return found
 
 
-def place(model: Model, joint: JointPrecision, point: Point, at: np.ndarray) -> Point:
+def point_of_variables(model: Model, joint: JointPrecision, point: Point, at: np.ndarray) -> Point:
     """The point of variables (n,), with the known states and the levels of another."""
     return _point(model, point, _slots(joint), _roots(model, joint, point), jnp.asarray(at))
 

@@ -1,0 +1,53 @@
+"""A bent network of radars and ears for tests of the sparse form, and the libraries of factors."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import probcal as pc
+from probcal.geometry import bearing, norm
+from probcal.smoothing.cholesky import Cholmod, SuperLU
+
+TIME = np.arange(30.0)
+MOTION = {"car": pc.ConstantVelocity(1.0), "van": pc.ConstantVelocity(1.0), "mast": pc.Static()}
+LIBRARIES = [pytest.param(kind, id=kind.__name__) for kind in (Cholmod, SuperLU)]
+
+
+@pc.sensor(range=pc.Channel("m", std=2.0), azimuth=pc.Channel("rad", std=0.02, wrap=True))
+def radar(target, pose, *, range_offset=pc.Bias("m", 3.0), gain=pc.Bias("1", 0.01, shared="type")):
+    """Range with an offset of its own and a gain of its type, and azimuth."""
+    line = pose.local(target.position)
+    return dict(range=(1 + gain) * norm(line) + range_offset, azimuth=bearing(line))
+
+
+@pc.sensor(azimuth=pc.Channel("rad", std=0.01, wrap=True))
+def ear(target, pose):
+    """Azimuth alone."""
+    return dict(azimuth=bearing(pose.local(target.position)))
+
+
+@pc.sensor(azimuth=pc.Channel("rad", std=pc.Unknown(0.02), wrap=True))
+def loud_ear(target, pose):
+    """Azimuth alone, of unknown noise."""
+    return dict(azimuth=bearing(pose.local(target.position)))
+
+
+@cache
+def drawn():
+    """Two moving targets and one at rest, seen by three radars, one surveyed, and two ears; some rows lost."""
+    turned = {"heading": 0.05}
+    nodes = [
+        pc.Node("a", (0.0, 0.0), survey={"position": 0.5}, scale=turned),
+        pc.Node("b", (400.0, 0.0), scale={"position": 5.0} | turned),
+        pc.Node("c", (0.0, 400.0), scale={"position": 5.0} | turned),
+        pc.Node("d", (400.0, 400.0), scale=turned),
+        pc.Node("e", (-200.0, 200.0), scale=turned),
+    ]
+    network = pc.Network([kind.on(node) for kind, node in zip((radar, radar, radar, ear, ear), nodes, strict=True)])
+    way = np.stack([np.linspace(50, 350, len(TIME)), 120 + 60 * np.sin(TIME / 5)], 1)
+    tracks = {"car": way, "van": way[::-1] + np.array([0.0, 100.0]), "mast": np.array([[150.0, 250.0]])}
+    biases = {"b.position_x": 6.0, "c.heading": 0.08, "radar.gain": 0.015, "b.range_offset": -4.0}
+    run = pc.simulate(network, MOTION, TIME, key=3, tracks=tracks, biases=biases)
+    table = run.table.sample(frac=0.67, random_state=0)
+    return pc.Problem(network, MOTION, table), run.truth
