@@ -448,9 +448,7 @@ class SparseChains(SparsePosterior):
         )
         middle = np.asarray(state.reference)[: joint.states] + total / count
         whole = np.concatenate([np.maximum(variance, 0.0), blocks.variance])
-        states = [
-            np.asarray(x) for x in point_of_variables(model, joint, system.point, np.concatenate([middle, mean])).states
-        ]
+        point = point_of_variables(model, joint, system.point, np.concatenate([middle, mean]))
         return cls(
             problem, prior, system.point, summary, system, system.entries, alpha, whole, declared, (), 0, None, run,
             tuple(np.asarray(x) for x in point.states),
