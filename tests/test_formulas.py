@@ -10,7 +10,7 @@ import pytest
 from worlds import exact, linear, resting, ruler
 
 from probcal import ARD, Channel, ConstantVelocity, Network, Node, Problem, Unknown, simulate
-from probcal.inference.posterior import _bias_status
+from probcal.inference.posterior import bias_status
 from probcal.model.rows import noise_std
 from probcal.priors import Precision
 from probcal.sensors import doa
@@ -48,7 +48,7 @@ def test_a_bias_whose_chains_disagree_is_not_mixed():
     problem, _ = linear("plane")
     r_hat = np.ones(len(problem.labels))
     r_hat[1] = 1.06
-    found = _bias_status(problem, {"r_hat": r_hat}, len(r_hat))
+    found = bias_status(problem, {"r_hat": r_hat}, len(r_hat))
     assert found[1] == "not mixed"
     assert set(found[:1] + found[2:]) == {"estimated", "survey"}
 

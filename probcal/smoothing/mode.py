@@ -251,7 +251,7 @@ class _Search(NamedTuple):
     cost: jax.Array
     damping: jax.Array
     change: jax.Array
-    still: jax.Array  # no step lowers the cost, and none promised to
+    still: jax.Array  # no step lowers the cost by more than its rounding, and none promised to
     moved: jax.Array  # some step lowered the cost
     iteration: jax.Array
     done: jax.Array
@@ -295,8 +295,9 @@ def find_mode(
         damping = jnp.where(better & (tries <= 2), s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
         damping = jnp.where(damping < 1e-6, 0.0, damping)
         change = jnp.where(better, s.cost - value, jnp.inf)
-        small = jnp.abs(promised) <= jnp.maximum(tolerance, ROUNDING * jnp.abs(s.cost))
-        still = ~better & (s.damping <= 1.0) & small & jnp.isfinite(s.cost)
+        rounding = ROUNDING * jnp.abs(s.cost)
+        small = jnp.abs(promised) <= jnp.maximum(tolerance, rounding)
+        still = (~better | (change <= rounding)) & (s.damping <= 1.0) & small & jnp.isfinite(s.cost)
         done = (better & (change < tolerance) & (s.damping <= 1.0)) | (damping > DAMPING) | still
         moved = s.moved | (better & (change > 0))
         return _Search(point, jnp.where(better, value, s.cost), damping, change, still, moved, s.iteration + 1, done)
