@@ -35,7 +35,8 @@ class Precision(NamedTuple):
     @staticmethod
     def single(alpha: jax.Array) -> "Precision":
         """Independent biases of precisions alpha (M,)."""
-        return Precision(alpha, None, jnp.zeros(()))
+        nothing: Any = np.zeros(())
+        return Precision(alpha, None, nothing)
 
     def matrix(self) -> jax.Array:
         """The precision matrix (M, M)."""

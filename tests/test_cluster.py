@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from functools import partial
 
 import cloudpickle
 import pandas as pd
@@ -158,6 +159,28 @@ def test_table_and_picture_are_written_while_a_study_runs(tmp_path):
 
 
 # with one
+
+
+def place(_, batch):
+    import distributed
+
+    time.sleep(0.05)
+    return distributed.get_worker().address
+
+
+@pytest.mark.parametrize(("size", "count"), [(0, 2), (0, 24), (20_000, 24)])
+def test_every_worker_gets_batches(size, count):
+    """Also where the work is large, so that it lies with one worker at first."""
+    import distributed
+
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as made,
+        distributed.Client(made, set_as_default=False) as client,
+    ):
+        places = [found for _, found in spread(partial(place, b"x" * size), list(range(count)), scheduler=client)]
+    shares = [places.count(one) / count for one in set(places)]
+    assert len(shares) == 2
+    assert min(shares) >= 0.25
 
 
 @pytest.fixture(scope="module")

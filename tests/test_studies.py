@@ -2,7 +2,9 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -14,6 +16,7 @@ from probcal.cli.options import parse_values
 from probcal.diagnostics import study_table
 from probcal.errors import InputError
 from probcal.inference.fit import calibrate
+from probcal.inference.run import State, stepped
 from probcal.plots import plot_study
 from probcal.status import Status
 
@@ -39,6 +42,22 @@ def check(scenario, shares, runs):
             assert mean.sel(share=share, estimator=method) < 1.15 * figure, (scenario, share, method)
             assert mean.sel(share=share, estimator="ml") > 2 * mean.sel(share=share, estimator=method)
     return found
+
+
+class Lost:
+    """A method whose objective is lost at every step."""
+
+    def iterate(self, model, prior, given, state):
+        return state._replace(objective=jnp.array(jnp.nan), done=jnp.array(False))
+
+
+def test_a_climb_that_has_lost_its_objective_ends():
+    blank = State(*[None] * len(State._fields))
+    state = blank._replace(objective=jnp.array(-jnp.inf), done=jnp.array(False))
+    model = SimpleNamespace(with_mixing=lambda _: None)
+    once = stepped(Lost(), model, None, None, state)
+    assert not once.done
+    assert stepped(Lost(), model, None, None, once).done
 
 
 @pytest.mark.slow

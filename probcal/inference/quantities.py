@@ -6,7 +6,7 @@ part of the data (Modrak et al. 2023).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -58,6 +58,7 @@ class Pool:
     status: str
     run: SamplerRun | None = None  # of a sampler
     hierarchy: Hierarchy | None = None  # that the hyper-parameters belong to
+    joint: Callable[[Point, Phi], float] | None = None  # the log density that a sampler keeps of each draw
 
     @property
     def count(self) -> int:
@@ -88,7 +89,12 @@ def pool_of(answer: Answer, key: jax.Array) -> Pool:
         posterior.hierarchy if isinstance(posterior, MixturePosterior) else None if run is None else run.form.hierarchy
     )
     status = TAKEN if taken else str(answer.status) if run is None else "sampled"
-    return Pool(points, hyper, drawn.z.shape[0], posterior.chained, posterior.held, status, run, hierarchy)
+    joint: Callable[[Point, Phi], float] | None = None
+    if isinstance(posterior, SparseChains):
+        joint = posterior.log_joint
+    elif run is not None and isinstance(run.posed, Posed):
+        joint = partial(_joint, run.form, run.posed)
+    return Pool(points, hyper, drawn.z.shape[0], posterior.chained, posterior.held, status, run, hierarchy, joint)
 
 
 @jax.jit
@@ -97,9 +103,13 @@ def _likelihoods(model: Model, z: jax.Array, levels: jax.Array, states: Any) -> 
     return jax.lax.map(lambda d: log_likelihood(model, At(d[2], d[0], d[1])), (z, levels, states))
 
 
-@partial(jax.jit, static_argnames="form")
-def _joint(form: Form, posed: Posed, point: Point, phi: Phi) -> jax.Array:
+def _joint(form: Form, posed: Posed, point: Point, phi: Phi) -> float:
     """Log joint density of data, noises and biases at the truth, as samplers keep it of each draw."""
+    return float(_framed_joint(form, posed, point, phi))
+
+
+@partial(jax.jit, static_argnames="form")
+def _framed_joint(form: Form, posed: Posed, point: Point, phi: Phi) -> jax.Array:
     theta = jnp.concatenate([point.z, point.levels])
     spread = volume(posed.model, posed.frame, theta)
     return mixed_density(posed.model, point) + spread + log_prior(form, posed, theta, phi)
@@ -156,9 +166,8 @@ def _quantities(trial: Trial, found: Pool) -> dict[str, _Quantity]:
         draws = np.asarray(_likelihoods(problem.model, *args))
         truth = float(_likelihoods(problem.model, *true)[0])
         all_["log likelihood"] = _Quantity("density", truth, draws)
-    if sampled is not None and trial.joint and isinstance(sampled.posed, Posed):
-        phi = {name: jnp.asarray(value) for name, value in trial.phi.items()}
-        truth = float(_joint(sampled.form, sampled.posed, point, phi))
+    if found.joint is not None and sampled is not None and trial.joint:
+        truth = found.joint(point, {name: jnp.asarray(value) for name, value in trial.phi.items()})
         all_["log joint"] = _Quantity("density", truth, np.asarray(sampled.draws.density).reshape(-1))
     return all_
 

@@ -269,9 +269,8 @@ def given_of(method: Maximiser, problem: Problem, prior: Prior) -> Given:
     group = prior.groups(problem.members)
     group = np.where(problem.surveyed, len(group) + np.arange(len(group)), group)  # surveyed biases share none
     group = np.unique(group, return_inverse=True)[1]
-    return Given(
-        first_precision(problem, prior), *jax.device_put((problem.surveyed, group, np.array(float(method.tolerance))))
-    )
+    numbers: Any = problem.surveyed, group, np.array(float(method.tolerance))
+    return Given(first_precision(problem, prior), *numbers)
 
 
 def first_state(given: Given, model: Model, start: Point, carry: Any, seed: jax.Array) -> State:
@@ -327,9 +326,9 @@ def chunk(
 
 
 def stepped(method: Any, model: Model, prior: Prior, given: Given, state: State) -> State:
-    """One outer iteration at the precisions of the process noise that a state has."""
+    """One outer iteration at the precisions of the process noise that a state has; two without an objective end it."""
     after: State = method.iterate(model.with_mixing(state.mixing), prior, given, state)
-    return after
+    return after._replace(done=after.done | (jnp.isnan(after.objective) & jnp.isnan(state.objective)))
 
 
 def maximise(

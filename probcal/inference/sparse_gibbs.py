@@ -44,7 +44,7 @@ from probcal.results.schema import INTERVAL, ROPE
 from probcal.smoothing.cholesky import Factor
 from probcal.smoothing.joint import JointPrecision, blocks_of, missing
 from probcal.smoothing.joint_density import JointDensity, point_of_variables, variables_of
-from probcal.smoothing.mode import Point
+from probcal.smoothing.mode import Point, log_density
 from probcal.smoothing.sparse_mode import SparseSystem, find_sparse_mode, system_at
 from probcal.status import Status
 
@@ -244,8 +244,9 @@ def _precisions(form: Form, phi: Phi, first: Precision) -> jax.Array:
     return form.hierarchy.alpha(phi, first.alpha)
 
 
-def _log_prior(form: Form, phi: Phi, alpha: np.ndarray, z: np.ndarray) -> float:
-    """Log density of biases and hyper-parameters, that of a flat prior counting as one."""
+def _log_prior(form: Form, phi: Phi, first: Precision, z: np.ndarray) -> float:
+    """Log density of biases (M,) and hyper-parameters, that of a flat prior counting as one."""
+    alpha = np.asarray(_precisions(form, phi, first))
     own = np.where(alpha > 0, np.log(np.where(alpha > 0, alpha, 1.0) / (2 * np.pi)) - alpha * z**2, 0.0)
     return 0.5 * float(np.sum(own)) + float(form.hierarchy.log_prior(phi))
 
@@ -384,7 +385,7 @@ class _SparseChains:
         at, z, none = chain.at, chain.at[self.joint.states :], np.zeros(0)
         step = at - density.at
         value = density.value + chain.rest + float(step @ (density.slope - 0.5 * (density.matrix @ step)))
-        value += _log_prior(self.form, chain.phi, np.asarray(_precisions(self.form, chain.phi, self.prior)), z)
+        value += _log_prior(self.form, chain.phi, self.prior, z)
         most = NUMBERS / (self.method.chains * self.method.draws)
         phi = {name: np.asarray(leaf) for name, leaf in chain.phi.items() if np.size(leaf) <= most}
         fields: dict[str, Any] = {"theta": z, "phi": phi, "gamma": none, "variance": none, "density": np.array(value)}
@@ -453,6 +454,11 @@ class SparseChains(SparsePosterior):
             problem, prior, system.point, summary, system, system.entries, alpha, whole, declared, (), 0, None, run,
             tuple(np.asarray(x) for x in point.states),
         )  # fmt: skip
+
+    def log_joint(self, point: Point, phi: Phi) -> float:
+        """Log density of data, noises, biases and hyper-parameters at a point, as it is kept of each draw."""
+        known = _log_prior(self._run.form, phi, self._run.posed.first, np.asarray(point.z))
+        return float(log_density(self.problem.model, point)) + known
 
     @property
     def states(self) -> Sequence[np.ndarray]:

@@ -1,8 +1,8 @@
 """Batches of work, given back as they are finished: on threads of this process, or on a dask cluster.
 
-On a cluster the work travels as one task whose value any worker can be asked for again, and each batch is a task that
-takes it, so that the death of a worker costs what it was busy with. Only this process hears of results: what is kept is
-kept by one writer.
+On a cluster each batch is a task, and large work is one too, whose value any worker can be asked for again and which
+the batches take, so that the death of a worker costs what it was busy with. Only this process hears of results: what is
+kept is kept by one writer.
 """
 
 from __future__ import annotations
@@ -37,6 +37,12 @@ else:
 LOCAL = "local"  # a scheduler and workers of this machine, for as long as the call lasts
 TIMEOUT = 10.0  # s in which a scheduler must answer
 SENT = 500  # batches that are handed over at a time
+SMALL = 10_000  # bytes of work that go with every batch
+QUIET = {  # settings of dask for workers of this machine: what costs a quarter of the time of small kernels
+    "distributed.worker.profile.enabled": False,
+    # as dask sets them but for MALLOC_TRIM_THRESHOLD_, under which glibc asks for memory anew at every kernel
+    "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1},
+}
 KERNELS = (  # settings of jax, by which workers keep compiled kernels in the folder of this process
     "jax_compilation_cache_dir", "jax_compilation_cache_max_size", "jax_persistent_cache_min_compile_time_secs",
     "jax_persistent_cache_min_entry_size_bytes",
@@ -90,23 +96,26 @@ def _on_threads[B, R](work: Callable[[B], R], batches: Sequence[B], threads: int
 
 def _on_cluster[B, R](work: Callable[[B], R], batches: Sequence[B], scheduler: Any) -> Generator[tuple[int, R]]:
     with _client(scheduler, len(batches)) as client:
-        name = f"probcal-{uuid4().hex}"
-        packed = client.submit(_given, cloudpickle.dumps(work), key=f"{name}-work", pure=False)
-        waiting: dict[str, int] = {f"{name}-{k}": k for k in range(len(batches))}
-        futures = client.map(
-            _task, batches, key=list(waiting), packed=packed, here=_here(), pure=False, batch_size=SENT
-        )
+        name, packed = uuid4().hex, cloudpickle.dumps(work)
+        # dask runs a task where what it takes lies: so small work travels with each batch, and large work by a key of
+        # another first word, by which dask tells that the many batches are not tied to it
+        own = [] if len(packed) <= SMALL else [client.submit(_given, packed, key=f"work-{name}", pure=False)]
+        sent = client.map(
+            _task, batches, key=[f"batch-{name}-{k}" for k in range(len(batches))], packed=own[0] if own else packed,
+            here=_here(), pure=False, batch_size=SENT,
+        )  # fmt: skip
+        waiting = {future.key: (k, future) for k, future in enumerate(sent)}
         try:
-            finished = distributed.as_completed(futures, loop=client.loop)
-            del futures
+            finished = distributed.as_completed(sent, loop=client.loop)
+            del sent
             for future in finished:
-                yield waiting.pop(future.key), _result(future, client)
+                yield waiting.pop(future.key)[0], _result(future, client)
                 future.release()
             if waiting:  # as_completed ends where the scheduler is gone
                 raise _lost(client)
         finally:
             if client.status == "running":
-                client.cancel([packed], force=True)
+                client.cancel([*(future for _, future in waiting.values()), *own], force=True)
 
 
 def _result(future: Any, client: Any) -> Any:
@@ -146,10 +155,12 @@ def _local_cluster(batches: int) -> Any:
     from dask.system import CPU_COUNT
 
     try:
-        return distributed.LocalCluster(
-            n_workers=min(CPU_COUNT, batches), threads_per_worker=1, memory_limit=None, silence_logs=logging.CRITICAL,
-            dashboard_address=None, scheduler_kwargs={"dashboard_address": "127.0.0.1:0"}, preload=__name__,
-        )  # fmt: skip
+        with dask.config.set(QUIET):
+            return distributed.LocalCluster(
+                n_workers=min(CPU_COUNT, batches), threads_per_worker=1, memory_limit=None,
+                silence_logs=logging.CRITICAL, dashboard_address=None,
+                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"}, preload=__name__,
+            )  # fmt: skip
     except Exception as error:  # of the first worker that did not start
         raise InputError(
             f"the workers of this machine did not start ({error}); a script that asks for them does so below"
@@ -158,8 +169,14 @@ def _local_cluster(batches: int) -> Any:
 
 
 def dask_setup(worker: Any) -> None:
-    """Leave Ctrl-C to the process that has the client: dask calls this name where a local worker begins."""
+    """Dask calls this name where a local worker begins: Ctrl-C is left to the process that has the client.
+
+    There is a worker for every processor, so each computes in one thread: kernels of studies are small, and to share
+    one out among threads costs more than it gains.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ["NPROC"] = "1"  # by which XLA counts its threads
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
 def _check_answer(address: str) -> None:

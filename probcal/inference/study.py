@@ -15,7 +15,7 @@ import xarray as xr
 
 from probcal.errors import InputError, nearest
 from probcal.inference.ending import conclude
-from probcal.inference.fits import Fits, open_fits
+from probcal.inference.fits import BATCH, Fits, open_fits
 from probcal.inference.identity import identity, problem_digest
 from probcal.inference.integrate import Integrated, Integration, integrate
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
@@ -150,7 +150,8 @@ def _batch(
     with jax.enable_x64(True):
         whole = [_simulated(setting, point, number, _needs_linear(methods)) for number in numbers]
         found: list[dict[str, Any]] = []
-        for name, (method, prior) in methods.items():
+        for name in _turned(list(methods), numbers[0] // BATCH):
+            method, prior = methods[name]
             if isinstance(method, Sampler) or method.by_particles:
                 found += [
                     {"run": run.number, "method": name} | _record(run, _drawn(run, method, prior)) for run in whole
@@ -180,6 +181,11 @@ def _batch(
             first = next(record for record in found if record["run"] == numbers[0])
             first["problem"] = _number(whole[0].problem, whole[0].truth)
         return found
+
+
+def _turned(names: list[str], by: int) -> list[str]:
+    """Names from another one on: workers that begin with different methods each compile what the others then find."""
+    return names[by % len(names) :] + names[: by % len(names)]
 
 
 def _number(problem: Problem, truth: Truth) -> int:
