@@ -51,3 +51,21 @@ def drawn():
     run = pc.simulate(network, MOTION, TIME, key=3, tracks=tracks, biases=biases)
     table = run.table.sample(frac=0.67, random_state=0)
     return pc.Problem(network, MOTION, table), run.truth
+
+
+@cache
+def drawn_in_space():
+    """Two moving targets in 3-D, seen by two radars and two of altitude and range, all displaced; some rows lost."""
+    kinds = [pc.sensors.radar_3d, pc.sensors.radar_3d, pc.sensors.ranger, pc.sensors.ranger]
+    places = [(0.0, 0.0, 0.0), (400.0, 0.0, 30.0), (0.0, 400.0, 60.0), (400.0, 400.0, 0.0)]
+    nodes = [
+        pc.Node(name, place, **({"survey": {"position": 0.5}} if name == "a" else {"scale": {"position": 4.0}}))
+        for name, place in zip("abcd", places, strict=True)
+    ]
+    network = pc.Network([kind.on(node) for kind, node in zip(kinds, nodes, strict=True)])
+    up = np.linspace(60, 160, len(TIME))
+    way = np.stack([np.linspace(50, 350, len(TIME)), 120 + 60 * np.sin(TIME / 5), up], 1)
+    tracks = {"car": way, "van": way[::-1] + np.array([0.0, 100.0, 20.0])}
+    motion = {name: pc.ConstantVelocity(1.0) for name in tracks}
+    run = pc.simulate(network, motion, TIME, key=3, tracks=tracks, biases={"b.position_z": 5.0})
+    return pc.Problem(network, motion, run.table.sample(frac=0.7, random_state=0)), run.truth
