@@ -103,6 +103,49 @@ def test_a_piece_on_the_wrong_side_is_turned():
     assert off(only(tree)["mean"].values, path) < 4
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_scene_on_the_wrong_side_is_turned_in_sparse_form(seed):
+    """From the whole track reflected, 20 m off at the most: `converged` there, before other sides were looked at."""
+    problem, path = beside(seed)
+    with jax.enable_x64(True):
+        start = automatic_start(problem)
+        z = np.asarray(start.z)
+        (line,) = planes(problem, z)
+        start = track_mode(problem, reflect(problem, start, line, [np.ones(120, bool)], z))
+    assert off(start.states[0], path) > 15
+    tree = probcal.fit(problem, probcal.MAP(form="sparse"), prior=probcal.Gaussian(), start=start)
+    assert off(only(tree)["mean"].values, path) < 4
+
+
+@pytest.mark.parametrize(
+    ("method", "prior"),
+    [
+        (probcal.MAP(form="sparse"), probcal.Gaussian()),
+        pytest.param(probcal.EA(form="sparse"), None, marks=pytest.mark.ci),
+        (probcal.Gibbs(chains=1, warmup=5, draws=20, patience=1), probcal.Gaussian()),
+    ],
+    ids=["map", "ea", "gibbs"],
+)
+def test_a_mirror_is_reported_in_sparse_form(method, prior):
+    """Nodes on a line, biases free: the other side fits as well to 1e-3 nats, with the places of nodes turned over."""
+    problem, _ = networks.setting(0, "line", share=1.0)
+    tree = probcal.fit(problem, method, prior=prior)
+    assert "Another answer fits as well" in tree.attrs["message"]
+    group = tree["mirror"].to_dataset()
+    across = [label for label in problem.labels if label.endswith("position_y")]
+    own = tree["calibration"].to_dataset().sel(bias_label=across)
+    assert np.abs(group["gain"].values).min() < 1e-3
+    there = group["bias"].isel(mirror=0).sel(bias_label=across).values
+    np.testing.assert_allclose(there, -own["mean"].values, atol=2 * own["sd"].values.max())
+
+
+def test_nodes_that_span_the_plane_have_no_mirror_in_sparse_form():
+    problem, _ = networks.setting(1, "beacons")
+    tree = probcal.fit(problem, probcal.MAP(form="sparse"), prior=probcal.Gaussian())
+    assert "mirror" not in tree.children
+    assert "nother answer" not in tree.attrs["message"]
+
+
 @pytest.mark.slow
 def test_pieces_of_fifty_tracks_are_turned():
     """50 runs, share 0.3 of the biases: all within 6 m of the path, or the path's side is reported as fitting as well.

@@ -11,12 +11,12 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.inference.methods import MAP
 from probcal.inference.run import Context, Maximiser, Method
-from probcal.inference.sparse import check_sparse, gains_by_sparse, takes_sparse
+from probcal.inference.sparse import PRODUCTS, check_sparse, gains_by_sparse, sparse_climb, takes_sparse
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.grid import follow_states, grid_start
-from probcal.smoothing.mirrors import NEAR, SAME, Mirrored, other_sides
+from probcal.smoothing.mirrors import NEAR, SAME, Climb, Mirrored, Sides, other_sides
 from probcal.smoothing.mode import Point
 from probcal.smoothing.room import check_room
 from probcal.starts import further_starts
@@ -43,7 +43,7 @@ def solve(
     if (sparse := _sparsely(problem, method, prior, starts)) is not None:
         method = sparse
         first = grid_start(problem, jnp.zeros(problem.model.biases), 30) if start is None else start
-        return method.answer(problem, prior, first, context)
+        return _in_sparse_form(problem, method, prior, first, context)
     points = [o.point for o in optima_of(problem)] if start is None else [_suited(given, problem, start)]
     points += further_starts(problem, starts - len(points), jax.random.fold_in(context.key, 1))
     climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint"), Gaussian())
@@ -79,6 +79,25 @@ def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> Me
     return None
 
 
+def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point, context: Context) -> Answer:
+    """The answer of a method in sparse form, the other sides of a mirror seen to.
+
+    A sampler starts on the side that fits best, and its answer tells of the others.
+    """
+    if getattr(method, "form", "") == PRODUCTS:  # no factor, and no evidence that is good enough
+        return method.answer(problem, prior, start, context)
+    climb = sparse_climb(problem)
+    if method.climbs:
+        return _beside_mirrors(method.answer(problem, prior, start, context), method, context, climb)
+    try:
+        sides = other_sides(problem, climb.mode(start)[0], climb)
+    except MemoryError:  # which the method says
+        sides = Sides(start, False, ())
+    found = method.answer(problem, prior, sides.point, context)
+    mean = found.posterior.summary.mean
+    return replace(found, mirrors=tuple(o._replace(shift=np.asarray(o.point.z) - mean) for o in sides.others))
+
+
 def _by_particles(
     problem: Problem, method: Method, prior: Prior, context: Context, start: Point | None, starts: int
 ) -> Answer:
@@ -112,11 +131,11 @@ def _by_particles(
     return replace(answers[best], optima=tuple(answers) if starts > 1 else (), best=best, mirrors=mirrors)
 
 
-def _beside_mirrors(answer: Answer, method: Method, context: Context) -> Answer:
+def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Climb | None = None) -> Answer:
     """The answer on the side of a mirror that fits best, and those of other sides that fit about as well."""
     if not (answer.status.valid and answer.posterior.sound):
         return answer
-    sides = other_sides(answer.problem, answer.posterior.point)
+    sides = other_sides(answer.problem, answer.posterior.point, climb)
     found = answer
     if sides.moved:
         again = method.answer(answer.problem, answer.prior, sides.point, context)

@@ -35,6 +35,7 @@ from probcal.smoothing.cholesky import Factor, exact
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.joint import JointPrecision, blocks_of, is_thin, missing, prefers_sparse
 from probcal.smoothing.linearised import linearise_rows
+from probcal.smoothing.mirrors import Climb
 from probcal.smoothing.mode import Point
 from probcal.smoothing.sparse_mode import SparseMode, SparseSystem, find_sparse_mode, system_at
 
@@ -252,6 +253,23 @@ def _untold(problem: Problem, joint: JointPrecision, point: Point, alpha: np.nda
     information = joint.within(joint.values(problem.model, linearise_rows(problem.model, point), point.levels))
     nothing = np.flatnonzero(information.diagonal() + alpha == 0)
     return [problem.labels[m] for m in nothing]
+
+
+def sparse_climb(problem: Problem) -> Climb:
+    """To the marginal mode by sparse factors, with its log evidence."""
+    scales = np.ones(problem.model.biases)
+    joint: JointPrecision | None = None
+
+    def mode(point: Point) -> tuple[Point, float]:
+        nonlocal joint
+        joint = JointPrecision.of(problem.model) if joint is None else joint
+        try:
+            found = find_sparse_mode(problem.model, joint, point, scales, STEPS, 1e-3)
+            return found.system.point, _evidence(found, problem, scales)[0]
+        except np.linalg.LinAlgError:
+            return point, -np.inf
+
+    return Climb(mode, lambda _, evidence: evidence)
 
 
 def _evidence(mode: SparseMode, problem: Problem, alpha: np.ndarray) -> tuple[float, float]:

@@ -6,7 +6,7 @@ the misfit of the data at the reflected places with the prior spread of the bias
 that has no mirror pays for two looks at its data.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, pairwise
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from probcal.problem import Problem
 from probcal.smoothing.grid import follow_states, grid_start, known_places, profile, track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import Mode, Point, find_mode
+from probcal.smoothing.mode import Point, find_mode
 from probcal.types import float64
 
 WORSE = 0.4  # nats a datum by which a reflected place may fit worse and is still polished: 0 to 0.2 beside a mirror,
@@ -61,6 +61,24 @@ class Mirrored(NamedTuple):
     shift: np.ndarray  # (M,) its biases z less those of the answer
 
 
+class Climb(NamedTuple):
+    """How the mode next to a point under the declared scales is found and weighed."""
+
+    mode: Callable[[Point], tuple[Point, float]]  # the mode, and its log density or evidence, -inf where there is none
+    evidence: Callable[[Point, float], float]  # of a mode and what came with it
+
+    @classmethod
+    def dense(cls, problem: Problem) -> "Climb":
+        """To the joint mode, weighed by Laplace's formula."""
+        scales = Precision.single(jnp.ones(problem.model.biases))
+
+        def mode(point: Point) -> tuple[Point, float]:
+            found = find_mode(problem.model, point, scales, 30, 1e-3)
+            return found.point, -float(found.cost)
+
+        return cls(mode, lambda at, _: float(laplace(problem.model, at, scales).evidence))
+
+
 class Sides(NamedTuple):
     """What a search on the other sides found."""
 
@@ -70,27 +88,27 @@ class Sides(NamedTuple):
 
 
 @float64
-def other_sides(problem: Problem, point: Point) -> Sides:
+def other_sides(problem: Problem, point: Point, climb: Climb | None = None) -> Sides:
     """Search the other sides of a point: pieces of tracks first, then all of the scene, polished and compared."""
-    scales = Precision.single(jnp.ones(problem.model.biases))
-    point, turned, pieces = _turned(problem, point)
-    best: Point | None = None
+    climb = Climb.dense(problem) if climb is None else climb
+    point, turned, pieces = _turned(problem, point, climb)
+    best: tuple[Point, float] | None = None
     found: list[Mirrored] = []
     whole = ((name, across, track_mode(problem, across)) for name, across in _candidates(problem, point))
     for name, candidate, start in chain(whole, pieces):
-        best = _polished(problem, point, scales).point if best is None else best
-        polished = _polished(problem, start, scales).point
-        size = distance(problem, candidate, best)
-        if not new(problem, polished, [best, *(other.point for other in found)], size):
+        best = climb.mode(point) if best is None else best
+        polished = climb.mode(start)
+        size = distance(problem, candidate, best[0])
+        if not new(problem, polished[0], [best[0], *(other.point for other in found)], size):
             continue
-        worth = [float(laplace(problem.model, at, scales).evidence) for at in (polished, best)]
+        worth = [climb.evidence(*at) for at in (polished, best)]
         if np.isfinite(worth).all() and worth[0] - worth[1] > -NEAR:
-            found.append(Mirrored(name, worth[0] - worth[1], polished, np.asarray(polished.z - best.z)))
+            found.append(Mirrored(name, worth[0] - worth[1], polished[0], np.asarray(polished[0].z - best[0].z)))
     found.sort(key=lambda other: -other.gain)
     if found and best is not None and found[0].gain > 0.1:
         first = found[0]
         rest = [o._replace(gain=o.gain - first.gain, shift=o.shift - first.shift) for o in found[1:]]
-        back = Mirrored(first.name, -first.gain, best, -first.shift)
+        back = Mirrored(first.name, -first.gain, best[0], -first.shift)
         kept = [other for other in (back, *rest) if other.gain > -NEAR]
         return Sides(first.point, True, tuple(kept[:MOST]))
     return Sides(point, turned, tuple(found[:MOST]))
@@ -278,35 +296,34 @@ def new(problem: Problem, point: Point, known: Sequence[Point], size: float) -> 
     return size > 0 and all(distance(problem, point, other) > APART * size for other in known)
 
 
-def _turned(problem: Problem, point: Point) -> tuple[Point, bool, list[tuple[str, Point, Point]]]:
+def _turned(problem: Problem, point: Point, climb: Climb) -> tuple[Point, bool, list[tuple[str, Point, Point]]]:
     """The point with those pieces of tracks on the other side that fit better there; whether any do.
 
     Also those that fit about as well: names, reflected and polished points.
     Where there is a piece to be tried the whole track is searched again too, at the biases reached so far.
     """
-    scales = Precision.single(jnp.ones(problem.model.biases))
     others: list[tuple[str, Point, Point]] = []
-    best: Mode | None = None
+    best: tuple[Point, float] | None = None
     turned, again = False, True
     for _ in range(ROUNDS):
         if not again:
             break
         again, others = False, []
         for name, candidate in _cut(problem, point):
-            best = _polished(problem, point, scales) if best is None else best
+            best = climb.mode(point) if best is None else best
             smoothed = track_mode(problem, candidate)
-            if not new(problem, smoothed, [best.point], distance(problem, candidate, best.point)):
+            if not new(problem, smoothed, [best[0]], distance(problem, candidate, best[0])):
                 continue  # it came back by itself
-            tried = _polished(problem, smoothed, scales)
-            if float(tried.cost) < float(best.cost) - GAIN:
-                point, best, turned, again = tried.point, tried, True, True
-            elif float(tried.cost) < float(best.cost) + NEAR:
-                others.append((name, candidate, tried.point))
+            tried = climb.mode(smoothed)
+            if tried[1] > best[1] + GAIN:
+                point, best, turned, again = tried[0], tried, True, True
+            elif tried[1] > best[1] - NEAR:
+                others.append((name, candidate, tried[0]))
         if best is not None and not again:
-            searched = at_levels(problem.model, grid_start(problem, best.point.z, 30), point.levels)
-            tried = _polished(problem, searched, scales)
-            if float(tried.cost) < float(best.cost) - GAIN:
-                point, best, turned, again = tried.point, tried, True, True
+            searched = at_levels(problem.model, grid_start(problem, best[0].z, 30), point.levels)
+            tried = climb.mode(searched)
+            if tried[1] > best[1] + GAIN:
+                point, best, turned, again = tried[0], tried, True, True
     return point, turned, others
 
 
@@ -330,11 +347,6 @@ def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
         first, last = problem.epochs[r].time[own[[0, -1]]]
         name = f'target "{target}" from {first:.6g} to {last:.6g} s reflected in {plane.name}'
         yield name, reflect(problem, point, plane, chosen, z)
-
-
-def _polished(problem: Problem, point: Point, scales: Precision) -> Mode:
-    """The joint mode under the declared scales next to a point."""
-    return find_mode(problem.model, point, scales, 30, 1e-3)
 
 
 def _pieces(problem: Problem, point: Point, plane: Plane, r: int, mine: np.ndarray) -> list[np.ndarray]:
