@@ -262,8 +262,10 @@ def _candidates(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
     z, movable, counts = np.asarray(point.z), _movable(problem), _counts(problem)
     targets = [name for epochs in problem.epochs for name in dict.fromkeys(epochs.target)]
     every = sum(float(count.sum()) for count in counts)
-    for plane in planes(problem, z):
-        here, nodes = _losses(problem, z, point, None), reflect_nodes(problem, z, plane)
+    found = planes(problem, z)
+    here = _losses(problem, z, point, None) if found else []
+    for plane in found:
+        nodes = reflect_nodes(problem, z, plane)
         ways = [(z, "")] if np.array_equal(nodes, z) else [(nodes, " and nodes"), (z, "")]
         for biases, word in ways:
             there = _losses(problem, biases, point, plane)
@@ -330,9 +332,10 @@ def _turned(problem: Problem, point: Point, climb: Climb) -> tuple[Point, bool, 
 def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
     """Pieces of tracks on the other side, those first that fit best there unpolished: names, and the points."""
     z, movable, counts = np.asarray(point.z), _movable(problem), _counts(problem)
-    pieces = []
-    for plane in planes(problem, z):
-        here, there = _losses(problem, z, point, None), _losses(problem, z, point, plane)
+    pieces, found = [], planes(problem, z)
+    here = _losses(problem, z, point, None) if found else []
+    for plane in found:
+        there = _losses(problem, z, point, plane)
         for r, epochs in enumerate(problem.epochs):
             worse = there[r] - here[r]
             for target in dict.fromkeys(epochs.target):
