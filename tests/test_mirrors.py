@@ -4,6 +4,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import jax
 import jax.numpy as jnp
@@ -137,6 +138,23 @@ def test_a_mirror_is_reported_in_sparse_form(method, prior):
     assert np.abs(group["gain"].values).min() < 1e-3
     there = group["bias"].isel(mirror=0).sel(bias_label=across).values
     np.testing.assert_allclose(there, -own["mean"].values, atol=2 * own["sd"].values.max())
+
+
+@pytest.mark.parametrize(
+    ("error", "message"), [(MemoryError(), "Memory did not hold"), (probcal.FitError("no answer there"), "")]
+)
+def test_an_answer_outlives_what_looks_at_its_other_side(error, message):
+    """The answer of the first climb stands where the other side takes too much memory, or has none."""
+    problem, _ = networks.setting(0, "line", share=1.0)
+
+    def refused(*_):
+        raise error
+
+    with patch("probcal.inference.solve.other_sides", refused):
+        tree = probcal.fit(problem, probcal.MAP(form="sparse"), prior=probcal.Gaussian())
+    assert tree.attrs["status"] == "converged"
+    assert message in tree.attrs["message"]
+    assert "mirror" not in tree.children
 
 
 def test_nodes_that_span_the_plane_have_no_mirror_in_sparse_form():

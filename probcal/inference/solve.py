@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.errors import InputError
+from probcal.errors import FitError, InputError
 from probcal.inference.methods import MAP
 from probcal.inference.run import Context, Maximiser, Method
 from probcal.inference.sparse import PRODUCTS, check_sparse, gains_by_sparse, sparse_climb, takes_sparse
@@ -88,7 +88,16 @@ def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point
         return method.answer(problem, prior, start, context)
     climb = sparse_climb(problem)
     if method.climbs:
-        return _beside_mirrors(method.answer(problem, prior, start, context), method, context, climb)
+        found = method.answer(problem, prior, start, context)
+        if getattr(found.method, "form", "") == PRODUCTS:  # memory held no factor
+            return found
+        try:
+            return _beside_mirrors(found, method, context, climb)
+        except FitError:  # there is no answer of this method on the other side
+            return found
+        except MemoryError:
+            unseen = "Memory did not hold what looking at the other side of a mirror takes."
+            return replace(found, message=f"{found.message} {unseen}".strip())
     try:
         sides = other_sides(problem, climb.mode(start)[0], climb)
     except MemoryError:  # which the method says
