@@ -19,7 +19,7 @@ from probcal.sensors import radar, ranger
 from probcal.smoothing import recursion
 from probcal.smoothing.grid import track_mode
 from probcal.smoothing.information import at_levels
-from probcal.smoothing.mirrors import Sides, other_sides, planes, reflect, reflect_nodes
+from probcal.smoothing.mirrors import Mirrored, Sides, other_sides, planes, reflect, reflect_nodes
 from probcal.smoothing.mode import factors
 from probcal.starts import automatic_start
 from probcal.status import Status
@@ -140,21 +140,37 @@ def test_a_mirror_is_reported_in_sparse_form(method, prior):
     np.testing.assert_allclose(there, -own["mean"].values, atol=2 * own["sd"].values.max())
 
 
-@pytest.mark.parametrize(
-    ("error", "message"), [(MemoryError(), "Memory did not hold"), (probcal.FitError("no answer there"), "")]
-)
-def test_an_answer_outlives_what_looks_at_its_other_side(error, message):
-    """The answer of the first climb stands where the other side takes too much memory, or has none."""
+def test_an_answer_outlives_the_memory_that_its_other_side_takes():
     problem, _ = networks.setting(0, "line", share=1.0)
 
     def refused(*_):
-        raise error
+        raise MemoryError
 
     with patch("probcal.inference.solve.other_sides", refused):
         tree = probcal.fit(problem, probcal.MAP(form="sparse"), prior=probcal.Gaussian())
     assert tree.attrs["status"] == "converged"
-    assert message in tree.attrs["message"]
+    assert "Memory did not hold" in tree.attrs["message"]
     assert "mirror" not in tree.children
+
+
+def fails(*_):
+    raise probcal.FitError("nothing there")
+
+
+def test_an_answer_stands_where_no_fit_comes_from_a_better_place(monkeypatch):
+    there = SimpleNamespace(z=jnp.ones(1))
+    monkeypatch.setattr(solve, "other_sides", lambda *_: Sides(there, True, ()))
+    found = solve._beside_mirrors(Stub(100.0), SimpleNamespace(answer=fails), None)
+    assert found.objective == 100.0
+    assert found.mirrors == ()
+    assert "another place fits better (pieces of tracks on their other side), from which no fit came" in found.message
+
+
+def test_a_further_answer_that_no_fit_confirms_is_kept_as_it_was_found(monkeypatch):
+    other = Mirrored("the targets", -0.5, SimpleNamespace(z=jnp.ones(1)), np.ones(1))
+    monkeypatch.setattr(solve, "other_sides", lambda *_: Sides(SimpleNamespace(z=jnp.zeros(1)), False, (other,)))
+    found = solve._beside_mirrors(Stub(100.0), SimpleNamespace(answer=fails), None)
+    assert found.mirrors == (other,)
 
 
 def test_nodes_that_span_the_plane_have_no_mirror_in_sparse_form():
@@ -268,7 +284,8 @@ class Stub:
     objective: float
     mirrors: tuple = ()
     status: Status = Status.CONVERGED
-    problem = prior = None
+    message: str = ""
+    problem = prior = method = None
     posterior = SimpleNamespace(sound=True, point=None, summary=SimpleNamespace(mean=np.zeros(1)))
 
 

@@ -12,6 +12,7 @@ from probcal.errors import FitError, InputError
 from probcal.inference.methods import MAP
 from probcal.inference.run import Context, Maximiser, Method
 from probcal.inference.sparse import PRODUCTS, check_sparse, gains_by_sparse, sparse_climb, takes_sparse
+from probcal.inference.sparse_gibbs import check_gibbs
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -68,6 +69,7 @@ def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> Me
     if method.sparsely:
         if starts > 1:
             raise InputError(f"{method.name} takes one start: its chains begin at different draws (chains=...)")
+        check_gibbs(problem, prior)
         return method
     if isinstance(method, Maximiser) and takes_sparse(method, problem):
         check_sparse(method, prior, starts)
@@ -93,8 +95,6 @@ def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point
             return found
         try:
             return _beside_mirrors(found, method, context, climb)
-        except FitError:  # there is no answer of this method on the other side
-            return found
         except MemoryError:
             unseen = "Memory did not hold what looking at the other side of a mirror takes."
             return replace(found, message=f"{found.message} {unseen}".strip())
@@ -144,23 +144,35 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Cli
     """The answer on the side of a mirror that fits best, and those of other sides that fit about as well."""
     if not (answer.status.valid and answer.posterior.sound):
         return answer
+
+    def answered(point: Point) -> Answer | None:
+        """The answer from a point, if there is one in the form of the first."""
+        try:
+            found = method.answer(answer.problem, answer.prior, point, context)
+        except FitError:
+            return None
+        return found if found.method == answer.method else None
+
     sides = other_sides(answer.problem, answer.posterior.point, climb)
     found = answer
     if sides.moved:
-        again = method.answer(answer.problem, answer.prior, sides.point, context)
+        name = sides.others[0].name if sides.others else "pieces of tracks on their other side"
+        again = answered(sides.point)
+        if again is None:
+            unseen = f"Under the declared scales another place fits better ({name}), from which no fit came."
+            return replace(answer, message=f"{answer.message} {unseen}".strip())
         gain = again.objective - answer.objective
         if not (again.status.valid and gain > 0):  # better under the declared scales, not under the prior
-            name = sides.others[0].name if sides.others else "pieces of tracks on their other side"
             shift = np.asarray(sides.point.z) - answer.posterior.summary.mean
             near = again.status.valid and gain > -NEAR
             return replace(answer, mirrors=(Mirrored(name, gain, sides.point, shift),) if near else ())
         found = replace(again, motion=answer.motion, optima=answer.optima, best=answer.best)
     others = []
     for other in sides.others:
-        if other.gain > -SAME:  # as good as the first: an answer of its own
-            own = method.answer(answer.problem, answer.prior, other.point, context).posterior
-            if own.sound:
-                other = other._replace(point=own.point, shift=own.summary.mean - found.posterior.summary.mean)
+        own = answered(other.point) if other.gain > -SAME else None  # as good as the first: an answer of its own
+        if own is not None and own.posterior.sound:
+            shift = own.posterior.summary.mean - found.posterior.summary.mean
+            other = other._replace(point=own.posterior.point, shift=shift)
         others.append(other)
     return replace(found, mirrors=tuple(others))
 

@@ -38,11 +38,6 @@ LOCAL = "local"  # a scheduler and workers of this machine, for as long as the c
 TIMEOUT = 10.0  # s in which a scheduler must answer
 SENT = 500  # batches that are handed over at a time
 SMALL = 10_000  # bytes of work that go with every batch
-QUIET = {  # settings of dask for workers of this machine: what costs a quarter of the time of small kernels
-    "distributed.worker.profile.enabled": False,
-    # as dask sets them but for MALLOC_TRIM_THRESHOLD_, under which glibc asks for memory anew at every kernel
-    "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1},
-}
 KERNELS = (  # settings of jax, by which workers keep compiled kernels in the folder of this process
     "jax_compilation_cache_dir", "jax_compilation_cache_max_size", "jax_persistent_cache_min_compile_time_secs",
     "jax_persistent_cache_min_entry_size_bytes",
@@ -154,10 +149,15 @@ def _local_cluster(batches: int) -> Any:
     """A scheduler and a worker for each processor that this process may use."""
     from dask.system import CPU_COUNT
 
+    count, ours = min(CPU_COUNT, batches), "distributed.nanny.pre-spawn-environ"
+    # with MALLOC_TRIM_THRESHOLD_, which dask sets, glibc asks for memory anew at every kernel; by NPROC XLA counts its
+    # threads: kernels of studies are small, and to share one out among processors costs more than it gains
+    environ = {name: value for name, value in dask.config.get(ours).items() if name != "MALLOC_TRIM_THRESHOLD_"}
+    settings = {ours: environ | {"NPROC": CPU_COUNT // count}, "distributed.worker.profile.enabled": False}
     try:
-        with dask.config.set(QUIET):
+        with dask.config.set(settings):
             return distributed.LocalCluster(
-                n_workers=min(CPU_COUNT, batches), threads_per_worker=1, memory_limit=None,
+                n_workers=count, threads_per_worker=1, memory_limit=None,
                 silence_logs=logging.CRITICAL, dashboard_address=None,
                 scheduler_kwargs={"dashboard_address": "127.0.0.1:0"}, preload=__name__,
             )  # fmt: skip
@@ -169,13 +169,8 @@ def _local_cluster(batches: int) -> Any:
 
 
 def dask_setup(worker: Any) -> None:
-    """Dask calls this name where a local worker begins: Ctrl-C is left to the process that has the client.
-
-    There is a worker for every processor, so each computes in one thread: kernels of studies are small, and to share
-    one out among threads costs more than it gains.
-    """
+    """Dask calls this name where a local worker begins: it leaves Ctrl-C to the client, and computes where it asks."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ["NPROC"] = "1"  # by which XLA counts its threads
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 

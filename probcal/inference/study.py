@@ -15,7 +15,7 @@ import xarray as xr
 
 from probcal.errors import InputError, nearest
 from probcal.inference.ending import conclude
-from probcal.inference.fits import BATCH, Fits, open_fits
+from probcal.inference.fits import Fits, open_fits
 from probcal.inference.identity import identity, problem_digest
 from probcal.inference.integrate import Integrated, Integration, integrate
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
@@ -143,14 +143,14 @@ def _form(run: _Run) -> tuple[Any, ...]:
 
 def _batch(
     setting: Setting, methods: Mapping[str, tuple[Method, Prior]], stored: bool,
-    batch: tuple[dict[str, Any], list[int]],
+    batch: tuple[int, dict[str, Any], list[int]],
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Records of all methods on some runs of a grid point; one of them says what its problem was, if `stored`."""
-    point, numbers = batch
+    turn, point, numbers = batch
     with jax.enable_x64(True):
         whole = [_simulated(setting, point, number, _needs_linear(methods)) for number in numbers]
         found: list[dict[str, Any]] = []
-        for name in _turned(list(methods), numbers[0] // BATCH):
+        for name in _turned(list(methods), turn):
             method, prior = methods[name]
             if isinstance(method, Sampler) or method.by_particles:
                 found += [
@@ -334,11 +334,11 @@ def _fit_missing(
     wanted = set(numbers)
     points = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
     blocks = [(point, [run for run in runs if run in wanted]) for point in points for runs in fits.missing(point)]
-    batches = [(point, runs) for point, runs in blocks if runs]
+    batches = [(k, point, runs) for k, (point, runs) in enumerate(block for block in blocks if block[1])]
     total = len(points) * len(numbers) * len(methods)
     with closing(spread(partial(_batch, setting, methods, stored), batches, scheduler=scheduler)) as finished:
         for k, records in finished:
-            fits.add(batches[k][0], records)
+            fits.add(batches[k][1], records)
             if progress is not None:
                 progress(Progress("fits", fits.count(axes, numbers), total))
 
