@@ -183,6 +183,20 @@ def test_every_worker_gets_batches(size, count):
     assert min(shares) >= 0.25
 
 
+def surroundings(batch):
+    return [os.environ.get(name) for name in ("NPROC", "MALLOC_TRIM_THRESHOLD_", "PROBCAL_MINE")]
+
+
+@pytest.mark.ci
+def test_local_workers_have_their_environment_and_leave_this_process_its_own(monkeypatch):
+    monkeypatch.setenv("PROBCAL_MINE", "kept")
+    monkeypatch.setattr("dask.system.CPU_COUNT", 6)
+    before = dict(os.environ)
+    found = [place for _, place in spread(surroundings, [0, 1], scheduler="local")]
+    assert found == [["3", None, "kept"]] * 2
+    assert dict(os.environ) == before
+
+
 @pytest.fixture(scope="module")
 def cluster():
     """A scheduler and a worker in this process, and a client."""

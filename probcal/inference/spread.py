@@ -138,11 +138,24 @@ def _client(scheduler: Any, batches: int) -> Iterator[Any]:
         return
     with ExitStack() as stack:
         if scheduler == LOCAL:
+            stack.enter_context(_same_environment())
             at: Any = stack.enter_context(_local_cluster(batches))
         else:
             at = scheduler
             _check_answer(scheduler)
         yield stack.enter_context(distributed.Client(at, timeout=TIMEOUT, set_as_default=False))
+
+
+@contextmanager
+def _same_environment() -> Iterator[None]:
+    """Leave this process the environment that it had: dask changes it where it begins workers."""
+    before = dict(os.environ)
+    try:
+        yield
+    finally:
+        for name in set(os.environ) - set(before):
+            del os.environ[name]
+        os.environ.update(before)
 
 
 def _local_cluster(batches: int) -> Any:
