@@ -104,7 +104,7 @@ def test_a_piece_on_the_wrong_side_is_turned():
     assert off(only(tree)["mean"].values, path) < 4
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.ci)])
 def test_a_scene_on_the_wrong_side_is_turned_in_sparse_form(seed):
     """From the whole track reflected, 20 m off at the most: `converged` there, before other sides were looked at."""
     problem, path = beside(seed)
@@ -123,7 +123,7 @@ def test_a_scene_on_the_wrong_side_is_turned_in_sparse_form(seed):
     [
         (probcal.MAP(form="sparse"), probcal.Gaussian()),
         pytest.param(probcal.EA(form="sparse"), None, marks=pytest.mark.ci),
-        (probcal.Gibbs(chains=1, warmup=5, draws=20, patience=1), probcal.Gaussian()),
+        pytest.param(probcal.Gibbs(chains=1, warmup=5, draws=20, patience=1), probcal.Gaussian(), marks=pytest.mark.ci),
     ],
     ids=["map", "ea", "gibbs"],
 )
@@ -173,6 +173,7 @@ def test_a_further_answer_that_no_fit_confirms_is_kept_as_it_was_found(monkeypat
     assert found.mirrors == (other,)
 
 
+@pytest.mark.ci
 def test_nodes_that_span_the_plane_have_no_mirror_in_sparse_form():
     problem, _ = networks.setting(1, "beacons")
     tree = probcal.fit(problem, probcal.MAP(form="sparse"), prior=probcal.Gaussian())

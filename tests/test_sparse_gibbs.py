@@ -29,7 +29,7 @@ def density_of(problem, point):
     return JointDensity.of(problem.model, joint, point, variables_of(joint, point))
 
 
-@pytest.mark.parametrize("made", [drawn, drawn_in_space])
+@pytest.mark.parametrize("made", [drawn, pytest.param(drawn_in_space, marks=pytest.mark.ci)])
 def test_the_joint_density_is_that_of_its_point_and_its_slope_that_of_differences(made):
     """Of moving targets, one at rest, bent sensors, in 2-D and 3-D: value to 1e-9, slope to 1e-5 of differences."""
     problem = made()[0]
@@ -87,6 +87,7 @@ def test_draws_of_a_linear_world_have_its_exact_moments(name, library):
         np.testing.assert_allclose(other["sd"].values[free] / one["sd"].values[free], 1.0, atol=5 * error)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("prior", [pc.Horseshoe(), pc.Gaussian()], ids=["horseshoe", "gaussian"])
 def test_the_density_of_a_draw_is_the_joint_one_at_its_point(prior):
     """To 1e-9: what simulation-based calibration ranks a truth by."""

@@ -17,7 +17,7 @@ from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.grid import follow_states, grid_start
-from probcal.smoothing.mirrors import NEAR, SAME, Climb, Mirrored, Sides, other_sides
+from probcal.smoothing.mirrors import NEAR, SAME, Mirrored, SideClimb, Sides, other_sides
 from probcal.smoothing.mode import Point
 from probcal.smoothing.room import check_room
 from probcal.starts import further_starts
@@ -140,7 +140,7 @@ def _by_particles(
     return replace(answers[best], optima=tuple(answers) if starts > 1 else (), best=best, mirrors=mirrors)
 
 
-def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Climb | None = None) -> Answer:
+def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: SideClimb | None = None) -> Answer:
     """The answer on the side of a mirror that fits best, and those of other sides that fit about as well."""
     if not (answer.status.valid and answer.posterior.sound):
         return answer

@@ -35,7 +35,7 @@ from probcal.smoothing.cholesky import Factor, exact
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.joint import JointPrecision, blocks_of, is_thin, missing, prefers_sparse
 from probcal.smoothing.linearised import linearise_rows
-from probcal.smoothing.mirrors import Climb
+from probcal.smoothing.mirrors import SideClimb
 from probcal.smoothing.mode import Point
 from probcal.smoothing.sparse_mode import SparseMode, SparseSystem, find_sparse_mode, system_at
 
@@ -255,7 +255,7 @@ def _untold(problem: Problem, joint: JointPrecision, point: Point, alpha: np.nda
     return [problem.labels[m] for m in nothing]
 
 
-def sparse_climb(problem: Problem) -> Climb:
+def sparse_climb(problem: Problem) -> SideClimb:
     """To the marginal mode by sparse factors, with its log evidence."""
     scales = np.ones(problem.model.biases)
     joint: JointPrecision | None = None
@@ -269,7 +269,7 @@ def sparse_climb(problem: Problem) -> Climb:
         except np.linalg.LinAlgError:
             return point, -np.inf
 
-    return Climb(mode, lambda _, evidence: evidence)
+    return SideClimb(mode, lambda _, evidence: evidence)
 
 
 def _evidence(mode: SparseMode, problem: Problem, alpha: np.ndarray) -> tuple[float, float]:

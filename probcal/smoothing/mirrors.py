@@ -61,14 +61,14 @@ class Mirrored(NamedTuple):
     shift: np.ndarray  # (M,) its biases z less those of the answer
 
 
-class Climb(NamedTuple):
+class SideClimb(NamedTuple):
     """How the mode next to a point under the declared scales is found and weighed."""
 
     mode: Callable[[Point], tuple[Point, float]]  # the mode, and its log density or evidence, -inf where there is none
     evidence: Callable[[Point, float], float]  # of a mode and what came with it
 
     @classmethod
-    def dense(cls, problem: Problem) -> "Climb":
+    def dense(cls, problem: Problem) -> "SideClimb":
         """To the joint mode, weighed by Laplace's formula."""
         scales = Precision.single(jnp.ones(problem.model.biases))
 
@@ -88,9 +88,9 @@ class Sides(NamedTuple):
 
 
 @float64
-def other_sides(problem: Problem, point: Point, climb: Climb | None = None) -> Sides:
+def other_sides(problem: Problem, point: Point, climb: SideClimb | None = None) -> Sides:
     """Search the other sides of a point: pieces of tracks first, then all of the scene, polished and compared."""
-    climb = Climb.dense(problem) if climb is None else climb
+    climb = SideClimb.dense(problem) if climb is None else climb
     point, turned, pieces = _turned(problem, point, climb)
     best: tuple[Point, float] | None = None
     found: list[Mirrored] = []
@@ -298,7 +298,7 @@ def new(problem: Problem, point: Point, known: Sequence[Point], size: float) -> 
     return size > 0 and all(distance(problem, point, other) > APART * size for other in known)
 
 
-def _turned(problem: Problem, point: Point, climb: Climb) -> tuple[Point, bool, list[tuple[str, Point, Point]]]:
+def _turned(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, bool, list[tuple[str, Point, Point]]]:
     """The point with those pieces of tracks on the other side that fit better there; whether any do.
 
     Also those that fit about as well: names, reflected and polished points.
