@@ -88,7 +88,9 @@ def test_draws_of_a_linear_world_have_its_exact_moments(name, library):
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("prior", [pc.Horseshoe(), pc.Gaussian()], ids=["horseshoe", "gaussian"])
+@pytest.mark.parametrize(
+    "prior", [pc.Horseshoe(), pytest.param(pc.Gaussian(), marks=pytest.mark.slow)], ids=["horseshoe", "gaussian"]
+)
 def test_the_density_of_a_draw_is_the_joint_one_at_its_point(prior):
     """To 1e-9: what simulation-based calibration ranks a truth by."""
     problem = drawn()[0]
