@@ -55,7 +55,7 @@ def drawn():
 
 @cache
 def drawn_in_space():
-    """Two moving targets in 3-D, seen by two radars and two of altitude and range, all displaced; some rows lost."""
+    """Two moving targets in 3-D, seen by two radars and two rangers, one of them surveyed; some rows lost."""
     kinds = [pc.sensors.radar_3d, pc.sensors.radar_3d, pc.sensors.ranger, pc.sensors.ranger]
     places = [(0.0, 0.0, 0.0), (400.0, 0.0, 30.0), (0.0, 400.0, 60.0), (400.0, 400.0, 0.0)]
     nodes = [

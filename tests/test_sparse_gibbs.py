@@ -88,9 +88,7 @@ def test_draws_of_a_linear_world_have_its_exact_moments(name, library):
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize(
-    "prior", [pc.Horseshoe(), pytest.param(pc.Gaussian(), marks=pytest.mark.slow)], ids=["horseshoe", "gaussian"]
-)
+@pytest.mark.parametrize("prior", [pc.Horseshoe(), pc.Gaussian()], ids=["horseshoe", "gaussian"])
 def test_the_density_of_a_draw_is_the_joint_one_at_its_point(prior):
     """To 1e-9: what simulation-based calibration ranks a truth by."""
     problem = drawn()[0]
@@ -109,7 +107,7 @@ def test_the_density_of_a_draw_is_the_joint_one_at_its_point(prior):
 
 @pytest.mark.slow
 def test_it_agrees_with_the_collapsed_sampler_in_space():
-    """3-D radars and rangers, all displaced: means within 0.25 sds, sds within a fifth."""
+    """3-D radars and rangers, three of four displaced: means within 0.25 sds, sds within a fifth."""
     problem, truth = drawn_in_space()
     ours = pc.fit(problem, Gibbs(warmup=50, draws=300), prior=pc.Gaussian())["calibration"].to_dataset()
     other = pc.fit(problem, pc.Collapsed(draws=300), prior=pc.Gaussian())["calibration"].to_dataset()
