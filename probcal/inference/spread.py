@@ -182,7 +182,7 @@ def _local_cluster(batches: int) -> Any:
 
 
 def dask_setup(worker: Any) -> None:
-    """Dask calls this name where a local worker begins: Ctrl-C is left to the client, no thread of XLA is waited for."""
+    """Where a local worker begins dask calls this: Ctrl-C is left to the client, no thread of XLA is waited for."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
