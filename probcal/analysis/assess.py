@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.analysis import checks, leave, nees, pieces, predictive, process, residuals, scaling, shape, verdict
+from probcal.analysis.beside import mirror_doubts, mirror_findings
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.large import assess_large
@@ -21,13 +22,11 @@ from probcal.results.answer import Answer
 from probcal.results.groups import bias_coords, node_of
 from probcal.results.read import each_track
 from probcal.simulate import Key, Truth, as_key
-from probcal.smoothing.mirrors import touched
 from probcal.status import INVALID, Status
 from probcal.types import float64
 
 QUARTERS = 4
 SHARED = 1.8  # sd that an open combination of one scale may put a bias off; of four with a free common part, about 1.9
-BEYOND = 2.0  # sd that an answer as good may be away
 COPIES = 2000  # most biases of all pieces together
 
 
@@ -91,12 +90,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     bent = None if tree.attrs["status"] in INVALID else shape.check_shape(fit, tree)
     findings += [] if bent is None else [bent]
     groups["verdict"] = _verdicts(fit, tree, found, groups, bent)
-    if "mirror" in tree.children:
-        group = tree["mirror"].to_dataset()
-        findings += [
-            Finding("mirror", "fit", f"{name}: an answer {abs(gain):.1f} nats apart")
-            for name, gain in zip(group["mirror"].values, group["gain"].values, strict=True)
-        ]
+    findings += mirror_findings(tree)
     columns = [groups["verdict"][name].values.tolist() for name in ("verdict", "bias_label", "reason")]
     alarms = [row for row in zip(*columns, strict=True) if row[0] in ("drifting", "conflicting")]
     findings += [Finding(word, label, f"{label}: {reason}") for word, label, reason in alarms]
@@ -156,7 +150,7 @@ def _verdicts(
     status = Status(tree.attrs["status"])
     doubts = {} if bent is None else dict.fromkeys(range(M), "the answer is far from Gaussian, so its interval is none")
     words, reasons = verdict.judge_biases(
-        problem, status, ended, known, drifts, disagreements, first, _shared(tree), doubts | _mirrored(fit, tree)
+        problem, status, ended, known, drifts, disagreements, first, _shared(tree), doubts | mirror_doubts(fit, tree)
     )
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}
@@ -184,32 +178,6 @@ def _shared(tree: xr.DataTree) -> dict[int, str]:
     for m in np.flatnonzero(off.max(0, initial=0.0) > SHARED):
         k = int(off[:, m].argmax())
         found[int(m)] = f"{group['direction'].values[k]} (information {information[k]:.2g})"
-    return found
-
-
-def _mirrored(fit: Fitted, tree: xr.DataTree) -> dict[int, str]:
-    """How far each bias is another one in an answer on the other side of a mirror that fits as well.
-
-    All of them where a target touches the mirror, since it may then go on at either side.
-    """
-    found = dict[int, str]()
-    if "mirror" not in tree.children:
-        return found
-    group = tree["mirror"].to_dataset()
-    alike = np.flatnonzero(group["gain"].values > -group.attrs["same"])
-    for k in alike:
-        away = group["apart"].values[k]
-        for m in np.flatnonzero(away > BEYOND):
-            found.setdefault(
-                int(m), f"it is {away[m]:.1f} sd away in an answer that fits as well: {group['mirror'].values[k]}"
-            )
-    if len(alike):
-        near, where = touched(
-            fit.problem, fit.point, [np.asarray(v) for v in fit.at.variances(jnp.asarray(fit.covariance))]
-        )
-        if near < BEYOND:
-            every = dict.fromkeys(range(fit.problem.model.biases), f"{where}, which hides on which side it goes on")
-            return every | found
     return found
 
 

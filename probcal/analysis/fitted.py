@@ -101,13 +101,13 @@ def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
     names = [[weight_name(problem, r, k) for k in range(len(p.tails))] for r, p in enumerate(problem.model.recursions)]
     return problem.with_mixing(
         tuple(
-            tuple(jnp.asarray(_saved(epochs, tracked, name, "process noise")) for name in own)
+            tuple(jnp.asarray(saved_by_epoch(epochs, tracked, name, "process noise")) for name in own)
             for epochs, own in zip(problem.epochs, names, strict=True)
         )
     )
 
 
-def _saved(epochs: Epochs, tracked: dict[str, xr.Dataset], name: str, what: str) -> np.ndarray:
+def saved_by_epoch(epochs: Epochs, tracked: dict[str, xr.Dataset], name: str, what: str) -> np.ndarray:
     """A variable of the tracks of a tree at the epochs of a recursion, (E, ...)."""
     parts = []
     for target in dict.fromkeys(np.asarray(epochs.target, str).tolist()):
@@ -121,7 +121,7 @@ def _saved(epochs: Epochs, tracked: dict[str, xr.Dataset], name: str, what: str)
 def point_of(problem: Problem, fit: xr.DataTree) -> Point:
     """Biases and levels of the tree, trajectories at their mode, searched from the saved ones."""
     tracked = dict(each_track(fit))
-    saved = [_saved(epochs, tracked, "mean", "targets") for epochs in problem.epochs]
+    saved = [saved_by_epoch(epochs, tracked, "mean", "targets") for epochs in problem.epochs]
     point = follow_states(problem, saved)
     if problem.levels:
         level = fit["level"].to_dataset()

@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.analysis import checks, predictive, residuals, verdict
+from probcal.analysis.beside import mirror_doubts, mirror_findings
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Judged, identified, point_of
 from probcal.analysis.widen import rejection, widened
@@ -59,6 +60,7 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
     turned = residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     findings += [Finding("wrapping", *pair) for pair in turned]
     groups["verdict"] = _verdicts(fit, tree, _inflation(fit, found))
+    findings += mirror_findings(tree)
     if tree.attrs["status"] in INVALID:
         text = (
             f"the fit ended {tree.attrs['status']}, which is no answer: what is left of the data says nothing of them"
@@ -163,7 +165,15 @@ def _verdicts(fit: JudgedLarge, tree: xr.DataTree, inflation: np.ndarray) -> xr.
     )  # fmt: skip
     shared = shared_in_blocks(problem, fit.point, fit.declared.members, fit.declared.covariance, SHARED)
     words, reasons = verdict.judge_biases(
-        problem, Status(tree.attrs["status"]), group["status"].values.tolist(), known, {}, {}, "", shared
+        problem,
+        Status(tree.attrs["status"]),
+        group["status"].values.tolist(),
+        known,
+        {},
+        {},
+        "",
+        shared,
+        mirror_doubts(fit, tree),
     )
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}

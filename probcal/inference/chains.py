@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from probcal.devices import over_devices
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.sides import Sided, shifted, side_of
@@ -101,5 +102,9 @@ def run_sided(method: Any, form: Form, sides: Posed, state: Sided, thin: jax.Arr
     return jax.lax.scan(one, state, None, length=method.chunk)
 
 
-run_sideds = jax.jit(jax.vmap(run_sided, in_axes=(None, None, None, 0, None)), static_argnums=(0, 1))
-run_chunks = jax.jit(jax.vmap(run_chunk, in_axes=(None, None, None, 0, None)), static_argnums=(0, 1))
+@partial(jax.jit, static_argnames=("run", "method", "form"))
+def run_together(
+    run: Callable[..., tuple[Any, Draw]], method: Any, form: Form, posed: Posed, states: Any, thin: jax.Array
+) -> tuple[Any, Draw]:
+    """All chains, leading dim (chains,), by `run_chunk` or `run_sided`, on all devices."""
+    return over_devices(jax.vmap(lambda state: run(method, form, posed, state, thin)), states)

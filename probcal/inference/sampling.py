@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.inference.chains import Draw, run_chunk, run_chunks, run_sided, run_sideds
+from probcal.inference.chains import Draw, run_chunk, run_sided, run_together
 from probcal.inference.hierarchy import SpikeAndSlab
 from probcal.inference.mixed import settled
 from probcal.inference.orbits import orbits_of
@@ -292,9 +292,9 @@ class _Run:
 
     def advance(self, state: Any, thin: int, pool: ThreadPoolExecutor) -> tuple[Any, Draw]:
         """All chains one chunk further, every `thin`-th step kept."""
-        alone, together = (run_sided, run_sideds) if self.mirrored else (run_chunk, run_chunks)
+        alone = run_sided if self.mirrored else run_chunk
         if not self.apart:
-            return together(self.method.kernel(), self.form, self.posed, state, jnp.asarray(thin))
+            return run_together(alone, self.method.kernel(), self.form, self.posed, state, jnp.asarray(thin))
 
         def one(k: int) -> tuple[Any, Draw]:
             with jax.enable_x64(True):

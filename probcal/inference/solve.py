@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ import numpy as np
 from probcal.errors import FitError, InputError
 from probcal.inference.methods import MAP
 from probcal.inference.run import Context, Maximiser, Method
-from probcal.inference.sparse import PRODUCTS, check_sparse, gains_by_sparse, sparse_climb, takes_sparse
+from probcal.inference.sparse import check_sparse, gains_by_sparse, sparse_climb, takes_sparse
 from probcal.inference.sparse_gibbs import check_gibbs
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
@@ -86,18 +86,15 @@ def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point
 
     A sampler starts on the side that fits best, and its answer tells of the others.
     """
-    if getattr(method, "form", "") == PRODUCTS:  # no factor, and no evidence that is good enough
-        return method.answer(problem, prior, start, context)
-    climb = sparse_climb(problem)
     if method.climbs:
         found = method.answer(problem, prior, start, context)
-        if getattr(found.method, "form", "") == PRODUCTS:  # memory held no factor
-            return found
+        used = cast("Method", found.method)  # "matrix-free" where memory held no factor
         try:
-            return _beside_mirrors(found, method, context, climb)
+            return _beside_mirrors(found, used, context, sparse_climb(problem, getattr(used, "form", "")))
         except MemoryError:
             unseen = "Memory did not hold what looking at the other side of a mirror takes."
             return replace(found, message=f"{found.message} {unseen}".strip())
+    climb = sparse_climb(problem, "sparse")
     try:
         sides = other_sides(problem, climb.mode(start)[0], climb)
     except MemoryError:  # which the method says

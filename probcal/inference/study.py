@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from probcal.devices import over_devices
 from probcal.errors import InputError, nearest
 from probcal.inference.ending import conclude
 from probcal.inference.fits import Fits, open_fits
@@ -90,9 +91,9 @@ _alone = partial(jax.jit, static_argnums=(0, 1, 2))(_climb)
 def _together(
     method: Any, prior: Prior, how: Integration | None, iterations: int, models: Model, givens: Given, starts: Point
 ) -> _Solved:
-    """Run a method on many problems of one form, stacked."""
-    climb = partial(_climb, method, prior, how, iterations)
-    return jax.vmap(climb)(models, givens, starts)
+    """Run a method on many problems of one form, stacked, on all devices."""
+    climb = jax.vmap(partial(_climb, method, prior, how, iterations))
+    return over_devices(climb, models, givens, starts)
 
 
 def _solve(

@@ -1,0 +1,46 @@
+"""Answers beside the one reported, on the other side of a mirror: what they say of a fit, and of each bias."""
+
+import numpy as np
+import xarray as xr
+
+from probcal.analysis.findings import Finding
+from probcal.analysis.fitted import Judged, saved_by_epoch
+from probcal.results.read import each_track
+from probcal.smoothing.mirrors import touched
+
+BEYOND = 2.0  # sd that an answer as good may be away
+
+
+def mirror_findings(tree: xr.DataTree) -> list[Finding]:
+    """One for each answer that fits about as well."""
+    if "mirror" not in tree.children:
+        return []
+    group = tree["mirror"].to_dataset()
+    pairs = zip(group["mirror"].values, group["gain"].values, strict=True)
+    return [Finding("mirror", "fit", f"{name}: an answer {abs(gain):.1f} nats apart") for name, gain in pairs]
+
+
+def mirror_doubts(fit: Judged, tree: xr.DataTree) -> dict[int, str]:
+    """How far each bias is another one in an answer on the other side of a mirror that fits as well.
+
+    All of them where a target touches the mirror, since it may then go on at either side.
+    """
+    found = dict[int, str]()
+    if "mirror" not in tree.children:
+        return found
+    group = tree["mirror"].to_dataset()
+    alike = np.flatnonzero(group["gain"].values > -group.attrs["same"])
+    for k in alike:
+        away = group["apart"].values[k]
+        for m in np.flatnonzero(away > BEYOND):
+            found.setdefault(
+                int(m), f"it is {away[m]:.1f} sd away in an answer that fits as well: {group['mirror'].values[k]}"
+            )
+    if len(alike):
+        tracked = dict(each_track(tree))
+        variances = [saved_by_epoch(epochs, tracked, "sd", "targets") ** 2 for epochs in fit.problem.epochs]
+        near, where = touched(fit.problem, fit.point, variances)
+        if near < BEYOND:
+            every = dict.fromkeys(range(fit.problem.model.biases), f"{where}, which hides on which side it goes on")
+            return every | found
+    return found
