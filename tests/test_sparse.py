@@ -572,7 +572,7 @@ def test_a_fit_of_many_data_keeps_what_a_mail_holds(monkeypatch, tmp_path):
     """Above `LARGE` data: the log-likelihood in sum, residuals and tracks to a small part of noise and sd."""
     problem = worlds.small()
     small = pc.fit(problem, pc.MAP(), prior=pc.Gaussian())
-    monkeypatch.setattr(sys.modules["probcal.results.build"], "LARGE", 3)
+    monkeypatch.setattr("probcal.smoothing.draws.LARGE", 3)
     large = pc.fit(problem, pc.MAP(), prior=pc.Gaussian())
     assert "log_likelihood" not in large.children
     sums = small["log_likelihood"]["y"].sum("datum").values

@@ -259,6 +259,9 @@ def _watched(answer: Answer) -> Answer:
             for name, far in strained_starts(problem, point)
         ]
     found += [_mirrored(answer, other) for other in answer.mirrors]
+    if any(other.gain > -SAME for other in answer.mirrors):
+        word, side = "line" if problem.network.dimension == 2 else "plane", "declare on which side a target starts"
+        found.append(f"Survey a position off that {word}, or {side}, Target(motion, start={{...}}).")
     return replace(answer, status=status, message=" ".join(found))
 
 
@@ -273,11 +276,7 @@ def _mirrored(answer: Answer, other: Mirrored) -> str:
     )
     if other.gain <= -SAME:
         return f"Another answer fits {-other.gain:.1f} nats worse only: {where}."
-    word = "line" if problem.network.dimension == 2 else "plane"
-    return (
-        f"Another answer fits as well ({abs(other.gain):.1f} nats apart): {where}. Survey a position off that {word},"
-        " or declare on which side a target starts, Target(motion, start={...})."
-    )
+    return f"Another answer fits as well ({abs(other.gain):.1f} nats apart): {where}."
 
 
 def _check_store(method: Method, store: str | PathLike[str] | None, resume: bool, overwrite: bool) -> None:

@@ -17,7 +17,7 @@ from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.grid import follow_states, grid_start
-from probcal.smoothing.mirrors import NEAR, SAME, Mirrored, SideClimb, Sides, other_sides
+from probcal.smoothing.mirrors import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, distance, other_sides
 from probcal.smoothing.mode import Point
 from probcal.smoothing.room import check_room
 from probcal.starts import further_starts
@@ -151,27 +151,59 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
         return found if found.method == answer.method else None
 
     sides = other_sides(answer.problem, answer.posterior.point, climb)
-    found = answer
+    found, rest, again = answer, sides.others, None
     if sides.moved:
         name = sides.others[0].name if sides.others else "pieces of tracks on their other side"
         again = answered(sides.point)
         if again is None:
             unseen = f"Under the declared scales another place fits better ({name}), from which no fit came."
             return replace(answer, message=f"{answer.message} {unseen}".strip())
-        gain = again.objective - answer.objective
-        if not (again.status.valid and gain > 0):  # better under the declared scales, not under the prior
-            shift = np.asarray(sides.point.z) - answer.posterior.summary.mean
-            near = again.status.valid and gain > -NEAR
-            return replace(answer, mirrors=(Mirrored(name, gain, sides.point, shift),) if near else ())
-        found = replace(again, motion=answer.motion, optima=answer.optima, best=answer.best)
-    others = []
-    for other in sides.others:
-        own = answered(other.point) if other.gain > -SAME else None  # as good as the first: an answer of its own
-        if own is not None and own.posterior.sound:
-            shift = own.posterior.summary.mean - found.posterior.summary.mean
-            other = other._replace(point=own.posterior.point, shift=shift)
-        others.append(other)
-    return replace(found, mirrors=tuple(others))
+        if not again.status.valid:
+            return answer
+        if again.objective > answer.objective:
+            found = _in_place_of(answer, again)
+        else:  # better under the declared scales, not under the prior
+            rest = _seen_from(answer, sides, name, again.objective - answer.objective)
+    others: list[tuple[Mirrored, Answer | None]] = []
+    for other in rest:
+        own = again if other.point is sides.point else answered(other.point) if other.gain > -SAME else None
+        own = own if own is not None and own.status.valid and own.posterior.sound else None
+        others.append((other if own is None else _beside(found, own, other.name), own))
+    best = max((own for _, own in others if own is not None), key=lambda own: own.objective, default=found)
+    if best.objective > found.objective + MORE:
+        name = next(other.name for other, own in others if own is best)
+        gain, shift = best.objective - found.objective, best.posterior.summary.mean - found.posterior.summary.mean
+        kept = [
+            other._replace(gain=other.gain - gain, shift=other.shift - shift)
+            for other, own in others
+            if own is not best
+        ]
+        found, mirrors = _in_place_of(answer, best), [_beside(best, found, name), *kept]
+    else:
+        mirrors = [other for other, _ in others]
+    mirrors = sorted((other for other in mirrors if other.gain > -NEAR), key=lambda other: -other.gain)
+    return replace(found, mirrors=tuple(mirrors))
+
+
+def _in_place_of(answer: Answer, other: Answer) -> Answer:
+    """Another answer, with what is known of the search from several starts."""
+    return replace(other, motion=answer.motion, optima=answer.optima, best=answer.best)
+
+
+def _beside(answer: Answer, other: Answer, name: str) -> Mirrored:
+    """Another answer of the same method, as seen from one."""
+    shift = other.posterior.summary.mean - answer.posterior.summary.mean
+    return Mirrored(name, other.objective - answer.objective, other.posterior.point, shift)
+
+
+def _seen_from(answer: Answer, sides: Sides, name: str, gain: float) -> tuple[Mirrored, ...]:
+    """The best side, of that gain, and those beside it, less the one at which the answer stands, as seen from there."""
+    mean = answer.posterior.summary.mean
+    every = [Mirrored(name, 0.0, sides.point, np.zeros_like(mean)), *sides.others]
+    away = [distance(answer.problem, answer.posterior.point, other.point) for other in every if sides.others]
+    nearest = int(np.argmin(away)) if away else 0
+    here = every.pop(nearest).gain if nearest else -gain
+    return tuple(o._replace(gain=o.gain - here, shift=np.asarray(o.point.z) - mean) for o in every)
 
 
 def _beside_optima(answer: Answer, others: Sequence[Answer]) -> tuple[Mirrored, ...]:

@@ -58,6 +58,10 @@ class Rows(NamedTuple):
     level: jax.Array  # (N, C) which unknown level multiplies std, H where known
 
 
+BY_ROW = ("epoch", "sensor", "pose", "y", "mask", "std", "level")  # arrays of `Rows` that have an entry a row
+AT_ONCE = 100_000  # rows that are looked at together: what lies between two results of a row takes no room for others
+
+
 class Linearised(NamedTuple):
     """Derivatives of a block at one point; masked data have weight, score and information zero."""
 
@@ -149,6 +153,32 @@ def pose_vector(node: Node, extras: tuple[str, ...], time: np.ndarray) -> np.nda
     return np.concatenate(columns, 1).astype(float)
 
 
+def by_parts(look: Callable[..., Any], rows: Rows, *more: jax.Array) -> Any:
+    """`look(rows, *more)`, what it gives of each row (N, ...), some rows at a time where there are many.
+
+    `more` has an entry a row as well. Going backwards through it makes each part again, and keeps nothing of it.
+    """
+    whole = {name: getattr(rows, name) for name in BY_ROW}, more
+    count = rows.y.shape[0]
+    if count <= 2 * AT_ONCE:
+        return look(rows, *more)
+    parts = -(-count // AT_ONCE)
+    size = -(-count // parts)
+    starts = np.minimum(np.arange(parts) * size, count - size)  # the last one begins within the one before it
+    joined = (parts - 1) * size
+
+    @jax.checkpoint
+    def one(start: jax.Array) -> Any:
+        own, others = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, size), whole)
+        return look(rows._replace(**own), *others)
+
+    def together(leaf: jax.Array) -> jax.Array:
+        first = leaf[:-1].reshape(joined, *leaf.shape[2:])
+        return jnp.concatenate([first, leaf[-1, joined - count :]])
+
+    return jax.tree.map(together, jax.lax.map(one, jnp.asarray(starts)))
+
+
 def read_biases(block: Block, rows: Rows, z: jax.Array) -> jax.Array:
     """Biases of each row, in their units, shape (N, p)."""
     padded = jnp.concatenate([z, jnp.zeros(1, z.dtype)])
@@ -208,7 +238,7 @@ def look(block: Block, rows: Rows, states: jax.Array, z: jax.Array, seen: Callab
 @partial(jax.jit, static_argnames="block")
 def predict(block: Block, rows: Rows, states: jax.Array, z: jax.Array) -> jax.Array:
     """Predicted values (N, C) from the states of all epochs (E, n) and the biases z (M,)."""
-    return predict_local(block, rows, states[rows.epoch], read_biases(block, rows, z))
+    return by_parts(lambda own: predict_local(block, own, states[own.epoch], read_biases(block, own, z)), rows)
 
 
 def predict_local(block: Block, rows: Rows, states: jax.Array, biases: jax.Array) -> jax.Array:
@@ -240,7 +270,11 @@ def innovation(block: Block, rows: Rows, predicted: jax.Array) -> jax.Array:
 @partial(jax.jit, static_argnames="block")
 def log_likelihood(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
     """Log density of every datum, zero where missing, shape (N, C)."""
-    return rows.mask * _by_channel(block, "log_likelihood", rows.y, predicted, noise_std(rows, levels))
+
+    def look(own: Rows, values: jax.Array) -> jax.Array:
+        return own.mask * _by_channel(block, "log_likelihood", own.y, values, noise_std(own, levels))
+
+    return by_parts(look, rows, predicted)
 
 
 def level_score(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
@@ -274,6 +308,13 @@ def linearise(
     block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: bool
 ) -> Linearised:
     """Score, weight and Jacobians at one point; `expected` takes the information instead of the step weight."""
+    return by_parts(lambda own: _linearised(block, own, states, z, levels, expected=expected), rows)
+
+
+def _linearised(
+    block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: bool
+) -> Linearised:
+    """What `linearise` gives of some rows."""
     local = read_biases(block, rows, z)
     reached = states[rows.epoch]
 

@@ -9,9 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.model.model import Model
-from probcal.model.rows import Rows
-
-BY_ROW = ("epoch", "sensor", "pose", "y", "mask", "std", "level")  # arrays of `Rows` that have an entry a row
+from probcal.model.rows import BY_ROW, Rows
 
 
 def part(model: Model, r: int) -> Model:

@@ -11,8 +11,7 @@ import numpy as np
 
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
-
-BY_ROW = ("epoch", "sensor", "pose", "y", "mask", "std", "level")
+from probcal.model.rows import BY_ROW
 
 
 class Targets(NamedTuple):

@@ -51,7 +51,7 @@ class Draws(NamedTuple):
     levels: np.ndarray  # (chain, draw, H)
     states: Sequence[np.ndarray]  # (chain, draw, E, n) of each recursion
     kept: np.ndarray  # (kept,) which draws of each chain have values by datum
-    log_likelihood: Sequence[np.ndarray]  # (chain, kept, N, C) of each block
+    log_likelihood: Sequence[np.ndarray]  # (chain, kept, N, C) of each block, (chain, kept, 1, 1) of many data
     replicas: Sequence[np.ndarray]  # (chain, kept, N, C) of each block
 
 

@@ -25,7 +25,7 @@ from probcal.results.groups import (
     track_groups,
 )
 from probcal.results.schema import BOUND, EVIDENCE, INTERVAL, RESULTS_VERSION
-from probcal.smoothing.draws import residuals
+from probcal.smoothing.draws import many_data, residuals
 from probcal.smoothing.mirrors import SAME
 from probcal.smoothing.mode import Point
 
@@ -39,7 +39,6 @@ else:
 SHARP = 256  # steps to which the spread of a log-likelihood over the draws is rounded, so that its file is small
 AT_ONCE = 10_000  # data that are rounded at once
 COARSE = 64  # the same of residuals by noise and of tracks by their sd, in the file of a large fit
-LARGE = 500_000  # data above which a file holds no log-likelihood by datum, and nothing finer than noise or sd tell
 SAMPLE = ("chain", "draw")
 
 
@@ -53,7 +52,7 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
     draws = posterior.draws(key, keep)
     before = posterior.before
     tracks = bands(posterior.tracks(), before)
-    large = sum(int(mask.sum()) for mask in problem.model.measured) > LARGE
+    large = many_data(problem.model)  # no log-likelihood by datum, and nothing finer than noise or sd tell
     tracks = [_coarse(own) for own in tracks] if large else tracks
     groups = {
         "posterior": _posterior_group(answer, draws),

@@ -16,14 +16,20 @@ PASS = 200  # draws that are made at once
 VALUES = 4_000_000  # of all states that are drawn at once, at most
 LEAST, MOST = 10, 250  # draws of a chain
 DATA = 10_000_000  # values by datum and draw up to which every chain has the most draws
+LARGE = 500_000  # data above which only the sum of their log-likelihoods is kept of a draw
 
 
 class JointDraws(NamedTuple):
     """Draws of trajectories and of what hangs on them; empty where it was not asked for."""
 
     states: tuple[jax.Array, ...]  # (D, E, n) of each recursion
-    log_likelihood: Data  # (D, N, C) of each block
+    log_likelihood: Data  # (D, N, C) of each block, (D, 1, 1) in sum where data are many (`many_data`)
     replicas: Data  # (D, N, C) of each block
+
+
+def many_data(model: Model) -> bool:
+    """Whether data are too many for a value of each and of each draw to be kept."""
+    return sum(int(mask.sum()) for mask in model.measured) > LARGE
 
 
 def draws_a_chain(data: int, chains: int) -> int:
@@ -50,7 +56,7 @@ def draw(
     count = z.shape[0]
     size = max(1, min(PASS, count, VALUES // at.model.state_size))
     biases, log_levels = np.asarray(z), np.broadcast_to(np.asarray(levels), (count, at.point.levels.shape[0]))
-    passes = []
+    passes, large = [], many_data(at.model)
     for k, start in enumerate(range(0, count, size)):
         chosen = np.minimum(np.arange(start, start + size), count - 1)  # the last pass is filled with its last draw
         seeds = jax.random.split(jax.random.fold_in(key, k))
@@ -58,7 +64,8 @@ def draw(
         states = at.draw(mine, seeds[0])
         by_datum: tuple[Data, Data] = ((), ())
         if {"log_likelihood", "replicas"} & set(keep):
-            by_datum = predictive(at.model, log_levels[chosen], mine, states, seeds[1], keep)
+            told, again = predictive(at.model, log_levels[chosen], mine, states, seeds[1], keep)
+            by_datum = tuple(part.sum((1, 2), keepdims=True) for part in told) if large else told, again
         kept = JointDraws(states if "states" in keep else (), *by_datum)
         passes.append(jax.tree.map(lambda leaf, most=count - start: np.asarray(leaf)[:most], kept))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *passes)

@@ -145,7 +145,7 @@ def _seen(
     levels = jnp.zeros(model.level_spread.shape)
     some: list[Rows] = []
     for data, (first, _) in zip(mine.rows, alike, strict=True):
-        chosen: dict[str, Any] = {name: getattr(data, name)[first] for name in variants.BY_ROW}
+        chosen: dict[str, Any] = {name: getattr(data, name)[first] for name in waist.BY_ROW}
         some.append(data._replace(**chosen | {"epoch": jnp.zeros_like(first)}))
     stds = [waist.noise_std(data, levels) for data in mine.rows]
 

@@ -28,9 +28,11 @@ WORSE = 0.4  # nats a datum by which a reflected place may fit worse and is stil
 FAR = 6.0  # scales beyond which a node is not reflected
 APART = 0.1  # share of a reflection that must be left after polishing: below, it came back
 TRIED, BREAKS, ROUNDS = 8, 30, 5  # pieces of tracks that are polished, places where one may be cut, and rounds of it
+LOOKED = 3 * TRIED  # pieces that are smoothed: those that come back by themselves are not polished
+ALIKE = 0.7  # share of common epochs from which pieces, cut by different planes, are one
 SHORTEST = 3  # epochs of a piece: fewer do not stay on another side than their neighbours
 STRAIN = 20.0  # sum of squares of a process noise from which a track may be cut there
-GAIN = 1.0  # nats from which a piece belongs on the other side
+GAIN, MORE = 1.0, 0.1  # nats from which a piece belongs on the other side, and from which a scene does
 SAME, NEAR = 3.0, 10.0  # nats within which another answer is as good, and within which it is mentioned
 MOST = 4  # answers that are kept
 WINDOWS, HEARD = 60, 4  # parts of a track in which nodes may be heard alone, and sets of such nodes that are looked at
@@ -89,8 +91,22 @@ class Sides(NamedTuple):
 
 @float64
 def other_sides(problem: Problem, point: Point, climb: SideClimb | None = None) -> Sides:
-    """Search the other sides of a point: pieces of tracks first, then all of the scene, polished and compared."""
-    climb = SideClimb.dense(problem) if climb is None else climb
+    """Search the other sides of a point: pieces of tracks first, then all of the scene, polished and compared.
+
+    Where a scene fits better on another side its pieces are looked at again from there.
+    """
+    climb, moved = SideClimb.dense(problem) if climb is None else climb, False
+    for _ in range(ROUNDS):
+        sides, gain = _searched(problem, point, climb)
+        moved = moved or sides.moved
+        if gain <= MORE:
+            break
+        point = sides.point
+    return sides._replace(moved=moved)
+
+
+def _searched(problem: Problem, point: Point, climb: SideClimb) -> tuple[Sides, float]:
+    """One search from a point, and by how much the best scene fits better than the place with its pieces turned."""
     point, turned, pieces = _turned(problem, point, climb)
     best: tuple[Point, float] | None = None
     found: list[Mirrored] = []
@@ -105,13 +121,13 @@ def other_sides(problem: Problem, point: Point, climb: SideClimb | None = None) 
         if np.isfinite(worth).all() and worth[0] - worth[1] > -NEAR:
             found.append(Mirrored(name, worth[0] - worth[1], polished[0], np.asarray(polished[0].z - best[0].z)))
     found.sort(key=lambda other: -other.gain)
-    if found and best is not None and found[0].gain > 0.1:
+    if found and best is not None and found[0].gain > MORE:
         first = found[0]
         rest = [o._replace(gain=o.gain - first.gain, shift=o.shift - first.shift) for o in found[1:]]
         back = Mirrored(first.name, -first.gain, best[0], -first.shift)
         kept = [other for other in (back, *rest) if other.gain > -NEAR]
-        return Sides(first.point, True, tuple(kept[:MOST]))
-    return Sides(point, turned, tuple(found[:MOST]))
+        return Sides(first.point, True, tuple(kept[:MOST])), first.gain
+    return Sides(point, turned, tuple(found[:MOST])), 0.0
 
 
 def planes(problem: Problem, z: np.ndarray) -> list[Plane]:
@@ -310,13 +326,15 @@ def _turned(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, bo
     for _ in range(ROUNDS):
         if not again:
             break
-        again, others = False, []
+        again, others, climbs = False, [], 0
         for name, candidate in _cut(problem, point):
             best = climb.mode(point) if best is None else best
             smoothed = track_mode(problem, candidate)
             if not new(problem, smoothed, [best[0]], distance(problem, candidate, best[0])):
                 continue  # it came back by itself
-            tried = climb.mode(smoothed)
+            if climbs == TRIED:
+                break
+            tried, climbs = climb.mode(smoothed), climbs + 1
             if tried[1] > best[1] + GAIN:
                 point, best, turned, again = tried[0], tried, True, True
             elif tried[1] > best[1] - NEAR:
@@ -329,10 +347,32 @@ def _turned(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, bo
     return point, turned, others
 
 
+class _Piece(NamedTuple):
+    """A piece of a track, and how much worse a datum of it fits on the other side, unpolished."""
+
+    worse: float
+    recursion: int
+    target: str
+    own: np.ndarray  # its epochs
+    plane: Plane
+
+    def alike(self, other: "_Piece") -> bool:
+        """Whether it is the same piece, reflected in whatever plane."""
+        if (self.recursion, self.target) != (other.recursion, other.target):
+            return False
+        both = len(np.intersect1d(self.own, other.own, assume_unique=True))
+        return both >= ALIKE * (len(self.own) + len(other.own) - both)
+
+
 def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
-    """Pieces of tracks on the other side, those first that fit best there unpolished: names, and the points."""
+    """Pieces of tracks on the other side, those first whose data fit best there unpolished: names, and the points.
+
+    Of pieces that differ by where their planes cut them there is one. A long piece does not go before a short one:
+    what is left over when a track goes over from one side to the other is short as often.
+    """
     z, movable, counts = np.asarray(point.z), _movable(problem), _counts(problem)
-    pieces, found = [], planes(problem, z)
+    found = planes(problem, z)
+    pieces = list[_Piece]()
     here = _losses(problem, z, point, None) if found else []
     for plane in found:
         there = _losses(problem, z, point, plane)
@@ -341,10 +381,14 @@ def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
             for target in dict.fromkeys(epochs.target):
                 mine = np.flatnonzero((epochs.target == target) & movable[r])
                 for own in _pieces(problem, point, plane, r, mine):
-                    gain = float(WORSE * counts[r][own].sum() - worse[own].sum())
-                    if gain > 0 and len(own) >= SHORTEST and counts[r][own].any():
-                        pieces.append((gain, r, own, plane, target))
-    for _, r, own, plane, target in sorted(pieces, key=lambda piece: -piece[0])[:TRIED]:
+                    count = float(counts[r][own].sum())
+                    if len(own) >= SHORTEST and count > 0 and worse[own].sum() < WORSE * count:
+                        pieces.append(_Piece(float(worse[own].sum()) / count, r, target, own, plane))
+    kept = list[_Piece]()
+    for piece in sorted(pieces, key=lambda piece: piece.worse):
+        if len(kept) < LOOKED and not any(piece.alike(other) for other in kept):
+            kept.append(piece)
+    for _, r, target, own, plane in kept:
         chosen = [np.zeros(len(epochs.time), bool) for epochs in problem.epochs]
         chosen[r][own] = True
         first, last = problem.epochs[r].time[own[[0, -1]]]
