@@ -92,7 +92,7 @@ PARTS = (
     ),
     Part(
         "Accuracy over the real recordings",
-        ("benchmarks/accuracy.py",),
+        ("benchmarks/accuracy.py", "--limit", "150"),
         ("benchmarks/accuracy.py", "--only", "plaza", "beacons", "--methods", "uncalibrated", "GTSAM, Huber", "EA"),
         limit=5400,
         said=(

@@ -12,7 +12,19 @@ from probcal.inference.methods import METHODS as BY_NAME
 
 ROOT = Path(probcal.__file__).parent
 FLOORS = {
-    0: ("linalg", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files", "status"),
+    0: (
+        "linalg",
+        "devices",
+        "geometry",
+        "types",
+        "errors",
+        "labels",
+        "lazy",
+        "kernels",
+        "fingerprint",
+        "files",
+        "status",
+    ),
     1: ("sensor", "motion", "priors", "noise", "detection"),
     2: ("sensors",),
     3: ("geodesy", "network", "table", "nodes", "plausible", "roads"),
