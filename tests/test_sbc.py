@@ -9,6 +9,7 @@ import os
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -56,7 +57,7 @@ from probcal.inference.nuts import NUTS
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Form
 from probcal.inference.prior_draws import draw_prior
-from probcal.inference.sbc import sbc, short
+from probcal.inference.sbc import _check_quantities, sbc, short
 from probcal.plots.sbc import draw_sbc, plot_ranks
 from probcal.priors import BernoulliGaussian
 
@@ -458,6 +459,15 @@ def test_runs_are_resumed(tmp_path):
     fresh = sbc(problem, method, prior=Gaussian(), runs=3, store=tmp_path, key=1, overwrite=True)
     assert sorted(os.listdir(tmp_path)) == ["probcal-run.json", "runs-000000.npz", "runs-000001.npz"]
     assert not np.allclose(fresh["sbc"]["truth"], whole["sbc"]["truth"][:3])
+
+
+def test_runs_that_rank_other_quantities_are_not_counted_together():
+    """Those of an earlier version, kept in a folder; a run that failed ranks none."""
+    kept = SimpleNamespace(storage=SimpleNamespace(path="old"), records={0: {"quantity": np.array(["z", "gamma"])}})
+    alike = [{"failed": np.array("diverged")}, {"quantity": np.array(["z", "gamma"])}]
+    _check_quantities(kept, alike)
+    with pytest.raises(InputError, match=r"old: an earlier version .* ranked other quantities .* \(log joint\)"):
+        _check_quantities(kept, [{"quantity": np.array(["z", "gamma", "log joint"])}])
 
 
 def test_a_run_without_posterior_is_counted_apart(monkeypatch):

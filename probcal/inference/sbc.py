@@ -9,6 +9,7 @@ target whose start is not declared would pass many network sizes away.
 
 import os
 import time
+from collections.abc import Sequence
 from contextlib import closing
 from copy import copy
 from dataclasses import replace
@@ -120,6 +121,7 @@ def _runs(
     try:
         with closing(spread(engine.several, batches, scheduler=scheduler, threads=threads)) as finished:
             for k, records in finished:
+                _check_quantities(box, records)
                 box.add(batches[k], records)
                 if progress is not None:
                     progress(Progress("runs", sum(k in box.records for k in range(runs)), runs))
@@ -128,6 +130,17 @@ def _runs(
         if len(box.records) < 2:
             raise
     return box.records, interrupted
+
+
+def _check_quantities(box: Records, made: Sequence[dict[str, np.ndarray]]) -> None:
+    """Raise `InputError` where runs that are kept rank other quantities than those made now."""
+    named = [record["quantity"].tolist() for record in (*box.records.values(), *made) if "quantity" in record]
+    if any(names != named[0] for names in named):
+        other = sorted(set(named[0]) ^ set(named[-1]))
+        raise InputError(
+            f"{box.storage.path}: an earlier version of probcal ranked other quantities in the runs kept there"
+            f" ({', '.join(other)}): give another folder, or --overwrite (overwrite=True)"
+        )
 
 
 def short(method: Method) -> Method:
