@@ -15,7 +15,7 @@ def over_devices(batched: Callable[..., Any], *batches: Any) -> Any:
     the number of devices the last entry is computed again, and dropped. With one device this is a plain call. What
     `batched` closes over is copied to every device.
     """
-    count = len(jax.devices())
+    count = jax.local_device_count()
     size = jax.tree.leaves(batches)[0].shape[0]
     if count == 1 or size == 1:
         return batched(*batches)
@@ -24,7 +24,7 @@ def over_devices(batched: Callable[..., Any], *batches: Any) -> Any:
     def padded(leaf: Any) -> jax.Array:
         return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], missing, axis=0)]) if missing else jnp.asarray(leaf)
 
-    mesh = jax.make_mesh((count,), ("batch",), axis_types=(jax.sharding.AxisType.Auto,))
+    mesh = jax.make_mesh((count,), ("batch",), axis_types=(jax.sharding.AxisType.Auto,), devices=jax.local_devices())
     each = PartitionSpec("batch")
     spread = jax.shard_map(batched, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)
     return jax.tree.map(lambda leaf: leaf[:size], spread(*jax.tree.map(padded, batches)))

@@ -202,26 +202,6 @@ def test_an_answer_outlives_the_memory_that_its_other_side_takes():
     assert "mirror" not in tree.children
 
 
-def fails(*_):
-    raise probcal.FitError("nothing there")
-
-
-def test_an_answer_stands_where_no_fit_comes_from_a_better_place(monkeypatch):
-    there = SimpleNamespace(z=jnp.ones(1))
-    monkeypatch.setattr(solve, "other_sides", lambda *_: Sides(there, True, ()))
-    found = solve._beside_mirrors(Stub(100.0), SimpleNamespace(answer=fails), None)
-    assert found.objective == 100.0
-    assert found.mirrors == ()
-    assert "another place fits better (pieces of tracks on their other side), from which no fit came" in found.message
-
-
-def test_a_further_answer_that_no_fit_confirms_is_kept_as_it_was_found(monkeypatch):
-    other = Mirrored("the targets", -0.5, SimpleNamespace(z=jnp.ones(1)), np.ones(1))
-    monkeypatch.setattr(solve, "other_sides", lambda *_: Sides(SimpleNamespace(z=jnp.zeros(1)), False, (other,)))
-    found = solve._beside_mirrors(Stub(100.0), SimpleNamespace(answer=fails), None)
-    assert found.mirrors == (other,)
-
-
 @pytest.mark.ci
 def test_nodes_that_span_the_plane_have_no_mirror_in_sparse_form():
     problem, _ = networks.setting(1, "beacons")
@@ -344,20 +324,93 @@ def test_chains_visit_both_sides_by_their_weights(method):
 
 @dataclass(frozen=True)
 class Stub:
-    """As much of an answer as a comparison of sides reads."""
+    """As much of an answer as a comparison of sides reads; it stands at a number."""
 
+    at: float
     objective: float
-    mirrors: tuple = ()
     status: Status = Status.CONVERGED
+    mirrors: tuple = ()
     message: str = ""
-    problem = prior = method = None
-    posterior = SimpleNamespace(sound=True, point=None, summary=SimpleNamespace(mean=np.zeros(1)))
+    motion: str = "used"
+    optima: tuple = ()
+    best: int = 0
+    trace: tuple = (0.0,)
+    problem = prior = None
+    method: object = None
+
+    @property
+    def posterior(self):
+        mean = np.full(1, self.at)
+        return SimpleNamespace(sound=True, point=SimpleNamespace(z=mean), summary=SimpleNamespace(mean=mean))
 
 
-@pytest.mark.parametrize(("lost", "mentioned"), [(5.0, [-5.0]), (20.0, [])])
+def beside_others(monkeypatch, sides, ends, method=None):
+    """What is made of sides (name, place, gain; the best first, where one is better) if fits from places end so."""
+    others = tuple(Mirrored(name, gain, SimpleNamespace(z=np.full(1, at)), np.zeros(1)) for name, at, gain in sides[1])
+    found = Sides(SimpleNamespace(z=np.zeros(1)), False, others)
+    if sides[0]:
+        name, at, gain = sides[0]
+        found = Sides(SimpleNamespace(z=np.full(1, at)), True, others, name, gain)
+    monkeypatch.setattr(solve, "other_sides", lambda *_: found)
+    monkeypatch.setattr(solve, "distance", lambda _, a, b: float(abs(a.z - b.z)[0]))
+    monkeypatch.setattr(
+        solve, "new", lambda _, point, known, size: all(abs(point.z - o.z)[0] > 0.1 * size for o in known)
+    )
+
+    def answer(problem, prior, point, context):
+        end = ends[float(point.z[0])]
+        if end is None:
+            raise probcal.FitError("nothing there")
+        return end
+
+    first = Stub(0.0, 100.0, method=method)
+    return solve._beside_mirrors(first, SimpleNamespace(answer=answer), None)
+
+
+def listed(found):
+    return [(other.name, round(other.gain, 6), float(other.shift[0])) for other in found.mirrors]
+
+
+@pytest.mark.parametrize(("lost", "mentioned"), [(5.0, [("across", -5.0, 4.0)]), (20.0, [])])
 def test_a_side_that_the_prior_likes_less_is_mentioned(monkeypatch, lost, mentioned):
-    there = SimpleNamespace(z=np.ones(1))
-    monkeypatch.setattr(solve, "other_sides", lambda *_: Sides(there, True, ()))
-    found = solve._beside_mirrors(Stub(100.0), SimpleNamespace(answer=lambda *_: Stub(100.0 - lost)), None)
-    assert found.objective == 100.0
-    assert [other.gain for other in found.mirrors] == mentioned
+    found = beside_others(monkeypatch, (("across", 4.0, 2.0), []), {4.0: Stub(4.0, 100.0 - lost)})
+    assert found.at == 0.0
+    assert listed(found) == mentioned
+
+
+def test_the_best_answer_of_the_method_is_taken_and_the_others_are_seen_from_it(monkeypatch):
+    """One beside the best side is the place of the answer itself; one comes back there; one is far below."""
+    others = [("back", 0.001, -2.0), ("scene", 9.0, 0.0), ("piece", 6.0, -1.0), ("far", 5.0, -5.5)]
+    ends = {
+        4.0: Stub(4.0, 101.0), 0.001: Stub(0.0, 100.0), 9.0: Stub(9.0, 104.0), 6.0: Stub(1e-5, 100.0),
+    }  # fmt: skip
+    found = beside_others(monkeypatch, (("across", 4.0, 2.0), others), ends)
+    assert found.at == 9.0
+    assert found.motion == "used"
+    assert listed(found) == [("across", -3.0, -5.0), ("scene", -4.0, -9.0), ("far", -7.5, -4.0)]
+
+
+def test_an_answer_that_did_not_converge_takes_no_ones_place(monkeypatch):
+    ends = {4.0: Stub(4.0, 103.0, Status.NOT_CONVERGED)}
+    found = beside_others(monkeypatch, (None, [("across", 4.0, 0.0)]), ends)
+    assert found.at == 0.0
+    assert listed(found) == [("across", 3.0, 4.0)]
+
+
+def test_sides_without_a_factor_are_compared_by_their_density(monkeypatch):
+    """The evidences differ by what their estimates are off."""
+    ends = {4.0: Stub(4.0, 97.0, method=probcal.MAP(form="matrix-free"))}
+    found = beside_others(monkeypatch, (None, [("across", 4.0, 0.0)]), ends, probcal.MAP(form="matrix-free"))
+    assert listed(found) == [("across", 0.0, 4.0)]
+
+
+def test_an_answer_stands_where_no_fit_comes_from_a_better_place(monkeypatch):
+    found = beside_others(monkeypatch, (("pieces of tracks", 4.0, 2.0), []), {4.0: None})
+    assert found.at == 0.0
+    assert found.mirrors == ()
+    assert "another place fits better (pieces of tracks), from which no fit came" in found.message
+
+
+def test_a_further_answer_that_no_fit_confirms_is_kept_as_it_was_found(monkeypatch):
+    found = beside_others(monkeypatch, (None, [("across", 4.0, -0.5)]), {4.0: None})
+    assert listed(found) == [("across", -0.5, 4.0)]

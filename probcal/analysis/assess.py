@@ -149,8 +149,20 @@ def _verdicts(
     ended = calibration["status"].values.tolist()
     status = Status(tree.attrs["status"])
     doubts = {} if bent is None else dict.fromkeys(range(M), "the answer is far from Gaussian, so its interval is none")
+
+    def around() -> list[np.ndarray]:  # draws of chains lie on both sides
+        return [np.asarray(variance) for variance in fit.at.variances(jnp.asarray(fit.covariance))]
+
     words, reasons = verdict.judge_biases(
-        problem, status, ended, known, drifts, disagreements, first, _shared(tree), doubts | mirror_doubts(fit, tree)
+        problem,
+        status,
+        ended,
+        known,
+        drifts,
+        disagreements,
+        first,
+        _shared(tree),
+        doubts | mirror_doubts(fit, tree, around),
     )
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}

@@ -1,5 +1,7 @@
 """Answers beside the one reported, on the other side of a mirror: what they say of a fit, and of each bias."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 import xarray as xr
 
@@ -20,10 +22,13 @@ def mirror_findings(tree: xr.DataTree) -> list[Finding]:
     return [Finding("mirror", "fit", f"{name}: an answer {abs(gain):.1f} nats apart") for name, gain in pairs]
 
 
-def mirror_doubts(fit: Judged, tree: xr.DataTree) -> dict[int, str]:
+def mirror_doubts(
+    fit: Judged, tree: xr.DataTree, variances: Callable[[], Sequence[np.ndarray]] | None = None
+) -> dict[int, str]:
     """How far each bias is another one in an answer on the other side of a mirror that fits as well.
 
-    All of them where a target touches the mirror, since it may then go on at either side.
+    All of them where a target touches the mirror, since it may then go on at either side. `variances` are those (E, n)
+    of the states of each recursion on this side of it, by default those of the saved tracks.
     """
     found = dict[int, str]()
     if "mirror" not in tree.children:
@@ -38,9 +43,17 @@ def mirror_doubts(fit: Judged, tree: xr.DataTree) -> dict[int, str]:
             )
     if len(alike):
         tracked = dict(each_track(tree))
-        variances = [saved_by_epoch(epochs, tracked, "sd", "targets") ** 2 for epochs in fit.problem.epochs]
-        near, where = touched(fit.problem, fit.point, variances)
+        own = (
+            variances() if variances else [saved_by_epoch(e, tracked, "sd", "targets") ** 2 for e in fit.problem.epochs]
+        )
+        near, where = touched(fit.problem, fit.point, own)
         if near < BEYOND:
             every = dict.fromkeys(range(fit.problem.model.biases), f"{where}, which hides on which side it goes on")
             return every | found
     return found
+
+
+def _saved(fit: Judged, tree: xr.DataTree) -> list[np.ndarray]:
+    """Variances (E, n) of the states of each recursion from the saved tracks."""
+    tracked = dict(each_track(tree))
+    return [saved_by_epoch(epochs, tracked, "sd", "targets") ** 2 for epochs in fit.problem.epochs]

@@ -24,7 +24,7 @@ from probcal.inference.progress import OnProgress
 from probcal.inference.rates import of_calibration
 from probcal.inference.run import Context, Method
 from probcal.inference.selfconfig import SelfConfiguration
-from probcal.inference.solve import solve
+from probcal.inference.solve import ELSEWHERE, solve
 from probcal.inference.sparse import SparsePosterior
 from probcal.inference.storage import Storage
 from probcal.inference.weighted import track_by_particles
@@ -259,7 +259,7 @@ def _watched(answer: Answer) -> Answer:
             for name, far in strained_starts(problem, point)
         ]
     found += [_mirrored(answer, other) for other in answer.mirrors]
-    if any(other.gain > -SAME for other in answer.mirrors):
+    if any(other.gain > -SAME and other.name != ELSEWHERE for other in answer.mirrors):
         word, side = "line" if problem.network.dimension == 2 else "plane", "declare on which side a target starts"
         found.append(f"Survey a position off that {word}, or {side}, Target(motion, start={{...}}).")
     return replace(answer, status=status, message=" ".join(found))

@@ -11,19 +11,20 @@ import numpy as np
 from probcal.errors import FitError, InputError
 from probcal.inference.methods import MAP
 from probcal.inference.run import Context, Maximiser, Method
-from probcal.inference.sparse import check_sparse, gains_by_sparse, sparse_climb, takes_sparse
+from probcal.inference.sparse import PRODUCTS, check_sparse, gains_by_sparse, sparse_climb, takes_sparse
 from probcal.inference.sparse_gibbs import check_gibbs
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.grid import follow_states, grid_start
-from probcal.smoothing.mirrors import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, distance, other_sides
+from probcal.smoothing.mirrors import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, distance, new, other_sides
 from probcal.smoothing.mode import Point
 from probcal.smoothing.room import check_room
 from probcal.starts import further_starts
 from probcal.starts import optima as optima_of
 from probcal.status import Status
 
+ELSEWHERE = "found from another start"
 TRIES = 3  # climbs by particles from one start
 DIFFERENT = 2.0  # sd by which an answer from another start must differ in some bias to be one of its own
 APART = 0.01  # scales that count as an sd where that is smaller
@@ -138,72 +139,61 @@ def _by_particles(
 
 
 def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: SideClimb | None = None) -> Answer:
-    """The answer on the side of a mirror that fits best, and those of other sides that fit about as well."""
+    """The answer on the side of a mirror that fits best, and those of other sides that fit about as well.
+
+    Sides are found under the declared scales. Those that fit about as well, or better, are fitted by the method, whose
+    own answers are compared; one that comes back to where another stands is none.
+    """
     if not (answer.status.valid and answer.posterior.sound):
         return answer
+    problem, here = answer.problem, answer.posterior.point
 
     def answered(point: Point) -> Answer | None:
-        """The answer from a point, if there is one in the form of the first."""
+        """The answer from a point, if there is a good one in the form of the first."""
         try:
-            found = method.answer(answer.problem, answer.prior, point, context)
+            found = method.answer(problem, answer.prior, point, context)
         except FitError:
             return None
-        return found if found.method == answer.method else None
+        return found if found.method == answer.method and found.status.valid and found.posterior.sound else None
 
-    sides = other_sides(answer.problem, answer.posterior.point, climb)
-    found, rest, again = answer, sides.others, None
-    if sides.moved:
-        name = sides.others[0].name if sides.others else "pieces of tracks on their other side"
-        again = answered(sides.point)
-        if again is None:
-            unseen = f"Under the declared scales another place fits better ({name}), from which no fit came."
-            return replace(answer, message=f"{answer.message} {unseen}".strip())
-        if not again.status.valid:
-            return answer
-        if again.objective > answer.objective:
-            found = _in_place_of(answer, again)
-        else:  # better under the declared scales, not under the prior
-            rest = _seen_from(answer, sides, name, again.objective - answer.objective)
-    others: list[tuple[Mirrored, Answer | None]] = []
-    for other in rest:
-        own = again if other.point is sides.point else answered(other.point) if other.gain > -SAME else None
-        own = own if own is not None and own.status.valid and own.posterior.sound else None
-        others.append((other if own is None else _beside(found, own, other.name), own))
-    best = max((own for _, own in others if own is not None), key=lambda own: own.objective, default=found)
-    if best.objective > found.objective + MORE:
-        name = next(other.name for other, own in others if own is best)
-        gain, shift = best.objective - found.objective, best.posterior.summary.mean - found.posterior.summary.mean
-        kept = [
-            other._replace(gain=other.gain - gain, shift=other.shift - shift)
-            for other, own in others
-            if own is not best
-        ]
-        found, mirrors = _in_place_of(answer, best), [_beside(best, found, name), *kept]
-    else:
-        mirrors = [other for other, _ in others]
+    sides = other_sides(problem, here, climb)
+    places = [Mirrored(sides.name, 0.0, sides.point, np.zeros(0))] if sides.moved else []
+    places = [other._replace(gain=other.gain + sides.gain) for other in (*places, *sides.others)]
+    found, unfitted, unseen = [("", answer)], list[Mirrored](), ""
+    for other in places:
+        own = answered(other.point) if other.gain > -SAME else None
+        if own is None:
+            if other.gain > MORE:
+                unseen = f"Under the declared scales another place fits better ({other.name}), from which no fit came."
+            else:
+                unfitted.append(other)
+            continue
+        size = distance(problem, other.point, here)
+        if new(problem, own.posterior.point, [one.posterior.point for _, one in found], size):
+            found.append((other.name, own))
+    first = _weight(answer)
+    better = [one for one in found[1:] if one[1].status.settled >= answer.status.settled]
+    name, best = max(better, key=lambda one: _weight(one[1]), default=found[0])
+    if _weight(best) <= first + MORE:
+        name, best = found[0]
+    gain, mean = _weight(best) - first, best.posterior.summary.mean
+    mirrors = [
+        Mirrored(own or name, _weight(one) - first - gain, one.posterior.point, one.posterior.summary.mean - mean)
+        for own, one in found
+        if one is not best
+    ]
+    mirrors += [o._replace(gain=o.gain - gain, shift=np.asarray(o.point.z) - mean) for o in unfitted]
     mirrors = sorted((other for other in mirrors if other.gain > -NEAR), key=lambda other: -other.gain)
-    return replace(found, mirrors=tuple(mirrors))
+    return replace(
+        best, motion=answer.motion, optima=answer.optima, best=answer.best, mirrors=tuple(mirrors),
+        message=f"{best.message} {unseen}".strip(),
+    )  # fmt: skip
 
 
-def _in_place_of(answer: Answer, other: Answer) -> Answer:
-    """Another answer, with what is known of the search from several starts."""
-    return replace(other, motion=answer.motion, optima=answer.optima, best=answer.best)
-
-
-def _beside(answer: Answer, other: Answer, name: str) -> Mirrored:
-    """Another answer of the same method, as seen from one."""
-    shift = other.posterior.summary.mean - answer.posterior.summary.mean
-    return Mirrored(name, other.objective - answer.objective, other.posterior.point, shift)
-
-
-def _seen_from(answer: Answer, sides: Sides, name: str, gain: float) -> tuple[Mirrored, ...]:
-    """The best side, of that gain, and those beside it, less the one at which the answer stands, as seen from there."""
-    mean = answer.posterior.summary.mean
-    every = [Mirrored(name, 0.0, sides.point, np.zeros_like(mean)), *sides.others]
-    away = [distance(answer.problem, answer.posterior.point, other.point) for other in every if sides.others]
-    nearest = int(np.argmin(away)) if away else 0
-    here = every.pop(nearest).gain if nearest else -gain
-    return tuple(o._replace(gain=o.gain - here, shift=np.asarray(o.point.z) - mean) for o in every)
+def _weight(answer: Answer) -> float:
+    """What sides are compared by: the evidence, or where that is estimated the log marginal density of the biases."""
+    estimated = getattr(answer.method, "form", "") == PRODUCTS and answer.trace is not None
+    return float(answer.trace[-1]) if estimated and answer.trace is not None else answer.objective
 
 
 def _beside_optima(answer: Answer, others: Sequence[Answer]) -> tuple[Mirrored, ...]:
@@ -219,7 +209,7 @@ def _beside_optima(answer: Answer, others: Sequence[Answer]) -> tuple[Mirrored, 
             continue
         there = other.posterior.here[0]
         if all(np.max(np.abs(there - one) / np.maximum(sd, APART), initial=0.0) > DIFFERENT for one in known):
-            found.append(Mirrored("found from another start", gain, other.posterior.point, there - mean))
+            found.append(Mirrored(ELSEWHERE, gain, other.posterior.point, there - mean))
             known.append(there)
     return tuple(found)
 

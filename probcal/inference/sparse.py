@@ -270,7 +270,7 @@ def sparse_climb(problem: Problem, form: str) -> SideClimb:
             found = find_sparse_mode(problem.model, joint, point, scales, STEPS, 1e-3)
             worth = -found.value if products else _evidence(found, problem, scales)[0]
             return found.system.point, worth
-        except np.linalg.LinAlgError:
+        except (np.linalg.LinAlgError, FitError):  # not positive definite, or conjugate gradients did not end
             return point, -np.inf
 
     return SideClimb(mode, lambda _, evidence: evidence)

@@ -29,12 +29,13 @@ FAR = 6.0  # scales beyond which a node is not reflected
 APART = 0.1  # share of a reflection that must be left after polishing: below, it came back
 TRIED, BREAKS, ROUNDS = 8, 30, 5  # pieces of tracks that are polished, places where one may be cut, and rounds of it
 LOOKED = 3 * TRIED  # pieces that are smoothed: those that come back by themselves are not polished
-ALIKE = 0.7  # share of common epochs from which pieces, cut by different planes, are one
+ALIKE = 0.7  # share of common epochs, and of what two reflections have in common, from which two pieces are one
 SHORTEST = 3  # epochs of a piece: fewer do not stay on another side than their neighbours
 STRAIN = 20.0  # sum of squares of a process noise from which a track may be cut there
 GAIN, MORE = 1.0, 0.1  # nats from which a piece belongs on the other side, and from which a scene does
 SAME, NEAR = 3.0, 10.0  # nats within which another answer is as good, and within which it is mentioned
 MOST = 4  # answers that are kept
+PIECES = "pieces of tracks on their other side"
 WINDOWS, HEARD = 60, 4  # parts of a track in which nodes may be heard alone, and sets of such nodes that are looked at
 
 
@@ -86,7 +87,9 @@ class Sides(NamedTuple):
 
     point: Point  # the best place
     moved: bool  # whether it is another than the given one
-    others: tuple[Mirrored, ...]  # those within `NEAR` nats of it, the best first
+    others: tuple[Mirrored, ...]  # those within `NEAR` nats of it
+    name: str = ""  # what was reflected on the way to it
+    gain: float = 0.0  # its evidence less that of the given place
 
 
 @float64
@@ -95,39 +98,52 @@ def other_sides(problem: Problem, point: Point, climb: SideClimb | None = None) 
 
     Where a scene fits better on another side its pieces are looked at again from there.
     """
-    climb, moved = SideClimb.dense(problem) if climb is None else climb, False
+    climb = SideClimb.dense(problem) if climb is None else climb
+    given, name = point, ""
     for _ in range(ROUNDS):
-        sides, gain = _searched(problem, point, climb)
-        moved = moved or sides.moved
-        if gain <= MORE:
+        sides = _searched(problem, point, climb)
+        name = sides.name or name
+        if sides.gain <= MORE:
             break
         point = sides.point
-    return sides._replace(moved=moved)
+    if not name:
+        return sides
+    there, begun = (climb.evidence(*climb.mode(at)) for at in (sides.point, given))
+    if not np.isfinite(there - begun):  # nothing was found at the given place itself
+        return Sides(given, False, ())
+    return sides._replace(moved=True, name=name, gain=there - begun)
 
 
-def _searched(problem: Problem, point: Point, climb: SideClimb) -> tuple[Sides, float]:
-    """One search from a point, and by how much the best scene fits better than the place with its pieces turned."""
+def _searched(problem: Problem, point: Point, climb: SideClimb) -> Sides:
+    """One search from a point; its gain is that of the best scene over the place with its pieces turned."""
     point, turned, pieces = _turned(problem, point, climb)
     best: tuple[Point, float] | None = None
-    found: list[Mirrored] = []
-    whole = ((name, across, track_mode(problem, across)) for name, across in _candidates(problem, point))
-    for name, candidate, start in chain(whole, pieces):
+    found: list[tuple[bool, Mirrored]] = []  # whether it is a piece
+    whole = ((False, name, across, track_mode(problem, across)) for name, across in _candidates(problem, point))
+    for piece, name, candidate, start in chain(whole, ((True, *own) for own in pieces)):
         best = climb.mode(point) if best is None else best
         polished = climb.mode(start)
         size = distance(problem, candidate, best[0])
-        if not new(problem, polished[0], [best[0], *(other.point for other in found)], size):
+        if not new(problem, polished[0], [best[0], *(other.point for _, other in found)], size):
             continue
         worth = [climb.evidence(*at) for at in (polished, best)]
         if np.isfinite(worth).all() and worth[0] - worth[1] > -NEAR:
-            found.append(Mirrored(name, worth[0] - worth[1], polished[0], np.asarray(polished[0].z - best[0].z)))
-    found.sort(key=lambda other: -other.gain)
-    if found and best is not None and found[0].gain > MORE:
-        first = found[0]
-        rest = [o._replace(gain=o.gain - first.gain, shift=o.shift - first.shift) for o in found[1:]]
+            shift = np.asarray(polished[0].z - best[0].z)
+            found.append((piece, Mirrored(name, worth[0] - worth[1], polished[0], shift)))
+    found.sort(key=lambda one: -one[1].gain)
+    if found and best is not None and found[0][1].gain > MORE:
+        first = found[0][1]
+        rest = [(p, o._replace(gain=o.gain - first.gain, shift=o.shift - first.shift)) for p, o in found[1:]]
         back = Mirrored(first.name, -first.gain, best[0], -first.shift)
-        kept = [other for other in (back, *rest) if other.gain > -NEAR]
-        return Sides(first.point, True, tuple(kept[:MOST])), first.gain
-    return Sides(point, turned, tuple(found[:MOST])), 0.0
+        return Sides(first.point, True, _kept([(False, back), *rest]), first.name, first.gain)
+    return Sides(point, turned, _kept(found), PIECES if turned else "")
+
+
+def _kept(found: Sequence[tuple[bool, Mirrored]]) -> tuple[Mirrored, ...]:
+    """Those that are told of: as good ones first, and of these whole scenes before pieces."""
+    near = [(piece, other) for piece, other in found if other.gain > -NEAR]
+    near.sort(key=lambda one: (one[1].gain <= -SAME, one[0], -one[1].gain))
+    return tuple(other for _, other in near[:MOST])
 
 
 def planes(problem: Problem, z: np.ndarray) -> list[Plane]:
@@ -355,13 +371,18 @@ class _Piece(NamedTuple):
     target: str
     own: np.ndarray  # its epochs
     plane: Plane
+    place: np.ndarray  # (n, d) where it is
 
     def alike(self, other: "_Piece") -> bool:
-        """Whether it is the same piece, reflected in whatever plane."""
+        """Whether it is the same piece, reflected to about the same places."""
         if (self.recursion, self.target) != (other.recursion, other.target):
             return False
-        both = len(np.intersect1d(self.own, other.own, assume_unique=True))
-        return both >= ALIKE * (len(self.own) + len(other.own) - both)
+        both, mine, others = np.intersect1d(self.own, other.own, assume_unique=True, return_indices=True)
+        if len(both) < ALIKE * (len(self.own) + len(other.own) - len(both)):
+            return False
+        here, there = self.plane.across(self.place[mine]), other.plane.across(other.place[others])
+        moved = max(np.linalg.norm(here - self.place[mine]), np.linalg.norm(there - other.place[others]))
+        return bool(np.linalg.norm(here - there) <= (1.0 - ALIKE) * moved)
 
 
 def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
@@ -383,12 +404,13 @@ def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
                 for own in _pieces(problem, point, plane, r, mine):
                     count = float(counts[r][own].sum())
                     if len(own) >= SHORTEST and count > 0 and worse[own].sum() < WORSE * count:
-                        pieces.append(_Piece(float(worse[own].sum()) / count, r, target, own, plane))
+                        place = np.asarray(point.states[r])[own][:, slice(*epochs.position)]
+                        pieces.append(_Piece(float(worse[own].sum()) / count, r, target, own, plane, place))
     kept = list[_Piece]()
     for piece in sorted(pieces, key=lambda piece: piece.worse):
         if len(kept) < LOOKED and not any(piece.alike(other) for other in kept):
             kept.append(piece)
-    for _, r, target, own, plane in kept:
+    for _, r, target, own, plane, _ in kept:
         chosen = [np.zeros(len(epochs.time), bool) for epochs in problem.epochs]
         chosen[r][own] = True
         first, last = problem.epochs[r].time[own[[0, -1]]]
