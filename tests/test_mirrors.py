@@ -318,8 +318,11 @@ def test_chains_visit_both_sides_by_their_weights(method):
     assert "The posterior has 2 sides" in tree.attrs["message"]
     assert tree["calibration"]["r_hat"].max() < 1.05
     assert tree["calibration"]["sd"].sel(bias_label="b1.position_y") > 2.0
-    verdict = probcal.assess(problem, tree)["verdict"]["verdict"]
-    assert verdict.sel(bias_label="b1.position_y").item() == "weak"
+    verdicts = probcal.assess(problem, tree)["verdict"].to_dataset()
+    assert verdicts["verdict"].sel(bias_label="b1.position_y").item() == "weak"
+    alike = verdicts.sel(bias_label="b1.position_x")
+    assert alike["verdict"].item() == "determined" or tree.attrs["status"] == "not converged"
+    assert not any("touches" in text for text in verdicts["reason"].values)  # the target never comes near the line
 
 
 @dataclass(frozen=True)
@@ -353,6 +356,7 @@ def beside_others(monkeypatch, sides, ends, method=None):
         found = Sides(SimpleNamespace(z=np.full(1, at)), True, others, name, gain)
     monkeypatch.setattr(solve, "other_sides", lambda *_: found)
     monkeypatch.setattr(solve, "distance", lambda _, a, b: float(abs(a.z - b.z)[0]))
+    monkeypatch.setattr(solve, "extent", lambda *_: 0.1)
     monkeypatch.setattr(
         solve, "new", lambda _, point, known, size: all(abs(point.z - o.z)[0] > 0.1 * size for o in known)
     )

@@ -17,7 +17,7 @@ from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.grid import follow_states, grid_start
-from probcal.smoothing.mirrors import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, distance, new, other_sides
+from probcal.smoothing.mirrors import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, distance, extent, new, other_sides
 from probcal.smoothing.mode import Point
 from probcal.smoothing.room import check_room
 from probcal.starts import further_starts
@@ -27,6 +27,7 @@ from probcal.status import Status
 ELSEWHERE = "found from another start"
 TRIES = 3  # climbs by particles from one start
 DIFFERENT = 2.0  # sd by which an answer from another start must differ in some bias to be one of its own
+FAINT = 0.03  # share of the extent of the tracks, of which a part (`new`) is no other place
 APART = 0.01  # scales that count as an sd where that is smaller
 
 
@@ -168,7 +169,7 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
             else:
                 unfitted.append(other)
             continue
-        size = distance(problem, other.point, here)
+        size = max(distance(problem, other.point, here), FAINT * extent(problem, here))
         if new(problem, own.posterior.point, [one.posterior.point for _, one in found], size):
             found.append((other.name, own))
     first = _weight(answer)

@@ -325,6 +325,12 @@ def distance(problem: Problem, a: Point, b: Point) -> float:
     return float(np.sqrt(sum(places)))
 
 
+def extent(problem: Problem, point: Point) -> float:
+    """Root of the sum of squares of the places of a point about their mean, as `distance` counts."""
+    places = [np.asarray(x)[:, slice(*e.position)] for x, e in zip(point.states, problem.epochs, strict=True)]
+    return float(np.sqrt(sum(np.sum((own - own.mean(0)) ** 2) for own in places)))
+
+
 def new(problem: Problem, point: Point, known: Sequence[Point], size: float) -> bool:
     """Whether a point lies apart from all that are known, by a good part of the size of a reflection."""
     return size > 0 and all(distance(problem, point, other) > APART * size for other in known)
