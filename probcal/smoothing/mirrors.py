@@ -29,7 +29,7 @@ FAR = 6.0  # scales beyond which a node is not reflected
 APART = 0.1  # share of a reflection that must be left after polishing: below, it came back
 TRIED, BREAKS, ROUNDS = 8, 30, 5  # pieces of tracks that are polished, places where one may be cut, and rounds of it
 LOOKED = 3 * TRIED  # pieces that are smoothed: those that come back by themselves are not polished
-ALIKE = 0.7  # share of common epochs, and of what two reflections have in common, from which two pieces are one
+ALIKE = 0.7  # share of common epochs from which pieces that are reflected to about the same places are one
 SHORTEST = 3  # epochs of a piece: fewer do not stay on another side than their neighbours
 STRAIN = 20.0  # sum of squares of a process noise from which a track may be cut there
 GAIN, MORE = 1.0, 0.1  # nats from which a piece belongs on the other side, and from which a scene does
@@ -348,15 +348,17 @@ def _turned(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, bo
     for _ in range(ROUNDS):
         if not again:
             break
-        again, others, climbs = False, [], 0
+        again, others, climbs, back = False, [], 0, 0
         for name, candidate in _cut(problem, point):
             best = climb.mode(point) if best is None else best
             smoothed = track_mode(problem, candidate)
             if not new(problem, smoothed, [best[0]], distance(problem, candidate, best[0])):
                 continue  # it came back by itself
-            if climbs == TRIED:
+            if TRIED in (climbs, back):
                 break
-            tried, climbs = climb.mode(smoothed), climbs + 1
+            tried = climb.mode(smoothed)
+            apart = new(problem, tried[0], [best[0]], distance(problem, candidate, best[0]))
+            climbs, back = climbs + apart, back + (not apart)  # those that climb back take no other's place
             if tried[1] > best[1] + GAIN:
                 point, best, turned, again = tried[0], tried, True, True
             elif tried[1] > best[1] - NEAR:
@@ -388,7 +390,7 @@ class _Piece(NamedTuple):
             return False
         here, there = self.plane.across(self.place[mine]), other.plane.across(other.place[others])
         moved = max(np.linalg.norm(here - self.place[mine]), np.linalg.norm(there - other.place[others]))
-        return bool(np.linalg.norm(here - there) <= (1.0 - ALIKE) * moved)
+        return bool(np.linalg.norm(here - there) <= 0.5 * moved)
 
 
 def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
