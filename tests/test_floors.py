@@ -13,16 +13,7 @@ from probcal.inference.methods import METHODS as BY_NAME
 ROOT = Path(probcal.__file__).parent
 FLOORS = {
     0: (
-        "linalg",
-        "devices",
-        "geometry",
-        "types",
-        "errors",
-        "labels",
-        "lazy",
-        "kernels",
-        "fingerprint",
-        "files",
+        "linalg", "devices", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files",
         "status",
     ),
     1: ("sensor", "motion", "priors", "noise", "detection"),
@@ -34,7 +25,7 @@ FLOORS = {
     7: ("inference",),
     8: ("analysis",),
     9: ("adapters", "cli", "report", "plots", "diagnostics"),
-}
+}  # fmt: skip
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
 METHODS = tuple(
     f"inference.{name}"

@@ -153,16 +153,9 @@ def _verdicts(
     def around() -> list[np.ndarray]:  # draws of chains lie on both sides
         return [np.asarray(variance) for variance in fit.at.variances(jnp.asarray(fit.covariance))]
 
+    doubts |= mirror_doubts(fit, tree, around)
     words, reasons = verdict.judge_biases(
-        problem,
-        status,
-        ended,
-        known,
-        drifts,
-        disagreements,
-        first,
-        _shared(tree),
-        doubts | mirror_doubts(fit, tree, around),
+        problem, status, ended, known, drifts, disagreements, first, _shared(tree), doubts
     )
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}

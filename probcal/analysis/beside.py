@@ -42,11 +42,7 @@ def mirror_doubts(
                 int(m), f"it is {away[m]:.1f} sd away in an answer that fits as well: {group['mirror'].values[k]}"
             )
     if len(alike):
-        tracked = dict(each_track(tree))
-        own = (
-            variances() if variances else [saved_by_epoch(e, tracked, "sd", "targets") ** 2 for e in fit.problem.epochs]
-        )
-        near, where = touched(fit.problem, fit.point, own)
+        near, where = touched(fit.problem, fit.point, variances() if variances else _saved(fit, tree))
         if near < BEYOND:
             every = dict.fromkeys(range(fit.problem.model.biases), f"{where}, which hides on which side it goes on")
             return every | found

@@ -164,16 +164,9 @@ def _verdicts(fit: JudgedLarge, tree: xr.DataTree, inflation: np.ndarray) -> xr.
         float(np.sqrt(verdict.limit_of(M))),
     )  # fmt: skip
     shared = shared_in_blocks(problem, fit.point, fit.declared.members, fit.declared.covariance, SHARED)
+    ended, doubts = group["status"].values.tolist(), mirror_doubts(fit, tree)
     words, reasons = verdict.judge_biases(
-        problem,
-        Status(tree.attrs["status"]),
-        group["status"].values.tolist(),
-        known,
-        {},
-        {},
-        "",
-        shared,
-        mirror_doubts(fit, tree),
+        problem, Status(tree.attrs["status"]), ended, known, {}, {}, "", shared, doubts
     )
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}

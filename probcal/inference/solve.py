@@ -193,8 +193,9 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
 
 def _weight(answer: Answer) -> float:
     """What sides are compared by: the evidence, or where that is estimated the log marginal density of the biases."""
-    estimated = getattr(answer.method, "form", "") == PRODUCTS and answer.trace is not None
-    return float(answer.trace[-1]) if estimated and answer.trace is not None else answer.objective
+    if getattr(answer.method, "form", "") == PRODUCTS and answer.trace is not None:
+        return float(answer.trace[-1])
+    return answer.objective
 
 
 def _beside_optima(answer: Answer, others: Sequence[Answer]) -> tuple[Mirrored, ...]:

@@ -29,7 +29,8 @@ FAR = 6.0  # scales beyond which a node is not reflected
 APART = 0.1  # share of a reflection that must be left after polishing: below, it came back
 TRIED, BREAKS, ROUNDS = 8, 30, 5  # pieces of tracks that are polished, places where one may be cut, and rounds of it
 LOOKED = 3 * TRIED  # pieces that are smoothed: those that come back by themselves are not polished
-ALIKE = 0.7  # share of common epochs from which pieces that are reflected to about the same places are one
+ALIKE, APART_BY = 0.7, 0.5  # share of common epochs from which pieces are one, if their reflections lie at most so
+# much of their own size apart
 SHORTEST = 3  # epochs of a piece: fewer do not stay on another side than their neighbours
 STRAIN = 20.0  # sum of squares of a process noise from which a track may be cut there
 GAIN, MORE = 1.0, 0.1  # nats from which a piece belongs on the other side, and from which a scene does
@@ -390,7 +391,7 @@ class _Piece(NamedTuple):
             return False
         here, there = self.plane.across(self.place[mine]), other.plane.across(other.place[others])
         moved = max(np.linalg.norm(here - self.place[mine]), np.linalg.norm(there - other.place[others]))
-        return bool(np.linalg.norm(here - there) <= 0.5 * moved)
+        return bool(np.linalg.norm(here - there) <= APART_BY * moved)
 
 
 def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
