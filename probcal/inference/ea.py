@@ -13,6 +13,7 @@ from probcal.inference.ending import astray
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.integrate import Integration, likelihood
 from probcal.inference.posed import Form
+from probcal.inference.pruned import without_far_modes
 from probcal.inference.relevance import best_precisions
 from probcal.inference.run import (
     Context,
@@ -20,13 +21,14 @@ from probcal.inference.run import (
     Maximiser,
     State,
     first_precision,
+    given_of,
     learn,
     maximise,
     reweighted,
     valued,
 )
 from probcal.inference.sparse import FORMS, PRODUCTS
-from probcal.model.model import Model
+from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
 from probcal.smoothing.information import paper_b, update_levels
@@ -201,11 +203,25 @@ class EA(Maximiser):
         return prior.hierarchical if self.precisions == "integrated" else isinstance(prior, ARD)
 
     def climb(self, problem: Problem, prior: Prior, start: Point, context: Context) -> tuple[State, np.ndarray]:
-        """The outer loop; where each precision is maximised alone, again from better ones while there are any."""
+        """The outer loop; where precisions are maximised, again without biases that another mode keeps in."""
         state, trace = maximise(self, problem, prior, start, context)
-        alone = isinstance(prior, ARD) and (prior.shape, prior.rate, prior.by) == (1.0, 0.0, None)
-        if self.trajectory != "marginal" or not alone:
+        if self.trajectory != "marginal" or not isinstance(prior, ARD) or self.integrates(prior):
             return state, trace
+        if (prior.shape, prior.rate, prior.by) == (1.0, 0.0, None):
+            state, trace = self._climbed_again(problem, prior, state, trace, context)
+        if prior.correlation:
+            return state, trace
+
+        def climb(point: Point, alpha: np.ndarray, mixing: Mixing) -> State:
+            return maximise(self, problem.with_mixing(mixing), prior, point, context, alpha)[0]
+
+        kept = without_far_modes(problem.model, prior, given_of(self, problem, prior), state, climb)
+        return kept, trace if kept is state else np.append(trace, float(kept.objective))
+
+    def _climbed_again(
+        self, problem: Problem, prior: Prior, state: State, trace: np.ndarray, context: Context
+    ) -> tuple[State, np.ndarray]:
+        """The state after climbs from better precisions, while there are any."""
         for _ in range(BETTER):
             alpha, gain = self._better(problem, prior, state)
             if gain <= GAIN or not np.isfinite(float(state.objective)):
