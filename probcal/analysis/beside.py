@@ -8,7 +8,8 @@ import xarray as xr
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Judged, saved_by_epoch
 from probcal.results.read import each_track
-from probcal.smoothing.mirrors import touched
+from probcal.smoothing.mirrors import PIECE, SCENE
+from probcal.smoothing.reflections import touched
 
 BEYOND = 2.0  # sd that an answer as good may be away
 
@@ -27,8 +28,9 @@ def mirror_doubts(
 ) -> dict[int, str]:
     """How far each bias is another one in an answer on the other side of a mirror that fits as well.
 
-    All of them where a target touches the mirror, since it may then go on at either side. `variances` are those (E, n)
-    of the states of each recursion on this side of it, by default those of the saved tracks.
+    All of them where a target touches the mirror of a scene or a piece, since it may then go on at either side.
+    `variances` are those (E, n) of the states of each recursion on this side of it, by default those of the saved
+    tracks.
     """
     found = dict[int, str]()
     if "mirror" not in tree.children:
@@ -41,7 +43,7 @@ def mirror_doubts(
             found.setdefault(
                 int(m), f"it is {away[m]:.1f} sd away in an answer that fits as well: {group['mirror'].values[k]}"
             )
-    if len(alike):
+    if {SCENE, PIECE} & set(group["kind"].values[alike].tolist()):
         near, where = touched(fit.problem, fit.point, variances() if variances else _saved(fit, tree))
         if near < BEYOND:
             every = dict.fromkeys(range(fit.problem.model.biases), f"{where}, which hides on which side it goes on")

@@ -24,7 +24,7 @@ from probcal.inference.progress import OnProgress
 from probcal.inference.rates import of_calibration
 from probcal.inference.run import Context, Method
 from probcal.inference.selfconfig import SelfConfiguration
-from probcal.inference.solve import ELSEWHERE, solve
+from probcal.inference.solve import solve
 from probcal.inference.sparse import SparsePosterior
 from probcal.inference.storage import Storage
 from probcal.inference.weighted import track_by_particles
@@ -41,7 +41,7 @@ from probcal.smoothing.grid import grid_start, track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.joint import too_large
 from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mirrors import SAME, Mirrored
+from probcal.smoothing.mirrors import NODE, SAME, START, Mirrored
 from probcal.smoothing.mode import Point
 from probcal.smoothing.sparse_mode import settle_each, settled_variances
 from probcal.smoothing.tails import settle
@@ -259,7 +259,10 @@ def _watched(answer: Answer) -> Answer:
             for name, far in strained_starts(problem, point)
         ]
     found += [_mirrored(answer, other) for other in answer.mirrors]
-    if any(other.gain > -SAME and other.name != ELSEWHERE for other in answer.mirrors):
+    alike = {other.kind for other in answer.mirrors if other.gain > -SAME}
+    if NODE in alike:
+        found.append("Survey on which side of the path such a node stands, or narrow its scale to less than that.")
+    if alike - {NODE, START}:
         word, side = "line" if problem.network.dimension == 2 else "plane", "declare on which side a target starts"
         found.append(f"Survey a position off that {word}, or {side}, Target(motion, start={{...}}).")
     return replace(answer, status=status, message=" ".join(found))

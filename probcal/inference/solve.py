@@ -17,8 +17,9 @@ from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.grid import follow_states, grid_start
-from probcal.smoothing.mirrors import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, distance, extent, new, other_sides
+from probcal.smoothing.mirrors import MORE, NEAR, SAME, SCENE, START, Mirrored, SideClimb, Sides, other_sides
 from probcal.smoothing.mode import Point
+from probcal.smoothing.reflections import apart, new
 from probcal.smoothing.room import check_room
 from probcal.starts import further_starts
 from probcal.starts import optima as optima_of
@@ -27,7 +28,6 @@ from probcal.status import Status
 ELSEWHERE = "found from another start"
 TRIES = 3  # climbs by particles from one start
 DIFFERENT = 2.0  # sd by which an answer from another start must differ in some bias to be one of its own
-FAINT = 0.03  # share of the extent of the tracks, of which a part (`new`) is no other place
 APART = 0.01  # scales that count as an sd where that is smaller
 
 
@@ -158,9 +158,9 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
         return found if found.method == answer.method and found.status.valid and found.posterior.sound else None
 
     sides = other_sides(problem, here, climb)
-    places = [Mirrored(sides.name, 0.0, sides.point, np.zeros(0))] if sides.moved else []
+    places = [Mirrored(sides.name, 0.0, sides.point, np.zeros(0), sides.kind)] if sides.moved else []
     places = [other._replace(gain=other.gain + sides.gain) for other in (*places, *sides.others)]
-    found, unfitted, unseen = [("", answer)], list[Mirrored](), ""
+    found, unfitted, unseen = [(("", SCENE), answer)], list[Mirrored](), ""
     for other in places:
         own = answered(other.point) if other.gain > -SAME else None
         if own is None:
@@ -169,20 +169,20 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
             else:
                 unfitted.append(other)
             continue
-        size = max(distance(problem, other.point, here), FAINT * extent(problem, here))
-        if new(problem, own.posterior.point, [one.posterior.point for _, one in found], size):
-            found.append((other.name, own))
+        known = [one.posterior.point for _, one in found]
+        if new(problem, own.posterior.point, known, apart(problem, other.point, here)):
+            found.append(((other.name, other.kind), own))
     first = _weight(answer)
     better = [one for one in found[1:] if one[1].status.settled >= answer.status.settled]
-    name, best = max(better, key=lambda one: _weight(one[1]), default=found[0])
+    way, best = max(better, key=lambda one: _weight(one[1]), default=found[0])
     if _weight(best) <= first + MORE:
-        name, best = found[0]
+        way, best = found[0]
     gain, mean = _weight(best) - first, best.posterior.summary.mean
-    mirrors = [
-        Mirrored(own or name, _weight(one) - first - gain, one.posterior.point, one.posterior.summary.mean - mean)
-        for own, one in found
-        if one is not best
-    ]
+    mirrors = list[Mirrored]()
+    for side, one in found:
+        if one is not best:
+            (name, kind), place = side if side[0] else way, one.posterior
+            mirrors.append(Mirrored(name, _weight(one) - first - gain, place.point, place.summary.mean - mean, kind))
     mirrors += [o._replace(gain=o.gain - gain, shift=np.asarray(o.point.z) - mean) for o in unfitted]
     mirrors = sorted((other for other in mirrors if other.gain > -NEAR), key=lambda other: -other.gain)
     return replace(
@@ -211,7 +211,7 @@ def _beside_optima(answer: Answer, others: Sequence[Answer]) -> tuple[Mirrored, 
             continue
         there = other.posterior.here[0]
         if all(np.max(np.abs(there - one) / np.maximum(sd, APART), initial=0.0) > DIFFERENT for one in known):
-            found.append(Mirrored(ELSEWHERE, gain, other.posterior.point, there - mean))
+            found.append(Mirrored(ELSEWHERE, gain, other.posterior.point, there - mean, START))
             known.append(there)
     return tuple(found)
 

@@ -240,12 +240,14 @@ def add_optima(tree: xr.DataTree, answers: Sequence[Answer], best: int) -> xr.Da
 def add_mirrors(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
     """Add the answers on other sides of a mirror: names, biases, places, and evidence less that of the answer.
 
-    `apart` says by how many sd each bias is another one there; within `same` nats an answer is as good.
+    `apart` says by how many sd each bias is another one there; within `same` nats an answer is as good. `kind` is what
+    stands on its other side: the scene, a piece of a track, a node alone; "start" where another start led there.
     """
     problem, others = answer.problem, answer.mirrors
     shifts, (mean, sd) = np.stack([other.shift for other in others]), answer.posterior.here
     values: dict[str, Any] = {
         "gain": ("mirror", np.array([other.gain for other in others])),
+        "kind": ("mirror", np.array([other.kind for other in others], str)),
         "bias": (("mirror", "bias_label"), (mean + shifts) * problem.scales),
         "apart": (("mirror", "bias_label"), np.abs(shifts) / np.maximum(sd, 1e-12)),
     }

@@ -13,20 +13,18 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg
-from probcal.labels import AXES
 from probcal.priors import Precision
 from probcal.problem import Problem
-from probcal.smoothing.grid import follow_states, grid_start, known_places, profile, track_mode
+from probcal.smoothing.crossings import node_sides
+from probcal.smoothing.grid import grid_start, profile, track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import laplace
 from probcal.smoothing.mode import Point, find_mode
+from probcal.smoothing.reflections import Plane, distance, movable, new, planes, reflect, reflect_nodes
 from probcal.types import float64
 
 WORSE = 0.4  # nats a datum by which a reflected place may fit worse and is still polished: 0 to 0.2 beside a mirror,
 # 0.9 to 5 in networks without one (models/, share 0.3)
-FAR = 6.0  # scales beyond which a node is not reflected
-APART = 0.1  # share of a reflection that must be left after polishing: below, it came back
 TRIED, BREAKS, ROUNDS = 8, 30, 5  # pieces of tracks that are polished, places where one may be cut, and rounds of it
 LOOKED = 3 * TRIED  # pieces that are smoothed: those that come back by themselves are not polished
 ALIKE, APART_BY = 0.7, 0.5  # share of common epochs from which pieces are one, if their reflections lie at most so
@@ -35,25 +33,12 @@ SHORTEST = 3  # epochs of a piece: fewer do not stay on another side than their 
 STRAIN = 20.0  # sum of squares of a process noise from which a track may be cut there
 GAIN, MORE = 1.0, 0.1  # nats from which a piece belongs on the other side, and from which a scene does
 SAME, NEAR = 3.0, 10.0  # nats within which another answer is as good, and within which it is mentioned
+CROSSED = 30  # nodes that cross at most
 MOST = 4  # answers that are kept
 PIECES = "pieces of tracks on their other side"
-WINDOWS, HEARD = 60, 4  # parts of a track in which nodes may be heard alone, and sets of such nodes that are looked at
 
 
-class Plane(NamedTuple):
-    """A line in 2-D or a plane in 3-D."""
-
-    name: str
-    centre: np.ndarray  # (d,)
-    normal: np.ndarray  # (d,) unit
-
-    def distance(self, place: np.ndarray) -> np.ndarray:
-        """Signed distance (...) of places (..., d)."""
-        return (place - self.centre) @ self.normal
-
-    def across(self, place: np.ndarray) -> np.ndarray:
-        """Places (..., d) on the other side."""
-        return place - 2.0 * self.distance(place)[..., None] * self.normal
+SCENE, PIECE, NODE, START = KINDS = ("scene", "piece", "node", "start")  # what another answer differs by
 
 
 class Mirrored(NamedTuple):
@@ -63,6 +48,7 @@ class Mirrored(NamedTuple):
     gain: float
     point: Point
     shift: np.ndarray  # (M,) its biases z less those of the answer
+    kind: str = SCENE
 
 
 class SideClimb(NamedTuple):
@@ -91,6 +77,7 @@ class Sides(NamedTuple):
     others: tuple[Mirrored, ...]  # those within `NEAR` nats of it
     name: str = ""  # what was reflected on the way to it
     gain: float = 0.0  # its evidence less that of the given place
+    kind: str = SCENE
 
 
 @float64
@@ -100,11 +87,11 @@ def other_sides(problem: Problem, point: Point, climb: SideClimb | None = None) 
     Where a scene fits better on another side its pieces are looked at again from there.
     """
     climb = SideClimb.dense(problem) if climb is None else climb
-    given, name = point, ""
+    given, name, kind = point, "", SCENE
     for _ in range(ROUNDS):
         sides = _searched(problem, point, climb)
-        name = sides.name or name
-        if sides.gain <= MORE:
+        name, kind = (sides.name, sides.kind) if sides.name else (name, kind)
+        if sides.gain <= MORE and not (sides.moved and sides.kind == NODE):
             break
         point = sides.point
     if not name:
@@ -112,162 +99,69 @@ def other_sides(problem: Problem, point: Point, climb: SideClimb | None = None) 
     there, begun = (climb.evidence(*climb.mode(at)) for at in (sides.point, given))
     if not np.isfinite(there - begun):  # nothing was found at the given place itself
         return Sides(given, False, ())
-    return sides._replace(moved=True, name=name, gain=there - begun)
+    return sides._replace(moved=True, name=name, gain=there - begun, kind=kind)
 
 
 def _searched(problem: Problem, point: Point, climb: SideClimb) -> Sides:
-    """One search from a point; its gain is that of the best scene over the place with its pieces turned."""
+    """One search from a point; its gain is that of the best scene over the place with its pieces and nodes turned."""
     point, turned, pieces = _turned(problem, point, climb)
+    point, crossed, nodes = _crossed(problem, point, climb)
     best: tuple[Point, float] | None = None
-    found: list[tuple[bool, Mirrored]] = []  # whether it is a piece
-    whole = ((False, name, across, track_mode(problem, across)) for name, across in _candidates(problem, point))
-    for piece, name, candidate, start in chain(whole, ((True, *own) for own in pieces)):
+    found: list[Mirrored] = []
+    whole = ((SCENE, name, there, track_mode(problem, there)) for name, there in _candidates(problem, point))
+    parts = [(NODE, *own) for own in nodes] + [(PIECE, *own) for own in (() if crossed else pieces)]
+    for kind, name, candidate, start in chain(whole, parts):
         best = climb.mode(point) if best is None else best
         polished = climb.mode(start)
         size = distance(problem, candidate, best[0])
-        if not new(problem, polished[0], [best[0], *(other.point for _, other in found)], size):
+        if not new(problem, polished[0], [best[0], *(other.point for other in found)], size):
             continue
         worth = [climb.evidence(*at) for at in (polished, best)]
         if np.isfinite(worth).all() and worth[0] - worth[1] > -NEAR:
             shift = np.asarray(polished[0].z - best[0].z)
-            found.append((piece, Mirrored(name, worth[0] - worth[1], polished[0], shift)))
-    found.sort(key=lambda one: -one[1].gain)
-    if found and best is not None and found[0][1].gain > MORE:
-        first = found[0][1]
-        rest = [(p, o._replace(gain=o.gain - first.gain, shift=o.shift - first.shift)) for p, o in found[1:]]
-        back = Mirrored(first.name, -first.gain, best[0], -first.shift)
-        return Sides(first.point, True, _kept([(False, back), *rest]), first.name, first.gain)
-    return Sides(point, turned, _kept(found), PIECES if turned else "")
+            found.append(Mirrored(name, worth[0] - worth[1], polished[0], shift, kind))
+    found.sort(key=lambda one: -one.gain)
+    if found and best is not None and found[0].gain > MORE:
+        first = found[0]
+        rest = [o._replace(gain=o.gain - first.gain, shift=o.shift - first.shift) for o in found[1:]]
+        back = Mirrored(first.name, -first.gain, best[0], -first.shift, first.kind)
+        return Sides(first.point, True, _kept([back, *rest]), first.name, first.gain, first.kind)
+    name, kind = (crossed, NODE) if crossed else (PIECES, PIECE) if turned else ("", SCENE)
+    return Sides(point, turned or bool(crossed), _kept(found), name, kind=kind)
 
 
-def _kept(found: Sequence[tuple[bool, Mirrored]]) -> tuple[Mirrored, ...]:
-    """Those that are told of: as good ones first, and of these whole scenes before pieces."""
-    near = [(piece, other) for piece, other in found if other.gain > -NEAR]
-    near.sort(key=lambda one: (one[1].gain <= -SAME, one[0], -one[1].gain))
-    return tuple(other for _, other in near[:MOST])
+def _kept(found: Sequence[Mirrored]) -> tuple[Mirrored, ...]:
+    """Those that are told of: as good ones first, and of these whole scenes before nodes and pieces."""
+    near = [other for other in found if other.gain > -NEAR]
+    near.sort(key=lambda one: (one.gain <= -SAME, one.kind != SCENE, -one.gain))
+    return tuple(near[:MOST])
 
 
-def planes(problem: Problem, z: np.ndarray) -> list[Plane]:
-    """Least-squares lines (in 3-D planes) at biases z (M,): of the known nodes, of all, of those heard together."""
-    d, place = problem.network.dimension, node_places(problem, z)
-    free = {b.owner for b in problem.biases if b.component == "position"}
-    groups = [("the known nodes", [name for name in place if name not in free]), ("the nodes", list(place))]
-    groups += [(_listed(names), names) for names in _heard(problem, set(place))]
-    found: list[Plane] = []
-    for name, group in groups:
-        points = np.array([place[n] for n in group]).reshape(-1, d)
-        if len(group) < d:
-            continue
-        centre = points.mean(0)
-        values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(np.cov(points.T))))
-        if values[1] <= 1e-9 * values[-1]:  # nodes at one place, or on one line in 3-D
-            continue
-        plane = Plane(f"the {'line' if d == 2 else 'plane'} of {name}", centre, vectors[:, 0])
-        size = float(np.sqrt(values[-1]))
-        same = (abs(plane.normal @ p.normal) > 1 - 1e-9 and abs(p.distance(centre)) < 1e-6 * size for p in found)
-        if not any(same):
-            found.append(plane)
-    return found
+def _crossed(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, str, list[tuple[str, Point, Point]]]:
+    """The point with those nodes on the other side of their paths that fit better there, and the name of the last one.
 
-
-def touched(problem: Problem, point: Point, variances: Sequence[np.ndarray]) -> tuple[float, str]:
-    """How near in sd a target comes to a plane of the nodes, at the least, and in words which, when and where.
-
-    `variances` are those (E, n) of the states of each recursion. On the plane the data do not tell how far off it a
-    target is, nor on which side it goes on: an approximation by a Gaussian around one track says too little there.
+    Also those that fit about as well: names, reflected and polished points.
     """
-    least, words = np.inf, ""
-    for plane in planes(problem, np.asarray(point.z)):
-        for epochs, states, variance, mine in zip(
-            problem.epochs, point.states, variances, _movable(problem), strict=True
-        ):
-            place = slice(*epochs.position)
-            away = np.abs(plane.distance(np.asarray(states)[:, place]))
-            sd = np.sqrt(np.asarray(variance)[:, place] @ plane.normal**2)
-            ratio = np.where(mine, away / np.maximum(sd, 1e-300), np.inf)
-            k = int(ratio.argmin())
-            if ratio[k] < least:
-                least = float(ratio[k])
-                words = f'target "{epochs.target[k]}" touches {plane.name} at {epochs.time[k]:.6g} s'
-    return least, words
-
-
-def _heard(problem: Problem, resting: set[str]) -> list[list[str]]:
-    """Sets of resting nodes that alone tell of a target for some time, those of most rows first."""
-    data, sensors = problem.measurements, problem.network.sensors
-    nodes = [sorted({node.name for node in sensor.nodes} & resting) for sensor in sensors]
-    rows: dict[tuple[str, ...], int] = {}
-    for k in range(len(data.target_names)):
-        mine = np.flatnonzero(data.target == k)
-        for window in np.array_split(mine[np.argsort(data.time[mine], kind="stable")], WINDOWS):
-            names = tuple(sorted({name for s in np.unique(data.sensor[window]) for name in nodes[s]}))
-            if 2 <= len(names) < len(resting):
-                rows[names] = rows.get(names, 0) + len(window)
-    return [list(names) for names in sorted(rows, key=lambda names: -rows[names])[:HEARD]]
-
-
-def _listed(names: list[str]) -> str:
-    """Names in a sentence."""
-    few = names[:4]
-    return ", ".join(few[:-1]) + f" and {few[-1]}" if len(names) <= 4 else f"{', '.join(few)} and {len(names) - 4} more"
-
-
-def node_places(problem: Problem, z: np.ndarray) -> dict[str, np.ndarray]:
-    """Place (d,) of every node that rests, by name, at biases z (M,)."""
-    d = problem.network.dimension
-    place = {
-        node.name: node.position + [problem.fixed.get(f"{node.name}.position_{axis}", 0.0) for axis in AXES[:d]]
-        for node in problem.network.nodes
-        if node.path is None
-    }
-    for m, bias in enumerate(problem.biases):
-        if bias.component == "position" and bias.owner in place and bias.since is None:
-            place[bias.owner][bias.axis] += z[m] * bias.scale
-    return place
-
-
-def reflect_nodes(problem: Problem, z: np.ndarray, plane: Plane) -> np.ndarray:
-    """Biases (M,) with every node of free place on the other side, where that is within `FAR` scales."""
-    place, moved = node_places(problem, z), np.array(z, float)
-    own: dict[str, list[int]] = {}
-    for m, bias in enumerate(problem.biases):
-        if bias.component == "position" and bias.owner in place and bias.since is None:
-            own.setdefault(bias.owner, []).append(m)
-    for name, members in own.items():
-        shift = plane.across(place[name]) - place[name]
-        new = z[members] + [shift[problem.biases[m].axis] / problem.scales[m] for m in members]
-        if len(members) == problem.network.dimension and np.abs(new).max() < FAR:
-            moved[members] = new
-        elif len(members) < problem.network.dimension:
-            free = np.array([problem.biases[m].axis for m in members])
-            held = np.delete(shift, free)
-            if np.abs(held).max(initial=0.0) < 1e-6 * max(np.abs(shift).max(), 1e-300) and np.abs(new).max() < FAR:
-                moved[members] = new
-    return moved
-
-
-def reflect(problem: Problem, point: Point, plane: Plane, chosen: list[np.ndarray], z: np.ndarray) -> Point:
-    """The point at biases z (M,) with the chosen epochs (E,) of each recursion on the other side of a plane."""
-    tracks = []
-    for epochs, states, mine in zip(problem.epochs, point.states, chosen, strict=True):
-        moved = np.array(states)
-        for name, start, stop, _ in epochs.layout:
-            if name == "position":
-                moved[mine, start:stop] = plane.across(moved[mine, start:stop])
-            elif name in ("velocity", "acceleration"):
-                vector = moved[mine, start:stop]
-                moved[mine, start:stop] = vector - 2.0 * (vector @ plane.normal)[:, None] * plane.normal
-        tracks.append(moved)
-    return at_levels(problem.model, follow_states(problem, tracks)._replace(z=jnp.asarray(z)), point.levels)
-
-
-def _movable(problem: Problem) -> list[np.ndarray]:
-    """Epochs (E,) of each recursion whose place the data tell, not the motion."""
-    found = []
-    for r, epochs in enumerate(problem.epochs):
-        _, known = known_places(problem, r, epochs.position)
-        found.append(~known)
-    return found
+    others: list[tuple[str, Point, Point]] = []
+    crossed = ""
+    for _ in range(CROSSED):
+        again, others, climbs, back = False, [], 0, 0
+        best: tuple[Point, float] | None = None
+        for name, candidate in node_sides(problem, point, WORSE):
+            best = climb.mode(point) if best is None else best
+            tried = climb.mode(candidate)
+            far = new(problem, tried[0], [best[0]], distance(problem, candidate, best[0]))
+            climbs, back = climbs + far, back + (not far)
+            if far and tried[1] > best[1] + GAIN:
+                point, crossed, again = tried[0], name, True
+                break
+            if far and tried[1] > best[1] - NEAR:
+                others.append((name, candidate, tried[0]))
+            if TRIED in (climbs, back):
+                break
+        if not again:
+            break
+    return point, crossed, others
 
 
 def _losses(problem: Problem, z: np.ndarray, point: Point, plane: Plane | None) -> list[np.ndarray]:
@@ -292,7 +186,7 @@ def _counts(problem: Problem) -> list[np.ndarray]:
 
 def _candidates(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
     """Reflections of the whole scene, and of the track of one target alone, that fit nearly as well unpolished."""
-    z, movable, counts = np.asarray(point.z), _movable(problem), _counts(problem)
+    z, free, counts = np.asarray(point.z), movable(problem), _counts(problem)
     targets = [name for epochs in problem.epochs for name in dict.fromkeys(epochs.target)]
     every = sum(float(count.sum()) for count in counts)
     found = planes(problem, z)
@@ -303,38 +197,18 @@ def _candidates(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
         for biases, word in ways:
             there = _losses(problem, biases, point, plane)
             worse = [b - a for a, b in zip(here, there, strict=True)]
-            total = sum(float(w[mine].sum()) for w, mine in zip(worse, movable, strict=True))
-            if any(mine.any() for mine in movable) and total < WORSE * every:
+            total = sum(float(w[mine].sum()) for w, mine in zip(worse, free, strict=True))
+            if any(mine.any() for mine in free) and total < WORSE * every:
                 who = "the targets" if len(targets) > 1 else f'target "{targets[0]}"'
-                yield f"{who}{word} reflected in {plane.name}", reflect(problem, point, plane, movable, biases)
+                yield f"{who}{word} reflected in {plane.name}", reflect(problem, point, plane, free, biases)
             if len(targets) < 2 or word:
                 continue
             for name in targets[:MOST]:
-                own = [m & (e.target == name) for m, e in zip(movable, problem.epochs, strict=True)]
+                own = [m & (e.target == name) for m, e in zip(free, problem.epochs, strict=True)]
                 much = sum(float(c[mine].sum()) for c, mine in zip(counts, own, strict=True))
                 loss = sum(float(w[mine].sum()) for w, mine in zip(worse, own, strict=True))
                 if any(mine.any() for mine in own) and loss < WORSE * much:
                     yield f'target "{name}" reflected in {plane.name}', reflect(problem, point, plane, own, z)
-
-
-def distance(problem: Problem, a: Point, b: Point) -> float:
-    """Root of the sum of squares of what lies between the places of two points."""
-    places = [
-        np.sum((np.asarray(x) - np.asarray(y))[:, slice(*epochs.position)] ** 2)
-        for x, y, epochs in zip(a.states, b.states, problem.epochs, strict=True)
-    ]
-    return float(np.sqrt(sum(places)))
-
-
-def extent(problem: Problem, point: Point) -> float:
-    """Root of the sum of squares of the places of a point about their mean, as `distance` counts."""
-    places = [np.asarray(x)[:, slice(*e.position)] for x, e in zip(point.states, problem.epochs, strict=True)]
-    return float(np.sqrt(sum(np.sum((own - own.mean(0)) ** 2) for own in places)))
-
-
-def new(problem: Problem, point: Point, known: Sequence[Point], size: float) -> bool:
-    """Whether a point lies apart from all that are known, by a good part of the size of a reflection."""
-    return size > 0 and all(distance(problem, point, other) > APART * size for other in known)
 
 
 def _turned(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, bool, list[tuple[str, Point, Point]]]:
@@ -400,7 +274,7 @@ def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
     Of pieces that differ by where their planes cut them there is one. A long piece does not go before a short one:
     what is left over when a track goes over from one side to the other is short as often.
     """
-    z, movable, counts = np.asarray(point.z), _movable(problem), _counts(problem)
+    z, free, counts = np.asarray(point.z), movable(problem), _counts(problem)
     found = planes(problem, z)
     pieces = list[_Piece]()
     here = _losses(problem, z, point, None) if found else []
@@ -409,7 +283,7 @@ def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
         for r, epochs in enumerate(problem.epochs):
             worse = there[r] - here[r]
             for target in dict.fromkeys(epochs.target):
-                mine = np.flatnonzero((epochs.target == target) & movable[r])
+                mine = np.flatnonzero((epochs.target == target) & free[r])
                 for own in _pieces(problem, point, plane, r, mine):
                     count = float(counts[r][own].sum())
                     if len(own) >= SHORTEST and count > 0 and worse[own].sum() < WORSE * count:
