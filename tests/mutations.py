@@ -76,7 +76,7 @@ MUTATIONS = [
     Mutation("inference/orbits.py", "gain = gain - there + here", "gain = gain + 0.0 * (there + here)", "test_orbits.py"),
     Mutation("inference/orbits.py", "density(at) + orbit.volume * r", "density(at)", "test_orbits.py"),
     # smoothing/mirrors.py, and crossing
-    Mutation("smoothing/mirrors.py", "return place - 2.0 * self.distance(place)", "return place - 1.0 * self.distance(place)", "test_mirrors.py"),
+    Mutation("smoothing/reflections.py", "return place - 2.0 * self.distance(place)", "return place - 1.0 * self.distance(place)", "test_mirrors.py"),
     Mutation("inference/collapsed.py", "return weight + posed.frame.log_likelihood(theta) - 0.5 * square + volume", "return weight - 0.5 * square + volume", "test_mirrors.py"),
     Mutation("inference/relevance.py", "change / (1.0 + change * row[m])", "change / (1.0 - change * row[m])", "test_relevance.py"),
     # inference/integrate.py, propagate.py

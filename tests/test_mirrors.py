@@ -19,8 +19,9 @@ from probcal.sensors import radar, ranger
 from probcal.smoothing import recursion
 from probcal.smoothing.grid import track_mode
 from probcal.smoothing.information import at_levels
-from probcal.smoothing.mirrors import Mirrored, Sides, other_sides, planes, reflect, reflect_nodes
+from probcal.smoothing.mirrors import Mirrored, Sides, other_sides
 from probcal.smoothing.mode import factors
+from probcal.smoothing.reflections import planes, reflect, reflect_nodes
 from probcal.starts import automatic_start
 from probcal.status import Status
 
@@ -358,8 +359,7 @@ def beside_others(monkeypatch, sides, ends, method=None):
         name, at, gain = sides[0]
         found = Sides(SimpleNamespace(z=np.full(1, at)), True, others, name, gain)
     monkeypatch.setattr(solve, "other_sides", lambda *_: found)
-    monkeypatch.setattr(solve, "distance", lambda _, a, b: float(abs(a.z - b.z)[0]))
-    monkeypatch.setattr(solve, "extent", lambda *_: 0.1)
+    monkeypatch.setattr(solve, "reach", lambda _, a, b: max(float(abs(a.z - b.z)[0]), 0.003))
     monkeypatch.setattr(
         solve, "new", lambda _, point, known, size: all(abs(point.z - o.z)[0] > 0.1 * size for o in known)
     )

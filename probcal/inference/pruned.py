@@ -26,14 +26,14 @@ Climb = Callable[[Point, np.ndarray, Mixing], State]  # from a point with precis
 
 
 @dataclass(frozen=True)
-class Standing:
+class GroupEvidence:
     """A group of biases of one precision: information s (K,) and squared score q2 (K,) in the axes that part them."""
 
     s: np.ndarray
     q2: np.ndarray
 
     @classmethod
-    def of(cls, covariance: np.ndarray, mean: np.ndarray, alpha: float) -> "Standing":
+    def of(cls, covariance: np.ndarray, mean: np.ndarray, alpha: float) -> "GroupEvidence":
         """From the posterior of the group, the others integrated."""
         values, axes = np.linalg.eigh(np.linalg.inv(covariance))
         return cls(np.maximum(values - alpha, 0.0), (values * (axes.T @ mean)) ** 2)
@@ -52,7 +52,7 @@ class Standing:
     def stays(self, prior: ARD, share: float) -> bool:
         """Whether some precision is best for a group of so much less score, or none short of the upper bound."""
         hyper = (prior.shape - 1) * np.log(GRID) - prior.rate * GRID
-        worth = Standing(self.s, max(share, 0.0) * self.q2).gain(GRID) + hyper
+        worth = GroupEvidence(self.s, max(share, 0.0) * self.q2).gain(GRID) + hyper
         return bool(np.any((worth[1:-1] > worth[:-2]) & (worth[1:-1] >= worth[2:])))
 
 
@@ -74,7 +74,7 @@ def _without_one(model: Model, prior: ARD, given: Given, state: State, climb: Cl
     far = sorted(set(group[inside].tolist()), key=lambda g: -np.abs(z[group == g]).max())
     for g in far[:TRIED]:
         mine = np.flatnonzero(group == g)
-        standing = Standing.of(covariance[np.ix_(mine, mine)], z[mine], float(alpha[mine[0]]))
+        standing = GroupEvidence.of(covariance[np.ix_(mine, mine)], z[mine], float(alpha[mine[0]]))
         out, at = alpha.copy(), z.copy()
         out[mine], at[mine] = PRECISION_BOUNDS[1], 0.0
         now = given.prior._replace(alpha=jax.device_put(out))

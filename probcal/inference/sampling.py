@@ -27,7 +27,7 @@ from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.smoothing.mirrors import Mirrored, other_sides
 from probcal.smoothing.mode import Point
-from probcal.smoothing.reflections import apart, new
+from probcal.smoothing.reflections import new, reach
 
 if TYPE_CHECKING:
     from probcal.inference.sampler import Sampler
@@ -161,7 +161,7 @@ def sample(
     sides, poses = list[Mirrored](), [(posed, found)]
     for k, other in enumerate(around.others if around is not None and method.crosses else ()):
         _, there, drawn_there, _ = pose(problem, prior, other.point, jax.random.fold_in(keys[0], 1 + k))
-        size = apart(problem, other.point, start)
+        size = reach(problem, other.point, start)
         if new(problem, there.frame.point, [one.frame.point for one, _ in poses], size):  # none is visited twice
             sides.append(other)
             poses.append((there, drawn_there))

@@ -18,7 +18,7 @@ from probcal.smoothing.frame import log_weight, place, unit_normals
 from probcal.smoothing.grid import track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import Point, mixed_density
-from probcal.smoothing.reflections import apart, new
+from probcal.smoothing.reflections import new, reach
 
 
 class Sided(NamedTuple):
@@ -45,7 +45,7 @@ def distances(problem: Problem, points: Sequence[Point]) -> list[Point]:
     for other in points[1:]:
         other = at_levels(problem.model, other, first.levels)
         alone = track_mode(problem, other._replace(z=first.z))
-        chosen = alone if new(problem, alone, [first], apart(problem, other, first)) else other
+        chosen = alone if new(problem, alone, [first], reach(problem, other, first)) else other
         found.append(jax.tree.map(jnp.subtract, chosen, first)._replace(levels=first.levels))
     return found
 

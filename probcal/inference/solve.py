@@ -19,7 +19,7 @@ from probcal.results.answer import Answer
 from probcal.smoothing.grid import follow_states, grid_start
 from probcal.smoothing.mirrors import MORE, NEAR, SAME, SCENE, START, Mirrored, SideClimb, Sides, other_sides
 from probcal.smoothing.mode import Point
-from probcal.smoothing.reflections import apart, new
+from probcal.smoothing.reflections import new, reach
 from probcal.smoothing.room import check_room
 from probcal.starts import further_starts
 from probcal.starts import optima as optima_of
@@ -170,7 +170,7 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
                 unfitted.append(other)
             continue
         known = [one.posterior.point for _, one in found]
-        if new(problem, own.posterior.point, known, apart(problem, other.point, here)):
+        if new(problem, own.posterior.point, known, reach(problem, other.point, here)):
             found.append(((other.name, other.kind), own))
     first = _weight(answer)
     better = [one for one in found[1:] if one[1].status.settled >= answer.status.settled]

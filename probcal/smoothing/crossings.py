@@ -14,7 +14,7 @@ from probcal.model.model import At, Model
 from probcal.problem import Problem
 from probcal.smoothing.grid import robust_misfit
 from probcal.smoothing.mode import Point
-from probcal.smoothing.reflections import APART, Plane, across, free_places, node_places
+from probcal.smoothing.reflections import SHIFTED, Plane, across, node_places, place_biases
 
 FEW = 3  # rows without which a node hears no path
 STILL = 1e-3  # extent of a path, over how far off a node stands, below which it is none
@@ -26,7 +26,7 @@ def node_sides(problem: Problem, point: Point, worse: float) -> Iterator[tuple[s
     Only where its free axes let it, within the reach of its scales, and its data fit at most `worse` nats a datum worse
     with the prior spread of the biases added to the noise.
     """
-    z, members, place = np.asarray(point.z), free_places(problem), node_places(problem, np.asarray(point.z))
+    z, members, place = np.asarray(point.z), place_biases(problem), node_places(problem, np.asarray(point.z))
     if not members:
         return
     names = list(members)
@@ -35,7 +35,7 @@ def node_sides(problem: Problem, point: Point, worse: float) -> Iterator[tuple[s
     for k, plane in _paths(problem, point, heard, np.array([place[name] for name in names])):
         mine = members[names[k]]
         there = across(problem, z, place[names[k]], mine, plane)
-        if there is not None and np.abs(there - z[mine]).max() > APART:
+        if there is not None and np.abs(there - z[mine]).max() > SHIFTED:
             moved[k] = there
     if not moved:
         return

@@ -15,6 +15,7 @@ from probcal.smoothing.mode import Point
 
 FAR = 6.0  # scales beyond which a node is not reflected
 FAINT = 0.03  # share of the extent of the tracks, of which a part (`new`) is no other place
+SHIFTED = 0.3  # scales by which nodes must be moved to count as reflected
 APART = 0.1  # share of a reflection that must be left after polishing: below, it came back
 WINDOWS, HEARD = 60, 4  # parts of a track in which nodes may be heard alone, and sets of such nodes that are looked at
 
@@ -114,7 +115,7 @@ def node_places(problem: Problem, z: np.ndarray) -> dict[str, np.ndarray]:
     return place
 
 
-def free_places(problem: Problem) -> dict[str, list[int]]:
+def place_biases(problem: Problem) -> dict[str, list[int]]:
     """Which biases are those of the place of each resting node that has some, by name."""
     resting = {node.name for node in problem.network.nodes if node.path is None}
     found: dict[str, list[int]] = {}
@@ -142,7 +143,7 @@ def across(
 def reflect_nodes(problem: Problem, z: np.ndarray, plane: Plane) -> np.ndarray:
     """Biases (M,) with every node of free place on the other side, where that is within `FAR` scales."""
     place, moved = node_places(problem, z), np.array(z, float)
-    for name, members in free_places(problem).items():
+    for name, members in place_biases(problem).items():
         if (own := across(problem, z, place[name], members, plane)) is not None:
             moved[members] = own
     return moved
@@ -185,15 +186,15 @@ def distance(problem: Problem, a: Point, b: Point) -> Gap:
         np.sum((np.asarray(x) - np.asarray(y))[:, slice(*epochs.position)] ** 2)
         for x, y, epochs in zip(a.states, b.states, problem.epochs, strict=True)
     ]
-    own = [m for members in free_places(problem).values() for m in members]
+    own = [m for members in place_biases(problem).values() for m in members]
     moved = (np.asarray(a.z) - np.asarray(b.z))[own]
     return Gap(float(np.sqrt(sum(places))), float(np.sqrt(np.sum(moved**2))))
 
 
-def apart(problem: Problem, a: Point, b: Point) -> Gap:
+def reach(problem: Problem, a: Point, b: Point) -> Gap:
     """What lies between two answers, so much at least that a part of it (`new`) is another place."""
     gap = distance(problem, a, b)
-    return Gap(max(gap.tracks, FAINT * extent(problem, b)), gap.nodes if gap.nodes > 1.0 else 0.0)
+    return gap._replace(tracks=max(gap.tracks, FAINT * extent(problem, b)))
 
 
 def extent(problem: Problem, point: Point) -> float:
@@ -205,6 +206,6 @@ def extent(problem: Problem, point: Point) -> float:
 def new(problem: Problem, point: Point, known: Sequence[Point], size: Gap) -> bool:
     """Whether a point lies apart from all that are known, by a good part of the size of a reflection."""
     gaps = [distance(problem, point, other) for other in known]
-    return max(size) > 0 and all(
-        any(0 < own * APART < there for there, own in zip(gap, size, strict=True)) for gap in gaps
-    )
+    nodes = size.nodes if size.nodes > SHIFTED else np.inf
+    tracks = size.tracks if size.tracks > 0 else np.inf
+    return all(gap.tracks > APART * tracks or gap.nodes > APART * nodes for gap in gaps)
