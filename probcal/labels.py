@@ -3,6 +3,7 @@
 from collections.abc import Collection
 
 AXES = ("x", "y", "z")
+SCENE, PIECE, NODE, START = "scene", "piece", "node", "start"  # what an answer beside another differs by
 
 
 def label_parts(label: str) -> tuple[str, str]:

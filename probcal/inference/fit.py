@@ -28,6 +28,7 @@ from probcal.inference.solve import solve
 from probcal.inference.sparse import SparsePosterior
 from probcal.inference.storage import Storage
 from probcal.inference.weighted import track_by_particles
+from probcal.labels import NODE, START
 from probcal.lazy import Later
 from probcal.particle.settings import Particles
 from probcal.priors import Prior
@@ -41,7 +42,7 @@ from probcal.smoothing.grid import grid_start, track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.joint import too_large
 from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mirrors import NODE, SAME, START, Mirrored
+from probcal.smoothing.mirrors import SAME, Mirrored
 from probcal.smoothing.mode import Point
 from probcal.smoothing.sparse_mode import settle_each, settled_variances
 from probcal.smoothing.tails import settle

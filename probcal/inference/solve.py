@@ -13,11 +13,12 @@ from probcal.inference.methods import MAP
 from probcal.inference.run import Context, Maximiser, Method
 from probcal.inference.sparse import PRODUCTS, check_sparse, gains_by_sparse, sparse_climb, takes_sparse
 from probcal.inference.sparse_gibbs import check_gibbs
+from probcal.labels import SCENE, START
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.grid import follow_states, grid_start
-from probcal.smoothing.mirrors import MORE, NEAR, SAME, SCENE, START, Mirrored, SideClimb, Sides, other_sides
+from probcal.smoothing.mirrors import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, other_sides
 from probcal.smoothing.mode import Point
 from probcal.smoothing.reflections import new, reach
 from probcal.smoothing.room import check_room

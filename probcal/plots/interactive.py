@@ -61,7 +61,8 @@ def interactive_map(tree: xr.DataTree) -> LayoutDOM:
 def layers(shown: Scene) -> dict[str, str]:
     """Tags of the layers that a map has, and what they are called."""
     has = {
-        "before": bool(shown.tracks), "after": bool(shown.tracks), "mirror": bool(shown.mirrored),
+        "before": bool(shown.tracks), "after": bool(shown.tracks),
+        "mirror": bool(shown.mirrored) or len(shown.elsewhere) > 0,
         "truth": any(np.isfinite(track.true).any() for track in shown.tracks),
         "objects": bool(shown.objects), "views": bool(shown.views),
         "ellipses": _encircled(shown), "names": len(shown.nodes.name) <= NAMED,
@@ -225,6 +226,10 @@ def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: l
     after = lines("after", tracks, "after", line_width=1.5)
     if any(np.isfinite(track.true).any() for track in tracks):
         lines("truth", tracks, "true", line_color=MIDDLE, line_dash="dotted", line_width=2)
+    for way in shown.elsewhere:
+        u, v = way[:, plane].T
+        _tagged("mirror", sheet.line(u, v, line_dash="dashed", line_color=MIDDLE))
+        _tagged("mirror", sheet.scatter(u[1:], v[1:], size=9, fill_color=None, line_color=MIDDLE))
     if shown.mirrored:
         lines("mirror", [track.thin(most) for track in shown.mirrored], "after", line_dash="dashed", line_width=1.5)
     x, y = (AXES[axis] for axis in plane)

@@ -33,15 +33,16 @@ def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw stated and calibrated nodes with their ellipses, the tracks before and after calibration.
 
     Dotted: the true tracks, where `add_scores` has met them. Dashed: the tracks of an answer on the other side of a
-    mirror that fits as well. Of detections that nobody named: a broad line where an object was, in the colour of its
-    existence and faint where that is small; and what each sensor sees, from where it was found to stand.
+    mirror that fits as well, and the way to where a node stands in such an answer (a ring). Of detections that nobody
+    named: a broad line where an object was, in the colour of its existence and faint where that is small; and what each
+    sensor sees, from where it was found to stand.
     """
     ax = new_axes(ax, 9.0, 6.5)
     ax.set_aspect("equal", adjustable="box")
     shown = scene(tree)
     ax.set(xlim=(shown.low[0], shown.high[0]), ylim=(shown.low[1], shown.high[1]))
     keys = _draw_views(ax, shown.views) + _draw_objects(ax, shown.objects)
-    keys += _draw_tracks(ax, shown.tracks) + _draw_mirrored(ax, shown.mirrored)
+    keys += _draw_tracks(ax, shown.tracks) + _draw_mirrored(ax, shown.mirrored, shown.elsewhere)
     keys += _draw_nodes(ax, shown.nodes, probability(tree))
     ax.set(xlabel="x in m", ylabel="y in m")
     ax.set_title("Map of nodes and tracks" + (" (x-y plane, z not shown)" if shown.dimension > 2 else ""), loc="left")
@@ -81,12 +82,16 @@ def _draw_objects(ax: Axes, objects: list[Found]) -> list[Line2D]:
     return [Line2D([], [], color=SURE, linewidth=4.0, label=f"{len(objects)} objects, by existence")]
 
 
-def _draw_mirrored(ax: Axes, tracks: list[Track]) -> list[Line2D]:
-    """Draw the tracks of the other side and return the legend entry."""
+def _draw_mirrored(ax: Axes, tracks: list[Track], elsewhere: np.ndarray) -> list[Line2D]:
+    """Draw the tracks and the nodes of the other side and return the legend entry."""
     for k, track in enumerate(tracks):
         places = track.thin(_most(tracks)).after[:, :2]
         ax.plot(*places.T, "--", color=colour(k), linewidth=1.0, alpha=0.7, zorder=2.5)
-    return [Line2D([], [], color="0.3", linestyle="--", label="fits as well")] if tracks else []
+    for way in elsewhere:
+        ax.plot(*way[:, :2].T, "--", color="0.3", linewidth=0.8, zorder=4)
+        ax.plot(*way[1, :2], "o", color="0.3", markerfacecolor="none", markersize=7, zorder=5)
+    drawn = tracks or len(elsewhere)
+    return [Line2D([], [], color="0.3", linestyle="--", label="fits as well")] if drawn else []
 
 
 def _draw_tracks(ax: Axes, tracks: list[Track]) -> list[Line2D]:

@@ -11,12 +11,13 @@ import xarray as xr
 
 from probcal.errors import InputError
 from probcal.geodesy import GEODETIC, LocalFrame
-from probcal.labels import AXES
+from probcal.labels import AXES, NODE
 from probcal.results.read import each_object, each_track
 
 ARC = 48  # corners of a sector's arc
 SEEN = 0.5  # share of an object in view at which the outline of a view is drawn
 ASIDE = 0.25  # of the extent of nodes and tracks up to which views and faint objects widen the map
+BEYOND = 2.0  # sd from which a node stands elsewhere in an answer that fits as well
 SURE = 0.5  # existence from which an object widens it at all
 
 
@@ -91,7 +92,8 @@ class Scene:
 
     nodes: Places
     tracks: list[Track]
-    mirrored: list[Track]  # of the best answer on the other side of a mirror, where one fits as well
+    mirrored: list[Track]  # of the best answer with tracks on the other side of a mirror, where one fits as well
+    elsewhere: np.ndarray  # (K, 2, d) where a node was found, and where it stands in an answer that fits as well
     objects: list[Found]
     views: list[Outline]
     low: np.ndarray
@@ -112,11 +114,12 @@ def scene(tree: xr.DataTree) -> Scene:
     attrs = tree["constant_data"].attrs
     frame = LocalFrame(*(float(attrs[name]) for name in GEODETIC)) if GEODETIC[0] in attrs else None
     objects = [Found(name, *rest) for name, *rest in each_object(tree, AXES[: nodes.stated.shape[1]])]
+    elsewhere = _elsewhere(tree, nodes)
     low, high = _limits(nodes, [*tracks, *mirrored], diverged=tree.attrs.get("status") == "diverged")
     views = list(_views(tree, nodes, float(np.linalg.norm(high - low))))
     sure = [own.position[own.existence >= SURE] for own in objects]
-    low, high = _widened(low, high, sure, [line for own in views for line in own.lines])
-    return Scene(nodes, tracks, mirrored, objects, views, low, high, frame)
+    low, high = _widened(low, high, sure, [*elsewhere, *(line for own in views for line in own.lines)])
+    return Scene(nodes, tracks, mirrored, elsewhere, objects, views, low, high, frame)
 
 
 def ellipse(covariance: np.ndarray, probability: float) -> tuple[float, float, float]:
@@ -174,18 +177,42 @@ def _tracks(tree: xr.DataTree) -> Iterator[Track]:
             yield Track(target, group["time"].values, part["before"].values, after, part["sd"].values, true)
 
 
+def _alike(tree: xr.DataTree) -> xr.Dataset:
+    """Answers that fit as well, without their tracks; none where there is no group of them."""
+    if "mirror" not in tree.children:
+        return xr.Dataset({"gain": ("mirror", np.zeros(0))})
+    group = tree["mirror"].to_dataset()
+    return group.assign(number=("mirror", np.arange(group.sizes["mirror"]))).isel(
+        mirror=group["gain"].values > -group.attrs["same"]
+    )
+
+
 def _mirrored(tree: xr.DataTree) -> Iterator[Track]:
     """Tracks of the best answer on the other side of a mirror, where one fits as well."""
-    if "mirror" not in tree.children:
+    alike = _alike(tree)
+    if alike.sizes["mirror"] and "kind" in alike:
+        alike = alike.isel(mirror=alike["kind"].values != NODE)
+    if not alike.sizes["mirror"]:
         return
-    group = tree["mirror"].to_dataset()
-    best = int(group["gain"].values.argmax())
-    if group["gain"].values[best] <= -group.attrs["same"]:
-        return
+    best = int(alike["number"].values[alike["gain"].values.argmax()])
     for target, there in each_track(tree.children["mirror"]):
         places = there["position"].isel(mirror=best).values
         nothing = np.full(places.shape, np.nan)
         yield Track(target, there["time"].values, places, places, nothing, nothing)
+
+
+def _elsewhere(tree: xr.DataTree, nodes: Places) -> np.ndarray:
+    """Where nodes were found and where they stand in answers that fit as well (K, 2, d), if that is another place."""
+    alike, d = _alike(tree), nodes.stated.shape[1]
+    found = list[np.ndarray]()
+    label = {name: k for k, name in enumerate(alike["bias_label"].values.tolist())} if len(alike.coords) else {}
+    at = np.array([[label.get(f"{name}.position_{axis}", -1) for axis in AXES[:d]] for name in nodes.name.tolist()])
+    for own in range(alike.sizes["mirror"]):
+        bias, apart = (np.append(alike[name].values[own], 0.0) for name in ("bias", "apart"))
+        for k in np.flatnonzero(apart[at].max(1) > BEYOND):
+            there = np.where(at[k] >= 0, nodes.stated[k] + bias[at[k]], nodes.calibrated[k])
+            found.append(np.stack([nodes.calibrated[k], there]))
+    return np.array(found).reshape(-1, 2, d)
 
 
 def _views(tree: xr.DataTree, nodes: Places, far: float) -> Iterator[Outline]:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.labels import NODE, PIECE, SCENE
 from probcal.priors import Precision
 from probcal.problem import Problem
 from probcal.smoothing.crossings import node_sides
@@ -36,9 +37,6 @@ SAME, NEAR = 3.0, 10.0  # nats within which another answer is as good, and withi
 CROSSED = 30  # nodes that cross at most
 MOST = 4  # answers that are kept
 PIECES = "pieces of tracks on their other side"
-
-
-SCENE, PIECE, NODE, START = KINDS = ("scene", "piece", "node", "start")  # what another answer differs by
 
 
 class Mirrored(NamedTuple):
