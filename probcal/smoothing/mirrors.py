@@ -21,7 +21,7 @@ from probcal.smoothing.grid import grid_start, profile, track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import laplace
 from probcal.smoothing.mode import Point, find_mode
-from probcal.smoothing.reflections import Plane, distance, movable, new, planes, reflect, reflect_nodes
+from probcal.smoothing.reflections import Plane, distance, movable, new, planes, reach, reflect, reflect_nodes
 from probcal.types import float64
 
 WORSE = 0.4  # nats a datum by which a reflected place may fit worse and is still polished: 0 to 0.2 beside a mirror,
@@ -89,7 +89,7 @@ def other_sides(problem: Problem, point: Point, climb: SideClimb | None = None) 
     for _ in range(ROUNDS):
         sides = _searched(problem, point, climb)
         name, kind = (sides.name, sides.kind) if sides.name else (name, kind)
-        if sides.gain <= MORE and not (sides.moved and sides.kind == NODE):
+        if sides.gain <= MORE:
             break
         point = sides.point
     if not name:
@@ -100,32 +100,45 @@ def other_sides(problem: Problem, point: Point, climb: SideClimb | None = None) 
     return sides._replace(moved=True, name=name, gain=there - begun, kind=kind)
 
 
+class _Beside(NamedTuple):
+    """Another place that may fit as well."""
+
+    kind: str
+    name: str
+    candidate: Point  # as it was reflected
+    start: Point  # polished
+
+
 def _searched(problem: Problem, point: Point, climb: SideClimb) -> Sides:
     """One search from a point; its gain is that of the best scene over the place with its pieces and nodes turned."""
-    point, turned, pieces = _turned(problem, point, climb)
-    point, crossed, nodes = _crossed(problem, point, climb)
+    name = ""
+    for _ in range(ROUNDS):
+        point, turned, pieces = _turned(problem, point, climb)
+        point, crossed, nodes = _crossed(problem, point, climb)
+        name = crossed or name or (PIECES if turned else "")
+        if not crossed:
+            break
     best: tuple[Point, float] | None = None
     found: list[Mirrored] = []
-    whole = ((SCENE, name, there, track_mode(problem, there)) for name, there in _candidates(problem, point))
-    parts = [(NODE, *own) for own in nodes] + [(PIECE, *own) for own in (() if crossed else pieces)]
-    for kind, name, candidate, start in chain(whole, parts):
+    whole = (_Beside(SCENE, name, there, track_mode(problem, there)) for name, there in _candidates(problem, point))
+    for kind, named, candidate, start in chain(whole, nodes, pieces):
         best = climb.mode(point) if best is None else best
         polished = climb.mode(start)
-        size = distance(problem, candidate, best[0])
+        size = (reach if kind == NODE or named == PIECES else distance)(problem, candidate, best[0])
         if not new(problem, polished[0], [best[0], *(other.point for other in found)], size):
             continue
         worth = [climb.evidence(*at) for at in (polished, best)]
         if np.isfinite(worth).all() and worth[0] - worth[1] > -NEAR:
             shift = np.asarray(polished[0].z - best[0].z)
-            found.append(Mirrored(name, worth[0] - worth[1], polished[0], shift, kind))
+            found.append(Mirrored(named, worth[0] - worth[1], polished[0], shift, kind))
     found.sort(key=lambda one: -one.gain)
     if found and best is not None and found[0].gain > MORE:
         first = found[0]
         rest = [o._replace(gain=o.gain - first.gain, shift=o.shift - first.shift) for o in found[1:]]
         back = Mirrored(first.name, -first.gain, best[0], -first.shift, first.kind)
         return Sides(first.point, True, _kept([back, *rest]), first.name, first.gain, first.kind)
-    name, kind = (crossed, NODE) if crossed else (PIECES, PIECE) if turned else ("", SCENE)
-    return Sides(point, turned or bool(crossed), _kept(found), name, kind=kind)
+    kind = SCENE if not name else PIECE if name == PIECES else NODE
+    return Sides(point, bool(name), _kept(found), name, kind=kind)
 
 
 def _kept(found: Sequence[Mirrored]) -> tuple[Mirrored, ...]:
@@ -135,26 +148,29 @@ def _kept(found: Sequence[Mirrored]) -> tuple[Mirrored, ...]:
     return tuple(near[:MOST])
 
 
-def _crossed(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, str, list[tuple[str, Point, Point]]]:
-    """The point with those nodes on the other side of their paths that fit better there, and the name of the last one.
+def _crossed(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, str, list[_Beside]]:
+    """The point with those nodes on the other side of their paths that fit better there, and what went there last.
 
-    Also those that fit about as well: names, reflected and polished points.
+    Also those that fit about as well. A node may come back and leave pieces of tracks on another side.
     """
-    others: list[tuple[str, Point, Point]] = []
+    others: list[_Beside] = []
     crossed = ""
     for _ in range(CROSSED):
         again, others, climbs, back = False, [], 0, 0
         best: tuple[Point, float] | None = None
         for name, candidate in node_sides(problem, point, WORSE):
             best = climb.mode(point) if best is None else best
-            tried = climb.mode(candidate)
-            far = new(problem, tried[0], [best[0]], distance(problem, candidate, best[0]))
-            climbs, back = climbs + far, back + (not far)
-            if far and tried[1] > best[1] + GAIN:
-                point, crossed, again = tried[0], name, True
+            tried, size = climb.mode(candidate), reach(problem, candidate, best[0])
+            far = new(problem, tried[0], [best[0]], size._replace(tracks=0.0))
+            kind, named = (NODE, name) if far else (PIECE, PIECES)
+            climbs, back = climbs + far, back + (not far)  # those that come back take no other's place
+            if not (far or new(problem, tried[0], [best[0]], size)):
+                continue
+            if tried[1] > best[1] + GAIN:
+                point, crossed, again = tried[0], named, True
                 break
-            if far and tried[1] > best[1] - NEAR:
-                others.append((name, candidate, tried[0]))
+            if tried[1] > best[1] - NEAR:
+                others.append(_Beside(kind, named, candidate, tried[0]))
             if TRIED in (climbs, back):
                 break
         if not again:
@@ -209,13 +225,13 @@ def _candidates(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
                     yield f'target "{name}" reflected in {plane.name}', reflect(problem, point, plane, own, z)
 
 
-def _turned(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, bool, list[tuple[str, Point, Point]]]:
+def _turned(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, bool, list[_Beside]]:
     """The point with those pieces of tracks on the other side that fit better there; whether any do.
 
-    Also those that fit about as well: names, reflected and polished points.
-    Where there is a piece to be tried the whole track is searched again too, at the biases reached so far.
+    Also those that fit about as well. Where there is a piece to be tried the whole track is searched again too, at the
+    biases reached so far.
     """
-    others: list[tuple[str, Point, Point]] = []
+    others: list[_Beside] = []
     best: tuple[Point, float] | None = None
     turned, again = False, True
     for _ in range(ROUNDS):
@@ -235,7 +251,7 @@ def _turned(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, bo
             if tried[1] > best[1] + GAIN:
                 point, best, turned, again = tried[0], tried, True, True
             elif tried[1] > best[1] - NEAR:
-                others.append((name, candidate, tried[0]))
+                others.append(_Beside(PIECE, name, candidate, tried[0]))
         if best is not None and not again:
             searched = at_levels(problem.model, grid_start(problem, best[0].z, 30), point.levels)
             tried = climb.mode(searched)
