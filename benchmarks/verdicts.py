@@ -136,7 +136,7 @@ WRONG = {
     "anchored-30": anchored(30.0),
     "signal": right("signal", 0.3),
 }
-MIRRORS = {name: right(name, 0.5) for name in ("line", "ceiling")}
+MIRRORS = {name: right(name, 0.5) for name in ("line", "ceiling", "beside")}
 CASES = RIGHT | SMOOTH | MIRRORS | WRONG
 
 

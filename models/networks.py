@@ -10,6 +10,8 @@
 - signal: eight signal-strength receivers whose gains share a loss of about 4 dB that nobody knows (every bias counts);
 - line: four range beacons on one line, two of them free; the target on the other side of it fits as well;
 - ceiling: six range anchors at one height above a drone (3-D), two of them free: the drone above them fits as well;
+- beside: seven range beacons at both sides of a path that bends by 2 m, four of them surveyed to 6 m: which of these
+  stand on which side of it hangs on that bend;
 - corners: the beacons, and a target that goes straight and turns five times; with `tails="student"` its process noise
   has heavy tails, as the motion has;
 - bearings: six cameras surveyed to 2 m with free headings, where motion noise alone tells the size of the scene.
@@ -39,7 +41,7 @@ from probcal.geometry import bearing, norm
 from probcal.noise import Normal
 from probcal.sensors import radar, ranger, rss, toa
 
-NAMES = ("beacons", "clocks", "pass", "signal", "bearings", "line", "ceiling", "corners")
+NAMES = ("beacons", "clocks", "pass", "signal", "bearings", "line", "ceiling", "beside", "corners")
 FIXED = {"line": ("*.range_scale", "*.range_offset")}
 CAMERAS = np.array([(0, 0), (60, 0), (60, 40), (0, 40), (30, -10), (30, 50)], float)
 
@@ -95,11 +97,18 @@ def _ceiling():
     return Network([anchor.on(Node(f"a{k}", p, scale=scales.get(k))) for k, p in enumerate(places)])
 
 
+def _beside():
+    places = [(0, 10), (40, -14), (80, 12), (120, -9), (60, 40), (20, -40), (100, -38)]
+    scales = [{"position": 6.0} if k < 4 else None for k in range(7)]
+    return Network([ranger.on(Node(f"b{k}", p, scale=s)) for k, (p, s) in enumerate(zip(places, scales, strict=True))])
+
+
 NETWORKS = {"beacons": _beacons, "clocks": _clocks, "pass": _pass, "signal": _signal, "bearings": _bearings}
-NETWORKS |= {"line": _line, "ceiling": _ceiling, "corners": _beacons}
+NETWORKS |= {"line": _line, "ceiling": _ceiling, "beside": _beside, "corners": _beacons}
 
 
 STEPS = {"beacons": 0.5, "clocks": 0.5, "pass": 0.3, "signal": 0.3, "bearings": 0.03, "line": 0.5, "ceiling": 0.5}
+STEPS |= {"beside": 0.5}
 TAILS = {"gaussian": Normal(), "student": StudentT(4.0), "heavy": StudentT(2.0)}
 
 
@@ -125,6 +134,7 @@ def _path(network, time, rng):
         "clocks": (35 + 22 * np.cos(t / 9), 28 + 20 * np.sin(t / 6)),
         "pass": (-20 + 2.8 * t, 35 + 0.4 * t),
         "signal": (5 + 1.2 * t, 50 + 35 * np.sin(t / 9)),
+        "beside": (-10 + 2.3 * t, 2 * np.sin(t / 9)),
         "line": (-10 + 1.9 * t, 15 + 8 * np.sin(t / 8)),
         "ceiling": (5 + 3 * np.cos(t / 3), 4 + 2.5 * np.sin(t / 2.2), 1.2 + 0.5 * np.sin(t / 4)),
     }[network]
@@ -165,7 +175,7 @@ def _wander(time, rng):
 def times(network):
     """Times of the measurements of a network."""
     steps = {"beacons": (100, 0.5), "bearings": (400, 0.5), "line": (120, 0.5), "ceiling": (150, 0.2)}
-    steps["corners"] = (120, 0.5)
+    steps |= {"corners": (120, 0.5), "beside": (120, 0.5)}
     count, step = steps.get(network, (80, 1.0))
     return step * np.arange(count)
 

@@ -51,8 +51,8 @@ def assess(
 
     Limits have a false-alarm rate of 1 %: of one epoch in `epoch_check`, else of all comparisons of a kind together.
     Refits of large networks are one step from the fit (attribute `refits` of the group). Of a misfit nothing is left
-    out and no halves are compared. A fit in sparse form is judged by its innovations and by how much the data narrow
-    each bias (`probcal.analysis.large`). Raises `InputError` where the tree is no fit of the problem.
+    out and no halves are compared. A fit in sparse form is judged by its innovations, by its halves, and by how much
+    the data narrow each bias (`probcal.analysis.large`). Raises `InputError` where the tree is no fit of the problem.
 
     >>> checked = assess(problem, tree)
     >>> checked["verdict"]["verdict"].sel(bias_label="sonar_1.range_offset").item()
@@ -259,13 +259,9 @@ def _inflation(fit: Fitted, found: residuals.Filtered, divided: Pieces, grid: _G
 
 def _drift(problem: Problem, change: Change, inflation: np.ndarray, limit: float) -> str:
     """Reason of a bias whose halves differ: by how much."""
-    bias, contrast = problem.biases[change.bias], change.contrast
-    sd = np.sqrt(inflation[change.bias] / contrast.information[0, 0]) * bias.scale
-    unit = f" {bias.unit}" if bias.unit != "1" else ""
-    return (
-        f"second half less first {contrast.estimate[0] * bias.scale:.3g} \N{PLUS-MINUS SIGN} {sd:.2g}{unit} "
-        f"({np.sqrt(change.square):.1f} sd, limit {np.sqrt(limit):.1f})"
-    )
+    contrast = change.contrast
+    sd = np.sqrt(inflation[change.bias] / contrast.information[0, 0])
+    return pieces.changed(problem, change.bias, float(contrast.estimate[0]), float(sd), limit)
 
 
 def _shape(shape: pieces.Contrast | None, edges: np.ndarray) -> str:

@@ -1,8 +1,9 @@
 """`assess` of a fit in sparse form: innovations and verdicts, by nothing of size (M, M).
 
 Innovations are those of any fit. The degrees of freedom that the biases used, the sum of gamma, are shared among the
-data by what each tells of the biases of its sensor. Left out are refits without a sensor or a target, halves of the
-recording, replicas, and the shape of the posterior.
+data by what each tells of the biases of its sensor. Halves of the recording are compared by one factor more
+(`halves`), but for fits without one. Left out are refits without a sensor or a target, replicas, and the shape of the
+posterior.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal.analysis import checks, predictive, residuals, verdict
+from probcal.analysis import checks, pieces, predictive, residuals, verdict
 from probcal.analysis.beside import mirror_doubts, mirror_findings
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Judged, identified, point_of
+from probcal.analysis.halves import SAMPLED, Divided, Halves, changing
 from probcal.analysis.widen import rejection, widened
 from probcal.identifiability.directions import shared_in_blocks
 from probcal.inference.sparse import SparsePosterior, declared_blocks
@@ -26,7 +28,7 @@ from probcal.results.answer import Answer
 from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import bias_coords
 from probcal.smoothing.joint import JointPrecision
-from probcal.smoothing.sparse_mode import system_at
+from probcal.smoothing.sparse_mode import SparseSystem, system_at
 from probcal.status import INVALID, Status
 
 SHARED = 1.8  # sd that an open combination of one scale may put a bias off
@@ -37,6 +39,7 @@ DRAWS = 20  # of data about the fit, from which the kurtosis of noise that is no
 class JudgedLarge(Judged):
     """A fit in sparse form taken up again."""
 
+    system: SparseSystem
     blocks: SensorBlocks  # of the covariance of z
     declared: SensorBlocks  # what a prior of the declared scales leaves
 
@@ -59,7 +62,7 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
     residual = tree["residual"].to_dataset()
     turned = residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     findings += [Finding("wrapping", *pair) for pair in turned]
-    groups["verdict"] = _verdicts(fit, tree, _inflation(fit, found))
+    groups["verdict"] = _verdicts(fit, tree, _inflation(fit, found), groups)
     findings += mirror_findings(tree)
     if tree.attrs["status"] in INVALID:
         text = (
@@ -90,14 +93,17 @@ def _taken_up(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> Jud
     else:
         declared = declared_blocks(problem, system)
     blocks = SensorBlocks.read(told, problem.labels, problem.scales)
-    return JudgedLarge(problem, system.point, system.rows, system.solved, picks, data, blocks, declared)
+    return JudgedLarge(problem, system.point, system.rows, system.solved, picks, data, system, blocks, declared)
 
 
-def _innovations(fit: JudgedLarge, gamma: np.ndarray) -> residuals.Innovations:
-    """Innovations of all data with the biases at their means."""
-    still = [jnp.zeros((lin.bias.shape[0], lin.bias.shape[2])) for lin in fit.lins]
+def _innovations(
+    fit: JudgedLarge, gamma: np.ndarray, shift: list[np.ndarray] | None = None
+) -> residuals.Innovations:  # fmt: skip
+    """Innovations of all data with the biases at their means, or shifted (N, p) from row to row."""
+    moved = [jnp.zeros((lin.bias.shape[0], lin.bias.shape[2])) for lin in fit.lins]
+    moved = moved if shift is None else [jnp.asarray(own) for own in shift]
     filters = residuals.prepare(fit.solved)
-    found = residuals.innovations_at(fit.problem.model, fit.point, fit.lins, filters, still)
+    found = residuals.innovations_at(fit.problem.model, fit.point, fit.lins, filters, moved)
     value, kept = (fit.flat(parts) for parts in zip(*found, strict=True))
     told = np.maximum(fit.flat(_told(fit)), 0.0)
     used = np.minimum(told * (gamma.sum() / max(told.sum(), 1e-300)), 0.9)
@@ -154,19 +160,67 @@ def _inflation(fit: JudgedLarge, found: residuals.Innovations) -> np.ndarray:
     return np.maximum(weighed[:M] / np.maximum(told[:M], 1e-300), np.average(wide, weights=counts))
 
 
-def _verdicts(fit: JudgedLarge, tree: xr.DataTree, inflation: np.ndarray) -> xr.Dataset:
-    """Group `verdict`."""
+def _divided(fit: JudgedLarge, alpha: np.ndarray) -> tuple[Divided, float] | None:
+    """The fit with the halves of its recording apart, and the time between them.
+
+    None where there is one half only, or no room for a factor.
+    """
+    data = fit.problem.measurements
+    measured = np.sort(data.time[data.measured.any(1)])
+    middle = float(measured[len(measured) // 2])
+    if middle == measured[0]:
+        return None
+    late = [data.time[index] >= middle for index in fit.problem.row_index]
+    try:
+        return Divided(fit.problem.model, fit.system, alpha, late), middle
+    except (MemoryError, np.linalg.LinAlgError):
+        return None
+
+
+def _compared(
+    problem: Problem, found: Halves, middle: float, inflation: np.ndarray
+) -> tuple[xr.Dataset, np.ndarray, dict[int, str], str]:
+    """Group `halves`, chi-squares (M,), the reasons of the biases that drift, and the label of the first of these."""
+    M = problem.model.biases
+    limit, told = verdict.limit_of(M), np.flatnonzero(found.information > 0)
+    scale = problem.scales[told]
+    change = found.estimate[told] * scale
+    sd = np.sqrt(inflation[told] / found.information[told]) * scale
+    values = {"change": change, "sd": sd, "t": change / sd, "solved": np.isin(told, found.solved)}
+    group = xr.Dataset({name: ("bias_label", own) for name, own in values.items()}, bias_coords(problem, told.tolist()))
+    group.attrs |= {"time": middle, "limit": float(np.sqrt(limit)), "rate": verdict.RATE, "draws": SAMPLED}
+    changes = changing(found, inflation, limit)
+    drifts = {
+        one.bias: pieces.changed(
+            problem, one.bias, one.estimate, np.sqrt(inflation[one.bias] / one.information), limit
+        )
+        for one in changes
+    }  # fmt: skip
+    return group, found.square / inflation, drifts, problem.labels[changes[0].bias] if changes else ""
+
+
+def _verdicts(
+    fit: JudgedLarge, tree: xr.DataTree, inflation: np.ndarray, groups: dict[str, xr.Dataset]
+) -> xr.Dataset:  # fmt: skip
+    """Group `verdict`; adds the group `halves` where the recording can be divided."""
     problem, group = fit.problem, tree["calibration"].to_dataset()
     M, z = problem.model.biases, np.asarray(fit.point.z)
     alpha, gamma = group["precision"].values, group["gamma"].values
+    square, drifts, first = np.zeros(M), dict[int, str](), ""
+    sound = tree.attrs["status"] not in INVALID and "sd_error" not in group
+    if sound and (divided := _divided(fit, alpha)) is not None:
+        halves, middle = divided
+        inflation = _inflation(fit, _innovations(fit, gamma, halves.own_shift()))  # a change does not hide itself
+        compared = halves.compare(inflation, verdict.limit_of(M))
+        groups["halves"], square, drifts, first = _compared(problem, compared, middle, inflation)
     known = verdict.Grounds(
-        np.clip(1.0 - fit.declared.variance, 0.0, 1.0), np.zeros(M), verdict.pull(z, alpha, gamma, inflation),
+        np.clip(1.0 - fit.declared.variance, 0.0, 1.0), square, verdict.pull(z, alpha, gamma, inflation),
         float(np.sqrt(verdict.limit_of(M))),
     )  # fmt: skip
     shared = shared_in_blocks(problem, fit.point, fit.declared.members, fit.declared.covariance, SHARED)
     ended, doubts = group["status"].values.tolist(), mirror_doubts(fit, tree)
     words, reasons = verdict.judge_biases(
-        problem, Status(tree.attrs["status"]), ended, known, {}, {}, "", shared, doubts
+        problem, Status(tree.attrs["status"]), ended, known, drifts, {}, first, shared, doubts
     )
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}

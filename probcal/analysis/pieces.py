@@ -14,6 +14,7 @@ import numpy as np
 from probcal.analysis.fitted import Fitted
 from probcal.model import variants
 from probcal.model.model import Model
+from probcal.problem import Problem
 from probcal.smoothing.linearised import compress_and_eliminate
 
 Limit = Callable[[int], float]  # chi-square by degrees of freedom
@@ -127,6 +128,16 @@ def own_biases(pieces: Pieces, member: np.ndarray) -> np.ndarray:
     to = np.kron(np.eye(int(member.max()) + 1)[member], np.eye(M))
     step = np.linalg.solve(to.T @ pieces.information @ to + np.eye(to.shape[1]), to.T @ pieces.score)
     return step.reshape(-1, M)[member]
+
+
+def changed(problem: Problem, m: int, estimate: float, sd: float, limit: float) -> str:
+    """By how much the halves of a bias differ, from estimate and sd in z, as the reason of a verdict."""
+    bias = problem.biases[m]
+    unit = f" {bias.unit}" if bias.unit != "1" else ""
+    return (
+        f"second half less first {estimate * bias.scale:.3g} \N{PLUS-MINUS SIGN} {sd * bias.scale:.2g}{unit} "
+        f"({abs(estimate) / sd:.1f} sd, limit {np.sqrt(limit):.1f})"
+    )
 
 
 class Change(NamedTuple):
