@@ -22,6 +22,7 @@ from probcal.smoothing.sparse_mode import SparseSystem
 SAMPLED, TOGETHER = 128, 16  # of the joint Gaussian, and of them at once
 SUSPECT, MOST = 0.4, 100  # share of the limit from which a bias is suspected, and how many are solved for at most
 FREED = 20  # biases that may differ together
+TOLD = 4.0  # errors above which draws tell how much is left of an information
 STEPS = 30  # of conjugate gradients at most
 
 
@@ -135,7 +136,7 @@ class Divided:
         score = self.score - self.half.along(step[None])[0] - alpha * z * self.crossed
         score = score - root * self.crossed * (step[self.joint.states :] + alpha * z * self.levels)
         error = left * np.sqrt(2.0 / SAMPLED)
-        information = np.where(self.own - left > np.maximum(error, LEAST), self.own - left, 0.0)
+        information = np.where(self.own - left > np.maximum(TOLD * error, LEAST), self.own - left, 0.0)
         least = np.maximum(self.own - left - 2.0 * error, 0.05 * self.own + 1e-300)
         may = score**2 / least / inflation * (self.own > LEAST)
         suspects = np.argsort(-may)[:MOST]

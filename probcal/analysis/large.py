@@ -207,7 +207,7 @@ def _verdicts(
     M, z = problem.model.biases, np.asarray(fit.point.z)
     alpha, gamma = group["precision"].values, group["gamma"].values
     square, drifts, first = np.zeros(M), dict[int, str](), ""
-    sound = tree.attrs["status"] not in INVALID and "sd_error" not in group
+    sound = tree.attrs["status"] not in INVALID and "log_evidence_error" not in tree.attrs  # there was a factor
     if sound and (divided := _divided(fit, alpha)) is not None:
         halves, middle = divided
         inflation = _inflation(fit, _innovations(fit, gamma, halves.own_shift()))  # a change does not hide itself

@@ -1,0 +1,100 @@
+"""Halves of a recording in sparse form: those of the dense form, by solves and by draws."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from sparse_worlds import LIBRARIES, MOTION, TIME, drawn, drawn_in_space
+
+import probcal as pc
+from probcal.analysis import halves
+
+DRIFTS = {"b": ("range", 12.0), "e": ("azimuth", 0.06)}  # of the sensor of a node, from the middle on
+
+
+@cache
+def drifting(*names):
+    """The network in the plane, some of its sensors another one in the second half."""
+    problem = drawn()[0]
+    table = problem.measurements.table.frame.copy()
+    for name in names:
+        channel, change = DRIFTS[name]
+        mine = (table["sensor"].astype(str) == name) & (table["time"] >= TIME[len(TIME) // 2])
+        table.loc[mine, channel] += change
+    return pc.Problem(problem.network, MOTION, table)
+
+
+@cache
+def assessed(form, problem):
+    """Its MAP in one form, judged."""
+    return pc.assess(problem, pc.fit(problem, pc.MAP(form=form), prior=pc.Gaussian()))
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+@pytest.mark.parametrize("names", [(), ("b", "e")], ids=["still", "two drift"])
+def test_halves_are_those_of_the_dense_form(library, names, monkeypatch):
+    """Every bias solved for: the same changes and sds, and the same biases drift, in words too."""
+    problem = drifting(*names)
+    wanted = assessed("dense", problem)
+    monkeypatch.setattr(halves, "SUSPECT", 0.0)
+    found = pc.assess(problem, pc.fit(problem, pc.MAP(form="sparse"), prior=pc.Gaussian()))
+    a, b = wanted["halves"].to_dataset(), found["halves"].to_dataset()
+    assert b["solved"].all()
+    assert a["bias_label"].values.tolist() == b["bias_label"].values.tolist()
+    np.testing.assert_allclose(b["change"], a["change"], rtol=2e-3, atol=2e-3 * a["sd"].values.min())
+    np.testing.assert_allclose(b["sd"], a["sd"], rtol=0.08)  # quarters were let free there, halves here
+    assert b.attrs["time"] == a.attrs["time"]
+    drift = [tree["verdict"]["verdict"].values == "drifting" for tree in (wanted, found)]
+    assert drift[1].tolist() == drift[0].tolist()
+    assert drift[1].sum() == len(names)
+
+
+def test_draws_say_what_solves_do(monkeypatch):
+    """Of a network in 3-D: sds within the error of 128 draws; what they cannot tell is left out."""
+    problem = drawn_in_space()[0]
+    tree = pc.fit(problem, pc.MAP(form="sparse"), prior=pc.Gaussian())
+    found = []
+    for share in (0.0, np.inf):
+        monkeypatch.setattr(halves, "SUSPECT", share)
+        found.append(pc.assess(problem, tree)["halves"].to_dataset())
+    solved, by_draws = found
+    assert not by_draws["solved"].any()
+    solved = solved.sel(bias_label=by_draws["bias_label"].values)
+    np.testing.assert_allclose(by_draws["sd"], solved["sd"], rtol=0.3)
+    assert np.abs(by_draws["t"] - solved["t"]).max() < 0.5
+    assert len(by_draws["bias_label"]) >= 4
+
+
+@pytest.mark.parametrize("prior", [pc.Horseshoe(), pc.Flat()], ids=["mixture", "flat"])
+def test_a_drift_is_named_under_other_priors(prior):
+    """Of precisions that are integrated, and without any: b drifts, nothing else does."""
+    problem = drifting("b")
+    method = pc.EA(form="sparse") if isinstance(prior, pc.Horseshoe) else pc.MAP(form="sparse")
+    tree = pc.fit(problem, method, prior=prior)
+    verdicts = pc.assess(problem, tree)["verdict"].to_dataset()["verdict"].to_series()
+    assert verdicts.index[verdicts == "drifting"].tolist() == ["b.range_offset"]
+
+
+def test_what_cannot_be_compared_is_not():
+    """A fit without a factor, one epoch, or no room: verdicts without halves."""
+    problem = drifting("b")
+    tree = pc.fit(problem, pc.MAP(form="matrix-free"), prior=pc.Gaussian())
+    assert "halves" not in pc.assess(problem, tree).children
+    tree = pc.fit(problem, pc.MAP(form="sparse"), prior=pc.Gaussian())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("probcal.analysis.large.Divided", lambda *_: (_ for _ in ()).throw(MemoryError))
+        checked = pc.assess(problem, tree)
+    assert "halves" not in checked.children
+    assert "drifting" not in checked["verdict"]["verdict"].values
+
+
+def test_a_bias_without_a_level_of_its_own_is_left_out():
+    """What only one half tells is no difference."""
+    table = drawn()[0].measurements.table.frame
+    late = (table["sensor"].astype(str) == "d") & (table["time"] < TIME[len(TIME) // 2])
+    problem = pc.Problem(drawn()[0].network, MOTION, table[~late])
+    tree = pc.fit(problem, pc.MAP(form="sparse"), prior=pc.Gaussian())
+    compared = pc.assess(problem, tree)["halves"]["bias_label"].values
+    dense = assessed("dense", problem)["halves"]["bias_label"].values
+    assert "d.heading" not in compared
+    assert set(compared) <= set(dense)
