@@ -162,7 +162,7 @@ def test_what_must_move_is_free_and_within_reach():
 def test_a_node_surveyed_on_its_side_costs_no_look():
     """Its scale is 1 m, the other side 20 m away."""
     problem = beside(0, 0.0, scale=1.0)
-    with jax.enable_x64(True), patch("probcal.smoothing.crossings._by_row") as looked:
+    with jax.enable_x64(True), patch("probcal.smoothing.crossings._linearised") as looked:
         assert not list(node_sides(problem, automatic_start(problem), 0.4))
     assert not looked.called
 

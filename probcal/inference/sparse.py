@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
 CHAINS, NUMBERS, MOST = 4, 400_000, 250  # of the draws of all biases that a tree holds, and draws of a chain
 STEPS = 60  # of the climb
+HELD = 30.0  # nats that a node may fit worse on its other side, tracks held, and is still tried: each is a climb
 NAMED = 20  # combinations of single sensors that are named
 PRODUCTS = "matrix-free"
 SPARSE = ("sparse", PRODUCTS)
@@ -273,7 +274,7 @@ def sparse_climb(problem: Problem, form: str) -> SideClimb:
         except (np.linalg.LinAlgError, FitError):  # not positive definite, or conjugate gradients did not end
             return point, -np.inf
 
-    return SideClimb(mode, lambda _, evidence: evidence)
+    return SideClimb(mode, lambda _, evidence: evidence, HELD)
 
 
 def _evidence(mode: SparseMode, problem: Problem, alpha: np.ndarray) -> tuple[float, float]:

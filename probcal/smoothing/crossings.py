@@ -5,26 +5,29 @@ Where its place is known to no better than that, each side is a place of its own
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from probcal.model.model import At, Model
+from probcal.model.rows import Linearised
 from probcal.problem import Problem
-from probcal.smoothing.grid import robust_misfit
 from probcal.smoothing.mode import Point
 from probcal.smoothing.reflections import SHIFTED, Plane, across, node_places, place_biases
 
 FEW = 3  # rows without which a node hears no path
 STILL = 1e-3  # extent of a path, over how far off a node stands, below which it is none
+STEPS, STRIDE = 8, 1.0  # by which a node settles on its other side, and scales that one may move a bias
+ASIDE = 5.0  # sd from where it settles on its own side at which it stands on another: below, it came back
 
 
-def node_sides(problem: Problem, point: Point, worse: float) -> Iterator[tuple[str, Point]]:
+def node_sides(problem: Problem, point: Point, worse: float, most: float = np.inf) -> Iterator[tuple[str, Point]]:
     """Each node on the other side of its path, tracks as they are: names and points, those first that fit best.
 
-    Only where its free axes let it, within the reach of its scales, and its data fit at most `worse` nats a datum worse
-    with the prior spread of the biases added to the noise.
+    Only where its free axes let it, within the reach of its scales. Its biases, and those of its sensors, settle there;
+    what then fits more than `worse` nats a datum worse, or more than `most` nats, is left out.
     """
     z, members, place = np.asarray(point.z), place_biases(problem), node_places(problem, np.asarray(point.z))
     if not members:
@@ -39,19 +42,105 @@ def node_sides(problem: Problem, point: Point, worse: float) -> Iterator[tuple[s
             moved[k] = there
     if not moved:
         return
-    loss = np.full(len(names), np.inf)
-    here = _losses(problem.model, point, point.z, heard, len(names))
+    own = _Own.of(problem, names, heard)
+    drop, aside, settled = np.full(len(names), np.inf), np.zeros(len(names)), dict[int, np.ndarray]()
     for together in _parted(heard, moved):
-        other = z.copy()
+        home, other = z, z.copy()
         for k in together:
             other[members[names[k]]] = moved[k]
-        there = _losses(problem.model, point, jnp.asarray(other), heard, len(names))
-        loss[together] = (there - here)[together]
-    for k in sorted(moved, key=lambda k: loss[k]):
-        if loss[k] < worse:
-            other = z.copy()
-            other[members[names[k]]] = moved[k]
-            yield f'node "{names[k]}" on the other side of the path that it hears', point._replace(z=jnp.asarray(other))
+        for _ in range(STEPS):
+            home, _ = own.step(problem.model, point, home, together)
+            other, information = own.step(problem.model, point, other, together)
+        away = np.append(other - home, 0.0)[own.biases[together]]
+        aside[together] = np.sqrt(np.einsum("kp,kpq,kq->k", away, information, away))
+        there, here = (own.losses(problem.model, point, at) for at in (other, home))
+        drop[together] = (there - here)[together]
+        for k in together:
+            local = own.biases[k][own.biases[k] < len(z)]
+            settled[k] = z.copy()
+            settled[k][local] = other[local]
+    for k in sorted(moved, key=lambda k: drop[k]):
+        if aside[k] > ASIDE and drop[k] < min(worse * own.count[k], most):
+            name = f'node "{names[k]}" on the other side of the path that it hears'
+            yield name, point._replace(z=jnp.asarray(settled[k]))
+
+
+@dataclass(frozen=True)
+class _Own:
+    """Which biases and which data are those of one node alone, of K nodes."""
+
+    biases: np.ndarray  # (K, P), M of none
+    place: np.ndarray  # (M + 1, 2) node and position in `biases` of each bias, -1 of none
+    nodes: list[np.ndarray]  # of each block the nodes (N, p) of the sensor of each row, -1 of none
+    count: np.ndarray  # (K,) data
+
+    @classmethod
+    def of(cls, problem: Problem, names: list[str], heard: list[np.ndarray]) -> "_Own":
+        """Of named nodes: their own biases, and those of sensors that have no other node."""
+        number, M = {name: k for k, name in enumerate(names)}, problem.model.biases
+        alone = {sensor.name: sensor.nodes[0].name for sensor in problem.network.sensors if len(sensor.nodes) == 1}
+        lists: list[list[int]] = [[] for _ in names]
+        place = np.full((M + 1, 2), -1)
+        for m, bias in enumerate(problem.biases):
+            k = number.get(bias.owner, number.get(alone.get(bias.owner, ""), -1))
+            if k >= 0:
+                place[m] = k, len(lists[k])
+                lists[k].append(m)
+        biases = np.full((len(names), max(map(len, lists))), M)
+        for k, listed in enumerate(lists):
+            biases[k, : len(listed)] = listed
+        data = problem.model.rows
+        nodes = [own[np.asarray(rows.sensor)] for own, rows in zip(heard, data, strict=True)]
+        count = np.zeros(len(names))
+        for own, rows in zip(nodes, data, strict=True):
+            _add(count, own, np.asarray(rows.mask).sum(1))
+        return cls(biases, place, nodes, count)
+
+    def losses(self, model: Model, point: Point, z: np.ndarray) -> np.ndarray:
+        """Cost (K,) of the data of each node and of its own biases under their scales."""
+        found = 0.5 * np.sum(np.append(z, 0.0)[self.biases] ** 2, 1)
+        for own, loss in zip(self.nodes, _by_row(model, point, jnp.asarray(z)), strict=True):
+            _add(found, own, np.nan_to_num(np.asarray(loss), nan=1e9, posinf=1e9))
+        return found
+
+    def step(
+        self, model: Model, point: Point, z: np.ndarray, moving: list[int]
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Biases (M,) after a Gauss-Newton step of some nodes each by itself, tracks and other biases held.
+
+        And the information (moving, P, P) about the biases of each, that of their scales with it.
+        """
+        (K, P), M = self.biases.shape, len(z)
+        number = np.full(K + 1, -1)
+        number[moving] = np.arange(len(moving))
+        node = number[self.place[:, 0]]  # (M + 1,) which of those that move, by bias
+        size = len(moving) * P * P
+        much, pull = np.zeros(size), -np.append(z, 0.0)[self.biases[moving]].ravel()
+        for read, lin in zip(model.read, _linearised(model, point, jnp.asarray(z)), strict=True):
+            on = np.flatnonzero((node[np.asarray(read)] >= 0).any(1))
+            read, slope, weight, score = (np.asarray(own)[on] for own in (read, lin.bias, lin.weight, lin.score))
+            whose, at = node[read], self.place[read, 1]
+            for a in range(read.shape[1]):
+                mine = whose[:, a] >= 0
+                first = whose[:, a] * P + at[:, a]
+                pull += np.bincount(first[mine], np.sum(score * slope[:, :, a], 1)[mine], len(pull))
+                for b in range(read.shape[1]):
+                    both = mine & (whose[:, b] == whose[:, a])
+                    own = np.sum(weight * slope[:, :, a] * slope[:, :, b], 1)
+                    much += np.bincount((first * P + at[:, b])[both], own[both], size)
+        information = much.reshape(-1, P, P) + np.eye(P)
+        change = np.linalg.solve(information, pull.reshape(-1, P, 1))[:, :, 0]
+        change *= STRIDE / np.maximum(np.abs(np.nan_to_num(change)).max(1, keepdims=True), STRIDE)
+        after = np.append(z, 0.0)
+        after[self.biases[moving]] += np.nan_to_num(change)
+        return after[:M], information
+
+
+def _add(total: np.ndarray, node: np.ndarray, value: np.ndarray) -> None:
+    """Add a value (N,) of each row to the total (K,) of each of its nodes (N, p), -1 of none."""
+    for slot in range(node.shape[1]):
+        mine = node[:, slot] >= 0
+        np.add.at(total, node[mine, slot], value[mine])
 
 
 def _heard(problem: Problem, first: list[int]) -> list[np.ndarray]:
@@ -102,20 +191,12 @@ def _parted(heard: list[np.ndarray], moved: dict[int, np.ndarray]) -> list[list[
     return sets
 
 
-def _losses(model: Model, point: Point, z: jax.Array, heard: list[np.ndarray], nodes: int) -> np.ndarray:
-    """Robust misfit (nodes,) a datum of the rows of each node at biases z, tracks as they are."""
-    total, count = np.zeros(nodes), np.zeros(nodes)
-    for own, data, loss in zip(heard, model.rows, _by_row(model, point, z), strict=True):
-        value = np.nan_to_num(np.asarray(loss), nan=1e9, posinf=1e9)
-        much = np.asarray(data.mask).sum(1)
-        for slot in range(own.shape[1]):
-            node = own[:, slot][np.asarray(data.sensor)]
-            np.add.at(total, node[node >= 0], value[node >= 0])
-            np.add.at(count, node[node >= 0], much[node >= 0])
-    return total / np.maximum(count, 1.0)
+@jax.jit
+def _by_row(model: Model, point: Point, z: jax.Array) -> tuple[jax.Array, ...]:
+    """Negative log-likelihood (N,) of the rows of each block."""
+    return tuple(-jnp.sum(own, 1) for own in model.log_likelihood(At(point.states, z, point.levels)))
 
 
 @jax.jit
-def _by_row(model: Model, point: Point, z: jax.Array) -> tuple[jax.Array, ...]:
-    """Robust misfit (N,) of the rows of each block."""
-    return tuple(robust_misfit(lin) for lin in model.linearise(At(point.states, z, point.levels), expected=False))
+def _linearised(model: Model, point: Point, z: jax.Array) -> tuple[Linearised, ...]:
+    return model.linearise_biases(At(point.states, z, point.levels), expected=False)

@@ -59,7 +59,7 @@ def _widened(lin: Linearised) -> Linearised:
     return lin._replace(score=lin.score * factor, weight=lin.weight * factor)
 
 
-def robust_misfit(lin: Linearised) -> jax.Array:
+def _misfit(lin: Linearised) -> jax.Array:
     """Robust misfit (N,) of every row, with the prior spread of the biases added to its noise.
 
     One logarithm of the product of its channels: most of the time of a start goes there.
@@ -96,9 +96,7 @@ def profile(model: Model, r: int, span: tuple[int, int], z: jax.Array, place: ja
         A, b = A + J, b + score
         step = linalg.solve_batched(A[:, loose[:, None], loose[None, :]], b[:, loose])
         states = states.at[:, loose].add(step)
-    (loss,) = mine.by_epoch(
-        [robust_misfit(lin)[:, None] for lin in mine.linearise(At((states,), z, levels), expected=False)]
-    )
+    (loss,) = mine.by_epoch([_misfit(lin)[:, None] for lin in mine.linearise(At((states,), z, levels), expected=False)])
     return loss, states
 
 
@@ -159,7 +157,7 @@ def _seen(
             looked = apart((waist.predict(block, few, state, z), spread))
             predicted, spread = apart(jax.tree.map(lambda part, own=own: part[own], looked))
             score, weight = waist.weigh(block, data, predicted, std, expected=False)
-            misfits.append(robust_misfit(Linearised(score, weight, jnp.zeros((*score.shape, 0)), spread)))
+            misfits.append(_misfit(Linearised(score, weight, jnp.zeros((*score.shape, 0)), spread)))
         return misfits
 
     found = jnp.zeros((mine.recursions[0].drift.shape[0], len(places)))

@@ -54,6 +54,7 @@ class SideClimb(NamedTuple):
 
     mode: Callable[[Point], tuple[Point, float]]  # the mode, and its log density or evidence, -inf where there is none
     evidence: Callable[[Point, float], float]  # of a mode and what came with it
+    most: float = np.inf  # nats that a node may fit worse on its other side, tracks held, and is still tried
 
     @classmethod
     def dense(cls, problem: Problem) -> "SideClimb":
@@ -158,7 +159,7 @@ def _crossed(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, s
     for _ in range(CROSSED):
         again, others, climbs, back = False, [], 0, 0
         best: tuple[Point, float] | None = None
-        for name, candidate in node_sides(problem, point, WORSE):
+        for name, candidate in node_sides(problem, point, WORSE, climb.most):
             best = climb.mode(point) if best is None else best
             tried, size = climb.mode(candidate), reach(problem, candidate, best[0])
             far = new(problem, tried[0], [best[0]], size._replace(tracks=0.0))
