@@ -10,11 +10,12 @@ from scipy import stats
 
 import probcal
 from probcal import ARD, EA, MAP, ConstantVelocity, Gaussian, Network, Node, Problem, simulate
-from probcal.inference.pruned import GroupEvidence
+from probcal.inference.pruned import GroupEvidence, without_far_modes
 from probcal.plots.interactive import interactive_map, layers
 from probcal.plots.map import plot_map
 from probcal.plots.scene import scene
 from probcal.sensors import ranger, tdoa
+from probcal.smoothing import mirrors
 from probcal.smoothing.crossings import _parted, node_sides
 from probcal.smoothing.grid import track_mode
 from probcal.smoothing.reflections import Plane, across
@@ -96,6 +97,37 @@ def test_an_anchor_above_or_below_the_flight_is_found(kind, shift):
     mean, sd = bias(tree, "b0.position_z")
     assert abs(mean - shift) < 4 * max(sd, 0.5)
     assert sd < 4.0
+
+
+def test_a_height_alone_is_free():
+    """The path is a plane by least squares, tilted a little: 18 sd off, `converged`, where x and y had to move too."""
+    problem = above(0, -25.0, "ranger", **{"b0.position_z": -56.0})
+    stated = Problem(problem.network, ConstantVelocity(0.5), problem.measurements.table, fix=("b0.position_[xy]",))
+    mean, sd = bias(probcal.fit(stated, MAP(), prior=Gaussian()), "b0.position_z")
+    assert abs(mean + 56.0) < 4 * sd < 20.0
+
+
+def test_nodes_cross_together_and_climbs_that_come_back_are_few(monkeypatch):
+    """Of a hundred nodes that come back eight are climbed; those that fit better go in one climb."""
+    problem = beside(0, 4.0, **{"b0.position_y": -20.0})
+    with jax.enable_x64(True):
+        point, climbs = automatic_start(problem), []
+
+        def mode(at):
+            climbs.append(at)
+            return point, 0.0
+
+        monkeypatch.setattr(mirrors, "node_sides", lambda *_: ((f"n{k}", point) for k in range(100)))
+        assert mirrors._crossed(problem, point, mirrors.SideClimb(mode, lambda *_: 0.0)) == (point, "", [])
+        assert len(climbs) == 1 + mirrors.TRIED
+        shifts = {f"b{k}.position_y": -2.0 * PLACES[k][1] for k in (0, 1, 2)}
+        three = beside(0, 4.0, ("b0", "b1", "b2"), scale=10.0, **shifts)
+        first, _ = next(node_sides(three, automatic_start(three), 0.4))
+    assert first.endswith("nodes on the other side of the paths that they hear")
+    tree = probcal.fit(three, MAP(), prior=Gaussian())
+    for label, shift in shifts.items():
+        mean, sd = bias(tree, label)
+        assert abs(mean - shift) < 4 * sd
 
 
 def test_where_nothing_tells_the_sides_apart_both_are_told():
@@ -199,3 +231,24 @@ def test_a_bias_stays_from_the_square_that_its_prior_asks_for(shape, least):
         group = GroupEvidence(np.ones(1), np.array([square]))
         assert group.stays(ARD(shape=shape), 1.0) is stays
     assert not GroupEvidence(np.ones(1), np.array([4 * least])).stays(ARD(shape=shape), 0.2)
+    assert GroupEvidence(np.ones(1), np.array([1e3])).stays(ARD(shape=shape), 1.0)  # best at the lower bound
+
+
+@pytest.mark.parametrize("evidence", [np.nan, -np.inf])
+def test_a_trial_that_ends_nowhere_takes_no_ones_place(evidence):
+    """The climb without a group of biases has no evidence: the state stands."""
+    problem = beside(0, 0.0, tuple(f"b{k}" for k in range(7)))
+    start = on_the_wrong_side(problem, "b0.position_y", -20.0)
+    ended = []
+
+    def lost(model, prior, given, state, climb):
+        def nowhere(point, alpha, mixing):
+            ended.append(state)
+            return state._replace(found=state.found._replace(evidence=jnp.asarray(evidence)))
+
+        return without_far_modes(model, prior, given, state, nowhere)
+
+    with patch("probcal.inference.ea.without_far_modes", lost):
+        tree = probcal.fit(problem, EA(precisions="maximised"), prior=ARD(shape=4.0), start=start)
+    assert ended
+    assert np.isfinite(tree.attrs["log_evidence_type_ii"])

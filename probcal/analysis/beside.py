@@ -43,7 +43,8 @@ def mirror_doubts(
             found.setdefault(
                 int(m), f"it is {away[m]:.1f} sd away in an answer that fits as well: {group['mirror'].values[k]}"
             )
-    if {SCENE, PIECE} & set(group["kind"].values[alike].tolist()):
+    kinds = group["kind"].values if "kind" in group else np.full(len(group["gain"]), SCENE)  # those of older files
+    if {SCENE, PIECE} & set(kinds[alike].tolist()):
         near, where = touched(fit.problem, fit.point, variances() if variances else _saved(fit, tree))
         if near < BEYOND:
             every = dict.fromkeys(range(fit.problem.model.biases), f"{where}, which hides on which side it goes on")

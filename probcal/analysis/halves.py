@@ -21,6 +21,7 @@ from probcal.smoothing.sparse_mode import SparseSystem
 
 SAMPLED, TOGETHER = 128, 16  # of the joint Gaussian, and of them at once
 SUSPECT, MOST = 0.4, 100  # share of the limit from which a bias is suspected, and how many are solved for at most
+COLUMNS = 25  # solved together
 FREED = 20  # biases that may differ together
 TOLD = 4.0  # errors above which draws tell how much is left of an information
 STEPS = 30  # of conjugate gradients at most
@@ -30,8 +31,9 @@ class Halves(NamedTuple):
     """How each bias alone differs in the second half, in z; of those not in `solved` by draws."""
 
     estimate: np.ndarray  # (M,)
-    information: np.ndarray  # (M,) about it, 0 where nothing is told
+    information: np.ndarray  # (M,) about it, 0 where nothing is told, or less than draws can tell
     solved: np.ndarray  # (S,) biases
+    unsolved: int  # more that were suspected
     exact: "Exact"
 
     @property
@@ -65,7 +67,7 @@ class Exact(NamedTuple):
         return information, self.score[k] - along - across @ root @ level
 
 
-class Change(NamedTuple):
+class HalfChange(NamedTuple):
     """A bias that differs between the halves beside those before it."""
 
     bias: int
@@ -135,42 +137,51 @@ class Divided:
         left = self.left + root * self.crossed**2
         score = self.score - self.half.along(step[None])[0] - alpha * z * self.crossed
         score = score - root * self.crossed * (step[self.joint.states :] + alpha * z * self.levels)
-        error = left * np.sqrt(2.0 / SAMPLED)
+        share = np.minimum(alpha * self.levels, 1.0) / np.maximum(1.0 - alpha * self.levels, 1e-3)
+        error = (left + root * self.crossed**2 * share) * np.sqrt(2.0 / SAMPLED)
         information = np.where(self.own - left > np.maximum(TOLD * error, LEAST), self.own - left, 0.0)
         least = np.maximum(self.own - left - 2.0 * error, 0.05 * self.own + 1e-300)
         may = score**2 / least / inflation * (self.own > LEAST)
-        suspects = np.argsort(-may)[:MOST]
-        suspects = np.sort(suspects[may[suspects] > SUSPECT * limit])
+        every = np.argsort(-may)[: np.count_nonzero(may > SUSPECT * limit)]
+        suspects = np.sort(every[:MOST])
         exact = self._solved(suspects)
         estimate = np.where(information > 0, score / np.maximum(information, 1e-300), 0.0)
         for k, m in enumerate(suspects):
             (told,), (pull,) = (part.ravel() for part in exact.differences([k]))
             information[m] = told if told > LEAST else 0.0
             estimate[m] = pull / told if told > LEAST else 0.0
-        return Halves(estimate, information, suspects, exact)
+        return Halves(estimate, information, suspects, max(len(every) - MOST, 0), exact)
 
     def _solved(self, suspects: np.ndarray) -> Exact:
         """What is exact about suspected biases, by two solves of each."""
-        S, start = len(suspects), self.joint.states
-        levels = np.zeros((self.joint.places.size, S))
-        levels[start + suspects, np.arange(S)] = 1.0
+        S, start, n = len(suspects), self.joint.states, self.joint.places.size
         units = np.zeros((S, len(self.alpha)))
         units[np.arange(S), suspects] = 1.0
-        sides = np.concatenate([np.stack([self.half.back(unit) for unit in units], 1), levels], 1) if S else levels
-        among = sides.T @ self.factor.solve(sides) if S else np.zeros((0, 0))
+        sides = np.stack([self.half.back(unit) for unit in units], 1) if S else np.zeros((n, 0))
+
+        def along(columns: np.ndarray) -> np.ndarray:  # of the differences, then of the levels
+            return np.concatenate([sides.T @ columns, columns[start + suspects]])
+
+        among = np.zeros((2 * S, 2 * S))
+        for first in range(0, S, COLUMNS):
+            mine = slice(first, min(first + COLUMNS, S))
+            among[:, mine] = along(self.factor.solve(sides[:, mine]))
+            levels = np.zeros((n, mine.stop - first))
+            levels[start + suspects[mine], np.arange(mine.stop - first)] = 1.0
+            among[:, S + first : S + mine.stop] = along(self.factor.solve(levels))
         return Exact(
-            sides[start + suspects, :S], 0.5 * (among + among.T), self.score[suspects], sides.T @ self.step,
-            self.z[suspects], self.alpha[suspects],
+            sides[start + suspects], 0.5 * (among + among.T), self.score[suspects], along(self.step), self.z[suspects],
+            self.alpha[suspects],
         )  # fmt: skip
 
 
-def changing(halves: Halves, inflation: np.ndarray, limit: float) -> list[Change]:
+def drifts_of(halves: Halves, inflation: np.ndarray, limit: float) -> list[HalfChange]:
     """Biases whose halves differ beyond the limit, the strongest first, as `pieces.changing` lets them free.
 
     One is let free at a time, that whose change of the order of its scale explains most, and the others are judged
     anew beside it.
     """
-    found, held = list[Change](), list[int]()
+    found, held = list[HalfChange](), list[int]()
     while len(held) < FREED:
         best, most = None, -np.inf
         for k, m in enumerate(halves.solved):
@@ -183,7 +194,7 @@ def changing(halves: Halves, inflation: np.ndarray, limit: float) -> list[Change
             if told <= LEAST or pull**2 / told / inflation[m] <= limit:
                 continue
             if (plausible := pull**2 / (told + 0.5) / inflation[m]) > most:
-                best, most = (k, Change(int(m), float(pull / told), float(told))), plausible
+                best, most = (k, HalfChange(int(m), float(pull / told), float(told))), plausible
         if best is None:
             break
         held.append(best[0])

@@ -8,6 +8,7 @@ posterior.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import jax
@@ -19,7 +20,7 @@ from probcal.analysis import checks, pieces, predictive, residuals, verdict
 from probcal.analysis.beside import mirror_doubts, mirror_findings
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Judged, identified, point_of
-from probcal.analysis.halves import SAMPLED, Divided, Halves, changing
+from probcal.analysis.halves import SAMPLED, Divided, Halves, drifts_of
 from probcal.analysis.widen import rejection, widened
 from probcal.identifiability.directions import shared_in_blocks
 from probcal.inference.sparse import SparsePosterior, declared_blocks
@@ -27,6 +28,7 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import bias_coords
+from probcal.smoothing import cholesky
 from probcal.smoothing.joint import JointPrecision
 from probcal.smoothing.sparse_mode import SparseSystem, system_at
 from probcal.status import INVALID, Status
@@ -63,6 +65,9 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
     turned = residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     findings += [Finding("wrapping", *pair) for pair in turned]
     groups["verdict"] = _verdicts(fit, tree, _inflation(fit, found), groups)
+    if "halves" in groups and (unsolved := groups["halves"].attrs["unsolved"]):
+        text = f"{unsolved} more biases may differ between the halves than were looked at: so many are no drift of one"
+        findings.append(Finding("halves", "fit", text))
     findings += mirror_findings(tree)
     if tree.attrs["status"] in INVALID:
         text = (
@@ -160,21 +165,12 @@ def _inflation(fit: JudgedLarge, found: residuals.Innovations) -> np.ndarray:
     return np.maximum(weighed[:M] / np.maximum(told[:M], 1e-300), np.average(wide, weights=counts))
 
 
-def _divided(fit: JudgedLarge, alpha: np.ndarray) -> tuple[Divided, float] | None:
-    """The fit with the halves of its recording apart, and the time between them.
-
-    None where there is one half only, or no room for a factor.
-    """
-    data = fit.problem.measurements
+def _middle(problem: Problem) -> float | None:
+    """The time that parts the rows of a recording in halves; None where there is one half only."""
+    data = problem.measurements
     measured = np.sort(data.time[data.measured.any(1)])
     middle = float(measured[len(measured) // 2])
-    if middle == measured[0]:
-        return None
-    late = [data.time[index] >= middle for index in fit.problem.row_index]
-    try:
-        return Divided(fit.problem.model, fit.system, alpha, late), middle
-    except (MemoryError, np.linalg.LinAlgError):
-        return None
+    return middle if middle > measured[0] else None
 
 
 def _compared(
@@ -188,15 +184,18 @@ def _compared(
     sd = np.sqrt(inflation[told] / found.information[told]) * scale
     values = {"change": change, "sd": sd, "t": change / sd, "solved": np.isin(told, found.solved)}
     group = xr.Dataset({name: ("bias_label", own) for name, own in values.items()}, bias_coords(problem, told.tolist()))
-    group.attrs |= {"time": middle, "limit": float(np.sqrt(limit)), "rate": verdict.RATE, "draws": SAMPLED}
-    changes = changing(found, inflation, limit)
+    group.attrs |= {"time": middle, "limit": float(np.sqrt(limit)), "rate": verdict.RATE}
+    group.attrs |= {"draws": SAMPLED, "unsolved": found.unsolved}
+    changes = drifts_of(found, inflation, limit)
     drifts = {
         one.bias: pieces.changed(
             problem, one.bias, one.estimate, np.sqrt(inflation[one.bias] / one.information), limit
         )
         for one in changes
     }  # fmt: skip
-    return group, found.square / inflation, drifts, problem.labels[changes[0].bias] if changes else ""
+    square = np.zeros(M)
+    square[found.solved] = (found.square / inflation)[found.solved]  # what the strongest may explain
+    return group, square, drifts, problem.labels[changes[0].bias] if changes else ""
 
 
 def _verdicts(
@@ -207,12 +206,16 @@ def _verdicts(
     M, z = problem.model.biases, np.asarray(fit.point.z)
     alpha, gamma = group["precision"].values, group["gamma"].values
     square, drifts, first = np.zeros(M), dict[int, str](), ""
-    sound = tree.attrs["status"] not in INVALID and "log_evidence_error" not in tree.attrs  # there was a factor
-    if sound and (divided := _divided(fit, alpha)) is not None:
-        halves, middle = divided
-        inflation = _inflation(fit, _innovations(fit, gamma, halves.own_shift()))  # a change does not hide itself
-        compared = halves.compare(inflation, verdict.limit_of(M))
-        groups["halves"], square, drifts, first = _compared(problem, compared, middle, inflation)
+    without = "log_evidence_error" in tree.attrs or ("sd_error" in group and cholesky.exact())  # a factor of the biases
+    middle = _middle(problem)
+    if tree.attrs["status"] not in INVALID and not without and middle is not None:
+        late = [problem.measurements.time[index] >= middle for index in problem.row_index]
+        with suppress(MemoryError, np.linalg.LinAlgError):  # no room for a factor: no halves
+            halves = Divided(problem.model, fit.system, alpha, late)
+            own = _inflation(fit, _innovations(fit, gamma, halves.own_shift()))  # a change does not hide itself
+            compared = halves.compare(own, verdict.limit_of(M))
+            groups["halves"], square, drifts, first = _compared(problem, compared, middle, own)
+            inflation = own
     known = verdict.Grounds(
         np.clip(1.0 - fit.declared.variance, 0.0, 1.0), square, verdict.pull(z, alpha, gamma, inflation),
         float(np.sqrt(verdict.limit_of(M))),

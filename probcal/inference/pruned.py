@@ -50,41 +50,50 @@ class GroupEvidence:
         return float((fall - 0.5 * np.sum(np.log(alpha / own))) / max(promised, 1e-300))
 
     def stays(self, prior: ARD, share: float) -> bool:
-        """Whether some precision is best for a group of so much less score, or none short of the upper bound."""
+        """Whether some precision short of the upper bound is best for a group of so much less score."""
         hyper = (prior.shape - 1) * np.log(GRID) - prior.rate * GRID
         worth = GroupEvidence(self.s, max(share, 0.0) * self.q2).gain(GRID) + hyper
-        return bool(np.any((worth[1:-1] > worth[:-2]) & (worth[1:-1] >= worth[2:])))
+        return bool(worth[0] > worth[1] or np.any((worth[1:-1] > worth[:-2]) & (worth[1:-1] >= worth[2:])))
 
 
 def without_far_modes(model: Model, prior: ARD, given: Given, state: State, climb: Climb) -> State:
-    """The state after every group of biases that another mode keeps in was taken out, one after the other."""
+    """The state after every group of biases that another mode keeps in was taken out, one after the other.
+
+    A climb that did not end, or ended nowhere, is left as it is.
+    """
+    stayed = set[int]()
     for _ in range(TRIED):
-        found = _without_one(model, prior, given, state, climb)
+        sound = bool(state.done) and bool(jnp.isfinite(state.found.evidence))
+        found = _without_one(model, prior, given, state, climb, stayed) if sound else None
         if found is None:
             break
         state = found
     return state
 
 
-def _without_one(model: Model, prior: ARD, given: Given, state: State, climb: Climb) -> State | None:
-    """The state without the first group that does not stay, None where all do."""
+def _without_one(
+    model: Model, prior: ARD, given: Given, state: State, climb: Climb, stayed: set[int]
+) -> State | None:  # fmt: skip
+    """The state without the first group that does not stay, None where all do; `stayed` gathers what was tried."""
     z, alpha, covariance = (np.asarray(x) for x in (state.point.z, state.alpha, state.found.covariance))
     group, inside = np.asarray(given.group), (alpha < 0.1 * PRECISION_BOUNDS[1]) & ~np.asarray(given.surveyed)
     model = model.with_mixing(state.mixing)
     far = sorted(set(group[inside].tolist()), key=lambda g: -np.abs(z[group == g]).max())
-    for g in far[:TRIED]:
+    for g in [g for g in far if g not in stayed][:TRIED]:
         mine = np.flatnonzero(group == g)
-        standing = GroupEvidence.of(covariance[np.ix_(mine, mine)], z[mine], float(alpha[mine[0]]))
+        first = float(alpha[mine[0]])
+        standing = GroupEvidence.of(covariance[np.ix_(mine, mine)], z[mine], first)
         out, at = alpha.copy(), z.copy()
         out[mine], at[mine] = PRECISION_BOUNDS[1], 0.0
         now = given.prior._replace(alpha=jax.device_put(out))
         start = smooth_tracks(model, state.point._replace(z=jnp.asarray(at)))
         start = find_mode(model, start, now, 30, 1e-3).point
         fall = float(state.found.evidence - laplace(model, start, now).evidence)
-        if not standing.share(float(alpha[mine[0]]), fall) < SHARE:
+        if not standing.share(first, fall) < SHARE:
             continue
         tried = climb(start, out, state.mixing)
         fall = float(state.found.evidence - tried.found.evidence)
-        if bool(tried.done) and not standing.stays(prior, standing.share(float(alpha[mine[0]]), fall)):
+        stayed.add(g)
+        if bool(tried.done) and np.isfinite(fall) and not standing.stays(prior, standing.share(first, fall)):
             return tried
     return None

@@ -15,11 +15,13 @@ from probcal.model.model import At, Model
 from probcal.model.rows import Linearised
 from probcal.problem import Problem
 from probcal.smoothing.mode import Point
-from probcal.smoothing.reflections import SHIFTED, Plane, across, node_places, place_biases
+from probcal.smoothing.reflections import FAR, SHIFTED, Plane, node_places, place_biases
 
 FEW = 3  # rows without which a node hears no path
 STILL = 1e-3  # extent of a path, over how far off a node stands, below which it is none
 STEPS, STRIDE = 8, 1.0  # by which a node settles on its other side, and scales that one may move a bias
+LEVEL = 0.25  # square of the part of a normal that lies along the free axes of a node, below which it cannot cross
+SETS = 40  # of nodes that are moved together, one set after the other
 ASIDE = 5.0  # sd from where it settles on its own side at which it stands on another: below, it came back
 
 
@@ -37,14 +39,16 @@ def node_sides(problem: Problem, point: Point, worse: float, most: float = np.in
     moved: dict[int, np.ndarray] = {}
     for k, plane in _paths(problem, point, heard, np.array([place[name] for name in names])):
         mine = members[names[k]]
-        there = across(problem, z, place[names[k]], mine, plane)
+        there = _beyond(problem, z, place[names[k]], mine, plane)
         if there is not None and np.abs(there - z[mine]).max() > SHIFTED:
             moved[k] = there
     if not moved:
         return
+    moved = dict(sorted(moved.items(), key=lambda pair: np.abs(pair[1]).max()))  # the likeliest first
     own = _Own.of(problem, names, heard)
     drop, aside, settled = np.full(len(names), np.inf), np.zeros(len(names)), dict[int, np.ndarray]()
-    for together in _parted(heard, moved):
+    sets = _parted(heard, moved)[:SETS]
+    for together in sets:
         home, other = z, z.copy()
         for k in together:
             other[members[names[k]]] = moved[k]
@@ -53,16 +57,39 @@ def node_sides(problem: Problem, point: Point, worse: float, most: float = np.in
             other, information = own.step(problem.model, point, other, together)
         away = np.append(other - home, 0.0)[own.biases[together]]
         aside[together] = np.sqrt(np.einsum("kp,kpq,kq->k", away, information, away))
-        there, here = (own.losses(problem.model, point, at) for at in (other, home))
-        drop[together] = (there - here)[together]
+        there, here, before = (own.losses(problem.model, point, at) for at in (other, home, z))
+        drop[together] = (there - np.minimum(here, before))[together]
         for k in together:
             local = own.biases[k][own.biases[k] < len(z)]
             settled[k] = z.copy()
             settled[k][local] = other[local]
+    better = [[k for k in together if aside[k] > ASIDE and drop[k] < 0.0] for together in sets]
+    if len(most_of := max(better, key=len)) > 1:
+        whole = z.copy()
+        for k in most_of:
+            local = own.biases[k][own.biases[k] < len(z)]
+            whole[local] = settled[k][local]
+        name = f"{len(most_of)} nodes on the other side of the paths that they hear"
+        yield name, point._replace(z=jnp.asarray(whole))
     for k in sorted(moved, key=lambda k: drop[k]):
         if aside[k] > ASIDE and drop[k] < min(worse * own.count[k], most):
             name = f'node "{names[k]}" on the other side of the path that it hears'
             yield name, point._replace(z=jnp.asarray(settled[k]))
+
+
+def _beyond(
+    problem: Problem, z: np.ndarray, place: np.ndarray, members: list[int], plane: Plane
+) -> np.ndarray | None:  # fmt: skip
+    """Biases z of a node at `place` (d,) beyond a plane, by its free axes alone; None where these do not lead there.
+
+    None too where it lies `FAR` scales off. A path is a plane by least squares only: how exactly it is reflected does
+    not matter, since it settles there.
+    """
+    normal = plane.normal[[problem.biases[m].axis for m in members]]
+    if normal @ normal < LEVEL:
+        return None
+    moved = z[members] - 2.0 * plane.distance(place) * normal / (normal @ normal) / problem.scales[members]
+    return moved if np.abs(moved).max() < FAR else None
 
 
 @dataclass(frozen=True)

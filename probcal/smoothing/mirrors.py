@@ -3,7 +3,8 @@
 Sensors that see a distance, a strength or a delay cannot tell the two sides of the line (in 3-D the plane) on which
 their nodes lie. A climb ends on one side, and pieces of a track may end on different ones. Candidates are screened by
 the misfit of the data at the reflected places with the prior spread of the biases added to the noise, so that a network
-that has no mirror pays for two looks at its data.
+that has no mirror pays for two looks at its data, and one with nodes that may stand on either side of what they hear
+for some thirty.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -21,7 +22,7 @@ from probcal.smoothing.grid import grid_start, profile, track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import laplace
 from probcal.smoothing.mode import Point, find_mode
-from probcal.smoothing.reflections import Plane, distance, movable, new, planes, reach, reflect, reflect_nodes
+from probcal.smoothing.reflections import Gap, Plane, distance, movable, new, planes, reach, reflect, reflect_nodes
 from probcal.types import float64
 
 WORSE = 0.4  # nats a datum by which a reflected place may fit worse and is still polished: 0 to 0.2 beside a mirror,
@@ -34,7 +35,7 @@ SHORTEST = 3  # epochs of a piece: fewer do not stay on another side than their 
 STRAIN = 20.0  # sum of squares of a process noise from which a track may be cut there
 GAIN, MORE = 1.0, 0.1  # nats from which a piece belongs on the other side, and from which a scene does
 SAME, NEAR = 3.0, 10.0  # nats within which another answer is as good, and within which it is mentioned
-CROSSED = 30  # nodes that cross at most
+CROSSED = 30  # times that nodes may cross
 MOST = 4  # answers that are kept
 PIECES = "pieces of tracks on their other side"
 
@@ -108,6 +109,7 @@ class _Beside(NamedTuple):
     name: str
     candidate: Point  # as it was reflected
     start: Point  # polished
+    mode: tuple[Point, float] | None = None  # that it leads to, where it was looked for
 
 
 def _searched(problem: Problem, point: Point, climb: SideClimb) -> Sides:
@@ -122,10 +124,11 @@ def _searched(problem: Problem, point: Point, climb: SideClimb) -> Sides:
     best: tuple[Point, float] | None = None
     found: list[Mirrored] = []
     whole = (_Beside(SCENE, name, there, track_mode(problem, there)) for name, there in _candidates(problem, point))
-    for kind, named, candidate, start in chain(whole, nodes, pieces):
+    for kind, named, candidate, start, mode in chain(whole, nodes, pieces):
         best = climb.mode(point) if best is None else best
-        polished = climb.mode(start)
-        size = (reach if kind == NODE or named == PIECES else distance)(problem, candidate, best[0])
+        polished = climb.mode(start) if mode is None else mode
+        loose = kind == NODE or named == PIECES
+        size = reach(problem, candidate, best[0]) if loose else _size(problem, candidate, point, best[0])
         if not new(problem, polished[0], [best[0], *(other.point for other in found)], size):
             continue
         worth = [climb.evidence(*at) for at in (polished, best)]
@@ -142,6 +145,12 @@ def _searched(problem: Problem, point: Point, climb: SideClimb) -> Sides:
     return Sides(point, bool(name), _kept(found), name, kind=kind)
 
 
+def _size(problem: Problem, candidate: Point, point: Point, best: Point) -> Gap:
+    """What lies between a reflection of a point and the best place; nodes count where they were reflected too."""
+    gap = distance(problem, candidate, best)
+    return gap._replace(nodes=0.0) if np.array_equal(candidate.z, point.z) else gap
+
+
 def _kept(found: Sequence[Mirrored]) -> tuple[Mirrored, ...]:
     """Those that are told of: as good ones first, and of these whole scenes before nodes and pieces."""
     near = [other for other in found if other.gain > -NEAR]
@@ -150,16 +159,18 @@ def _kept(found: Sequence[Mirrored]) -> tuple[Mirrored, ...]:
 
 
 def _crossed(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, str, list[_Beside]]:
-    """The point with those nodes on the other side of their paths that fit better there, and what went there last.
+    """The point with those nodes on the other side of their paths that fit better there, and in words which went last.
 
     Also those that fit about as well. A node may come back and leave pieces of tracks on another side.
     """
     others: list[_Beside] = []
+    best: tuple[Point, float] | None = None
     crossed = ""
     for _ in range(CROSSED):
         again, others, climbs, back = False, [], 0, 0
-        best: tuple[Point, float] | None = None
         for name, candidate in node_sides(problem, point, WORSE, climb.most):
+            if max(climbs, back) >= TRIED:
+                break
             best = climb.mode(point) if best is None else best
             tried, size = climb.mode(candidate), reach(problem, candidate, best[0])
             far = new(problem, tried[0], [best[0]], size._replace(tracks=0.0))
@@ -168,12 +179,10 @@ def _crossed(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, s
             if not (far or new(problem, tried[0], [best[0]], size)):
                 continue
             if tried[1] > best[1] + GAIN:
-                point, crossed, again = tried[0], named, True
+                point, best, crossed, again = tried[0], tried, named, True
                 break
             if tried[1] > best[1] - NEAR:
-                others.append(_Beside(kind, named, candidate, tried[0]))
-            if TRIED in (climbs, back):
-                break
+                others.append(_Beside(kind, named, candidate, tried[0], tried))
         if not again:
             break
     return point, crossed, others
@@ -242,17 +251,18 @@ def _turned(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, bo
         for name, candidate in _cut(problem, point):
             best = climb.mode(point) if best is None else best
             smoothed = track_mode(problem, candidate)
-            if not new(problem, smoothed, [best[0]], distance(problem, candidate, best[0])):
+            size = _size(problem, candidate, point, best[0])
+            if not new(problem, smoothed, [best[0]], size):
                 continue  # it came back by itself
             if TRIED in (climbs, back):
                 break
             tried = climb.mode(smoothed)
-            apart = new(problem, tried[0], [best[0]], distance(problem, candidate, best[0]))
+            apart = new(problem, tried[0], [best[0]], size)
             climbs, back = climbs + apart, back + (not apart)  # those that climb back take no other's place
             if tried[1] > best[1] + GAIN:
                 point, best, turned, again = tried[0], tried, True, True
             elif tried[1] > best[1] - NEAR:
-                others.append(_Beside(PIECE, name, candidate, tried[0]))
+                others.append(_Beside(PIECE, name, candidate, tried[0], tried))
         if best is not None and not again:
             searched = at_levels(problem.model, grid_start(problem, best[0].z, 30), point.levels)
             tried = climb.mode(searched)
