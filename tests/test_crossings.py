@@ -120,6 +120,7 @@ def test_nodes_cross_together_and_climbs_that_come_back_are_few(monkeypatch):
         monkeypatch.setattr(mirrors, "node_sides", lambda *_: ((f"n{k}", point) for k in range(100)))
         assert mirrors._crossed(problem, point, mirrors.SideClimb(mode, lambda *_: 0.0)) == (point, "", [])
         assert len(climbs) == 1 + mirrors.TRIED
+        monkeypatch.undo()
         shifts = {f"b{k}.position_y": -2.0 * PLACES[k][1] for k in (0, 1, 2)}
         three = beside(0, 4.0, ("b0", "b1", "b2"), scale=10.0, **shifts)
         first, _ = next(node_sides(three, automatic_start(three), 0.4))
