@@ -22,6 +22,7 @@ STILL = 1e-3  # extent of a path, over how far off a node stands, below which it
 STEPS, STRIDE = 8, 1.0  # by which a node settles on its other side, and scales that one may move a bias
 LEVEL = 0.25  # square of the part of a normal that lies along the free axes of a node, below which it cannot cross
 SETS = 40  # of nodes that are moved together, one set after the other
+NEAR = 2.0  # scales from its path within which a node may have settled on neither side
 ASIDE = 5.0  # sd from where it settles on its own side at which it stands on another: below, it came back
 
 
@@ -29,67 +30,70 @@ def node_sides(problem: Problem, point: Point, worse: float, most: float = np.in
     """Each node on the other side of its path, tracks as they are: names and points, those first that fit best.
 
     Only where its free axes let it, within the reach of its scales. Its biases, and those of its sensors, settle there;
-    what then fits more than `worse` nats a datum worse, or more than `most` nats, is left out.
+    what then fits more than `worse` nats a datum worse, or more than `most` nats, is left out. A node within `NEAR`
+    scales of its path may have settled on neither side, and begins at so many on both too.
     """
     z, members, place = np.asarray(point.z), place_biases(problem), node_places(problem, np.asarray(point.z))
     if not members:
         return
     names = list(members)
     heard = _heard(problem, [members[name][0] for name in names])
-    moved: dict[int, np.ndarray] = {}
-    for k, plane in _paths(problem, point, heard, np.array([place[name] for name in names])):
-        mine = members[names[k]]
-        there = _beyond(problem, z, place[names[k]], mine, plane)
-        if there is not None and np.abs(there - z[mine]).max() > SHIFTED:
-            moved[k] = there
-    if not moved:
+    paths = dict(_paths(problem, point, heard, np.array([place[name] for name in names])))
+    starts = {k: _starts(problem, z, place[names[k]], members[names[k]], plane) for k, plane in paths.items()}
+    starts = {k: own for k, own in starts.items() if own}
+    if not starts:
         return
-    moved = dict(sorted(moved.items(), key=lambda pair: np.abs(pair[1]).max()))  # the likeliest first
     own = _Own.of(problem, names, heard)
-    drop, aside, settled = np.full(len(names), np.inf), np.zeros(len(names)), dict[int, np.ndarray]()
-    sets = _parted(heard, moved)[:SETS]
+    drop, settled = np.full(len(names), np.inf), dict[int, np.ndarray]()
+    likely = sorted(starts, key=lambda k: float(np.abs(starts[k][0]).max()))
+    sets = _parted(heard, likely)[:SETS]
     for together in sets:
-        home, other = z, z.copy()
-        for k in together:
-            other[members[names[k]]] = moved[k]
-        for _ in range(STEPS):
-            home, _ = own.step(problem.model, point, home, together)
-            other, information = own.step(problem.model, point, other, together)
-        away = np.append(other - home, 0.0)[own.biases[together]]
-        aside[together] = np.sqrt(np.einsum("kp,kpq,kq->k", away, information, away))
-        there, here, before = (own.losses(problem.model, point, at) for at in (other, home, z))
-        drop[together] = (there - np.minimum(here, before))[together]
-        for k in together:
-            local = own.biases[k][own.biases[k] < len(z)]
-            settled[k] = z.copy()
-            settled[k][local] = other[local]
-    better = [[k for k in together if aside[k] > ASIDE and drop[k] < 0.0] for together in sets]
+        home = own.settled(problem.model, point, z, together)[0]
+        here = np.minimum(*(own.losses(problem.model, point, at) for at in (home, z)))
+        for turn in range(max(len(starts[k]) for k in together)):
+            moving = [k for k in together if turn < len(starts[k])]
+            other = z.copy()
+            for k in moving:
+                other[members[names[k]]] = starts[k][turn]
+            other, information = own.settled(problem.model, point, other, moving)
+            away = np.append(other - home, 0.0)[own.biases[moving]]
+            aside = np.sqrt(np.einsum("kp,kpq,kq->k", away, information, away))
+            worth = own.losses(problem.model, point, other) - here
+            for k, apart in zip(moving, aside, strict=True):
+                if apart > ASIDE and worth[k] < drop[k]:
+                    drop[k], settled[k] = worth[k], other[own.of_node(k)]
+    better = [[k for k in together if drop[k] < 0.0] for together in sets]
     if len(most_of := max(better, key=len)) > 1:
         whole = z.copy()
         for k in most_of:
-            local = own.biases[k][own.biases[k] < len(z)]
-            whole[local] = settled[k][local]
-        name = f"{len(most_of)} nodes on the other side of the paths that they hear"
-        yield name, point._replace(z=jnp.asarray(whole))
-    for k in sorted(moved, key=lambda k: drop[k]):
-        if aside[k] > ASIDE and drop[k] < min(worse * own.count[k], most):
-            name = f'node "{names[k]}" on the other side of the path that it hears'
-            yield name, point._replace(z=jnp.asarray(settled[k]))
+            whole[own.of_node(k)] = settled[k]
+        yield f"{len(most_of)} nodes elsewhere beside the paths that they hear", point._replace(z=jnp.asarray(whole))
+    for k in sorted(settled, key=lambda k: drop[k]):
+        if drop[k] < min(worse * own.count[k], most):
+            other = z.copy()
+            other[own.of_node(k)] = settled[k]
+            now = node_places(problem, other)[names[k]]
+            crossed = paths[k].distance(now) * paths[k].distance(place[names[k]]) < 0
+            where = "on the other side of the path" if crossed else "elsewhere beside the path"
+            yield f'node "{names[k]}" {where} that it hears', point._replace(z=jnp.asarray(other))
 
 
-def _beyond(
+def _starts(
     problem: Problem, z: np.ndarray, place: np.ndarray, members: list[int], plane: Plane
-) -> np.ndarray | None:  # fmt: skip
-    """Biases z of a node at `place` (d,) beyond a plane, by its free axes alone; None where these do not lead there.
+) -> list[np.ndarray]:  # fmt: skip
+    """Where a node at `place` (d,) may stand beside a plane, by its free axes: biases z, the other side first.
 
-    None too where it lies `FAR` scales off. A path is a plane by least squares only: how exactly it is reflected does
-    not matter, since it settles there.
+    None where these axes do not lead there, or it lies `FAR` scales off. A path is a plane by least squares only: how
+    exactly a node is reflected does not matter, since it settles there.
     """
-    normal = plane.normal[[problem.biases[m].axis for m in members]]
+    normal, scales = plane.normal[[problem.biases[m].axis for m in members]], problem.scales[members]
     if normal @ normal < LEVEL:
-        return None
-    moved = z[members] - 2.0 * plane.distance(place) * normal / (normal @ normal) / problem.scales[members]
-    return moved if np.abs(moved).max() < FAR else None
+        return []
+    now = float(plane.distance(place))
+    reach = NEAR * float(np.linalg.norm(normal * scales) / np.sqrt(normal @ normal))
+    wanted = [-now] if abs(now) > reach else [-now, reach, -reach]
+    found = [z[members] + (there - now) * normal / (normal @ normal) / scales for there in wanted]
+    return [own for own in found if np.abs(own).max() < FAR and np.abs(own - z[members]).max() > SHIFTED]
 
 
 @dataclass(frozen=True)
@@ -122,6 +126,16 @@ class _Own:
         for own, rows in zip(nodes, data, strict=True):
             _add(count, own, np.asarray(rows.mask).sum(1))
         return cls(biases, place, nodes, count)
+
+    def of_node(self, k: int) -> np.ndarray:
+        """Biases of one node."""
+        return self.biases[k][self.biases[k] < len(self.place) - 1]
+
+    def settled(self, model: Model, point: Point, z: np.ndarray, moving: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Biases (M,) after all steps of some nodes, and the information (moving, P, P) about those of each."""
+        for _ in range(STEPS):
+            z, information = self.step(model, point, z, moving)
+        return z, information
 
     def losses(self, model: Model, point: Point, z: np.ndarray) -> np.ndarray:
         """Cost (K,) of the data of each node and of its own biases under their scales."""
@@ -199,12 +213,12 @@ def _paths(problem: Problem, point: Point, heard: list[np.ndarray], place: np.nd
             yield k, Plane("its path", place[k] + centre, axis[:, 0])
 
 
-def _parted(heard: list[np.ndarray], moved: dict[int, np.ndarray]) -> list[list[int]]:
+def _parted(heard: list[np.ndarray], moved: list[int]) -> list[list[int]]:
     """Nodes that are moved in sets of which no sensor has two."""
     beside: dict[int, set[int]] = {k: set() for k in moved}
     for own in heard:
         for sensor in np.unique(own, axis=0):
-            both = [k for k in sensor.tolist() if k in moved]
+            both = [k for k in sensor.tolist() if k in beside]
             for k in both:
                 beside[k].update(both)
     sets: list[list[int]] = []
