@@ -29,7 +29,7 @@ METHODS = {"ea": (pc.EA, None), "map": (pc.MAP, pc.Gaussian()), "gibbs": (pc.Gib
 
 
 def drifted(problem, metres):
-    """The problem with three radars' ranges longer in the second half, of those that hear most in both; which biases."""
+    """The problem with three radars' ranges longer in the second half, of those that hear most; and which biases."""
     table = problem.measurements.table.frame.copy()
     late = table["time"] >= table["time"].median()
     heard = table.groupby(["sensor", late]).size().unstack(fill_value=0).min(axis=1)
