@@ -63,7 +63,7 @@ def on_the_wrong_side(problem, label, shift):
         return track_mode(problem, start._replace(z=jnp.asarray(z)))
 
 
-@pytest.mark.parametrize("form", ["dense", "sparse", "matrix-free"])
+@pytest.mark.parametrize("form", ["dense", *(pytest.param(f, marks=pytest.mark.ci) for f in ("sparse", "matrix-free"))])
 def test_a_node_that_stands_on_the_other_side_is_found(form):
     """The path bends by 4 m, which tells the sides apart; every climb begins on the stated one."""
     problem = beside(0, 4.0, **{"b0.position_y": -20.0})
@@ -99,6 +99,7 @@ def test_an_anchor_above_or_below_the_flight_is_found(kind, shift):
     assert sd < 4.0
 
 
+@pytest.mark.ci
 def test_a_height_alone_is_free():
     """The path is a plane by least squares, tilted a little: 18 sd off, `converged`, where x and y had to move too."""
     problem = above(0, -25.0, "ranger", **{"b0.position_z": -56.0})
@@ -107,8 +108,8 @@ def test_a_height_alone_is_free():
     assert abs(mean + 56.0) < 4 * sd < 20.0
 
 
-def test_nodes_cross_together_and_climbs_that_come_back_are_few(monkeypatch):
-    """Of a hundred nodes that come back eight are climbed; those that fit better go in one climb."""
+def test_climbs_that_come_back_are_few(monkeypatch):
+    """Of a hundred nodes that come back eight are climbed."""
     problem = beside(0, 4.0, **{"b0.position_y": -20.0})
     with jax.enable_x64(True):
         point, climbs = automatic_start(problem), []
@@ -120,7 +121,12 @@ def test_nodes_cross_together_and_climbs_that_come_back_are_few(monkeypatch):
         monkeypatch.setattr(mirrors, "node_sides", lambda *_: ((f"n{k}", point) for k in range(100)))
         assert mirrors._crossed(problem, point, mirrors.SideClimb(mode, lambda *_: 0.0)) == (point, "", [])
         assert len(climbs) == 1 + mirrors.TRIED
-        monkeypatch.undo()
+
+
+@pytest.mark.ci
+def test_nodes_cross_together():
+    """Of three on the wrong side those that fit better without the others go in one climb."""
+    with jax.enable_x64(True):
         shifts = {f"b{k}.position_y": -2.0 * PLACES[k][1] for k in (0, 1, 2)}
         three = beside(0, 4.0, ("b0", "b1", "b2"), scale=10.0, **shifts)
         first, _ = next(node_sides(three, automatic_start(three), 0.4))

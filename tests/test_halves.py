@@ -49,6 +49,7 @@ def test_halves_are_those_of_the_dense_form(library, names, monkeypatch):
     assert drift[1].sum() == len(names)
 
 
+@pytest.mark.ci
 def test_draws_say_what_solves_do(monkeypatch):
     """Of a network in 3-D: sds within the error of 128 draws; what they cannot tell is left out."""
     problem = drawn_in_space()[0]
@@ -65,6 +66,7 @@ def test_draws_say_what_solves_do(monkeypatch):
     assert len(by_draws["bias_label"]) >= 3
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("prior", [pc.Horseshoe(), pc.Flat()], ids=["mixture", "flat"])
 def test_a_drift_is_named_under_other_priors(prior):
     """Of precisions that are integrated, and without any: b drifts, nothing else does."""
@@ -75,6 +77,7 @@ def test_a_drift_is_named_under_other_priors(prior):
     assert verdicts.index[verdicts == "drifting"].tolist() == ["b.range_offset"]
 
 
+@pytest.mark.ci
 def test_what_cannot_be_compared_is_not():
     """A fit without a factor, or no room for one or for its solves: verdicts without halves."""
     problem = drifting("b")
@@ -100,6 +103,7 @@ def test_more_suspects_than_are_looked_at_are_a_finding(monkeypatch):
     assert any("were looked at" in text for text in checked["finding"]["sentence"].values)
 
 
+@pytest.mark.ci
 def test_a_bias_without_a_level_of_its_own_is_left_out():
     """What only one half tells is no difference."""
     table = drawn()[0].measurements.table.frame

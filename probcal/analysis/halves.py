@@ -5,9 +5,8 @@ What the states and the other biases leave of the information about a difference
 read off draws from its sparse factor; of the biases that these suspect it is solved for.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +24,10 @@ COLUMNS = 25  # solved together
 FREED = 20  # biases that may differ together
 TOLD = 4.0  # errors above which draws tell how much is left of an information
 STEPS = 30  # of conjugate gradients at most
+
+
+Parts = tuple[tuple[Linearised, jax.Array, jax.Array], ...]  # rows, the biases that each reads, and its epoch
+Form = tuple[tuple[tuple[int, ...], int], ...]  # of each block the state entries that it reads, and the recursion
 
 
 class Halves(NamedTuple):
@@ -73,11 +76,6 @@ class HalfChange(NamedTuple):
     bias: int
     estimate: float
     information: float
-
-    @property
-    def square(self) -> float:
-        """Chi-square of no difference."""
-        return self.estimate**2 * self.information
 
 
 class Divided:
@@ -209,10 +207,9 @@ class _Half:
         self, model: Model, rows: tuple[Linearised, ...], joint: JointPrecision, late: list[np.ndarray]
     ):  # fmt: skip
         self.joint, self.biases, self.reads = joint, model.biases, model.read
-        self._back: Callable[[jax.Array], tuple[jax.Array]] | None = None
-        self._used, self._recursion = tuple(block.used for block in model.blocks), model.recursion
+        self._form = tuple((tuple(block.used), r) for block, r in zip(model.blocks, model.recursion, strict=True))
         self._parts = tuple(
-            (_only(lin, on), jnp.asarray(read), data.epoch)
+            (_only(lin, on), np.asarray(read), data.epoch)
             for lin, read, data, on in zip(rows, model.read, model.rows, late, strict=True)
         )
 
@@ -236,50 +233,40 @@ class _Half:
                     found += np.bincount(which[:, a], own, self.biases + 1)
         return found[:-1]
 
-    def _split(self, values: jax.Array) -> tuple[tuple[jax.Array, ...], jax.Array]:
-        """States (E, n) of each recursion and biases (M,) of values (n,) of all variables."""
-        padded = jnp.append(values, 0.0)
-        states = tuple(padded[jnp.asarray(own)] for own in self.joint.slots)
-        return states, values[self.joint.states :]
-
     def along(self, values: np.ndarray) -> np.ndarray:
         """Products (K, M) of the information between differences and all variables with values (K, n)."""
-        states, z = jax.vmap(self._split)(jnp.asarray(values))
-        return np.asarray(_along(self._parts, self._used, self._recursion, states, z))
+        return np.asarray(_along(self._parts, self._form, self.joint.slots, self.biases, values))
 
     def back(self, difference: np.ndarray) -> np.ndarray:
         """The information (n,) between all variables and differences (M,)."""
-
-        def product(values: jax.Array) -> jax.Array:
-            states, z = self._split(values)
-            return _along(self._parts, self._used, self._recursion, tuple(x[None] for x in states), z[None])[0]
-
-        if self._back is None:
-            _, self._back = jax.vjp(product, jnp.zeros(self.joint.places.size))
-        return np.asarray(self._back(jnp.asarray(difference))[0])
+        return np.asarray(_back(self._parts, self._form, self.joint.slots, self.joint.places.size, difference))
 
 
-def _only(lin: Linearised, on: np.ndarray) -> Linearised:
+def _only(lin: Linearised, on: np.ndarray) -> Any:
     """Rows of which those that are not `on` say nothing."""
-    kept = jnp.asarray(on, float)[:, None]
-    return lin._replace(weight=lin.weight * kept, score=lin.score * kept)
+    kept = np.asarray(on, float)[:, None]
+    return lin._replace(weight=np.asarray(lin.weight) * kept, score=np.asarray(lin.score) * kept)
 
 
-@partial(jax.jit, static_argnames=("used", "recursion"))
-def _along(
-    parts: tuple[tuple[Linearised, jax.Array, jax.Array], ...], used: tuple[tuple[int, ...], ...],
-    recursion: tuple[int, ...], states: tuple[jax.Array, ...], z: jax.Array,
-) -> jax.Array:  # fmt: skip
-    """Of each of K directions of states (K, E, n) and biases (K, M): what rows see of it, along each bias (K, M)."""
-    M = z.shape[1]
+@partial(jax.jit, static_argnames=("form", "biases"))
+def _along(parts: Parts, form: Form, slots: tuple[jax.Array, ...], biases: int, values: jax.Array) -> jax.Array:
+    """Of each of K directions (K, n) of all variables what rows see of it, along each bias (K, M)."""
+    return jnp.asarray(jax.lax.map(partial(_seen, parts, form, slots, biases), values))
 
-    def one(direction: tuple[tuple[jax.Array, ...], jax.Array]) -> jax.Array:
-        moved, own = direction
-        padded, total = jnp.append(own, 0.0), jnp.zeros(M + 1)
-        for (lin, read, epoch), entries, r in zip(parts, used, recursion, strict=True):
-            at = moved[r][epoch][:, jnp.asarray(entries, int)]
-            seen = jnp.einsum("ncu,nu->nc", lin.state, at) + jnp.einsum("ncp,np->nc", lin.bias, padded[read])
-            total = total.at[read].add(jnp.einsum("nc,nc,ncp->np", lin.weight, seen, lin.bias))
-        return total[:-1]
 
-    return jnp.asarray(jax.lax.map(one, (states, z)))
+@partial(jax.jit, static_argnames=("form", "size"))
+def _back(parts: Parts, form: Form, slots: tuple[jax.Array, ...], size: int, difference: jax.Array) -> jax.Array:
+    """The transpose of what rows see: of a difference (M,), along each of all variables (n,)."""
+    _, back = jax.vjp(partial(_seen, parts, form, slots, len(difference)), jnp.zeros(size))
+    return jnp.asarray(back(difference)[0])
+
+
+def _seen(parts: Parts, form: Form, slots: tuple[jax.Array, ...], biases: int, values: jax.Array) -> jax.Array:
+    """What rows see of one direction (n,), along each bias (M,)."""
+    padded, total = jnp.append(values, 0.0), jnp.zeros(biases + 1)
+    z = jnp.append(values[len(values) - biases :], 0.0)
+    for (lin, read, epoch), (used, r) in zip(parts, form, strict=True):
+        at = padded[slots[r][epoch][:, jnp.asarray(used, int)]]
+        seen = jnp.einsum("ncu,nu->nc", lin.state, at) + jnp.einsum("ncp,np->nc", lin.bias, z[read])
+        total = total.at[read].add(jnp.einsum("nc,nc,ncp->np", lin.weight, seen, lin.bias))
+    return total[:-1]
