@@ -77,6 +77,11 @@ MUTATIONS = [
     Mutation("inference/orbits.py", "density(at) + orbit.volume * r", "density(at)", "test_orbits.py"),
     # smoothing/mirrors.py, and crossing
     Mutation("smoothing/reflections.py", "return place - 2.0 * self.distance(place)", "return place - 1.0 * self.distance(place)", "test_mirrors.py"),
+    # smoothing/crossings.py, inference/pruned.py, analysis/halves.py
+    Mutation("smoothing/crossings.py", "[-now, reach, -reach]", "[now, now]", "test_crossings.py"),
+    Mutation("smoothing/mirrors.py", "if max(climbs, back) >= TRIED:", "if climbs >= TRIED:", "test_crossings.py"),
+    Mutation("inference/pruned.py", "0.0) * self.q2).gain", "1.0) * self.q2).gain", "test_crossings.py"),
+    Mutation("analysis/halves.py", "- self.among[np.ix_(k, k)] - across", "- across", "test_halves.py"),
     Mutation("inference/collapsed.py", "return weight + posed.frame.log_likelihood(theta) - 0.5 * square + volume", "return weight - 0.5 * square + volume", "test_mirrors.py"),
     Mutation("inference/relevance.py", "change / (1.0 + change * row[m])", "change / (1.0 - change * row[m])", "test_relevance.py"),
     # inference/integrate.py, propagate.py

@@ -25,7 +25,6 @@ FREED = 20  # biases that may differ together
 TOLD = 4.0  # errors above which draws tell how much is left of an information
 STEPS = 30  # of conjugate gradients at most
 
-
 Parts = tuple[tuple[Linearised, jax.Array, jax.Array], ...]  # rows, the biases that each reads, and its epoch
 Form = tuple[tuple[tuple[int, ...], int], ...]  # of each block the state entries that it reads, and the recursion
 
