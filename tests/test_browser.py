@@ -20,6 +20,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import WebDriverWait
 
 from probcal.report import write_report
 
@@ -125,17 +126,22 @@ def test_the_map_is_zoomed_by_keyboard_and_reset(browser, pages):
     assert ranges(browser) == pytest.approx(before)
 
 
+def wait(browser, condition):
+    """Wait until a condition holds: Chromium scrolls and draws after the wheel's command has returned."""
+    WebDriverWait(browser, 30, poll_frequency=0.05).until(lambda _: condition())
+
+
 def test_the_wheel_zooms_with_ctrl_and_scrolls_without(browser, pages):
     visit(browser, pages["ea"])
     before, sheet = ranges(browser), ScrollOrigin.from_element(browser.find_element(By.ID, "map"))
     ActionChains(browser).scroll_from_origin(sheet, 0, 120).perform()
+    wait(browser, lambda: browser.execute_script("return window.scrollY") > 0)
     assert ranges(browser) == pytest.approx(before)
-    assert browser.execute_script("return window.scrollY") > 0
     browser.execute_script("window.scrollTo(0, 0)")
+    wait(browser, lambda: browser.execute_script("return window.scrollY") == 0)
     held = ActionChains(browser).key_down(Keys.CONTROL).scroll_from_origin(sheet, 0, -240).key_up(Keys.CONTROL)
     held.perform()
-    low, high = ranges(browser)
-    assert high - low < 0.95 * (before[1] - before[0])
+    wait(browser, lambda: np.ptp(ranges(browser)) < 0.95 * np.ptp(before))
 
 
 def words_at(browser, source):
@@ -158,7 +164,7 @@ def words_at(browser, source):
             (e) => [e, ...(e.shadowRoot ? deep(e.shadowRoot) : [])]);
           const tips = deep(document).filter((e) => e.classList?.contains('bk-tooltip-content'));
           const text = tips.map((e) => e.innerText).join('\\n');
-          text || Date.now() - began > 5000 ? done(text) : setTimeout(look, 50); };
+          text || Date.now() - began > 30000 ? done(text) : setTimeout(look, 50); };
         look();"""
     )
 
