@@ -279,6 +279,16 @@ class Problem:
         other.model = self.model.with_tilt(tilt)
         return other
 
+    @property
+    def tilted(self) -> bool:
+        """Whether there is such a term."""
+        return self.model.tilt is not None and any(np.any(leaf) for leaf in self.model.tilt)
+
+    @property
+    def untilted(self) -> Problem:
+        """The same problem with no such term, which holds near one point only."""
+        return self if self.model.tilt is None else self.with_tilt(Tilt.none(self.model.biases))
+
     def with_mixing(self, weights: Mixing) -> Problem:
         """The same problem with other precisions (E,) of the process noises that are not Gaussian."""
         if not self.model.tailed:

@@ -8,6 +8,7 @@ import pytest
 from scipy.special import logsumexp
 
 import probcal as pc
+from probcal.inference.fit import calibrate
 from probcal.priors import Precision
 from probcal.smoothing.mode import find_mode
 from probcal.smoothing.places import places_of, tilt_of
@@ -156,3 +157,40 @@ def test_a_tag_that_all_hear_well_is_left_to_laplace():
         with jax.enable_x64(True):
             still = places_of(problem.model, consistent(problem))
         assert still is None or not any(bool(jnp.any(own.on)) for own in still)
+
+
+def line_of_anchors(seed=3):
+    """Ten tags heard by two known nodes and a loose one, which stands 6 m above their line and is stated on it."""
+    rng = np.random.default_rng(seed)
+    stated = {"a0": (0.0, 0.0), "a1": (40.0, 0.0), "a2": (20.0, 0.0)}
+    true, rows = stated | {"a2": (21.0, 6.0)}, []
+    for k in range(10):
+        place = np.array([rng.uniform(0, 40), rng.uniform(4, 30) * (1 if k % 3 else -1)])
+        for name, own in true.items():
+            told = np.linalg.norm(place - own) + 0.3 * rng.standard_normal()
+            rows.append(dict(time=0.0, sensor=name, target=f"t{k}", range=told))
+    loose = {"a2": {"scale": {"position": 5.0}}}
+    network = pc.Network([anchor.on(pc.Node(name, own, **loose.get(name, {}))) for name, own in stated.items()])
+    motion = pc.Target(pc.Static(), {"position": ((20.0, 0.0), 20.0)})
+    return pc.Problem(network, motion, pd.DataFrame(rows), fix=["*.offset"])
+
+
+def test_the_other_side_is_seen_where_places_are_integrated():
+    problem = line_of_anchors()
+    tree = pc.assess(problem, pc.fit(problem, pc.MAP()))
+    assert tree.attrs["places"] == "integrated"
+    gain = tree["mirror"]["gain"].values
+    assert np.abs(gain).max() < 0.01
+    assert tree["verdict"]["verdict"].sel(bias_label="a2.position_y") == "weak"
+
+
+@pytest.mark.ci
+def test_a_tree_with_integrated_places_is_judged_alike_with_and_without_its_answer():
+    network, motion, table = tags(0, [2, 3, 2, 3, 1, 2])
+    problem = pc.Problem(network, motion, table)
+    tree, answer = calibrate(problem, pc.MAP())
+    assert answer.problem.tilted
+    with_it, without = pc.assess(problem, tree, answer=answer), pc.assess(problem, tree)
+    for name in ("elpd", "rest_nis"):
+        near = with_it["target_check"][name].values
+        np.testing.assert_allclose(without["target_check"][name].values, near, atol=0.05)

@@ -243,6 +243,22 @@ def test_simulated_tracks_and_prior_draws_have_the_tails():
     assert together > 0.1  # the axes share their precision
 
 
+@pytest.mark.parametrize("before", [ConstantVelocity(0.5, singular=True), ConstantVelocity(0.5)])
+def test_tails_drive_their_own_component_behind_noise_of_lower_rank(before):
+    @probcal.sensor(range=Channel("m", std=1.0), level=Channel("dB", std=1.0))
+    def listener(target, pose):
+        return {"range": jnp.linalg.norm(target.position - pose.position + 1e-3), "level": target.power}
+
+    network = Network([listener.on(Node("a", (0.0, 0.0))), listener.on(Node("b", (50.0, 0.0)))])
+    motion = before + RandomWalk("power", "dB", 1.0, (90.0, 0.1), noise=StudentT(2.5))
+    run = simulate(network, motion, np.arange(400.0), key=0)
+    (part,) = Problem(network, motion, run.table).model.recursions
+    (tail,) = part.tails
+    driving = np.flatnonzero(np.asarray(part.L)[3, -1])
+    assert driving.tolist() == list(range(*tail.columns))
+    assert stats.kurtosis(np.diff(run.truth.tracks["power"])) > 3.0
+
+
 @pytest.mark.ci
 def test_a_tree_is_taken_up_without_its_answer():
     problem = turned()

@@ -8,7 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal.analysis import checks, leave, nees, pieces, predictive, process, residuals, scaling, shape, verdict
+from probcal.analysis import (
+    checks,
+    leave,
+    levels,
+    nees,
+    pieces,
+    predictive,
+    process,
+    residuals,
+    scaling,
+    shape,
+    verdict,
+)
 from probcal.analysis.beside import mirror_doubts, mirror_findings
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted, take_up
@@ -42,6 +54,7 @@ def assess(
     - `datum_check`, `epoch_check`, `channel_check`, `sensor_check`, `target_check`: innovations, and their NIS (mean
       square a datum) with limits; whiteness; posterior predictive p-values; PSIS-LOO by row; by sensor and target
       the log predictive density `elpd` of what was left out, and its NIS given the rest.
+    - `level_check`: the noise levels that the data ask for, and what the biases would move with them.
     - `halves`: what each bias alone would change from the first half of the recording to the second.
     - `sensitivity`: power scaling of prior and likelihood, where the tree holds both.
     - `verdict`: `verdict` and `reason` of every bias (rules in `probcal.analysis.verdict`); `finding`: sentences.
@@ -89,7 +102,12 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups) + process.check_process_noise(fit, keys[2])
     bent = None if tree.attrs["status"] in INVALID else shape.check_shape(fit, tree)
     findings += [] if bent is None else [bent]
-    groups["verdict"] = _verdicts(fit, tree, found, groups, bent)
+    hanging = dict[int, str]()
+    if tree.attrs["status"] not in INVALID:
+        asked, more, hanging = levels.check_levels(fit)
+        groups |= {} if asked is None else {"level_check": asked}
+        findings += more
+    groups["verdict"] = _verdicts(fit, tree, found, groups, bent, hanging)
     findings += mirror_findings(tree)
     columns = [groups["verdict"][name].values.tolist() for name in ("verdict", "bias_label", "reason")]
     alarms = [row for row in zip(*columns, strict=True) if row[0] in ("drifting", "conflicting")]
@@ -116,7 +134,12 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
 
 
 def _verdicts(
-    fit: Fitted, tree: xr.DataTree, found: residuals.Filtered, groups: dict[str, xr.Dataset], bent: Finding | None
+    fit: Fitted,
+    tree: xr.DataTree,
+    found: residuals.Filtered,
+    groups: dict[str, xr.Dataset],
+    bent: Finding | None,
+    hanging: dict[int, str],
 ) -> xr.Dataset:
     """Group `verdict`; adds the group `halves` where the recording can be divided."""
     problem, calibration = fit.problem, tree["calibration"].to_dataset()
@@ -148,7 +171,9 @@ def _verdicts(
     )  # fmt: skip
     ended = calibration["status"].values.tolist()
     status = Status(tree.attrs["status"])
-    doubts = {} if bent is None else dict.fromkeys(range(M), "the answer is far from Gaussian, so its interval is none")
+    doubts = (
+        hanging if bent is None else dict.fromkeys(range(M), "the answer is far from Gaussian, so its interval is none")
+    )
 
     def around() -> list[np.ndarray]:  # draws of chains lie on both sides
         return [np.asarray(variance) for variance in fit.at.variances(jnp.asarray(fit.covariance))]

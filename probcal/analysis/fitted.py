@@ -22,6 +22,7 @@ from probcal.smoothing.grid import follow_states, track_mode
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.linearised import Linearisation, linearise
 from probcal.smoothing.mode import Eliminated, Point
+from probcal.smoothing.places import tilt_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,13 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
     problem, datum, picks = identified(problem, fit, answer)
     group = fit["calibration"].to_dataset()
     covariance = matrix_of(group, "covariance", "assess").values / np.outer(problem.scales, problem.scales)
-    at = linearise(problem.model, point_of(problem, fit)) if answer is None else answer.posterior.linearised
+    if answer is None:
+        point = point_of(problem, fit)
+        if fit.attrs.get("places") == "integrated":
+            problem = problem.with_tilt(tilt_at(problem.model, point))
+        at = linearise(problem.model, point)
+    else:
+        at = answer.posterior.linearised
     return Fitted(problem, at.point, at.rows, at.solved, picks, datum, at, _prior(group), covariance)
 
 

@@ -27,11 +27,13 @@ from probcal.model.rows import Linearised, standardised
 from probcal.priors import Precision
 from probcal.results.read import summed_log_likelihood
 from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
-from probcal.smoothing.mode import Eliminated, Point, cost, find_mode, follow
+from probcal.smoothing.mode import Eliminated, Point, cost, find_mode, follow, smooth_tracks
+from probcal.smoothing.places import tilt_at
 
 STEPS = 20  # Gauss-Newton steps of a refit
 TOLERANCE = 1e-5  # nats
 WORK = 3e9  # operations of all eliminations beyond which a refit is one step from the fit
+PLACED = 100  # refits up to which the places of targets at rest are integrated anew
 TARGETS = 32  # beyond which targets are not left out one by one
 
 
@@ -75,6 +77,7 @@ class _Refits:
         model = fit.problem.model
         sizes = model.state_size
         self.fit, self.quick = fit, 2.0 * jobs * sizes * model.biases**2 > WORK
+        self.placed = fit.problem.tilted and jobs <= PLACED
 
     def run(self, out: np.ndarray | None, alpha: np.ndarray, held: np.ndarray) -> tuple[float, float]:
         """Evidence and least squares without the rows (of the table) in `out`, at precisions alpha (M,)."""
@@ -82,6 +85,9 @@ class _Refits:
         prior = fit.prior._replace(alpha=jnp.asarray(alpha))
         model = fit.problem.model if out is None else masked(fit, out)
         point, lins = fit.point, fit.lins
+        if out is not None and self.placed:
+            point = smooth_tracks(model, point)
+            model = model.with_tilt(tilt_at(model, point))
         if not self.quick:
             frozen = variants.without(model, held)
             start = point._replace(z=jnp.asarray(np.where(held, 0.0, point.z)))

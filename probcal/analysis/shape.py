@@ -11,12 +11,12 @@ import xarray as xr
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted
 from probcal.results.read import summed_log_likelihood
-from probcal.smoothing import mode
+from probcal.smoothing.mode import log_likelihood
 
 LINEAR, MOST = 0.5, 0.75  # nats a datum: at most of a linear model, and from which it is a finding
 GAUSSIAN = ("Laplace", "mixture")  # kinds of answers that draw from Gaussians around a mode
 
-_log_likelihood = jax.jit(mode.log_likelihood)
+_log_likelihood = jax.jit(log_likelihood)
 
 
 def check_shape(fit: Fitted, tree: xr.DataTree) -> Finding | None:
@@ -24,7 +24,8 @@ def check_shape(fit: Fitted, tree: xr.DataTree) -> Finding | None:
     drawn = summed_log_likelihood(tree)
     if tree.attrs["approximate"] not in GAUSSIAN or drawn is None:
         return None
-    fall = (float(_log_likelihood(fit.problem.model, fit.point)) - float(drawn.median())) / len(fit.data)
+    mode = float(_log_likelihood(fit.problem.untilted.model, fit.point))  # draws are those of rows alone
+    fall = (mode - float(drawn.median())) / len(fit.data)
     if not fall > MOST:
         return None
     text = (

@@ -82,8 +82,8 @@ def _eliminated(model: Model, point: Point) -> Eliminated:
 
 
 def _alone(model: Model, prior: Prior, trajectory: str) -> bool:
-    """Whether a climb is to one marginal mode, nothing being learnt between steps."""
-    return trajectory == "marginal" and not (prior.learns or model.level_spread.shape[0] or model.tailed)
+    """Whether a climb is to marginal modes of which each takes many steps, no precision being learnt in between."""
+    return trajectory == "marginal" and not (prior.learns or model.tailed)
 
 
 def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, trajectory: str) -> State:

@@ -143,12 +143,13 @@ def _by_particles(
 def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: SideClimb | None = None) -> Answer:
     """The answer on the side of a mirror that fits best, and those of other sides that fit about as well.
 
-    Sides are found under the declared scales. Those that fit about as well, or better, are fitted by the method, whose
-    own answers are compared; one that comes back to where another stands is none.
+    Sides are found under the declared scales, without what integrated places add, which is known near this answer
+    only. Those that fit about as well, or better, are fitted by the method, whose own answers are compared; one that
+    comes back to where another stands is none.
     """
     if not (answer.status.valid and answer.posterior.sound):
         return answer
-    problem, here = answer.problem, answer.posterior.point
+    problem, here = answer.problem.untilted, answer.posterior.point
 
     def answered(point: Point) -> Answer | None:
         """The answer from a point, if there is a good one in the form of the first."""

@@ -11,9 +11,9 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.model.sampled import SampledMotion, sampled_of
 from probcal.motion import Layout, Motion, Target, as_motion
-from probcal.motion.base import level_name
+from probcal.motion.base import GAUSSIAN, level_name
 from probcal.motion.layout import layout_of, stacked
-from probcal.noise import Bernoulli, Level, Unknown, guess_of
+from probcal.noise import Bernoulli, Level, Normal, Unknown, guess_of
 
 DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
 FAR = 10.0  # times as wide where no sensor measures a range: bearings of a small array reach far beyond it
@@ -76,6 +76,19 @@ def linear_of(motion: Motion) -> tuple[Any, ...]:
     return () if vector is None else vector.components
 
 
+def blocks_of(components: tuple[Any, ...], d: int) -> list[tuple[Any, slice, slice]]:
+    """Each component, its entries of the state in d axes, and the columns of the noise factor that drive it.
+
+    A component has as many columns as entries, for its start; of these its noise needs the first ones, or all.
+    """
+    found, row = [], 0
+    for component in components:
+        size, width = component.noise_factor(np.ones(1), d).shape[1:]
+        found.append((component, slice(row, row + size), slice(row, row + width)))
+        row += size
+    return found
+
+
 def form_of(name: str, motion: Motion, levels: Levels, d: int) -> tuple[Layout, SampledMotion | None]:
     """What rows read of a target's state in d axes, and the static form of a motion that is not linear."""
     others = motion.split[1]
@@ -99,13 +112,9 @@ def chain(
     F, L = np.zeros((epochs, n, n)), np.zeros((epochs, n, n))
     level, drift = np.full((epochs, n), -1), np.zeros((epochs, n))
     dt = np.diff(time, prepend=time[0] if before is None else before)
-    row = column = 0
-    for component in components:
-        transition, factor = component.transition(dt, d), component.noise_factor(dt, d)
-        size, width = factor.shape[1:]
-        here, noise = slice(row, row + size), slice(column, column + width)
-        F[:, here, here] = transition
-        L[:, here, noise] = factor * guess_of(component.std)
+    for component, here, noise in blocks_of(components, d):
+        F[:, here, here] = component.transition(dt, d)
+        L[:, here, noise] = component.noise_factor(dt, d) * guess_of(component.std)
         level[:, noise] = levels.of(component.std, f"motion.{level_name(component)}", "")
         try:
             drift[:, here] = component.means(time, d)
@@ -117,7 +126,6 @@ def chain(
             mean, std = start_of(name, component, target, time, area)
             drift[0, here] = mean
             L[0, here, here] = np.diag(std)
-        row, column = row + size, column + size
     if before is None:
         F[0] = 0.0
     return F, L, level, drift
@@ -127,21 +135,13 @@ def tails_of(
     target: Target, epochs: int, begins: bool, dimension: int
 ) -> list[tuple[Any, str, tuple[int, int], np.ndarray]]:
     """Families of the noise of one target that are not Gaussian: what they drive, columns, and epochs (E,)."""
-    vector = as_motion(target.motion).split[0]
     found = []
-    for family, start, stop in () if vector is None else vector.mixed(dimension):
-        component = _driving(vector, start, dimension)
-        on = np.ones(epochs, bool)
+    for component, _, noise in blocks_of(linear_of(as_motion(target.motion)), dimension):
+        family, on = getattr(component, "noise", GAUSSIAN), np.ones(epochs, bool)
         on[0] = component.memoryless or not begins
-        if stop > start:
-            found.append((family, component.driven, (start, stop), on))
+        if noise.stop > noise.start and not isinstance(family, Normal):
+            found.append((family, component.driven, (noise.start, noise.stop), on))
     return found
-
-
-def _driving(vector: Any, column: int, dimension: int) -> Any:
-    """The component that a column of the noise factor belongs to."""
-    ends = np.cumsum([component.noise_factor(np.ones(1), dimension).shape[2] for component in vector.components])
-    return vector.components[int(np.searchsorted(ends, column, side="right"))]
 
 
 def start_of(name: str, component: Any, target: Target, time: np.ndarray, area: Area) -> tuple[np.ndarray, np.ndarray]:

@@ -177,6 +177,7 @@ def _attrs(answer: Answer) -> dict[str, Any]:
         "status": str(answer.status), "message": answer.message, "data": answer.problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
         **answer.posterior.attrs, **_epoch(answer.problem),
+        **({"places": "integrated"} if answer.problem.tilted else {}),
     }  # fmt: skip
     if found.evidence is not None:
         tailed = answer.problem.model.tailed

@@ -73,6 +73,15 @@ def tilt_of(model: Model, point: Point, still: tuple[Still, ...]) -> Tilt | None
     return Tilt(np.asarray(point.z), np.asarray(height), slope, curvature)
 
 
+def tilt_at(model: Model, point: Point) -> Tilt:
+    """What exact integrals over places add near a consistent point of a model, whatever tilt that has; else nothing."""
+    none = Tilt.none(model.biases)
+    plain = model.with_tilt(none)
+    places = places_of(plain, point)
+    found = None if places is None else tilt_of(plain, point, places)
+    return none if found is None else found
+
+
 def _bounded(information: np.ndarray, curvature: np.ndarray) -> np.ndarray:
     """A curvature (M, M) that leaves its share of the information (M, M) of Laplace's formula along every direction."""
     root = np.linalg.cholesky(information + (1e-9 * np.trace(information) + 1e-6) * np.eye(len(information)))

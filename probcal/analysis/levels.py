@@ -1,0 +1,249 @@
+"""Are the declared noise levels those of the data, and which biases hang on them?
+
+A level that is declared too large or too small does not only make intervals wrong: along what the data hardly tell (the
+size of a network that the motion alone fixes) it moves the answer by many sd. The evidence is expanded about the fit in
+all log levels at once, biases following: its slope by a log level is that of MacKay (Paper B 25, for noise), and its
+curvature comes from the slopes a little to either side, trajectories at their mode there.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from probcal.analysis.findings import PRACTICAL, Finding
+from probcal.analysis.fitted import Fitted
+from probcal.analysis.verdict import limit_of
+from probcal.model.model import Model
+from probcal.model.motions import blocks_of, linear_of
+from probcal.motion import as_motion
+from probcal.motion.base import level_name
+from probcal.noise import Bernoulli, Unknown, guess_of
+from probcal.problem import Problem
+from probcal.results.groups import bias_coords
+from probcal.smoothing.linearised import linearise
+from probcal.smoothing.marginal import SETTLED, TRACK_STEPS, volume_slope
+from probcal.smoothing.mode import Point, find_tracks
+
+STEP = 0.1  # of a log level to either side
+FEWEST = 30  # noises below which nothing is said of their level
+MOST = 12  # levels that are looked at, those of the most noises
+FARTHEST = 1.5  # log of a factor beyond which an expansion says nothing of where the level lies
+HANGS = 1.0  # sd by which biases must move to hang on a level
+
+
+class Level(NamedTuple):
+    """One noise level of a problem."""
+
+    label: str
+    declared: float | None  # None where it stands in the table
+    unknown: int = -1  # its number among the unknown ones
+
+
+class Members(NamedTuple):
+    """Which level (by its place in `levels`) every datum and every process noise has, -1 where none."""
+
+    levels: list[Level]
+    rows: list[np.ndarray]  # (N, C) of each block
+    noises: list[np.ndarray]  # (E, n) of each recursion
+
+    def sums(self, rows: list[np.ndarray], noises: list[np.ndarray]) -> np.ndarray:
+        """Sums (K,) of values of the data and of the process noises over those of each level."""
+        total = np.zeros(len(self.levels) + 1)  # what has no level goes last
+        for index, value in zip([*self.rows, *self.noises], [*rows, *noises], strict=True):
+            np.add.at(total, index, np.asarray(value))
+        return total[:-1]
+
+
+class Slopes(NamedTuple):
+    """Slopes of the log evidence at a point: by log levels, and by z before the prior."""
+
+    level: np.ndarray  # (K,)
+    z: np.ndarray  # (M,)
+
+
+class Asked(NamedTuple):
+    """What the data ask for: where the evidence is largest by its expansion, and what would move with it."""
+
+    step: np.ndarray  # (K,) of the log levels
+    sd: np.ndarray  # (K,)
+    square: np.ndarray  # (K,) of each step alone over its variance
+    shift: np.ndarray  # (K, M) of z with the step of each level
+
+
+def members_of(problem: Problem) -> Members:
+    """The levels of a problem that have enough noises, at most `MOST`; those of sampled motions are left out."""
+    found: dict[Level, int] = {}
+    rows = [_of_rows(problem, b, found) for b in range(len(problem.model.blocks))]
+    noises = [_of_noises(problem, r, found) for r in range(len(problem.model.recursions))]
+    counts = np.bincount(np.concatenate([k.ravel() for k in (*rows, *noises)]) + 1, minlength=len(found) + 1)[1:]
+    kept = sorted(k for k in np.argsort(-counts, kind="stable")[:MOST] if counts[k] >= FEWEST)
+    place = np.full(len(found) + 1, -1)
+    place[kept] = np.arange(len(kept))
+    levels = list(found)
+    return Members([levels[k] for k in kept], [place[k] for k in rows], [place[k] for k in noises])
+
+
+def _of_rows(problem: Problem, b: int, found: dict[Level, int]) -> np.ndarray:
+    """Level (N, C) of every datum of a block."""
+    block, data, H = problem.model.blocks[b], problem.model.rows[b], len(problem.levels)
+    number, std, index = np.asarray(data.level), np.asarray(data.std), np.full(data.std.shape, -1)
+    for c, (name, channel) in enumerate(block.type.expand(block.dimension)):
+        if isinstance(channel.noise, Bernoulli):
+            continue
+        label = f"{block.type.name}.{name.rpartition('_')[0] if channel.per_axis else name}_std"
+        own = (number[:, c] == H) & (isinstance(channel.std, Unknown) | (std[:, c] != guess_of(channel.std)))
+        levels = [Level(label, None if isinstance(channel.std, Unknown) else float(channel.std)), Level(label, None)]
+        for level, mine in zip(levels, ((number[:, c] == H) & ~own, own), strict=True):
+            if mine.any():
+                index[mine, c] = found.setdefault(level, len(found))
+    return np.where(np.asarray(data.mask) > 0, _with_unknown(problem, number, index, found), -1)
+
+
+def _of_noises(problem: Problem, r: int, found: dict[Level, int]) -> np.ndarray:
+    """Level (E, n) of every whitened process noise of a recursion, starts left out."""
+    epochs, part = problem.epochs[r], problem.model.recursions[r]
+    first, index = np.asarray(part.first), np.full(part.drift.shape, -1)
+    for target in dict.fromkeys(epochs.target):
+        mine = (epochs.target == target) & ~first
+        components = linear_of(as_motion(problem.target(target).motion))
+        for component, _, own in blocks_of(components, problem.network.dimension):
+            if mine.any() and not isinstance(component.std, Unknown):
+                level = Level(f"motion.{level_name(component)}", float(component.std))
+                index[mine, own] = found.setdefault(level, len(found))
+    index = _with_unknown(problem, np.asarray(part.level), index, found)
+    return np.where(np.asarray(part.L).any(1) & ~first[:, None], index, -1)
+
+
+def _with_unknown(problem: Problem, number: np.ndarray, index: np.ndarray, found: dict[Level, int]) -> np.ndarray:
+    """The index with the unknown levels in it, `number` of each entry."""
+    for h in np.unique(number[number < len(problem.levels)]).tolist():
+        record = problem.levels[h]
+        index = np.where(number == h, found.setdefault(Level(record.label, record.guess, h), len(found)), index)
+    return index
+
+
+def slopes(model: Model, point: Point, prior: np.ndarray, members: Members) -> Slopes:
+    """Slopes of the log evidence at a point with trajectories at their mode, `prior` (M, M) the precision of z."""
+    at = linearise(model, point)
+    covariance = jnp.asarray(np.linalg.inv(np.asarray(at.information) + prior))
+    informed = zip(model.information(point), at.predicted_variances(covariance), strict=True)
+    spread = [np.asarray(weight) * np.asarray(own) for weight, own in informed]
+    squares = zip(model.level_score(point), spread, model.measured, strict=True)
+    rows = [np.asarray(square) + own - np.asarray(there) for square, own, there in squares]
+    driven = zip(point.noises, at.noise_variances(covariance), strict=True)
+    noises = [np.asarray(u) ** 2 + np.asarray(own) - 1.0 for u, own in driven]
+    volume, _ = volume_slope(model, point, at.solved)
+    return Slopes(members.sums(rows, noises), np.asarray(at.solved.score - 0.5 * volume))
+
+
+def _beside(model: Model, point: Point, members: Members, k: int, step: float) -> tuple[Model, Point]:
+    """The model with a level a step (of its log) away, trajectories at their mode there, biases held."""
+    rows = tuple(
+        own._replace(std=jnp.asarray(np.asarray(own.std) * np.exp(step * (index == k))))
+        for own, index in zip(model.rows, members.rows, strict=True)
+    )
+    scales = [np.exp(step * (index == k)) for index in members.noises]
+    recursions = tuple(
+        part._replace(L=jnp.asarray(np.asarray(part.L) * scale[:, None, :]))
+        for part, scale in zip(model.recursions, scales, strict=True)
+    )
+    noises = tuple(jnp.asarray(np.asarray(u) / scale) for u, scale in zip(point.noises, scales, strict=True))
+    other = replace(model, rows=rows, recursions=recursions)
+    return other, find_tracks(other, point._replace(noises=noises), TRACK_STEPS, SETTLED)
+
+
+def ask(fit: Fitted, members: Members) -> Asked | None:
+    """Where the evidence expanded about a fit is largest in all log levels; None where it has no maximum."""
+    model, prior = fit.problem.model, np.asarray(fit.prior.matrix())
+    here, beside = slopes(model, fit.point, prior, members), list[tuple[Slopes, Slopes]]()
+    for k in range(len(members.levels)):
+        sides = (slopes(*_beside(model, fit.point, members, k, step), prior, members) for step in (STEP, -STEP))
+        beside.append(tuple(sides))
+    pull = np.array([(up.z - down.z) / (2 * STEP) for up, down in beside])  # (K, M)
+    curved = -np.array([(up.level - down.level) / (2 * STEP) for up, down in beside])
+    follow = np.linalg.solve(np.asarray(fit.solved.information) + prior, pull.T).T  # (K, M) of z by each log level
+    matrix = 0.5 * (curved + curved.T) - pull @ follow.T
+    slope, unknown = here.level, np.array([level.unknown for level in members.levels])
+    own = np.flatnonzero(unknown >= 0)
+    if len(own):
+        spread, levels = np.asarray(model.level_spread)[unknown[own]], np.asarray(fit.point.levels)[unknown[own]]
+        matrix[own, own] += 1.0 / spread**2
+        slope[own] -= levels / spread**2
+    values = np.linalg.eigvalsh(matrix) if np.isfinite(matrix).all() else np.zeros(1)
+    if not values.min(initial=1.0) > 0 or not np.isfinite(slope).all():
+        return None
+    covariance = np.linalg.inv(matrix)
+    step, variance = covariance @ slope, np.diag(covariance)
+    return Asked(step, np.sqrt(variance), step**2 / variance, step[:, None] * follow)
+
+
+def check_levels(fit: Fitted) -> tuple[xr.Dataset | None, list[Finding], dict[int, str]]:
+    """Group `level_check`, findings on declared levels, and why the answer of some biases is in doubt with them.
+
+    `factor` is what the data ask for over what the fit had (all levels together), `factor_sd` its sd, `square` the
+    chi-square of that alone, `shift` what every bias would move with it, in its unit.
+    """
+    members = members_of(fit.problem)
+    asked = ask(fit, members) if members.levels and fit.problem.model.biases else None
+    if asked is None:
+        return None, [], {}
+    problem, limit = fit.problem, limit_of(sum(level.unknown < 0 for level in members.levels))
+    sd = np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
+    factor = np.exp(np.clip(asked.step, -FARTHEST, FARTHEST))
+    sure = np.array([level.unknown < 0 for level in members.levels]) & (asked.square > limit)
+    moved = np.where(sure[:, None], asked.shift / sd, 0.0)
+    findings = []
+    for k in np.flatnonzero(sure & ((np.abs(np.log(factor)) > np.log(PRACTICAL)) | (np.abs(moved) > HANGS).any(1))):
+        text = _sentence(members.levels[k], factor[k], asked.sd[k] * factor[k])
+        findings.append(Finding("level", members.levels[k].label, text + _moved(problem, moved[k])))
+    values = {
+        "factor": ("level", factor), "factor_sd": ("level", asked.sd * factor), "square": ("level", asked.square),
+        "shift": (("level", "bias_label"), asked.shift * problem.scales),
+    }  # fmt: skip
+    group = xr.Dataset(values, bias_coords(problem) | {"level": _names(members.levels)})
+    group.attrs |= {"limit": float(limit)}
+    return group, findings, _doubts(members, moved, factor)
+
+
+def _names(levels: list[Level]) -> list[str]:
+    """A name of its own for each level: its label, with a number where it is declared more than once."""
+    names = list[str]()
+    for k, level in enumerate(levels):
+        twins = sum(other.label.partition("#")[0] == level.label for other in levels[:k])
+        names.append(f"{level.label}#{twins + 1}" if twins else level.label)
+    return names
+
+
+def _sentence(level: Level, factor: float, sd: float) -> str:
+    """What the data ask of a level, and how to let them have it."""
+    what = "what the table has" if level.declared is None else f"the declared {level.declared:g}"
+    if abs(np.log(factor)) >= FARTHEST:
+        size = f"far {'more' if factor > 1 else 'less'} than {what}"
+    else:
+        size = f"{factor:.2f} ± {sd:.2f} times {what}"
+    remedy = "correct its std" if level.declared is None else f"declare Unknown({level.declared:g})"
+    return f"{level.label}: the data ask for {size}: {remedy}"
+
+
+def _moved(problem: Problem, moved: np.ndarray) -> str:
+    """What hangs on a level, `moved` (M,) by it in sd."""
+    order = np.argsort(-np.abs(moved))
+    count = int((np.abs(moved) > HANGS).sum())
+    if not count:
+        return ""
+    more = f" and {count - 1} more" if count > 1 else ""
+    return f"; {problem.labels[order[0]]}{more} would move by {abs(moved[order[0]]):.1f} sd"
+
+
+def _doubts(members: Members, moved: np.ndarray, factor: np.ndarray) -> dict[int, str]:
+    """Why the answers of biases are in doubt that would move by more than `HANGS` sd, `moved` (K, M)."""
+    found = {}
+    for m in np.flatnonzero(np.abs(moved.sum(0)) > HANGS).tolist():
+        k = int(np.abs(moved[:, m]).argmax())
+        label = members.levels[k].label
+        found[m] = f"it would move by {abs(moved[:, m].sum()):.1f} sd with the {label} that the data ask for"
+        found[m] += f" ({factor[k]:.2f} times what is declared)"
+    return found
