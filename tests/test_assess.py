@@ -479,9 +479,8 @@ def test_limits_of_squares_hold_their_rate_for_heavy_and_light_tails():
     score = 5 * r / (4 + r**2) / np.sqrt(5 / 7)  # of Student-t noise, standardised
     for value in (random.standard_normal(80_000), score):
         kurtosis = np.full(80_000, np.mean(value**4) - 3.0)
-        part = residuals.squares(
-            residuals.Innovations(value, np.zeros(80_000), kurtosis), np.arange(80_000) // 40, 2000, 0.05
-        )
+        found = residuals.Innovations(value, np.zeros(80_000), kurtosis, np.ones(80_000))
+        part = residuals.squares(found, np.arange(80_000) // 40, 2000, 0.05)
         out = int(((part.nis < part.lower) | (part.nis > part.upper)).sum())
         assert stats.binom.ppf(1e-4, 2000, 0.05) <= out <= stats.binom.isf(1e-4, 2000, 0.05)
 

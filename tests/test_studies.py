@@ -1,11 +1,13 @@
 """Studies: the same fits as one by one, and scenarios C1 and C2 against the figures of the trial (runs 0 to 7)."""
 
 import sys
+from copy import copy
 from pathlib import Path
 from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from worlds import heights
@@ -100,6 +102,41 @@ def test_each_fit_of_a_study_is_that_of_fit_alone():
             )
             np.testing.assert_allclose(one["sd"], alone.sd, rtol=1e-5)  # of fits that diverge: rounding grows
             assert (str(one["status"].values), int(one["iterations"])) == (str(answer.status), answer.iterations)
+
+
+@pytest.mark.ci
+def test_runs_that_survey_other_nodes_keep_their_own_priors():
+    def setting(run, share=0.3):
+        problem, truth = radars.setting(run, share=share, scenario="C1")
+        held = {f"radar_{k}.position_{axis}" for k in ((0, 1) if run % 2 else (2, 3)) for axis in "xy"}
+        surveyed = np.array([label in held for label in problem.labels])
+        assert surveyed.sum() == 4
+        problem = copy(problem)
+        problem.surveyed = surveyed
+        return problem, truth
+
+    both = study(setting, {"share": [0.3]}, {"ea": EA()}, runs=[0, 1])
+    alone = study(setting, {"share": [0.3]}, {"ea": EA()}, runs=[1])
+    np.testing.assert_array_equal(both["sd"].sel(run=1), alone["sd"].sel(run=1))
+
+
+@pytest.mark.ci
+def test_a_study_whose_fits_are_more_than_one_climb_runs_them_as_fit_does():
+    @probcal.sensor(range=probcal.Channel("m", std=1.0))
+    def anchor(target, pose, *, offset=probcal.Bias("m", 6.0, shared="type")):
+        return {"range": jnp.sqrt(jnp.sum((target.position - pose.position) ** 2) + 1e-6) + offset}
+
+    places = {"a0": (0.0, 0.0), "a1": (40.0, 0.0), "a2": (0.0, 40.0)}
+    network = probcal.Network([anchor.on(probcal.Node(name, place)) for name, place in places.items()])
+    heard = [("t0", "a0", 21.0), ("t0", "a1", 35.0), ("t1", "a1", 30.0), ("t2", "a0", 18.0), ("t2", "a2", 33.0)]
+    table = pd.DataFrame(heard, columns=["target", "sensor", "range"]).assign(time=0.0)
+    motion = probcal.Target(probcal.Static(), {"position": ((15.0, 12.0), 10.0)})
+    problem, truth = probcal.Problem(network, motion, table), probcal.Truth(biases={"anchor.offset": 0.0})
+    found = study(lambda run, k: (problem, truth), {"k": [0]}, {"map": MAP()}, runs=1).isel(k=0, run=0, estimator=0)
+    tree = probcal.fit(problem, MAP())
+    mean = tree["calibration"]["mean"].values / problem.scales
+    np.testing.assert_allclose(found["error"].values, mean, atol=1e-6)
+    assert tree.attrs["places"] == "integrated"
 
 
 def test_values_of_settings():

@@ -267,13 +267,13 @@ def _inflation(fit: Fitted, found: residuals.Filtered, divided: Pieces, grid: _G
         jnp.asarray(step[piece[index][:, None], np.asarray(bias)])
         for index, bias in zip(fit.problem.row_index, fit.problem.model.read, strict=True)
     ]
-    value = residuals.moved_innovations(fit, found, shift)
+    freed = found.innovations._replace(value=residuals.moved_innovations(fit, found, shift))
     group, labels = checks.codes(fit.data, ["sensor", "channel"])
     data = np.bincount(group)
     target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
     wide = np.array(
         [
-            max(float(np.mean(value[mine] ** 2)), 1.0) * residuals.memory(value[mine], target[mine], time[mine])
+            max(freed.spread(mine), 1.0) * residuals.memory(freed.value[mine], target[mine], time[mine])
             for mine in (group == k for k in range(len(labels)))
         ]
     )

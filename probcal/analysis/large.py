@@ -112,7 +112,7 @@ def _innovations(
     value, kept = (fit.flat(parts) for parts in zip(*found, strict=True))
     told = np.maximum(fit.flat(_told(fit)), 0.0)
     used = np.minimum(told * (gamma.sum() / max(told.sum(), 1e-300)), 0.9)
-    return residuals.Innovations(value, used, _kurtosis(fit) * kept**4)
+    return residuals.Innovations(value, used, _kurtosis(fit) * kept**4, residuals.expected_squares(fit, kept))
 
 
 def _told(fit: JudgedLarge) -> list[np.ndarray]:
@@ -152,8 +152,12 @@ def _inflation(fit: JudgedLarge, found: residuals.Innovations) -> np.ndarray:
     counts = np.bincount(group)
     members = np.split(np.argsort(group, kind="stable"), np.cumsum(counts)[:-1])
     target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
-    parts = [(found.value[mine], target[mine], time[mine]) for mine in members]
-    wide = np.array([max(float(np.mean(part[0] ** 2)), 1.0) * residuals.memory(*part) for part in parts])
+    wide = np.array(
+        [
+            max(found.spread(mine), 1.0) * residuals.memory(found.value[mine], target[mine], time[mine])
+            for mine in members
+        ]
+    )
     M, start = fit.problem.model.biases, 0
     told, weighed = np.zeros(M + 1), np.zeros(M + 1)
     for read, lin, (row, channel) in zip(fit.problem.model.read, fit.lins, fit.picks, strict=True):

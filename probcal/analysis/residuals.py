@@ -40,6 +40,20 @@ class Innovations(NamedTuple):
     value: np.ndarray  # (D,)
     used: np.ndarray  # (D,) degrees of freedom that the biases took
     kurtosis: np.ndarray  # (D,) excess over a Gaussian's
+    expected: np.ndarray  # (D,) of its square: 1, less where a row has a weight below one
+
+    def spread(self, mine: Any) -> float:
+        """Mean square of some of them over what is expected."""
+        return float(np.sum(self.value[mine] ** 2) / max(np.sum(self.expected[mine]), 1e-300))
+
+
+def expected_squares(fit: Judged, kept: np.ndarray) -> np.ndarray:
+    """What is expected of the square of every innovation (D,), of which `kept` is the share of the datum's own noise.
+
+    A row of weight w counts as if its noise had the variance 1 / w, but scatters as declared.
+    """
+    found: np.ndarray = 1.0 - (1.0 - fit.flat(fit.problem.model.measured)) * kept**2
+    return found
 
 
 @jax.jit
@@ -136,7 +150,7 @@ def innovations(fit: Fitted, kurtosis: np.ndarray) -> Filtered:
     found = [_innovations(model, fit.point, fit.lins, filters, still, part) for part in roots]
     value, _, kept = (fit.flat(parts) for parts in zip(*found[0], strict=True))
     used = np.sum([fit.flat([own for _, own, _ in part]) for part in found], axis=0)
-    return Filtered(filters, Innovations(value, used, kurtosis * kept**4), roots)
+    return Filtered(filters, Innovations(value, used, kurtosis * kept**4, expected_squares(fit, kept)), roots)
 
 
 def moved_innovations(fit: Fitted, known: Filtered, shift: list[jax.Array]) -> np.ndarray:
@@ -163,10 +177,12 @@ def squares(found: Innovations, group: Any, count: int, rate: float) -> Squares:
     """
     group = np.asarray(group)
     data, total, used, kurtosis = (
-        np.bincount(group, weight, count) for weight in (np.ones(len(group)), found.value**2, *found[1:])
+        np.bincount(group, weight, count)
+        for weight in (np.ones(len(group)), found.value**2, found.used, found.kurtosis * found.expected**2)
     )
-    expected = np.maximum(data - used, 1e-9)
-    variance = np.maximum(2.0 * expected + kurtosis, 1e-9 * expected)
+    whole, second = (np.maximum(np.bincount(group, found.expected**k, count), 1e-300) for k in (1, 2))
+    expected = np.maximum(whole - used, 1e-9)
+    variance = np.maximum(2.0 * expected * second / whole + kurtosis, 1e-9 * expected)
     scale, freedom = variance / (2.0 * expected), 2.0 * expected**2 / variance
     lower, upper = (scale * special.chdtri(freedom, p) / expected for p in (1 - rate / 2, rate / 2))
     judged = freedom >= 1.0  # below, as with events that hardly ever happen, there is no limit

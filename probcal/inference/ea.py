@@ -218,6 +218,11 @@ class EA(Maximiser):
         kept = without_far_modes(problem.model, prior, given_of(self, problem, prior), state, climb)
         return kept, trace if kept is state else np.append(trace, float(kept.objective))
 
+    def climbs_once(self, problem: Problem, prior: Prior) -> bool:
+        """Not where maximised precisions are tried anew after a climb."""
+        again = self.trajectory == "marginal" and isinstance(prior, ARD) and not self.integrates(prior)
+        return super().climbs_once(problem, prior) and not again
+
     def _climbed_again(
         self, problem: Problem, prior: Prior, state: State, trace: np.ndarray, context: Context
     ) -> tuple[State, np.ndarray]:

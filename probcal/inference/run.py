@@ -188,6 +188,10 @@ class Maximiser(Method, ABC):
         _, solved = compress_and_eliminate(model, state.point, linearise_rows(model, state.point))
         return -float(_marginal_cost(model, state.point, given, solved)) - beside
 
+    def climbs_once(self, problem: Problem, prior: Prior) -> bool:
+        """Whether an answer is what one climb finds (and an integration there), so that many are one kernel."""
+        return not (takes_sparse(self, problem) or (self.integrates_places and problem.model.rests))
+
     @property
     def integrates_places(self) -> bool:
         """Whether trajectories are integrated, so that places that are far from Gaussian matter."""

@@ -34,7 +34,6 @@ from probcal.inference.run import (
     kernel,
     stepped,
 )
-from probcal.inference.sampler import Sampler
 from probcal.inference.settings import check_setting
 from probcal.inference.solve import solve
 from probcal.inference.spread import check_scheduler, spread
@@ -153,20 +152,21 @@ def _batch(
         found: list[dict[str, Any]] = []
         for name in _turned(list(methods), turn):
             method, prior = methods[name]
-            if isinstance(method, Sampler) or method.by_particles:
-                found += [
-                    {"run": run.number, "method": name} | _record(run, _drawn(run, method, prior)) for run in whole
-                ]
+            once = [_climbs_once(method, prior, run, name == ORACLE) for run in whole]
+            alone = [run for run, own in zip(whole, once, strict=True) if not own]
+            records = [_record(run, _alone_by(run, method, prior)) for run in alone]
+            found += [{"run": run.number, "method": name} | own for run, own in zip(alone, records, strict=True)]
+            if len(alone) == len(whole):
                 continue
             assert isinstance(method, Maximiser)
-            runs = [_prepared(method, run) for run in whole]
+            runs = [_prepared(method, run) for run, own in zip(whole, once, strict=True) if own]
             groups: dict[tuple[Any, ...], list[int]] = {}
-            for k, run in enumerate(runs):
-                groups.setdefault(_form(run), []).append(k)
-            for members in groups.values():
+            for k, run in enumerate(runs):  # one kernel serves those of one form, whose precisions are integrated alike
+                groups.setdefault((_form(run), method.integration(run.problem, prior)), []).append(k)
+            for (_, how), members in groups.items():
                 chosen = [runs[k] for k in members]
                 pieces = [(run.problem.model, _given(method, prior, run, name == ORACLE), run.start) for run in chosen]
-                how, climb = method.integration(chosen[0].problem, prior), method.climbs_under(prior)
+                climb = method.climbs_under(prior)
                 inside = how if how is not None and how.sweeps else None  # a propagation runs on the host
                 solved = _solve(kernel(method), climb, inside, method.iterations, pieces)
                 for j, k in enumerate(members):
@@ -240,8 +240,15 @@ def _record(run: _Run, answer: Answer) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _drawn(run: _Run, method: Method, prior: Prior) -> Answer:
-    """The answer of a sampler, or of a method by particles, which take their runs one by one."""
+def _climbs_once(method: Method, prior: Prior, run: _Run, oracle: bool) -> bool:
+    """Whether runs are solved together: not by samplers and particles, nor where a fit is more than one climb."""
+    if not isinstance(method, Maximiser) or method.by_particles:
+        return False
+    return oracle or method.climbs_once(run.problem, prior)
+
+
+def _alone_by(run: _Run, method: Method, prior: Prior) -> Answer:
+    """The answer to a run that is solved by itself, as `fit` does it."""
     context = Context(jax.random.key(run.number), threads=1, fallback=NUTS())
     return solve(run.problem, method, prior, context, start=None if method.by_particles else run.start)
 
@@ -302,9 +309,11 @@ def study(
     `lower` and `upper` end of the interval less the truth, `true`, `sd` (all over their scales) and `gamma`.
     `store` is a folder that keeps finished fits as zarr (`load_study` reads them meanwhile), `resume` goes on with it,
     for more runs and settings too, `overwrite` replaces what it holds; an interruption changes no result.
-    Runs are solved in batches by compiled kernels, on as many threads as there are processors; `scheduler` spreads them
-    otherwise: "local" (processes of this machine), the address of a dask scheduler, or a `distributed.Client`. The
-    numbers are the same, bit for bit, on processors of one kind.
+    Where a fit is one climb, runs are solved in batches by compiled kernels: unlike `fit`, these do not look for the
+    other side of a mirror, nor for a second optimum of integrated precisions. Others are solved as `fit` does it. All
+    go on as many threads as there are processors; `scheduler` spreads them otherwise: "local" (processes of this
+    machine), the address of a dask scheduler, or a `distributed.Client`. The numbers are the same, bit for bit, on
+    processors of one kind.
     Raises `InputError` for an unknown method, settings whose biases differ and a folder that holds another study, and
     `FitError` where a cluster is lost on the way.
     """

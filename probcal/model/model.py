@@ -390,6 +390,11 @@ class Model(Stepwise):
         """Precisions (E,) that the noises of each tail of each recursion are taken to have."""
         return tuple(tuple(tail.weight for tail in part.tails) for part in self.recursions)
 
+    @property
+    def rests(self) -> bool:
+        """Whether some target stands still at a place that is not known."""
+        return any(at_rest(part, T).any() for part, T in zip(self.recursions, self.targets, strict=True))
+
     def with_tilt(self, tilt: Tilt) -> "Model":
         """The model with a term of the log-likelihood of the biases beside that of the rows."""
         return replace(self, tilt=tilt)
