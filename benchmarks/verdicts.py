@@ -152,7 +152,9 @@ def one(case, run):
     true = np.array([truth.biases.get(str(label), 0.0) for label in group["bias_label"].values])
     off = np.abs(group["mean"].values - true) / group["sd"].values
     held = (group["lower"].values <= true) & (true <= group["upper"].values)
-    kinds = list(dict.fromkeys(tree["finding"]["kind"].values.tolist()))
+    said = tree["finding"].to_dataset()
+    pairs = zip(said["kind"].values.tolist(), said["subject"].values.tolist(), strict=True)
+    kinds = list(dict.fromkeys("motion" if subject.startswith("motion.") else kind for kind, subject in pairs))
     told = group["gamma"].values > PULLED
     return tree.attrs["status"], (off, held, true != 0, told, tree["verdict"]["verdict"].values.astype(str)), kinds
 

@@ -316,7 +316,12 @@ def _probe(
         target_asked |= target
         pose_asked |= pose
         dimensions.append(dimension)
-    if returned is None:
+    if isinstance(failure, jax.errors.TracerArrayConversionError) and returned is None:
+        raise InputError(
+            f"sensor {function.__name__}: the function calls NumPy on its arguments, which jax cannot follow: write it"
+            " with jax.numpy, and norm, bearing and elevation of probcal.geometry"
+        ) from failure
+    if failure is not None and returned is None:
         raise InputError(f"sensor {function.__name__}: the function failed on a trial call: {failure}") from failure
     return returned, target_asked, pose_asked, dimensions
 
@@ -356,6 +361,11 @@ def sensor(
                     raise InputError(f'sensor {label}: argument "{parameter.name}" needs Bias(unit, scale) as default')
                 biases[parameter.name] = parameter.default
             elif parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD):
+                if isinstance(parameter.default, Bias):
+                    raise InputError(
+                        f'sensor {label}: argument "{parameter.name}" is a bias: write a * before the first bias, as in'
+                        f" def {label}(target, pose, *, {parameter.name}=Bias(...))"
+                    )
                 positional.append(parameter.name)
             else:
                 raise InputError(f'sensor {label}: argument "*{parameter.name}" is not allowed')

@@ -339,7 +339,7 @@ def test_a_fit_that_fails_to_be_written_leaves_nothing_behind(tmp_path, monkeypa
     ("options", "text"),
     [
         (["--method", "collapsed", "--resume"], "--resume needs --out, the folder of the run to go on with"),
-        (["--method", "map", "--draws", "10"], '--draws: "map" draws no chains; take collapsed, nuts or svi'),
+        (["--method", "map", "--draws", "10"], '--draws: "map" draws no chains; take collapsed, nuts, gibbs or svi'),
     ],
 )
 def test_options_of_samplers_are_checked(options, text, model, rows):

@@ -130,8 +130,9 @@ def test_absurd_data_end_in_no_answer(change):
     problem = Problem(network, ConstantVelocity(0.5), change(table))
     tree = probcal.fit(problem, EA())
     assert tree.attrs["status"] in ("misfit", "diverged")
-    assert "Check units, the time column, sentinels such as -9999 and the noise std" in " ".join(
-        tree.attrs["message"].split()
+    assert (
+        "Check units, the time column, the target of each row, sentinels such as -9999 and the noise std"
+        in " ".join(tree.attrs["message"].split())
     )
     judged = assess(problem, tree)
     assert "determined" not in judged["verdict"]["verdict"].values

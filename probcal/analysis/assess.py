@@ -22,7 +22,7 @@ from probcal.analysis import (
     verdict,
 )
 from probcal.analysis.beside import mirror_doubts, mirror_findings
-from probcal.analysis.findings import Finding
+from probcal.analysis.findings import Finding, in_order
 from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.large import assess_large
 from probcal.analysis.pieces import Change, Pieces
@@ -95,11 +95,14 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     for name in ("sensor", "target"):
         groups[f"{name}_check"], more = checks.squares_by(fit, found.innovations, name)
         findings += more
+    findings += checks.outliers(fit, found.innovations)
     residual = tree["residual"].to_dataset()
     findings += [
         Finding("wrapping", *pair) for pair in residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     ]
-    findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups) + process.check_process_noise(fit, keys[2])
+    findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups)
+    if not (_absurd(tree) or any(one.kind == "outliers" for one in findings)):  # these look like turns
+        findings += process.check_process_noise(fit, keys[2])
     bent = None if tree.attrs["status"] in INVALID else shape.check_shape(fit, tree)
     findings += [] if bent is None else [bent]
     hanging = dict[int, str]()
@@ -125,7 +128,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
         _score(fit, tree, drawn, truth, groups)
     inflation = groups["verdict"]["inflation"].values
     result, widening = widened(tree, inflation, rejection(found.innovations, groups["channel_check"]))
-    findings += widening
+    findings = in_order(findings + widening)
     texts = {name: ("finding", np.array([getattr(f, name) for f in findings], str)) for name in Finding._fields}
     groups["finding"] = xr.Dataset(texts)
     for name, group in groups.items():
@@ -157,7 +160,9 @@ def _verdicts(
                 groups["halves"] = _halves(problem, alone, inflation, grid.edges[len(grid.edges) // 2], limit_of(M))
         changes = pieces.changing(divided, grid.patterns, wide, partial(limit_of, M))
         shapes = pieces.contrasts(divided, grid.quarters) if changes and grid.quarters.shape[1] > 1 else {}
-        first = problem.labels[changes[0].bias] if changes else ""
+        if changes:
+            first = problem.labels[changes[0].bias]
+            hanging = hanging | _touched(fit, divided, changes, grid.patterns)
         for change in changes:
             if change.name == "halves":
                 text = _drift(problem, change, inflation, limit_of(M))
@@ -187,6 +192,16 @@ def _verdicts(
     group = xr.Dataset({name: ("bias_label", value) for name, value in values.items()}, bias_coords(problem))
     group.attrs |= {"rate": RATE, "limit": known.limit}
     return group
+
+
+def _touched(fit: Fitted, divided: Pieces, changes: list[Change], patterns: pieces.Patterns) -> dict[int, str]:
+    """Why the answers of biases are in doubt that would move by more than `HANGS` sd if others may change."""
+    free = [(change.bias, patterns[change.name]) for change in changes]
+    moved = pieces.freed(divided, free) / np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
+    first = fit.problem.labels[changes[0].bias]
+    others = f"{first} and {len(changes) - 1} more" if len(changes) > 1 else first
+    told = np.flatnonzero(np.abs(moved) > levels.HANGS).tolist()
+    return {m: f"it would move by {abs(moved[m]):.1f} sd if {others} may change" for m in told}
 
 
 def _shared(tree: xr.DataTree) -> dict[int, str]:

@@ -214,9 +214,20 @@ def _alike(both: pieces.Pieces, moved: int, free: dict[int, pieces.Contrast], in
     return [k for k, one in found.items() if k not in free and one.square / inflation[k] > least]
 
 
+def _contradictions(tree: xr.DataTree) -> str:
+    """How many biases of a fit drift or are in conflict, where its assessment was kept; empty where none."""
+    words = tree["verdict"]["verdict"].values.tolist() if "verdict" in tree.children else []
+    counts = {word: words.count(word) for word in ("drifting", "conflicting")}
+    return ", ".join(f"{count} {word}" for word, count in counts.items() if count)
+
+
 def _findings(found: xr.Dataset, pair: dict[str, xr.DataTree]) -> list[Finding]:
     """A sentence for each bias that moved, one for those that are not told, one for what stays common otherwise."""
-    said = []
+    said = [
+        Finding("doubt", name, f"{name} contradicts its model ({doubt}): what is said to have moved may be that")
+        for name, doubt in ((name, _contradictions(tree)) for name, tree in pair.items())
+        if doubt
+    ]
     verdicts, far = found["verdict"].values, np.abs(found["t"].values)
     labels = found["bias_label"].values.astype(str)
     for k in sorted(np.flatnonzero(verdicts == "moved").tolist(), key=lambda k: -far[k]):

@@ -11,8 +11,12 @@ from probcal.analysis import leave, predictive, residuals
 from probcal.analysis.findings import LAGGED, NAMES, NOTABLE, PRACTICAL, Finding
 from probcal.analysis.fitted import Fitted, Judged
 from probcal.analysis.verdict import RATE
+from probcal.noise import Normal
 from probcal.results.groups import by_target
 
+OUTLYING = 4.0  # std from which a datum is an outlier
+NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal
+TOGETHER = 0.3  # share of outliers whose next lies off to the same side, from which something else is wrong
 GAIN = 5.0  # nats that a calibration must win before it is a finding
 
 
@@ -94,6 +98,35 @@ def by_channel(
         values[f"p_{kind}"] = of[first]
         findings += _unlike_replicas(kind, names, of[first], replicas.draws)
     return xr.Dataset({name: ("part", value) for name, value in values.items()}, coords), findings
+
+
+def outliers(fit: Judged, found: residuals.Innovations) -> list[Finding]:
+    """A finding on channels of Gaussian noise of which single data lie far off, by what most of their data scatter.
+
+    Their next of the same target does not lie off to the same side: what jumps or drifts is no outlier.
+    """
+    group, labels = codes(fit.data, ["sensor", "channel"])
+    kinds = {s.name: dict(s.type.expand(fit.problem.network.dimension)) for s in fit.problem.network.sensors}
+    target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
+    members = np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
+    counts = {}
+    for (sensor, channel), mine in zip(labels.itertuples(index=False), members, strict=True):
+        if not isinstance(kinds[sensor][channel].noise, Normal):
+            continue
+        order = mine[np.lexsort((time[mine], target[mine]))]
+        value, owner = found.value[order], target[order]
+        off = np.abs(value) > OUTLYING * max(float(np.median(np.abs(value))) / NORMAL_MEDIAN, 1.0)
+        again = off[1:] & off[:-1] & (np.sign(value[1:]) == np.sign(value[:-1])) & (owner[1:] == owner[:-1])
+        count = int(off.sum())
+        chance = special.bdtrc(count - 1, len(mine), 2 * special.ndtr(-OUTLYING)) if count else 1.0
+        if count > 1 and chance < RATE / len(labels) and again.sum() < TOGETHER * count:
+            counts[f"{sensor}.{channel}"] = f"{count} of {len(mine)}"
+    if not counts:
+        return []
+    listed = ", ".join(f"{name} {count}" for name, count in list(counts.items())[:NAMES])
+    listed += f" and {len(counts) - NAMES} more" if len(counts) > NAMES else ""
+    text = f"single data lie more than {OUTLYING:g} std off: {listed}; declare Channel(..., noise=StudentT(4))"
+    return [Finding("outliers", next(iter(counts)), text)]
 
 
 def _unlike_replicas(kind: str, names: list[str], p: np.ndarray, draws: int) -> list[Finding]:

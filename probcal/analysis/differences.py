@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.analysis.findings import NAMES, Finding
+from probcal.analysis.loo import BAD
 from probcal.analysis.overlap import ZERO
 from probcal.results.schema import EVIDENCES
 from probcal.status import INVALID, Status
@@ -19,7 +20,6 @@ NARROW = 0.7  # ratio of sds beyond which, either way, a method is not enough
 GAMMA = 0.05  # by which a gamma must lie above the interval of the reference's to be a finding
 CERTAIN = 4.0  # nats of elpd below which a difference is none, whatever its error
 MIXED = 1.01  # r_hat above which chains disagree
-BAD = 0.01  # share of bad Pareto k that is a finding
 
 
 def findings(comparison: xr.DataTree) -> list[Finding]:
@@ -130,7 +130,8 @@ def _prediction(methods: dict[str, xr.Dataset]) -> list[Finding]:
     for name, at in known.items():
         if at["bad_k"] > BAD:
             text = f"Pareto k of {at['bad_k']:.1%} of the data is above {at['good_k']:.2f}, its elpd is uncertain"
-            found.append(Finding("loo", name, f"{name}: {text}"))
+            found.append(Finding("loo", name, f"{name}: {text} and is compared with no other"))
+    known = {name: at for name, at in known.items() if at["bad_k"] <= BAD}
     if len(known) < 2:
         return found
     best, alike = max(known, key=lambda name: known[name]["elpd"]), list[str]()

@@ -8,9 +8,24 @@ LAGGED = 2.5  # sd of its lag-1 correlation from which a channel is called corre
 NOTABLE = 0.1  # lag-1 correlation, and mean, of innovations within which neither is
 
 
+FIRST = ("status", "wrapping", "drifting", "conflicting", "outliers", "level", "nis", "motion")  # likely causes
+LAST = ("predictive", "rest", "gain", "loo")  # and what says little of them
+
+
 class Finding(NamedTuple):
     """One thing to know about a fit: its kind, what it concerns, and a sentence."""
 
     kind: str
     subject: str
     sentence: str
+
+
+def in_order(findings: list[Finding]) -> list[Finding]:
+    """The findings with likely causes first, those of one kind as they came."""
+
+    def place(one: Finding) -> int:
+        if one.kind in FIRST:
+            return FIRST.index(one.kind)
+        return len(FIRST) + (1 + LAST.index(one.kind) if one.kind in LAST else 0)
+
+    return sorted(findings, key=place)

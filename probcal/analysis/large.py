@@ -18,7 +18,7 @@ import xarray as xr
 
 from probcal.analysis import checks, pieces, predictive, residuals, verdict
 from probcal.analysis.beside import mirror_doubts, mirror_findings
-from probcal.analysis.findings import Finding
+from probcal.analysis.findings import Finding, in_order
 from probcal.analysis.fitted import Judged, identified, point_of
 from probcal.analysis.halves import SAMPLED, Divided, Halves, drifts_of
 from probcal.analysis.widen import rejection, widened
@@ -61,6 +61,7 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
     for name in ("sensor", "target"):
         groups[f"{name}_check"], more = checks.squares_by(fit, found, name)
         findings += more
+    findings += checks.outliers(fit, found)
     residual = tree["residual"].to_dataset()
     turned = residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     findings += [Finding("wrapping", *pair) for pair in turned]
@@ -76,7 +77,7 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
         findings = [Finding("status", "fit", text), *(f for f in findings if f.kind in ("wrapping", "nis"))]
     reason = rejection(found, groups["channel_check"])
     result, widening = widened(tree, groups["verdict"]["inflation"].values, reason)
-    findings += widening
+    findings = in_order(findings + widening)
     texts = {name: ("finding", np.array([getattr(f, name) for f in findings], str)) for name in Finding._fields}
     groups["finding"] = xr.Dataset(texts)
     for name, group in groups.items():

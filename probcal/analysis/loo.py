@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 else:
     arviz_stats = Later("arviz_stats")
 
+BAD = 0.01  # share of bad Pareto k from which an elpd is uncertain
+
 
 def same_data(fits: Mapping[str, xr.DataTree]) -> dict[str, np.ndarray]:
     """The order in which the data of each fit are those of all, by row and channel; sensor models may order them anew.
@@ -41,7 +43,10 @@ def same_data(fits: Mapping[str, xr.DataTree]) -> dict[str, np.ndarray]:
 
 
 def elpd(fits: Mapping[str, xr.DataTree], orders: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """By fit with a log-likelihood: elpd, its error, p_loo, share of bad Pareto k, and difference to the best."""
+    """By fit with a log-likelihood: elpd, its error, p_loo, share of bad Pareto k, and difference to the best.
+
+    The best is one whose elpd is certain, if there is any.
+    """
     found, pointwise = dict[str, dict[str, Any]](), dict[str, np.ndarray]()
     for name, tree in fits.items():
         if not tailed(tree):
@@ -59,7 +64,7 @@ def elpd(fits: Mapping[str, xr.DataTree], orders: Mapping[str, np.ndarray]) -> d
         found[name] = {"elpd": float(loo.elpd), "elpd_se": float(loo.se), "p_loo": float(loo.p), "bad_k": bad}
         found[name]["good_k"] = float(loo.good_k)
     if len(found) > 1:
-        best = max(found, key=lambda name: found[name]["elpd"])
+        best = max(found, key=lambda name: (found[name]["bad_k"] <= BAD, found[name]["elpd"]))
         for name, values in found.items():
             apart = pointwise[name] - pointwise[best]
             values |= {

@@ -122,6 +122,23 @@ def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.
     return found
 
 
+def freed(pieces: Pieces, free: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
+    """Change (M,) of what all pieces have in common, in z, where the biases in `free` differ along their patterns."""
+    M, held = len(pieces.z), [m for m, _ in free]
+    same = np.tile(np.eye(M), (len(pieces.score) // M, 1))
+    steps = []
+    for columns in (same, np.concatenate([same, *(np.kron(own, np.eye(M)[:, [m]]) for m, own in free)], 1)):
+        prior = pieces.prior.copy()
+        if columns is not same:
+            prior[held, :], prior[:, held] = 0.0, 0.0
+        K, slope = columns.T @ pieces.information @ columns, columns.T @ pieces.score
+        K[:M, :M] += prior
+        slope[:M] -= prior @ pieces.z
+        steps.append((np.linalg.pinv(K, hermitian=True) @ slope)[:M])
+    change: np.ndarray = steps[1] - steps[0]
+    return change
+
+
 def own_biases(pieces: Pieces, member: np.ndarray) -> np.ndarray:
     """Change (P, M) from the fit where groups of pieces, `member` (P,), have own biases, held by their scales."""
     M = len(pieces.z)

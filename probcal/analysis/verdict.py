@@ -8,10 +8,11 @@ conflicting  it lies beyond the limit of its survey (or of its scale under a pri
              targets disagree on it beyond the limit, after what stronger changes explain
 prior only   s < 0.05
 weak         s < 0.5 (information below 1), or one scale along a combination of biases that the data leave open would
-             put it more than 1.8 sd off, or it is another one in an answer that fits as well (a mirror, all biases
-             where a target touches it), or the answer is far from Gaussian, or the fit is no answer (not converged,
-             at bound, diverged), or the chains of the bias have not mixed, or it was pruned: held at zero by a
-             precision that was maximised; "conflicting" where the fit explains nothing (misfit)
+             put it more than 1.8 sd off, or it would move by more than one sd with the noise levels that the data ask
+             for or if the biases that drift were free to, or it is another one in an answer that fits as well (a
+             mirror, all biases where a target touches it), or the answer is far from Gaussian, or the fit is no answer
+             (not converged, at bound, diverged), or the chains of the bias have not mixed, or it was pruned: held at
+             zero by a precision that was maximised; all are "conflicting" where the fit explains nothing (misfit)
 determined   none of these
 
 Limits have a false-alarm rate of 1 % over all biases together, and the standard deviations behind them carry the
@@ -88,7 +89,9 @@ def judge_biases(
         declared = bias.kind
         sizes = f"{declared} of {_size(bias.scale, unit)} to {_size(bias.scale * np.sqrt(1 - s), unit)}"
         information = f"information {s / max(1 - s, 1e-12):.2g}"
-        if m in drifts:
+        if status is Status.MISFIT:
+            verdict, reason = "conflicting", "the fit ended misfit: model and data contradict each other"
+        elif m in drifts:
             verdict, reason = "drifting", drifts[m]
         elif known.pull[m] > known.limit:
             verdict = "conflicting"
@@ -104,9 +107,7 @@ def judge_biases(
             verdict, reason = "weak", doubts[m]
         elif m in shared:
             verdict, reason = "weak", f"it belongs to {shared[m]}, which the data leave open"
-        elif status is Status.MISFIT:
-            verdict, reason = "conflicting", "the fit ended misfit: model and data contradict each other"
-        elif not status.settled:
+        elif not status.settled and "not mixed" not in ended:
             verdict, reason = "weak", f"the fit ended {status}, which is no answer"
         elif ended[m] == "not mixed":
             verdict, reason = "weak", "its chains have not mixed, which is no answer"

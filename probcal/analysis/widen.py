@@ -10,6 +10,7 @@ from probcal.analysis.findings import LAGGED, NOTABLE, PRACTICAL, Finding
 from probcal.results.blocks import SensorBlocks
 from probcal.status import Status
 
+TOLD = 1.05  # times as wide, from which sds are widened
 REJECTED = 1e-3  # probability of the NIS of all data, or of the whiteness of any channel, of a model that is wrong
 
 
@@ -31,16 +32,18 @@ def widened(tree: xr.DataTree, inflation: np.ndarray, reason: str) -> tuple[xr.D
     """A copy of a fit whose biases have the variance that the innovations call for, and the finding that says so.
 
     `inflation` (M,) is of the variance that comes from the data: a bias takes the share gamma of it. Mean and draws
-    keep their place; sd, interval, covariance and the spread of the draws grow together. A fit that is no answer, or
-    was widened before, stays as it is.
+    keep their place; sd, interval, covariance and the spread of the draws grow together, where some sd grows by the
+    factor `TOLD`. A fit that is no answer, or was widened before, stays as it is.
     """
     result = tree.copy()
     if not reason or "widened" in tree.attrs or not Status(tree.attrs["status"]).valid:
         return result, []
     group = tree["calibration"].to_dataset()
     wide = np.sqrt(1.0 + group["gamma"].values * (inflation - 1.0))
-    if wide.max() < 1.0 + 1e-6:
-        return result, []
+    if wide.max() < TOLD:
+        text = f"the innovations reject the model: {reason}"
+        result.attrs["message"] = f"{tree.attrs['message']} {text[0].upper()}{text[1:]}.".strip()
+        return result, [Finding("widened", "fit", text)]
     mean = group["mean"].values
     ends = {name: mean + wide * (group[name].values - mean) for name in ("lower", "upper")}
     columns = {"sd": group["sd"].values * wide, **ends, "widened": wide}

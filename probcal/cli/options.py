@@ -71,7 +71,7 @@ def chain_sizes(method: str, sizes: Mapping[str, int | None]) -> dict[str, int]:
     """The numbers of chains and draws that are given; raises `InputError` for a method that draws none."""
     given = {option: number for option, number in sizes.items() if number is not None}
     if given and not METHODS[method].chains:
-        raise InputError(f'--{next(iter(given))}: "{method}" draws no chains; take collapsed, nuts or svi')
+        raise InputError(f'--{next(iter(given))}: "{method}" draws no chains; take collapsed, nuts, gibbs or svi')
     return given
 
 
@@ -99,7 +99,7 @@ def saved_names(text: str) -> list[str]:
 def check_resumed(method: str, resume: bool) -> None:
     """Raise `InputError` where a method that keeps no draws is to go on with a run."""
     if resume and not METHODS[method].chains:
-        raise InputError(f'--resume: "{method}" keeps no draws to go on with; take collapsed, nuts or svi')
+        raise InputError(f'--resume: "{method}" keeps no draws to go on with; take collapsed, nuts, gibbs or svi')
 
 
 def method_names(text: str) -> list[str]:

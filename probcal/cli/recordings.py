@@ -113,7 +113,8 @@ def run(
                 last = time.monotonic()
     table = _write(found, files, outputs)
     print(table.to_string(index=False, float_format=lambda value: f"{value:.4g}"))
-    print(f"{len(files)} recordings, {len(missing)} of them fitted now, {time.perf_counter() - began:.1f} s")
+    fitted = sum(found[path][0]["status"] != REFUSED for path, _ in missing)
+    print(f"{len(files)} recordings, {fitted} of them fitted now, {time.perf_counter() - began:.1f} s")
     say_written([outputs.folder / "fits.csv"])
     refused: dict[str, list[str]] = {}
     for rows in found.values():

@@ -143,7 +143,8 @@ def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
     channel = problem.columns[block][c]
     return (
         f"The fit explains nothing: mean square a datum {square:.2g} where 1 is expected, worst {sensor}.{channel} at"
-        f" {data.time[row]:.6g} s. Check units, the time column, sentinels such as -9999 and the noise std."
+        f" {data.time[row]:.6g} s. Check units, the time column, the target of each row,"
+        f" sentinels such as -9999 and the noise std."
     )
 
 

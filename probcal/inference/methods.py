@@ -60,6 +60,8 @@ def choose_prior(method: Method, prior: Prior | None) -> Prior:
     """The prior of a fit: the given one if the method takes it, else the method's first."""
     if prior is None:
         return method.first_prior()
+    if not isinstance(prior, Prior):
+        raise InputError(f"the prior is {prior!r}; give a prior itself, such as Horseshoe() or Gaussian()")
     if not method.takes(prior):
         allowed = ", ".join(name for name, known in PRIORS.items() if method.takes(known))
         raise InputError(f"{method.name} does not take the prior {type(prior).__name__}; it takes: {allowed}")

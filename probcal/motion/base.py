@@ -361,7 +361,7 @@ def as_motion(value: Any) -> Motion:
     if isinstance(value, Motion):
         return value
     for member in ("names", "transition", "noise_factor", "start"):
-        if not hasattr(value, member):
+        if not hasattr(value, member) or isinstance(value, type):
             raise InputError(f"{value!r} is not a motion; give ConstantVelocity(std), Static(), or a sum of components")
     return LinearMotion((value,))
 
