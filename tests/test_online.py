@@ -43,9 +43,9 @@ def rows(names="ab", missing=0.3):
     return found.table.dropna(how="all", subset=["east", "north"]).sort_values("time", kind="stable", ignore_index=True)
 
 
-def filtered(method, frame=None, chunk=7, **settings):
+def filtered(method, frame=None, chunk=7, motion=MOTION, **settings):
     frame = rows() if frame is None else frame
-    online = pc.Online(network(), MOTION, method, targets=3, **settings)
+    online = pc.Online(network(), motion, method, targets=3, **settings)
     for k in range(0, len(frame), chunk):
         online.update(frame.iloc[k : k + chunk])
     return online
@@ -441,6 +441,9 @@ WRONG = {
     "is not a finite time; give seconds or ISO dates": lambda: filtered(None, rows().assign(time="noon")),
     "the time is infinite; give seconds or ISO dates": lambda: filtered(None, rows().assign(time=np.inf)),
     'target "q" has no motion': lambda: filtered(None, rows("a").assign(target="q")),
+    'target "a" moves by ConstantVelocity with noise=StudentT': lambda: filtered(
+        None, rows("a"), motion=pc.Target(pc.ConstantVelocity(0.5, noise=pc.StudentT(2.5)), MOTION["a"].start)
+    ),
     "rows have no measured value; fill the channel columns": lambda: filtered(
         None, rows()[["time", "sensor", "target"]].assign(east=None)
     ),

@@ -16,6 +16,7 @@ from probcal.model.epochs import Epoch, merged
 from probcal.model.motions import Area, linear_of, start_of
 from probcal.motion import Target, as_motion
 from probcal.network import Network
+from probcal.noise import Normal
 from probcal.problem import Problem, check_linear, declared_target
 from probcal.smoothing.grid import candidates
 from probcal.table import Table, header, measure, names_as_text
@@ -227,7 +228,20 @@ class Arrivals:
         template = Problem(self.network, self.motions(kept["target"]), kept, fix=self.fixed, epoch=self.epoch)
         if self.linear:
             check_linear(template)
+            self._check_gaussian(template)
         self.template, self.sizes = template, ()
+
+    def _check_gaussian(self, template: Problem) -> None:
+        """Raise `InputError` naming target, motion and noise where what drives a target is not Gaussian."""
+        for name in template.measurements.target_names:
+            for component in linear_of(as_motion(template.target(name).motion)):
+                noise = getattr(component, "noise", None)
+                if not isinstance(noise, Normal | None):
+                    raise InputError(
+                        f'target "{name}" moves by {type(component).__name__} with noise={noise!r}, which'
+                        " AugmentedFilter() would take for Gaussian; take ParticleFilter(1000) (--particles 1000),"
+                        " leave noise= out, or fit the rows as a batch"
+                    )
 
     def target(self, name: str) -> Target:
         """Motion and start of a target as they are declared; raises `InputError` where it has none."""
