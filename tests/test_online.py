@@ -13,6 +13,7 @@ import worlds
 import probcal as pc
 from probcal.errors import InputError
 from probcal.inference.checkpoint import pack_state, unpack_state
+from probcal.inference.relearnt import relearnt
 
 
 @pc.sensor(east=pc.Channel("m", 1.0), north=pc.Channel("m", 2.0))
@@ -382,6 +383,20 @@ def test_sparse_priors_are_laid_on_what_was_filtered():
     walking = filtered(pc.AugmentedFilter(lag=0, walk={"*.shift": 0.1}))
     with pytest.raises(InputError, match="have no prior that could be replaced; fit the rows as a batch"):
         walking.under(pc.Horseshoe())
+
+
+def test_surveyed_biases_share_no_precision_with_a_group_that_is_learnt():
+    problem = worlds.linear("plane")[0]
+    M = len(problem.labels)
+    half = np.random.default_rng(2).normal(size=(M, M))
+    covariance = np.linalg.inv(half @ half.T + np.eye(M))
+    mean, root = np.where(problem.surveyed, 3.0, 0.3), np.linalg.cholesky(covariance)
+    with jax.enable_x64(True):
+        held = pc.Gaussian().precision(problem.labels, problem.surveyed)
+        found = relearnt(problem, pc.ARD(by="type"), held, mean, root, 0)
+    alpha, own = (1.0 - found.gamma) / np.diag(found.covariance), ~problem.surveyed
+    np.testing.assert_allclose(alpha[~own], 1.0)
+    np.testing.assert_allclose(alpha[own], found.gamma[own].sum() / (found.mean[own] ** 2).sum(), rtol=1e-3)
 
 
 def test_the_tree_serves_track_and_a_further_stream(tmp_path):

@@ -381,6 +381,13 @@ class SpikeAndSlab(Hierarchy):
         return [share] if self.prior.share is None else []
 
 
+def learnt_groups(prior: Prior, problem: Problem) -> np.ndarray:
+    """Which learnt precision governs each bias, (M,), numbered from 0; those with a survey share none."""
+    group = prior.groups(problem.members)
+    group = np.where(problem.surveyed, len(group) + np.arange(len(group)), group)
+    return np.unique(group, return_inverse=True)[1]
+
+
 def hierarchy_of(prior: Prior, problem: Problem) -> Hierarchy:
     """The hierarchy of a prior for the biases of a problem; those with a survey keep their own Gaussian.
 

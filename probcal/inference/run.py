@@ -16,6 +16,7 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.inference.ending import conclude
+from probcal.inference.hierarchy import learnt_groups
 from probcal.inference.integrate import Integration, integrate
 from probcal.inference.progress import OnProgress, Progress
 from probcal.inference.sparse import sparse_answer, takes_sparse
@@ -270,10 +271,7 @@ def first_precision(problem: Problem, prior: Prior) -> Precision:
 def given_of(method: Maximiser, problem: Problem, prior: Prior) -> Given:
     """Arrays of a prior and of the stopping rule for a problem."""
     prior = method.climbs_under(prior)
-    group = prior.groups(problem.members)
-    group = np.where(problem.surveyed, len(group) + np.arange(len(group)), group)  # surveyed biases share none
-    group = np.unique(group, return_inverse=True)[1]
-    numbers: Any = problem.surveyed, group, np.array(float(method.tolerance))
+    numbers: Any = problem.surveyed, learnt_groups(prior, problem), np.array(float(method.tolerance))
     return Given(first_precision(problem, prior), *numbers)
 
 
