@@ -26,12 +26,14 @@ from probcal import (
     InputError,
     Network,
     Node,
+    Truth,
     sensor,
     simulate,
 )
 from probcal.analysis import leave, pieces, residuals
 from probcal.analysis.assess import assess
 from probcal.analysis.fitted import take_up
+from probcal.analysis.nees import of_biases
 from probcal.geometry import bearing, norm
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
@@ -577,6 +579,28 @@ def test_a_known_target_has_no_error_to_be_judged():
     assert "nees" not in epochs["plane"]
     assert np.isfinite(epochs["car"]["nees"].values).all()
     assert np.isfinite([epochs["car"].attrs[name] for name in ("nees", "nees_lower", "nees_upper")]).all()
+
+
+@pytest.mark.parametrize(
+    ("true", "expected", "rank"),
+    [
+        ({"a": 3.0, "b": 0.0, "c": 2.0}, 3.5, 2),
+        ({"a": 3.0, "b": 0.1, "c": 2.0}, np.inf, 2),
+        ({"b": 0.0}, 0.0, 0),
+        ({"b": 0.1}, np.inf, 0),
+        ({"c": 2.0, "d": 2.0}, 8 / 3, 1),
+    ],
+)
+def test_a_bias_without_spread_has_no_error_to_be_judged_but_another_value(true, expected, rank):
+    """Bias b is an atom of its prior, d the same as c."""
+    matrix = np.array([[4.0, 0, 1, 1], [0, 0, 0, 0], [1, 0, 1.5, 1.5], [1, 0, 1.5, 1.5]])
+    both = {"bias_label": list("abcd"), "bias_label_other": list("abcd")}
+    values = {"mean": ("bias_label", np.zeros(4)), "scale": ("bias_label", np.full(4, 2.0))}
+    group = xr.Dataset(values | {"covariance": (tuple(both), matrix)}, both)
+    value, count, lower, upper = of_biases(xr.DataTree.from_dict({"calibration": group}), Truth(biases=true), 0.01)
+    assert value == pytest.approx(expected)
+    assert count == rank
+    assert 0 <= lower <= upper < 20
 
 
 @pytest.mark.slow

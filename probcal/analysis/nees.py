@@ -12,7 +12,7 @@ from probcal.labels import AXES
 from probcal.results.schema import matrix_of
 from probcal.simulate import Truth
 
-EXACT = 1e-9  # sd over the size of the scene below which a position is known: it has no error to be judged
+EXACT = 1e-9  # sd over the size of the scene, or the scale of a bias, below which a position or bias is known
 
 
 class Nees(NamedTuple):
@@ -55,7 +55,11 @@ def of_positions(target: str, track: xr.Dataset, states: np.ndarray, truth: Trut
 
 
 def of_biases(tree: xr.DataTree, truth: Truth, rate: float) -> tuple[float, int, float, float] | None:
-    """NEES of all biases that the truth knows, their number and limits; None where it knows none."""
+    """NEES of all biases that the truth knows, the rank of their covariance and limits; None where it knows none.
+
+    A bias without spread, as in the spike of a prior, adds nothing where it is true and makes the NEES infinite
+    where it is not. Of others that depend on each other the combinations that have a spread are judged.
+    """
     group = tree["calibration"].to_dataset()
     labels = [label for label in group["bias_label"].values.tolist() if label in truth.biases]
     if not labels:
@@ -64,6 +68,12 @@ def of_biases(tree: xr.DataTree, truth: Truth, rate: float) -> tuple[float, int,
     chosen = group.sel(bias_label=labels, bias_label_other=labels)
     error = (chosen["mean"].values - np.array([truth.biases[label] for label in labels])) / chosen["scale"].values
     covariance = chosen["covariance"].values / np.outer(chosen["scale"].values, chosen["scale"].values)
-    value = float(error @ np.linalg.solve(covariance, error))
-    lower, upper = special.chdtri(len(labels), [1 - rate / 2, rate / 2])
-    return value, len(labels), float(lower), float(upper)
+    sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    free = sd > EXACT
+    variance, vectors = np.linalg.eigh(covariance[np.ix_(free, free)] / np.outer(sd[free], sd[free]))
+    spread = variance > len(variance) * np.finfo(float).eps * variance.max(initial=1.0)
+    along = ((error[free] / sd[free]) @ vectors)[spread]
+    value = np.inf if (np.abs(error[~free]) > EXACT).any() else float(np.sum(along**2 / variance[spread]))
+    rank = int(spread.sum())
+    lower, upper = special.chdtri(rank, [1 - rate / 2, rate / 2]) if rank else (0.0, 0.0)
+    return value, rank, float(lower), float(upper)
