@@ -117,7 +117,7 @@ class Problem:
         network = network.with_floors(whole.floors)
         self.network = network
         self.motion = {str(name): value for name, value in motion.items()} if isinstance(motion, Mapping) else motion
-        self.fixed = _fixed(network, fix)
+        self.fixed = fixed_biases(network, fix)
         self.biases: tuple[BiasRecord, ...] = tuple(b for b in network.biases if b.label not in self.fixed)
         self.scales = np.array([bias.scale for bias in self.biases])
         self.surveyed = np.array([bias.kind != "scale" for bias in self.biases], bool)
@@ -596,7 +596,7 @@ def check_linear(problem: Problem) -> None:
             )
 
 
-def _fixed(network: Network, fix: Mapping[str, float] | Iterable[str]) -> dict[str, float]:
+def fixed_biases(network: Network, fix: Mapping[str, float] | Iterable[str]) -> dict[str, float]:
     """Labels and values of the fixed biases, patterns expanded."""
     given = dict(fix) if isinstance(fix, Mapping) else dict.fromkeys([fix] if isinstance(fix, str) else fix, 0.0)
     fixed: dict[str, float] = {}

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import worlds
+import xarray as xr
 
 import probcal as pc
 from probcal.errors import InputError
@@ -397,6 +398,21 @@ def test_surveyed_biases_share_no_precision_with_a_group_that_is_learnt():
     alpha, own = (1.0 - found.gamma) / np.diag(found.covariance), ~problem.surveyed
     np.testing.assert_allclose(alpha[~own], 1.0)
     np.testing.assert_allclose(alpha[own], found.gamma[own].sum() / (found.mean[own] ** 2).sum(), rtol=1e-3)
+
+
+def test_biases_that_a_calibration_held_stay_held():
+    labels = [label for label in network().labels if label != "n0.shift"]
+    known = {"bias_label": labels, "bias_label_other": labels}
+    spread = ("bias_label", "bias_label_other"), np.diag(np.full(len(labels), 0.25))
+    group = xr.Dataset({"mean": ("bias_label", np.ones(len(labels))), "covariance": spread}, known)
+    held = xr.Dataset({"fixed": ("fixed_label", [1.5])}, {"fixed_label": ["n0.shift"]})
+    tree = xr.DataTree.from_dict({"calibration": group, "constant_data": held})
+    online = filtered(pc.AugmentedFilter(lag=0), calibration=tree)
+    assert list(online.labels) == labels
+    assert (online.biases["sd"] < 0.5).all()
+    assert online.arrivals.fixed == {"n0.shift": 1.5}
+    other = pc.Online(network(), MOTION, fix={"n0.*": 0.5}, calibration=tree)
+    assert other.arrivals.fixed == {"n0.shift": 0.5, "n0.lift": 0.5}
 
 
 def test_the_tree_serves_track_and_a_further_stream(tmp_path):

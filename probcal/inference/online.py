@@ -26,9 +26,9 @@ from probcal.online.lag import Window, run_plain, run_window
 from probcal.online.particles import Cloud
 from probcal.online.starts import FIRST, place_new
 from probcal.priors import Gaussian, Prior
-from probcal.problem import Problem
+from probcal.problem import Problem, fixed_biases
 from probcal.results.answer import HALF
-from probcal.results.read import apply
+from probcal.results.read import apply, held_by
 from probcal.smoothing.grid import NEAR
 from probcal.table import read_table
 from probcal.types import float64
@@ -181,8 +181,8 @@ class Online:
 
     `motion` is one motion for all targets, or a mapping by name, as in `Problem`; a target of which no start is
     declared starts where the first rows let it. The prior of the biases is Gaussian, of the declared scales, or
-    `calibration`, a tree of an earlier fit. `epoch` puts rows at common epochs of that length in s, as in `Problem`.
-    `targets` are carried at once; of a new one beyond them that which has
+    `calibration`, a tree of an earlier fit: biases that it held fixed stay so. `epoch` puts rows at common epochs of
+    that length in s, as in `Problem`. `targets` are carried at once; of a new one beyond them that which has
     been silent for longest is given up. Unknown noise levels are held at their guess, or at what `calibration` has.
     Raises `InputError` for what cannot be calibrated online.
 
@@ -221,7 +221,9 @@ class Online:
                 _chosen(network.labels, pattern, what)
         if epoch is not None and not (isinstance(epoch, (int, float)) and np.isfinite(epoch) and epoch > 0):
             raise InputError(f"Online(epoch={epoch!r}): give the length of common epochs in s, or leave it out")
-        self.arrivals = Arrivals(network, motion, fix, targets, isinstance(self.method, AugmentedFilter), epoch)
+        held = {} if calibration is None else held_by(calibration, network.labels)
+        fixed = held | fixed_biases(network, fix)
+        self.arrivals = Arrivals(network, motion, fixed, targets, isinstance(self.method, AugmentedFilter), epoch)
         self.calibration = calibration
         self.pending: pd.DataFrame | None = None
         self.cloud: Cloud | None = None

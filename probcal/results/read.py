@@ -131,15 +131,20 @@ class Calibrated:
         return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
+def held_by(calibration: xr.DataTree, labels: Sequence[str]) -> dict[str, float]:
+    """The biases among some labels that a fit held fixed, and their values."""
+    constant = calibration["constant_data"].to_dataset()
+    fixed = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
+    return {label: value for label, value in fixed.items() if label in labels}
+
+
 def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
     """What a fit found, for another problem of its network; biases and levels are matched by label.
 
     Biases that the fit held are held; a level that it did not estimate stays at its guess. Raises `InputError` if the
     calibration lacks a bias.
     """
-    constant = calibration["constant_data"].to_dataset()
-    held = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
-    held = {label: value for label, value in held.items() if label in problem.labels}
+    held = held_by(calibration, problem.labels)
     problem = problem.rebuild(fix=problem.fixed | held) if held else problem
     group, labels = calibration["calibration"].to_dataset(), list(problem.labels)
     known = [str(label) for label in group["bias_label"].values]
