@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from os import PathLike
@@ -48,8 +48,8 @@ def as_key(key: Key) -> jax.Array:
 class Truth:
     """What is known of the truth: tracks (columns time, [target], position_x, ...) and biases by label.
 
-    `tracks` is a path or a DataFrame, in s and m where its headers state no unit. Raises `InputError` naming file, row
-    and column.
+    `tracks` is a path or a DataFrame, in s and m where its headers state no unit; without a column target it is the
+    track of a single one. Raises `InputError` naming file, row and column.
 
     >>> Truth(biases={"sonar_1.range_offset": 8.0}).biases
     {'sonar_1.range_offset': 8.0}
@@ -57,18 +57,36 @@ class Truth:
 
     tracks: pd.DataFrame | str | PathLike[str] | None = None
     biases: Mapping[str, float] = field(default_factory=dict)
+    source: str = field(default="", init=False, repr=False)  # name of the table of the tracks
 
     def __post_init__(self):
         if self.tracks is not None:
-            object.__setattr__(self, "tracks", _tracks(read_table(self.tracks)))
+            table = read_table(self.tracks)
+            object.__setattr__(self, "tracks", _tracks(table))
+            object.__setattr__(self, "source", table.source)
         if not isinstance(self.biases, Mapping):
             raise InputError(f"truth: biases is {type(self.biases).__name__}; give a mapping from label to value")
         for label, value in self.biases.items():
             if not isinstance(value, (int, float, np.number)) or not np.isfinite(value):
                 raise InputError(f'truth: bias "{label}" is {value!r}; give a finite number')
 
+    def check_targets(self, names: Iterable[str]) -> None:
+        """Raise `InputError` where the tracks do not say of which of several targets they are."""
+        if not isinstance(self.tracks, pd.DataFrame) or "target" in self.tracks:
+            return
+        targets = list(dict.fromkeys(map(str, names)))
+        if len(targets) > 1:
+            raise InputError(
+                f'truth {self.source} has no column "target", by which {len(targets)} targets ({", ".join(targets[:3])}'
+                f"{', ...' if len(targets) > 3 else ''}) are told apart; add it"
+            )
+
     def positions(self, time: np.ndarray, target: np.ndarray, dimension: int) -> np.ndarray:
-        """True positions (E, d) at times and targets (E,), interpolated; NaN outside the recorded track."""
+        """True positions (E, d) at times and targets (E,), interpolated; NaN outside the recorded track.
+
+        Raises `InputError` for several targets where the tracks do not name theirs.
+        """
+        self.check_targets(target)
         found = np.full((len(time), dimension), np.nan)
         if not isinstance(self.tracks, pd.DataFrame):
             return found

@@ -71,6 +71,20 @@ def test_a_score_says_how_it_was_aligned():
         scores(tree, truth, align="affine")
 
 
+def test_a_track_without_a_name_is_that_of_a_single_target():
+    time, nothing = np.arange(2.0), np.zeros((2, 2))
+    states = dict.fromkeys(("mean", "before"), (("time", "component"), nothing))
+    group = xr.Dataset(states, coords={"time": time, "component": ["position_x", "position_y"]})
+    one, two = (group.assign_attrs(target=name) for name in ("one", "two"))
+    truth = Truth(pd.DataFrame({"time": time, "position_x": 3.0, "position_y": 4.0}))
+    assert scores(xr.DataTree.from_dict({"track/one": one}), truth)["position_rmse_after"] == pytest.approx(5.0)
+    said = 'truth data has no column "target", by which 2 targets'
+    with pytest.raises(InputError, match=said):
+        scores(xr.DataTree.from_dict({"track/one": one, "track/two": two}), truth)
+    with pytest.raises(InputError, match=said):
+        truth.positions(time, np.array(["one", "two"]), 2)
+
+
 def test_too_few_places_are_refused():
     with pytest.raises(InputError, match="at least 3 different finite places are needed in 3-D"):
         align(np.zeros((5, 3)), np.zeros((5, 3)), "rigid")

@@ -111,7 +111,8 @@ def test_the_posterior_bound_is_the_hybrid_one_and_the_prior():
     """On a linear problem, where no kind depends on where the sensors are linearised."""
     network, motion, table, _ = LINEAR["plane"]()
     problem = Problem(network, motion, table)
-    track = pd.DataFrame({"time": [0.0, 5.0], "position_x": [0.0, 3.0], "position_y": [1.0, 1.0]})
+    line = pd.DataFrame({"time": [0.0, 5.0], "position_x": [0.0, 3.0], "position_y": [1.0, 1.0]})
+    track = pd.concat([line.assign(target=name) for name in ("one", "two")])
     found = {
         kind: bounds(problem, kind=kind, truth=Truth(track, {"a.position_x": 1.0}), draws=3)
         for kind in ("posterior", "hybrid", "parametric")

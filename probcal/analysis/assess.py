@@ -345,6 +345,7 @@ def _score(
 ) -> None:
     """Add NEES of positions by epoch to `epoch_check`, and those of all positions and biases to its attributes."""
     tracked = dict(each_track(tree))
+    truth.check_targets(tracked)
     for r, epochs in enumerate(fit.problem.epochs):
         for target in dict.fromkeys(np.asarray(epochs.target, str).tolist()):
             states = np.asarray(drawn.states[r])[:, epochs.target == target]

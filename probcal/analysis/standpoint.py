@@ -78,6 +78,7 @@ def draw_states(problem: Problem, count: int, key: jax.Array | None) -> tuple[ja
 
 def true_states(problem: Problem, truth: Truth) -> list[np.ndarray]:
     """What the tracks say of the states (E, n) of each recursion, NaN where they say nothing; whole targets only."""
+    truth.check_targets(problem.measurements.target_names)
     found = []
     for epochs in problem.epochs:
         known = np.isfinite(truth.positions(epochs.time, epochs.target, problem.network.dimension)).all(1)

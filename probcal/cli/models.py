@@ -179,6 +179,7 @@ def load_truth(
         if not isinstance(truth, Truth | None):
             raise InputError(f"{model.name}: truth() returned {type(truth).__name__}; return a probcal.Truth or None")
     if truth is not None:
+        truth.check_targets(problem.measurements.target_names)
         truth.positions(np.zeros(0), np.zeros(0, str), problem.network.dimension)
     return truth
 

@@ -198,6 +198,7 @@ def _simulated(setting: Setting, point: dict[str, Any], number: int, linear: boo
     """One problem with its start; raises `InputError` where a setting does not return what a study needs."""
     problem, truth = _made(setting, point, number, linear)
     d = problem.network.dimension
+    truth.check_targets(problem.measurements.target_names)
     places = [truth.positions(epochs.time, epochs.target, d) for epochs in problem.epochs]
     return _Run(problem, truth, automatic_start(problem) if linear else None, number, places)
 

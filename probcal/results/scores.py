@@ -46,8 +46,9 @@ def _true(name: str, track: xr.Dataset, truth: Truth) -> np.ndarray:
 
 def _met(tree: xr.DataTree, truth: Truth) -> list[np.ndarray]:
     """Positions (N, d) without and with calibration and true ones, of every epoch that the truth covers."""
-    pairs = []
-    for name, track in each_track(tree):
+    pairs, tracks = [], list(each_track(tree))
+    truth.check_targets(name for name, _ in tracks)
+    for name, track in tracks:
         true = _true(name, track, truth)
         known = np.isfinite(true).all(1)
         pairs.append([track[kind].sel(component=_axes(track)).values[known] for kind in ("before", "mean")])
