@@ -166,7 +166,7 @@ class Problem:
 
     def _unlinked(self, name: str, target: Target) -> Target:
         """Each component that links epochs replaced by one drawn anew, as wide as an undeclared start."""
-        time = self.measurements.time[self.measurements.target == self.measurements.target_names.index(name)]
+        time = self._counting(name)
         free: list[Any] = []
         for component in linear_of(as_motion(target.motion)):
             if component.memoryless or isinstance(component, Static):
@@ -183,6 +183,13 @@ class Problem:
         kept = {part for c in free if isinstance(c, Static) for part, _ in c.names()}
         return Target(LinearMotion(tuple(free)), {part: pair for part, pair in target.start.items() if part in kept})
 
+    def _counting(self, name: str) -> np.ndarray:
+        """Times of the rows of a target whose weight is not 0, of all its rows where none counts."""
+        data = self.measurements
+        mine = data.target == data.target_names.index(name)
+        counts = mine & (data.weight > 0)
+        return data.time[counts if counts.any() else mine]
+
     @property
     def area(self) -> Area:
         """Where a target starts of which nothing is stated."""
@@ -198,12 +205,13 @@ class Problem:
 
     @property
     def extent(self) -> float:
-        """Diagonal of the network in metres, or the largest measured length if that is larger."""
+        """Diagonal of the network in metres, or the largest measured length that counts if that is larger."""
         lengths = [1.0, float(np.linalg.norm(np.ptp(self.node_positions, axis=0)))]
+        counts = self.measurements.weight > 0
         for j, name in enumerate(self.measurements.channels):
             units = {dict(t.expand(self.network.dimension))[name].unit for t in self.network.types
                      if name in dict(t.expand(self.network.dimension))}  # fmt: skip
-            there = self.measurements.value[self.measurements.measured[:, j], j]
+            there = self.measurements.value[self.measurements.measured[:, j] & counts, j]
             if units == {"m"} and len(there):
                 lengths.append(float(np.quantile(np.abs(there), 0.99)))
         return max(lengths)
@@ -451,7 +459,7 @@ class Problem:
             if getattr(as_motion(target.motion), "static", False) and name not in begun:
                 time = time[:1]
             epoch_of[rows] = offset + np.minimum(np.searchsorted(time, data.time[rows]), len(time) - 1)
-            arrays = chain(name, target, time, levels, begun.get(name), area)
+            arrays = chain(name, target, time, levels, begun.get(name), area, self._counting(name))
             first = np.arange(len(time)) == (0 if name not in begun else -1)
             dt = np.diff(time, prepend=begun.get(name, time[0]))
             drives += [(tail, offset) for tail in tails_of(target, len(time), name not in begun, dimension)]

@@ -23,6 +23,7 @@ from probcal.geometry import norm
 from probcal.priors import Precision
 from probcal.smoothing.linearised import linearise
 from probcal.smoothing.mode import find_mode
+from probcal.starts.recognise import seen_directions
 
 TOLERANCE = 1e-6  # in z, and in metres for tracks of sd near one metre
 AXES = "xyz"
@@ -229,6 +230,17 @@ def test_a_blank_row_equals_no_row():
     same({k: v for k, v in found.states.items() if k[1] not in new}, expected.states)
     same({k: v for k, v in found.state_sd.items() if k[1] not in new}, expected.state_sd)
     assert found.evidence == pytest.approx(expected.evidence, abs=1e-6)
+
+
+def test_a_row_of_weight_zero_moves_no_start():
+    table = pd.DataFrame({"time": np.arange(8.0), "sensor": ["r0", "r1"] * 4, "range": 40.0, "azimuth": 0.5})
+    absurd = table.iloc[:2].assign(time=[2.5, 9.0], range=1e4, azimuth=1.5, weight=0.0)
+    network, motion = WORLDS["pair"]().network(), probcal.ConstantVelocity(1.0)
+    plain, more = (probcal.Problem(network, motion, rows) for rows in (table, pd.concat([table, absurd])))
+    assert more.extent == plain.extent
+    np.testing.assert_array_equal(more.model.recursions[0].L[0], plain.model.recursions[0].L[0])
+    for found, told in zip(seen_directions(more), seen_directions(plain), strict=True):
+        np.testing.assert_array_equal(found.time, told.time)
 
 
 @sensor(range=Channel("km", std=0.01), azimuth=Channel("deg", std=10.0, wrap=True))

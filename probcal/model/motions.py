@@ -104,9 +104,18 @@ def form_of(name: str, motion: Motion, levels: Levels, d: int) -> tuple[Layout, 
 
 
 def chain(
-    name: str, target: Target, time: np.ndarray, levels: Levels, before: float | None, area: Area
+    name: str,
+    target: Target,
+    time: np.ndarray,
+    levels: Levels,
+    before: float | None,
+    area: Area,
+    seen: np.ndarray | None = None,
 ) -> tuple[np.ndarray, ...]:
-    """Arrays of one target's epochs: F, L, level, drift; it begins at the first, or goes on from a time before."""
+    """Arrays of one target's epochs: F, L, level, drift; it begins at the first, or goes on from a time before.
+
+    An undeclared start is as wide as the times `seen` ask for, by default those of the epochs.
+    """
     d, components = area.dimension, linear_of(as_motion(target.motion))
     n, epochs = sum(stop - start for _, start, stop, _ in layout_of(components, d)), len(time)
     F, L = np.zeros((epochs, n, n)), np.zeros((epochs, n, n))
@@ -123,7 +132,7 @@ def chain(
         if not component.memoryless and before is None:
             F[0, here, here], drift[0, here] = 0.0, 0.0
             L[0, here, :], level[0, noise] = 0.0, -1
-            mean, std = start_of(name, component, target, time, area)
+            mean, std = start_of(name, component, target, time if seen is None else seen, area)
             drift[0, here] = mean
             L[0, here, here] = np.diag(std)
     if before is None:

@@ -161,7 +161,8 @@ def seen_directions(problem: Problem) -> list[Directions]:
             continue
         for t, target in enumerate(data.target_names):
             columns = [own["azimuth"][0]] + ([own["elevation"][0]] if d == 3 else [])
-            mine = np.flatnonzero((data.sensor == k) & (data.target == t) & data.measured[:, columns].all(1))
+            told = data.measured[:, columns].all(1) & (data.weight > 0)
+            mine = np.flatnonzero((data.sensor == k) & (data.target == t) & told)
             if not len(mine):
                 continue
             angles, stds = [], []
