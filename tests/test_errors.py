@@ -15,6 +15,7 @@ import xarray as xr
 import probcal
 from probcal import (
     EA,
+    MAP,
     Bias,
     Channel,
     ConstantVelocity,
@@ -45,6 +46,8 @@ from probcal import (
 from probcal.cli import commands
 from probcal.cli.models import load_model, load_truth
 from probcal.geometry import norm
+from probcal.inference.methods import choose_prior
+from probcal.motion import as_motion
 from probcal.simulate import truth_beside
 from probcal.types import TargetView
 
@@ -187,6 +190,11 @@ def points(*features):
 
 
 CASES = [
+    (lambda _: Problem([1], CV, None), "Problem: the network is [1]; give a Network of sensors, as in Network([...])"),
+    (lambda _: choose_prior(MAP(), "gaussian"), "the prior is 'gaussian'; give a prior itself, such as Horseshoe() or"),
+    (lambda _: as_motion(ConstantVelocity), "ConstantVelocity'> is not a motion; give ConstantVelocity(std)"),
+    (lambda _: sensor(a=Channel("m"))(lambda target, pose: {"a": np.linalg.norm(target.position)}), "the function calls NumPy on its arguments, which jax cannot follow"),
+    (lambda _: sensor(a=Channel("m"))(lambda target, pose, o=Bias("m", 1.0): {"a": o}), 'argument "o" is a bias: write a * before the first bias'),
     # sensor
     (lambda _: Bias("m", 1.0, nominal=np.nan), "nominal=nan): the nominal value must be finite"),
     (lambda _: Bias("m", 1.0, shared="node"), 'shared=\'node\'): shared is None or "type"'),

@@ -95,7 +95,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     for name in ("sensor", "target"):
         groups[f"{name}_check"], more = checks.squares_by(fit, found.innovations, name)
         findings += more
-    findings += checks.outliers(fit, found.innovations)
+    findings += checks.outlying(fit, found.innovations)
     residual = tree["residual"].to_dataset()
     findings += [
         Finding("wrapping", *pair) for pair in residuals.wrapping(fit, residual["after"].values, residual["std"].values)

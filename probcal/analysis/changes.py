@@ -216,7 +216,7 @@ def _alike(both: pieces.Pieces, moved: int, free: dict[int, pieces.Contrast], in
 
 def _contradictions(tree: xr.DataTree) -> str:
     """How many biases of a fit drift or are in conflict, where its assessment was kept; empty where none."""
-    words = tree["verdict"]["verdict"].values.tolist() if "verdict" in tree.children else []
+    words = tree["verdict"].to_dataset()["verdict"].values.tolist() if "verdict" in tree.children else []
     counts = {word: words.count(word) for word in ("drifting", "conflicting")}
     return ", ".join(f"{count} {word}" for word, count in counts.items() if count)
 

@@ -100,7 +100,7 @@ def by_channel(
     return xr.Dataset({name: ("part", value) for name, value in values.items()}, coords), findings
 
 
-def outliers(fit: Judged, found: residuals.Innovations) -> list[Finding]:
+def outlying(fit: Judged, found: residuals.Innovations) -> list[Finding]:
     """A finding on channels of Gaussian noise of which single data lie far off, by what most of their data scatter.
 
     Their next of the same target does not lie off to the same side: what jumps or drifts is no outlier.

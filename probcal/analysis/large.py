@@ -61,7 +61,7 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
     for name in ("sensor", "target"):
         groups[f"{name}_check"], more = checks.squares_by(fit, found, name)
         findings += more
-    findings += checks.outliers(fit, found)
+    findings += checks.outlying(fit, found)
     residual = tree["residual"].to_dataset()
     turned = residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     findings += [Finding("wrapping", *pair) for pair in turned]

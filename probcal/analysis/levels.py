@@ -17,7 +17,7 @@ from probcal.analysis.findings import PRACTICAL, Finding
 from probcal.analysis.fitted import Fitted
 from probcal.analysis.verdict import limit_of
 from probcal.model.model import Model
-from probcal.model.motions import blocks_of, linear_of
+from probcal.model.motions import by_component, linear_of
 from probcal.motion import as_motion
 from probcal.motion.base import level_name
 from probcal.noise import Bernoulli, Unknown, guess_of
@@ -64,7 +64,7 @@ class Slopes(NamedTuple):
     z: np.ndarray  # (M,)
 
 
-class Asked(NamedTuple):
+class Wanted(NamedTuple):
     """What the data ask for: where the evidence is largest by its expansion, and what would move with it."""
 
     step: np.ndarray  # (K,) of the log levels
@@ -109,7 +109,7 @@ def _of_noises(problem: Problem, r: int, found: dict[Level, int]) -> np.ndarray:
     for target in dict.fromkeys(epochs.target):
         mine = (epochs.target == target) & ~first
         components = linear_of(as_motion(problem.target(target).motion))
-        for component, _, own in blocks_of(components, problem.network.dimension):
+        for component, _, own in by_component(components, problem.network.dimension):
             if mine.any() and not isinstance(component.std, Unknown):
                 level = Level(f"motion.{level_name(component)}", float(component.std))
                 index[mine, own] = found.setdefault(level, len(found))
@@ -155,13 +155,13 @@ def _beside(model: Model, point: Point, members: Members, k: int, step: float) -
     return other, find_tracks(other, point._replace(noises=noises), TRACK_STEPS, SETTLED)
 
 
-def ask(fit: Fitted, members: Members) -> Asked | None:
+def ask(fit: Fitted, members: Members) -> Wanted | None:
     """Where the evidence expanded about a fit is largest in all log levels; None where it has no maximum."""
     model, prior = fit.problem.model, np.asarray(fit.prior.matrix())
     here, beside = slopes(model, fit.point, prior, members), list[tuple[Slopes, Slopes]]()
     for k in range(len(members.levels)):
-        sides = (slopes(*_beside(model, fit.point, members, k, step), prior, members) for step in (STEP, -STEP))
-        beside.append(tuple(sides))
+        up, down = (slopes(*_beside(model, fit.point, members, k, step), prior, members) for step in (STEP, -STEP))
+        beside.append((up, down))
     pull = np.array([(up.z - down.z) / (2 * STEP) for up, down in beside])  # (K, M)
     curved = -np.array([(up.level - down.level) / (2 * STEP) for up, down in beside])
     follow = np.linalg.solve(np.asarray(fit.solved.information) + prior, pull.T).T  # (K, M) of z by each log level
@@ -177,7 +177,7 @@ def ask(fit: Fitted, members: Members) -> Asked | None:
         return None
     covariance = np.linalg.inv(matrix)
     step, variance = covariance @ slope, np.diag(covariance)
-    return Asked(step, np.sqrt(variance), step**2 / variance, step[:, None] * follow)
+    return Wanted(step, np.sqrt(variance), step**2 / variance, step[:, None] * follow)
 
 
 def check_levels(fit: Fitted) -> tuple[xr.Dataset | None, list[Finding], dict[int, str]]:

@@ -133,7 +133,7 @@ def freed(pieces: Pieces, free: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
             prior[held, :], prior[:, held] = 0.0, 0.0
         K, slope = columns.T @ pieces.information @ columns, columns.T @ pieces.score
         K[:M, :M] += prior
-        slope[:M] -= prior @ pieces.z
+        slope[:M] = slope[:M] - prior @ pieces.z
         steps.append((np.linalg.pinv(K, hermitian=True) @ slope)[:M])
     change: np.ndarray = steps[1] - steps[0]
     return change

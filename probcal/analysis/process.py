@@ -13,7 +13,7 @@ import numpy as np
 
 from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted
-from probcal.model.motions import blocks_of, linear_of
+from probcal.model.motions import by_component, linear_of
 from probcal.motion import as_motion
 from probcal.motion.base import GAUSSIAN, level_name
 from probcal.noise import Normal, guess_of
@@ -74,7 +74,7 @@ def _driven(fit: Fitted, key: jax.Array, count: int) -> Iterator[Driven]:
         for name in dict.fromkeys(epochs.target):
             mine = (epochs.target == name) & ~first
             components = linear_of(as_motion(problem.target(name).motion))
-            for component, _, own in blocks_of(components, problem.network.dimension):
+            for component, _, own in by_component(components, problem.network.dimension):
                 gaussian = isinstance(getattr(component, "noise", GAUSSIAN), Normal)
                 if not gaussian or guess_of(component.std) == 0 or mine.sum() < FEWEST:
                     continue

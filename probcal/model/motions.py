@@ -76,7 +76,7 @@ def linear_of(motion: Motion) -> tuple[Any, ...]:
     return () if vector is None else vector.components
 
 
-def blocks_of(components: tuple[Any, ...], d: int) -> list[tuple[Any, slice, slice]]:
+def by_component(components: tuple[Any, ...], d: int) -> list[tuple[Any, slice, slice]]:
     """Each component, its entries of the state in d axes, and the columns of the noise factor that drive it.
 
     A component has as many columns as entries, for its start; of these its noise needs the first ones, or all.
@@ -121,7 +121,7 @@ def chain(
     F, L = np.zeros((epochs, n, n)), np.zeros((epochs, n, n))
     level, drift = np.full((epochs, n), -1), np.zeros((epochs, n))
     dt = np.diff(time, prepend=time[0] if before is None else before)
-    for component, here, noise in blocks_of(components, d):
+    for component, here, noise in by_component(components, d):
         F[:, here, here] = component.transition(dt, d)
         L[:, here, noise] = component.noise_factor(dt, d) * guess_of(component.std)
         level[:, noise] = levels.of(component.std, f"motion.{level_name(component)}", "")
@@ -145,7 +145,7 @@ def tails_of(
 ) -> list[tuple[Any, str, tuple[int, int], np.ndarray]]:
     """Families of the noise of one target that are not Gaussian: what they drive, columns, and epochs (E,)."""
     found = []
-    for component, _, noise in blocks_of(linear_of(as_motion(target.motion)), dimension):
+    for component, _, noise in by_component(linear_of(as_motion(target.motion)), dimension):
         family, on = getattr(component, "noise", GAUSSIAN), np.ones(epochs, bool)
         on[0] = component.memoryless or not begins
         if noise.stop > noise.start and not isinstance(family, Normal):
