@@ -194,3 +194,29 @@ def test_a_tree_with_integrated_places_is_judged_alike_with_and_without_its_answ
     for name in ("elpd", "rest_nis"):
         near = with_it["target_check"][name].values
         np.testing.assert_allclose(without["target_check"][name].values, near, atol=0.05)
+
+
+@pytest.mark.ci
+def test_a_tag_that_many_rows_place_to_a_hair_is_integrated_around_its_mode():
+    """Heavy-tailed noise far from the place hides it: a search by slopes alone ended on its way there."""
+
+    @pc.sensor(range=pc.Channel("m", std=0.05, noise=pc.StudentT(4)))
+    def ranger(target, pose, *, offset=pc.Bias("m", 1.0)):
+        return dict(range=jnp.sqrt(jnp.sum((target.position - pose.position) ** 2) + 1e-6) + offset)
+
+    nodes = [pc.Node(f"a{k}", (30.0 * np.cos(k), 30.0 * np.sin(k))) for k in range(7)]
+    network = pc.Network([ranger.on(node) for node in nodes])
+    motion = pc.Target(pc.Static(), {"position": ((0.0, 0.0), 400.0)})
+    rng, rows = np.random.default_rng(0), []
+    for k, place in enumerate([(11.0, -7.0), (-13.0, 4.0), (3.0, 21.0)]):
+        for n, node in enumerate(nodes):
+            told = np.linalg.norm(np.asarray(node.position) - place) + 0.05 * rng.standard_t(4, 60)
+            rows += [dict(time=0.01 * r, sensor=f"a{n}", target=f"t{k}", range=v) for r, v in enumerate(told)]
+    problem = pc.Problem(network, motion, pd.DataFrame(rows))
+    tree, answer = calibrate(problem, pc.MAP())
+    assert tree.attrs["status"] == "converged"
+    with jax.enable_x64(True):
+        still = [one._replace(on=jnp.ones_like(one.on)) for one in places_of(problem.model, answer.posterior.point)]
+        tilt = tilt_of(problem.untilted.model, answer.posterior.point, tuple(still))
+    assert tilt is not None
+    assert abs(float(tilt.height)) < 0.5  # of three places that are nearly Gaussian

@@ -25,7 +25,7 @@ OFF = 0.02  # nats by which Gauss-Hermite quadrature and Laplace's formula may d
 REACH, FIRST = 5.0, {1: 64, 2: 16, 3: 10}  # sds of the prior, and cells an axis of the first grid
 FINE = 0.8  # sds of what is left that a cell may be wide
 FAR = 22.0  # nats below the best within which cells are kept
-LEVELS, CELLS = 14, 2048  # most halvings, and cells of a target that are halved at once
+LEVELS, CELLS = 22, 2048  # most halvings, and cells of a target that are halved at once
 WORK = 4e7  # cells times rows of a look: more rows have fewer cells
 LEAST = 0.1  # share of the information of Laplace's formula that is left along every direction
 BATCH, ROWS = 256, 2_000_000  # cells evaluated by one call, and rows times cells of it that are in memory at once
@@ -285,13 +285,17 @@ def _halved(cells: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 class _Target:
-    """Cells of one target: those that are fine enough, and those still to be halved."""
+    """Cells of one target: those that are fine enough, and those still to be halved.
 
-    def __init__(self, n: int, rows: int):
+    Those around the mode stay: from far off heavy-tailed noise hides how much better the data fit there.
+    """
+
+    def __init__(self, mode: np.ndarray, top: float, rows: int):
+        n, self.mode = len(mode), mode
         axis = REACH * (2 * np.arange(FIRST[n]) + 1 - FIRST[n]) / FIRST[n]
         self.cells = np.stack(np.meshgrid(*[axis] * n, indexing="ij"), -1).reshape(-1, n)
         self.width = np.full(len(self.cells), 2 * REACH / FIRST[n])
-        self.best, self.most = -np.inf, max(min(CELLS, int(WORK / max(rows, 1) / 2**n)), 32)
+        self.best, self.most = top, max(min(CELLS, int(WORK / max(rows, 1) / 2**n)), 32)
         self.kept: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def seen(self, f: np.ndarray, g: np.ndarray, W: np.ndarray, last: bool) -> None:
@@ -301,12 +305,13 @@ class _Target:
         rise = 0.5 * np.einsum("ki,ki->k", g, np.linalg.solve(W, g[:, :, None])[:, :, 0])
         rise = np.minimum(np.abs(rise), 0.5 * np.abs(g).sum(1) * self.width)
         self.best = max(self.best, float(f.max(initial=-np.inf)))
-        near = f + rise >= self.best - FAR
+        around = np.abs(self.cells - self.mode).max(1) <= self.width
+        near = (f + rise >= self.best - FAR) | around
         wide = (self.width * np.sqrt(np.linalg.eigvalsh(W)[:, -1]) > FINE) & (not last)
         ready = near & ~wide
         self.kept.append((self.cells[ready], self.width[ready], f[ready]))
         again = np.flatnonzero(near & wide)
-        again = again[np.argsort(-(f + rise)[again], kind="stable")[: self.most]]
+        again = again[np.argsort(-np.where(around, np.inf, f + rise)[again], kind="stable")[: self.most]]
         self.cells, self.width = _halved(self.cells[again], self.width[again])
 
     def nodes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -323,7 +328,13 @@ def _cells(model: Model, point: Point, still: tuple[Still, ...]) -> tuple[list[n
     They are cells as fine as the density asks for, found by halving those that may matter.
     """
     rows = sum(data.y.shape[0] for data in model.rows)
-    chosen = {(r, int(t)): _Target(s.mean.shape[1], rows) for r, s in enumerate(still) for t in np.flatnonzero(s.on)}
+    modes = _first(model, point)
+    tops = [f[0] for f, _, _ in _looked(model, point, still, [m[None] for m in modes])]
+    chosen = {
+        (r, int(t)): _Target(modes[r][t], float(tops[r][t]), rows)
+        for r, s in enumerate(still)
+        for t in np.flatnonzero(s.on)
+    }
     for level in range(LEVELS):
         if not any(len(own.cells) for own in chosen.values()):
             break
