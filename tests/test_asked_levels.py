@@ -79,7 +79,9 @@ def test_slope_and_curvature_are_those_of_the_evidence():
     np.testing.assert_allclose(precision, curvature, rtol=0.06)
 
 
-@pytest.mark.parametrize(("name", "times"), [("place", 2.0), ("rate", 0.5), ("motion", 1.6)])
+@pytest.mark.parametrize(
+    ("name", "times"), [("place", 2.0), pytest.param("rate", 0.5, marks=pytest.mark.ci), ("motion", 1.6)]
+)
 def test_a_level_that_is_declared_wrong_is_named_with_what_the_data_ask_for(name, times):
     right = {"place": 0.5, "rate": 0.2, "motion": 0.4}
     problem, _ = world(table=world()[1], **{name: right[name] / times})
@@ -94,6 +96,7 @@ def test_a_level_that_is_declared_wrong_is_named_with_what_the_data_ask_for(name
     assert (others["square"] < check["square"].sel(level=label)).all()
 
 
+@pytest.mark.ci
 def test_levels_in_the_table_and_unknown_ones_have_their_place():
     _, table = world()
     table = table.assign(rate_std=0.2)

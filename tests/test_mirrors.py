@@ -342,7 +342,8 @@ class Stub:
     optima: tuple = ()
     best: int = 0
     trace: tuple = (0.0,)
-    problem = prior = None
+    prior = None
+    problem = SimpleNamespace(untilted=None)
     method: object = None
 
     @property

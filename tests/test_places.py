@@ -175,6 +175,7 @@ def line_of_anchors(seed=3):
     return pc.Problem(network, motion, pd.DataFrame(rows), fix=["*.offset"])
 
 
+@pytest.mark.ci
 def test_the_other_side_is_seen_where_places_are_integrated():
     problem = line_of_anchors()
     tree = pc.assess(problem, pc.fit(problem, pc.MAP()))

@@ -9,14 +9,14 @@ curvature comes from the slopes a little to either side, trajectories at their m
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import xarray as xr
 
 from probcal.analysis.findings import PRACTICAL, Finding
 from probcal.analysis.fitted import Fitted
 from probcal.analysis.verdict import limit_of
-from probcal.model.model import Model
+from probcal.model.model import Data, Model
 from probcal.model.motions import by_component, linear_of
 from probcal.motion import as_motion
 from probcal.motion.base import level_name
@@ -125,32 +125,39 @@ def _with_unknown(problem: Problem, number: np.ndarray, index: np.ndarray, found
     return index
 
 
+@jax.jit
+def _of_data(model: Model, point: Point) -> tuple[Data, Data]:
+    """Expected information of every datum, and one plus the derivative of its log density by log std."""
+    return model.information(point), model.level_score(point)
+
+
 def slopes(model: Model, point: Point, prior: np.ndarray, members: Members) -> Slopes:
     """Slopes of the log evidence at a point with trajectories at their mode, `prior` (M, M) the precision of z."""
     at = linearise(model, point)
-    covariance = jnp.asarray(np.linalg.inv(np.asarray(at.information) + prior))
-    informed = zip(model.information(point), at.predicted_variances(covariance), strict=True)
+    covariance = jax.device_put(np.linalg.inv(np.asarray(at.information) + prior))
+    information, score = _of_data(model, point)
+    informed = zip(information, at.predicted_variances(covariance), strict=True)
     spread = [np.asarray(weight) * np.asarray(own) for weight, own in informed]
-    squares = zip(model.level_score(point), spread, model.measured, strict=True)
+    squares = zip(score, spread, model.measured, strict=True)
     rows = [np.asarray(square) + own - np.asarray(there) for square, own, there in squares]
     driven = zip(point.noises, at.noise_variances(covariance), strict=True)
     noises = [np.asarray(u) ** 2 + np.asarray(own) - 1.0 for u, own in driven]
     volume, _ = volume_slope(model, point, at.solved)
-    return Slopes(members.sums(rows, noises), np.asarray(at.solved.score - 0.5 * volume))
+    return Slopes(members.sums(rows, noises), np.asarray(at.solved.score) - 0.5 * np.asarray(volume))
 
 
 def _beside(model: Model, point: Point, members: Members, k: int, step: float) -> tuple[Model, Point]:
     """The model with a level a step (of its log) away, trajectories at their mode there, biases held."""
     rows = tuple(
-        own._replace(std=jnp.asarray(np.asarray(own.std) * np.exp(step * (index == k))))
+        own._replace(std=jax.device_put(np.asarray(own.std) * np.exp(step * (index == k))))
         for own, index in zip(model.rows, members.rows, strict=True)
     )
     scales = [np.exp(step * (index == k)) for index in members.noises]
     recursions = tuple(
-        part._replace(L=jnp.asarray(np.asarray(part.L) * scale[:, None, :]))
+        part._replace(L=jax.device_put(np.asarray(part.L) * scale[:, None, :]))
         for part, scale in zip(model.recursions, scales, strict=True)
     )
-    noises = tuple(jnp.asarray(np.asarray(u) / scale) for u, scale in zip(point.noises, scales, strict=True))
+    noises = tuple(jax.device_put(np.asarray(u) / scale) for u, scale in zip(point.noises, scales, strict=True))
     other = replace(model, rows=rows, recursions=recursions)
     return other, find_tracks(other, point._replace(noises=noises), TRACK_STEPS, SETTLED)
 
