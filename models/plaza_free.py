@@ -2,8 +2,8 @@
 
 Positions grow and range scales shrink together (a dilation), and the whole scene can be moved and turned: positions
 are `weak`, and the fit names what to anchor, as in `--fix "beacon_0.position_*" --fix "beacon_1.position_*"`. The size
-hangs on how sharply the mower is said to turn, which is therefore learnt: declared as 1 m s^-3/2 the scales came out as 1 %
-instead of 7, with sds of 2 %, and the track 1.7 m off instead of 0.5.
+hangs on how sharply the mower is said to turn, which is therefore learnt: declared as 1 m s^-3/2 the scales came out as
+1 % instead of 7, with sds of 2 %, and the track 1.7 m off instead of 0.5.
 """
 
 from plaza import HERE, MOTION, network, truth
