@@ -197,7 +197,7 @@ MUTATIONS = [
     Mutation("analysis/pieces.py", "np.eye(q) + np.ones((q, q))", "np.eye(q)", "test_assess.py"),
     Mutation("analysis/residuals.py", "expected = np.maximum(whole - used, 1e-9)", "expected = np.maximum(whole, 1e-9)", "test_assess.py"),
     Mutation("analysis/levels.py", "(curved + curved.T) - pull @ follow.T", "(curved + curved.T)", "test_asked_levels.py"),
-    Mutation("analysis/levels.py", "+ np.asarray(own) - 1.0 for", "- 1.0 for", "test_asked_levels.py"),
+    Mutation("analysis/levels.py", "u**2 + spread - 1.0", "u**2 - 1.0", "test_asked_levels.py"),
     Mutation("analysis/pieces.py", "change: np.ndarray = steps[1] - steps[0]", "change: np.ndarray = 0.0 * steps[1]", "test_asked_levels.py"),
     Mutation("analysis/checks.py", "and again.sum() < TOGETHER * count", "", "test_asked_levels.py"),
     Mutation("analysis/residuals.py", "1.0 - (1.0 - fit.flat(fit.problem.model.measured)) * kept**2", "0.0 * kept + 1.0", "test_assess.py"),

@@ -150,6 +150,7 @@ def jumped(by):
     return table
 
 
+@pytest.mark.ci
 def test_what_moves_where_others_may_change_is_that_of_a_fit_where_they_do():
     table = jumped(3.0)
     problem, _ = world(table=table)

@@ -487,6 +487,7 @@ def test_limits_of_squares_hold_their_rate_for_heavy_and_light_tails():
         assert stats.binom.ppf(1e-4, 2000, 0.05) <= out <= stats.binom.isf(1e-4, 2000, 0.05)
 
 
+@pytest.mark.ci
 def test_rows_of_half_the_weight_scatter_as_declared():
     network, motion = radars(), ConstantVelocity(0.5)
     table = simulate(network, motion, np.arange(60.0), key=5, share=0.0, tracks={"car": TRACKS["car"]}).table

@@ -6,8 +6,9 @@ all log levels at once, biases following: its slope by a log level is that of Ma
 curvature comes from the slopes a little to either side, trajectories at their mode there.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,7 +24,7 @@ from probcal.motion.base import level_name
 from probcal.noise import Bernoulli, Unknown, guess_of
 from probcal.problem import Problem
 from probcal.results.groups import bias_coords
-from probcal.smoothing.linearised import linearise
+from probcal.smoothing.linearised import Linearisation, linearise
 from probcal.smoothing.marginal import SETTLED, TRACK_STEPS, volume_slope
 from probcal.smoothing.mode import Point, find_tracks
 
@@ -49,7 +50,7 @@ class Members(NamedTuple):
     rows: list[np.ndarray]  # (N, C) of each block
     noises: list[np.ndarray]  # (E, n) of each recursion
 
-    def sums(self, rows: list[np.ndarray], noises: list[np.ndarray]) -> np.ndarray:
+    def sums(self, rows: Sequence[Any], noises: Sequence[Any]) -> np.ndarray:
         """Sums (K,) of values of the data and of the process noises over those of each level."""
         total = np.zeros(len(self.levels) + 1)  # what has no level goes last
         for index, value in zip([*self.rows, *self.noises], [*rows, *noises], strict=True):
@@ -126,22 +127,25 @@ def _with_unknown(problem: Problem, number: np.ndarray, index: np.ndarray, found
 
 
 @jax.jit
-def _of_data(model: Model, point: Point) -> tuple[Data, Data]:
-    """Expected information of every datum, and one plus the derivative of its log density by log std."""
-    return model.information(point), model.level_score(point)
+def _terms(at: Linearisation, covariance: jax.Array) -> tuple[Data, tuple[jax.Array, ...]]:
+    """What the slope of the log evidence by each log level is a sum of, for a covariance (M, M) of z.
+
+    Of every datum (N, C) of the blocks, and of every whitened noise (E, n) of the recursions.
+    """
+    model, point = at.model, at.point
+    data = zip(
+        model.level_score(point), model.information(point), at.predicted_variances(covariance), model.measured,
+        strict=True,
+    )  # fmt: skip
+    rows = tuple(square + weight * spread - there for square, weight, spread, there in data)
+    driven = zip(point.noises, at.noise_variances(covariance), strict=True)
+    return rows, tuple(u**2 + spread - 1.0 for u, spread in driven)
 
 
 def slopes(model: Model, point: Point, prior: np.ndarray, members: Members) -> Slopes:
     """Slopes of the log evidence at a point with trajectories at their mode, `prior` (M, M) the precision of z."""
     at = linearise(model, point)
-    covariance = jax.device_put(np.linalg.inv(np.asarray(at.information) + prior))
-    information, score = _of_data(model, point)
-    informed = zip(information, at.predicted_variances(covariance), strict=True)
-    spread = [np.asarray(weight) * np.asarray(own) for weight, own in informed]
-    squares = zip(score, spread, model.measured, strict=True)
-    rows = [np.asarray(square) + own - np.asarray(there) for square, own, there in squares]
-    driven = zip(point.noises, at.noise_variances(covariance), strict=True)
-    noises = [np.asarray(u) ** 2 + np.asarray(own) - 1.0 for u, own in driven]
+    rows, noises = _terms(at, jax.device_put(np.linalg.inv(np.asarray(at.information) + prior)))
     volume, _ = volume_slope(model, point, at.solved)
     return Slopes(members.sums(rows, noises), np.asarray(at.solved.score) - 0.5 * np.asarray(volume))
 
