@@ -189,7 +189,7 @@ MUTATIONS = [
     Mutation("inference/sampling.py", "min((chunk - self.begin + 1) * size", "min((chunk - self.begin) * size", "test_mixing.py"),
     Mutation("inference/storage.py", "self.storage.numbers[first:last])", "self.storage.numbers[first:last][:-1] or self.storage.numbers)", "test_storage.py"),
     # analysis/
-    Mutation("analysis/verdict.py", "elif not status.settled and", "elif status is Status.DIVERGED and", "test_guards.py"),
+    Mutation("analysis/verdict.py", "elif not status.settled:", "elif status is Status.DIVERGED:", "test_guards.py"),
     Mutation("analysis/verdict.py", "(gamma + inflation * (1.0 - gamma))", "gamma", "test_assess.py"),
     Mutation("analysis/leave.py", "-least - 0.5 * (solved.logdet + logdet)", "-least - 0.5 * solved.logdet", "test_assess.py"),
     Mutation("analysis/leave.py", "solved.score - prior.pull(point.z) - matrix @ away", "solved.score - prior.pull(point.z)", "test_assess.py"),

@@ -221,3 +221,13 @@ def test_a_tag_that_many_rows_place_to_a_hair_is_integrated_around_its_mode():
         tilt = tilt_of(problem.untilted.model, answer.posterior.point, tuple(still))
     assert tilt is not None
     assert abs(float(tilt.height)) < 0.5  # of three places that are nearly Gaussian
+
+
+@pytest.mark.ci
+def test_a_tag_beyond_the_reach_of_its_start_is_no_crash():
+    network = pc.Network([anchor.on(pc.Node(f"a{k}", tuple(place))) for k, place in enumerate(ANCHORS)])
+    place = np.array([8.0, 6.0])
+    rows = [dict(time=0.0, sensor=f"a{k}", target="t", range=np.linalg.norm(place - a)) for k, a in enumerate(ANCHORS)]
+    problem = pc.Problem(network, pc.Target(pc.Static(), {"position": ((0.0, 0.0), 1.0)}), pd.DataFrame(rows))
+    tree = pc.fit(problem, pc.MAP())
+    assert np.isfinite(tree["calibration"]["mean"].values).all()

@@ -100,17 +100,16 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     findings += [
         Finding("wrapping", *pair) for pair in residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     ]
-    findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups)
-    if not (_absurd(tree) or any(one.kind == "outliers" for one in findings)):  # these look like turns
-        findings += process.check_process_noise(fit, keys[2])
+    findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups) + process.check_process_noise(fit, keys[2])
     bent = None if tree.attrs["status"] in INVALID else shape.check_shape(fit, tree)
     findings += [] if bent is None else [bent]
-    hanging = dict[int, str]()
+    hanging, more = dict[int, str](), list[Finding]()
     if tree.attrs["status"] not in INVALID:
-        asked, more, hanging = levels.check_levels(fit)
+        asked, more, hanging = levels.check_levels(fit, tree)
         groups |= {} if asked is None else {"level_check": asked}
-        findings += more
     groups["verdict"] = _verdicts(fit, tree, found, groups, bent, hanging)
+    if not (any(f.kind == "outliers" for f in findings) or (groups["verdict"]["verdict"] == "drifting").any()):
+        findings += more  # else the levels are only a sign of these
     findings += mirror_findings(tree)
     columns = [groups["verdict"][name].values.tolist() for name in ("verdict", "bias_label", "reason")]
     alarms = [row for row in zip(*columns, strict=True) if row[0] in ("drifting", "conflicting")]
@@ -119,7 +118,9 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
         text = (
             f"the fit ended {tree.attrs['status']}, which is no answer: what is left of the data says nothing of them"
         )
-        kept = [f for f in findings if f.kind == "wrapping" or (f.kind == "nis" and _absurd(tree))]  # likely causes
+        kept = [
+            f for f in findings if f.kind in ("wrapping", "outliers") or (f.kind == "nis" and _absurd(tree))
+        ]  # likely causes
         findings = [Finding("status", "fit", text), *kept]
     scaled = scaling.power_scaling(tree) if leave.weighable(tree) else None
     if scaled is not None:

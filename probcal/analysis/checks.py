@@ -17,6 +17,7 @@ from probcal.results.groups import by_target
 OUTLYING = 4.0  # std from which a datum is an outlier
 NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal
 TOGETHER = 0.3  # share of outliers whose next lies off to the same side, from which something else is wrong
+SEVERAL = 2  # data of one target that are off at one time, and are then no outliers
 GAIN = 5.0  # nats that a calibration must win before it is a finding
 
 
@@ -103,24 +104,30 @@ def by_channel(
 def outlying(fit: Judged, found: residuals.Innovations) -> list[Finding]:
     """A finding on channels of Gaussian noise of which single data lie far off, by what most of their data scatter.
 
-    Their next of the same target does not lie off to the same side: what jumps or drifts is no outlier.
+    Their next of the same target does not lie off to the same side: what jumps or drifts is no outlier. Nor is what
+    several data of one target say at one time: it has turned.
     """
     group, labels = codes(fit.data, ["sensor", "channel"])
     kinds = {s.name: dict(s.type.expand(fit.problem.network.dimension)) for s in fit.problem.network.sensors}
     target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
     members = np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
-    counts = {}
+    off, chosen = np.zeros(len(target), bool), list[tuple[str, np.ndarray]]()
     for (sensor, channel), mine in zip(labels.itertuples(index=False), members, strict=True):
-        if not isinstance(kinds[sensor][channel].noise, Normal):
-            continue
-        order = mine[np.lexsort((time[mine], target[mine]))]
-        value, owner = found.value[order], target[order]
-        off = np.abs(value) > OUTLYING * max(float(np.median(np.abs(value))) / NORMAL_MEDIAN, 1.0)
-        again = off[1:] & off[:-1] & (np.sign(value[1:]) == np.sign(value[:-1])) & (owner[1:] == owner[:-1])
-        count = int(off.sum())
-        chance = special.bdtrc(count - 1, len(mine), 2 * special.ndtr(-OUTLYING)) if count else 1.0
+        if isinstance(kinds[sensor][channel].noise, Normal):
+            order = mine[np.lexsort((time[mine], target[mine]))]
+            size = np.abs(found.value[order])
+            off[order] = size > OUTLYING * max(float(np.median(size)) / NORMAL_MEDIAN, 1.0)
+            chosen.append((f"{sensor}.{channel}", order))
+    epoch = fit.data.groupby(["target", "time"], sort=False).ngroup().to_numpy()
+    off &= np.bincount(epoch, off)[epoch] < SEVERAL
+    counts = {}
+    for name, order in chosen:
+        value, owner, out = found.value[order], target[order], off[order]
+        again = out[1:] & out[:-1] & (np.sign(value[1:]) == np.sign(value[:-1])) & (owner[1:] == owner[:-1])
+        count = int(out.sum())
+        chance = special.bdtrc(count - 1, len(order), 2 * special.ndtr(-OUTLYING)) if count else 1.0
         if count > 1 and chance < RATE / len(labels) and again.sum() < TOGETHER * count:
-            counts[f"{sensor}.{channel}"] = f"{count} of {len(mine)}"
+            counts[name] = f"{count} of {len(order)}"
     if not counts:
         return []
     listed = ", ".join(f"{name} {count}" for name, count in list(counts.items())[:NAMES])

@@ -77,7 +77,7 @@ class _Refits:
         model = fit.problem.model
         sizes = model.state_size
         self.fit, self.quick = fit, 2.0 * jobs * sizes * model.biases**2 > WORK
-        self.placed = fit.problem.tilted and jobs <= PLACED
+        self.placed = fit.problem.tilted and jobs <= PLACED and not self.quick
 
     def run(self, out: np.ndarray | None, alpha: np.ndarray, held: np.ndarray) -> tuple[float, float]:
         """Evidence and least squares without the rows (of the table) in `out`, at precisions alpha (M,)."""
@@ -133,7 +133,8 @@ def leave_sensors(fit: Fitted) -> Left | None:
     problem, readers = fit.problem, fit.readers
     alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.model.biases, bool)
     sensor = problem.measurements.sensor
-    present = np.unique(sensor[problem.measurements.measured.any(1)])
+    counted = set(fit.data["sensor"])  # some have rows of weight 0 only
+    present = [s for s in np.unique(sensor) if problem.network.sensors[s].name in counted]
     if len(present) < 2:
         return None
     refits, rows = _Refits(fit, 3 * len(present)), []
@@ -148,7 +149,8 @@ def leave_sensors(fit: Fitted) -> Left | None:
 def leave_targets(fit: Fitted) -> Left | None:
     """Every target left out; None where there is one only, or more than 32."""
     problem, target = fit.problem, fit.problem.measurements.target
-    present = np.unique(target[problem.measurements.measured.any(1)])
+    counted = set(fit.data["target"])
+    present = [t for t in np.unique(target) if problem.measurements.target_names[t] in counted]
     if not 1 < len(present) <= TARGETS:
         return None
     alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.model.biases, bool)

@@ -7,6 +7,7 @@ curvature comes from the slopes a little to either side, trajectories at their m
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -30,6 +31,8 @@ from probcal.smoothing.mode import Point, find_tracks
 
 STEP = 0.1  # of a log level to either side
 FEWEST = 30  # noises below which nothing is said of their level
+TURNS, LONGEST, NEAR = 4, 1.0, 0.15  # most expansions, the longest step of a log level in one, and one that is the last
+CLIMBS, SETTLED_Z = 3, 0.01  # most steps of z to its mode, and scales within which it is there
 MOST = 12  # levels that are looked at, those of the most noises
 FARTHEST = 1.5  # log of a factor beyond which an expansion says nothing of where the level lies
 HANGS = 1.0  # sd by which biases must move to hang on a level
@@ -63,6 +66,7 @@ class Slopes(NamedTuple):
 
     level: np.ndarray  # (K,)
     z: np.ndarray  # (M,)
+    information: np.ndarray  # (M, M) about z
 
 
 class Wanted(NamedTuple):
@@ -74,11 +78,12 @@ class Wanted(NamedTuple):
     shift: np.ndarray  # (K, M) of z with the step of each level
 
 
-def members_of(problem: Problem) -> Members:
+def members_of(problem: Problem, *, moving: bool = True) -> Members:
     """The levels of a problem that have enough noises, at most `MOST`; those of sampled motions are left out."""
     found: dict[Level, int] = {}
     rows = [_of_rows(problem, b, found) for b in range(len(problem.model.blocks))]
     noises = [_of_noises(problem, r, found) for r in range(len(problem.model.recursions))]
+    noises = noises if moving else [np.full_like(own, -1) for own in noises]
     counts = np.bincount(np.concatenate([k.ravel() for k in (*rows, *noises)]) + 1, minlength=len(found) + 1)[1:]
     kept = sorted(k for k in np.argsort(-counts, kind="stable")[:MOST] if counts[k] >= FEWEST)
     place = np.full(len(found) + 1, -1)
@@ -100,7 +105,8 @@ def _of_rows(problem: Problem, b: int, found: dict[Level, int]) -> np.ndarray:
         for level, mine in zip(levels, ((number[:, c] == H) & ~own, own), strict=True):
             if mine.any():
                 index[mine, c] = found.setdefault(level, len(found))
-    return np.where(np.asarray(data.mask) > 0, _with_unknown(problem, number, index, found), -1)
+    whole = np.asarray(data.mask) == 1  # rows of less weight scatter more than they count
+    return np.where(whole, _with_unknown(problem, number, index, found), -1)
 
 
 def _of_noises(problem: Problem, r: int, found: dict[Level, int]) -> np.ndarray:
@@ -145,60 +151,119 @@ def _terms(at: Linearisation, covariance: jax.Array) -> tuple[Data, tuple[jax.Ar
 def slopes(model: Model, point: Point, prior: np.ndarray, members: Members) -> Slopes:
     """Slopes of the log evidence at a point with trajectories at their mode, `prior` (M, M) the precision of z."""
     at = linearise(model, point)
-    rows, noises = _terms(at, jax.device_put(np.linalg.inv(np.asarray(at.information) + prior)))
+    information = np.asarray(at.information)
+    rows, noises = _terms(at, jax.device_put(np.linalg.inv(information + prior)))
     volume, _ = volume_slope(model, point, at.solved)
-    return Slopes(members.sums(rows, noises), np.asarray(at.solved.score) - 0.5 * np.asarray(volume))
+    score = np.asarray(at.solved.score) - 0.5 * np.asarray(volume)
+    return Slopes(members.sums(rows, noises), score, information)
 
 
-def _beside(model: Model, point: Point, members: Members, k: int, step: float) -> tuple[Model, Point]:
-    """The model with a level a step (of its log) away, trajectories at their mode there, biases held."""
+def _at(model: Model, point: Point, members: Members, step: np.ndarray, z: np.ndarray) -> tuple[Model, Point]:
+    """The model with the levels a step (K,) of their logs away, trajectories at their mode there, biases moved by z."""
+    factor = np.append(np.exp(step), 1.0)  # what has no level goes last
     rows = tuple(
-        own._replace(std=jax.device_put(np.asarray(own.std) * np.exp(step * (index == k))))
+        own._replace(std=jax.device_put(np.asarray(own.std) * factor[index]))
         for own, index in zip(model.rows, members.rows, strict=True)
     )
-    scales = [np.exp(step * (index == k)) for index in members.noises]
+    scales = [factor[index] for index in members.noises]
     recursions = tuple(
         part._replace(L=jax.device_put(np.asarray(part.L) * scale[:, None, :]))
         for part, scale in zip(model.recursions, scales, strict=True)
     )
     noises = tuple(jax.device_put(np.asarray(u) / scale) for u, scale in zip(point.noises, scales, strict=True))
     other = replace(model, rows=rows, recursions=recursions)
-    return other, find_tracks(other, point._replace(noises=noises), TRACK_STEPS, SETTLED)
+    moved = point._replace(noises=noises, z=jax.device_put(np.asarray(point.z) + z))
+    return other, find_tracks(other, moved, TRACK_STEPS, SETTLED)
 
 
-def ask(fit: Fitted, members: Members) -> Wanted | None:
-    """Where the evidence expanded about a fit is largest in all log levels; None where it has no maximum."""
-    model, prior = fit.problem.model, np.asarray(fit.prior.matrix())
-    here, beside = slopes(model, fit.point, prior, members), list[tuple[Slopes, Slopes]]()
-    for k in range(len(members.levels)):
-        up, down = (slopes(*_beside(model, fit.point, members, k, step), prior, members) for step in (STEP, -STEP))
+class _Expansion(NamedTuple):
+    """The log evidence about a point: slope and negative curvature by log levels, biases following."""
+
+    slope: np.ndarray  # (K,)
+    covariance: np.ndarray  # (K, K) the inverse of that curvature
+    pull: np.ndarray  # (K, M) of the score of z by each log level
+    follow: np.ndarray  # (K, M) of the mode of z
+
+
+def _expanded(
+    fit: Fitted, prior: np.ndarray, model: Model, point: Point, members: Members, moved: np.ndarray
+) -> tuple[_Expansion | None, Point]:
+    """The expansion where the levels have moved already, (K,), at the mode of z near a point; None without a maximum.
+
+    Also the mode.
+    """
+    K, none = len(members.levels), np.zeros(len(members.levels))
+    here = slopes(model, point, prior, members)
+    for _ in range(CLIMBS):
+        away = np.linalg.solve(here.information + prior, here.z - prior @ np.asarray(point.z))
+        if not np.abs(away).max(initial=0.0) > SETTLED_Z:
+            break
+        _, point = _at(model, point, members, none, away)
+        here = slopes(model, point, prior, members)
+    still, beside = np.zeros(len(point.z)), list[tuple[Slopes, Slopes]]()
+    for unit in np.eye(K):
+        up, down = (slopes(*_at(model, point, members, s * unit, still), prior, members) for s in (STEP, -STEP))
         beside.append((up, down))
     pull = np.array([(up.z - down.z) / (2 * STEP) for up, down in beside])  # (K, M)
     curved = -np.array([(up.level - down.level) / (2 * STEP) for up, down in beside])
-    follow = np.linalg.solve(np.asarray(fit.solved.information) + prior, pull.T).T  # (K, M) of z by each log level
-    matrix = 0.5 * (curved + curved.T) - pull @ follow.T
-    slope, unknown = here.level, np.array([level.unknown for level in members.levels])
+    follow = np.linalg.solve(here.information + prior, pull.T).T
+    matrix, slope = 0.5 * (curved + curved.T) - pull @ follow.T, here.level
+    unknown = np.array([level.unknown for level in members.levels])
     own = np.flatnonzero(unknown >= 0)
-    if len(own):
-        spread, levels = np.asarray(model.level_spread)[unknown[own]], np.asarray(fit.point.levels)[unknown[own]]
-        matrix[own, own] += 1.0 / spread**2
-        slope[own] -= levels / spread**2
-    values = np.linalg.eigvalsh(matrix) if np.isfinite(matrix).all() else np.zeros(1)
-    if not values.min(initial=1.0) > 0 or not np.isfinite(slope).all():
-        return None
-    covariance = np.linalg.inv(matrix)
-    step, variance = covariance @ slope, np.diag(covariance)
-    return Wanted(step, np.sqrt(variance), step**2 / variance, step[:, None] * follow)
+    spread = np.asarray(fit.problem.model.level_spread)[unknown[own]]
+    known = np.zeros(K)
+    known[own] = 1.0 / spread**2
+    slope = slope - known * moved
+    slope[own] -= np.asarray(fit.point.levels)[unknown[own]] / spread**2
+    alone = np.diag(curved) + known
+    if not (np.isfinite(matrix).all() and np.isfinite(slope).all() and (alone > 0).all()):
+        return None, point
+    matrix = matrix + np.diag(known)
+    if not np.linalg.eigvalsh(matrix).min() > 0:  # far from the maximum: each level by itself
+        matrix = np.diag(alone)
+    return _Expansion(slope, np.linalg.inv(matrix), pull, follow), point
 
 
-def check_levels(fit: Fitted) -> tuple[xr.Dataset | None, list[Finding], dict[int, str]]:
+def ask(fit: Fitted, members: Members, prior: np.ndarray) -> Wanted | None:
+    """Where the evidence is largest in all log levels, from the fit on; None where it has no maximum.
+
+    `prior` (M, M) is the precision of z that is held. What biases move is their covariance times what their score
+    changes, the slope of any posterior mean by what is added to the score.
+
+    The slope of N noises of mean square r^2 is N (r^2 exp(-2 t) - 1): a Newton step d stands for t = -log(1 - 2 d) / 2.
+    """
+    model, point, K = fit.problem.model, fit.point, len(members.levels)
+    step, shift, square = np.zeros(K), np.zeros((K, len(point.z))), np.zeros(K)
+    sd = np.zeros(K)
+    for turn in range(TURNS):
+        found, point = _expanded(fit, prior, model, point, members, step)
+        if found is None:
+            return None if turn == 0 else Wanted(step, sd, square, shift)
+        newton, sd = found.covariance @ found.slope, np.sqrt(np.diag(found.covariance))
+        square = newton**2 / sd**2 if turn == 0 else square
+        bent = -0.5 * np.log(np.maximum(1.0 - 2.0 * newton, np.exp(-2.0 * LONGEST)))
+        own = np.clip(bent, -LONGEST, LONGEST)
+        step, shift = step + own, shift + own[:, None] * (found.pull @ fit.covariance)
+        if np.abs(own).max() < NEAR:
+            break
+        model, point = _at(model, point, members, own, own @ found.follow)
+    return Wanted(step, sd, square, shift)
+
+
+def check_levels(fit: Fitted, tree: xr.DataTree) -> tuple[xr.Dataset | None, list[Finding], dict[int, str]]:
     """Group `level_check`, findings on declared levels, and why the answer of some biases is in doubt with them.
 
     `factor` is what the data ask for over what the fit had (all levels together), `factor_sd` its sd, `square` the
-    chi-square of that alone, `shift` what every bias would move with it, in its unit.
+    chi-square of that alone, `shift` what every bias would move with it, in its unit. Of process noise nothing is said
+    where it was left out of the fit. Where precisions were integrated the declared scales are held.
     """
-    members = members_of(fit.problem)
-    asked = ask(fit, members) if members.levels and fit.problem.model.biases else None
+    members = members_of(fit.problem, moving=tree.attrs.get("motion") != "left out")
+    integrated = tree.attrs["precisions"] == "integrated"
+    prior = np.eye(len(fit.point.z)) if integrated else np.asarray(fit.prior.matrix())
+    asked = None
+    if members.levels and fit.problem.model.biases:
+        with suppress(np.linalg.LinAlgError):  # a flat prior on biases that the data leave open
+            asked = ask(fit, members, prior)
     if asked is None:
         return None, [], {}
     problem, limit = fit.problem, limit_of(sum(level.unknown < 0 for level in members.levels))
@@ -220,11 +285,15 @@ def check_levels(fit: Fitted) -> tuple[xr.Dataset | None, list[Finding], dict[in
 
 
 def _names(levels: list[Level]) -> list[str]:
-    """A name of its own for each level: its label, with a number where it is declared more than once."""
+    """A name of its own for each level: that of an unknown one, else its label, numbered where that is taken."""
+    taken = {level.label for level in levels if level.unknown >= 0}
     names = list[str]()
-    for k, level in enumerate(levels):
-        twins = sum(other.label.partition("#")[0] == level.label for other in levels[:k])
-        names.append(f"{level.label}#{twins + 1}" if twins else level.label)
+    for level in levels:
+        name, k = level.label, 1
+        while level.unknown < 0 and name in taken:
+            name, k = f"{level.label}#{k + 1}", k + 1
+        taken.add(name)
+        names.append(name)
     return names
 
 

@@ -186,7 +186,9 @@ def squares(found: Innovations, group: Any, count: int, rate: float) -> Squares:
     scale, freedom = variance / (2.0 * expected), 2.0 * expected**2 / variance
     lower, upper = (scale * special.chdtri(freedom, p) / expected for p in (1 - rate / 2, rate / 2))
     judged = freedom >= 1.0  # below, as with events that hardly ever happen, there is no limit
-    return Squares(data.astype(int), total / expected, np.where(judged, lower, 0.0), np.where(judged, upper, np.inf))
+    light = whole < data * (1.0 - 1e-9)  # rows with a weight tell each other less than they scatter
+    lower, upper = np.where(judged & ~light, lower, 0.0), np.where(judged, upper, np.inf)
+    return Squares(data.astype(int), total / expected, lower, upper)
 
 
 def enough(kurtosis: np.ndarray) -> bool:

@@ -107,7 +107,7 @@ def judge_biases(
             verdict, reason = "weak", doubts[m]
         elif m in shared:
             verdict, reason = "weak", f"it belongs to {shared[m]}, which the data leave open"
-        elif not status.settled and "not mixed" not in ended:
+        elif not status.settled:
             verdict, reason = "weak", f"the fit ended {status}, which is no answer"
         elif ended[m] == "not mixed":
             verdict, reason = "weak", "its chains have not mixed, which is no answer"

@@ -42,7 +42,7 @@ def widened(tree: xr.DataTree, inflation: np.ndarray, reason: str) -> tuple[xr.D
     wide = np.sqrt(1.0 + group["gamma"].values * (inflation - 1.0))
     if wide.max() < TOLD:
         text = f"the innovations reject the model: {reason}"
-        result.attrs["message"] = f"{tree.attrs['message']} {text[0].upper()}{text[1:]}.".strip()
+        result.attrs |= {"message": f"{tree.attrs['message']} {text[0].upper()}{text[1:]}.".strip(), "widened": 1.0}
         return result, [Finding("widened", "fit", text)]
     mean = group["mean"].values
     ends = {name: mean + wide * (group[name].values - mean) for name in ("lower", "upper")}

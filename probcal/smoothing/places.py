@@ -292,6 +292,7 @@ class _Target:
 
     def __init__(self, mode: np.ndarray, top: float, rows: int):
         n, self.mode = len(mode), mode
+        top = top if np.abs(mode).max() <= REACH else -np.inf  # the grid does not reach it
         axis = REACH * (2 * np.arange(FIRST[n]) + 1 - FIRST[n]) / FIRST[n]
         self.cells = np.stack(np.meshgrid(*[axis] * n, indexing="ij"), -1).reshape(-1, n)
         self.width = np.full(len(self.cells), 2 * REACH / FIRST[n])
