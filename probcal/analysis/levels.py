@@ -32,6 +32,7 @@ from probcal.smoothing.mode import Point, find_tracks
 STEP = 0.1  # of a log level to either side
 FEWEST = 30  # noises below which nothing is said of their level
 TURNS, LONGEST, NEAR = 4, 1.0, 0.15  # most expansions, the longest step of a log level in one, and one that is the last
+NEGLIGIBLE = 6.0  # chi-square up to which a step is chance, and is not followed
 CLIMBS, SETTLED_Z = 3, 0.01  # most steps of z to its mode, and scales within which it is there
 MOST = 12  # levels that are looked at, those of the most noises
 FARTHEST = 1.5  # log of a factor beyond which an expansion says nothing of where the level lies
@@ -244,7 +245,7 @@ def ask(fit: Fitted, members: Members, prior: np.ndarray) -> Wanted | None:
         bent = -0.5 * np.log(np.maximum(1.0 - 2.0 * newton, np.exp(-2.0 * LONGEST)))
         own = np.clip(bent, -LONGEST, LONGEST)
         step, shift = step + own, shift + own[:, None] * (found.pull @ fit.covariance)
-        if np.abs(own).max() < NEAR:
+        if np.abs(own).max() < NEAR or not (newton**2 > NEGLIGIBLE * sd**2).any():
             break
         model, point = _at(model, point, members, own, own @ found.follow)
     return Wanted(step, sd, square, shift)
