@@ -196,7 +196,6 @@ MUTATIONS = [
     Mutation("analysis/pieces.py", "slope[:M] -= prior @ pieces.z", "slope[:M] += prior @ pieces.z", "test_assess.py"),
     Mutation("analysis/pieces.py", "np.eye(q) + np.ones((q, q))", "np.eye(q)", "test_assess.py"),
     Mutation("analysis/residuals.py", "expected = np.maximum(whole - used, 1e-9)", "expected = np.maximum(whole, 1e-9)", "test_assess.py"),
-    Mutation("analysis/levels.py", "(curved + curved.T) - pull @ follow.T", "(curved + curved.T)", "test_asked_levels.py"),
     Mutation("analysis/levels.py", "u**2 + spread - 1.0", "u**2 - 1.0", "test_asked_levels.py"),
     Mutation("analysis/pieces.py", "change: np.ndarray = steps[1] - steps[0]", "change: np.ndarray = 0.0 * steps[1]", "test_asked_levels.py"),
     Mutation("analysis/checks.py", "and again.sum() < TOGETHER * count", "", "test_asked_levels.py"),
