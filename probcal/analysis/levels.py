@@ -35,7 +35,7 @@ TURNS, LONGEST, NEAR = 4, 1.0, 0.15  # most expansions, the longest step of a lo
 NEGLIGIBLE = 6.0  # chi-square up to which a step is chance, and is not followed
 CLIMBS, SETTLED_Z = 3, 0.01  # most steps of z to its mode, and scales within which it is there
 MOST = 12  # levels that are looked at, those of the most noises
-FARTHEST = 1.5  # log of a factor beyond which an expansion says nothing of where the level lies
+FARTHEST = 1.5  # log of a factor beyond which only its side is said
 HANGS = 1.0  # sd by which biases must move to hang on a level
 
 
