@@ -50,7 +50,9 @@ def check_driving(noise: Any, what: str) -> None:
     """Raise `InputError` unless a family can drive a motion: Gaussian, or a scale mixture around zero."""
     if isinstance(noise, Normal) or (isinstance(noise, ScaleMixture) and not getattr(noise, "delay", 0.0)):
         return
-    raise InputError(f"{what} is {noise!r}, which cannot drive a motion: give Gaussian(), StudentT(df) or a Mixture")
+    raise InputError(
+        f"{what} is {noise!r}, which cannot drive a motion: give noise.Normal(), StudentT(df) or Mixture(share, scale)"
+    )
 
 
 def check_level(level: Level, what: str, *, zero: bool = False) -> None:

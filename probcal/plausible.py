@@ -127,11 +127,15 @@ def _check_sizes(data: Measurements, name: str, j: int, rows: np.ndarray) -> Non
     size = max(float(np.quantile(np.abs(value), 0.9)), float(np.ptp(np.quantile(value, [0.1, 0.9]))))
     if size == 0.0:
         return
-    std = data.std[rows, j] / size
-    for chosen, words in ((std < NARROW, "smaller"), (std > WIDE, "larger")):
-        if chosen.any():
-            row = int(rows[np.flatnonzero(chosen)[0]])
+    std, own = data.std[rows, j], np.maximum(np.abs(value), 1e-300)
+    for words, off, alone in (
+        ("smaller", std < NARROW * size, std < NARROW * own),
+        ("larger", std > WIDE * size, std > WIDE * own),
+    ):
+        if off.any():  # of large values that make a proper std small, their row is named
+            row = int(rows[np.flatnonzero(off & alone if (off & alone).any() else off)[0]])
             raise InputError(
                 f'{data.table.where(row)} column "{name}_std": a std of {data.std[row, j]:g} is many orders of'
-                f" magnitude {words} than the values (about {size:.3g}); check its unit, or leave the cell blank"
+                f" magnitude {words} than the values (here {data.value[row, j]:.3g}); check the units of both, or"
+                " leave the cell blank"
             )

@@ -464,5 +464,6 @@ def _check_duplicates(data: Measurements, network: Network) -> None:
             first = int(np.flatnonzero(same & data.measured[:, j])[0])
             raise InputError(
                 f'{data.table.where(again)}: sensor "{network.sensors[data.sensor[again]].name}" has a second '
-                f'"{name}" at time {data.time[again]:g} (first in row {data.table.lines[first]}); keep one'
+                f'"{name}" at time {data.time[again]:g} (first in row {data.table.lines[first]}); keep one, '
+                'or name two targets in the column "target", or place the sensor with detection=Detection(...)'
             )

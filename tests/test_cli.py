@@ -225,7 +225,7 @@ BAD = {
     "text in a channel": (lambda t: cell(t, 6, 2, "abc"), 'bad.csv row 6 column "range": "abc" is no number'),
     "unknown unit": (lambda t: t.replace("range", "range [mm2]", 1), 'bad.csv column "range": unit "mm2" is not known; did you mean "mm"?'),
     "wrong unit": (lambda t: t.replace("range", "range [deg]", 1), 'bad.csv column "range": unit "deg" is no length'),
-    "duplicate row": (lambda t: t + t.splitlines()[1] + "\n", 'has a second "range" at time 0 (first in row 2); keep one'),
+    "duplicate row": (lambda t: t + t.splitlines()[1] + "\n", 'has a second "range" at time 0 (first in row 2); keep one, or name two targets in the column "target"'),
     "empty table": (lambda t: t.splitlines()[0] + "\n", "bad.csv has no rows"),
     "empty file": (lambda t: "", "bad.csv is not a CSV table"),
     "one row": (lambda t: "\n".join(t.splitlines()[:2]) + "\n", "bad.csv has one measured row only"),

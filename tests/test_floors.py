@@ -18,7 +18,7 @@ FLOORS = {
     ),
     1: ("sensor", "motion", "priors", "noise", "detection"),
     2: ("sensors",),
-    3: ("geodesy", "network", "table", "nodes", "plausible", "roads"),
+    3: ("geodesy", "misfit", "network", "table", "nodes", "plausible", "roads"),
     4: ("model", "problem", "scans", "simulate"),
     5: ("smoothing", "particle", "doa", "starts", "rss", "association", "online"),
     6: ("identifiability", "results"),

@@ -224,6 +224,8 @@ def test_a_fit_of_free_radars_says_what_the_data_leave_open():
     for name in MOVED_2D:
         assert name in tree.attrs["message"]
     assert tree["direction"]["direction"].values.tolist() == MOVED_2D
+    advice = tree["direction"]["remedy"].values.tolist()
+    assert all("fix " in words and "done" not in words for words in advice)
 
 
 def test_each_remedy_is_verified_by_recomputing():

@@ -66,6 +66,10 @@ EPOCH = 1.7e9  # s since 1970, in 2023
         (lambda d: d.assign(range_std=1.0).pipe(with_cell("range_std", 3, 1e-30)), 'row 3 column "range_std"'),
         (lambda d: d.assign(range_std=1e12), "many orders of magnitude larger"),
         (
+            lambda d: d.assign(range=d["range"] + np.where(d["time"] > 6.0, 1.07e11, 0.0), range_std=40.0),
+            'row 21 column "range_std": a std of 40 is many orders of magnitude smaller than the values (here 1.07e+',
+        ),
+        (
             lambda d: kilometres(d).assign(range_std=1.0),
             'column "range_std" has no unit beside "range [km]": write range_std [km], or range_std [m]',
         ),

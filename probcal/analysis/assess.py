@@ -120,8 +120,8 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
             f"the fit ended {tree.attrs['status']}, which is no answer: what is left of the data says nothing of them"
         )
         kept = [
-            f for f in findings if f.kind in ("wrapping", "outliers") or (f.kind == "nis" and _absurd(tree))
-        ]  # likely causes
+            f for f in findings if f.kind in ("wrapping", "nis" if _absurd(tree) else "outliers")
+        ]  # likely causes; the message of a misfit has its own
         findings = [Finding("status", "fit", text), *kept]
     scaled = scaling.power_scaling(tree) if leave.weighable(tree) else None
     if scaled is not None:
@@ -171,10 +171,11 @@ def _verdicts(
                 drifts[change.bias] = text + _shape(shapes.get(change.bias), grid.edges)
             else:
                 disagreements[change.bias] = _disagreement(problem, change, limit_of(M, change.contrast.freedom))
-    z, alpha = np.asarray(fit.point.z), np.asarray(fit.prior.alpha)
+    z, alpha, gamma = np.asarray(fit.point.z), np.asarray(fit.prior.alpha), calibration["gamma"].values
     known = verdict.Grounds(
         verdict.contraction(calibration["information"].values), square,
-        verdict.pull(z, alpha, calibration["gamma"].values, inflation), float(np.sqrt(limit_of(M))),
+        verdict.pull(z, alpha, gamma, inflation), float(np.sqrt(limit_of(M))),
+        verdict.explained_part(z, alpha, gamma, found.innovations.excess),
     )  # fmt: skip
     ended = calibration["status"].values.tolist()
     status = Status(tree.attrs["status"])

@@ -65,7 +65,7 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
     residual = tree["residual"].to_dataset()
     turned = residuals.wrapping(fit, residual["after"].values, residual["std"].values)
     findings += [Finding("wrapping", *pair) for pair in turned]
-    groups["verdict"] = _verdicts(fit, tree, _inflation(fit, found), groups)
+    groups["verdict"] = _verdicts(fit, tree, _inflation(fit, found), found.excess, groups)
     if "halves" in groups and (unsolved := groups["halves"].attrs["unsolved"]):
         text = f"{unsolved} more biases may differ between the halves than were looked at: so many are no drift of one"
         findings.append(Finding("halves", "fit", text))
@@ -204,8 +204,8 @@ def _compared(
 
 
 def _verdicts(
-    fit: JudgedLarge, tree: xr.DataTree, inflation: np.ndarray, groups: dict[str, xr.Dataset]
-) -> xr.Dataset:  # fmt: skip
+    fit: JudgedLarge, tree: xr.DataTree, inflation: np.ndarray, excess: float, groups: dict[str, xr.Dataset]
+) -> xr.Dataset:
     """Group `verdict`; adds the group `halves` where the recording can be divided."""
     problem, group = fit.problem, tree["calibration"].to_dataset()
     M, z = problem.model.biases, np.asarray(fit.point.z)
@@ -223,7 +223,7 @@ def _verdicts(
             inflation = own
     known = verdict.Grounds(
         np.clip(1.0 - fit.declared.variance, 0.0, 1.0), square, verdict.pull(z, alpha, gamma, inflation),
-        float(np.sqrt(verdict.limit_of(M))),
+        float(np.sqrt(verdict.limit_of(M))), verdict.explained_part(z, alpha, gamma, excess),
     )  # fmt: skip
     shared = shared_in_blocks(problem, fit.point, fit.declared.members, fit.declared.covariance, SHARED)
     ended, doubts = group["status"].values.tolist(), mirror_doubts(fit, tree)

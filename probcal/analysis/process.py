@@ -15,7 +15,7 @@ from probcal.analysis.findings import Finding
 from probcal.analysis.fitted import Fitted
 from probcal.model.motions import by_component, linear_of
 from probcal.motion import as_motion
-from probcal.motion.base import GAUSSIAN, level_name
+from probcal.motion.base import GAUSSIAN, Component, level_name
 from probcal.noise import Normal, guess_of
 
 REPLICAS, MOST = 200, 2e7  # drawn, and entries of all of them together
@@ -32,6 +32,7 @@ class Driven(NamedTuple):
     name: str  # of the target
     component: str  # what they drive
     family: str  # its class, for the remedy
+    next_order: str  # what to declare instead where the noise has a memory
     noises: np.ndarray  # (epochs, entries) over the sd of the replicas
     replicas: np.ndarray  # (epochs, entries, D) likewise
 
@@ -46,8 +47,8 @@ def check_process_noise(fit: Fitted, key: jax.Array) -> list[Finding]:
         where = f'target "{own.name}": the noise of its {own.component}'
         if away > LIMIT and heavy > HEAVIER * expected:
             text = (
-                f"{where} has heavy tails (kurtosis {heavy:.1f}, {expected:.1f} expected): it goes straight, then"
-                f" turns; take {own.family}(std, noise=StudentT(4))"
+                f"{where} has heavy tails (kurtosis {heavy:.1f}, {expected:.1f} expected): declare"
+                f" {own.family}(..., noise=StudentT(4))"
             )
             found.append(Finding("motion", own.name, text))
             continue
@@ -56,8 +57,8 @@ def check_process_noise(fit: Fitted, key: jax.Array) -> list[Finding]:
         lag, value, usual, far = max(tried, key=lambda one: one[3])
         if far > LIMIT and value - usual > TOGETHER:
             text = (
-                f"{where} goes together over time (correlation {value:.2f} at lag {lag}, {usual:.2f} expected): it"
-                " keeps turning or braking; take a motion with one state more, such as ConstantAcceleration"
+                f"{where} is correlated in time ({value:.2f} at lag {lag}, {usual:.2f} expected): declare"
+                f" {own.next_order}"
             )
             found.append(Finding("motion", own.name, text))
     return found
@@ -85,7 +86,8 @@ def _driven(fit: Fitted, key: jax.Array, count: int) -> Iterator[Driven]:
                 scale = np.where(told, 1.0 / np.where(told, sd, 1.0), 0.0)
                 drives = level_name(component).removesuffix("_std")
                 own_noises = smoothed[mine, own] * scale, columns[mine, own] * scale[:, :, None]
-                yield Driven(name, drives, type(component).__name__, *own_noises)
+                order = getattr(component, "next_order", Component.next_order)
+                yield Driven(name, drives, type(component).__name__, order, *own_noises)
 
 
 def _kurtosis(noises: np.ndarray) -> np.ndarray:

@@ -42,6 +42,11 @@ class Innovations(NamedTuple):
     kurtosis: np.ndarray  # (D,) excess over a Gaussian's
     expected: np.ndarray  # (D,) of its square: 1, less where a row has a weight below one
 
+    @property
+    def excess(self) -> float:
+        """Sum of squares of all above what is expected of it."""
+        return float(np.sum(self.value**2 - self.expected + self.used))
+
     def spread(self, mine: Any) -> float:
         """Mean square of some of them over what is expected."""
         return float(np.sum(self.value[mine] ** 2) / max(np.sum(self.expected[mine]), 1e-300))

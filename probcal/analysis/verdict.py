@@ -4,12 +4,14 @@ With s = 1 - [(G + I)^-1]_mm, G the information of the data in units of the decl
 biases marginalised), how much the data narrow a bias, the first that applies:
 
 drifting     the halves of the recording differ on it beyond the limit, after what stronger changes explain
-conflicting  it lies beyond the limit of its survey (or of its scale under a prior that does not learn), or the
-             targets disagree on it beyond the limit, after what stronger changes explain
+conflicting  it lies beyond the limit of its survey (or of its scale under a prior that does not learn) and explains a
+             tenth of what the innovations have too much, or the targets disagree on it beyond the limit, after what
+             stronger changes explain
 prior only   s < 0.05
 weak         s < 0.5 (information below 1), or one scale along a combination of biases that the data leave open would
              put it more than 1.8 sd off, or it would move by more than one sd with the noise levels that the data ask
-             for or if the biases that drift were free to, or it is another one in an answer that fits as well (a
+             for or if the biases that drift were free to, or it lies beyond the limit of its survey by a misfit that is
+             mostly elsewhere, or it is another one in an answer that fits as well (a
              mirror, all biases where a target touches it), or the answer is far from Gaussian, or the fit is no answer
              (not converged, at bound, diverged), or the chains of the bias have not mixed, or it was pruned: held at
              zero by a precision that was maximised; all are "conflicting" where the fit explains nothing (misfit)
@@ -21,7 +23,7 @@ whose data fit the rest badly, is a finding of its own: it widens those standard
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -31,6 +33,7 @@ from probcal.status import Status
 
 RATE = 0.01  # false alarms of each kind of check, all its comparisons together
 PRIOR_ONLY, WEAK = 0.05, 0.5
+PART = 0.1  # share of the chi-square of the innovations above its mean from which a bias is one of its causes
 VERDICTS = ("determined", "prior only", "weak", "drifting", "conflicting")
 
 
@@ -41,6 +44,7 @@ class Grounds(NamedTuple):
     square: np.ndarray  # of halves alike, over its limit's chi-square, 0 where nothing can be told
     pull: np.ndarray  # sd from the prior, 0 where the prior follows the data
     limit: float  # of pull and of the root of `square`
+    part: Any = 1.0  # share of the chi-square that the innovations have too much which the bias alone explains
 
 
 def contraction(information: np.ndarray) -> np.ndarray:
@@ -60,6 +64,14 @@ def pull(z: np.ndarray, alpha: np.ndarray, gamma: np.ndarray, inflation: np.ndar
     """
     spread = np.sqrt(np.maximum(gamma * (gamma + inflation * (1.0 - gamma)), 1e-12))
     return np.where(alpha == 1.0, np.abs(z) / spread, 0.0)
+
+
+def explained_part(z: np.ndarray, alpha: np.ndarray, gamma: np.ndarray, excess: float) -> np.ndarray:
+    """Share (M,), one at most, of the excess chi-square of the innovations that each bias explains without its prior.
+
+    The squared distance from the prior, at the declared noise, is the chi-square that goes with that prior.
+    """
+    return np.minimum(pull(z, alpha, gamma, np.ones(len(z))) ** 2 / max(excess, 1e-300), 1.0)
 
 
 def limit_of(count: int, freedom: int = 1) -> float:
@@ -84,25 +96,28 @@ def judge_biases(
     `doubts` why the answer of some is not one bell: another answer that fits as well, or draws that fit badly.
     """
     verdicts, sentences = [], []
+    explained = np.broadcast_to(known.part, len(problem.biases))
     for m, bias in enumerate(problem.biases):
         s, unit = known.contraction[m], bias.unit if bias.unit != "1" else ""
         declared = bias.kind
         sizes = f"{declared} of {_size(bias.scale, unit)} to {_size(bias.scale * np.sqrt(1 - s), unit)}"
         information = f"information {s / max(1 - s, 1e-12):.2g}"
+        beyond = f"{known.pull[m]:.1f} sd beyond its {declared} of {_size(bias.scale, unit)} (limit {known.limit:.1f})"
         if status is Status.MISFIT:
             verdict, reason = "conflicting", "the fit ended misfit: model and data contradict each other"
         elif m in drifts:
             verdict, reason = "drifting", drifts[m]
-        elif known.pull[m] > known.limit:
-            verdict = "conflicting"
-            where = f"its {declared} of {_size(bias.scale, unit)}"
-            reason = f"{known.pull[m]:.1f} sd beyond {where} (limit {known.limit:.1f})"
+        elif known.pull[m] > known.limit and explained[m] >= PART:
+            verdict, reason = "conflicting", beyond
         elif m in disagreements:
             verdict, reason = "conflicting", disagreements[m]
         elif s < PRIOR_ONLY:
             verdict, reason = "prior only", f"the data hardly narrow its {declared} ({information})"
         elif s < WEAK:
             verdict, reason = "weak", f"the data narrow its {sizes} only ({information})"
+        elif known.pull[m] > known.limit:
+            verdict = "weak"
+            reason = f"{beyond}, by a misfit elsewhere: it explains {explained[m]:.1g} of the excess of the innovations"
         elif doubts and m in doubts:
             verdict, reason = "weak", doubts[m]
         elif m in shared:

@@ -59,7 +59,7 @@ def with_remedies(
             continue
         left -= 1
         if _count(known, done) <= left:
-            yield replace(direction, fix=fixed, remedy=f"{before}done by fixing {together(fixed, problem.labels)}")
+            yield replace(direction, fix=fixed, remedy=f"{before}fix {together(fixed, problem.labels)}")
             continue
         members = [[labels.index(name) for name in group] for group in groups]
         both = [m for group in members[:2] for m in group]

@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from probcal.inference.mixture import MixturePosterior
+from probcal.misfit import MisfitData, misfit_text
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, NormalPosterior, Posterior, Summary
+from probcal.results.groups import datum_of, gather
+from probcal.smoothing.draws import residuals
 from probcal.smoothing.information import squares_of
 from probcal.smoothing.mode import Point
 from probcal.status import Status
@@ -134,18 +137,23 @@ def verdict(end: End) -> Status:
 
 
 def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
-    """What to check where a fit explains nothing, and the datum that is worst explained."""
-    squares = [np.asarray(part) for part in squares_of(problem.model, point)]
-    block = int(np.argmax([np.nan_to_num(part, nan=np.inf).max() for part in squares]))
-    n, c = np.unravel_index(np.argmax(np.nan_to_num(squares[block], nan=np.inf)), squares[block].shape)
-    row, data = problem.row_index[block][n], problem.measurements
-    sensor = problem.network.sensors[data.sensor[row]].name
-    channel = problem.columns[block][c]
-    return (
-        f"The fit explains nothing: mean square a datum {square:.2g} where 1 is expected, worst {sensor}.{channel} at"
-        f" {data.time[row]:.6g} s. Check units, the time column, the target of each row,"
-        f" sentinels such as -9999 and the noise std."
+    """What a point that explains nothing leaves of the data, the likely cause and what to do."""
+    network, (datum, picks) = problem.network, datum_of(problem)
+    names = {name: values for name, (_, values) in datum["coords"].items()}
+    units = {
+        (placed.name, channel): known.unit
+        for placed in network.sensors
+        for channel, known in placed.type.expand(network.dimension)
+    }
+    left = MisfitData(
+        gather(squares_of(problem.model, point), picks),
+        gather(residuals(problem.model, point).innovation, picks),
+        datum["y"],
+        *(np.asarray(names[name], str) for name in ("sensor", "channel", "target")),
+        names["time"],
+        np.array([units[pair] for pair in zip(names["sensor"], names["channel"], strict=True)]),
     )
+    return misfit_text(square, left)
 
 
 def _message(

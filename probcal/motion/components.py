@@ -35,6 +35,8 @@ class ConstantVelocity(Component):
     `singular=True`: `std` in m s^-2, G = [T^2/2, T], the rank-deficient form of the papers.
     """
 
+    next_order: ClassVar[str] = "ConstantAcceleration(std)"
+
     std: Level
     singular: bool = False
     noise: Any = GAUSSIAN
@@ -104,6 +106,8 @@ class CoordinatedTurn(Component):
     `std` in m s^-3/2: white acceleration as in `ConstantVelocity`, here carried along the turn; a rate of 0, and
     the z axis, are constant velocity.
     """
+
+    next_order: ClassVar[str] = "another rate, or ConstantAcceleration(std)"
 
     std: Level
     rate: float
@@ -219,6 +223,7 @@ class White(Component):
     """A component drawn anew at every epoch (an unknown emission range, say): `mean` (one or one an axis), `std`."""
 
     memoryless: ClassVar[bool] = True
+    next_order: ClassVar[str] = "RandomWalk(name, unit, std, initial)"
 
     name: str
     unit: str

@@ -11,9 +11,9 @@ from probcal.errors import InputError, nearest
 from probcal.geometry import slopes
 from probcal.labels import AXES
 from probcal.lazy import Later
-from probcal.motion.base import Component
+from probcal.motion.base import GAUSSIAN, Component
 from probcal.motion.components import blocks
-from probcal.noise import Level, check_level
+from probcal.noise import Level, check_driving, check_level
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,6 +28,7 @@ class Known(Component):
     `track` is a DataFrame with the columns time, position_x, position_y[, position_z] and, where known, velocity_x,
     ... (or a pair of arrays, times (T,) in s and positions (T, d) in m); without velocities they are its differences.
     `std` is that of the reported position on each axis in m, drawn anew at every epoch; 0 takes it as exact.
+    `noise=StudentT(4)` allows for outliers of the report; all axes of an epoch share its latent scale.
 
     >>> Known(([0.0, 10.0], [(0.0, 0.0), (50.0, 0.0)]), std=0.02).std
     0.02
@@ -36,14 +37,19 @@ class Known(Component):
     memoryless: ClassVar[bool] = True
     timed: ClassVar[bool] = True
     driven: ClassVar[str] = "position"
+    next_order: ClassVar[str] = (
+        "its reports as rows of a sensor with biases, sensors.position.on(Node(...)), and ConstantVelocity(std)"
+    )
 
     track: Any
     std: Level = 0.0
+    noise: Any = GAUSSIAN
     time: np.ndarray = field(init=False, repr=False)  # (T,)
     state: np.ndarray = field(init=False, repr=False)  # (T, 2d) positions, velocities
 
     def __post_init__(self):
         check_level(self.std, "Known: std", zero=True)
+        check_driving(self.noise, "Known: noise")
         time, position, velocity = _track(self.track)
         if time.ndim != 1 or position.ndim != 2 or len(position) != len(time) or position.shape[1] not in (2, 3):
             raise InputError(
