@@ -83,6 +83,8 @@ if TYPE_CHECKING:
     from probcal.simulate import Simulation, Truth, simulate
     from probcal.table import read_table
 
+__version__: str  # of the installed package, read when it is asked for
+
 __all__ = lazy(
     __name__,
     {

@@ -1,7 +1,21 @@
 """Errors, and the words that they share; nothing here needs jax or NumPy."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
+from functools import wraps
+from inspect import formatannotation, signature
+from typing import Any
+
+GIVE = {  # class of an argument: the remedy where a value of another class is given
+    "Problem": "a Problem, as in Problem(network, motion, table)",
+    "Network": "a Network, as in Network([sensor_type.on(node), ...])",
+    "Method": "a method, such as EA() or MAP()",
+    "Prior": "a prior, such as Gaussian() or Horseshoe()",
+    "Particles": "the number of particles, as in Particles(2000)",
+    "Point": "a Point, as probcal.starts.automatic_start(problem) returns it",
+    "Truth": "a Truth, such as the truth of simulate(...)",
+    "DataTree": "the tree that fit(problem) or load(folder) returns",
+}
 
 
 class InputError(ValueError):
@@ -13,6 +27,40 @@ class InputError(ValueError):
 
 class FitError(RuntimeError):
     """A fit that left nothing to report: the text says why and what to do."""
+
+
+def checked[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """Raise `InputError` for an argument whose class is not the declared one, for the classes of `GIVE`.
+
+    Classes are compared by name, so that no module is imported for the annotations.
+    """
+    names = list(signature(function).parameters)
+    declared = {name: _classes(one.annotation) for name, one in signature(function).parameters.items()}
+    wanted = {name: classes for name, classes in declared.items() if classes <= {*GIVE, "NoneType"}}
+    verb = function.__qualname__.removesuffix(".__init__")
+
+    @wraps(function)
+    def entry(*args: P.args, **kwargs: P.kwargs) -> R:
+        for name, value in (*zip(names, args, strict=False), *kwargs.items()):
+            if name in wanted and wanted[name].isdisjoint(kind.__name__ for kind in type(value).__mro__):
+                give = " or ".join(GIVE[kind] for kind in sorted(wanted[name] - {"NoneType"}))
+                raise InputError(f"{verb}: {name} is {_described(value)}; give {give}")
+        return function(*args, **kwargs)
+
+    return entry
+
+
+def _classes(annotation: object) -> set[str]:
+    """Names of the classes that an annotation allows, without their modules."""
+    parts = formatannotation(annotation).strip("'").split(" | ")
+    return {"NoneType" if part == "None" else part.rpartition(".")[2] for part in parts}
+
+
+def _described(value: Any) -> str:
+    """A value of the wrong class in a few words."""
+    if isinstance(value, type):
+        return f"the class {value.__name__} itself"
+    return f'the text "{value}"' if isinstance(value, str) else f"of type {type(value).__name__}"
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

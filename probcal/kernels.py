@@ -1,18 +1,48 @@
-"""Compiled kernels of this process: every one takes memory maps, of which the system allows a limited number."""
+"""Compiled kernels: kept in a folder between processes, and dropped before memory maps run out in one of them."""
 
+import os
 import threading
 import time
+from functools import cache
 from pathlib import Path
 
 import jax
+import platformdirs
+from jax.experimental.compilation_cache import compilation_cache
 
 MAPS = Path("/proc/self/maps")
 LIMIT = Path("/proc/sys/vm/max_map_count")
 SHARE = 0.3  # of the limit above which all kernels are dropped
 PAUSE = 1.0  # s between two looks
 
+KEPT = 10**9  # bytes of kernels that stay in the user's cache folder, the latest ones
+
 _looked = [0.0]
 _looking = threading.Lock()
+
+
+@cache
+def keep_kernels() -> None:
+    """From the first call on, keep every kernel that jax compiles in the user's cache folder.
+
+    Nothing changes where jax has a folder already (`JAX_COMPILATION_CACHE_DIR`), where its cache is off, where
+    `PROBCAL_NO_CACHE` is set, and where the folder cannot be written.
+    """
+    off = os.environ.get("PROBCAL_NO_CACHE") or not jax.config.jax_enable_compilation_cache
+    if off or jax.config.jax_compilation_cache_dir:
+        return
+    folder = platformdirs.user_cache_path("probcal") / "kernels"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if not os.access(folder, os.W_OK):
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_compilation_cache_max_size", KEPT)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    compilation_cache.reset_cache()  # jax decides once per process, when it first compiles
 
 
 def maps() -> int:

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -17,6 +18,9 @@ class LazyPackage(ModuleType):
             value = getattr(import_module(self._homes[name]), name)
             setattr(self, name, value)
             return value
+        if name == "__version__":
+            with suppress(ImportError):  # a package that is not installed has none
+                return import_module("importlib.metadata").version(self.__name__)
         module = f"{self.__name__}.{name}"
         if not name.startswith("_"):
             try:

@@ -18,6 +18,7 @@ from probcal.sensor import Bias, Drift, Sensor, SensorType
 POSE_UNITS = {"position": "m", "heading": "rad", "pitch": "rad", "roll": "rad", "clock": "m", "time_offset": "s"}
 ANGLES = ("heading", "pitch", "roll")
 MOVING = ("velocity", "acceleration")  # what the path of a node says
+TURN = 2 * np.pi  # rad of a heading, pitch or roll above which degrees were meant
 Spread = float | Bias
 
 
@@ -112,6 +113,11 @@ class Node:
                     f'node "{name}": {component} must be a finite number, got {value!r}'
                     + ("" if component in own else f", or {len(stated)} of them, one an axis")
                 )
+            if component in ANGLES and abs(value) > TURN:
+                raise InputError(
+                    f'node "{name}": {component} is {value:g} rad, more than a turn; give radians, as in'
+                    f" np.deg2rad({value:g})"
+                )
         self.spread: dict[str, tuple[str, Bias]] = {}
         for kind, given in (("survey", survey), ("scale", scale)):
             entries: Mapping[str, Spread] = (
@@ -139,6 +145,11 @@ class Node:
         unit = POSE_UNITS.get(component)
         if component != "clock" and unit is not None and value.unit != unit:
             raise InputError(f'node "{self.name}": {kind} of {component} is in "{value.unit}"; give it in {unit}')
+        if component in ANGLES and value.scale > TURN / 2:
+            raise InputError(
+                f'node "{self.name}": {kind} of {component} is {value.scale:g} rad, more than half a turn;'
+                f" give radians, as in np.deg2rad({value.scale:g})"
+            )
         if value.nominal or value.shared:
             raise InputError(f'node "{self.name}": {component} takes no nominal or shared; state the value instead')
         self.spread[component] = (kind, value)

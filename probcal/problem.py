@@ -111,8 +111,6 @@ class Problem:
         fix: Mapping[str, float] | Iterable[str] = (),
         epoch: float | None = None,
     ):
-        if not isinstance(network, Network):
-            raise InputError(f"Problem: the network is {network!r}; give a Network of sensors, as in Network([...])")
         whole = measure(read_table(data), network)
         network = network.with_floors(whole.floors)
         self.network = network

@@ -16,10 +16,36 @@ from probcal.errors import InputError, nearest
 from probcal.fingerprint import computes
 from probcal.labels import AXES
 from probcal.noise import Bernoulli, Family, Heard, Level, Normal, check_level
-from probcal.types import PoseView, TargetView
+from probcal.types import PoseView, TargetView, untraceable
 
 VECTORS = ("position", "velocity", "acceleration", "moment")  # have one value an axis without being declared so
 PERIODS = {"rad": 2 * np.pi, "deg": 360.0}
+WORDS = {  # unit: words that stand for it where the symbol is asked for, in the singular
+    "m": ("meter", "metre"), "km": ("kilometer", "kilometre"), "cm": ("centimeter", "centimetre"),
+    "mm": ("millimeter", "millimetre"), "ft": ("foot", "feet"), "mi": ("mile",), "rad": ("radian",), "deg": ("degree",),
+    "s": ("second", "sec"), "ms": ("millisecond",), "min": ("minute",), "h": ("hour",), "Hz": ("hertz",),
+    "kHz": ("kilohertz",), "dB": ("decibel",), "dBm": (), "%": ("percent",),
+}  # fmt: skip
+
+
+def meant_unit(unit: str) -> str | None:
+    """The symbol of a unit that is written as a word or in other letters, None where it is none of `WORDS`."""
+    if unit in WORDS:
+        return None
+    word = unit.strip().lower()
+    for symbol, words in WORDS.items():
+        other = {symbol.lower()} if len(symbol) > 1 else set()
+        if {word, word.removesuffix("s")} & {*words, *other}:
+            return symbol
+    return None
+
+
+def _check_unit(kind: str, unit: Any) -> None:
+    """Raise `InputError` for a unit that is no text, or the word for one."""
+    if not isinstance(unit, str):
+        raise InputError(f'{kind}({unit!r}, ...): the first argument is the unit, a string such as "m"')
+    if meant := meant_unit(unit):
+        raise InputError(f'{kind}: the unit "{unit}" is not known; write "{meant}"')
 
 
 @dataclass(frozen=True)
@@ -85,8 +111,7 @@ class Bias:
     drift: Drift | None = None
 
     def __post_init__(self):
-        if not isinstance(self.unit, str):
-            raise InputError(f'Bias({self.unit!r}, ...): the first argument is the unit, a string such as "m"')
+        _check_unit("Bias", self.unit)
         if not (np.isfinite(self.scale) and self.scale > 0):
             raise InputError(
                 f"Bias({self.unit!r}, scale={self.scale}): the scale must be positive; to fix a bias use fix="
@@ -119,8 +144,7 @@ class Channel:
     compass: bool = False
 
     def __post_init__(self):
-        if not isinstance(self.unit, str):
-            raise InputError(f'Channel({self.unit!r}, ...): the first argument is the unit, a string such as "m"')
+        _check_unit("Channel", self.unit)
         if not hasattr(self.noise, "log_likelihood"):
             raise InputError(
                 f"Channel({self.unit!r}, noise={self.noise!r}): give a noise family such as StudentT(4), Mixture(), "
@@ -316,13 +340,9 @@ def _probe(
         target_asked |= target
         pose_asked |= pose
         dimensions.append(dimension)
-    if isinstance(failure, jax.errors.TracerArrayConversionError) and returned is None:
-        raise InputError(
-            f"sensor {function.__name__}: the function calls NumPy on its arguments, which jax cannot follow: write it"
-            " with jax.numpy, and norm, bearing and elevation of probcal.geometry"
-        ) from failure
     if failure is not None and returned is None:
-        raise InputError(f"sensor {function.__name__}: the function failed on a trial call: {failure}") from failure
+        reason = untraceable(failure) or f"the function failed on a trial call: {failure}"
+        raise InputError(f"sensor {function.__name__}: {reason}") from failure
     return returned, target_asked, pose_asked, dimensions
 
 
@@ -332,9 +352,27 @@ def sensor(
     """Declare a sensor type from a function `f(target, pose, *, bias=Bias(...))` that returns its channels.
 
     The function sees one target and a pose for each of its nodes, and returns a dict of scalars by channel name;
-    keyword-only arguments are its biases. `vectors` names the components of targets and poses that have one value an
-    axis (`vectors=("wind",)`), besides position, velocity, acceleration and moment, which always do; all others are
-    numbers. Raises `InputError` naming function and argument.
+    keyword-only arguments are its biases. It is traced by jax: write `jnp.` for `np.` and `math.`, and
+    `jnp.where(condition, a, b)` for `if`.
+
+    The target offers, in the common frame:
+
+    - `position`, `velocity`, `acceleration` (d,) in m, m/s, m/s^2, as far as its motion has them;
+    - each further component of the motion by its name, such as `power` of `RandomWalk("power", "dB", 1.0)`;
+    - `at(dt)`: the target dt seconds later, along velocity and acceleration.
+
+    A pose offers, with its biases added:
+
+    - `position`, `velocity` (d,), the velocity that of its `Path`, else 0;
+    - `heading` in rad from the x axis (east), counter-clockwise; in 3-D `pitch`, positive with the nose up, and
+      `roll`, positive with the left side up;
+    - `clock` in m, `time_offset` in s, and what the node states, such as `gain` of `Node(..., gain=0.0)`;
+    - `local(point)`: a point in the node's own axes, from the node: x ahead, y left, z up;
+    - `turn(vector)`: a vector in these axes.
+
+    `vectors` names the further components with one value per axis, as in `vectors=("wind",)`; position, velocity,
+    acceleration and moment need no name. `probcal.geometry` has `norm`, `bearing` and `elevation` with finite
+    gradients. Raises `InputError` naming function and argument.
 
     >>> from probcal.geometry import norm
     >>> @sensor(range=Channel("m", std=0.5))

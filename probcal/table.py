@@ -17,7 +17,7 @@ from probcal.errors import InputError, nearest
 from probcal.lazy import Later
 from probcal.network import Network
 from probcal.noise import Bernoulli, Censored, Heard
-from probcal.sensor import Channel
+from probcal.sensor import Channel, meant_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,7 +51,7 @@ class Table:
     word: str = "row"
 
     def where(self, row: int) -> str:
-        """Name of a row in complaints: the line of the file (the header is line 1), or the index of a frame."""
+        """Name of a row in complaints: line of the file (the header is line 1), label or position in the frame."""
         return f"{self.source} {self.word} {self.lines[row]}"
 
 
@@ -88,7 +88,10 @@ def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
     if isinstance(source, Table):
         return source
     if isinstance(source, pd.DataFrame):
-        return Table(source.reset_index(drop=True), "data", np.asarray(source.index))
+        frame = source.reset_index(drop=True)
+        if not source.index.is_unique:  # as of several frames joined: a label would name several rows
+            return Table(frame, "data", np.arange(len(frame)), "row at position")
+        return Table(frame, "data", np.asarray(source.index))
     if not isinstance(source, (str, PathLike)):
         raise InputError(f"data must be a path or a DataFrame, got {type(source).__name__}")
     path = Path(source)
@@ -209,7 +212,8 @@ def header(table: Table) -> tuple[list[str], dict[str, str | None]]:
         if name in units:
             raise InputError(f'{table.source} has the column "{name}" twice')
         if unit is not None and unit not in UNITS:
-            raise InputError(f'{table.source} column "{name}": unit "{unit}" is not known{nearest(unit, UNITS)}')
+            hint = nearest(meant_unit(unit) or unit, UNITS)
+            raise InputError(f'{table.source} column "{name}": unit "{unit}" is not known{hint}')
         names.append(name)
         units[name] = unit
     return names, units

@@ -1,28 +1,61 @@
 """The float64 guard of entry points, and the views that a sensor function reads."""
 
 import functools
+import linecache
+import traceback
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from probcal.errors import InputError, nearest
-from probcal.kernels import drop_if_many
+from probcal.errors import InputError, checked, nearest
+from probcal.kernels import drop_if_many, keep_kernels
+
+REMEDIES: dict[type[Exception], str] = {  # what jax raises where Python asks for the value of a traced number
+    jax.errors.TracerBoolConversionError: "write jnp.where(condition, a, b) for if, and, or, min and max",
+    jax.errors.NonConcreteBooleanIndexError: "write jnp.where(condition, a, b) for an index that is a condition",
+    jax.errors.TracerArrayConversionError: "write jnp. for np. (import jax.numpy as jnp)",
+    jax.errors.TracerIntegerConversionError: "write jnp.asarray(values)[index] for an index into a list",
+    jax.errors.ConcretizationTypeError: "leave out float() and int(), and write jnp. for math.",
+}
+LIBRARIES = ("probcal", "jax", "jaxlib", "numpy")  # packages whose lines are not the user's
 
 
 def float64[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """Run a public entry point in double precision without touching the global configuration of jax."""
+    """Run a public entry point in double precision, its arguments checked, its kernels kept between processes."""
+    run = checked(function)
 
     @functools.wraps(function)
     def entry(*args: P.args, **kwargs: P.kwargs) -> R:
+        keep_kernels()
         try:
             with jax.enable_x64(True):
-                return function(*args, **kwargs)
+                return run(*args, **kwargs)
+        except tuple(REMEDIES) as error:
+            if text := untraceable(error):
+                raise InputError(text) from error
+            raise
         finally:
             drop_if_many()
 
     return entry
+
+
+def untraceable(error: BaseException) -> str | None:
+    """The line of a user's file that jax cannot follow, with the remedy; None where no such line is to blame."""
+    remedy = next((text for kind, text in REMEDIES.items() if isinstance(error, kind)), None)
+    own = [
+        (frame.f_code.co_filename, line)
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if str(frame.f_globals.get("__name__")).partition(".")[0] not in LIBRARIES
+    ]
+    if remedy is None or not own:
+        return None
+    file, line = own[-1]
+    code = linecache.getline(file, line).strip()
+    return f'{Path(file).name} line {line}, "{code}", asks for a value that jax knows only when it runs; {remedy}'
 
 
 class View:

@@ -4,7 +4,6 @@ import os
 import shutil
 
 import committed
-import jax
 import numpy as np
 import pandas as pd
 import pytest
@@ -14,7 +13,6 @@ from matplotlib import image
 from terminal import call
 
 import probcal
-from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_model, load_problem, load_truth, prior_named
 from probcal.inference import METHODS
 from probcal.results.read import each_track
@@ -335,6 +333,11 @@ def test_a_fit_that_fails_to_be_written_leaves_nothing_behind(tmp_path, monkeypa
     assert not list(tmp_path.glob("*fit.nc*"))
 
 
+def test_the_recording_of_a_model_is_taken_where_none_is_given(model, rows):
+    model.write_text(model.read_text().replace("data=None", f"data={str(rows)!r}"))
+    assert load_problem(model, None)[1].measurements.table.source == "rows.csv"
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [
@@ -346,26 +349,6 @@ def test_options_of_samplers_are_checked(options, text, model, rows):
     code, _, err = call("fit", model, rows, *options)
     assert code == 2
     assert text in err
-
-
-def test_kernels_are_kept_in_the_cache_folder_of_the_user_unless_jax_has_one(tmp_path, monkeypatch):
-    cache = ("jax_compilation_cache_dir", "jax_compilation_cache_max_size")
-    least = ("jax_persistent_cache_min_compile_time_secs", "jax_persistent_cache_min_entry_size_bytes")
-    before = {name: getattr(jax.config, name) for name in (*cache, *least)}
-    assert before[cache[0]], "the tests share one"
-    keep_kernels()
-    assert jax.config.jax_compilation_cache_dir == before[cache[0]]
-    (tmp_path / "file").write_text("no folder")
-    try:
-        for home, kept in ((tmp_path / "cache", True), (tmp_path / "file", False)):
-            jax.config.update(cache[0], None)
-            monkeypatch.setenv("XDG_CACHE_HOME", str(home))
-            keep_kernels()
-            assert bool(jax.config.jax_compilation_cache_dir) == kept
-            assert (home / "probcal" / "kernels").is_dir() == kept
-    finally:
-        for name, value in before.items():
-            jax.config.update(name, value)
 
 
 def test_draws_of_states_and_replicas_are_saved_where_asked_for(fitted, tmp_path):

@@ -5,6 +5,8 @@ other error shares. Values that are filled in (`{name}`) are no part of the text
 """
 
 import ast
+import inspect
+import re
 from pathlib import Path as File
 
 import numpy as np
@@ -19,6 +21,7 @@ from probcal import (
     Bias,
     Channel,
     ConstantVelocity,
+    Detection,
     Gaussian,
     Horseshoe,
     InputError,
@@ -45,11 +48,13 @@ from probcal import (
 )
 from probcal.cli import commands
 from probcal.cli.models import load_model, load_truth
+from probcal.errors import GIVE, _classes
 from probcal.geometry import norm
 from probcal.inference.methods import choose_prior
 from probcal.motion import as_motion
+from probcal.network import ANGLES
 from probcal.simulate import truth_beside
-from probcal.types import TargetView
+from probcal.types import PoseView, TargetView
 
 ROOT = File(probcal.__file__).parent
 TESTS = File(__file__).parent
@@ -190,14 +195,18 @@ def points(*features):
 
 
 CASES = [
-    (lambda _: Problem([1], CV, None), "Problem: the network is [1]; give a Network of sensors, as in Network([...])"),
+    (lambda _: Problem([1], CV, None), "Problem: network is of type list; give a Network, as in Network([sensor_type.on("),
     (lambda _: choose_prior(MAP(), "gaussian"), "the prior is 'gaussian'; give a prior itself, such as Horseshoe() or"),
     (lambda _: as_motion(ConstantVelocity), "ConstantVelocity'> is not a motion; give ConstantVelocity(std)"),
-    (lambda _: sensor(a=Channel("m"))(lambda target, pose: {"a": np.linalg.norm(target.position)}), "the function calls NumPy on its arguments, which jax cannot follow"),
     (lambda _: sensor(a=Channel("m"))(lambda target, pose, o=Bias("m", 1.0): {"a": o}), 'argument "o" is a bias: write a * before the first bias'),
     # sensor
     (lambda _: Bias("m", 1.0, nominal=np.nan), "nominal=nan): the nominal value must be finite"),
     (lambda _: Bias("m", 1.0, shared="node"), 'shared=\'node\'): shared is None or "type"'),
+    (lambda _: Bias(5.0, 5.0), 'Bias(5.0, ...): the first argument is the unit, a string such as "m"'),
+    (lambda _: Channel("meter"), 'Channel: the unit "meter" is not known; write "m"'),
+    (lambda _: Bias("Degrees", 1.0), 'Bias: the unit "Degrees" is not known; write "deg"'),
+    (lambda _: node(heading=45.0), 'node "n": heading is 45 rad, more than a turn; give radians, as in np.deg2rad(45)'),
+    (lambda _: node(scale={"heading": 5}), "scale of heading is 5 rad, more than half a turn; give radians, as in"),
     (lambda _: Channel("m", wrap=True), "Channel('m', wrap=True): only angles in rad or deg wrap"),
     (lambda _: sensors.tdoa.on(node()), "tdoa uses 2 node(s), 1 given"),
     (lambda _: sensor(range=1.0), "sensor channel range=1.0: give Channel(unit, std=...)"),
@@ -271,7 +280,9 @@ CASES = [
      "is not a fit written by probcal: its group calibration is missing or incomplete"),
     # inference, command line
     (lambda _: fit(problem(), key=2**63), "key=9223372036854775808: a seed is a whole number below 2**63"),
-    (lambda _: fit(problem(), EA), "method must be a value such as EA() or MAP(), got <class"),
+    (lambda _: fit(problem(), EA), "fit: method is the class EA itself; give a method, such as EA() or MAP()"),
+    (lambda _: fit(problem(), start=np.zeros(3)), "fit: start is of type ndarray; give a Point, as probcal.starts."),
+    (lambda _: track(problem(), "out"), 'track: calibration is the text "out"; give the tree that fit(problem) or load('),
     (lambda _: fit(problem(), save=("tracks",)), 'which is no group of draws; give "states", "predictive" or both'),
     (lambda _: track(problem(), calibrated("other")), "; fit the same network, or fix that bias"),
     (lambda f: load_model(written(f, "model.txt", "")), "model.txt is not a Python file; a model file defines"),
@@ -321,6 +332,65 @@ def test_an_error_says_what_is_wrong_and_what_to_do(call, text, tmp_path):
     with pytest.raises(InputError) as caught:
         call(tmp_path)
     assert text in str(caught.value)
+
+
+VERBS = [
+    name
+    for name in probcal.__all__
+    if inspect.isfunction(verb := getattr(probcal, name))
+    and {*_classes(next(iter(inspect.signature(verb).parameters.values())).annotation)} & {*GIVE}
+]
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_a_verb_says_what_its_first_argument_must_be(name):
+    assert len(VERBS) > 20
+    with pytest.raises(InputError, match=rf"^{name}: \w+ is of type object; give "):
+        getattr(probcal, name)(object())
+
+
+def turns(target, pose):
+    if norm(target.position - pose.position) > 5.0:
+        return 1.0
+    return 0.0
+
+
+def numbers(target, pose):
+    return float(target.position[0])
+
+
+def arrays(target, pose):
+    return np.hypot(*target.position)
+
+
+@pytest.mark.parametrize(
+    ("function", "code", "remedy"),
+    [
+        (turns, "if norm(target.position - pose.position) > 5.0:", "write jnp.where(condition, a, b) for if"),
+        (numbers, "return float(target.position[0])", "leave out float() and int()"),
+        (arrays, "return np.hypot(*target.position)", "write jnp. for np."),
+    ],
+)
+def test_python_that_jax_cannot_follow_is_named_with_its_line(function, code, remedy):
+    """In a sensor where it is declared, in a field of view at the first verb, in a motion where it is compiled."""
+    line = inspect.getsourcelines(function)[1] + 1
+    where = rf'test_errors\.py line {line}, "{re.escape(code)}", asks for .*; {re.escape(remedy)}'
+
+    def read(target, pose):
+        return {"range": function(target, pose)}
+
+    with pytest.raises(InputError, match=f"^sensor read: {where}"):
+        gauge()(read)
+    seen = RANGER.on(node(), detection=Detection(0.9, view=function))
+    with pytest.raises(InputError, match=f"^{where}"):
+        simulate(Network([seen]), CV, [0.0, 1.0])
+
+
+def test_the_help_of_a_sensor_lists_what_target_and_pose_offer():
+    text = inspect.getdoc(sensor)
+    offered = {*PoseView.__dict__, *TargetView.__dict__} - {*object.__dict__, "__module__", "__firstlineno__"}
+    for name in ("position", "velocity", *ANGLES, "clock", *(name for name in offered if name[0] != "_")):
+        assert f"`{name}" in text
 
 
 def test_the_report_without_plot_packages_says_what_to_install(monkeypatch, tmp_path):

@@ -38,7 +38,7 @@ SHARED = tuple(
         "coordinates", "guides", "psis", "leaps", "sides", "mixed", "particle_em", "weighted",
     )
 )  # fmt: skip  # what they share: it knows none of them
-LOW = {"jax", "numpy", "filelock"}  # third parties of floor 0, besides the standard library
+LOW = {"jax", "numpy", "filelock", "platformdirs"}  # third parties of floor 0, besides the standard library
 FACTORISE = {
     "cho_factor", "cho_solve", "cholesky", "eigh", "eig", "eigvalsh", "inv", "lu", "lu_factor", "lu_solve",
     "lstsq", "matrix_rank", "pinv", "qr", "slogdet", "svd", "solve_triangular", "triangular_solve",

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import importlib.metadata
 import pkgutil
 import shutil
 import subprocess
@@ -95,6 +96,14 @@ def test_importing_the_package_loads_nothing_heavy():
         "print(loaded())\nimport jax\nprint(loaded())"
     )
     assert fresh(code) == ["nothing", "nothing", "jax.numpy numpy"]
+
+
+def test_the_version_is_that_of_the_installed_package():
+    version = importlib.metadata.version("probcal")
+    code = COMMANDS + "import probcal\nprint(probcal.__version__)\nsys.argv = ['probcal', '--version']\n"
+    assert fresh(code + "try:\n    main()\nfinally:\n    print(loaded())\n") == [
+        version, f"probcal {version}", "nothing",
+    ]  # fmt: skip
 
 
 def test_help_and_errors_of_options_load_nothing_heavy():

@@ -1,5 +1,10 @@
 """Kernels are shared by all that computes the same, and never fill the memory maps of a process."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,6 +118,69 @@ def test_a_function_that_computes_something_else_at_every_call_is_refused():
 
     with pytest.raises(InputError, match="computes something else at every call"):
         Network([restless.on(Node("a", (0.0, 0.0)))])
+
+
+SETTINGS = (
+    "jax_compilation_cache_dir", "jax_compilation_cache_max_size", "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+)  # fmt: skip
+
+
+def test_kernels_are_kept_in_the_cache_folder_of_the_user_unless_something_speaks_against_it(tmp_path, monkeypatch):
+    keep = kernels.keep_kernels.__wrapped__  # once per process otherwise
+    before = {name: getattr(jax.config, name) for name in SETTINGS}
+    assert before[SETTINGS[0]], "the tests share one"
+    keep()
+    assert {name: getattr(jax.config, name) for name in SETTINGS} == before
+    (tmp_path / "file").write_text("no folder")
+    try:
+        for home, off, kept in (("cache", "", True), ("file", "", False), ("off", "1", False)):
+            jax.config.update(SETTINGS[0], None)
+            monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / home))
+            monkeypatch.setenv("PROBCAL_NO_CACHE", off)
+            keep()
+            assert bool(jax.config.jax_compilation_cache_dir) == kept
+            assert (tmp_path / home / "probcal" / "kernels").is_dir() == kept
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+
+
+SESSION = """
+import jax
+hits = []
+jax.monitoring.register_event_listener(lambda event, **_: hits.append(event == "/jax/compilation_cache/cache_hits"))
+jax.jit(lambda x: x + 1)(1.0)  # jax decides on its cache when it first compiles
+import probcal
+print(jax.config.jax_compilation_cache_dir)
+network = probcal.Network([probcal.sensors.ranger.on(probcal.Node("mast", (0.0, 0.0)))])
+probcal.simulate(network, probcal.ConstantVelocity(1.0), [0.0, 1.0])
+print(sum(hits))
+"""
+
+
+@pytest.mark.ci
+def test_a_second_session_reads_the_kernels_of_the_first(tmp_path):
+    """Also where jax has compiled before the first verb; importing the package changes nothing."""
+    home = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "PROBCAL_"))}
+    folder = Path("probcal", "kernels")
+
+    def session(name, **changes):
+        environment = home | {"XDG_CACHE_HOME": str(tmp_path / name)} | changes
+        done = subprocess.run([sys.executable, "-c", SESSION], env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        at_import, hits = done.stdout.split()
+        assert at_import == changes.get("JAX_COMPILATION_CACHE_DIR", "None")
+        return int(hits)
+
+    assert session("kept") == 0
+    made = len(list((tmp_path / "kept" / folder).glob("*-cache")))
+    assert made > 10
+    assert session("kept") >= made
+    session("off", PROBCAL_NO_CACHE="1")
+    session("own", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "elsewhere"))
+    assert not (tmp_path / "off").exists()
+    assert not (tmp_path / "own").exists()
 
 
 def test_kernels_are_dropped_before_the_maps_run_out(monkeypatch):

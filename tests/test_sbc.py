@@ -493,7 +493,7 @@ def test_a_run_without_posterior_is_counted_apart(monkeypatch):
 
 def test_arguments_are_checked():
     problem = linear()
-    with pytest.raises(InputError, match="sbc: method must be a value such as NUTS"):
+    with pytest.raises(InputError, match='sbc: method is the text "nuts"; give a method'):
         sbc(problem, "nuts")
     with pytest.raises(InputError, match="give at least 2 runs and 10 draws"):
         sbc(problem, MAP(), runs=1)

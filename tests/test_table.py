@@ -203,6 +203,9 @@ def test_rows_are_named_by_the_line_of_the_file_and_by_the_index_of_a_frame(tmp_
     with pytest.raises(InputError, match=r"data row 80 column .range.: .x. is no number"):
         measure(read_table(frame), network())
     assert read_table(path).lines.tolist() == [2, 3]
+    joined = pd.concat([frame.head(1), frame.head(1), frame])  # labels 70, 70, 70, 80 name no row
+    with pytest.raises(InputError, match=r"data row at position 3 column .range.: .x. is no number"):
+        measure(read_table(joined), network())
 
 
 def test_rows_are_brought_to_common_epochs(tmp_path):

@@ -16,7 +16,7 @@ from probcal.analysis import pieces
 from probcal.analysis.compare import common_labels
 from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import RATE, limit_of
-from probcal.errors import InputError
+from probcal.errors import InputError, checked
 from probcal.labels import step_of
 from probcal.results.answer import HALF
 from probcal.results.schema import INTERVAL, matrix_of
@@ -45,6 +45,7 @@ class Likelihood(NamedTuple):
         return Likelihood(labels, information, h[at] - gain.T @ h[rest], self.inflation[at])
 
 
+@checked
 def changes(first: xr.DataTree, second: xr.DataTree, *, names: Sequence[str] = ("first", "second")) -> xr.DataTree:
     """What moved between two recordings of one network, second less first, with intervals.
 

@@ -12,7 +12,7 @@ from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.analysis.differences import findings
 from probcal.analysis.findings import Finding
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, checked, nearest
 from probcal.labels import label_parts
 from probcal.results.schema import EVIDENCES
 from probcal.status import INVALID
@@ -102,6 +102,7 @@ def plugged_in(tree: xr.DataTree) -> bool:
     return bool(tree.attrs["approximate"] == "Laplace")
 
 
+@checked
 def interchangeable(
     tree: xr.DataTree, *, count: int = 3, among: Sequence[str] | None = None
 ) -> list[tuple[str, str, float]]:

@@ -11,7 +11,6 @@ import xarray as xr
 from probcal.analysis import bound_map, next_anchors, next_passes, next_sensors, observability
 from probcal.analysis.standpoint import standpoint
 from probcal.cli.files import can_plot, say_written, write_csv
-from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem
 from probcal.cli.progress import line
 from probcal.errors import InputError
@@ -33,7 +32,6 @@ STATUS = {
 
 def run(model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, Any], outputs: Outputs | None) -> int:
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
-    keep_kernels()
     _, problem = load_problem(model, data, fix, given)
     if too_large(problem.model):
         return _check_many(problem, model, outputs)

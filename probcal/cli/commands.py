@@ -1,6 +1,7 @@
 """The commands, their options and the checks of these; nothing heavy is imported before they hold."""
 
 import sys
+from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,6 +50,20 @@ def main() -> None:
 
 def _say(text: object) -> None:
     print(f"probcal: {text}", file=sys.stderr)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"probcal {metadata.version('probcal')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options_of_all(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and end")
+    ] = False,
+) -> None: ...
 
 
 @app.command(name="fit")

@@ -1,9 +1,11 @@
 """`fit`: calibrate, print one row a bias and what the fit is worth, write fit.nc, summary.csv and report.html."""
 
+import importlib
 import sys
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -13,7 +15,6 @@ import numpy as np
 import xarray as xr
 
 from probcal.cli.files import can_plot, report_of, say_written, write_csv
-from probcal.cli.kernels import keep_kernels, load_ahead
 from probcal.cli.models import load_problem, load_truth, prior_named
 from probcal.cli.progress import line
 from probcal.errors import InputError
@@ -37,9 +38,8 @@ def run(
     model: Path, data: Path | None, *, outputs: Outputs | None, resume: bool, overwrite: bool, **options: Any
 ) -> int:  # fmt: skip
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
-    keep_kernels()
     drawn = ["probcal.report.page", "probcal.report.chart"] if outputs is not None and can_plot() else []
-    load_ahead(["scipy.stats", *drawn] if options["assessed"] else [])
+    _load_ahead(["scipy.stats", *drawn] if options["assessed"] else [])
     began = time.perf_counter()
     with line() as progress:
         tree = calibrated(
@@ -52,6 +52,17 @@ def run(
         if not can_plot():
             print('report.html is left out: pip install "probcal[plot]"')
     return 0 if Status(tree.attrs["status"]).settled else 1
+
+
+def _load_ahead(names: Sequence[str]) -> None:
+    """Import modules that are needed later while kernels compile; what fails to load fails where it is needed."""
+
+    def load() -> None:
+        for name in names:
+            with suppress(ImportError):
+                importlib.import_module(name)
+
+    threading.Thread(target=load, daemon=True).start()
 
 
 def calibrated(

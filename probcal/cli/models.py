@@ -5,7 +5,7 @@ import importlib.util
 import inspect
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -135,7 +135,7 @@ def load_problem(
         if taken is not None and name not in taken:
             known = nearest(name, taken) or f"; it takes {', '.join(taken) or 'the data alone'}"
             raise InputError(f"{model.name}: problem() has no argument {name}{known}")
-    problem = call(module, model, "problem", data, **given)
+    problem = call(module, model, "problem", *_recording(module, "problem", data), **given)
     from probcal.problem import Problem  # loaded by the model, if it is one
 
     if not isinstance(problem, Problem):
@@ -160,6 +160,15 @@ def arguments(module: ModuleType, name: str) -> list[str] | None:
     return [one.name for one in found[1:] if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
 
 
+def _recording(module: ModuleType, name: str, data: Path | None) -> tuple[Path | None, ...]:
+    """The first argument of a function of a model file; none where its own default holds."""
+    with suppress(AttributeError, TypeError, ValueError):
+        first = next(iter(inspect.signature(getattr(module, name)).parameters.values()), None)
+        if data is None and first is not None and first.default is not first.empty:
+            return ()
+    return (data,)
+
+
 def load_truth(
     module: ModuleType, model: Path, data: Path | None, problem: "Problem", given: Mapping[str, Any] | None = None
 ) -> "Truth | None":
@@ -175,7 +184,7 @@ def load_truth(
     if truth is None and hasattr(module, "truth"):
         taken = arguments(module, "truth")
         own = {name: value for name, value in (given or {}).items() if taken is None or name in taken}
-        truth = call(module, model, "truth", data, **own)
+        truth = call(module, model, "truth", *_recording(module, "truth", data), **own)
         if not isinstance(truth, Truth | None):
             raise InputError(f"{model.name}: truth() returned {type(truth).__name__}; return a probcal.Truth or None")
     if truth is not None:

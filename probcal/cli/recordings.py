@@ -14,7 +14,6 @@ import pandas as pd
 
 from probcal.cli import fit
 from probcal.cli.files import say_written, write_csv
-from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import ModelFile, check_here, digest_of_file
 from probcal.cli.outputs import FIT, results_of_a_run
 from probcal.cli.progress import bar
@@ -60,7 +59,6 @@ class Recordings:
 
     def __call__(self, recording: tuple[Path, str]) -> list[dict[str, Any]]:
         """Fit a recording, its path and digest."""
-        keep_kernels()
         data, digest = recording
         check_here(data, digest)
         folder, store = self.out / data.stem, self.out / data.stem / "draws"
@@ -95,7 +93,6 @@ def run(
 ) -> int:  # fmt: skip
     """Fit several recordings, one after the other or spread over a cluster, and write one table of all."""
     check_scheduler(scheduler)
-    keep_kernels()
     began = time.perf_counter()
     work = Recordings(ModelFile.of(model), outputs.folder.resolve(), options, resume, overwrite)
     files = [(path.resolve(), digest_of_file(path)) for path in recordings]

@@ -9,7 +9,6 @@ import pandas as pd
 import xarray as xr
 
 from probcal.cli.files import can_plot, say_written, write_csv
-from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem, prior_named
 from probcal.cli.progress import bar
 from probcal.files import Outputs
@@ -27,7 +26,6 @@ def run(
     resume: bool, overwrite: bool, scheduler: str | None = None,
 ) -> int:  # fmt: skip
     """Check a method on a model by simulation: do its intervals hold the truth as often as they say?"""
-    keep_kernels()
     value, implied = METHODS[method]
     value = value if full else short(value)
     module, problem = load_problem(model, data, fix, given)

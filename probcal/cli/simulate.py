@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import call, load_model
 from probcal.errors import InputError
 from probcal.files import Outputs
@@ -11,7 +10,6 @@ from probcal.simulate import Simulation
 
 def run(model: Path, seed: int, outputs: Outputs) -> int:
     """Simulate a model's scenario: the table, and beside it its true tracks and biases."""
-    keep_kernels()
     module = load_model(model)
     simulation = call(module, model, "scenario", seed)
     if not isinstance(simulation, Simulation):

@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 
 from probcal.cli.files import can_plot, say_written, write_csv
-from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import ModelFile
 from probcal.cli.progress import bar
 from probcal.diagnostics import grid_of, study_table
@@ -29,7 +28,6 @@ def run(
     outputs: Outputs | None, resume: bool, overwrite: bool, scheduler: str | None = None,
 ) -> int:  # fmt: skip
     """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
-    keep_kernels()
     chosen = choose_methods(methods)
     setting = ModelFile.of(model).setting
     began = time.perf_counter()

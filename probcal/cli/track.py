@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from probcal.cli.files import write_csv
-from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem, load_truth
 from probcal.errors import InputError
 from probcal.files import Outputs
@@ -27,7 +26,6 @@ def run(model: Path, data: Path | None, given: Mapping[str, Any], calibration: P
         raise InputError(
             f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first"
         )
-    keep_kernels()
     module, problem = load_problem(model, data, (), given)
     truth = load_truth(module, model, data, problem, given)
     tree = track(problem, known, smoother=Particles(particles) if smoother == "particles" else None, key=seed)

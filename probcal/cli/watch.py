@@ -18,7 +18,6 @@ from rich.live import Live
 from rich.table import Table as Shown
 
 from probcal.cli.files import can_plot
-from probcal.cli.kernels import keep_kernels
 from probcal.cli.models import load_problem
 from probcal.errors import InputError
 from probcal.files import Outputs, write_whole
@@ -115,7 +114,6 @@ def run(
     outputs: Outputs | None, every: float, kept: Sequence[str],
 ) -> int:  # fmt: skip
     """Filter the rows of a file, or of standard input, until they end or the process is told to end."""
-    keep_kernels()
     known = None if calibration is None else load(calibration)
     if known is not None and known.attrs.get("status") in INVALID:
         raise InputError(

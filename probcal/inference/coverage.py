@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from probcal.errors import checked
 from probcal.inference.uniformity import p_value, shape, share, spread_p_value
 
 ALARM = 0.01  # probability of a false alarm, over all quantities together
@@ -58,6 +59,7 @@ def coverage(group: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(values, coords={"nominal": group["nominal"].values})
 
 
+@checked
 def coverage_table(tree: xr.DataTree) -> pd.DataFrame:
     """Coverage of the central intervals of the biases by `nominal` probability, each with its Monte Carlo error.
 

@@ -107,8 +107,6 @@ def calibrate(
 ) -> tuple[xr.DataTree, Answer]:  # fmt: skip
     """The tree of `fit`, and the answer behind it, which `assess` takes so that it need not be found again."""
     method = EA() if method is None else method
-    if not isinstance(method, Method):
-        raise InputError(f"method must be a value such as EA() or MAP(), got {method!r}")
     prior = choose_prior(method, prior)
     check_problem(problem, linear=not method.by_particles)
     if problem.scans is not None:

@@ -88,8 +88,6 @@ def sbc(
     Raises `InputError` for a prior that cannot be drawn from and a folder that holds another run, and `FitError` where
     no run left a posterior, or a cluster is lost on the way.
     """
-    if not isinstance(method, Method):
-        raise InputError(f"sbc: method must be a value such as NUTS() or EA(), got {method!r}")
     if runs < 2 or draws < 10:
         raise InputError(f"sbc(runs={runs}, draws={draws}): give at least 2 runs and 10 draws")
     if start not in STARTS:

@@ -25,6 +25,7 @@ from uuid import uuid4
 import jax
 
 from probcal.errors import FitError, InputError
+from probcal.kernels import keep_kernels
 from probcal.lazy import Later
 
 if TYPE_CHECKING:
@@ -211,6 +212,7 @@ class _Here(NamedTuple):
 
 
 def _here() -> _Here:
+    keep_kernels()
     return _Here({name: version(name) for name in PACKAGES}, {name: getattr(jax.config, name) for name in KERNELS})
 
 

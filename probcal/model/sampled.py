@@ -19,6 +19,7 @@ from probcal.errors import InputError
 from probcal.fingerprint import computes
 from probcal.motion import Joint, Layout, Motion
 from probcal.motion.layout import check_once, layout_of
+from probcal.types import untraceable
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +136,8 @@ def sampled_of(motion: Motion, dimension: int, levels: Mapping[str, int], values
             )
             shown = jax.eval_shape(other.view, state)
         except Exception as error:  # whatever a user's motion raises is reported with its name
-            raise InputError(f"motion {name}: the motion failed on a trial call: {error}") from error
+            reason = untraceable(error) or f"the motion failed on a trial call: {error}"
+            raise InputError(f"motion {name}: {reason}") from error
         forms = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype.kind), found) for found in (state, after)]
         if forms[0] != forms[1]:
             raise InputError(
@@ -176,4 +178,5 @@ def _begin(motion: Motion) -> Any:
     try:
         return jax.eval_shape(lambda: motion.initial(jax.random.key(0)))
     except Exception as error:  # as above
-        raise InputError(f"motion {type(motion).__name__}: initial failed on a trial call: {error}") from error
+        reason = untraceable(error) or f"initial failed on a trial call: {error}"
+        raise InputError(f"motion {type(motion).__name__}: {reason}") from error

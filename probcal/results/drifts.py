@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from probcal.errors import checked
 from probcal.labels import step_of
 from probcal.results.blocks import covariance_of
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+@checked
 def drift_table(tree: xr.DataTree) -> pd.DataFrame:
     """Values of the drifting biases of a fit, one row a piece: bias, unit, since (s), mean, sd, lower, upper.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probcal.errors import InputError
+from probcal.errors import InputError, checked
 from probcal.files import write_whole
 from probcal.lazy import Later
 from probcal.results.accessor import register
@@ -24,6 +24,7 @@ SMALL = 1024  # bytes up to which an array of a file has no chunk of its own
 SEAL = b"probcal sha256:"  # behind the content of a file, before its digest
 
 
+@checked
 def save(tree: xr.DataTree, path: str | PathLike[str]) -> Path:
     """Write netCDF in one step, compressed and with checksums: a file of that name is whole or absent.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probcal.errors import InputError
+from probcal.errors import InputError, checked
 from probcal.results.blocks import SensorBlocks, covariance_of
 from probcal.results.schema import MORE, SUMMARY
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from probcal.problem import Problem
 
 
+@checked
 def summary(tree: xr.DataTree) -> Any:
     """One row a bias as a DataFrame: bias, unit, scale, mean, sd, lower, upper, gamma, precision, status.
 
@@ -66,6 +67,7 @@ def each_object(tree: xr.DataTree, axes: Sequence[str]) -> Iterator[tuple[str, n
                 yield str(name), own["time"].to_numpy(), own[columns].to_numpy(float), own["existence"].to_numpy()
 
 
+@checked
 def tracks(tree: xr.DataTree) -> pd.DataFrame:
     """Tracks as a table, one row an epoch of a target: time (s), target, each state component and its sd.
 
@@ -94,6 +96,7 @@ def saved_states(problem: Problem, tracked: Mapping[str, xr.Dataset]) -> list[np
     ]
 
 
+@checked
 def outliers(tree: xr.DataTree, *, below: float = 0.5) -> pd.DataFrame:
     """Data that count less than `below` (heavy-tailed noise), the least first: row, time, sensor, residual, weight.
 

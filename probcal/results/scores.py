@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from probcal.errors import checked
 from probcal.labels import AXES
 from probcal.lazy import Later
 from probcal.results.alignment import Alignment
@@ -56,6 +57,7 @@ def _met(tree: xr.DataTree, truth: Truth) -> list[np.ndarray]:
     return [np.concatenate([part[k] for part in pairs]) for k in range(3)]
 
 
+@checked
 def scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> dict[str, float]:
     """Scores by name: position RMSE before and after, normalised bias RMSE and coverage of the intervals.
 
@@ -81,6 +83,7 @@ def scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> dict
     return found
 
 
+@checked
 def add_scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> xr.DataTree:
     """Add what a truth says of a fit: `scores` as attributes, true biases (group `truth`), true tracks (`true`).
 
