@@ -1,9 +1,10 @@
-"""The labels of biases and what they are made of; text only."""
+"""The labels of biases and what they are made of, and other names that stand in results; text only."""
 
 from collections.abc import Collection
 
 AXES = ("x", "y", "z")
 SCENE, PIECE, NODE, START = "scene", "piece", "node", "start"  # what an answer beside another differs by
+NOBODY = "no target"  # the target of rows that name none and whose sensor reads none
 
 
 def label_parts(label: str) -> tuple[str, str]:

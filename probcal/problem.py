@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from probcal.errors import InputError, nearest
+from probcal.labels import NOBODY
 from probcal.model.epochs import Epoch, merged
 from probcal.model.model import TILTED, Mixing, Model, Recursion, Tail, Tilt, at_rest
 from probcal.model.motions import (
@@ -33,13 +34,13 @@ from probcal.model.motions import (
 from probcal.model.rows import Block, Rows, addresses, make_block, pose_entries, pose_vector
 from probcal.model.sampled import SampledMotion
 from probcal.model.variants import aligned
-from probcal.motion import Layout, LinearMotion, Static, Target, White, as_motion, labels_of
+from probcal.motion import Known, Layout, LinearMotion, Static, Target, White, as_motion, labels_of
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, guess_of
 from probcal.plausible import check_plausible
 from probcal.scans import Scans, assigned_rows, scans_of
 from probcal.sensor import Sensor
-from probcal.table import OBJECT, Measurements, Table, header, measure, read_table, unit_factor
+from probcal.table import LARGEST, OBJECT, Measurements, Table, header, measure, read_table, unit_factor
 from probcal.types import float64
 
 if TYPE_CHECKING:
@@ -96,6 +97,10 @@ class Problem:
     (where a target moves at v it is off by up to v epoch / 2). `silent` names the sensors without rows: `fit`
     refuses them, `track` does not. Raises `InputError` naming what is wrong.
 
+    A row whose sensor reads no target, such as a distance between two nodes, need not name one: its cell is blank, or
+    the column is left out. Where no row has a target the motion is None or left out, `Problem(network, data=table)`.
+    Inside, such rows share a target that is known for ever at the centre of the nodes; no track is reported of it.
+
     >>> free = Problem(network, motion, run.table, fix="sonar_0.*")
     >>> free.model.biases, problem.model.biases
     (8, 12)
@@ -105,8 +110,8 @@ class Problem:
     def __init__(
         self,
         network: Network,
-        motion: Any,
-        data: str | PathLike[str] | pd.DataFrame | Table,
+        motion: Any = None,
+        data: str | PathLike[str] | pd.DataFrame | Table | None = None,
         *,
         fix: Mapping[str, float] | Iterable[str] = (),
         epoch: float | None = None,
@@ -135,6 +140,11 @@ class Problem:
     def labels(self) -> tuple[str, ...]:
         """Labels of the free biases, in the order of every bias array."""
         return tuple(bias.label for bias in self.biases)
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the targets; none where no row has one."""
+        return tuple(name for name in self.measurements.target_names if name != NOBODY)
 
     @property
     def members(self) -> list[dict[str, str]]:
@@ -217,7 +227,7 @@ class Problem:
     @property
     def node_positions(self) -> np.ndarray:
         """Stated positions of all nodes (a path's points for a moving one), shape (points, d)."""
-        return np.concatenate([n.position[None] if n.path is None else n.path.position for n in self.network.nodes])
+        return positions_of(self.network)
 
     def rebuild(self, data: Any = None, **changes: Any) -> Problem:
         """The same problem with other data or fixed biases."""
@@ -279,7 +289,7 @@ class Problem:
 
     def target(self, name: str) -> Target:
         """Motion and start of a target by name."""
-        return declared_target(self.motion, name)
+        return declared_target(self.motion, name, self.network)
 
     def with_tilt(self, tilt: Tilt) -> Problem:
         """The same problem with a term of the log-likelihood of its biases beside that of the rows."""
@@ -581,8 +591,21 @@ def _tails(drives: list[tuple[Any, int]], epochs: int) -> tuple[Tail, ...]:
     return tuple(Tail(*own) for own in found)
 
 
-def declared_target(motion: Any, name: str) -> Target:
+def positions_of(network: Network) -> np.ndarray:
+    """Stated positions of all nodes (the points of its path for a moving one), shape (points, d)."""
+    return np.concatenate([n.position[None] if n.path is None else n.path.position for n in network.nodes])
+
+
+def declared_target(motion: Any, name: str, network: Network) -> Target:
     """Motion and start of a target, of one motion for all or of a mapping by name; raises `InputError`."""
+    if name == NOBODY:
+        centre = positions_of(network).mean(0)
+        return Target(Known(([-LARGEST, LARGEST], [centre, centre])))
+    if motion is None:
+        raise InputError(
+            f'target "{name}" has no motion; give one, such as ConstantVelocity(std) or Static(). Rows of sensors that'
+            ' read no target need none: leave their column "target" blank'
+        )
     if isinstance(motion, Mapping):
         if name not in motion:
             raise InputError(f'target "{name}" has no motion{nearest(name, motion)}')

@@ -222,6 +222,11 @@ class SensorType:
     def __hash__(self) -> int:
         return hash(self.fingerprint)
 
+    @property
+    def reads_target(self) -> bool:
+        """Whether the function reads its target; the distance between two nodes, for one, does not."""
+        return bool(self.target_components)
+
     def on(self, *nodes: Any, name: str | None = None, detection: Detection | None = None) -> "Sensor":
         """Place a sensor of this type on its node(s); the name defaults to that of the node(s).
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.files import write_whole
-from probcal.labels import AXES
+from probcal.labels import AXES, NOBODY
 from probcal.lazy import Later
 from probcal.model import rows
 from probcal.model.sampled import path
@@ -251,6 +251,7 @@ def simulate(
     ]
     track = pd.concat(parts, ignore_index=True)
     track = track[["time", "target", *(c for c in track.columns if c not in ("time", "target"))]]
+    track = track[track["target"] != NOBODY].reset_index(drop=True)
     values = dict(zip(problem.labels, (z * problem.scales).tolist(), strict=True))
     return Simulation(table, Truth(track, values))
 

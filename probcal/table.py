@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probcal.errors import InputError, nearest
+from probcal.labels import NOBODY
 from probcal.lazy import Later
 from probcal.network import Network
 from probcal.noise import Bernoulli, Censored, Heard
@@ -37,7 +38,7 @@ UNITS = {
 }  # fmt: skip
 BLANK = ("", "nan", "NaN", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None", "-nan")  # cells without a number
 LARGEST = 1e100  # of a cell: what is computed from it, squares included, stays finite
-OBJECT = "object"  # the target of rows that name none
+OBJECT = "object"  # the target of detections that name none
 NAMES = ("sensor", "target", "node", "name")  # columns whose cells are read as text: 01 stays 01, NA is a name
 
 
@@ -169,7 +170,8 @@ def measure(table: Table, network: Network) -> Measurements:
     sensor = _sensors(table, frame["sensor"], network)
     time = _times(table, frame["time"], units["time"])
     detecting = np.array([placed.detection is not None for placed in network.sensors])[sensor]
-    target_names, target, unnamed = _targets(table, frame.get("target"), detecting)
+    reading = np.array([placed.type.reads_target for placed in network.sensors])[sensor]
+    target_names, target, unnamed = _targets(table, frame.get("target"), detecting, reading)
     weight = _weights(table, frame["weight"] if "weight" in names and "weight" not in channels else None)
     shape = (len(frame), len(channels))
     value, std = np.zeros(shape), np.zeros(shape)
@@ -323,30 +325,34 @@ def _sensors(table: Table, column: pd.Series, network: Network) -> np.ndarray:
 
 
 def _targets(
-    table: Table, column: pd.Series | None, detecting: np.ndarray
+    table: Table, column: pd.Series | None, detecting: np.ndarray, reading: np.ndarray
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Names of the targets, number of that of each row (N,), and which rows (N,) are detections that name none.
 
-    Detections have the target `OBJECT`, which stands for every object.
+    Detections have the target `OBJECT`, which stands for every object. Rows that name none and whose sensors are not
+    `reading` any (N,) have the target `NOBODY`.
     """
+    unnamed = np.where(detecting, OBJECT, np.where(reading, "target", NOBODY))
     if column is None:
-        text, unnamed = pd.Series(np.where(detecting, OBJECT, "target"), dtype=object), detecting
+        text, blank = pd.Series(unnamed, dtype=object), np.ones(len(reading), bool)
     else:
         text = pd.Series(names_as_text(column), dtype=object)
         blank = column.isna().to_numpy() | (text == "").to_numpy()
-        wrong = np.flatnonzero(blank & ~detecting)
+        wrong = np.flatnonzero(blank & ~detecting & reading)
         if len(wrong):
             raise InputError(
                 f'{table.where(wrong[0])} column "target" is blank; name the target or drop the column, or place the'
                 " sensor with detection=Detection(...)"
             )
-        unnamed = blank
         same = np.flatnonzero((text == OBJECT).to_numpy())
-        if blank.any() and len(same):
+        if (blank & detecting).any() and len(same):
             raise InputError(f'{table.where(same[0])}: "{OBJECT}" stands for the detections; rename the target')
-        text[blank] = OBJECT
+        same = np.flatnonzero((text == NOBODY).to_numpy() & reading)
+        if len(same):
+            raise InputError(f'{table.where(same[0])}: "{NOBODY}" stands for rows without a target; name the target')
+        text[blank] = unnamed[blank]
     codes, names = pd.factorize(text)
-    return tuple(names), codes, unnamed
+    return tuple(names), codes, blank & detecting
 
 
 def _weights(table: Table, column: pd.Series | None) -> np.ndarray:

@@ -16,7 +16,7 @@ from probcal.files import write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place
 from probcal.labels import AXES
 from probcal.lazy import Later
-from probcal.results.read import each_track
+from probcal.results.read import each_target
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -257,7 +257,7 @@ def _ellipse(centre: np.ndarray, covariance: np.ndarray, deviations: float) -> n
 def _track_features(tree: xr.DataTree, frame: LocalFrame, start: Any) -> list[dict[str, Any]]:
     zero = 0 if start is None else instant(start, "start")
     features = []
-    for target, group in each_track(tree):
+    for target, group in each_target(tree):
         components = [str(c) for c in group["component"].values]
         axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in components]
         position = group["mean"].sel(component=axes).values

@@ -32,7 +32,7 @@ from probcal.identifiability.remedies import WEAK
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.groups import bias_coords, node_of
-from probcal.results.read import each_track
+from probcal.results.read import each_target
 from probcal.simulate import Key, Truth, as_key
 from probcal.status import INVALID, Status
 from probcal.types import float64
@@ -347,10 +347,10 @@ def _score(
     fit: Fitted, tree: xr.DataTree, drawn: predictive.FitDraws, truth: Truth, groups: dict[str, xr.Dataset]
 ) -> None:
     """Add NEES of positions by epoch to `epoch_check`, and those of all positions and biases to its attributes."""
-    tracked = dict(each_track(tree))
+    tracked = dict(each_target(tree))
     truth.check_targets(tracked)
     for r, epochs in enumerate(fit.problem.epochs):
-        for target in dict.fromkeys(np.asarray(epochs.target, str).tolist()):
+        for target in (name for name in tracked if name in epochs.target):
             states = np.asarray(drawn.states[r])[:, epochs.target == target]
             found = nees.of_positions(target, tracked[target], states, truth, RATE)
             if found is not None:

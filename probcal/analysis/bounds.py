@@ -16,9 +16,10 @@ import xarray as xr
 
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
 from probcal.errors import InputError, nearest
+from probcal.labels import NOBODY
 from probcal.model.model import At, Model
 from probcal.problem import Problem
-from probcal.results.groups import bias_coords, by_target
+from probcal.results.groups import bias_coords, by_target, node_of
 from probcal.simulate import Key, Truth, as_key
 from probcal.smoothing import cholesky
 from probcal.smoothing.joint import JointPrecision, too_large
@@ -176,7 +177,7 @@ def _tree(
     place = [np.sqrt(v[:, slice(*epochs.position)].sum(1)) for epochs, v in zip(problem.epochs, variances, strict=True)]
     spread = (("time", "component"), [np.sqrt(v) for v in variances])
     tracks = by_target(problem, {"sd": spread, "position_rmse": (("time",), place)})
-    groups = {"bias": bias, **{f"track/{name}": group for name, group in tracks.items()}}
+    groups = {"bias": bias, **{f"track/{name}": group for name, group in tracks.items() if name != node_of(NOBODY)}}
     message = _message(labels, bounded, sd > problem.scales[bounded])
     if covariance is None and not cholesky.exact():
         message += f" Variances are estimated from {cholesky.PROBES} draws; install probcal[sparse] for exact ones."

@@ -12,7 +12,7 @@ import xarray as xr
 
 from probcal import linalg
 from probcal.errors import InputError, nearest
-from probcal.labels import AXES
+from probcal.labels import AXES, NOBODY
 from probcal.model.model import At, Model
 from probcal.problem import Problem, check_linear
 from probcal.results.read import apply
@@ -118,7 +118,9 @@ def _nodes(at: Problem, z: np.ndarray) -> np.ndarray:
 def snapshot(problem: Problem, target: str | None = None, time: float | None = None) -> Problem:
     """The problem of one instant, the first of the table by default: every placed sensor sees one target once."""
     names, motion = problem.measurements.target_names, problem.motion
-    name = names[0] if target is None else str(target)
+    name = next(iter(problem.targets), NOBODY) if target is None else str(target)
+    if name == NOBODY:
+        raise InputError("no row has a target, so there is no position to map: name a target and give its motion")
     if name not in (motion if isinstance(motion, Mapping) else names):
         raise InputError(f'there is no target "{name}"{nearest(name, names)}')
     instant = float(problem.measurements.time.min() if time is None else time)

@@ -16,7 +16,7 @@ from probcal.analysis.additions import Informed, gains_of_passes, gains_of_senso
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
 from probcal.identifiability.remedies import WEAK
-from probcal.labels import AXES
+from probcal.labels import AXES, NOBODY
 from probcal.model import variants
 from probcal.model.model import Model
 from probcal.network import Network, Node
@@ -288,7 +288,10 @@ def _levels(problem: Problem, other: Problem, point: Point) -> jax.Array:
 def _pattern(problem: Problem) -> tuple[str, Problem]:
     """The target with most rows, and the problem of its first epochs alone."""
     data = problem.measurements
-    counts = np.bincount(data.target, minlength=len(data.target_names))
+    seen = data.target[np.array(data.target_names)[data.target] != NOBODY]
+    if not len(seen):
+        raise InputError("next_passes: no row has a target; next_anchors and next_sensors tell what else would help")
+    counts = np.bincount(seen, minlength=len(data.target_names))
     mine = data.target == int(counts.argmax())
     times = np.unique(data.time[mine])
     kept = np.flatnonzero(mine & (data.time <= times[min(LONGEST, len(times)) - 1]))
@@ -377,7 +380,8 @@ def _with_sensor(problem: Problem, kind: SensorType) -> tuple[Problem, tuple[jax
     placed = kind.on(node, *like.nodes[1:], name=name)
     frame = data.table.frame
     columns = dict(zip(header(data.table)[0], frame.columns, strict=True))
-    seen = frame.drop_duplicates([columns[c] for c in ("time", "target") if c in columns])
+    there = kind.reads_target & (np.array(data.target_names)[data.target] == NOBODY)
+    seen = frame[~there].drop_duplicates([columns[c] for c in ("time", "target") if c in columns])
     units, typical = header(data.table)[1], typical_values(problem, kind)
     own = {
         columns[c]: typical[c] / unit_factor(data.table, c, units[c], channel.unit)

@@ -68,27 +68,31 @@ def _check_many(problem: Problem, model: Path, outputs: Outputs | None) -> int:
     return 1 if tree.attrs["status"] == "open" else 0
 
 
-def _planned(problem: Problem, start: Point) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
-    """What another pass, a survey and a further sensor would tell."""
-    return (
-        next_passes(problem, point=start), next_anchors(problem, point=start), next_sensors(problem, point=start)
-    )  # fmt: skip
+def _planned(problem: Problem, start: Point) -> tuple[xr.Dataset | None, xr.Dataset, xr.Dataset]:
+    """What another pass, a survey and a further sensor would tell; no pass where no row has a target."""
+    passes = next_passes(problem, point=start) if problem.targets else None
+    return passes, next_anchors(problem, point=start), next_sensors(problem, point=start)
 
 
-def _print_plans(plans: tuple[xr.Dataset, xr.Dataset, xr.Dataset]) -> None:
+def _print_plans(plans: tuple[xr.Dataset | None, xr.Dataset, xr.Dataset]) -> None:
     """What to measure next; of many biases without how many directions would be left."""
     passes, anchors, sensors_ = plans
-    counted = "weak" in passes
-    left = [f" ({plan['weak'].values[0]})" if counted else "" for plan in (passes, anchors)]
-    before = f"weak directions now: {passes.attrs['weak_before']}. " if counted else ""
+    counted = "weak" in anchors
+    before = f"weak directions now: {anchors.attrs['weak_before']}. " if counted else ""
     print(f"{before}What would tell most (nats{'; weak directions left' if counted else ''}):")
-    path = passes["path"].values[0]
-    ends = " to ".join("(" + ", ".join(f"{v:.4g}" for v in place) + ")" for place in path[[0, -1]][: len(path)])
-    what = "another pass" if len(path) > 1 else "another target"
-    print(f"  {what}, {ends} m: {passes['gain'].values[0]:.2f}{left[0]}")
-    print(f"  {_survey_text(anchors)}{left[1]}")
+    if passes is not None:
+        path = passes["path"].values[0]
+        ends = " to ".join("(" + ", ".join(f"{v:.4g}" for v in place) + ")" for place in path[[0, -1]][: len(path)])
+        what = "another pass" if len(path) > 1 else "another target"
+        print(f"  {what}, {ends} m: {passes['gain'].values[0]:.2f}{_left(passes)}")
+    print(f"  {_survey_text(anchors)}{_left(anchors)}")
     place = ", ".join(f"{v:.4g}" for v in sensors_["place"].values[0])
     print(f"  one more {sensors_['type'].values[0]} at ({place}) m: {sensors_['gain'].values[0]:.2f}")
+
+
+def _left(plan: xr.Dataset) -> str:
+    """Weak directions left by the best of a plan, in brackets, where they were counted."""
+    return f" ({plan['weak'].values[0]})" if "weak" in plan else ""
 
 
 def _survey_text(anchors: xr.Dataset) -> str:
@@ -102,7 +106,7 @@ def _print_known(problem: Problem, tree: xr.DataTree) -> None:
     """Data, biases (of many those that the data tell least of), sensors, targets and what is open."""
     data = problem.measurements
     print(
-        f"{data.table.source}: {len(data.time)} rows of {len(set(data.sensor))} sensors, {len(data.target_names)} "
+        f"{data.table.source}: {len(data.time)} rows of {len(set(data.sensor))} sensors, {len(problem.targets)} "
         f"target(s), {sum(len(e.time) for e in problem.epochs)} epochs over {np.ptp(data.time):g} s"
     )
     for name in problem.silent:
@@ -162,9 +166,9 @@ def _write_tables(tree: xr.DataTree, out: Path) -> list[Path]:
     return files
 
 
-def _write(problem: Problem, tree: xr.DataTree, passes: xr.Dataset, out: Path) -> None:
+def _write(problem: Problem, tree: xr.DataTree, passes: xr.Dataset | None, out: Path) -> None:
     files = _write_tables(tree, out)
-    if can_plot():
+    if passes is not None and can_plot():
         from probcal.plots import draw_check  # the plot packages are an extra
 
         files.append(out / "check.png")

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probcal.labels import AXES, label_parts
+from probcal.labels import AXES, NOBODY, label_parts
 from probcal.problem import Problem
 from probcal.smoothing.mode import Point
 
@@ -104,7 +104,7 @@ def cause(problem: Problem, point: Point) -> str:
     lines = []
     for epochs, states in zip(problem.epochs, point.states, strict=True):
         places = np.asarray(states)[:, slice(*epochs.position)]
-        for name in dict.fromkeys(epochs.target):
+        for name in dict.fromkeys(epochs.target[epochs.target != NOBODY]):
             path = places[epochs.target == name]
             if len(path) < 3:
                 return ""
@@ -112,6 +112,6 @@ def cause(problem: Problem, point: Point) -> str:
             if sizes[1] > STRAIGHT * sizes[0]:
                 return ""
             lines.append(along[0])
-    if np.abs(np.array(lines) @ lines[0]).min() < 1 - STRAIGHT:
+    if not lines or np.abs(np.array(lines) @ lines[0]).min() < 1 - STRAIGHT:
         return ""
     return ": the target passed on one line" if len(lines) == 1 else ": the targets passed along parallel lines"

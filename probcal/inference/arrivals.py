@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.labels import AXES
+from probcal.labels import AXES, NOBODY
 from probcal.lazy import Later
 from probcal.model.epochs import Epoch, merged
 from probcal.model.motions import Area, linear_of, start_of
@@ -19,7 +19,7 @@ from probcal.network import Network
 from probcal.noise import Normal
 from probcal.problem import Problem, check_linear, declared_target
 from probcal.smoothing.grid import candidates
-from probcal.table import Table, header, measure, names_as_text
+from probcal.table import Table, header, measure, name_as_text, names_as_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -92,7 +92,9 @@ class Arrivals:
                 raise InputError(f'{table.source} has no column "{column}"; a stream needs time and sensor')
         frame = self._in_seconds(table, names, units)
         frame["sensor"] = names_as_text(frame["sensor"])
+        blind = frame["sensor"].isin([name_as_text(s.name) for s in self.network.sensors if not s.type.reads_target])
         if "target" in frame:
+            frame["target"] = frame["target"].astype(object).mask(frame["target"].isna() & blind, NOBODY)
             blank = frame["target"].isna()
             if blank.any():
                 raise InputError(
@@ -103,7 +105,7 @@ class Arrivals:
         elif any(placed.detection is not None for placed in self.network.sensors):
             raise InputError(f"{table.source}: an online filter takes rows that name their target, no detections")
         else:
-            frame["target"] = ONLY
+            frame["target"] = np.where(blind, NOBODY, ONLY)
         data = [c for c in frame.columns if c not in ("time", "sensor", "target")]
         filled = frame[data].notna().to_numpy()
         power = np.int64(1) << (np.arange(len(data), dtype=np.int64) % 63)
@@ -245,11 +247,11 @@ class Arrivals:
 
     def target(self, name: str) -> Target:
         """Motion and start of a target as they are declared; raises `InputError` where it has none."""
-        return declared_target(self.motion, name)
+        return declared_target(self.motion, name, self.network)
 
     def _group(self, name: str) -> str:
         """What targets have in common whose motion is declared once."""
-        return str(name) if isinstance(self.motion, Mapping) else ""
+        return str(name) if isinstance(self.motion, Mapping) or name == NOBODY else ""
 
     def _freeze(self, problem: Problem) -> None:
         """Keep where targets start of which nothing is stated, as the first rows have it."""

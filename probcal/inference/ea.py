@@ -259,8 +259,8 @@ class EA(Maximiser):
         return Gaussian(correlation=prior.correlation) if self.integrates(prior) else prior
 
     def integration(self, problem: Problem, prior: Prior) -> Integration | None:
-        """The hierarchy of the prior, at the mode that the climb reached."""
-        if not self.integrates(prior):
+        """The hierarchy of the prior, at the mode that the climb reached; None where it governs no bias."""
+        if not self.integrates(prior) or problem.surveyed.all():
             return None
         form = Form(problem.model.biases, hierarchy_of(prior, problem))
         return Integration(form, self.trajectory == "marginal", len(form.hierarchy.learnt) <= MANY)

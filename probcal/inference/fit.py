@@ -324,6 +324,9 @@ def track(
     >>> later["track/target"]["mean"].dims
     ('time', 'component')
     """
+    if not problem.targets:
+        source = problem.measurements.table.source
+        raise InputError(f"track: no row of {source} has a target; fit(problem) tells of the biases")
     if (scans := problem.scans) is not None:
         check_linear(problem)
         problem = of_calibration(problem, calibration)

@@ -16,6 +16,7 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.inference.arrivals import Arrivals, Batch, padded
+from probcal.labels import NOBODY
 from probcal.lazy import Later
 from probcal.network import Network
 from probcal.online import belief as beliefs
@@ -500,7 +501,10 @@ class Online:
         self.time = max(self.time, float(batch.time[-1]))
         self.end = self.belief if begun == K else jax.tree.map(lambda leaf: leaf[-1], stack)
         self.jumps = [*self.jumps, *jumps]
-        return Update(self.time, begun, self._tracks(frames), tuple(jumps), most, self.doubts.total() == doubts)
+        tracks = self._tracks(frames)
+        there = tracks["target"] != NOBODY
+        settled = self.doubts.total() == doubts
+        return Update(self.time, begun, tracks[there].reset_index(drop=True), tuple(jumps), most, settled)
 
     def _populate(self, problem: Problem, method: ParticleFilter) -> None:
         """Particles with the slots of every form of a motion."""

@@ -22,7 +22,17 @@ from probcal.particle.settings import Particles, check_installed
 from probcal.particle.targets import Targets, targets_of
 from probcal.priors import Prior
 from probcal.problem import Problem
-from probcal.results.answer import CHAINS, HALF, Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
+from probcal.results.answer import (
+    CHAINS,
+    HALF,
+    Answer,
+    Draws,
+    Posterior,
+    Summary,
+    Tracks,
+    log_prior_normal,
+    precisions_of,
+)
 from probcal.results.build import build_tracks
 from probcal.results.groups import Band
 from probcal.smoothing.draws import draw_biases, draws_a_chain, predictive
@@ -289,7 +299,7 @@ def conclude_particles(
         half = HALF * np.sqrt(np.diag(covariance))
     gamma = np.clip(1.0 - alpha * np.diag(covariance), 0.0, 1.0)
     summary = Summary(
-        "Laplace", "maximised" if prior.learns else "given", z, covariance, z - half, z + half, gamma, alpha,
+        "Laplace", precisions_of(problem, prior), z, covariance, z - half, z + half, gamma, alpha,
         told.information, levels, evidence if prior.proper else None,
     )  # fmt: skip
     numbers = {"log_likelihood": told.log_likelihood, "log_likelihood_se": told.error, "particles": float(how.count)}

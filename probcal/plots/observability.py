@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from probcal.labels import label_parts
 from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, new_axes, plain_text, write_figure
 from probcal.plots.bounds import plot_bound_map
-from probcal.results.read import each_track
+from probcal.results.read import each_target
 
 REACH = 0.12  # longest arrow of a direction, in widths of the map
 SHOWN = 6  # directions on one map
@@ -96,7 +96,7 @@ def draw_check(tree: xr.DataTree, passes: xr.Dataset, bound: xr.Dataset, path: s
 def _draw_scene(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
     """Draw nodes and tracks, and return their legend entries."""
     nodes = tree["constant_data"].to_dataset()
-    for _, track in each_track(tree):
+    for _, track in each_target(tree):
         places = track["mean"].sel(component=["position_x", "position_y"]).values
         ax.plot(*places.T, "." if len(places) == 1 else "-", color=BEFORE, linewidth=1.0, zorder=1)
     stated = nodes["node_position"].values[:, :2]

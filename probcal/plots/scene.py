@@ -12,7 +12,7 @@ import xarray as xr
 from probcal.errors import InputError
 from probcal.geodesy import GEODETIC, LocalFrame
 from probcal.labels import AXES, NODE
-from probcal.results.read import each_object, each_track
+from probcal.results.read import each_object, each_target
 
 ARC = 48  # corners of a sector's arc
 SEEN = 0.5  # share of an object in view at which the outline of a view is drawn
@@ -168,7 +168,7 @@ def _of_places(group: xr.Dataset, at: np.ndarray) -> np.ndarray:
 
 def _tracks(tree: xr.DataTree) -> Iterator[Track]:
     """Positions of every target that has some."""
-    for target, group in each_track(tree):
+    for target, group in each_target(tree):
         axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in group["component"].values]
         if len(axes) > 1:
             part = group.sel(component=axes)
@@ -195,7 +195,7 @@ def _mirrored(tree: xr.DataTree) -> Iterator[Track]:
     if not alike.sizes["mirror"]:
         return
     best = int(alike["number"].values[alike["gain"].values.argmax()])
-    for target, there in each_track(tree.children["mirror"]):
+    for target, there in each_target(tree.children["mirror"]):
         places = there["position"].isel(mirror=best).values
         nothing = np.full(places.shape, np.nan)
         yield Track(target, there["time"].values, places, places, nothing, nothing)

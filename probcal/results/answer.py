@@ -199,7 +199,7 @@ class NormalPosterior(Posterior):
         with np.errstate(invalid="ignore"):  # a singular problem has no sd
             half = HALF * np.sqrt(np.diag(covariance))
         summary = Summary(
-            "Laplace", "maximised" if prior.learns else "given", mean, covariance, mean - half, mean + half,
+            "Laplace", precisions_of(problem, prior), mean, covariance, mean - half, mean + half,
             np.asarray(found.gamma), alpha, np.asarray(found.information), np.asarray(point.levels),
             float(found.evidence) if prior.proper else None,
         )  # fmt: skip
@@ -232,6 +232,11 @@ class NormalPosterior(Posterior):
         """Log density (chain, draw, M) of each bias given its precision; None for flat or correlated ones."""
         independent = self.prior.proper and not self.prior.correlation
         return log_prior_normal(draws.z, self.summary.precision) if independent else None
+
+
+def precisions_of(problem: Problem, prior: Prior) -> str:
+    """How a climb came by the precisions of the biases: "maximised", or "given" where it learns none."""
+    return "maximised" if prior.learns and not problem.surveyed.all() else "given"
 
 
 def tracks_of(at: Linearisation, covariance: jax.Array) -> list[Tracks]:

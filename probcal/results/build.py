@@ -165,7 +165,9 @@ def _data_groups(answer: Answer, draws: Draws, before: Point, large: bool) -> di
 def _attrs(answer: Answer) -> dict[str, Any]:
     """What was asked for, what ran, and how it ended."""
     found: Summary = answer.posterior.summary
+    stated = found.precisions == "given" and answer.prior.hierarchical  # it governs no bias
     intervals = (answer.prior.note if found.kind == "Laplace" else "") or answer.method.note(answer.prior)
+    intervals = "Laplace: every bias has a survey, so that no precision is estimated" if stated else intervals
     if found.kind == "Laplace" and answer.problem.model.tailed:
         intervals += "; each epoch's precision of the heavy-tailed process noise is held at its mean"
     attrs = {

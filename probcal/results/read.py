@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probcal.errors import InputError, checked
+from probcal.labels import NOBODY
 from probcal.results.blocks import SensorBlocks, covariance_of
 from probcal.results.schema import MORE, SUMMARY
 
@@ -54,6 +55,11 @@ def each_track(tree: xr.DataTree, group: str = "track") -> Iterator[tuple[str, x
             yield str(node.attrs["target"]), node.to_dataset(inherit=False)
 
 
+def each_target(tree: xr.DataTree) -> Iterator[tuple[str, xr.Dataset]]:
+    """Name and track of every target of a tree that exists: the rows without a target have a known state only."""
+    return (pair for pair in each_track(tree) if pair[0] != NOBODY)
+
+
 def each_object(tree: xr.DataTree, axes: Sequence[str]) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
     """Name, times (L,), positions (L, d) and existence (L,) of every object that nobody named; none without a group.
 
@@ -79,13 +85,13 @@ def tracks(tree: xr.DataTree) -> pd.DataFrame:
     import pandas as pd  # loaded where a table is made
 
     parts = []
-    for target, group in each_track(tree):
+    for target, group in each_target(tree):
         columns: dict[str, np.ndarray] = {"time": group["time"].values, "target": np.full(group.sizes["time"], target)}
         for component in group["component"].values:
             columns[str(component)] = group["mean"].sel(component=component).values
             columns[f"{component}_sd"] = group["sd"].sel(component=component).values
         parts.append(pd.DataFrame(columns))
-    return pd.concat(parts, ignore_index=True)
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=["time", "target"])
 
 
 def saved_states(problem: Problem, tracked: Mapping[str, xr.Dataset]) -> list[np.ndarray]:

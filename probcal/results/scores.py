@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probcal.errors import checked
-from probcal.labels import AXES
+from probcal.labels import AXES, NOBODY
 from probcal.lazy import Later
 from probcal.results.alignment import Alignment
 from probcal.results.alignment import align as laid_on
-from probcal.results.read import each_track
+from probcal.results.read import each_target
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -47,14 +47,14 @@ def _true(name: str, track: xr.Dataset, truth: Truth) -> np.ndarray:
 
 def _met(tree: xr.DataTree, truth: Truth) -> list[np.ndarray]:
     """Positions (N, d) without and with calibration and true ones, of every epoch that the truth covers."""
-    pairs, tracks = [], list(each_track(tree))
+    pairs, tracks = [], list(each_target(tree))
     truth.check_targets(name for name, _ in tracks)
     for name, track in tracks:
         true = _true(name, track, truth)
         known = np.isfinite(true).all(1)
         pairs.append([track[kind].sel(component=_axes(track)).values[known] for kind in ("before", "mean")])
         pairs[-1].append(true[known])
-    return [np.concatenate([part[k] for part in pairs]) for k in range(3)]
+    return [np.concatenate([part[k] for part in pairs]) if pairs else np.zeros((0, 0)) for k in range(3)]
 
 
 @checked
@@ -108,6 +108,8 @@ def add_scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> 
     frame: Alignment | None = None if align is None or not len(true) else laid_on(after, true, align)
     for node in tree["track"].children.values() if len(true) else ():
         track = node.to_dataset(inherit=False)
+        if node.attrs["target"] == NOBODY:
+            continue
         places = _true(str(node.attrs["target"]), track, truth)
         columns = np.full(track["mean"].shape, np.nan)
         columns[:, np.isin(track["component"].values, _axes(track))] = places if frame is None else frame.back(places)

@@ -211,7 +211,7 @@ def _counts(problem: Problem) -> list[np.ndarray]:
 def _candidates(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
     """Reflections of the whole scene, and of the track of one target alone, that fit nearly as well unpolished."""
     z, free, counts = np.asarray(point.z), movable(problem), _counts(problem)
-    targets = [name for epochs in problem.epochs for name in dict.fromkeys(epochs.target)]
+    targets = [n for epochs in problem.epochs for n in dict.fromkeys(epochs.target) if n in problem.targets]
     every = sum(float(count.sum()) for count in counts)
     found = planes(problem, z)
     here = _losses(problem, z, point, None) if found else []

@@ -19,7 +19,7 @@ from probcal.adapters.stone_soup.measurement import (
 from probcal.errors import InputError, nearest
 from probcal.labels import AXES
 from probcal.lazy import Later
-from probcal.results.read import each_track
+from probcal.results.read import each_target
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,7 +44,7 @@ def to_tracks(tree: xr.DataTree, *, start: datetime | None = None, mapping: Mapp
     types, arrays = stonesoup("types.state"), stonesoup("types.array")
     track = stonesoup("types.track").Track
     found = []
-    for name, group in each_track(tree):
+    for name, group in each_target(tree):
         components = [str(c) for c in group["component"].values]
         order = _order(components, mapping)
         mean, sd = group["mean"].values, group["sd"].values
