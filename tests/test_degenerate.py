@@ -5,6 +5,7 @@ Every method and verb answers or says one sentence.
 
 import numpy as np
 import pytest
+import xarray as xr
 import worlds
 from contracts import check_tree
 
@@ -146,7 +147,7 @@ def test_what_asks_for_a_target_says_that_there_is_none():
     with pytest.raises(InputError, match="there is no position to map"):
         probcal.bound_map(problem, ((0, 1), (0, 1)))
     with pytest.raises(InputError, match="track: no row of data has a target"):
-        track(problem, None)
+        track(problem, xr.DataTree())
 
 
 PROBLEMS = {
