@@ -1,10 +1,20 @@
 """The labels of biases and what they are made of, and other names that stand in results; text only."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 AXES = ("x", "y", "z")
 SCENE, PIECE, NODE, START = "scene", "piece", "node", "start"  # what an answer beside another differs by
 NOBODY = "no target"  # the target of rows that name none and whose sensor reads none
+
+
+def listed(names: Sequence[str], most: int = 4) -> str:
+    """The first names and how many there are beyond them: `A, B and 18 more`.
+
+    >>> listed(["a", "b", "c", "d"], 2)
+    'a, b and 2 more'
+    """
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def label_parts(label: str) -> tuple[str, str]:

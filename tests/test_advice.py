@@ -23,20 +23,10 @@ from probcal.results.accessor import Accessor
 
 ROOT = Path(probcal.__file__).parent
 FILLED = "FILLED_IN"  # stands for a value of an f-string
+OTHERS = {"np": "numpy", "jnp": "jax.numpy", "pd": "pandas"}  # packages
 # written by the user, or a method of what the sentence names
-HOOKS = [
-    "problem",
-    "scenario",
-    "setting",
-    "truth",
-    "initial",
-    "log_initial",
-    "log_density",
-    "draw",
-    "update",
-    "under",
-    "on",
-]
+HOOKS = ["problem", "scenario", "setting", "truth", "initial", "log_initial", "log_density", "draw", "on"]
+HOOKS += ["update", "under", "float", "int"]
 VALUES = {"problem": "Problem", "online": "Online", "motion": "Motion", "sensor_type": "SensorType"}  # their class
 NOISY = ["ConstantVelocity", "ConstantAcceleration", "CoordinatedTurn", "RandomWalk", "White", "Known"]
 CALLED = {"own.family": NOISY, "method.name": ["EA", "MAP"], "name": HOOKS}  # what a filled-in name may be
@@ -82,7 +72,7 @@ def looked_up(path, module):
         first, *rest = rest
         homes = [Accessor if path.startswith("tree.") else probcal]
     elif rest and first not in (*VALUES, *dir(probcal)):
-        first, *rest, homes = *rest, [importlib.import_module(first)]  # another package
+        first, *rest, homes = *rest, [importlib.import_module(OTHERS.get(first, first))]
     else:
         homes = [probcal, probcal.noise]
     first = VALUES.get(first, first) if rest else first
@@ -143,7 +133,8 @@ def test_code_that_a_message_advises_can_be_typed():
 
 def test_options_that_a_message_advises_exist():
     command = get_command(app)
-    options = {name for one in command.commands.values() for p in one.params for name in (*p.opts, *p.secondary_opts)}
+    commands = [command, *command.commands.values()]
+    options = {name for one in commands for p in one.params for name in (*p.opts, *p.secondary_opts)}
     for file in ROOT.rglob("*.py"):
         for line, text, *_ in written(file):
             for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", text):

@@ -30,7 +30,7 @@ from probcal import (
     sensor,
     simulate,
 )
-from probcal.analysis import verdict
+from probcal.analysis import findings, verdict
 from probcal.diagnostics import study_table
 from probcal.errors import FitError
 from probcal.geometry import bearing, norm
@@ -42,6 +42,7 @@ from probcal.misfit import MisfitData, misfit_text
 from probcal.noise import Bernoulli
 from probcal.priors import Precision
 from probcal.report.page import COLOURS
+from probcal.report.words import said_once
 from probcal.sensors import doa
 from probcal.smoothing.information import mean_square, squares_of
 from probcal.smoothing.linearised import laplace
@@ -405,6 +406,13 @@ def test_a_survey_is_in_conflict_only_where_it_explains_part_of_the_misfit():
         words, reasons = verdict.judge_biases(problem, Status.CONVERGED, ["estimated"] * M, known, {}, {}, "", {})
         assert set(words) == {word}
         assert all("7.0 sd beyond its" in text and reason in text for text in reasons)
+
+
+def test_one_reason_of_many_biases_is_said_once():
+    labels, reason = [f"n{k}.gain" for k in range(20)], "the fit ended misfit"
+    said = findings.alarms(labels, ["conflicting"] * 19 + ["weak"], [reason] * 20)
+    assert [one.sentence for one in said] == [f"n0.gain, n1.gain, n2.gain, n3.gain and 15 more: {reason}"]
+    assert said_once(labels[:3], [reason, "other", reason]) == [reason, "other", "as n0.gain"]
 
 
 @pytest.mark.ci

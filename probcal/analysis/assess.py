@@ -22,13 +22,14 @@ from probcal.analysis import (
     verdict,
 )
 from probcal.analysis.beside import mirror_doubts, mirror_findings
-from probcal.analysis.findings import Finding, in_order
+from probcal.analysis.findings import Finding, alarms, in_order
 from probcal.analysis.fitted import Fitted, take_up
 from probcal.analysis.large import assess_large
 from probcal.analysis.pieces import Change, Pieces
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.analysis.widen import rejection, widened
 from probcal.identifiability.remedies import WEAK
+from probcal.labels import listed
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.groups import bias_coords, node_of
@@ -112,9 +113,8 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     if not (any(f.kind == "outliers" for f in findings) or (groups["verdict"]["verdict"] == "drifting").any()):
         findings += more  # else the levels are only a sign of these
     findings += mirror_findings(tree)
-    columns = [groups["verdict"][name].values.tolist() for name in ("verdict", "bias_label", "reason")]
-    alarms = [row for row in zip(*columns, strict=True) if row[0] in ("drifting", "conflicting")]
-    findings += [Finding(word, label, f"{label}: {reason}") for word, label, reason in alarms]
+    columns = [groups["verdict"][name].values.tolist() for name in ("bias_label", "verdict", "reason")]
+    findings += alarms(*columns)
     if tree.attrs["status"] in INVALID:
         text = (
             f"the fit ended {tree.attrs['status']}, which is no answer: what is left of the data says nothing of them"
@@ -201,8 +201,7 @@ def _touched(fit: Fitted, divided: Pieces, changes: list[Change], patterns: piec
     """Why the answers of biases are in doubt that would move by more than `HANGS` sd if others may change."""
     free = [(change.bias, patterns[change.name]) for change in changes]
     moved = pieces.freed(divided, free) / np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
-    first = fit.problem.labels[changes[0].bias]
-    others = f"{first} and {len(changes) - 1} more" if len(changes) > 1 else first
+    others = listed([fit.problem.labels[change.bias] for change in changes], 1)
     told = np.flatnonzero(np.abs(moved) > levels.HANGS).tolist()
     return {m: f"it would move by {abs(moved[m]):.1f} sd if {others} may change" for m in told}
 
@@ -321,10 +320,9 @@ def _disagreement(problem: Problem, change: Change, limit: float) -> str:
     names, groups = problem.measurements.target_names, len(change.contrast.estimate) + 1
     alone = [change.contrast.along(unit[1:] - unit[0]) for unit in np.eye(groups)]
     odd = [name for k, name in enumerate(names) if k % groups == int(np.argmax(alone))]
-    listed = odd[0] if len(odd) == 1 else f"{odd[0]} and {len(odd) - 1} more"
-    listed = f"{names[0]} and {names[1]}" if len(names) == 2 else f"{listed} most"
+    most = f"{names[0]} and {names[1]}" if len(names) == 2 else f"{listed(odd, 1)} most"
     found = f"chi-square {change.square:.1f} on {change.contrast.freedom}, limit {limit:.1f}"
-    return f"the targets disagree, {listed} ({found})"
+    return f"the targets disagree, {most} ({found})"
 
 
 def _halves(

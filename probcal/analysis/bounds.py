@@ -16,7 +16,7 @@ import xarray as xr
 
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
 from probcal.errors import InputError, nearest
-from probcal.labels import NOBODY
+from probcal.labels import NOBODY, listed
 from probcal.model.model import At, Model
 from probcal.problem import Problem
 from probcal.results.groups import bias_coords, by_target, node_of
@@ -190,14 +190,11 @@ def _tree(
 
 def _message(labels: np.ndarray, bounded: np.ndarray, loose: np.ndarray) -> str:
     """What has no bound, and which of the bounded (M',) have one beyond their scale, in words."""
-
-    def listed(names: np.ndarray) -> str:
-        return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
-
     found = []
     if not bounded.all():
-        open_ = listed(labels[~bounded])
+        open_ = listed(labels[~bounded].tolist(), 12)
         found.append(f"Unbounded: the data say nothing of some combination of {open_}; survey or fix some of them.")
     if loose.any():
-        found.append(f"Bounded beyond their scale, the data leave them to a prior: {listed(labels[bounded][loose])}.")
+        wide = listed(labels[bounded][loose].tolist(), 12)
+        found.append(f"Bounded beyond their scale, the data leave them to a prior: {wide}.")
     return " ".join(found) or "Every bias has a bound within its scale."

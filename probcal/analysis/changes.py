@@ -17,7 +17,7 @@ from probcal.analysis.compare import common_labels
 from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.errors import InputError, checked
-from probcal.labels import step_of
+from probcal.labels import listed, step_of
 from probcal.results.answer import HALF
 from probcal.results.schema import INTERVAL, matrix_of
 from probcal.status import Status
@@ -244,8 +244,7 @@ def _findings(found: xr.Dataset, pair: dict[str, xr.DataTree]) -> list[Finding]:
         )
     silent = labels[verdicts == "not told"].tolist()
     if silent:
-        listed = ", ".join(silent[:4]) + (f" and {len(silent) - 4} more" if len(silent) > 4 else "")
-        said.append(Finding("not told", "", f"the data say too little to tell a change of {listed}"))
+        said.append(Finding("not told", "", f"the data say too little to tell a change of {listed(silent)}"))
     for name, tree in pair.items():
         if "verdict" not in tree.children:
             said.append(Finding("assess", name, f'"{name}" was not assessed: the declared noise is taken as right'))

@@ -11,6 +11,7 @@ from probcal.analysis import leave, predictive, residuals
 from probcal.analysis.findings import LAGGED, NAMES, NOTABLE, PRACTICAL, Finding
 from probcal.analysis.fitted import Fitted, Judged
 from probcal.analysis.verdict import RATE
+from probcal.labels import listed
 from probcal.noise import Normal
 from probcal.results.groups import by_target
 
@@ -27,10 +28,9 @@ def codes(frame: pd.DataFrame, names: list[str]) -> tuple[np.ndarray, pd.DataFra
     return group, frame[names].drop_duplicates().reset_index(drop=True)
 
 
-def _listed(names: list[str], values: np.ndarray, order: np.ndarray) -> str:
+def _sized(names: list[str], values: np.ndarray, order: np.ndarray) -> str:
     """The first names in an order, each with its number."""
-    text = ", ".join(f"{names[k]} {values[k]:.3g}" for k in order[:NAMES])
-    return text + (f" and {len(order) - NAMES} more" if len(order) > NAMES else "")
+    return listed([f"{names[k]} {values[k]:.3g}" for k in order], NAMES)
 
 
 def _beyond(names: list[str], part: residuals.Squares) -> list[Finding]:
@@ -40,7 +40,7 @@ def _beyond(names: list[str], part: residuals.Squares) -> list[Finding]:
     for out, word, limit in ((high, "more", part.upper), (low, "less", part.lower)):
         if out.any():
             order_out = order[out[order]]
-            text = f"NIS a datum {_listed(names, part.nis, order_out)} (limit {limit[order_out[0]]:.3g})"
+            text = f"NIS a datum {_sized(names, part.nis, order_out)} (limit {limit[order_out[0]]:.3g})"
             found.append(
                 Finding("nis", names[order_out[0]], f"{text}: the data scatter {word} than the declared noise")
             )
@@ -89,7 +89,7 @@ def by_channel(
     red = np.flatnonzero((extra[:, 2] < RATE / count) & (np.abs(r) > notable))
     if len(red):
         order = red[np.argsort(-np.abs(r[red]))]
-        text = f"innovations are correlated from one to the next: {_listed(names, r, order)}"
+        text = f"innovations are correlated from one to the next: {_sized(names, r, order)}"
         findings.append(Finding("whiteness", names[order[0]], text))
     coords = {name: ("part", labels[name].to_numpy(str)) for name in labels}
     first = np.array([mine[0] for mine in members], int)
@@ -130,9 +130,8 @@ def outlying(fit: Judged, found: residuals.Innovations) -> list[Finding]:
             counts[name] = f"{count} of {len(order)}"
     if not counts:
         return []
-    listed = ", ".join(f"{name} {count}" for name, count in list(counts.items())[:NAMES])
-    listed += f" and {len(counts) - NAMES} more" if len(counts) > NAMES else ""
-    text = f"single data lie more than {OUTLYING:g} std off: {listed}; declare Channel(..., noise=StudentT(4))"
+    named = listed([f"{name} {count}" for name, count in counts.items()], NAMES)
+    text = f"single data lie more than {OUTLYING:g} std off: {named}; declare Channel(..., noise=StudentT(4))"
     return [Finding("outliers", next(iter(counts)), text)]
 
 
@@ -146,9 +145,8 @@ def _unlike_replicas(kind: str, names: list[str], p: np.ndarray, draws: int) -> 
     for word, extreme in zip(words, (p + 1 / draws, 1 - p + 1 / draws), strict=True):
         out = np.flatnonzero(extreme < RATE / 2)
         if len(out) and special.bdtrc(len(out) - 1, len(p), RATE / 2) < RATE:
-            listed = ", ".join(names[k] for k in out[:NAMES])
-            listed += f" and {len(out) - NAMES} more" if len(out) > NAMES else ""
-            text = f"{listed}: the data {word} than replicas (posterior predictive p at most {extreme[out].max():.3f})"
+            named = listed([names[k] for k in out], NAMES)
+            text = f"{named}: the data {word} than replicas (posterior predictive p at most {extreme[out].max():.3f})"
             found.append(Finding("predictive", names[out[0]], text))
     return found
 

@@ -13,6 +13,7 @@ import xarray as xr
 from probcal.analysis.findings import NAMES, Finding
 from probcal.analysis.loo import BAD
 from probcal.analysis.overlap import ZERO
+from probcal.labels import listed
 from probcal.results.schema import EVIDENCES
 from probcal.status import INVALID, Status
 
@@ -69,11 +70,9 @@ def _against(comparison: xr.DataTree, name: str, reference: str) -> list[Finding
         """One sentence on the biases in a mask, {} their number, those of the largest size named."""
         order = np.flatnonzero(mask)[np.argsort(-size[mask], kind="stable")]
         if len(order):
-            listed = ", ".join(f"{labels[k]} ({of(k)})" for k in order[:NAMES])
-            more = f" and {len(order) - NAMES} more" if len(order) > NAMES else ""
-            found.append(
-                Finding(kind, labels[order[0]], f"{name}: {text.replace('{}', str(len(order)), 1)}: {listed}{more}")
-            )
+            said = f"{name}: {text.replace('{}', str(len(order)), 1)}"
+            named = listed([f"{labels[k]} ({of(k)})" for k in order], NAMES)
+            found.append(Finding(kind, labels[order[0]], f"{said}: {named}"))
 
     pair = comparison["pair"].to_dataset()
     mine = [{a, b} == {name, reference} for a, b in zip(pair["first"].values, pair["second"].values, strict=True)]

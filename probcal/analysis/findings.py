@@ -1,6 +1,9 @@
 """What a check has to say: one sentence each."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
+
+from probcal.labels import listed
 
 NAMES = 4  # that a sentence on several channels lists
 PRACTICAL = 1.25  # factor from 1 within which a NIS beyond its limits is no finding
@@ -18,6 +21,18 @@ class Finding(NamedTuple):
     kind: str
     subject: str
     sentence: str
+
+
+def alarms(labels: Sequence[str], verdicts: Sequence[str], reasons: Sequence[str]) -> list[Finding]:
+    """Findings on biases that drift or are in conflict: each reason once, with the biases that have it."""
+    owners = dict[tuple[str, str], list[str]]()
+    for label, word, reason in zip(labels, verdicts, reasons, strict=True):
+        owners.setdefault((word, reason), []).append(label)
+    return [
+        Finding(word, own[0], f"{listed(own)}: {reason}")
+        for (word, reason), own in owners.items()
+        if word in ("drifting", "conflicting")
+    ]
 
 
 def in_order(findings: list[Finding]) -> list[Finding]:

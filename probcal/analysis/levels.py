@@ -18,6 +18,7 @@ import xarray as xr
 from probcal.analysis.findings import PRACTICAL, Finding
 from probcal.analysis.fitted import Fitted
 from probcal.analysis.verdict import limit_of
+from probcal.labels import listed
 from probcal.model.model import Data, Model
 from probcal.model.motions import by_component, linear_of
 from probcal.motion import as_motion
@@ -311,12 +312,10 @@ def _sentence(level: Level, factor: float, sd: float) -> str:
 
 def _moved(problem: Problem, moved: np.ndarray) -> str:
     """What hangs on a level, `moved` (M,) by it in sd."""
-    order = np.argsort(-np.abs(moved))
-    count = int((np.abs(moved) > HANGS).sum())
-    if not count:
+    far = [m for m in np.argsort(-np.abs(moved)) if abs(moved[m]) > HANGS]
+    if not far:
         return ""
-    more = f" and {count - 1} more" if count > 1 else ""
-    return f"; {problem.labels[order[0]]}{more} would move by {abs(moved[order[0]]):.1f} sd"
+    return f"; {listed([problem.labels[m] for m in far], 1)} would move by {abs(moved[far[0]]):.1f} sd"
 
 
 def _doubts(members: Members, moved: np.ndarray, factor: np.ndarray) -> dict[int, str]:

@@ -8,6 +8,7 @@ import xarray as xr
 
 from probcal.errors import checked
 from probcal.inference.uniformity import p_value, shape, share, spread_p_value
+from probcal.labels import listed
 
 ALARM = 0.01  # probability of a false alarm, over all quantities together
 
@@ -33,9 +34,8 @@ def judge_coverage(tree: xr.DataTree) -> None:
     least = order[0]
     rate = f"over all {len(tests)} tests a right method fails with probability {ALARM:.0%} at most"
     if wrong:
-        listed = "; ".join(f"{tests[k]} (p {values[k]:.1g}, {shapes[k]})" for k in wrong[:4])
-        rest = f" and {len(wrong) - 4} more" if len(wrong) > 4 else ""
-        verdict = f"not uniform: {listed}{rest}; {rate}."
+        apart = listed([f"{tests[k]} (p {values[k]:.1g}, {shapes[k]})" for k in wrong])
+        verdict = f"not uniform: {apart}; {rate}."
     else:
         verdict = f"uniform over {len(place)} runs; the smallest p is {values[least]:.2g} of {tests[least]}; {rate}."
     tree.attrs |= {"status": "not uniform" if wrong else "uniform", "verdict": verdict, "false_alarm_rate": ALARM}

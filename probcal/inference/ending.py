@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from probcal.inference.mixture import MixturePosterior
+from probcal.labels import listed
 from probcal.misfit import MisfitData, misfit_text
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
@@ -145,13 +146,16 @@ def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
         for placed in network.sensors
         for channel, known in placed.type.expand(network.dimension)
     }
+    sensor, channel, target = (np.asarray(names[name], str) for name in ("sensor", "channel", "target"))
     left = MisfitData(
-        gather(squares_of(problem.model, point), picks),
-        gather(residuals(problem.model, point).innovation, picks),
-        datum["y"],
-        *(np.asarray(names[name], str) for name in ("sensor", "channel", "target")),
-        names["time"],
-        np.array([units[pair] for pair in zip(names["sensor"], names["channel"], strict=True)]),
+        square=gather(squares_of(problem.model, point), picks),
+        residual=gather(residuals(problem.model, point).innovation, picks),
+        value=datum["y"],
+        sensor=sensor,
+        channel=channel,
+        target=target,
+        time=names["time"],
+        unit=np.array([units[pair] for pair in zip(sensor, channel, strict=True)]),
     )
     return misfit_text(square, left)
 
@@ -166,17 +170,16 @@ def _message(
     iterations: int,
     precisions: str,
 ) -> str:
-    def listed(mask: np.ndarray) -> str:
-        labels = [label for label, hit in zip(problem.labels, mask, strict=True) if hit]
-        return ", ".join(labels[:12]) + (f" and {len(labels) - 12} more" if len(labels) > 12 else "")
+    def named(mask: np.ndarray) -> str:
+        return listed([label for label, hit in zip(problem.labels, mask, strict=True) if hit], 12)
 
     if status is Status.AT_BOUND and precisions == "integrated":
         return (
-            f"{listed(low)} lie more than {FAR:g} scales from the stated value: the estimate is invalid. Check labels,"
+            f"{named(low)} lie more than {FAR:g} scales from the stated value: the estimate is invalid. Check labels,"
             " units and the declared scales."
         )
     if status is Status.AT_BOUND:
-        return f"The precision of {listed(low)} stands at its lower bound: the estimate is invalid."
+        return f"The precision of {named(low)} stands at its lower bound: the estimate is invalid."
     if status is Status.MISFIT:
         return misfit_sentence(problem, point, end.square)
     if status is Status.DIVERGED and end.sound and end.refused and not end.far:
@@ -186,7 +189,7 @@ def _message(
         )
     if status is Status.DIVERGED:
         where = (
-            f"{listed(far)} lie more than {FAR:g} scales from the stated value"
+            f"{named(far)} lie more than {FAR:g} scales from the stated value"
             if far.any()
             else "the information matrix is singular"
         )

@@ -28,7 +28,7 @@ from probcal.inference.solve import solve
 from probcal.inference.sparse import SparsePosterior
 from probcal.inference.storage import Storage
 from probcal.inference.weighted import track_by_particles
-from probcal.labels import NODE, START
+from probcal.labels import NODE, START, listed
 from probcal.lazy import Later
 from probcal.particle.settings import Particles
 from probcal.priors import Prior
@@ -229,11 +229,11 @@ def _advised(answer: Answer, directions: Sequence[Direction]) -> str:
     """The message of an answer, with what the data leave open; a misfit is not for lack of data."""
     if not directions or answer.status is Status.MISFIT:
         return answer.message
-    listed = "; ".join(direction.sentence for direction in directions[:NAMED])
+    named = "; ".join(direction.sentence for direction in directions[:NAMED])
     count = answer.posterior.weak if isinstance(answer.posterior, SparsePosterior) else len(directions)
-    listed += f"; and {count - NAMED} more" if count > NAMED else ""
+    named += f"; and {count - NAMED} more" if count > NAMED else ""
     about = "Weakly determined by the data" if answer.status.settled else "The data do not fix"
-    return f"{answer.message} {about}: {listed}.".strip()
+    return f"{answer.message} {about}: {named}.".strip()
 
 
 def _watched(answer: Answer) -> Answer:
@@ -272,10 +272,7 @@ def _mirrored(answer: Answer, other: Mirrored) -> str:
     problem = answer.problem
     away = np.abs(other.shift) / np.maximum(answer.posterior.here[1], 1e-12)
     labels = [problem.labels[m] for m in np.argsort(-away) if away[m] > DIFFERENT]
-    more = f" and {len(labels) - NAMED} more" if len(labels) > NAMED else ""
-    where = (
-        f"{other.name}, with other {', '.join(labels[:NAMED])}{more}" if labels else f"{other.name}, the biases alike"
-    )
+    where = f"{other.name}, " + (f"with other {listed(labels, NAMED)}" if labels else "the biases alike")
     if other.gain <= -SAME:
         return f"Another answer fits {-other.gain:.1f} nats worse only: {where}."
     return f"Another answer fits as well ({abs(other.gain):.1f} nats apart): {where}."

@@ -15,6 +15,7 @@ from probcal import linalg
 from probcal.errors import InputError
 from probcal.inference.ending import ABSURD, FAR, low_and_far
 from probcal.inference.run import Given, Maximiser
+from probcal.labels import listed
 from probcal.model.model import Model
 from probcal.particle.ensemble import Ensemble, ensemble, nearest_states, observed_over_paths, state_moments
 from probcal.particle.proposals import check_proposal
@@ -419,9 +420,9 @@ def scatter(problem: Problem, point: Point) -> tuple[float, float]:
 
 def misfit(names: Sequence[str]) -> str:
     """What is said of targets that no path explains."""
-    listed = ", ".join(f'"{name}"' for name in names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    named = listed([f'"{name}"' for name in names])
     return (
-        f"No path of target {listed} explains its rows: check its roads or let it leave them, its start, units and"
+        f"No path of target {named} explains its rows: check its roads or let it leave them, its start, units and"
         " the noise std; or take more particles."
     )
 

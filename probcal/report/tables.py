@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from probcal.report.words import NONE, number, rounded, true_values
+from probcal.report.words import NONE, number, rounded, said_once, true_values
 from probcal.results.read import outliers
 from probcal.results.schema import EVIDENCES, evidence_in
 from probcal.status import INVALID
@@ -52,6 +52,8 @@ def biases(tree: xr.DataTree) -> tuple[list[str], list[dict[str, Any]]]:
     table = {str(name): group[name].values for name in (*group.data_vars, "unit") if group[name].ndim == 1}
     rows = []
     labels = group["bias_label"].values.tolist()
+    reasons = judged["reason"].values.tolist() if judged is not None else [""] * len(labels)
+    said = dict(zip(shown.tolist(), said_once([labels[k] for k in shown], [reasons[k] for k in shown]), strict=True))
     for k in shown.tolist():
         label = labels[k]
         one = {name: values[k] for name, values in table.items()}
@@ -61,7 +63,7 @@ def biases(tree: xr.DataTree) -> tuple[list[str], list[dict[str, Any]]]:
         cells += [(spread, False), (f"{lower} to {upper}", False), (_gamma(float(one["gamma"])), False)]
         cells += [(status, True)]
         if judged is not None:
-            cells += [(str(judged[name].values[k]), True) for name in ("verdict", "reason")]
+            cells += [(str(judged["verdict"].values[k]), True), (said[k], True)]
         cells += [(number(one[name], 4), False) for name in extra]
         if known:
             cells.append((rounded(known[label], sd) if label in known else "", False))

@@ -1,6 +1,7 @@
 """Numbers and sentences of a report: what a fit found, in words."""
 
 import re
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -137,7 +138,19 @@ def that_matter(tree: xr.DataTree) -> tuple[list[Row], int]:
         known = with_unit(rounded(true[label], grain), unit) if label in true else ""
         verdict = status[k] if status[k] in INVALID else verdicts[k]
         rows.append(Row(label, _value(group, k), f"{lower} to {upper}", verdict, reasons[k], known))
+    said = said_once([row.label for row in rows], [row.reason for row in rows])
+    rows = [row._replace(reason=reason) for row, reason in zip(rows, said, strict=True)]
     return rows, len(order) - len(rows)
+
+
+def said_once(labels: Sequence[str], reasons: Sequence[str]) -> list[str]:
+    """Every reason in full where it stands first; where it stands again, the bias that has it."""
+    first: dict[str, str] = {}
+    owners = [first.setdefault(reason, label) for label, reason in zip(labels, reasons, strict=True)]
+    return [
+        reason if owner == label or not reason else f"as {owner}"
+        for label, reason, owner in zip(labels, reasons, owners, strict=True)
+    ]
 
 
 def true_values(tree: xr.DataTree) -> dict[str, float]:

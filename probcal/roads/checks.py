@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from probcal.errors import InputError, nearest
+from probcal.labels import listed
 from probcal.roads.extra import shapely
 
 CLEARANCE = 1.0  # m of height between two roads above which they pass over each other
@@ -90,7 +91,7 @@ def check_connected(names: Sequence[str], ends: np.ndarray) -> None:
     kinds, counts = np.unique(part, return_counts=True)
     if len(kinds) > 1:
         rest = [f'"{name}"' for name, own in zip(names, part, strict=True) if own != kinds[counts.argmax()]]
-        shown = ", ".join(rest[:SHOWN]) + (f" and {len(rest) - SHOWN} more" if len(rest) > SHOWN else "")
+        shown = listed(rest, SHOWN)
         raise InputError(
             f"the roads are in {len(kinds)} parts, {shown} apart from the others; join them (a larger snap?),"
             " leave them out or give connected=False"
