@@ -48,7 +48,6 @@ from probcal import (
 )
 from probcal.cli import commands
 from probcal.cli.models import load_model, load_truth
-from probcal.errors import GIVE, _classes
 from probcal.geometry import norm
 from probcal.inference.methods import choose_prior
 from probcal.motion import as_motion
@@ -338,7 +337,7 @@ VERBS = [
     name
     for name in probcal.__all__
     if inspect.isfunction(verb := getattr(probcal, name))
-    and {*_classes(next(iter(inspect.signature(verb).parameters.values())).annotation)} & {*GIVE}
+    and next(iter(inspect.signature(verb).parameters)) in ("problem", "network", "tree")
 ]
 
 
