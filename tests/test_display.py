@@ -54,24 +54,32 @@ def test_a_notebook_shows_it():
     assert "<table" in data["text/html"]
 
 
-def test_progress_in_a_file_is_sparse(capsys):
-    now = [0.0]
-    say = progress.sparse(lambda: now[0])
-    for second in range(0, 3601):
+def test_progress_in_a_file_is_sparse():
+    now, due = [0.0], []
+    line = progress.Line(lambda: now[0])
+    for second in range(3601):
         now[0] = float(second)
-        say(Progress("EA", second, 4000, -1.5))
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "EA: 30 of 4000, objective -1.500, 30 s"
-    assert [line.rsplit(", ", 1)[1] for line in lines] == [
-        f"{s} s" for s in (30, 90, 210, 450, 930, 1530, 2130, 2730, 3330)
-    ]
+        line(Progress("EA", second, 4000, -1.5, phase="climb" if second < 100 else "checks", bound=True))
+        if line.due():
+            due.append(second)
+        if second == 5:
+            assert str(line) == "EA, climb: 5 of at most 4000, objective -1.500, 5 s"
+    assert due[:8] == [5, 25, 45, 65, 85, 100, 120, 140], "early, then every 20 s, and where the phase changes"
+    assert len(due) < 45
+    assert 330 <= due[-1] - due[-2] <= 360, "then a tenth of the time so far"
+
+
+def test_time_that_is_left_goes_on_without_news():
+    now = [0.0]
+    line = progress.Line(lambda: now[0])
+    line(Progress("NUTS", 150, 1150, -1.5, "draws", 41.0, 200.0))
+    now[0] = 30.0
+    assert str(line) == "NUTS, draws: 150 of 1150, objective -1.500, 30 s, about 2 min 50 s left"
 
 
 def test_a_short_command_says_nothing(capsys):
-    with progress.line() as say:
+    with progress.shown() as say:
         say(Progress("EA", 1, 2))
-    with progress.bar() as say:
-        say(Progress("runs", 1, 2))
     assert capsys.readouterr().err == ""
 
 

@@ -13,7 +13,8 @@ import pytest
 
 import probcal
 from probcal import ConstantVelocity, Network, Node, Problem, simulate
-from probcal.inference import solve
+from probcal.inference import calibrate, solve
+from probcal.inference.progress import Monitor
 from probcal.plots.map import plot_map
 from probcal.sensors import radar, ranger
 from probcal.smoothing import recursion
@@ -66,6 +67,27 @@ def test_the_other_side_is_found_with_its_nodes():
     axes = [label.endswith("y") for label in problem.labels]
     np.testing.assert_allclose(sides.others[0].shift[axes], -2 * np.asarray(point.z)[axes], atol=0.05)
     np.testing.assert_allclose(sides.others[0].point.states[0][:, 1], -np.asarray(point.states[0])[:, 1], atol=0.5)
+
+
+@pytest.mark.ci
+def test_a_limit_ends_the_search_for_mirror_images():
+    """Beacons on a line have another answer, which is not found in time: the message says that nobody looked."""
+    problem, _ = networks.setting(0, "line", share=1.0)
+    found = {}
+    for slow in ("mirror images", "never"):
+        now, phases = [0.0], dict[str, None]()
+
+        def late(at, now=now, phases=phases, slow=slow):
+            phases[at.phase] = None
+            now[0] = 300.0 * (at.phase == slow)
+
+        monitor = Monitor(late, 300.0, clock=lambda now=now: now[0])
+        found[slow], _ = calibrate(problem, probcal.MAP(), monitor=monitor)
+    said = "Ended by the limit of 300 s before mirror images were looked at"
+    assert [said in tree.attrs["message"] for tree in found.values()] == [True, False]
+    assert ["mirror" in tree.children for tree in found.values()] == [False, True]
+    assert all(tree.attrs["status"] == "converged" for tree in found.values())
+    assert list(phases) == ["start", "climb", "mirror images", "mirror image 1 of 1"]
 
 
 @pytest.mark.ci

@@ -77,7 +77,8 @@ def test_what_has_not_mixed_is_drawn_anew_and_resumed(tmp_path, monkeypatch):
     longer = drawn(progress=seen.append, store=tmp_path)
     assert longer.attrs["thin"] == 4
     assert longer["posterior"].sizes["draw"] == 100
-    assert [(at.done, at.total) for at in seen] == [(50, 150), (100, 150), (150, 150), (350, 550), (550, 550)]
+    steps = [(at.done, at.total) for at in seen if at.done]
+    assert steps == [(50, 150), (100, 150), (150, 150), (350, 550), (550, 550)]
     again = drawn(store=tmp_path, resume=True)
     assert np.array_equal(again["posterior"]["bias"], longer["posterior"]["bias"])
 

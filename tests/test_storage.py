@@ -445,7 +445,8 @@ def whole():
 @pytest.mark.ci
 def test_an_interrupted_fit_is_resumed_with_the_same_draws(tmp_path, whole):
     def stop(at):
-        assert (at.what, at.total) == ("Collapsed", 250)
+        assert at.what == "Collapsed"
+        assert at.total == 250 or at.done == 0, "a phase begins"
         if at.done >= 150:
             raise KeyboardInterrupt
 

@@ -12,9 +12,10 @@ from probcal.analysis import bound_map, next_anchors, next_passes, next_sensors,
 from probcal.analysis.standpoint import standpoint
 from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.cli.models import load_problem
-from probcal.cli.progress import line
+from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs
+from probcal.inference.progress import Monitor
 from probcal.problem import Problem
 from probcal.results.io import save
 from probcal.smoothing.joint import too_large
@@ -35,9 +36,14 @@ def run(model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, 
     _, problem = load_problem(model, data, fix, given)
     if too_large(problem.model):
         return _check_many(problem, model, outputs)
-    with line():
+    with shown() as progress:
+        monitor = Monitor(progress)
+        monitor.enter("start", "check")
         start = automatic_start(problem)
-        tree, plans = observability(problem, point=start), _planned(problem, start)
+        monitor.enter("determined directions")
+        tree = observability(problem, point=start)
+        monitor.enter("next measurements")
+        plans = _planned(problem, start)
     tree.attrs["model"] = model.stem
     _print_known(problem, tree)
     _print_plans(plans)
@@ -50,13 +56,17 @@ def run(model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, 
 
 def _check_many(problem: Problem, model: Path, outputs: Outputs | None) -> int:
     """The check of a network too large for matrices of all biases: tables, and no pictures of bounds."""
-    with line():
+    with shown() as progress:
+        monitor = Monitor(progress)
+        monitor.enter("start", "check")
         start = standpoint(problem, None, None)
+        monitor.enter("determined directions")
         tree = observability(problem, point=start)
     tree.attrs["model"] = model.stem
     _print_known(problem, tree)
     try:
-        with line():
+        with shown() as progress:
+            Monitor(progress).enter("next measurements", "check")
             plans = _planned(problem, start)
         _print_plans(plans)
     except InputError as error:

@@ -12,6 +12,7 @@ from probcal.cli import files, options, outputs
 from probcal.cli.names import METHODS, ORACLE, PRIORS
 from probcal.errors import FitError, InputError, nearest
 from probcal.files import Lock
+from probcal.inference.progress import Terminated, check_limit
 
 app = typer.Typer(
     help="Bayesian calibration of sensor networks from targets of opportunity.",
@@ -26,6 +27,7 @@ Given = Annotated[
     list[str] | None, typer.Option("--set", help="an argument of problem(): swap=3,4 (repeat)", show_default=False)
 ]
 LARGEST_SEED = 2**62
+TERMINATED = 143  # exit code of a command that SIGTERM ended
 SMOOTHERS = ("gaussian", "particles")
 KEPT = ("tracks", "rows")  # tables of a watch besides its history
 Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="seed of everything random")]
@@ -37,7 +39,10 @@ Scheduler = Annotated[
 
 
 def main() -> None:
-    """Entry point: one sentence on stderr and exit code 2 for bad input, 1 for a fit that left no answer."""
+    """Entry point: one sentence on stderr and exit code 2 for bad input, 1 for a fit that left no answer.
+
+    Ctrl-C ends a command with 130, SIGTERM with 143.
+    """
     try:
         app()
     except InputError as error:
@@ -46,6 +51,9 @@ def main() -> None:
     except FitError as error:
         _say(error)
         sys.exit(1)
+    except SystemExit as ended:
+        cause = ended.__context__ and ended.__context__.__cause__  # which typer makes an exit
+        sys.exit(TERMINATED if isinstance(cause, Terminated) else ended.code)
 
 
 def _say(text: object) -> None:
@@ -89,6 +97,9 @@ def fit_command(
         bool, typer.Option("--resume", help="go on with the stopped run of a sampler, or with the recordings, in --out")
     ] = False,
     overwrite: Overwrite = False,
+    limit: Annotated[
+        float | None, typer.Option(help="s after which the search for other answers ends", show_default=False)
+    ] = None,
     scheduler: Scheduler = None,
     save: Annotated[
         str, typer.Option(help="draws to keep in fit.nc besides those of the biases: states,predictive")
@@ -119,9 +130,10 @@ def fit_command(
     kept = options.saved_names(save)
     arguments = options.given(given or ())
     options.check_alignment(align)
+    check_limit(limit)
     chosen: dict[str, Any] = dict(
         method=method, prior=prior, fix=fix or (), given=arguments, starts=starts, seed=seed, sizes=sizes, kept=kept,
-        assessed=assessed, epoch=epoch, align=align,
+        assessed=assessed, epoch=epoch, align=align, limit=limit,
     )  # fmt: skip
     if recordings:
         options.check_files(model)

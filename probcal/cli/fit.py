@@ -1,6 +1,7 @@
 """`fit`: calibrate, print one row a bias and what the fit is worth, write fit.nc, summary.csv and report.html."""
 
 import importlib
+import signal
 import sys
 import threading
 import time
@@ -16,13 +17,13 @@ import xarray as xr
 
 from probcal.cli.files import can_plot, report_of, say_written, write_csv
 from probcal.cli.models import load_problem, load_truth, prior_named
-from probcal.cli.progress import line
+from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.inference import METHODS, calibrate
 from probcal.inference.fit import linear_form
 from probcal.inference.manifest import remove_run
-from probcal.inference.progress import OnProgress
+from probcal.inference.progress import Monitor
 from probcal.results.alignment import KINDS
 from probcal.results.io import save
 from probcal.results.read import outliers, summary
@@ -31,19 +32,22 @@ from probcal.status import Status
 
 FINDINGS = 8  # sentences of an assessment that are printed
 MANY, SHOWN = 400, 40  # biases up to which all are printed, and of more so many
+ENDING = (signal.SIGINT, signal.SIGTERM)  # signals that end a fit with the best answer so far
 LONG = 60.0  # s of a fit that is written before it is assessed
 
 
 def run(
-    model: Path, data: Path | None, *, outputs: Outputs | None, resume: bool, overwrite: bool, **options: Any
+    model: Path, data: Path | None, *, outputs: Outputs | None, resume: bool, overwrite: bool, limit: float | None,
+    **options: Any,
 ) -> int:  # fmt: skip
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
     drawn = ["probcal.report.page", "probcal.report.chart"] if outputs is not None and can_plot() else []
     _load_ahead(["scipy.stats", *drawn] if options["assessed"] else [])
     began = time.perf_counter()
-    with line() as progress:
+    with shown() as progress:
+        monitor = Monitor(progress, limit, signals=ENDING)
         tree = calibrated(
-            model, data, outputs=outputs, resume=resume, overwrite=overwrite, progress=progress, **options
+            model, data, outputs=outputs, resume=resume, overwrite=overwrite, monitor=monitor, **options
         )  # fmt: skip
     print(table_text(tree))
     _print_verdict(tree, time.perf_counter() - began)
@@ -51,6 +55,8 @@ def run(
         say_written(written(tree, outputs))
         if not can_plot():
             print('report.html is left out: pip install "probcal[plot]"')
+    if monitor.signal:
+        return 128 + monitor.signal
     return 0 if Status(tree.attrs["status"]).settled else 1
 
 
@@ -69,13 +75,14 @@ def calibrated(
     model: Path, data: Path | None, *, method: str, prior: str | None, fix: Sequence[str], given: Mapping[str, Any],
     starts: int, seed: int, outputs: Outputs | None, sizes: Mapping[str, int], resume: bool, overwrite: bool,
     kept: Sequence[str], assessed: bool, epoch: float | None = None, align: str | None = None,
-    progress: OnProgress | None = None, module: ModuleType | None = None,
+    monitor: Monitor | None = None, limit: float | None = None, module: ModuleType | None = None,
 ) -> xr.DataTree:  # fmt: skip
     """The tree of a fit, assessed and scored; `module` is that of the model file where it is loaded already."""
     known, implied = METHODS[method]
     value: Any = known
     value = replace(value, **sizes) if sizes else value
-    began = time.perf_counter()
+    began, monitor = time.perf_counter(), Monitor(limit=limit, signals=()) if monitor is None else monitor
+    monitor.enter("start", value.name)
     module, problem = load_problem(model, data, fix, given, epoch, module)
     chosen = prior_named(module, value, implied, prior)
     truth = load_truth(module, model, data, problem, given)
@@ -85,16 +92,22 @@ def calibrated(
     if outputs is not None and overwrite:
         outputs.begin()
     tree, answer = calibrate(
-        problem, value, prior=chosen, key=seed, starts=starts, progress=progress, save=kept, store=store,
+        problem, value, prior=chosen, key=seed, starts=starts, monitor=monitor, save=kept, store=store,
         resume=resume, overwrite=overwrite,
     )  # fmt: skip
-    if assessed and linear_form(answer):
+    if assessed and linear_form(answer) and not monitor.signal:
         from probcal.analysis import assess
 
-        with _safe(tree, outputs, time.perf_counter() - began > LONG):
+        monitor.enter("checks")
+        with _safe(tree, outputs, time.perf_counter() - began > LONG), monitor.leaving():
             near = truth if align is None else None  # of a truth in another frame no NEES
             named = problem if problem.scans is None else answer.problem
             tree = assess(named, tree, truth=near, key=seed, answer=answer)
+    if monitor.signal:
+        tree.attrs["interrupted"] = 1
+        if assessed:
+            unchecked = "The checks are missing, since the fit was interrupted."
+            tree.attrs["message"] = f"{tree.attrs['message']} {unchecked}".strip()
     tree.attrs["model"] = model.stem
     if given:
         tree.attrs["set"] = ", ".join(f"{name}={value}" for name, value in given.items())

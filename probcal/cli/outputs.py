@@ -1,5 +1,6 @@
 """The folder of a command's results: checked and locked before any work, so that nothing of another run is replaced."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -46,6 +47,10 @@ def results_of_a_run(
                 " with; give --overwrite instead of --resume, or another --out"
             )
         yield outputs
+    except KeyboardInterrupt:
+        if run := stored_run(store):
+            print(f"probcal: interrupted; {store} keeps {run}, --resume goes on with it", file=sys.stderr)
+        raise
     finally:
         lock.release()
 

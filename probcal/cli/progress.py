@@ -1,59 +1,92 @@
-"""Progress of a command: a line or a bar on a terminal; where stderr is a file, a line now and then."""
+"""Progress of a command on stderr: a live line on a terminal; in a file a line now and then."""
 
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress as Bar
+from rich.live import Live
+from rich.spinner import Spinner
+from rich.text import Text
 
-from probcal.inference.progress import OnProgress
-from probcal.inference.progress import Progress as At
+from probcal.inference.progress import OnProgress, Progress, Terminated, handled
 
-FIRST, LONGEST = 30.0, 600.0  # s to the first line in a file, which doubles up to the other
+FIRST = 5.0  # s to the first line in a file, and least between two where the phase changes
+GAP, SHARE, LONGEST = 20.0, 0.1, 600.0  # s to the next line of a phase: at least, as part of all so far, and at most
+
+
+class Line:
+    """The last line of progress; it says whether it is time to print it in a file."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic):
+        self._clock, self._began, self._phase = clock, clock(), ""
+        self._printed: float | None = None
+        self.at = Progress("starting", 0, 1)
+        self._told = self._began
+
+    def __call__(self, at: Progress) -> None:
+        """Take what is to be shown."""
+        self.at, self._told = at, self._clock()
+
+    def __str__(self) -> str:
+        now = self._clock()
+        left = None if self.at.left is None else max(self.at.left - (now - self._told), 0.0)
+        return str(self.at._replace(seconds=now - self._began, left=left))
+
+    def due(self) -> bool:
+        """Whether a line is to be printed now, which then counts as printed."""
+        now, phase = self._clock(), self.at.phase
+        if self._printed is None:
+            wait = now - self._began >= FIRST
+        else:
+            gap = min(max(GAP, SHARE * (now - self._began)), LONGEST)
+            wait = now - self._printed >= (gap if phase == self._phase else FIRST)
+        if wait:
+            self._printed, self._phase = now, phase
+        return wait
 
 
 @contextmanager
-def line() -> Iterator[OnProgress]:
-    """A line on a terminal that follows the iterations; in a file a line now and then."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield sparse()
-        return
-    with console.status("starting: compiling, finding the tracks") as status:
-        yield lambda at: status.update(_text(at))
+def shown() -> Iterator[OnProgress]:
+    """What shows progress: the phase, the time so far and an estimate of what is left, while a command works.
+
+    Meanwhile SIGTERM is as Ctrl-C.
+    """
+    with handled(_terminate, [signal.SIGTERM]), _on_stderr() as line:
+        yield line
+
+
+def _terminate(*_: Any) -> None:
+    raise Terminated
 
 
 @contextmanager
-def bar() -> Iterator[OnProgress]:
-    """A progress bar on a terminal; in a file a line now and then."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield sparse()
+def _on_stderr() -> Iterator[Line]:
+    """A line that is printed, live on a terminal."""
+    console, line = Console(stderr=True), Line()
+    if console.is_terminal:
+        spinner = Spinner("dots")
+
+        def render() -> Spinner:
+            spinner.update(text=Text(str(line)))
+            return spinner
+
+        with Live(get_renderable=render, console=console, transient=True, refresh_per_second=4):
+            yield line
         return
-    with Bar(console=console, transient=True) as shown:
-        task = shown.add_task("fits", total=None)
-        yield lambda at: shown.update(task, description=at.what, completed=at.done, total=at.total)
+    ended = threading.Event()
 
+    def write() -> None:
+        while not ended.wait(1.0):
+            if line.due():
+                print(line, file=sys.stderr, flush=True)
 
-def sparse(clock: Callable[[], float] = time.monotonic) -> OnProgress:
-    """Lines on stderr at growing distances: after 30 s, one minute, two, and so on, ten at most."""
-    began = clock()
-    due, gap = began + FIRST, FIRST
-
-    def say(at: At) -> None:
-        nonlocal due, gap
-        now = clock()
-        if now < due:
-            return
-        gap = min(2 * gap, LONGEST)
-        due = now + gap
-        print(f"{_text(at)}, {now - began:.0f} s", file=sys.stderr, flush=True)
-
-    return say
-
-
-def _text(at: At) -> str:
-    done = f"{at.what}: {at.done} of {at.total}"
-    return done if at.objective is None else f"{done}, objective {at.objective:.3f}"
+    threading.Thread(target=write, daemon=True).start()
+    try:
+        yield line
+    finally:
+        ended.set()

@@ -3,8 +3,8 @@
 import json
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,11 +16,11 @@ from probcal.cli import fit
 from probcal.cli.files import say_written, write_csv
 from probcal.cli.models import ModelFile, check_here, digest_of_file
 from probcal.cli.outputs import FIT, results_of_a_run
-from probcal.cli.progress import bar
+from probcal.cli.progress import shown
 from probcal.errors import FitError, InputError
 from probcal.files import Outputs, write_whole
 from probcal.inference.manifest import check_same, stored_run
-from probcal.inference.progress import Progress
+from probcal.inference.progress import Monitor
 from probcal.inference.spread import check_scheduler, spread
 from probcal.results.read import summary
 from probcal.status import Status
@@ -99,12 +99,16 @@ def run(
     found = {path: rows for path, digest in files if (rows := work.kept(path, digest)) is not None}
     missing = [(path, digest) for path, digest in files if path not in found]
     outputs.begin()
-    with bar() as advance, closing(spread(work, missing, scheduler=scheduler, threads=1)) as finished:
-        last = time.monotonic()
+    with (
+        shown() as progress, _kept(found, files, outputs),
+        closing(spread(work, missing, scheduler=scheduler, threads=1)) as finished,
+    ):  # fmt: skip
+        last, monitor = time.monotonic(), Monitor(progress)
+        monitor.tell("recordings", len(found), len(files))
         for k, rows in finished:
             found[missing[k][0]] = rows
             _check_seen(work.out, missing[k][0])
-            advance(Progress("recordings", len(found), len(files)))
+            monitor.tell("recordings", len(found), len(files))
             if time.monotonic() - last > PARTLY:
                 _write(found, files, outputs)
                 last = time.monotonic()
@@ -121,6 +125,20 @@ def run(
         print(f"{', '.join(names)}: {message}", file=sys.stderr)
     states = {rows[0]["status"] for rows in found.values()}
     return 0 if all(state != REFUSED and Status(state).settled for state in states) else 1
+
+
+@contextmanager
+def _kept(
+    found: Mapping[Path, list[dict[str, Any]]], files: Sequence[tuple[Path, str]], outputs: Outputs
+) -> Iterator[None]:
+    """Interrupted, the table of what is finished is written."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        _write(found, files, outputs)
+        done = f"interrupted; {len(found)} of {len(files)} recordings are finished, --resume goes on"
+        print(f"probcal: {done}", file=sys.stderr)
+        raise
 
 
 def _check_seen(out: Path, data: Path) -> None:

@@ -10,7 +10,7 @@ import xarray as xr
 
 from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.cli.models import load_problem, prior_named
-from probcal.cli.progress import bar
+from probcal.cli.progress import shown
 from probcal.files import Outputs
 from probcal.inference import METHODS, sbc
 from probcal.inference.coverage import coverage_table
@@ -33,10 +33,10 @@ def run(
     began = time.perf_counter()
     if outputs is not None and overwrite:
         outputs.begin()
-    with bar() as advance:
+    with shown() as progress:
         tree = sbc(
             problem, value, prior=chosen, runs=runs, simulate_from=PRIORS[truths] if truths is not None else None,
-            around="data" if posterior else None, key=seed, progress=advance, resume=resume,
+            around="data" if posterior else None, key=seed, progress=progress, resume=resume,
             overwrite=overwrite, scheduler=scheduler, store=None if outputs is None else outputs.folder / "runs",
         )  # fmt: skip
     tree.attrs["model"] = model.stem

@@ -10,7 +10,7 @@ import xarray as xr
 
 from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.cli.models import ModelFile
-from probcal.cli.progress import bar
+from probcal.cli.progress import shown
 from probcal.diagnostics import grid_of, study_table
 from probcal.errors import InputError
 from probcal.files import Outputs
@@ -33,11 +33,11 @@ def run(
     began = time.perf_counter()
     if outputs is not None and overwrite:
         outputs.begin()
-    with bar() as advance:
+    with shown() as progress:
         found = study(
             setting, grid, chosen, runs=range(seed, seed + runs), resume=resume, overwrite=overwrite,
             store=None if outputs is None else outputs.folder / "runs", scheduler=scheduler,
-            progress=advance if outputs is None else partly(outputs, advance),
+            progress=progress if outputs is None else partly(outputs, progress),
         )  # fmt: skip
     table = study_table(found)
     print(table.to_string(index=False, float_format=lambda value: f"{value:.4g}"))

@@ -7,9 +7,11 @@ from typing import Any
 
 from probcal.cli.files import write_csv
 from probcal.cli.models import load_problem, load_truth
+from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.inference import track
+from probcal.inference.progress import Monitor
 from probcal.particle.settings import Particles
 from probcal.results.io import load
 from probcal.results.read import tracks
@@ -28,7 +30,9 @@ def run(model: Path, data: Path | None, given: Mapping[str, Any], calibration: P
         )
     module, problem = load_problem(model, data, (), given)
     truth = load_truth(module, model, data, problem, given)
-    tree = track(problem, known, smoother=Particles(particles) if smoother == "particles" else None, key=seed)
+    with shown() as progress:
+        Monitor(progress).enter("tracks", "track")
+        tree = track(problem, known, smoother=Particles(particles) if smoother == "particles" else None, key=seed)
     frame = tracks(tree)
     out = outputs.folder / outputs.names[0]
     with outputs.writing():

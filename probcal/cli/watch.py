@@ -19,10 +19,12 @@ from rich.table import Table as Shown
 
 from probcal.cli.files import can_plot
 from probcal.cli.models import load_problem
+from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs, write_whole
 from probcal.inference.checkpoint import pack_state, unpack_state
 from probcal.inference.online import AugmentedFilter, Online, ParticleFilter, Update
+from probcal.inference.progress import Progress, handled
 from probcal.problem import Problem, check_linear
 from probcal.results.io import load, save
 from probcal.results.schema import ROPE
@@ -33,7 +35,6 @@ BLOCK = 1 << 18  # bytes that are read at once
 TRIED = 50  # first lines of which a model is made that has no data of its own, and that may be refused
 REST = 0.2  # s between two looks at a file that does not grow
 LISTED = 40  # biases of the live table; of more those that are largest in their sds
-EVERY = 60.0  # s between two lines where the output is no terminal
 DRAWN = 1000  # times of a history that is drawn
 PICTURE = "biases.png"
 STATE, HISTORY, JUMPS, TRACKS, REFUSED, ROWS, FIT = (
@@ -120,7 +121,9 @@ def run(
             f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first"
         )
     source = Source("standard input" if data is None else data.name)
-    problem = _declared(model, data, fix, given, source, follow)
+    with shown() as say:
+        say(Progress(f"watch: {source.name}", 0, 1, phase="start"))
+        problem = _declared(model, data, fix, given, source, follow)
     if isinstance(method, AugmentedFilter):
         check_linear(problem)
     online = Online(
@@ -178,15 +181,16 @@ class Watching:
     ending: bool = False
     unstored: bool = False
 
-    def follow(self, file: Any, grows: bool, show: Callable[[], None]) -> None:
+    def follow(self, file: Any, grows: bool, show: Callable[[str], None]) -> None:
         """Take lines until there are no more, or for as long as the file may grow."""
         while True:
             lines = self.source.take(file)
             if lines:
                 with self.undisturbed():
                     self.filter(lines)
-                show()
+                show("")
             elif self.source.ended and grows:
+                show("waiting for rows")
                 self.checkpoint()
                 time.sleep(REST)
             elif self.source.ended:
@@ -200,7 +204,7 @@ class Watching:
         if self.tables is not None:
             self.tables.add(TRACKS, self.held)
             self.held = self.held.iloc[:0]
-        show()
+        show("")
 
     def filter(self, lines: bytes) -> None:
         """Filter some lines; those that cannot be taken are put aside."""
@@ -287,6 +291,8 @@ class Watching:
 
     def said(self) -> str:
         """One line on where it stands."""
+        if self.online.end is None:
+            return f"no rows of {self.source.name} yet"
         counts = self.online.counts
         parts = [f"{counts['rows']:,} rows up to time {self.online.time:g} s"]
         parts += [f"{counts[name]:,} {name}" for name in ("late", "duplicates") if counts[name]]
@@ -301,21 +307,15 @@ class Watching:
         return ", ".join(parts)
 
     @contextmanager
-    def shown(self) -> Iterator[Callable[[], None]]:
-        """A live table on a terminal; in a file a line now and then."""
+    def shown(self) -> Iterator[Callable[[str], None]]:
+        """A live table on a terminal, else progress on stderr; to be called with the phase."""
         console = Console()
         if not console.is_terminal:
-            last = [time.monotonic()]
-
-            def line() -> None:
-                if time.monotonic() - last[0] >= EVERY:
-                    last[0] = time.monotonic()
-                    print(self.said(), flush=True)
-
-            yield line
+            with shown() as say:
+                yield lambda phase: say(Progress(f"watch: {self.said()}", 0, 1, phase=phase))
             return
         with Live(console=console, refresh_per_second=4, transient=True) as live:
-            yield lambda: live.update(_table(self)) if self.online.end is not None else None
+            yield lambda _: live.update(_table(self)) if self.online.end is not None else None
 
 
 def judged(online: Online) -> pd.DataFrame:
@@ -403,9 +403,5 @@ def _told_to_end(watching: Watching) -> Iterator[None]:
             raise KeyboardInterrupt
         watching.ending = True
 
-    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
+    with handled(end, (signal.SIGTERM, signal.SIGINT)):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

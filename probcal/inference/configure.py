@@ -58,6 +58,7 @@ def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context
     moves: list[float] = []
     room, stated = Room(problem), problem
     for k in range(method.iterations):
+        context.monitor.enter(f"objects, round {k + 1}", method.name)
         objects = track_objects(problem, z, covariance, **method.chances)
         if not objects.names:
             raise FitError(
@@ -76,7 +77,9 @@ def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context
         z, covariance = summary.mean, summary.whole
         if k and moves[-1] < method.tolerance:
             return Configured(objects, problem, rates, k + 1, True, beliefs)
-    return Configured(objects, problem, rates, method.iterations, False, beliefs)
+        if context.monitor.stopped:
+            break
+    return Configured(objects, problem, rates, k + 1, False, beliefs)
 
 
 class Room:

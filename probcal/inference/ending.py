@@ -37,31 +37,35 @@ def conclude(
     iterations: int,
     how: Integration | None = None,
     mixed: Integrated | None = None,
+    stopped: str = "",
 ) -> Answer:
     """The answer of a method whose outer loop ended in a state, whose data leave a mean square a datum.
 
-    Where precisions were integrated after it, `mixed` is what came of it.
+    Where precisions were integrated after it, `mixed` is what came of it; `stopped` says why it was ended early.
     """
     return conclude_at(
         problem, method, prior, _posterior(problem, prior, state, how, mixed), trace, square, iterations,
         converged=bool(state.done) and (mixed is None or bool(mixed.settled)), refused=bool(state.refused),
         evidence=float(state.found.evidence),
-        lost=fallen(prior, len(problem.levels), state.best, state.worth),
+        lost=fallen(prior, len(problem.levels), state.best, state.worth), stopped=stopped,
     )  # fmt: skip
 
 
 def conclude_at(
     problem: Problem, method: Maximiser, prior: Prior, posterior: Posterior, trace: np.ndarray, square: float,
-    iterations: int, *, converged: bool, refused: bool, evidence: float, lost: float = 0.0,
+    iterations: int, *, converged: bool, refused: bool, evidence: float, lost: float = 0.0, stopped: str = "",
 ) -> Answer:  # fmt: skip
     """The answer of a climb that ended at a posterior: whether it converged, never left its start, lost evidence."""
     point, summary = posterior.point, posterior.summary
     low, far = low_and_far(prior, summary, problem.surveyed)
-    asked = method.tolerance == 0.0  # to run so many iterations, whatever they reach
+    cut = bool(stopped) and not converged and iterations < method.iterations
+    asked = method.tolerance == 0.0 and not cut  # to run so many iterations, whatever they reach
     sound = posterior.sound and bool(np.isfinite(evidence))
     end = End(converged, asked, bool(low.any()), bool(far.any()), sound, refused, lost, square)
     status = verdict(end)
     message = _message(problem, point, status, end, low, far, iterations, summary.precisions)
+    if cut and status is Status.NOT_CONVERGED:
+        message = f"{stopped} after {iterations} iterations, before it converged: this is the best estimate so far."
     if status is Status.SPENT and len(trace) > 1:
         message = (
             f"All {iterations} iterations were run, as asked; the last moved the objective by"
@@ -69,7 +73,7 @@ def conclude_at(
         ).strip()
     ended = _bias_status(problem, summary, low, far)
     message = " ".join(part for part in (message, method.remark(prior)) if part)
-    return Answer(problem, method, method, prior, posterior, status, message, ended, iterations, trace)
+    return Answer(problem, method, method, prior, posterior, status, message, ended, iterations, trace, interrupted=cut)
 
 
 def _posterior(

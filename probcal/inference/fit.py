@@ -20,7 +20,7 @@ from probcal.inference.configure import configure
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.manifest import stored_run
 from probcal.inference.methods import EA, NUTS, check_problem, choose_prior
-from probcal.inference.progress import OnProgress
+from probcal.inference.progress import Monitor, OnProgress
 from probcal.inference.rates import of_calibration
 from probcal.inference.run import Context, Method
 from probcal.inference.selfconfig import SelfConfiguration
@@ -70,6 +70,7 @@ def fit(
     start: Point | None = None,
     starts: int = 1,
     progress: OnProgress | None = None,
+    limit: float | None = None,
     save: Collection[str] = (),
     store: str | PathLike[str] | None = None,
     resume: bool = False,
@@ -83,18 +84,21 @@ def fit(
     all of them with their evidence in the group `optimum`. `save` names draws that the tree keeps beside those of the
     biases and of the log-likelihood: "states" of every epoch (large), "predictive" replicas of the data. A
     sampler (`Collapsed()`, `NUTS()`, `SVI()`) writes its draws to the folder `store` while it runs; `resume` goes on
-    where a killed run of the same model, data and settings stopped, with the draws of an uninterrupted one; Ctrl-C
-    leaves what was drawn. A folder that holds a run is refused without `resume` or `overwrite`. The attributes `status`
-    and `message` say what the fit is worth. Raises `InputError` for a prior that the method does not take and
-    `FitError` where a flat prior leaves a singular problem without any interval.
+    where a killed run of the same model, data and settings stopped, with the draws of an uninterrupted one. A folder
+    that holds a run is refused without `resume` or `overwrite`. `progress` is called with the phase, the steps done and
+    the seconds (`Progress`). After `limit` seconds the search for other answers ends, and so do a climb and a sampler
+    that are not done. Ctrl-C ends a fit in the same way: the best answer so far, or the draws so far, come back with
+    the attribute `interrupted` and the status "not converged"; before there is one, and a second time, it raises. The
+    attributes `status` and `message` say what the fit is worth. Raises `InputError` for a prior that the method does
+    not take and `FitError` where a flat prior leaves a singular problem without any interval.
 
     >>> found = fit(problem)
     >>> found.attrs["status"]
     'converged'
     """
     found, _ = calibrate(
-        problem, method, prior=prior, key=key, start=start, starts=starts, progress=progress, save=save, store=store,
-        resume=resume, overwrite=overwrite,
+        problem, method, prior=prior, key=key, start=start, starts=starts, monitor=Monitor(progress, limit), save=save,
+        store=store, resume=resume, overwrite=overwrite,
     )  # fmt: skip
     return found
 
@@ -102,16 +106,16 @@ def fit(
 @float64
 def calibrate(
     problem: Problem, method: Method | None = None, *, prior: Prior | None = None, key: Key = 0,
-    start: Point | None = None, starts: int = 1, progress: OnProgress | None = None, save: Collection[str] = (),
+    start: Point | None = None, starts: int = 1, monitor: Monitor | None = None, save: Collection[str] = (),
     store: str | PathLike[str] | None = None, resume: bool = False, overwrite: bool = False,
 ) -> tuple[xr.DataTree, Answer]:  # fmt: skip
     """The tree of `fit`, and the answer behind it, which `assess` takes so that it need not be found again."""
-    method = EA() if method is None else method
+    method, monitor = EA() if method is None else method, monitor or Monitor()
     prior = choose_prior(method, prior)
     check_problem(problem, linear=not method.by_particles)
     if problem.scans is not None:
         return _configured(
-            problem, method, prior=prior, key=key, starts=starts, progress=progress, save=save, store=store,
+            problem, method, prior=prior, key=key, starts=starts, monitor=monitor, save=save, store=store,
             resume=resume, overwrite=overwrite,
         )  # fmt: skip
     keep = _kept(save)
@@ -127,10 +131,13 @@ def calibrate(
             start="" if start is None else points_digest(start),
         )  # fmt: skip
     folder = None if method.climbs else store
-    with Storage(folder, "draws", identity, resume=resume, overwrite=overwrite) as storage:
+    with (
+        Storage(folder, "draws", identity, resume=resume, overwrite=overwrite) as storage,
+        monitor.interruptible(),
+    ):
         keys = jax.random.split(as_key(key))
-        context = Context(keys[0], progress, storage, fallback=NUTS())
-        answer = solve(problem, method, prior, context, start=start, starts=starts)
+        context = Context(keys[0], monitor, storage, fallback=NUTS())
+        answer = _interrupted(solve(problem, method, prior, context, start=start, starts=starts), monitor)
         directions = _directions(answer)
         answer = _watched(replace(answer, message=_advised(answer, directions)))
         if not answer.posterior.sound:  # a flat prior on a singular problem: no interval exists
@@ -143,11 +150,21 @@ def calibrate(
     found.attrs["seed"] = int(key) if isinstance(key, (int, np.integer)) else -1
     if store is not None:
         found.attrs["identity"] = storage.digest
+    if monitor.signal:
+        found.attrs["interrupted"] = 1
     return found, answer
 
 
+def _interrupted(answer: Answer, monitor: Monitor) -> Answer:
+    """The answer, marked where Ctrl-C ended the search for it or for others."""
+    if not monitor.signal:
+        return answer
+    status = Status.NOT_CONVERGED if answer.status.settled else answer.status
+    return replace(answer, interrupted=True, status=status)
+
+
 def _configured(
-    problem: Problem, method: Method, *, prior: Prior, key: Key, progress: OnProgress | None, **settings: Any
+    problem: Problem, method: Method, *, prior: Prior, key: Key, monitor: Monitor, **settings: Any
 ) -> tuple[xr.DataTree, Answer]:
     """The fit of detections that name no target, with the objects that were found as groups of the tree."""
     scans = problem.scans
@@ -158,14 +175,15 @@ def _configured(
             f" SelfConfiguration({method.name.replace('-', '')}()), on the command line --method self-config, or name"
             " them, as in problem.assigned(track_objects(problem).rows)"
         )
-    context = Context(jax.random.split(as_key(key))[0], progress, None, fallback=NUTS())
-    found = configure(problem, method, prior, context)
+    context = Context(jax.random.split(as_key(key))[0], monitor, None, fallback=NUTS())
+    with monitor.interruptible():
+        found = configure(problem, method, prior, context)
     if silent := found.labelled.silent:
         raise FitError(
             f"No detection of {', '.join(silent)} belongs to an object that is confirmed: all count as clutter, and its"
             " biases are not found. Take it out of the network, or check its clock, its stated pose and Detection(...)."
         )
-    tree, answer = calibrate(found.labelled, method.method, prior=prior, key=key, progress=progress, **settings)
+    tree, answer = calibrate(found.labelled, method.method, prior=prior, key=key, monitor=monitor, **settings)
     wrong = []
     if not found.rests:
         wrong.append(f"{method.name} did not come to rest in {found.rounds} rounds: objects and biases still change.")

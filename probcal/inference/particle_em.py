@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.inference.progress import Progress
 from probcal.inference.run import Context, Given, Maximiser, bare, check_method, given_of, learn
 from probcal.inference.weighted import Ended, check_learnt, conclude_particles, prepared
 from probcal.model.model import At, Model
@@ -232,23 +231,24 @@ def climb_by_particles(
     keys = jax.random.split(context.key)
     state = _begun(problem, targets, how, given, z, keys[0])
     parts: list[Trace] = []
-    count, known, still = 0, bare(prior), Wandering(False, 0, np.inf)
+    count, known, still, stopped = 0, bare(prior), Wandering(False, 0, np.inf), ""
     while count < method.iterations:
         state, part = em_chunk(model, targets, known, given, state, jnp.asarray(method.iterations), how)
         part = jax.tree.map(lambda leaf, left=method.iterations - count: np.asarray(leaf)[:left], part)
         parts.append(part)
         count += len(part.log_likelihood)
-        if context.progress is not None:
-            context.progress(Progress(method.name, count, method.iterations, float(part.log_likelihood[-1])))
+        context.monitor.tell(method.name, count, method.iterations, float(part.log_likelihood[-1]), bound=True)
         traced = np.concatenate([own.z for own in parts])
         still = wandering(traced, np.sqrt(part.variance[-1]))
-        if method.tolerance > 0 and count >= 2 * WINDOW and still.still:
+        settled = method.tolerance > 0 and count >= 2 * WINDOW and still.still
+        stopped = "" if settled or count >= method.iterations else context.monitor.stopped
+        if settled or stopped:
             break
     trace = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     if still.still and how.m_step != "averaged":  # what is left is the noise of the particles
         state = state._replace(z=jnp.asarray(trace.z[-min(WINDOW, len(trace.z) // 2) :].mean(0)))
     ended = Ended(
-        state.z, state.levels, state.alpha, trace.log_likelihood, trace.z, still.still, _moved(problem, still)
+        state.z, state.levels, state.alpha, trace.log_likelihood, trace.z, still.still, _moved(problem, still), stopped
     )
     return conclude_particles(problem, method, how, prior, given, targets, ended, keys[1])
 

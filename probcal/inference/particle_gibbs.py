@@ -139,9 +139,9 @@ class ParticleGibbs(Sampler):
         group, of_sensor = groups_of(problem.model, np.asarray(natural.first.coupled()))
         held = Held(problem.model, targets, natural, group, reference, of_sensor)
         runs = _Gibbs(self, form, held, paths, z, levels, keys[1])
-        drawn, thin, interrupted = drawn_by(self, runs, 1, context.progress, context.storage, context.threads)
+        drawn, thin, stopped = drawn_by(self, runs, 1, context.monitor, context.storage, context.threads)
         run = ParticleRun(
-            self, self, form, natural, None, drawn, time.perf_counter() - began, interrupted, "", (), thin, paths
+            self, self, form, natural, None, drawn, time.perf_counter() - began, stopped, "", (), thin, paths
         )  # fmt: skip
         linear = all(part is None for part in problem.model.sampled)
         answer = conclude_draws(problem if linear else problem.seen(), prior, run, ParticleChains)

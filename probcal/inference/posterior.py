@@ -127,7 +127,7 @@ def conclude_draws(problem: Problem, prior: Prior, run: SamplerRun, kind: type[C
     ended = bias_status(problem, mixed, run.form.biases)
     return Answer(
         problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
-        interrupted=run.interrupted, mirrors=_mirrors(run),
+        interrupted=bool(run.stopped), mirrors=_mirrors(run),
     )  # fmt: skip
 
 
@@ -240,14 +240,14 @@ def judge_chains(
     chains, draws = run.z.shape[:2]
     good = True
     names = [*problem.labels, *(level.label for level in problem.levels)]
-    if run.interrupted:
+    if run.stopped:
         again = draws == run.method.draws
         how = (
             "while more steps were made, as the draws had not mixed"
             if again
             else f"after {draws} of {run.method.draws}"
         )
-        said.append(f"Interrupted {how}{'' if again else ' draws a chain'}; --resume goes on.")
+        said.append(f"{run.stopped} {how}{'' if again else ' draws a chain'}; --resume goes on.")
         good = False
     if "r_hat" in mixed and mixed["r_hat"].max() > R_HAT:
         worst = int(mixed["r_hat"].argmax())

@@ -237,18 +237,17 @@ class Propagation:
         off = self.of_biases((swept.mean - middle) / np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)))
         return float(np.sqrt(np.mean(off**2)))
 
-    def run(self, told: Callable[[int, float], Any] | None = None) -> None:
-        """Rounds until the means move by less than `CLOSE` sds in the root mean square, or all are spent.
+    def run(self, told: Callable[[int, float], bool] | None = None) -> None:
+        """Rounds until the means move by less than `CLOSE` sds in the root mean square, are spent, or `told` ends them.
 
         Between rounds the likelihood is taken anew at the mean.
         """
         for turn in range(ROUNDS):
             off = self.round(turn)
-            if told is not None:
-                told(turn, off)
+            ended = told is not None and told(turn, off)
             far = np.sqrt(np.mean((self.mean - self.likelihood.z) ** 2 / self.variance))
             self.settled = bool(turn >= SURE and off < CLOSE and far < NEAR)
-            if self.settled or turn + 1 == ROUNDS:
+            if self.settled or ended or turn + 1 == ROUNDS:
                 break
             if far >= AGAIN:
                 self.likelihood = self.likelihood.at(self.mean)

@@ -18,7 +18,7 @@ from probcal.errors import InputError
 from probcal.inference.ending import conclude
 from probcal.inference.hierarchy import learnt_groups
 from probcal.inference.integrate import Integration, integrate
-from probcal.inference.progress import OnProgress, Progress
+from probcal.inference.progress import Monitor
 from probcal.inference.sparse import sparse_answer, takes_sparse
 from probcal.inference.storage import Storage
 from probcal.model.model import Mixing, Model
@@ -67,7 +67,7 @@ class Context(NamedTuple):
     """What a run is given beside the problem."""
 
     key: jax.Array
-    progress: OnProgress | None = None
+    monitor: Monitor = Monitor()  # what says how far it is, and when to stop: this one never does
     storage: Storage | None = None  # where a sampler keeps its draws
     threads: int | None = None
     fallback: Any = None  # the sampler that takes over where a collapse does not fit
@@ -140,7 +140,8 @@ class Maximiser(Method, ABC):
             first = first_precision(problem, prior)
             mixed = integrate(how, problem.model, first, state.point, context.key, search=True)
         square = float(mean_square(problem.model, state.point if mixed is None else mixed.point))
-        return conclude(problem, self, prior, state, trace, square, len(trace), how, mixed)
+        stopped = context.monitor.stopped
+        return conclude(problem, self, prior, state, trace, square, len(trace), how, mixed, stopped)
 
     def _with_places(
         self, plain: Problem, prior: Prior, state: State, trace: np.ndarray, chosen: Any, context: Context
@@ -167,6 +168,9 @@ class Maximiser(Method, ABC):
             wants = _sds(tried, after.slope - held.pull(np.asarray(tried.point.z)))
             state, tilt, worth = tried, after, better
             if wants < ASIDE:
+                break
+            if context.monitor.stopped:
+                state = state._replace(done=jax.device_put(np.array(False)))
                 break
             looser = 0.25 * leash if leash > 0.1 else 0.0
             leash, wanted = max(4.0 * leash, 1.0) if wants > 0.5 * wanted else looser, wants
@@ -336,7 +340,7 @@ def stepped(method: Any, model: Model, prior: Prior, given: Given, state: State)
 def maximise(
     method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context, alpha: np.ndarray | None = None
 ) -> tuple[State, np.ndarray]:
-    """Run a method from a start until it is done or its iterations are spent; the last state and the objectives.
+    """Run a method from a start until it is done, spent or stopped; the last state and the objectives.
 
     It begins with precisions `alpha` (M,), those of the prior if None.
     """
@@ -345,7 +349,7 @@ def maximise(
     state = first_state(given, problem.model, start, method.begin(problem.model, start), context.key)
     state = state if alpha is None else state._replace(alpha=jnp.asarray(alpha))
     trace = np.zeros(0)
-    while len(trace) < method.iterations and not bool(state.done):
+    while len(trace) < method.iterations and not bool(state.done) and not (len(trace) and context.monitor.stopped):
         if method.steps_on_host(problem.model, prior):
             state = stepped(method, problem.model, prior, given, state)
             state = method.close(problem.model.with_mixing(state.mixing), prior, given, state)
@@ -356,6 +360,5 @@ def maximise(
             left = method.iterations - len(trace)
             state, (objective, idle) = chunk(kernel(method), problem.model, prior, given, state, left)
             trace = np.concatenate([trace, np.asarray(objective)[~np.asarray(idle)]])
-        if context.progress is not None:
-            context.progress(Progress(method.name, len(trace), method.iterations, float(trace[-1])))
+        context.monitor.tell(method.name, len(trace), method.iterations, float(trace[-1]), bound=True)
     return state, trace

@@ -62,7 +62,7 @@ class Sampler(Method, ABC):
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Draws of the posterior around a start, and what they say."""
         run = sample(
-            problem, self, prior, start, context.key, progress=context.progress, storage=context.storage,
+            problem, self, prior, start, context.key, monitor=context.monitor, storage=context.storage,
             threads=context.threads, fallback=context.fallback,
         )  # fmt: skip
         return conclude_draws(problem, prior, run)

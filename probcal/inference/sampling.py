@@ -20,7 +20,7 @@ from probcal.inference.mixed import settled
 from probcal.inference.orbits import orbits_of
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Natural, Posed
-from probcal.inference.progress import OnProgress, Progress
+from probcal.inference.progress import Monitor
 from probcal.inference.sides import Sided, distances, side_by_side
 from probcal.inference.storage import Chunks, Storage
 from probcal.priors import Prior
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from probcal.inference.sampler import Sampler
 
 GROWTH = 4  # by how many times more steps a draw is tried again that has not mixed
+WARM_UP = "warm-up"  # the phase that leaves no draws
 ROAMING = 0.9  # acceptance of leaps below which chains also move along orbits
 
 
@@ -47,7 +48,7 @@ class SamplerRun:
     worth: Worth | None  # of the frame, where there is one
     draws: Draw  # leading dims (chain, draw) of every array
     seconds: float
-    interrupted: bool
+    stopped: str  # why it was ended before all draws were made; empty where they were
     note: str  # what happened on the way, a sentence or nothing
     sides: tuple[Mirrored, ...] = ()  # other sides of a mirror that the chains visit, numbered from 1
     thin: int = 1  # steps from one draw to the next
@@ -118,6 +119,12 @@ class Plan:
         """Draws that are there after so many chunks."""
         return max(0, (count - self.begin) * self.method.chunk - self._unkept)
 
+    def phase(self, count: int) -> str:
+        """The phase after so many chunks."""
+        if self.done(count) == 0 and self.before is None and self._unkept:
+            return WARM_UP
+        return "draws" if self.thin == 1 else f"draws, {self.thin} steps each"
+
     def steps(self, count: int) -> int:
         """Steps of a chain after so many chunks."""
         own = (count - self.begin) * self.method.chunk * self.thin
@@ -136,15 +143,16 @@ def sample(
     start: Point,
     key: jax.Array,
     *,
-    progress: OnProgress | None = None,
+    monitor: Monitor,
     storage: Storage | None = None,
     threads: int | None = None,
     fallback: Sampler | None = None,
 ) -> SamplerRun:
     """Draws of a method from the posterior of a problem.
 
-    `storage` keeps draws and state, and what it holds is gone on with. `fallback` takes over where the frame does not
-    fit and has its prior. Raises `FitError` where no draw is finite, `InputError` where a stored chunk is damaged.
+    `storage` keeps draws and state, and what it holds is gone on with; `monitor` may end it early. `fallback` takes
+    over where the frame does not fit and has its prior. Raises `FitError` where no draw is finite, `InputError` where a
+    stored chunk is damaged.
     """
     began = time.perf_counter()
     keys = jax.random.split(key)
@@ -173,9 +181,9 @@ def sample(
         orbits = orbits_of(problem, posed, covariance)
         poses = [(one._replace(orbits=orbits), drawn) for one, drawn in poses]
     runs = _Run(method, form, [one for one, _ in poses], [draws for _, draws in poses], keys[1])
-    drawn, thin, interrupted = drawn_by(method, runs, len(poses), progress, storage, threads)
+    drawn, thin, stopped = drawn_by(method, runs, len(poses), monitor, storage, threads)
     seconds = time.perf_counter() - began
-    return SamplerRun(method, asked, form, posed, worth, drawn, seconds, interrupted, note, tuple(sides), thin)
+    return SamplerRun(method, asked, form, posed, worth, drawn, seconds, stopped, note, tuple(sides), thin)
 
 
 class Runnable(Protocol):
@@ -192,44 +200,50 @@ class Runnable(Protocol):
 
 
 def drawn_by(
-    method: Sampler, runs: Runnable, sides: int, progress: OnProgress | None, storage: Storage | None,
-    threads: int | None,
-) -> tuple[Draw, int, bool]:  # fmt: skip
-    """Draws of all chains, chunk by chunk, steps from one to the next, and whether they were interrupted.
+    method: Sampler, runs: Runnable, sides: int, monitor: Monitor, storage: Storage | None, threads: int | None
+) -> tuple[Draw, int, str]:
+    """Draws of all chains, chunk by chunk, steps from one to the next, and why they were ended early.
 
-    What a storage holds is gone on with. Raises `FitError` where no draw is finite.
+    What a storage holds is gone on with. Raises `FitError` where no draw is finite, and where a limit of time leaves
+    none.
     """
     box = Chunks(Storage(None, "draws", {}) if storage is None else storage)
     state = runs.restored(box.state) if box.state is not None else runs.first()
-    plan, interrupted = Plan(method), False
+    plan, phase, stopped = Plan(method), "", ""
+
+    def enter() -> None:
+        nonlocal phase
+        if phase != (phase := plan.phase(box.count)):
+            monitor.enter(phase, method.name, answering=phase != WARM_UP)
+
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        try:
-            while True:
-                while box.count < plan.end:
-                    state, draws = runs.advance(state, plan.thin, pool)
-                    kept = plan.kept(box.count)
-                    box.add(
-                        {n: a[:, a.shape[1] - kept :] for n, a in flat_arrays(draws).items()}, jax.tree.leaves(state)
-                    )
-                    if progress is not None:
-                        density = float(np.mean(draws.density))
-                        progress(Progress(method.name, plan.steps(box.count), plan.steps(plan.end), density))
-                drawn = plan.drawn(box)
-                if plan.last or settled(np.asarray(drawn.theta), _side(drawn), sides):
-                    break
-                plan = plan.longer()
-        except KeyboardInterrupt:
-            interrupted = True
-            if box.count * method.chunk <= method.warmup:
-                raise
-            if plan.before is not None and plan.done(box.count) * GROWTH < method.draws:
-                plan = plan.before
-            drawn = plan.drawn(box)
+        while True:
+            while box.count < plan.end and not stopped:
+                enter()
+                state, draws = runs.advance(state, plan.thin, pool)
+                kept = plan.kept(box.count)
+                box.add({n: a[:, a.shape[1] - kept :] for n, a in flat_arrays(draws).items()}, jax.tree.leaves(state))
+                enter()
+                density = float(np.mean(draws.density))
+                monitor.tell(method.name, plan.steps(box.count), plan.steps(plan.end), density)
+                stopped = monitor.stopped
+            if stopped and box.count < plan.end:
+                break
+            stopped, drawn = "", plan.drawn(box)
+            if plan.last or settled(np.asarray(drawn.theta), _side(drawn), sides):
+                break
+            plan = plan.longer()
+    if stopped:
+        if plan.before is not None and plan.done(box.count) * GROWTH < method.draws:
+            plan = plan.before
+        if not plan.done(box.count):
+            raise FitError(f"{stopped} in the warm-up, before there was a draw: give a longer limit, or fewer steps")
+        drawn = plan.drawn(box)
     if not np.isfinite(np.asarray(drawn.theta)).all():
         raise FitError(
             f"{method.name}: some draw is not finite; give biases that no row determines a survey, or fix them"
         )
-    return drawn, plan.thin, interrupted
+    return drawn, plan.thin, stopped
 
 
 def restored_as(form: Any, leaves: list[np.ndarray]) -> Any:

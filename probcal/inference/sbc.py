@@ -27,7 +27,7 @@ from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.methods import NUTS, check_problem, choose_prior
 from probcal.inference.posed import Form
 from probcal.inference.prior_draws import check_drawable, draw_data, draw_prior, far_start
-from probcal.inference.progress import OnProgress, Progress
+from probcal.inference.progress import Monitor, OnProgress
 from probcal.inference.quantities import TAKEN, Points, Pool, Trial, pool_of, ranked
 from probcal.inference.run import Context, Method
 from probcal.inference.sampler import Sampler
@@ -115,14 +115,14 @@ def _runs(
     """Records of all runs, those kept and those made now, and whether Ctrl-C stopped them."""
     missing = [k for k in range(runs) if k not in box.records]
     batches = [missing[:1], *(missing[k : k + BATCH] for k in range(1, len(missing), BATCH))] if missing else []
-    interrupted = False
+    interrupted, monitor = False, Monitor(progress)
+    monitor.tell("runs", runs - len(missing), runs)
     try:
         with closing(spread(engine.several, batches, scheduler=scheduler, threads=threads)) as finished:
             for k, records in finished:
                 _check_quantities(box, records)
                 box.add(batches[k], records)
-                if progress is not None:
-                    progress(Progress("runs", sum(k in box.records for k in range(runs)), runs))
+                monitor.tell("runs", sum(k in box.records for k in range(runs)), runs)
     except KeyboardInterrupt:
         interrupted = True
         if len(box.records) < 2:

@@ -10,6 +10,7 @@ import numpy as np
 
 from probcal.errors import FitError, InputError
 from probcal.inference.methods import MAP
+from probcal.inference.progress import Monitor, Stopped
 from probcal.inference.run import Context, Maximiser, Method
 from probcal.inference.sparse import PRODUCTS, check_sparse, gains_by_sparse, sparse_climb, takes_sparse
 from probcal.inference.sparse_gibbs import check_gibbs
@@ -38,8 +39,11 @@ def solve(
     """The answer of a method, the best of several starts; its `optima` are all of them where there are several.
 
     A sampler starts at the best joint mode under the declared scales where there are several starts, or noise levels
-    that are unknown. The context's key seeds draws and further starts.
+    that are unknown. The context's key seeds draws and further starts; its monitor may end the search for other answers
+    than the first.
     """
+    monitor = context.monitor
+    monitor.enter("start", method.name)
     if method.by_particles:
         return _by_particles(problem, method, prior, context, start, starts)
     given, problem = problem, method.prepare(problem)
@@ -48,23 +52,47 @@ def solve(
         method = sparse
         first = grid_start(problem, jnp.zeros(problem.model.biases), 30) if start is None else start
         return _in_sparse_form(problem, method, prior, first, context)
-    points = [o.point for o in optima_of(problem)] if start is None else [_suited(given, problem, start)]
-    points += further_starts(problem, starts - len(points), jax.random.fold_in(context.key, 1))
+    points = (
+        [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))] if start is None
+        else [_suited(given, problem, start)]
+    )  # fmt: skip
+    if not monitor.stopped:
+        points += further_starts(problem, starts - len(points), jax.random.fold_in(context.key, 1))
     climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint"), Gaussian())
-    optima: list[Answer] = []
+    optima, unseen = list[Answer](), ""
     if method.climbs or len(points) > 1 or problem.levels or problem.model.tailed:
-        optima = [climber.answer(problem, own, point, context) for point in points]
+        for k, point in enumerate(points):
+            if k and monitor.stopped:
+                break
+            if method.climbs:
+                monitor.enter(f"start {k + 1} of {len(points)}" if k else "climb", answering=True)
+            optima.append(climber.answer(problem, own, point, context))
+        unseen = starts_unseen(len(optima), max(len(points), starts))
         points = [optimum.posterior.point for optimum in optima]
     best = max(range(len(optima)), key=lambda k: _rank(optima[k])) if optima else 0
     if optima and not method.climbs:  # with the precisions that its process noise has there
         problem = optima[best].problem
     found = optima[best] if method.climbs else method.answer(problem, prior, points[best], context)
     motion = "used" if used else "left out"
+    found = _without(found, unseen, monitor)
     found = replace(found, motion=motion, optima=tuple(optima) if len(points) > 1 else (), best=best)
     if not (method.climbs and used):
         return found
     beside = _beside_mirrors(found, method, context)
     return replace(beside, mirrors=(*beside.mirrors, *_beside_optima(beside, (found, *found.optima))))
+
+
+def starts_unseen(climbed: int, wanted: int) -> str:
+    """The starts that were not climbed from, in words; empty where all were."""
+    return "" if climbed >= wanted else f"{wanted - climbed} of {wanted} starts"
+
+
+def _without(answer: Answer, unseen: str, monitor: Monitor) -> Answer:
+    """The answer with a sentence on other answers that were not looked for, since the search was ended."""
+    if not unseen:
+        return answer
+    said = f"{monitor.stopped} before {unseen} were looked at: there may be other answers."
+    return replace(answer, message=f"{answer.message} {said}".strip())
 
 
 def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> Method | None:
@@ -90,6 +118,7 @@ def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point
     A sampler starts on the side that fits best, and its answer tells of the others.
     """
     if method.climbs:
+        context.monitor.enter("climb", answering=True)
         found = method.answer(problem, prior, start, context)
         used = cast("Method", found.method)  # "matrix-free" where memory held no factor
         try:
@@ -121,7 +150,7 @@ def _by_particles(
     near = problem if linear else problem.loosened()
     mirrors: tuple[Mirrored, ...] = ()
     if start is None and near is not None:
-        first = solve(near, MAP(trajectory="joint"), Gaussian(), context._replace(progress=None))
+        first = solve(near, MAP(trajectory="joint"), Gaussian(), context._replace(monitor=context.monitor.silent()))
         start = first.posterior.point if first.status.valid and first.posterior.sound else None
         mirrors = first.mirrors if linear and start is not None and method.climbs else ()
     drawn = np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(context.key, 1))))
@@ -129,15 +158,22 @@ def _by_particles(
     places = [begin, *drawn.standard_normal((starts - 1, len(begin)))]
     answers = []
     for k, z in enumerate(places):
+        if k and context.monitor.stopped:
+            break
+        if method.climbs:
+            context.monitor.enter(f"start {k + 1} of {starts}" if k else "climb", answering=True)
         key = context.key if k == 0 else jax.random.fold_in(context.key, 1 + k)
         point = Point((), (), jnp.asarray(z), jnp.zeros(len(problem.levels)))
         tries = [method.answer(problem, prior, point, context._replace(key=key))]
         while method.climbs and tries[-1].status in (Status.NOT_CONVERGED, Status.MISFIT) and len(tries) < TRIES:
+            if context.monitor.stopped:
+                break
             other = context._replace(key=jax.random.fold_in(key, len(tries)))
             tries.append(method.answer(problem, prior, point, other))
         answers.append(max(tries, key=_rank))
-    best = max(range(starts), key=lambda k: _rank(answers[k]))
-    return replace(answers[best], optima=tuple(answers) if starts > 1 else (), best=best, mirrors=mirrors)
+    best = max(range(len(answers)), key=lambda k: _rank(answers[k]))
+    found = _without(answers[best], starts_unseen(len(answers), starts), context.monitor)
+    return replace(found, optima=tuple(answers) if len(answers) > 1 else (), best=best, mirrors=mirrors)
 
 
 def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: SideClimb | None = None) -> Answer:
@@ -149,7 +185,14 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
     """
     if not (answer.status.valid and answer.posterior.sound):
         return answer
-    problem, here = answer.problem.untilted, answer.posterior.point
+    problem, here, monitor = answer.problem.untilted, answer.posterior.point, context.monitor
+    monitor.enter("mirror images", answering=True)
+    climb = SideClimb.dense(problem) if climb is None else climb
+
+    def mode(point: Point, to: SideClimb = climb) -> tuple[Point, float]:
+        """The mode next to a point, where there is time for it."""
+        monitor.check()
+        return to.mode(point)
 
     def answered(point: Point) -> Answer | None:
         """The answer from a point, if there is a good one in the form of the first."""
@@ -157,16 +200,26 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
             found = method.answer(problem, answer.prior, point, context)
         except FitError:
             return None
-        return found if found.method == answer.method and found.status.valid and found.posterior.sound else None
+        whole = found.status.valid and found.posterior.sound and not found.interrupted
+        return found if found.method == answer.method and whole else None
 
-    sides = other_sides(problem, here, climb)
+    try:
+        sides = other_sides(problem, here, climb._replace(mode=mode))
+    except Stopped:
+        return _without(answer, "mirror images", monitor)
     places = [Mirrored(sides.name, 0.0, sides.point, np.zeros(0), sides.kind)] if sides.moved else []
     places = [other._replace(gain=other.gain + sides.gain) for other in (*places, *sides.others)]
     found, unfitted, unseen = [(("", SCENE), answer)], list[Mirrored](), ""
-    for other in places:
-        own = answered(other.point) if other.gain > -SAME else None
+    skipped = 0
+    for k, other in enumerate(places):
+        fits, own = other.gain > -SAME, None
+        if fits and not monitor.stopped:
+            monitor.enter(f"mirror image {k + 1} of {len(places)}", answering=True)
+            own = answered(other.point)
+        late = fits and own is None and bool(monitor.stopped)
+        skipped += late
         if own is None:
-            if other.gain > MORE:
+            if other.gain > MORE and not late:
                 unseen = f"Under the declared scales another place fits better ({other.name}), from which no fit came."
             else:
                 unfitted.append(other)
@@ -187,10 +240,11 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
             mirrors.append(Mirrored(name, _weight(one) - first - gain, place.point, place.summary.mean - mean, kind))
     mirrors += [o._replace(gain=o.gain - gain, shift=np.asarray(o.point.z) - mean) for o in unfitted]
     mirrors = sorted((other for other in mirrors if other.gain > -NEAR), key=lambda other: -other.gain)
-    return replace(
+    best = replace(
         best, motion=answer.motion, optima=answer.optima, best=answer.best, mirrors=tuple(mirrors),
         message=f"{best.message} {unseen}".strip(),
     )  # fmt: skip
+    return _without(best, f"{skipped} of {len(places)} mirror images" if skipped else "", monitor)
 
 
 def _weight(answer: Answer) -> float:

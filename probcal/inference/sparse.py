@@ -23,7 +23,6 @@ from probcal.inference.ending import conclude_at
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.integrate import quantile
 from probcal.inference.posed import Form
-from probcal.inference.progress import Progress
 from probcal.inference.propagate import BlockMarginals, Blocks, Propagation
 from probcal.model.model import Model
 from probcal.priors import PRECISION_BOUNDS, Flat, Gaussian, Precision, Prior
@@ -208,9 +207,9 @@ def sparse_answer(method: Maximiser, problem: Problem, prior: Prior, start: Poin
     first = np.asarray(prior_first.alpha)
     declared = np.ones_like(first) if integrated else first
 
-    def told(k: int, value: float) -> None:
-        if context.progress is not None:
-            context.progress(Progress(method.name, min(k, method.iterations), method.iterations, value))
+    def told(k: int, value: float) -> bool:
+        context.monitor.tell(method.name, min(k, method.iterations), method.iterations, value, bound=True)
+        return bool(context.monitor.stopped)
 
     try:
         mode = find_sparse_mode(
@@ -238,7 +237,7 @@ def sparse_answer(method: Maximiser, problem: Problem, prior: Prior, start: Poin
     square = float(mean_square(model, posterior.point))
     return conclude_at(
         problem, method, prior, posterior, mode.trace, square, len(mode.trace), converged=mode.converged and settled,
-        refused=mode.refused, evidence=evidence,
+        refused=mode.refused, evidence=evidence, stopped=context.monitor.stopped,
     )  # fmt: skip
 
 

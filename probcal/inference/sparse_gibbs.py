@@ -121,10 +121,10 @@ class Gibbs(Sampler):
             mode = find_sparse_mode(model, joint, start, declared, STEPS, 1e-3)
             together = unheld_directions(problem, mode.system, mode.factor) if prior.proper else ()
             runs = _SparseChains(self, form, first, model, joint, mode.system, context.key)
-            drawn, thin, interrupted = drawn_by(self, runs, 1, context.progress, context.storage, context.threads)
+            drawn, thin, stopped = drawn_by(self, runs, 1, context.monitor, context.storage, context.threads)
             natural = Natural(jnp.zeros((0, 0)), jnp.zeros(0), model.level_spread, first)
             seconds = time.perf_counter() - began
-            run = SamplerRun(self, self, form, natural, None, drawn, seconds, interrupted, "", (), thin)
+            run = SamplerRun(self, self, form, natural, None, drawn, seconds, stopped, "", (), thin)
             mixed = mixing(run.z)
             posterior = SparseChains.drawn(problem, prior, run, runs, mode.system, mixed)
         except MemoryError:
@@ -150,7 +150,7 @@ class Gibbs(Sampler):
             ).strip()
         ended = bias_status(problem, mixed, model.biases)
         return Answer(
-            problem, self, self, prior, posterior, status, message, ended, run.z.shape[1], interrupted=interrupted
+            problem, self, self, prior, posterior, status, message, ended, run.z.shape[1], interrupted=bool(stopped)
         )
 
     def keeps_states(self, model: Model) -> bool:

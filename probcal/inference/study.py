@@ -20,7 +20,7 @@ from probcal.inference.fits import Fits, open_fits
 from probcal.inference.identity import identity, problem_digest
 from probcal.inference.integrate import Integrated, Integration, integrate
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
-from probcal.inference.progress import OnProgress, Progress
+from probcal.inference.progress import Monitor, OnProgress
 from probcal.inference.run import (
     Context,
     Given,
@@ -346,12 +346,12 @@ def _fit_missing(
     points = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
     blocks = [(point, [run for run in runs if run in wanted]) for point in points for runs in fits.missing(point)]
     batches = [(k, point, runs) for k, (point, runs) in enumerate(block for block in blocks if block[1])]
-    total = len(points) * len(numbers) * len(methods)
+    total, monitor = len(points) * len(numbers) * len(methods), Monitor(progress)
+    monitor.tell("fits", fits.count(axes, numbers), total)
     with closing(spread(partial(_batch, setting, methods, stored), batches, scheduler=scheduler)) as finished:
         for k, records in finished:
             fits.add(batches[k][1], records)
-            if progress is not None:
-                progress(Progress("fits", fits.count(axes, numbers), total))
+            monitor.tell("fits", fits.count(axes, numbers), total)
 
 
 def _check_model(fits: Fits, setting: Setting, path: Path | None) -> None:

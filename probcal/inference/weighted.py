@@ -79,6 +79,7 @@ class Ended(NamedTuple):
     steps: np.ndarray  # (I, M) biases after every iteration
     still: bool
     said: str  # what still moves
+    stopped: str = ""  # why it was ended early
 
 
 class Trajectories(NamedTuple):
@@ -314,7 +315,7 @@ def conclude_particles(
     ).tolist() if M else []  # fmt: skip
     return Answer(
         posterior.problem, method, method, prior, posterior, status, message, tuple(words), len(ended.trace),
-        ended.trace, ended.steps,
+        ended.trace, ended.steps, bool(ended.stopped),
     )  # fmt: skip
 
 
@@ -438,6 +439,11 @@ def _judged(
         return Status.DIVERGED, f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases."
     if low:
         return Status.AT_BOUND, "A precision stands at its lower bound: the estimate is invalid."
+    if ended.stopped:
+        return Status.NOT_CONVERGED, (
+            f"{ended.stopped} after {len(ended.trace)} iterations, before it converged: this is the best estimate so"
+            " far."
+        )
     better = "more particles" if posterior.paths.how.m_step == "averaged" else 'm_step="averaged", more particles'
     square, count = scatter(posterior.problem, posterior.point)
     if square > max(SCATTER, 1 + SURE * np.sqrt(2 / count)):

@@ -187,11 +187,12 @@ class SparseMode(NamedTuple):
 
 def find_sparse_mode(
     model: Model, joint: JointPrecision, start: Point, alpha: np.ndarray, iterations: int, tolerance: float,
-    told: Callable[[int, float], Any] | None = None,
+    told: Callable[[int, float], bool] | None = None,
 ) -> SparseMode:  # fmt: skip
     """Climb to the mode of the marginal density under precisions alpha (M,) until a step promises less than tolerance.
 
-    A step that does not bring its share of what it promises is halved. Raises `numpy.linalg.LinAlgError` where the
+    A step that does not bring its share of what it promises is halved. It ends where `told`, called with the number of
+    steps and the density, says so. Raises `numpy.linalg.LinAlgError` where the
     precision is not positive definite: a flat prior on what no data tell.
     """
 
@@ -202,14 +203,14 @@ def find_sparse_mode(
 
     here, value = looked(start)
     secants: list[tuple[np.ndarray, np.ndarray]] = []
-    trace, converged = [-value], False
+    trace, converged, ended = [-value], False, False
     while True:
         factor = here.factor(alpha)
         slope = here.pull - alpha * np.asarray(here.point.z)
         step = _direction(factor, joint, slope, secants)
         promised = 0.5 * float(slope @ step)
         converged = promised <= max(tolerance, SMALL * 1e-3 * abs(value)) and np.isfinite(value)
-        if converged or len(trace) > iterations or not np.isfinite(value):
+        if converged or ended or len(trace) > iterations or not np.isfinite(value):
             break
         share, better = 1.0, False
         for _ in range(HALVINGS):
@@ -227,8 +228,7 @@ def find_sparse_mode(
             secants = [*secants, (moved, change)][-KEPT:]
         here, value = there, after
         trace.append(-value)
-        if told is not None:
-            told(len(trace) - 1, -value)
+        ended = told is not None and told(len(trace) - 1, -value)
     return SparseMode(here, factor, value, np.array(trace), converged, not converged and len(trace) == 1)
 
 

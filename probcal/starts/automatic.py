@@ -38,13 +38,14 @@ def automatic_start(problem: Problem, iterations: int = 30) -> Point:
 
 
 @float64
-def optima(problem: Problem, iterations: int = 30) -> list[Optimum]:
+def optima(problem: Problem, iterations: int = 30, stopped: Callable[[], bool] = lambda: False) -> list[Optimum]:
     """Joint modes at the declared scales that the data alone lead to: the best, and those that may be better.
 
     The grid, Viterbi path, motion model and iterated EKS at zero biases, then a few joint steps; the same at the biases
     that the geometry of a family of sensors tells (`FAMILIES`), where the stated network is too uncertain for the grid;
     and, where a node ends far from its stated place, at places exchanged. Modes are ordered by their cost under a
     Cauchy prior of the declared scales, to which one gross error costs little: a Gaussian one would rather spread it.
+    Once `stopped` no other start than the first is tried.
     """
     check_linear(problem)
     first = grid_start(problem, jax.device_put(np.zeros(problem.model.biases)), iterations)
@@ -53,9 +54,13 @@ def optima(problem: Problem, iterations: int = 30) -> list[Optimum]:
         found.append(_polished(problem, first._replace(z=jax.device_put(z)), iterations))
     for family in FAMILIES:
         for z in family(problem):
+            if stopped():
+                break
             found.append(_polished(problem, grid_start(problem, jax.device_put(z), iterations), iterations))
     best = min(found, key=_order)
     for tracked in exchanged(problem, first, best.point, best.settled):
+        if stopped():
+            break
         value = min(float(_sparse_cost(problem.model, tracked)), _polished(problem, tracked, iterations).value)
         found.append(Optimum(value, tracked))
     if len(found) == 1:
