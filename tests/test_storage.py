@@ -570,6 +570,14 @@ def set_to(group, name, value):
     return change
 
 
+def made(group, of, name):
+    def change(tree):
+        one = tree[group].to_dataset()
+        tree[group] = xr.DataTree(one.assign({name: of(one)}))
+
+    return change
+
+
 LACKS = [
     (without("calibration"), "is not a fit written by probcal: its group calibration is missing"),
     (without("constant_data"), "is incomplete: its group constant_data lacks what a fit holds; fit again"),
@@ -584,10 +592,23 @@ LACKS = [
     (unset("interval_probability"), "is incomplete: it has no attribute interval_probability"),
     (unset("results_version"), "was written by an older probcal; fit again"),
     (lambda tree: tree.attrs.update(results_version=99), "was written by a newer probcal; fit again"),
-    (set_to("calibration", "mean", np.nan), "its means or sds are not finite; fit again"),
-    (set_to("calibration", "sd", np.inf), "its means or sds are not finite"),
-    (set_to("calibration", "covariance", np.nan), "its means or sds are not finite"),
-]
+    (set_to("calibration", "mean", np.nan), "calibration/mean holds nan, which no fit can have; the file was changed"),
+    (set_to("calibration", "sd", np.inf), "calibration/sd holds inf, which no fit can have"),
+    (set_to("calibration", "covariance", np.nan), "calibration/covariance holds nan, which no fit can have"),
+    (set_to("calibration", "sd", -0.1), "calibration/sd holds -0.1, which no fit can have"),
+    (set_to("calibration", "gamma", 1.5), "calibration/gamma holds 1.5, which no fit can have"),
+    (set_to("track/car", "sd", -2.0), "track/car/sd holds -2, which no fit can have"),
+    (set_to("observed_data", "y", np.nan), "observed_data/y holds nan, which no fit can have"),
+    (set_to("calibration", "lower", 1e6), r"calibration/lower of \S+ lies above its upper; the file was changed"),
+    (set_to("calibration", "covariance", -1.0), "calibration/covariance is no covariance matrix; the file was changed"),
+    (made("calibration", lambda one: one["covariance"].copy(data=np.triu(one["covariance"])), "covariance"),
+     "calibration/covariance is no covariance matrix"),
+    (made("residual", lambda one: one["std"].astype(str), "std"), "residual/std holds no numbers; the file was changed"),
+    (made("calibration", lambda one: one["covariance"], "sd"), "calibration/sd has the dimensions .* in place of"),
+    (made("calibration", lambda one: one["bias_label"].values[::-1], "bias_label"), "labels that differ or repeat"),
+    (lambda tree: tree.attrs.update(status="done"), 'its attribute status is "done", which no fit has; fit again'),
+    (lambda tree: tree.attrs.update(interval_probability=1.5), "interval_probability does not lie between 0 and 1"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("change", "text"), LACKS, ids=range(len(LACKS)))

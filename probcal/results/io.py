@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,19 @@ from probcal.errors import InputError, checked
 from probcal.files import write_whole
 from probcal.lazy import Later
 from probcal.results.accessor import register
-from probcal.results.schema import ATTRIBUTES, JUDGED, NEEDED, RESULTS_VERSION, SUMMARY, TRACKED, WHOLE
+from probcal.results.blocks import SensorBlocks
+from probcal.results.schema import (
+    ATTRIBUTES,
+    BLOCKS,
+    JUDGED,
+    NEEDED,
+    RESULTS_VERSION,
+    SUMMARY,
+    TRACKED,
+    WHOLE,
+    Member,
+)
+from probcal.status import Status
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -22,6 +35,8 @@ else:
 
 SMALL = 1024  # bytes up to which an array of a file has no chunk of its own
 SEAL = b"probcal sha256:"  # behind the content of a file, before its digest
+ROUNDING = 1e-9  # by which a number of a fit may lie outside its range
+LOSS = 1e-6  # of a correlation matrix: asymmetry, and size of negative eigenvalues, that rounding leaves
 
 
 @checked
@@ -103,25 +118,92 @@ def _sealed(path: Path) -> bool:
 
 
 def check_content(tree: xr.DataTree, path: Path) -> None:
-    """Raise `InputError` where a fit lacks what its readers need."""
+    """Raise `InputError` where a fit lacks what its readers need, or holds what no fit can hold."""
     if "calibration" not in tree.children or not set(SUMMARY[1:]) <= set(tree["calibration"].variables):
         raise InputError(f"{path} is not a fit written by probcal: its group calibration is missing or incomplete")
     if (found := tree.attrs.get("results_version")) != RESULTS_VERSION:
         age = "a newer" if isinstance(found, (int, np.integer)) and found > RESULTS_VERSION else "an older"
         raise InputError(f"{path} was written by {age} probcal; fit again")
-    whole = {} if tree.attrs.get("sparse", 0) else {"calibration": WHOLE}
-    for group, names in [*NEEDED.items(), *whole.items()]:
-        if group not in tree.children or not set(names) <= set(tree[group].variables):
-            raise InputError(f"{path} is incomplete: its group {group} lacks what a fit holds; fit again")
-    for group, names in JUDGED.items():
-        if group in tree.children and not set(names) <= set(tree[group].variables):
-            raise InputError(f"{path} is incomplete: its group {group} lacks what a fit holds; fit again")
-    tracks = tree["track"].children if "track" in tree.children else {}
-    if not tracks or any(not {*TRACKED} <= {*node.variables} or "target" not in node.attrs for node in tracks.values()):
+    sparse = tree.attrs.get("sparse", 0)
+    tracks = list(tree["track"].children.values()) if "track" in tree.children else []
+    if not tracks or any("target" not in node.attrs for node in tracks):
         raise InputError(f"{path} is incomplete: its group track lacks what a fit holds; fit again")
+    judged = {group: members for group, members in JUDGED.items() if group in tree.children}
+    expected = [*NEEDED.items(), ("calibration", BLOCKS if sparse else WHOLE), *judged.items()]
+    for group, members in expected:
+        node = tree[group] if group in tree.children else None
+        if node is None or not set(members) <= set(node.variables):
+            raise InputError(f"{path} is incomplete: its group {group} lacks what a fit holds; fit again")
+        _check_members(node, members, f"{path}: {group}")
+    for node in tracks:
+        if not set(TRACKED) <= set(node.variables):
+            raise InputError(f"{path} is incomplete: its group track lacks what a fit holds; fit again")
+        _check_members(node, TRACKED, f"{path}: track/{node.name}")
     if missing := [name for name in ATTRIBUTES if name not in tree.attrs]:
         raise InputError(f"{path} is incomplete: it has no attribute {missing[0]}; fit again")
-    calibration = tree["calibration"].to_dataset()
-    told = [name for name in ("mean", "sd", "covariance") if name in calibration]
-    if not all(np.isfinite(calibration[name].values).all() for name in told):
-        raise InputError(f"{path}: its means or sds are not finite; fit again")
+    if (status := tree.attrs["status"]) not in set(Status):
+        raise InputError(f'{path}: its attribute status is "{status}", which no fit has; fit again')
+    if not 0.0 < float(tree.attrs["interval_probability"]) < 1.0:
+        raise InputError(f"{path}: its attribute interval_probability does not lie between 0 and 1; fit again")
+    _check_moments(tree, path)
+
+
+def _check_members(node: xr.DataTree, members: Mapping[str, Member], where: str) -> None:
+    """Raise `InputError` where a variable has other dimensions, another kind of values, or numbers out of range."""
+    for name, member in members.items():
+        variable = node.variables[name]
+        values, fault = variable.values, ""
+        if variable.dims != member.dims:
+            fault = f"has the dimensions {variable.dims} in place of {member.dims}"
+        elif values.size and member.kind not in ("any", _kind_of(values)):
+            fault = f"holds no {member.kind}"
+        elif member.kind == "numbers":
+            away = (values < member.least - ROUNDING) | (values > member.most + ROUNDING)
+            away |= member.finite & ~np.isfinite(values)
+            if away.any():
+                fault = f"holds {values[away].flat[0]:g}, which no fit can have"
+        if fault:
+            raise InputError(f"{where}/{name} {fault}; the file was changed, fit again")
+
+
+def _kind_of(values: np.ndarray) -> str:
+    """The kind of the values of an array, by the names of `Member`."""
+    if values.dtype.kind == "O":
+        return "texts" if all(isinstance(value, str) for value in values.ravel()) else "objects"
+    return {"U": "texts", "b": "flags", "i": "numbers", "u": "numbers", "f": "numbers"}.get(values.dtype.kind, "objects")
+
+
+def _check_moments(tree: xr.DataTree, path: Path) -> None:
+    """Raise `InputError` for labels that differ or repeat, intervals upside down, and covariances that are none."""
+    group, labels = tree["calibration"].to_dataset(), tree["calibration"]["bias_label"].values.tolist()
+    others = [tree["posterior"]["bias_label"].values.tolist()]
+    others += [] if "block" in group else [group["bias_label_other"].values.tolist()]
+    if len(set(labels)) < len(labels) or any(other != labels for other in others):
+        raise InputError(f"{path}: its biases have labels that differ or repeat; the file was changed, fit again")
+    upside = np.flatnonzero(group["lower"].values > group["upper"].values)
+    if len(upside):
+        raise InputError(
+            f"{path}: calibration/lower of {labels[upside[0]]} lies above its upper; the file was changed, fit again"
+        )
+    if "block" in group:
+        try:
+            name, blocks = "block_covariance", SensorBlocks.read(group, labels, np.ones(len(labels))).covariance
+        except (IndexError, ValueError):
+            raise InputError(f"{path}: calibration/block names no block; the file was changed, fit again") from None
+    else:
+        name, blocks = "covariance", group["covariance"].values[None]
+    if not _semi_definite(blocks):
+        raise InputError(f"{path}: calibration/{name} is no covariance matrix; the file was changed, fit again")
+
+
+def _semi_definite(matrices: np.ndarray) -> bool:
+    """Whether matrices (B, M, M) are symmetric and positive semi-definite but for rounding."""
+    size = np.sqrt(np.maximum(np.diagonal(matrices, axis1=1, axis2=2), np.finfo(float).tiny))
+    unit = matrices / size[:, :, None] / size[:, None, :]
+    if not (np.abs(unit - unit.swapaxes(1, 2)) <= LOSS).all():
+        return False
+    try:
+        np.linalg.cholesky(unit + LOSS * np.eye(unit.shape[1]))
+    except np.linalg.LinAlgError:
+        return False
+    return True

@@ -1,7 +1,9 @@
 """What a tree of results holds: version, columns, and what readers of a file take for granted."""
 
 from collections.abc import Container, Hashable
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from probcal.errors import InputError
 
@@ -9,16 +11,58 @@ INTERVAL = 0.89  # probability of lower to upper
 RESULTS_VERSION = 3  # of the groups and variables that a fit writes; a reader refuses any other
 MORE = ("r_hat", "ess", "ess_tail", "inclusion", "included", "contraction")  # columns of samplers
 SUMMARY = ("bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma")
-NEEDED = {  # what readers of a fit take for granted
-    "posterior": ("bias",),
-    "calibration": (*SUMMARY[1:], "bias_label", "precision", "status", "kind"),
-    "observed_data": ("y", "sensor", "channel", "target", "time", "row"),
-    "residual": ("before", "after", "std", "weight"),
-    "constant_data": ("node_position", "node_heading", "moving", "stated", "stated_node", "stated_component"),
+
+
+class Member(NamedTuple):
+    """The form of a variable of a saved fit: its dimensions, the kind of its values, and the range of numbers."""
+
+    dims: tuple[str, ...]
+    kind: str = "numbers"  # or "texts", "flags", "any"
+    least: float = -np.inf
+    most: float = np.inf
+    finite: bool = False  # whether the numbers are finite in every fit, one that gave no answer too
+
+
+_BIAS, _DATUM, _STATE = ("bias_label",), ("datum",), ("time", "component")
+_BIAS_TEXT, _DATUM_TEXT = Member(_BIAS, "texts"), Member(_DATUM, "texts")
+_PAIR = ("bias_label", "bias_label_other")
+_POSITIVE = Member(_BIAS, least=0.0, finite=True)
+NEEDED = {  # what readers of a fit take for granted, by group
+    "posterior": {"bias": Member(("chain", "draw", "bias_label"), finite=True)},
+    "calibration": {
+        "unit": _BIAS_TEXT, "scale": _POSITIVE, "mean": Member(_BIAS, finite=True), "sd": _POSITIVE,
+        "lower": Member(_BIAS, finite=True), "upper": Member(_BIAS, finite=True),
+        "gamma": Member(_BIAS, least=0.0, most=1.0, finite=True), "bias_label": _BIAS_TEXT,
+        "precision": Member(_BIAS, least=0.0), "status": _BIAS_TEXT, "kind": _BIAS_TEXT,
+    },
+    "observed_data": {
+        "y": Member(_DATUM, finite=True), "sensor": _DATUM_TEXT, "channel": _DATUM_TEXT, "target": _DATUM_TEXT,
+        "time": Member(_DATUM, finite=True), "row": Member(_DATUM, "any"),
+    },
+    "residual": {
+        "before": Member(_DATUM), "after": Member(_DATUM), "std": Member(_DATUM, least=0.0),
+        "weight": Member(_DATUM, least=0.0),
+    },
+    "constant_data": {
+        "node_position": Member(("node", "axis"), finite=True), "node_heading": Member(("node",), finite=True),
+        "moving": Member(("node",), "flags"), "stated": Member(("value",), finite=True),
+        "stated_node": Member(("value",), "texts"), "stated_component": Member(("value",), "texts"),
+    },
+}  # fmt: skip
+WHOLE = {"covariance": Member(_PAIR, finite=True), "information": Member(_PAIR)}  # of `calibration`, but for a fit in sparse form
+BLOCKS = {  # the same of a fit in sparse form
+    "block": Member(_BIAS, least=0.0, finite=True), "block_place": Member(_BIAS, least=0.0, finite=True),
+    "block_covariance": Member(("bias_label", "place"), finite=True),
+}  # fmt: skip
+TRACKED = {  # of each target
+    "mean": Member(_STATE), "sd": Member(_STATE, least=0.0), "before": Member(_STATE),
+    "time": Member(("time",), finite=True), "component": Member(("component",), "texts"),
+}  # fmt: skip
+JUDGED = {  # where they are
+    "verdict": {"verdict": _BIAS_TEXT, "reason": _BIAS_TEXT},
+    "finding": {"sentence": Member(("finding",), "texts")},
+    "level": {"std": Member(("level",), least=0.0), "guess": Member(("level",), least=0.0, finite=True)},
 }
-WHOLE = ("covariance", "information")  # of `calibration`, but for a fit in sparse form
-TRACKED = ("mean", "sd", "before", "time", "component")  # of each target
-JUDGED = {"verdict": ("verdict", "reason"), "finding": ("sentence",), "level": ("std", "guess")}  # where they are
 ATTRIBUTES = ("method", "prior", "seed", "status", "message", "intervals", "settings", "interval_probability", "data")
 ROPE = 0.1  # scales within which a bias is practically zero
 TYPE_II = "log_evidence_type_ii"  # the largest over the precisions, which are then taken as known
