@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from probcal.errors import InputError
 
@@ -47,6 +48,14 @@ def write_whole(path: str | PathLike[str], data: bytes | memoryview | str) -> Pa
     except (OSError, ValueError) as error:  # a ValueError of a name that no file can have
         raise cannot_write(path, error) from None
     return path
+
+
+def parsed_json(content: bytes) -> Any:
+    """The value of a JSON text in UTF-8, with or without a byte order mark; raises `ValueError` for anything else."""
+    try:
+        return json.loads(content.decode("utf-8-sig"))
+    except RecursionError:
+        raise ValueError("its lists are nested too deeply") from None
 
 
 def cannot_write(path: Path, error: OSError | ValueError) -> InputError:

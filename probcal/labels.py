@@ -1,10 +1,49 @@
 """The labels of biases and what they are made of, and other names that stand in results; text only."""
 
+import unicodedata
 from collections.abc import Collection, Sequence
+
+from probcal.errors import InputError
 
 AXES = ("x", "y", "z")
 SCENE, PIECE, NODE, START = "scene", "piece", "node", "start"  # what an answer beside another differs by
 NOBODY = "no target"  # the target of rows that name none and whose sensor reads none
+
+UNPRINTED = ("Cc", "Cs", "Zl", "Zp")  # Unicode categories: control characters, half of a pair, ends of lines
+FORMULA = ("=", "+", "-", "@")  # first characters of a cell that a spreadsheet computes
+
+
+def check_name(what: str, name: str) -> None:
+    """Raise `InputError` for a name that is blank or holds control characters, which a terminal would obey.
+
+    `what` names the thing. A name such as "'=a" is refused too: in a table it stands for "=a" (`escaped`).
+    """
+    if not name.strip():
+        raise InputError(f'{what} has the blank name "{name}"; give it letters or digits')
+    if any(unicodedata.category(character) in UNPRINTED for character in name):
+        raise InputError(f"{what} has control characters in its name {name!a}; leave them out")
+    if unescaped(name) != name:
+        raise InputError(f"{what} has the name {name}, which stands for {name[1:]} in a table; drop the apostrophe")
+
+
+def escaped(text: str) -> str:
+    """A text as the cell of a table: one that a spreadsheet would compute gets an apostrophe in front.
+
+    >>> escaped("=a.gain"), escaped("-1"), unescaped("'=a.gain")
+    ("'=a.gain", '-1', '=a.gain')
+    """
+    return f"'{text}" if unescaped(f"'{text}") == text else text
+
+
+def unescaped(text: str) -> str:
+    """The text that `escaped` made a cell of."""
+    if text[:1] != "'" or text[1:2] not in FORMULA:
+        return text
+    try:
+        float(text[1:])
+    except ValueError:
+        return text[1:]
+    return text  # of a number a spreadsheet makes a number
 
 
 def listed(names: Sequence[str], most: int = 4) -> str:

@@ -11,7 +11,7 @@ from probcal.detection import Detection
 from probcal.errors import InputError, nearest
 from probcal.geodesy import LocalFrame
 from probcal.geometry import slopes
-from probcal.labels import AXES
+from probcal.labels import AXES, check_name
 from probcal.noise import Heard
 from probcal.sensor import Bias, Drift, Sensor, SensorType
 
@@ -91,6 +91,7 @@ class Node:
         **components: Any,
     ):
         self.name = str(name)
+        check_name("a node", self.name)
         self.path = path
         if (position is None) == (path is None):
             raise InputError(f'node "{name}": give either position or path')
@@ -106,6 +107,7 @@ class Node:
                 f'node "{name}": {vector} cannot be stated; a moving node takes its velocity from path=Path(...)'
             )
         for component, value in self.components.items():
+            check_name(f'node "{name}": a component', component)
             if np.shape(value) == stated.shape and component not in own:
                 self.components[component] = np.asarray(value, float)
             if np.shape(value) not in ((), () if component in own else stated.shape) or not np.isfinite(value).all():

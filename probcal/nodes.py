@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from probcal.errors import InputError, nearest
-from probcal.files import write_whole
+from probcal.files import parsed_json, write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place, earth_axes
 from probcal.labels import AXES, step_of
 from probcal.lazy import Later
 from probcal.network import ANGLES, POSE_UNITS, Node
 from probcal.sensor import Bias
-from probcal.table import Table, header, name_as_text, numbers, read_table, unit_factor
+from probcal.table import Table, csv_text, header, name_as_text, numbers, read_table, unit_factor
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -112,12 +112,12 @@ def read_nodes(
 def _features(path: Path) -> Table:
     """Point features of a GeoJSON file as a table, one row a feature."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
+        content = parsed_json(path.read_bytes())
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise InputError(f"{path.name} is not GeoJSON: {error}") from None
     features = content.get("features") if isinstance(content, dict) else None
     if not isinstance(features, list):
@@ -287,7 +287,7 @@ def write_nodes(
     cells = pd.DataFrame(_rows(records, frame))
     idle = [c for c in cells.columns if c.split(" ")[0] in OWN and (cells[c].abs() < 1e-12).all()]
     cells = cells.drop(columns=idle)
-    text = _geojson(cells) if geojson else cells.to_csv(index=False)
+    text = _geojson(cells) if geojson else csv_text(cells)
     return write_whole(path, text)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from probcal.detection import Detection
 from probcal.errors import InputError, nearest
 from probcal.fingerprint import computes
-from probcal.labels import AXES
+from probcal.labels import AXES, check_name
 from probcal.noise import Bernoulli, Family, Heard, Level, Normal, check_level
 from probcal.types import PoseView, TargetView, untraceable
 
@@ -243,7 +243,9 @@ class SensorType:
             for channel, _ in detection.limits:
                 if channel not in known:
                     raise InputError(f'{self.name}: detection limits "{channel}"{nearest(channel, known)}')
-        return Sensor(self, tuple(nodes), name or "-".join(str(node.name) for node in nodes), detection)
+        name = "-".join(str(node.name) for node in nodes) if name is None else str(name)
+        check_name(f"{self.name}: a sensor", name)
+        return Sensor(self, tuple(nodes), name, detection)
 
     def expand(self, dimension: int) -> tuple[tuple[str, Channel], ...]:
         """Scalar channels by name, those declared per axis once a coordinate."""

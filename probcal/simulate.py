@@ -15,7 +15,7 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.files import write_whole
-from probcal.labels import AXES, NOBODY
+from probcal.labels import AXES, NOBODY, unescaped
 from probcal.lazy import Later
 from probcal.model import rows
 from probcal.model.sampled import path
@@ -23,7 +23,7 @@ from probcal.network import Network
 from probcal.noise import Bernoulli, Heard
 from probcal.problem import Epochs, Problem
 from probcal.sensor import Channel
-from probcal.table import Table, header, name_as_text, numbers, read_table, unit_factor
+from probcal.table import Table, csv_text, header, name_as_text, numbers, read_table, unit_factor
 from probcal.types import float64
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ class Simulation:
             (biases, pd.DataFrame({"bias": list(self.truth.biases), "value": list(self.truth.biases.values())}))
         )
         for target, frame in tables:
-            write_whole(target, frame.to_csv(index=False))
+            write_whole(target, csv_text(frame))
         return [target for target, _ in tables]
 
 
@@ -190,7 +190,7 @@ def _biases_of(table: Table) -> dict[str, float]:
     frame = _columns(table, value="1")
     if "bias" not in frame:
         raise InputError(f'truth {table.source} has no column "bias"{nearest("bias", frame.columns)}')
-    return dict(zip(frame["bias"].astype(str), frame["value"].tolist(), strict=True))
+    return dict(zip(frame["bias"].astype(str).map(unescaped), frame["value"].tolist(), strict=True))
 
 
 @float64

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from decimal import Decimal
 from numbers import Number
 from os import PathLike
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probcal.errors import InputError, nearest
-from probcal.labels import NOBODY
+from probcal.labels import NOBODY, check_name, escaped, unescaped
 from probcal.lazy import Later
 from probcal.network import Network
 from probcal.noise import Bernoulli, Censored, Heard
@@ -89,7 +91,7 @@ def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
     if isinstance(source, Table):
         return source
     if isinstance(source, pd.DataFrame):
-        frame = source.reset_index(drop=True)
+        frame = _plain(source.reset_index(drop=True))
         if not source.index.is_unique:  # as of several frames joined: a label would name several rows
             return Table(frame, "data", np.arange(len(frame)), "row at position")
         return Table(frame, "data", np.asarray(source.index))
@@ -102,6 +104,18 @@ def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+def _plain(frame: pd.DataFrame) -> pd.DataFrame:
+    """Replace cells that pandas cannot compare: an array without axes is its value, masked and signalling NaN blank."""
+    for k, dtype in enumerate(frame.dtypes):
+        column = frame.iloc[:, k] if dtype.kind == "O" else ()
+        if {*map(type, column)} & {np.ndarray, type(np.ma.masked), Decimal}:
+            blank = [cell is np.ma.masked or (isinstance(cell, Decimal) and cell.is_snan()) for cell in column]
+            cells = [None if gone else cell[()] if np.shape(cell) == () and isinstance(cell, np.ndarray) else cell
+                     for cell, gone in zip(column, blank, strict=True)]  # fmt: skip
+            frame.isetitem(k, pd.Series(cells, dtype=object))
+    return frame
 
 
 def read_lines(header: bytes, lines: bytes, name: str, first: int) -> Table:
@@ -147,9 +161,9 @@ def _check_separator(path: Path, header: Sequence[str]) -> None:
 
 def _once(path: Path, columns: list[str]) -> list[str]:
     """Headers of a file, each once."""
-    for column in columns:
-        if columns.count(column) > 1:
-            raise InputError(f'{path.name} has the column "{column}" twice')
+    column, count = Counter(columns).most_common(1)[0]
+    if count > 1:
+        raise InputError(f'{path.name} has the column "{column}" twice')
     return columns
 
 
@@ -200,7 +214,17 @@ def split_header(column: object) -> tuple[str, str | None]:
     if text.endswith("]"):
         text, _, unit = text[:-1].partition("[")
         unit = unit.strip()
-    return ("" if set("[]") & set(text + (unit or "")) else text.strip()), unit
+    return ("" if set("[]") & set(text + (unit or "")) else unescaped(text.strip())), unit
+
+
+def csv_text(frame: pd.DataFrame, *, header: bool = True) -> str:
+    """A table as CSV. Every writer of tables calls it: no text in it is a formula to a spreadsheet (`escaped`)."""
+    cells = frame.rename(columns=lambda name: escaped(str(name)))
+    for k, dtype in enumerate(frame.dtypes):
+        if not pd.api.types.is_numeric_dtype(dtype):
+            own = frame.iloc[:, k].astype(object)
+            cells.isetitem(k, own.map(lambda cell: escaped(cell) if isinstance(cell, str) else cell))
+    return cells.to_csv(index=False, header=header)
 
 
 def header(table: Table) -> tuple[list[str], dict[str, str | None]]:
@@ -211,6 +235,7 @@ def header(table: Table) -> tuple[list[str], dict[str, str | None]]:
         name, unit = split_header(column)
         if not name:
             raise InputError(f'{table.source} column "{column}": write the header as name or name [unit]')
+        check_name(f"{table.source}: a column", name)
         if name in units:
             raise InputError(f'{table.source} has the column "{name}" twice')
         if unit is not None and unit not in UNITS:
@@ -295,7 +320,7 @@ def _seconds(column: pd.Series) -> np.ndarray:
 
 def name_as_text(value: Any) -> str:
     """A sensor, target or node name as text: 1, 1.0 and " 1" are one name, 01 is another."""
-    text = str(value).strip()
+    text = unescaped(str(value).strip())
     whole, _, rest = text.partition(".")
     return whole if rest and not rest.strip("0") and whole.lstrip("-").isdigit() else text
 
@@ -352,6 +377,8 @@ def _targets(
             raise InputError(f'{table.where(same[0])}: "{NOBODY}" stands for rows without a target; name the target')
         text[blank] = unnamed[blank]
     codes, names = pd.factorize(text)
+    for name, row in zip(names, np.unique(codes, return_index=True)[1], strict=True):
+        check_name(f"{table.where(row)}: the target", name)
     return tuple(names), codes, blank & detecting
 
 

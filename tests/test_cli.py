@@ -278,6 +278,8 @@ def test_a_bad_model_gets_one_sentence_and_code_2(text, message, tmp_path):
 def test_other_bad_arguments(model, rows, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
+    for name in ("...csv", "fits.csv.csv", " .csv", "a\x1bb.csv"):
+        (tmp_path / name).write_bytes(rows.read_bytes())
     cases = [
         (("fit", tmp_path / "none.py"), "no such model file"),
         (("fit", model, tmp_path / "none.csv"), "no such file"),
@@ -286,7 +288,23 @@ def test_other_bad_arguments(model, rows, tmp_path):
         (("fit", model, rows, "--prior", "gausian"), 'did you mean "gaussian"?'),
         (("fit", model, rows, "--align", "scale"), '--align "scale": give rigid or similarity'),
         (("fit", model, rows, "--align", "rigid"), "there is no truth to lay the answer on; put one beside"),
-        (("fit", model, rows, "--epoch", "-1"), "Problem(epoch=-1.0): give seconds"),
+        (("fit", model, rows, "--epoch", "-1"), "--epoch -1: give a positive number from 1e-12 to 1e+12 in size"),
+        (("watch", model, rows, "--jumps", "1e-320"), "--jumps 9.99989e-321: give a positive number"),
+        (("watch", model, rows, "--within=-inf"), "--within -inf: give a positive number"),
+        (("watch", model, rows, "--every", "1e22"), "--every 1e+22: give 0 or a positive number"),
+        (("watch", model, rows, "--every", "nan"), "--every nan: give 0 or a positive number"),
+        (("levels", "none.wav", "--out", tmp_path / "a.csv", "--start=-1e99"), "--start -1e+99: give a number from"),
+        (("watch", model, rows, "--walk", "*=inf"), '--walk "*=inf": write PATTERN=STD, the positive'),
+        (("fit", model, rows, tmp_path / "...csv", "--out", tmp_path / "days"), 'cannot be fitted into a folder ".."'),
+        (("fit", model, rows, tmp_path / "fits.csv.csv", "--out", tmp_path / "days"), 'into a folder "fits.csv" of'),
+        (
+            ("fit", model, rows, tmp_path / " .csv", "--out", tmp_path / "days"),
+            'has the blank name " "; give it letters',
+        ),
+        (
+            ("fit", model, rows, tmp_path / "a\x1bb.csv", "--out", tmp_path / "days"),
+            "has control characters in its name",
+        ),
         (("fit", model, rows, "--prior", "gaussian"), "EA does not take the prior Gaussian; it takes: laplace"),
         (("fit", model, rows, "--fix", "gauge_9.*"), 'no bias is called "gauge_9.*"'),
         (("fit", model, rows, "--fix", "*"), "no free bias"),
@@ -303,6 +321,10 @@ def test_other_bad_arguments(model, rows, tmp_path):
         assert code == 2, arguments
         assert text in err
         assert err.count("\n") == 1
+    for count in (("fit", model, "--starts"), ("track", model, "--particles"), ("sbc", model, "--runs")):
+        code, _, err = call(*count, 10**23)
+        assert code == 2, count
+        assert "Invalid value" in err
 
 
 def test_arguments_of_a_model_come_from_the_command_line(rows, tmp_path):

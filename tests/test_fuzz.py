@@ -32,6 +32,7 @@ from probcal import (
 )
 from probcal.cli import commands
 from probcal.cli.models import load_model, load_problem, load_truth
+from probcal.roads import read_roads
 from probcal.simulate import truth_beside
 from probcal.table import measure
 
@@ -128,6 +129,8 @@ def test_bytes(content, name, folder):
     check_nodes(written(folder, "n.geojson", content))
     refused(lambda: Truth(path))
     refused(lambda: load(path))
+    refused(lambda: read_roads(written(folder, "n.geojson", content), crs="local"))
+    refused(lambda: read_roads(written(folder, "n.graphml", content)))
 
 
 @st.composite
@@ -177,6 +180,7 @@ OBJECTS = st.sampled_from([
     None, pd.NA, pd.NaT, np.nan, np.inf, 1, 2.5, -1, HUGE, True, 1j, "a", "01", "1", "", "2024-01-01", b"1", [1], {},
     (1, 2), np.array([1, 2]), datetime.datetime(2024, 1, 1), datetime.date(1, 1, 1), datetime.timedelta(1),
     pd.Timestamp("2024", tz="UTC"), np.datetime64("2024-01-01"), decimal.Decimal("NaN"), decimal.Decimal("1e400"),
+    decimal.Decimal("sNaN"), np.array(5.0), np.array("a"), np.ma.masked,
     pd.Interval(0, 1), pd.Period("2024"), float, np.float32(1), np.longdouble("1e4000"), "\ud800", "1e300", 1e300,
     -1e308,
 ])  # fmt: skip
@@ -266,10 +270,8 @@ def feature(name, place, **properties):
     }
 
 
-@fuzz
-@given(data=st.data())
-def test_geojson(data, folder):
-    content = {"type": "FeatureCollection", "features": [feature("a", [8, 47, 0], gain=1), feature("b", [8.1, 47, 9])]}
+def spoil(data, content):
+    """Put any JSON value in the place of one somewhere in the content."""
     holder, keys = content, []
     while isinstance(holder, (dict, list)) and len(holder) and (not keys or data.draw(st.booleans())):
         keys.append(
@@ -277,8 +279,25 @@ def test_geojson(data, folder):
         )
         holder = holder[keys[-1][1]]
     keys[-1][0][keys[-1][1]] = data.draw(JSON)
+
+
+@fuzz
+@given(data=st.data())
+def test_geojson(data, folder):
+    content = {"type": "FeatureCollection", "features": [feature("a", [8, 47, 0], gain=1), feature("b", [8.1, 47, 9])]}
+    spoil(data, content)
     check_nodes(written(folder, "n.geojson", json.dumps(content)))
     check_nodes(written(folder, "n.json", json.dumps(data.draw(JSON))))
+
+
+@fuzz
+@given(data=st.data())
+def test_roads(data, folder):
+    line = {"type": "LineString", "coordinates": [[0, 0], [60, 0]]}
+    content = {"type": "FeatureCollection", "features": [{"geometry": line, "properties": {"name": "a", "oneway": 1}}]}
+    spoil(data, content)
+    refused(lambda: read_roads(written(folder, "n.geojson", json.dumps(content)), crs="local"))
+    refused(lambda: read_roads(written(folder, "n.json", json.dumps(data.draw(JSON)))))
 
 
 def test_nested_and_overlong_json_is_refused(folder):

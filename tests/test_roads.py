@@ -644,6 +644,20 @@ FILES = [
     ("roads.graphml", "", "roads.graphml: the file is empty"),
     ("roads.json", "{", "roads.json: the file is no JSON"),
     ("roads.graphml", "<graph", "roads.graphml: the file is no GraphML"),
+    ("roads.json", "[" * 100_000, "roads.json: the file is no JSON: its lists are nested too deeply"),
+    ("roads.json", "1" * 6000, "roads.json: the file is no JSON: Exceeds the limit"),
+    ("roads.json", geojson(BOW).replace("0.0", "1" * 400), 'roads.json: edge "a": its points must be numbers'),
+    (
+        "roads.json",
+        geojson({"a": [(0, 0), (1e200, 0)]}),
+        'roads.json: edge "a" has a point that is not finite or beyond',
+    ),
+    (
+        "roads.json",
+        json.dumps({"type": "Feature", "geometry": {"type": "MultiLineString", "coordinates": 5}}),
+        'roads.json: edge "0": its points must be numbers',
+    ),
+    ("roads.graphml", '<?xml version="1.0" encoding="no such"?><graphml/>', "roads.graphml: the file is no GraphML"),
     ("roads.json", "[1]", "roads.json: the file is no GeoJSON object"),
     ("roads.json", geojson({}), "roads.json: the file has no LineString or MultiLineString feature"),
     ("roads.json", geojson({"a": [(0, 0)]}), 'roads.json: edge "a" has no length'),
@@ -660,6 +674,22 @@ def test_bad_files_are_named(name, text, said, tmp_path):
         read_roads(tmp_path / name, crs="local", dimension=3 if "height" in said else None)
     with pytest.raises(InputError, match='crs "EPSG:1" is not known; give one as "EPSG:25832", or "local" for metres'):
         RoadNetwork.from_graph(osm(), crs="EPSG:1")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_the_encoding_of_a_file_is_its_own(encoding, tmp_path):
+    """A byte order mark, as Windows writes it; GraphML says its encoding."""
+    graph = nx.Graph(start="Süd")
+    graph.add_edge("a", "b")
+    nx.set_node_attributes(graph, {"a": 0.0, "b": 60.0}, "x")
+    nx.set_node_attributes(graph, 0.0, "y")
+    nx.write_graphml(graph, path := tmp_path / "roads.graphml")
+    text = path.read_text("utf-8").replace("encoding='utf-8'", f"encoding='{encoding.removesuffix('-sig')}'")
+    path.write_bytes(text.encode(encoding))
+    assert read_roads(path).lengths.tolist() == [60.0]
+    if encoding == "utf-8-sig":
+        (tmp_path / "roads.json").write_bytes(geojson({"a": [(0, 0), (60, 0)]}).encode(encoding))
+        assert read_roads(tmp_path / "roads.json", crs="local").lengths.tolist() == [60.0]
 
 
 def osm():

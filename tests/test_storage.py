@@ -603,7 +603,7 @@ LACKS = [
     (set_to("calibration", "covariance", -1.0), "calibration/covariance is no covariance matrix; the file was changed"),
     (made("calibration", lambda one: one["covariance"].copy(data=np.triu(one["covariance"])), "covariance"),
      "calibration/covariance is no covariance matrix"),
-    (made("residual", lambda one: one["std"].astype(str), "std"), "residual/std holds no numbers; the file was changed"),
+    (made("residual", lambda one: one["std"].astype(str), "std"), "residual/std holds no numbers; the file"),
     (made("calibration", lambda one: one["covariance"], "sd"), "calibration/sd has the dimensions .* in place of"),
     (made("calibration", lambda one: one["bias_label"].values[::-1], "bias_label"), "labels that differ or repeat"),
     (lambda tree: tree.attrs.update(status="done"), 'its attribute status is "done", which no fit has; fit again'),

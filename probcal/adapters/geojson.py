@@ -12,7 +12,7 @@ import numpy as np
 
 from probcal.adapters.shared import check_frame, file_bytes, instant, since
 from probcal.errors import InputError
-from probcal.files import write_whole
+from probcal.files import parsed_json, write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place
 from probcal.labels import AXES
 from probcal.lazy import Later
@@ -83,10 +83,10 @@ def _features(path: str | PathLike[str]) -> list[Any]:
     """Features of a file."""
     name = Path(path).name
     try:
-        content = json.loads(file_bytes(path).decode("utf-8-sig"))
+        content = parsed_json(file_bytes(path))
     except InputError:
         raise
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise InputError(f"{name} cannot be read as GeoJSON: {error}") from None
     if isinstance(content, dict) and content.get("type") == "Feature":
         return [content]

@@ -17,7 +17,7 @@ from probcal.analysis.compare import common_labels
 from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.errors import InputError, checked
-from probcal.labels import listed, step_of
+from probcal.labels import check_name, listed, step_of
 from probcal.results.answer import HALF
 from probcal.results.schema import INTERVAL, matrix_of
 from probcal.status import Status
@@ -72,6 +72,8 @@ def changes(first: xr.DataTree, second: xr.DataTree, *, names: Sequence[str] = (
     if len(names) != 2 or names[0] == names[1]:
         raise InputError(f"changes: names is {tuple(names)}; give two that differ")
     pair = dict(zip(map(str, names), (first, second), strict=True))
+    for name in pair:
+        check_name("changes: a recording", name)
     for name, tree in pair.items():
         _check(name, tree)
     _check_zero(pair)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from probcal.errors import InputError
+from probcal.labels import check_name
 
 
 def check_count(count: int) -> None:
@@ -16,6 +17,7 @@ def check_names(names: Sequence[str], count: int) -> None:
     if len(names) != count or len(set(names)) < len(names):
         raise InputError(f"compare: {len(names)} names for {count} fits; give each fit a name of its own")
     for name in names:
+        check_name("compare: a fit", name)
         if not name.strip(".") or "/" in name:
             raise InputError(f'compare: a fit cannot be called "{name}"; give a name of letters, without "/"')
 

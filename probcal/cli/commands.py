@@ -87,12 +87,12 @@ def fit_command(
     ] = None,
     fix: Fix = None,
     given: Given = None,
-    starts: Annotated[int, typer.Option(min=1, help="starts of the search; the best optimum is reported")] = 1,
+    starts: Annotated[int, options.count(1, "starts of the search; the best optimum is reported")] = 1,
     seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(help="folder for fit.nc, summary.csv, report.html")] = None,
-    chains: Annotated[int | None, typer.Option(min=1, help="chains of a sampler")] = None,
-    draws: Annotated[int | None, typer.Option(min=1, help="draws of each chain after warm-up")] = None,
-    warmup: Annotated[int | None, typer.Option(min=0, help="steps of each chain before its draws")] = None,
+    chains: Annotated[int | None, options.count(1, "chains of a sampler")] = None,
+    draws: Annotated[int | None, options.count(1, "draws of each chain after warm-up")] = None,
+    warmup: Annotated[int | None, options.count(0, "steps of each chain before its draws")] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="go on with the stopped run of a sampler, or with the recordings, in --out")
     ] = False,
@@ -107,7 +107,7 @@ def fit_command(
     assessed: Annotated[
         bool, typer.Option("--assess/--no-assess", help="a verdict per bias, and what the residuals say")
     ] = True,
-    epoch: Annotated[float | None, typer.Option(help="bring rows to common epochs of so many s")] = None,
+    epoch: Annotated[float | None, options.quantity("bring rows to common epochs of so many s")] = None,
     align: Annotated[
         str | None, typer.Option(help="rigid | similarity: how the answer is laid on a truth in another frame")
     ] = None,
@@ -194,7 +194,7 @@ def track_command(
     calibration: Annotated[Path | None, typer.Option(help="folder (or fit.nc) of a fit", show_default=False)] = None,
     given: Given = None,
     smoother: Annotated[str, typer.Option(help="gaussian, or particles: for any motion, roads too")] = "gaussian",
-    particles: Annotated[int, typer.Option(min=2, help="particles of each target")] = 1000,
+    particles: Annotated[int, options.count(2, "particles of each target")] = 1000,
     seed: Seed = 0,
     out: Annotated[Path, typer.Option(help="table of tracks to write")] = Path("tracks.csv"),
 ) -> None:
@@ -225,11 +225,11 @@ def watch_command(
     out: Annotated[Path | None, typer.Option(help="folder for the state, the history of biases and fit.nc")] = None,
     by: Annotated[str | None, typer.Option(help="extended (if left out) | unscented | cubature")] = None,
     lag: Annotated[
-        int | None, typer.Option(min=0, help="epochs that are linearised again, 32 if left out; 0 is the plain filter")
+        int | None, options.count(0, "epochs that are linearised again, 32 if left out; 0 is the plain filter")
     ] = None,
     particles: Annotated[
         int | None,
-        typer.Option(min=2, help="filter by so many particles: for roads and other motions of no linear form"),
+        options.count(2, "filter by so many particles: for roads and other motions of no linear form"),
     ] = None,
     walk: Annotated[
         list[str] | None, typer.Option(help="biases that walk: PATTERN=STD over one second (repeat)")
@@ -237,12 +237,10 @@ def watch_command(
     consider: Annotated[
         list[str] | None, typer.Option(help="biases that are not estimated, by pattern (repeat)")
     ] = None,
-    jumps: Annotated[
-        float | None, typer.Option(help="find biases that jump, with so many false alarms an hour")
-    ] = None,
-    within: Annotated[float, typer.Option(help="s within which a jump must be found")] = 60.0,
-    targets: Annotated[int, typer.Option(min=1, help="targets that are carried at once")] = 16,
-    every: Annotated[float, typer.Option(min=0.0, help="s between two states that are stored")] = 1.0,
+    jumps: Annotated[float | None, options.quantity("find biases that jump, with so many false alarms an hour")] = None,
+    within: Annotated[float, options.quantity("s within which a jump must be found")] = 60.0,
+    targets: Annotated[int, options.count(1, "targets that are carried at once")] = 16,
+    every: Annotated[float, options.quantity("s between two states that are stored", zero=True)] = 1.0,
     keep: Annotated[str, typer.Option(help="tables to write besides: tracks,rows")] = "",
     fix: Fix = None,
     given: Given = None,
@@ -294,7 +292,7 @@ def study_command(
         typer.Option("--set", help="values of an argument of setting(): share=0:1:0.1, scenario=C1,C2"),
     ] = None,
     methods: Annotated[str, typer.Option(help=", ".join([*METHODS, ORACLE]))] = f"ml,em-ea,ea,{ORACLE}",
-    runs: Annotated[int, typer.Option(min=1, help="simulated runs of every setting")] = 20,
+    runs: Annotated[int, options.count(1, "simulated runs of every setting")] = 20,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="number of the first run")] = 0,
     out: Annotated[
         Path | None, typer.Option(help="folder for study.nc, study.csv, study.png, and finished fits")
@@ -365,8 +363,8 @@ def levels_command(
     recordings: Annotated[list[Path], typer.Argument(help="WAV files, each named like its sensor", show_default=False)],
     out: Annotated[Path, typer.Option(help="table to write (CSV): time, sensor and the column")],
     band: Annotated[str | None, typer.Option(help="frequencies that pass, in Hz: 50,500")] = None,
-    window: Annotated[float, typer.Option(help="s of one row")] = 0.5,
-    start: Annotated[float, typer.Option(help="s at which the recordings begin")] = 0.0,
+    window: Annotated[float, options.quantity("s of one row")] = 0.5,
+    start: Annotated[float, options.quantity("s at which the recordings begin", zero=True, negative=True)] = 0.0,
     column: Annotated[str, typer.Option(help="name of the channel")] = "level",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the table")] = False,
 ) -> None:
@@ -402,7 +400,7 @@ def sbc_command(
     ] = None,
     fix: Fix = None,
     given: Given = None,
-    runs: Annotated[int, typer.Option(min=2, help="simulations")] = 200,
+    runs: Annotated[int, options.count(2, "simulations")] = 200,
     seed: Seed = 0,
     posterior: Annotated[
         bool, typer.Option("--posterior", help="draw the truths from the posterior of the data instead of the prior")

@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
 def write_csv(frame: "pd.DataFrame", path: Path) -> None:
     """Write a table in one step."""
-    write_whole(path, frame.to_csv(index=False))
+    from probcal.table import csv_text  # it loads jax, and the options are checked before
+
+    write_whole(path, csv_text(frame))
 
 
 def can_plot() -> bool:

@@ -7,6 +7,7 @@ import pandas as pd
 
 from probcal.cli.files import say_written, write_csv
 from probcal.errors import InputError
+from probcal.labels import check_name
 from probcal.rss.samples import levels_of, read_wav
 
 
@@ -22,6 +23,7 @@ def run(
         samples, rate = read_wav(path)
         for c in range(samples.shape[1]):
             name = path.stem if samples.shape[1] == 1 else f"{path.stem}_{c + 1}"
+            check_name(f"{path}: the sensor of this file", name)
             try:
                 own = levels_of(samples[:, c], rate, band=frequencies, window=window, start=start, column=column)
             except InputError as error:

@@ -5,11 +5,35 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from probcal.cli.names import METHODS, ORACLE, PRIORS, SAVE
+from probcal.cli.outputs import RECORDINGS
 from probcal.errors import InputError, nearest
 from probcal.inference.settings import check_setting
+from probcal.labels import check_name
 
 MOST_VALUES = 10_000  # of a setting of a study
+MOST = 10**6  # largest count that an option takes: of more draws or particles no machine has the memory
+LEAST_SIZE, MOST_SIZE = 1e-12, 1e12  # range of the size of a number that an option takes, in its unit
+
+
+def count(least: int, text: str) -> Any:
+    """An option that is a count, `least` to `MOST`, with its help text."""
+    return typer.Option(min=least, max=MOST, help=text)
+
+
+def quantity(text: str, *, zero: bool = False, negative: bool = False) -> Any:
+    """An option that is a finite number of a sensible size, positive unless said otherwise, with its help text."""
+
+    def check(option: typer.CallbackParam, value: float | None) -> float | None:
+        fits = value is None or (LEAST_SIZE <= abs(value) <= MOST_SIZE and (negative or value > 0))
+        if not fits and not (zero and value == 0):
+            kind = "a number" if negative else "0 or a positive number" if zero else "a positive number"
+            raise InputError(f"--{option.name} {value:g}: give {kind} from {LEAST_SIZE:g} to {MOST_SIZE:g} in size")
+        return value
+
+    return typer.Option(help=text, callback=check)
 
 
 def check_files(model: Path, data: Path | None = None) -> None:
@@ -37,6 +61,9 @@ def recordings(data: Sequence[Path], out: Path | None, scheduler: str | None) ->
     for path in data:
         if not exists(path):
             raise InputError(f"{path}: no such file")
+        check_name(f"--out: the folder of {path}", path.stem)
+        if not path.stem.strip(".") or path.stem in RECORDINGS:
+            raise InputError(f'{path} cannot be fitted into a folder "{path.stem}" of --out; give it another name')
         if path.stem in seen:
             raise InputError(
                 f"{seen[path.stem]} and {path} would both be fitted into {out / path.stem}; give them different names"
@@ -81,8 +108,8 @@ def walks(texts: Sequence[str]) -> dict[str, float]:
     for text in texts:
         pattern, equals, value = text.rpartition("=")
         number = _number(value) if equals and pattern else None
-        if not isinstance(number, (int, float)):
-            raise InputError(f'--walk "{text}": write PATTERN=STD, the standard deviation over one second')
+        if not isinstance(number, (int, float)) or not LEAST_SIZE <= number <= MOST_SIZE:
+            raise InputError(f'--walk "{text}": write PATTERN=STD, the positive standard deviation over one second')
         found[pattern] = float(number)
     return found
 

@@ -29,7 +29,7 @@ from probcal.problem import Problem, check_linear
 from probcal.results.io import load, save
 from probcal.results.schema import ROPE
 from probcal.status import INVALID
-from probcal.table import Table, read_lines
+from probcal.table import Table, csv_text, read_lines
 
 BLOCK = 1 << 18  # bytes that are read at once
 TRIED = 50  # first lines of which a model is made that has no data of its own, and that may be refused
@@ -100,7 +100,7 @@ class Appended:
         """Rows at the end of a table."""
         if frame.empty:
             return
-        self.write(name, frame.to_csv(index=False, header=not self.length.get(name)).encode())
+        self.write(name, csv_text(frame, header=not self.length.get(name)).encode())
 
     def write(self, name: str, content: bytes) -> None:
         """Bytes at the end of a file."""

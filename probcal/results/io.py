@@ -170,7 +170,7 @@ def _kind_of(values: np.ndarray) -> str:
     """The kind of the values of an array, by the names of `Member`."""
     if values.dtype.kind == "O":
         return "texts" if all(isinstance(value, str) for value in values.ravel()) else "objects"
-    return {"U": "texts", "b": "flags", "i": "numbers", "u": "numbers", "f": "numbers"}.get(values.dtype.kind, "objects")
+    return {"U": "texts", "b": "flags"}.get(values.dtype.kind, "numbers" if values.dtype.kind in "iuf" else "objects")
 
 
 def _check_moments(tree: xr.DataTree, path: Path) -> None:

@@ -49,7 +49,7 @@ NEEDED = {  # what readers of a fit take for granted, by group
         "stated_node": Member(("value",), "texts"), "stated_component": Member(("value",), "texts"),
     },
 }  # fmt: skip
-WHOLE = {"covariance": Member(_PAIR, finite=True), "information": Member(_PAIR)}  # of `calibration`, but for a fit in sparse form
+WHOLE = {"covariance": Member(_PAIR, finite=True), "information": Member(_PAIR)}  # unless in sparse form
 BLOCKS = {  # the same of a fit in sparse form
     "block": Member(_BIAS, least=0.0, finite=True), "block_place": Member(_BIAS, least=0.0, finite=True),
     "block_covariance": Member(("bias_label", "place"), finite=True),

@@ -10,6 +10,7 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.labels import listed
 from probcal.roads.extra import shapely
+from probcal.table import LARGEST
 
 CLEARANCE = 1.0  # m of height between two roads above which they pass over each other
 SHOWN = 5  # edges that a sentence names
@@ -19,12 +20,12 @@ def as_points(name: str, points: object) -> np.ndarray:
     """Points (k, d) of an edge without repetitions; raises `InputError` where they are no polyline."""
     try:
         line = np.asarray(points, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         line = np.zeros(0)
     if line.ndim != 2 or line.shape[1] not in (2, 3):
         raise InputError(f'edge "{name}": its points must be numbers of shape (k, 2) or (k, 3) in m')
-    if not np.isfinite(line).all():
-        raise InputError(f'edge "{name}" has a point that is not finite; give numbers in m')
+    if not (np.abs(line) <= LARGEST).all():
+        raise InputError(f'edge "{name}" has a point that is not finite or beyond {LARGEST:g} m; give numbers in m')
     return line
 
 

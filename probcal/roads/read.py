@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
 from os import PathLike
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.files import parsed_json
 from probcal.geodesy import LocalFrame
 from probcal.roads.checks import as_points
 from probcal.roads.coordinates import WGS84, projection
@@ -45,7 +45,7 @@ def read_roads(
             return _geojson(path, frame, crs, dimension, snap, connected, bridges)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise InputError(f"{path} cannot be read: {error}") from None
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
@@ -54,13 +54,13 @@ def read_roads(
 
 def _graphml(path: Path, frame: Any, crs: Any, dimension: Any, snap: float, connected: bool, bridges: Any) -> Any:
     """The network of a GraphML file."""
-    import xml.etree.ElementTree as xml
-
-    if not path.read_text().strip():
+    if not path.read_bytes().strip():
         raise InputError("the file is empty")
     try:
         graph = networkx.read_graphml(path)
-    except (xml.ParseError, networkx.NetworkXError, ValueError, KeyError) as error:
+    except OSError:
+        raise
+    except Exception as error:  # whatever networkx and the XML library say of foreign bytes
         raise InputError(f"the file is no GraphML: {error}") from None
     for _, data in graph.nodes(data=True):
         if isinstance(data.get("pos"), str):
@@ -72,12 +72,12 @@ def _graphml(path: Path, frame: Any, crs: Any, dimension: Any, snap: float, conn
 
 def _geojson(path: Path, frame: Any, crs: Any, dimension: Any, snap: float, connected: bool, bridges: Any) -> Any:
     """The network of a GeoJSON file."""
-    text = path.read_text(encoding="utf-8")
+    text = path.read_bytes()
     if not text.strip():
         raise InputError("the file is empty")
     try:
-        content = json.loads(text)
-    except json.JSONDecodeError as error:
+        content = parsed_json(text)
+    except ValueError as error:
         raise InputError(f"the file is no JSON: {error}") from None
     names, lines, ways, over = _features(content)
     d = dimension or min(line.shape[1] for line in lines)
@@ -85,7 +85,7 @@ def _geojson(path: Path, frame: Any, crs: Any, dimension: Any, snap: float, conn
         raise InputError("some points have no height; give every point one, or dimension=2")
     stated = content.get("crs") if crs is None else crs
     if isinstance(stated, dict):
-        stated = (stated.get("properties") or {}).get("name")
+        stated = _mapping(stated.get("properties")).get("name")
     to_metres = projection(WGS84 if stated is None else stated, frame)
     points = to_metres(np.concatenate([line[:, :d] for line in lines]))
     lines = np.split(points, np.cumsum([len(line) for line in lines])[:-1])
@@ -113,11 +113,11 @@ def _features(content: Any) -> tuple[list[str], list[np.ndarray], list[int], lis
     for k, feature in enumerate(features if isinstance(features, list) else []):
         feature = _mapping(feature)
         geometry, own = _mapping(feature.get("geometry")), _mapping(feature.get("properties"))
-        kind, parts = geometry.get("type"), geometry.get("coordinates") or []
+        kind, parts = geometry.get("type"), geometry.get("coordinates")
         if kind not in ("LineString", "MultiLineString"):
             continue
         name = name_of({**own, "feature": feature.get("id")}, ("name", "id", "osmid", "feature"), str(k))
-        for part in [parts] if kind == "LineString" else parts:
+        for part in parts if kind == "MultiLineString" and isinstance(parts, list) else [parts]:
             names.append(name)
             lines.append(as_points(name, part))
             ways.append(direction(name, own.get("oneway")))
