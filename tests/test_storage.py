@@ -578,6 +578,21 @@ def made(group, of, name):
     return change
 
 
+def sparse(place, covariance=1.0):
+    """The form of a fit in sparse form: a block of one bias each, and where it says that this stands there."""
+
+    def change(tree):
+        one = tree["calibration"].to_dataset().drop_vars(["covariance", "information", "bias_label_other"])
+        M = one.sizes["bias_label"]
+        columns = {"block": np.arange(M), "block_place": np.full(M, place)}
+        one = one.assign({name: ("bias_label", values) for name, values in columns.items()})
+        one["block_covariance"] = (("bias_label", "place"), np.full((M, 1), covariance))
+        tree["calibration"] = xr.DataTree(one)
+        tree.attrs["sparse"] = 1
+
+    return change
+
+
 LACKS = [
     (without("calibration"), "is not a fit written by probcal: its group calibration is missing"),
     (without("constant_data"), "is incomplete: its group constant_data lacks what a fit holds; fit again"),
@@ -606,6 +621,8 @@ LACKS = [
     (made("residual", lambda one: one["std"].astype(str), "std"), "residual/std holds no numbers; the file"),
     (made("calibration", lambda one: one["covariance"], "sd"), "calibration/sd has the dimensions .* in place of"),
     (made("calibration", lambda one: one["bias_label"].values[::-1], "bias_label"), "labels that differ or repeat"),
+    (sparse(5), "calibration/block names no block; the file was changed"),
+    (sparse(0, -1.0), "calibration/block_covariance is no covariance matrix"),
     (lambda tree: tree.attrs.update(status="done"), 'its attribute status is "done", which no fit has; fit again'),
     (lambda tree: tree.attrs.update(interval_probability=1.5), "interval_probability does not lie between 0 and 1"),
 ]  # fmt: skip
@@ -617,6 +634,12 @@ def test_what_a_fit_lacks_is_one_sentence(change, text, saved):
     change(tree)
     with pytest.raises(InputError, match=text):
         check_content(tree, Path("fit.nc"))
+
+
+def test_a_fit_in_sparse_form_is_one(saved):
+    tree = saved[0].copy(deep=True)
+    sparse(0)(tree)
+    check_content(tree, Path("fit.nc"))
 
 
 @pytest.mark.parametrize(("change", "text"), [LACKS[5], LACKS[9]], ids=["array", "attribute"])
