@@ -30,21 +30,26 @@ class FitError(RuntimeError):
 
 
 def checked[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """Raise `InputError` for an argument whose class is not the declared one, for the classes of `GIVE`.
+    """Raise `InputError` for an argument that is missing or not of its declared class, for the classes of `GIVE`.
 
     Classes are compared by name, so that no module is imported for the annotations.
     """
-    names = list(signature(function).parameters)
-    declared = {name: _classes(one.annotation) for name, one in signature(function).parameters.items()}
+    parameters = signature(function).parameters
+    declared = {name: _classes(one.annotation) for name, one in parameters.items()}
     wanted = {name: classes for name, classes in declared.items() if classes <= {*GIVE, "NoneType"}}
+    give = {name: " or ".join(GIVE[kind] for kind in sorted(wanted[name] - {"NoneType"})) for name in wanted}
+    required = [name for name in wanted if parameters[name].default is parameters[name].empty]
     verb = function.__qualname__.removesuffix(".__init__")
 
     @wraps(function)
     def entry(*args: P.args, **kwargs: P.kwargs) -> R:
-        for name, value in (*zip(names, args, strict=False), *kwargs.items()):
+        given: dict[str, Any] = dict(zip(parameters, args, strict=False)) | kwargs
+        for name, value in given.items():
             if name in wanted and wanted[name].isdisjoint(kind.__name__ for kind in type(value).__mro__):
-                give = " or ".join(GIVE[kind] for kind in sorted(wanted[name] - {"NoneType"}))
-                raise InputError(f"{verb}: {name} is {_described(value)}; give {give}")
+                raise InputError(f"{verb}: {name} is {_described(value)}; give {give[name]}")
+        for name in required:
+            if name not in given:
+                raise InputError(f"{verb}: the argument {name} is missing; give {give[name]}")
         return function(*args, **kwargs)
 
     return entry
