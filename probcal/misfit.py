@@ -36,7 +36,14 @@ class MisfitData(NamedTuple):
 
 def misfit_text(mean: float, left: MisfitData) -> str:
     """The mean square of a misfit, the worst datum, and the likely cause with its remedy."""
-    left = left._replace(square=np.nan_to_num(left.square, nan=np.inf, posinf=1e300))
+    if (lost := np.isnan(left.square)).any():
+        first = int(np.argmax(lost))
+        return (
+            f"The fit explains nothing: the predictions of {lost.sum()} data are not numbers, the first"
+            f" {left.sensor[first]}.{left.channel[first]} at {left.time[first]:.6g} s. Check the sensor's function (a"
+            " division by zero, the root of a negative number), units, the start and sentinels such as -9999."
+        )
+    left = left._replace(square=np.minimum(left.square, 1e300))
     worst = int(np.argmax(left.square))
     name = f"{left.sensor[worst]}.{left.channel[worst]}"
     cause = _repeated(left, worst) or _single(left) or _jump(left) or _group(left) or UNEXPLAINED

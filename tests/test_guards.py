@@ -34,7 +34,7 @@ from probcal.analysis import findings, verdict
 from probcal.diagnostics import study_table
 from probcal.errors import FitError
 from probcal.geometry import bearing, norm
-from probcal.inference.ending import End, conclude
+from probcal.inference.ending import End, conclude, misfit_sentence
 from probcal.inference.ending import verdict as status_of
 from probcal.inference.fit import calibrate
 from probcal.inference.run import Context, first_state, given_of
@@ -339,6 +339,17 @@ def test_a_scene_that_collapses_is_no_answer():
     assert trace.max() - trace[-1] > 10.0, "the scene collapses"
     assert tree.attrs["status"] == "along a gauge"
     assert "nats below its best on the way" in tree.attrs["message"]
+
+
+def test_predictions_that_are_not_numbers_are_named():
+    network, table = gauges()
+    problem = Problem(network, ConstantVelocity(0.5), table)
+    with jax.enable_x64(True):
+        point = automatic_start(problem)
+        lost = point._replace(z=jnp.asarray(point.z).at[0].set(jnp.nan))
+        said = misfit_sentence(problem, lost, float(mean_square(problem.model, lost)))
+    assert "are not numbers, the first" in said
+    assert "nan" not in said
 
 
 def end(**changed):

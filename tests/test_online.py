@@ -421,6 +421,7 @@ def test_the_tree_serves_track_and_a_further_stream(tmp_path):
     group = tree["calibration"].to_dataset()
     np.testing.assert_allclose(group["mean"], online.biases["mean"], atol=1e-9)
     assert tree.attrs["stream_rows"] == len(rows())
+    assert (tree.attrs["status"], tree.attrs["message"]) == ("converged", "")
     assert "a" in pc.track(pc.Problem(network(), MOTION, rows()), tree)["track"].children
     further = pc.Online(network(), MOTION, pc.AugmentedFilter(lag=0), calibration=tree)
     later = rows().assign(time=rows()["time"] + 100.0)

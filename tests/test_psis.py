@@ -26,6 +26,14 @@ def test_more_rows_than_are_smoothed_at_once():
     np.testing.assert_array_equal(k[-2:], alone_k)
 
 
+def test_a_tail_too_heavy_for_a_double_is_fitted_in_silence():
+    """Ratios over ten thousand nats: quantiles beyond 1e308 are cut to the largest ratio."""
+    with np.errstate(over="raise", divide="raise", invalid="raise"):
+        weights, k = smoothed(-1e4 * np.random.default_rng(0).exponential(size=(40, 1000)))
+    assert (k > 1).all()
+    np.testing.assert_allclose(np.exp(weights).sum(1), 1.0)
+
+
 def test_rows_without_a_tail_to_fit():
     """Equal weights are the best there are; one draw with all the weight leaves no tail; few draws have none."""
     equal, lone = np.zeros(100), np.zeros(100)

@@ -10,7 +10,9 @@ from worlds import linear, posed_of, resting, small, two_motions
 from probcal import NUTS, SVI, Gaussian, Horseshoe, InputError
 from probcal.inference.coordinates import Free
 from probcal.inference.guides import GuideParameters, LowRank, MeanField, Structured
+from probcal.inference.mixed import mixing
 from probcal.inference.pose import pareto_khat
+from probcal.inference.posterior import judge_chains
 from probcal.inference.sampling import sample
 from probcal.inference.svi import noncentred
 from probcal.smoothing.frame import place, unit_normals
@@ -89,6 +91,19 @@ def test_linear_problems_are_exact():
     # no gradient where the guide is exact: it stays, and p / q is the evidence at every draw
     np.testing.assert_allclose(run.draws.stats["log_weight"], exact.evidence, atol=1e-5)
     np.testing.assert_allclose(run.draws.stats["elbo"][:, -1], exact.evidence, atol=1e-5)
+
+
+@pytest.mark.parametrize(("khat", "status"), [(0.69, "converged"), (0.7, "not converged"), (np.inf, "not converged")])
+def test_a_guide_that_does_not_fit_has_not_converged(khat, status, monkeypatch):
+    """The same run, judged by a k-hat on either side of the limit."""
+    monkeypatch.setattr("probcal.inference.posterior.pareto_khat", lambda _: khat)
+    run, _ = solved("plane", SVI(chains=2, warmup=50, draws=1000), Gaussian())
+    problem = linear("plane")[0]
+    mean = smooth_tracks(problem.model, resting(problem)._replace(z=jnp.asarray(run.z.mean((0, 1)))))
+    ended, message = judge_chains(problem, Gaussian(), run, mixing(run.z), mean)
+    assert str(ended) == status
+    assert ("it stands for the posterior" in message) == (status == "converged")
+    assert ("it does not fit the posterior; take nuts or collapsed" in message) == (status != "converged")
 
 
 @pytest.mark.slow

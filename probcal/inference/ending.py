@@ -66,7 +66,7 @@ def conclude_at(
     message = _message(problem, point, status, end, low, far, iterations, summary.precisions)
     if cut and status is Status.NOT_CONVERGED:
         message = f"{stopped} after {iterations} iterations, before it converged: this is the best estimate so far."
-    if status is Status.SPENT and len(trace) > 1:
+    if status is Status.SPENT and np.isfinite(trace[-2:]).all() and len(trace) > 1:
         message = (
             f"All {iterations} iterations were run, as asked; the last moved the objective by"
             f" {trace[-1] - trace[-2]:.2g}. {message}"

@@ -149,7 +149,8 @@ class ParticleGibbs(Sampler):
             return replace(answer, status=Status.MISFIT, message=misfit(names))
         if (share := float(np.mean(drawn.stats["renewed"]))) < STUCK:
             more = f"A sweep renews {share:.0%} of the paths only: take more particles."
-            answer = replace(answer, message=f"{answer.message} {more}".strip())
+            status = Status.NOT_CONVERGED if answer.status is Status.CONVERGED else answer.status
+            answer = replace(answer, status=status, message=f"{answer.message} {more}".strip())
         return answer
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:

@@ -28,6 +28,7 @@ from probcal.smoothing.mode import Point
 from probcal.status import Status
 
 RARE = 0.05  # share of leaps, or of swings, taken below which it is said
+K_HAT = 0.7  # Pareto k-hat from which importance weights, and so a guide, are unreliable (Vehtari et al. 2024)
 BFMI = 0.3  # below which the energy is not explored (Betancourt 2016)
 
 
@@ -266,8 +267,14 @@ def judge_chains(
     good = _say_steps(run, said) and good
     if not run.method.exact:
         khat = pareto_khat(_stats(run)["log_weight"].ravel())
-        worth = "it stands for the posterior" if khat < 0.7 else "it does not fit; take nuts or collapsed"
-        said.append(f"Pareto k-hat of the guide {khat:.2f}: {worth}.")
+        fits = khat < K_HAT
+        worth = (
+            f"below {K_HAT:g}: it stands for the posterior"
+            if fits
+            else f"not below {K_HAT:g}: it does not fit the posterior; take nuts or collapsed"
+        )
+        said.append(f"Pareto k-hat of the guide is {khat:.2f}, {worth}.")
+        good = fits and good
     if isinstance(prior, Flat) and (np.abs(run.z.mean((0, 1))[~problem.surveyed]) > FAR).any():
         said.append("Some biases lie far from the stated values: use a prior, or fix some.")
         return Status.DIVERGED, " ".join(said)

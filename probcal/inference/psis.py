@@ -26,15 +26,17 @@ def _smoothed(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return values - _log_sum(values), np.full(rows, np.inf)
     order = np.argsort(values, axis=1)[:, draws - tail - 1 :]
     last = np.take_along_axis(values, order, 1)
-    cutoff, ordered = np.exp(last[:, :1]), np.exp(last[:, 1:])
-    k, sigma = _pareto_fit(ordered - cutoff)
+    k, sigma = _pareto_fit(np.exp(last[:, 1:]) - np.exp(last[:, :1]))
     same = last[:, -1] - last[:, 1] < np.finfo(float).tiny
     good = np.isfinite(k) & (sigma > 0) & ~same
     probability = (np.arange(0.5, tail) / tail)[None]
     shape, scale = np.where(good, k, 1.0)[:, None], np.where(good, sigma, 1.0)[:, None]
+    # in logarithms: quantiles of a very heavy tail overflow before they are cut to the largest ratio
     flat = np.where(shape == 0, 1.0, shape)
-    curve = np.where(shape == 0, -np.log1p(-probability), np.expm1(-flat * np.log1p(-probability)) / flat)
-    fitted = np.minimum(np.log(cutoff + scale * curve), last[:, -1:])
+    power = -flat * np.log1p(-probability)
+    curved = np.maximum(power, 0.0) + np.log(-np.expm1(-np.abs(power))) - np.log(np.abs(flat))
+    curve = np.log(scale) + np.where(shape == 0, np.log(-np.log1p(-probability)), curved)
+    fitted = np.minimum(np.logaddexp(last[:, :1], curve), last[:, -1:])
     np.put_along_axis(values, order[:, 1:], np.where(good[:, None], fitted, last[:, 1:]), 1)
     values -= _log_sum(values)
     return values, np.where(same, 0.0, np.where(np.isfinite(k), k, np.inf))

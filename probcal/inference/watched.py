@@ -110,7 +110,7 @@ def calibration_tree(online: Online) -> xr.DataTree:
     posterior = replace(posterior, filtered=tracks) if sampled else posterior
     method = Watched(online.method)
     answer = Answer(
-        problem, method, method, online.prior, posterior, Status.NOT_CONVERGED if online.message else Status.SPENT,
+        problem, method, method, online.prior, posterior, Status.NOT_CONVERGED if online.message else Status.CONVERGED,
         online.message, ("",) * len(problem.labels), online.counts["rows"],
     )  # fmt: skip
     tree = build(answer, (), jax.random.key(0), ())
