@@ -42,7 +42,7 @@ from probcal import (
 )
 from probcal.inference.particle_em import wandering
 from probcal.inference.run import given_of
-from probcal.inference.weighted import Ended, Paths, conclude_particles, louis
+from probcal.inference.weighted import SD_ERROR, Ended, Paths, conclude_particles, louis, regressed_scores, score_slope
 from probcal.particle.ensemble import ensemble, nearest_states
 from probcal.particle.targets import targets_of
 from probcal.plots import plot_particles, plot_roads
@@ -123,6 +123,45 @@ def test_where_a_climb_is_not_at_the_top_its_slope_says_so(linear, away, status)
     assert np.abs(sd[:, None] * (told.information - curvature + np.eye(len(sd))) * sd).max() < 0.25
     assert str(answer.status) == status
     assert ("asks for a step of" in answer.message) == (away > 0)
+
+
+def test_sds_of_em_by_particles_are_the_exact_ones_whatever_the_key(linear):
+    """Six keys of four biases: ratios within 15 %, 2.5 of the largest error stated; false alarms below 1e-2."""
+    problem, exact = linear
+    group, levels = exact["calibration"].to_dataset(), np.zeros(0)
+    z, sd = group["mean"].values / 3.0, group["sd"].values / 3.0
+    with jax.enable_x64(True):
+        paths = Paths(problem, Particles(400), targets_of(problem.model))
+        for key in map(jax.random.key, range(6)):
+            found = score_slope(paths, louis(paths, z, levels, key), np.eye(4), z, levels, key)
+            ratio = np.sqrt(np.diag(np.linalg.inv(found.information + np.eye(4)))) / sd
+            assert (np.abs(np.log(ratio)) < np.log(1.15)).all()
+            assert (found.sd_error <= SD_ERROR).all()
+
+
+def test_sds_that_filters_leave_open_are_said_to_be(linear, monkeypatch):
+    problem, _ = linear
+    monkeypatch.setattr("probcal.inference.weighted.SD_ERROR", 1e-4)
+    monkeypatch.setattr("probcal.inference.weighted.FILTERED", 16)
+    answer = ended_at(problem, 0.0, Particles(400))[-1]
+    assert str(answer.status) == "not converged"
+    assert "after 16 filters: take more particles" in answer.message
+
+
+def test_the_error_of_an_sd_is_that_of_a_regression_and_lost_filters_count_less():
+    """200 regressions of 24 scores on places: the scatter of the sds is the error stated, within a fifth."""
+    rng, information = np.random.default_rng(0), np.array([[4.0, 1.0], [1.0, 2.0]])
+    ratios, errors = [], []
+    for _ in range(200):
+        away = rng.normal(size=(24, 2))
+        scores = -away @ information + rng.normal(size=(24, 2))
+        scores[0], logs = 1e4, np.r_[-1e4, rng.normal(size=23)]
+        found = regressed_scores(away, scores, logs, np.eye(2))
+        ratios.append(np.diag(np.linalg.inv(found.information + np.eye(2))))
+        errors.append(found.sd_error)
+    sd, exact = np.sqrt(ratios), np.sqrt(np.diag(np.linalg.inv(information + np.eye(2))))
+    np.testing.assert_allclose(np.median(sd, 0), exact, rtol=0.05)
+    np.testing.assert_allclose(np.median(errors, 0), np.std(np.log(sd), 0), rtol=0.25)
 
 
 def test_a_trace_that_drifts_is_not_still():

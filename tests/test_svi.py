@@ -13,6 +13,7 @@ from probcal.inference.guides import GuideParameters, LowRank, MeanField, Struct
 from probcal.inference.mixed import mixing
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posterior import judge_chains
+from probcal.inference.progress import Monitor
 from probcal.inference.sampling import sample
 from probcal.inference.svi import noncentred
 from probcal.smoothing.frame import place, unit_normals
@@ -77,7 +78,7 @@ def solved(name, method, prior):
     """A linear case by a method, and its exact posterior."""
     problem, naive = linear(name)
     start = smooth_tracks(problem.model, resting(problem))
-    run = sample(problem, method, prior, start, jax.random.key(4))
+    run = sample(problem, method, prior, start, jax.random.key(4), monitor=Monitor())
     return run, reference.dense(naive, np.ones(len(naive.labels)))
 
 
@@ -122,8 +123,10 @@ def test_mean_field_is_too_narrow_where_biases_are_correlated():
 def test_determined_biases_have_the_sds_of_nuts():
     problem = small(scans=20)
     start = automatic_start(problem)
-    exact = sample(problem, NUTS(chains=2, warmup=200, draws=400), Horseshoe(), start, jax.random.key(0))
-    found = sample(problem, SVI(chains=2), Horseshoe(), start, jax.random.key(1))
+    exact = sample(
+        problem, NUTS(chains=2, warmup=200, draws=400), Horseshoe(), start, jax.random.key(0), monitor=Monitor()
+    )
+    found = sample(problem, SVI(chains=2), Horseshoe(), start, jax.random.key(1), monitor=Monitor())
     determined = exact.draws.gamma.mean((0, 1)) > 0.5
     assert determined.sum() >= 2
     sd = exact.z.std((0, 1))

@@ -49,6 +49,10 @@ SCATTER = 1.5  # mean square of what is left, 1 expected, from which another opt
 FEW = 5  # different smoothed particles at an epoch, below which their spread says nothing
 AHEAD = 1.0  # sd a bias of the Newton step, from which the fit is not at the top
 SURE = 6.0  # sd by which that mean square lies above 1 at least
+PAIRS = 8  # least pairs of filters about the end of a climb, whose scores give the information of the biases
+FILTERED = 512  # most filters of these pairs
+SD_ERROR = 0.06  # relative Monte Carlo error of an sd at which no more are run: 2.5 of it are 15 %
+LOST = 3.0  # nats below the typical likelihood from which a filter counts less
 SPREAD = 32  # draws of the biases behind the sd of a track, and behind values by datum
 
 
@@ -243,6 +247,60 @@ def louis(paths: Paths, z: Any, levels: Any, key: jax.Array) -> Louis:
     )  # fmt: skip
 
 
+class ScoreSlope(NamedTuple):
+    """The information of the biases by how the score of the marginal likelihood falls about a place."""
+
+    information: np.ndarray  # (M, M) of the data, trajectories integrated
+    sd_error: np.ndarray  # (M,) Monte Carlo error of each sd of the posterior, over the sd
+    filters: int  # that were run
+
+
+def score_slope(paths: Paths, told: Louis, prior: np.ndarray, z: Any, levels: Any, key: jax.Array) -> ScoreSlope:
+    """Information of the biases z (M,) under a prior of precision (M, M), by regression of scores on biases.
+
+    Louis' identity takes the difference of two large matrices. The score (Fisher's identity) at pairs of places
+    z + d and z - d, one sd apart in random orthogonal directions, needs no difference: its mean slope is minus the
+    information averaged over the posterior. Pairs are added until every sd is known to `SD_ERROR`.
+    """
+    paths, M = paths.along_paths(), len(z)
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    found, away, rows = ScoreSlope(told.information, np.full(M, np.inf), 0), np.zeros((0, M)), list[np.ndarray]()
+    logs = np.zeros(0)
+    while M and found.filters < FILTERED and not (found.sd_error <= SD_ERROR).all():
+        try:
+            root = np.linalg.inv(np.linalg.cholesky(found.information + prior)).T
+        except np.linalg.LinAlgError:  # singular, which the covariance says
+            break
+        turns = [np.linalg.qr(rng.standard_normal((M, M)))[0] for _ in range(-(-PAIRS // M))]
+        half = np.sqrt(M) * np.concatenate(turns) @ root.T
+        for d in np.concatenate([half, -half]):
+            at = jnp.asarray(np.asarray(z) + d)
+            own = paths.at(at, levels, jax.random.fold_in(key, len(rows)))
+            rows.append(np.asarray(observed_over_paths(paths.problem.model, own, at, levels).score))
+            logs = np.append(logs, float(own.log_evidence))
+        away = np.concatenate([away, half, -half])
+        expected = away @ told.score - 0.5 * np.einsum("ka,ab,kb->k", away, found.information, away)
+        found = regressed_scores(away, np.stack(rows), logs - expected, prior)
+    return found
+
+
+def regressed_scores(away: np.ndarray, scores: np.ndarray, logs: np.ndarray, prior: np.ndarray) -> ScoreSlope:
+    """Minus the slope of scores (K, M) on places (K, M), and what its error means for each sd under a prior (M, M).
+
+    Filters whose log-likelihoods, less those expected, lie far below the others' lost a target and count less.
+    """
+    K, M = away.shape
+    weight = np.exp(np.minimum(logs - np.median(logs) + LOST, 0.0))
+    x, y = (part - weight @ part / weight.sum() for part in (away, scores))
+    inverse = np.linalg.inv(x.T @ (weight[:, None] * x))
+    slope = inverse @ x.T @ (weight[:, None] * y)
+    information = positive(-slope)
+    covariance = np.linalg.inv(information + prior)
+    left, pull = (y - x @ slope) @ covariance, x @ inverse @ covariance  # of each filter, by bias
+    variance = (weight[:, None] ** 2 * left**2 * pull**2).sum(0) * K / max(K - M - 1, 1)
+    return ScoreSlope(information, 0.5 * np.sqrt(variance) / np.diag(covariance), K)
+
+
 @jax.jit
 def vectors_of(model: Model, states: tuple[Any, ...]) -> tuple[jax.Array, ...]:
     """What rows see of particles (E, N leading) of each recursion."""
@@ -293,7 +351,8 @@ def conclude_particles(
     z, levels, M = np.asarray(ended.z), np.asarray(ended.levels), problem.model.biases
     told = louis(paths, z, levels, keys[0])
     now = given.prior._replace(alpha=ended.alpha)
-    matrix = jnp.asarray(told.information) + now.matrix()
+    slope = score_slope(paths, told, np.asarray(now.matrix()), z, levels, jax.random.fold_in(key, 2))
+    matrix = jnp.asarray(slope.information) + now.matrix()
     covariance, volume = (np.asarray(a) for a in linalg.inverse_and_logdet(matrix))
     evidence = told.log_likelihood + 0.5 * float(now.log_determinant() - now.square(ended.z)) - 0.5 * float(volume)
     alpha = np.asarray(ended.alpha)
@@ -302,14 +361,13 @@ def conclude_particles(
     gamma = np.clip(1.0 - alpha * np.diag(covariance), 0.0, 1.0)
     summary = Summary(
         "Laplace", precisions_of(problem, prior), z, covariance, z - half, z + half, gamma, alpha,
-        told.information, levels, evidence if prior.proper else None,
+        slope.information, levels, evidence if prior.proper else None, {"sd_error": slope.sd_error},
     )  # fmt: skip
     numbers = {"log_likelihood": told.log_likelihood, "log_likelihood_se": told.error, "particles": float(how.count)}
     posterior = posterior_of(paths, prior, summary, told, keys[1], numbers)
     low, far = low_and_far(prior, summary, problem.surveyed)
-    slope = told.score - np.asarray(now.matrix()) @ z
-    ahead = steepness(slope, covariance, told.noise)
-    status, message = _judged(posterior, method, ended, bool(low.any()), bool(far.any()), ahead)
+    ahead = steepness(told.score - np.asarray(now.matrix()) @ z, covariance, told.noise)
+    status, message = _judged(posterior, method, ended, bool(low.any()), bool(far.any()), ahead, slope)
     words = np.select(
         [problem.surveyed, low, far], ["survey", "at bound", "diverged"], "estimated"
     ).tolist() if M else []  # fmt: skip
@@ -429,7 +487,7 @@ def misfit(names: Sequence[str]) -> str:
 
 
 def _judged(
-    posterior: EnsemblePosterior, method: Maximiser, ended: Ended, low: bool, far: bool, ahead: float
+    posterior: EnsemblePosterior, method: Maximiser, ended: Ended, low: bool, far: bool, ahead: float, slope: ScoreSlope
 ) -> tuple[Status, str]:
     """Status of a climb by particles, and a sentence; `ahead` is how far a Newton step would go, in sd a bias."""
     if names := unexplained(posterior.problem, posterior.point):
@@ -455,6 +513,12 @@ def _judged(
         return Status.NOT_CONVERGED, (
             f"The slope of the likelihood where the fit ended asks for a step of {ahead:.1f} sd a bias: it is not the"
             f" top. Take {better} or more iterations."
+        )
+    if (error := float(np.max(slope.sd_error, initial=0.0))) > SD_ERROR:
+        worst = posterior.problem.labels[int(np.argmax(slope.sd_error))]
+        return Status.NOT_CONVERGED, (
+            f"The sd of {worst} has a Monte Carlo error of {error:.0%} after {slope.filters} filters: take more"
+            " particles."
         )
     if ended.still:
         return Status.CONVERGED, ""
