@@ -91,8 +91,8 @@ MUTATIONS = [
     Mutation("inference/propagate.py", "_positive(precision - self.sites.precision)", "_positive(precision)", "test_integrate.py"),
     Mutation("inference/propagate.py", "middle) - self.sites.pull\n", "middle)\n", "test_integrate.py"),
     Mutation("inference/propagate.py", "odds + 0.5 * jnp.log(", "0.5 * jnp.log(", "test_integrate.py"),
-    # analysis/widen.py
-    Mutation("analysis/widen.py", "1.0 + group[\"gamma\"].values * (inflation - 1.0)", "inflation", "test_watch.py"),
+    # inference/widen.py
+    Mutation("inference/widen.py", "1.0 + group[\"gamma\"].values * (inflation - 1.0)", "inflation", "test_watch.py"),
     # smoothing/information.py
     Mutation("smoothing/linearised.py", "0.5 * (solved.logdet + biases.log_determinant())", "0.5 * solved.logdet", "test_exact.py"),
     Mutation("smoothing/linearised.py", "half, -response.states,", "half, response.states,", "test_exact.py test_observability.py"),
@@ -195,13 +195,13 @@ MUTATIONS = [
     Mutation("analysis/leave.py", "solved.score - prior.pull(point.z) - matrix @ away", "solved.score - prior.pull(point.z)", "test_assess.py"),
     Mutation("analysis/pieces.py", "slope[:M] -= prior @ pieces.z", "slope[:M] += prior @ pieces.z", "test_assess.py"),
     Mutation("analysis/pieces.py", "np.eye(q) + np.ones((q, q))", "np.eye(q)", "test_assess.py"),
-    Mutation("analysis/residuals.py", "expected = np.maximum(whole - used, 1e-9)", "expected = np.maximum(whole, 1e-9)", "test_assess.py"),
+    Mutation("inference/residuals.py", "expected = np.maximum(whole - used, 1e-9)", "expected = np.maximum(whole, 1e-9)", "test_assess.py"),
     Mutation("analysis/levels.py", "u**2 + spread - 1.0", "u**2 - 1.0", "test_asked_levels.py"),
     Mutation("analysis/pieces.py", "change: np.ndarray = steps[1] - steps[0]", "change: np.ndarray = 0.0 * steps[1]", "test_asked_levels.py"),
     Mutation("analysis/checks.py", "and again.sum() < TOGETHER * count", "", "test_asked_levels.py"),
     Mutation("model/motions.py", "row += size", "row += width", "test_tails.py"),
-    Mutation("analysis/residuals.py", "* (n + 2) / n", "* n / (n + 2)", "test_assess.py"),
-    Mutation("analysis/residuals.py", "max(2.0 * np.sum(couples", "max(np.sum(couples", "test_assess.py"),
+    Mutation("inference/residuals.py", "* (n + 2) / n", "* n / (n + 2)", "test_assess.py"),
+    Mutation("inference/residuals.py", "max(2.0 * np.sum(couples", "max(np.sum(couples", "test_assess.py"),
 ]  # fmt: skip
 
 

@@ -13,8 +13,8 @@ import probcal
 from probcal import MAP, Bias, Channel, ConstantVelocity, Network, Node, Problem, Target, simulate
 from probcal.analysis import levels, pieces
 from probcal.analysis.assess import assess
-from probcal.analysis.fitted import take_up
 from probcal.inference.fit import calibrate
+from probcal.inference.fitted import take_up
 from probcal.noise import Unknown
 from probcal.sensor import Drift
 from probcal.types import float64

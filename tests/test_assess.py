@@ -1,5 +1,6 @@
 """What a fit is worth: exact on linear networks, right under the true model, and by name where something is wrong."""
 
+import re
 import sys
 import warnings
 from functools import cache
@@ -13,7 +14,7 @@ import pytest
 import reference
 import worlds
 import xarray as xr
-from scipy import stats
+from scipy import signal, stats
 
 import probcal
 from probcal import (
@@ -30,11 +31,13 @@ from probcal import (
     sensor,
     simulate,
 )
-from probcal.analysis import leave, pieces, residuals
+from probcal.analysis import leave, pieces
 from probcal.analysis.assess import assess
-from probcal.analysis.fitted import take_up
 from probcal.analysis.nees import of_biases
 from probcal.geometry import bearing, norm
+from probcal.inference import residuals
+from probcal.inference.fitted import take_up
+from probcal.inference.widen import Rejection, bias_factors, track_factors, unwidened
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import sflab
@@ -229,6 +232,11 @@ def radar(target, pose, *, range_offset=Bias("m", 5.0), tilt=Bias("rad", 0.1)):
     """`tilt` hardly matters, and where it does it looks like a range offset."""
     line = target.position - pose.position
     return dict(range=norm(line) + range_offset + 0.5 * tilt, azimuth=bearing(line) - pose.heading)
+
+
+@sensor(range=Channel("m", std=probcal.Unknown(0.05)))
+def uwb(target, pose, *, range_offset=Bias("m", 0.3)):
+    return dict(range=norm(target.position - pose.position) + range_offset)
 
 
 PLACES = {"north": (0.0, 200.0), "east": (200.0, 0.0), "south": (0.0, -200.0), "west": (-200.0, 0.0)}
@@ -681,3 +689,127 @@ def test_halves_hold_their_false_alarm_rate():
     square = (np.array(ratios) ** 2).sum(0)
     low, high = stats.chi2.ppf([5e-7 / len(square), 1 - 5e-7 / len(square)], runs)
     assert ((low < square) & (square < high)).all()
+
+
+# Widening: what the innovations call for, of biases and tracks
+
+
+def test_a_fit_is_judged_by_its_innovations_and_assessed_as_before(judged):
+    """`fit` widens biases, tracks and draws once, says that `assess` has not run, and what that finds is the same."""
+    tree, out, problem = judged("noisy")
+    assert "The innovations reject the model: their mean square is" in tree.attrs["message"]
+    assert tree.attrs["message"].endswith("`assess` has not run: it looks for the cause.")
+    assert "has not run" not in out.attrs["message"]
+    assert (tree.attrs["assessed"], out.attrs["assessed"]) == (0, 1)
+    left = unwidened(tree)
+    plain = assess(problem, left)
+    again = assess(problem, out)
+    for name in ("calibration", "track/car", "track/van"):
+        before, fitted, checked = (own[name].to_dataset() for own in (left, tree, out))
+        assert fitted["widened"].values.max() > 1.05
+        np.testing.assert_allclose(fitted["sd"], before["sd"] * fitted["widened"], rtol=1e-12)
+        for other in (checked, plain[name].to_dataset(), again[name].to_dataset()):
+            np.testing.assert_allclose(other["sd"], fitted["sd"], rtol=1e-9)
+    for name in ("verdict", "reason"):
+        assert plain["verdict"][name].values.tolist() == out["verdict"][name].values.tolist()
+    assert again.attrs["message"] == plain.attrs["message"] == out.attrs["message"]
+    drawn = tree["track/car"]["state"].std(("chain", "draw")) / left["track/car"]["state"].std(("chain", "draw"))
+    np.testing.assert_allclose(drawn, tree["track/car"]["widened"], rtol=1e-9)
+    sound = judged("true")[0]
+    assert "widened" not in sound.attrs
+    assert "innovations" not in sound.attrs["message"]
+
+
+def test_a_fit_says_what_cannot_be_meant(judged):
+    """A std a hundred times too large, and a time in milliseconds."""
+    problem = judged("true")[2]
+
+    def message(column, values):
+        table = problem.measurements.table.frame.copy()
+        table[column] = values
+        return probcal.fit(probcal.Problem(radars(), ConstantVelocity(0.5), table), EA()).attrs["message"]
+
+    found = re.search(r"The innovations \(mean square (\S+), limit (\S+)\) are too small", message("range_std", 100.0))
+    assert float(found[1]) < float(found[2])
+    time = problem.measurements.table.frame["time"].to_numpy()
+    found = re.search(r"The data show (\S+) of the std of the velocity noise of target", message("time", 1000.0 * time))
+    assert float(found[1]) < 1e-3
+
+
+def test_tracks_of_another_recording_are_judged(judged):
+    """Where its innovations reject the model its sds are widened; those of the recording of the fit are sound."""
+    known, problem = judged("true")[1], judged("true")[2]
+    sound, noisy = (probcal.track(own, known) for own in (problem, judged("noisy")[2]))
+    assert "message" not in sound.attrs
+    assert "the sd of the tracks are widened by up to" in noisy.attrs["message"]
+    ratio = (noisy["track/car"]["sd"] / sound["track/car"]["sd"]).values
+    assert ratio.min() >= 1.0 - 1e-6
+    assert ratio.max() > 1.05
+    np.testing.assert_allclose(noisy["track/car"]["widened"], ratio, rtol=0.05)
+
+
+def test_no_bias_is_widened_beyond_its_prior():
+    values = {"gamma": [0.9, 0.9, 0.0], "precision": [1.0, 0.25, 0.0], "scale": [0.5] * 3, "sd": [0.2, 0.2, 0.4]}
+    group = xr.Dataset({name: ("bias_label", np.array(own)) for name, own in values.items()})
+    np.testing.assert_allclose(bias_factors(group, np.full(3, 2.0), True) ** 2, [1.9, 1.9, 1.0])
+    np.testing.assert_allclose(bias_factors(group, np.full(3, 1e4), True) * group["sd"], [0.5, 1.0, 0.4])
+    np.testing.assert_allclose(bias_factors(group, np.full(3, 1e4), False) * group["sd"], [0.5, 0.5, 0.4])
+
+
+def test_tracks_take_the_variance_of_larger_noise_and_no_more_than_their_prior():
+    """Noise of nine times the variance against a dense regression, the biases held; noise without bound: the prior."""
+    problem, tree, naive, _ = assessed("plane")
+    M = len(naive.labels)
+    known, every, naive.data = reference.dense(naive, None, hold=np.zeros(M)), naive.data, []
+    prior = reference.dense(naive, None, hold=np.zeros(M)).covariance[M:, M:]
+    naive.data = every
+    posterior = known.covariance[M:, M:]
+    # P = (A'A + Q^-1)^-1 has P A'A P = P - P Q^-1 P of the data
+    data = posterior - posterior @ np.linalg.solve(prior, posterior)
+    with jax.enable_x64(True):
+        fit = take_up(problem, tree)
+        found = residuals.innovations(fit, np.zeros(len(fit.data))).innovations
+        channels = residuals.channels_of(fit.data, found)
+        for size in (3.0, 1e12):
+            scatter = residuals.Scatter(np.full(len(channels.members), size), np.ones(len(channels.members)))
+            called = Rejection("", np.ones(M), scatter, channels)
+            factors = track_factors(fit, called, tree["track"], np.zeros((M, 1)), np.ones(M))
+            start = 0
+            for chain in naive.chains:
+                own = slice(start, start := start + len(chain.names) * len(chain.times))
+                track = tree["track"][chain.target]
+                sd = track["sd"].sel(component=list(chain.names)).values
+                told = (factors[chain.target] * track["sd"]).sel(component=list(chain.names)).values
+                most = np.diag(prior)[own].reshape(sd.shape)
+                if size > 1e6:
+                    np.testing.assert_allclose(told**2, most, rtol=1e-6)
+                else:
+                    more = (size - 1.0) * np.diag(data)[own].reshape(sd.shape)
+                    ratio = told**2 / np.minimum(sd**2 + more, most)
+                    assert ratio.mean() == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.ci
+def test_tracks_hold_where_noise_is_remembered():
+    """89 % intervals of tracks hold 0.80 at least with noise of a memory of 2 s, as those of white noise do."""
+    places = {f"a{k}": place for k, place in enumerate([(0, 0), (10, 0), (10, 8), (0, 8), (5, 9)])}
+    network = Network([uwb.on(Node(name, place, survey=0.01)) for name, place in places.items()])
+    t = np.arange(0, 60, 0.2)
+    held = {2.0: [], 0.0: []}
+    for memory, seed in ((2.0, 1), (2.0, 2), (2.0, 3), (0.0, 1), (0.0, 2)):
+        random = np.random.default_rng(seed)
+        phase, again = random.uniform(0, 6, 2), np.exp(-0.2 / memory) if memory else 0.0
+        path = np.stack([5 + 3 * np.cos(t / 9 + phase[0]), 4 + 2.5 * np.sin(t / 7 + phase[1])], 1)
+        rows = []
+        for name, place in places.items():
+            noise = signal.lfilter([np.sqrt(1 - again**2)], [1.0, -again], random.standard_normal(len(t) + 100))[100:]
+            distance = np.linalg.norm(path - place, axis=1) + 0.05 * noise
+            rows.append(pd.DataFrame({"time": t, "sensor": name, "range": distance}))
+        tree = probcal.fit(probcal.Problem(network, ConstantVelocity(probcal.Unknown(0.1)), pd.concat(rows)), EA())
+        track = tree["track/target"].sel(component=["position_x", "position_y"]).to_dataset()
+        held[memory].append(np.mean(np.abs(track["mean"].values - path) < 1.598 * track["sd"].values))
+        assert ("widened" in tree.attrs) == (memory > 0)
+        biases = tree["calibration"].to_dataset()
+        assert (biases["sd"] <= biases["scale"]).all()
+    assert np.mean(held[2.0]) > 0.8
+    assert np.mean(held[0.0]) > 0.85

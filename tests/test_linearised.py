@@ -7,8 +7,8 @@ import pytest
 from worlds import exact, linear, resting
 
 from probcal import EA, MAP, Gaussian, assess, fit
-from probcal.analysis.fitted import take_up
 from probcal.inference import calibrate
+from probcal.inference.fitted import take_up
 from probcal.priors import Precision
 from probcal.results.schema import DECLARED
 from probcal.smoothing.linearised import laplace, linearise

@@ -16,19 +16,19 @@ from probcal.analysis import (
     pieces,
     predictive,
     process,
-    residuals,
     scaling,
     shape,
     verdict,
 )
 from probcal.analysis.beside import mirror_doubts, mirror_findings
-from probcal.analysis.findings import Finding, alarms, in_order
-from probcal.analysis.fitted import Fitted, take_up
+from probcal.analysis.findings import Finding, alarms, completed
 from probcal.analysis.large import assess_large
 from probcal.analysis.pieces import Change, Pieces
 from probcal.analysis.verdict import RATE, limit_of
-from probcal.analysis.widen import rejection, widened
 from probcal.identifiability.remedies import WEAK
+from probcal.inference import residuals
+from probcal.inference.fitted import Fitted, take_up
+from probcal.inference.widen import rejection, unwidened, widened
 from probcal.labels import listed
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -73,6 +73,7 @@ def assess(
     >>> checked["verdict"]["verdict"].sel(bias_label="sonar_1.range_offset").item()
     'determined'
     """
+    tree = unwidened(tree)  # what a fit made of its innovations is judged anew
     if tree.attrs.get("sparse", 0):
         with np.errstate(all="ignore" if _absurd(tree) else None):
             return assess_large(problem, tree, answer)
@@ -92,7 +93,8 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     found = residuals.innovations(fit, replicas.kurtosis)
     groups: dict[str, xr.Dataset] = {"epoch_check": xr.Dataset()} | checks.by_epoch(fit, found.innovations)
     groups["datum_check"], findings = checks.by_datum(fit, found.innovations, tree)
-    groups["channel_check"], more = checks.by_channel(fit, found.innovations, replicas)
+    channels = residuals.channels_of(fit.data, found.innovations)
+    groups["channel_check"], more = checks.by_channel(found.innovations, channels, replicas)
     findings += more
     for name in ("sensor", "target"):
         groups[f"{name}_check"], more = checks.squares_by(fit, found.innovations, name)
@@ -109,7 +111,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     if tree.attrs["status"] not in INVALID:
         asked, more, hanging = levels.check_levels(fit, tree)
         groups |= {} if asked is None else {"level_check": asked}
-    groups["verdict"] = _verdicts(fit, tree, found, groups, bent, hanging)
+    groups["verdict"] = _verdicts(fit, tree, found, channels, groups, bent, hanging)
     if not (any(f.kind == "outliers" for f in findings) or (groups["verdict"]["verdict"] == "drifting").any()):
         findings += more  # else the levels are only a sign of these
     findings += mirror_findings(tree)
@@ -128,20 +130,16 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
         groups["sensitivity"] = scaled
     if truth is not None:
         _score(fit, tree, drawn, truth, groups)
-    inflation = groups["verdict"]["inflation"].values
-    result, widening = widened(tree, inflation, rejection(found.innovations, groups["channel_check"]))
-    findings = in_order(findings + widening)
-    texts = {name: ("finding", np.array([getattr(f, name) for f in findings], str)) for name in Finding._fields}
-    groups["finding"] = xr.Dataset(texts)
-    for name, group in groups.items():
-        result[name] = xr.DataTree(group)
-    return result
+    rejected = rejection(fit, found.innovations, channels)
+    result, text = widened(fit, rejected, tree, residuals.root_of(fit.covariance))
+    return completed(result, text, groups, findings)
 
 
 def _verdicts(
     fit: Fitted,
     tree: xr.DataTree,
     found: residuals.Filtered,
+    channels: residuals.Channels,
     groups: dict[str, xr.Dataset],
     bent: Finding | None,
     hanging: dict[int, str],
@@ -153,7 +151,7 @@ def _verdicts(
     grid = _grid(problem)
     if grid.patterns and not _absurd(tree):
         divided = pieces.divide(fit, grid.piece, grid.pieces)
-        wide = {name: _inflation(fit, found, divided, grid, member) for name, member in grid.members.items()}
+        wide = {name: _inflation(fit, found, channels, divided, grid, member) for name, member in grid.members.items()}
         inflation = wide.get("halves", inflation)
         if "halves" in grid.patterns:
             alone = pieces.contrasts(divided, grid.patterns["halves"])
@@ -270,7 +268,14 @@ def _edges(time: np.ndarray, count: int) -> np.ndarray:
     return _edges(time, 2) if count > 2 else edges[:1]
 
 
-def _inflation(fit: Fitted, found: residuals.Filtered, divided: Pieces, grid: _Grid, member: np.ndarray) -> np.ndarray:
+def _inflation(
+    fit: Fitted,
+    found: residuals.Filtered,
+    channels: residuals.Channels,
+    divided: Pieces,
+    grid: _Grid,
+    member: np.ndarray,
+) -> np.ndarray:
     """How much wider (M,) the variance of a change is than the model says: overdispersion and correlation in time.
 
     Both are measured on innovations from which the own biases of every `member` (pieces,) are taken (each quarter, or
@@ -285,18 +290,8 @@ def _inflation(fit: Fitted, found: residuals.Filtered, divided: Pieces, grid: _G
         for index, bias in zip(fit.problem.row_index, fit.problem.model.read, strict=True)
     ]
     freed = found.innovations._replace(value=residuals.moved_innovations(fit, found, shift))
-    group, labels = checks.codes(fit.data, ["sensor", "channel"])
-    data = np.bincount(group)
-    target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
-    wide = np.array(
-        [
-            max(freed.spread(mine), 1.0) * residuals.memory(freed.value[mine], target[mine], time[mine])
-            for mine in (group == k for k in range(len(labels)))
-        ]
-    )
-    share = fit.share(group, len(labels))
-    read = share @ wide / np.maximum(share.sum(1), 1e-300)
-    return np.maximum(read, np.average(wide, weights=data))
+    wide = residuals.scatter_of(fit.data, freed, channels.members)
+    return residuals.inflation(fit, wide.size * wide.memory, channels.group)
 
 
 def _drift(problem: Problem, change: Change, inflation: np.ndarray, limit: float) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.analysis.findings import Finding
-from probcal.analysis.fitted import Judged, saved_by_epoch
+from probcal.inference.fitted import Judged, saved_by_epoch
 from probcal.labels import PIECE, SCENE
 from probcal.results.read import each_track
 from probcal.smoothing.reflections import touched

@@ -3,14 +3,15 @@
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 from scipy import special
 
-from probcal.analysis import leave, predictive, residuals
-from probcal.analysis.findings import LAGGED, NAMES, NOTABLE, PRACTICAL, Finding
-from probcal.analysis.fitted import Fitted, Judged
+from probcal.analysis import leave, predictive
+from probcal.analysis.findings import NAMES, Finding
 from probcal.analysis.verdict import RATE
+from probcal.inference import residuals
+from probcal.inference.fitted import Fitted, Judged
+from probcal.inference.residuals import LAGGED, NOTABLE, PRACTICAL, codes
 from probcal.labels import listed
 from probcal.noise import Normal
 from probcal.results.groups import by_target
@@ -20,12 +21,6 @@ NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal
 TOGETHER = 0.3  # share of outliers whose next lies off to the same side, from which something else is wrong
 SEVERAL = 2  # data of one target that are off at one time, and are then no outliers
 GAIN = 5.0  # nats that a calibration must win before it is a finding
-
-
-def codes(frame: pd.DataFrame, names: list[str]) -> tuple[np.ndarray, pd.DataFrame]:
-    """Number of each datum's group (D,), in order of appearance, and one row a group."""
-    group = frame.groupby(names, sort=False).ngroup().to_numpy()
-    return group, frame[names].drop_duplicates().reset_index(drop=True)
 
 
 def _sized(names: list[str], values: np.ndarray, order: np.ndarray) -> str:
@@ -58,7 +53,7 @@ def squares_by(fit: Judged, found: residuals.Innovations, name: str) -> tuple[xr
 
 
 def by_channel(
-    fit: Judged, found: residuals.Innovations, replicas: predictive.Predictive | None
+    found: residuals.Innovations, channels: residuals.Channels, replicas: predictive.Predictive | None
 ) -> tuple[xr.Dataset, list[Finding]]:
     """NIS, mean, correlation in time and predictive p-values of every sensor's channels, dimension `part`.
 
@@ -67,32 +62,24 @@ def by_channel(
     `white` is the Ljung-Box p-value; below 20 data (of a yes-or-no channel: events) nothing can be told, the
     correlation stays 0 and `white` 1.
     """
-    data, findings = fit.data, list[Finding]()
-    group, labels = codes(data, ["sensor", "channel"])
-    count = len(labels)
-    values: dict[str, Any] = residuals.squares(found, group, count, RATE / count)._asdict()
-    target, time = data["target"].to_numpy(str), data["time"].to_numpy()
-    extra = np.zeros((count, 3))
-    members = np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
-    for k, ((sensor, channel), mine) in enumerate(zip(labels.itertuples(index=False), members, strict=True)):
-        judged = residuals.enough(found.kurtosis[mine])
-        white = residuals.whiteness(found.value[mine], target[mine], time[mine]) if judged else None
-        extra[k] = (0.0, float(np.mean(found.value[mine])), 1.0) if white is None else white
-        name, mean, limit = f"{sensor}.{channel}", extra[k, 1], -special.ndtri(RATE / (2 * count)) / np.sqrt(len(mine))
-        if judged and abs(mean) > max(limit, NOTABLE):
+    findings, names, count = list[Finding](), channels.names, len(channels.names)
+    values: dict[str, Any] = residuals.squares(found, channels.group, count, RATE / count)._asdict()
+    for name, mine, mean in zip(names, channels.members, channels.mean, strict=True):
+        limit = -special.ndtri(RATE / (2 * count)) / np.sqrt(len(mine))
+        if residuals.enough(found.kurtosis[mine]) and abs(mean) > max(limit, NOTABLE):
             text = f"{name}: innovations have mean {mean:.2f} noise std (limit {limit:.2f}): a bias is left"
             text += ", or targets keep turning"
             findings.append(Finding("mean", name, text))
-    values |= dict(zip(("autocorrelation", "mean", "white"), extra.T, strict=True))
-    names, r = [".".join(pair) for pair in labels.to_numpy(str)], extra[:, 0]
-    notable = np.maximum(NOTABLE, LAGGED / np.sqrt(np.bincount(group)))
-    red = np.flatnonzero((extra[:, 2] < RATE / count) & (np.abs(r) > notable))
+    r = channels.autocorrelation
+    values |= {"autocorrelation": r, "mean": channels.mean, "white": channels.white}
+    notable = np.maximum(NOTABLE, LAGGED / np.sqrt(values["data"]))
+    red = np.flatnonzero((channels.white < RATE / count) & (np.abs(r) > notable))
     if len(red):
         order = red[np.argsort(-np.abs(r[red]))]
         text = f"innovations are correlated from one to the next: {_sized(names, r, order)}"
         findings.append(Finding("whiteness", names[order[0]], text))
-    coords = {name: ("part", labels[name].to_numpy(str)) for name in labels}
-    first = np.array([mine[0] for mine in members], int)
+    coords = {name: ("part", channels.labels[name].to_numpy(str)) for name in channels.labels}
+    first = np.array([mine[0] for mine in channels.members], int)
     if replicas is None:
         return xr.Dataset({name: ("part", value) for name, value in values.items()}, coords), findings
     for kind, of in (("misfit", replicas.misfit), ("mean", replicas.mean)):

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+import xarray as xr
+
+from probcal.inference.widen import said, sentence
 from probcal.labels import listed
 
 NAMES = 4  # that a sentence on several channels lists
-PRACTICAL = 1.25  # factor from 1 within which a NIS beyond its limits is no finding
-LAGGED = 2.5  # sd of its lag-1 correlation from which a channel is called correlated, beside its Ljung-Box test
-NOTABLE = 0.1  # lag-1 correlation, and mean, of innovations within which neither is
-
 
 FIRST = ("status", "wrapping", "drifting", "conflicting", "outliers", "level", "nis", "motion")  # likely causes
 LAST = ("predictive", "rest", "gain", "loo")  # and what says little of them
@@ -44,3 +44,16 @@ def in_order(findings: list[Finding]) -> list[Finding]:
         return len(FIRST) + (1 + LAST.index(one.kind) if one.kind in LAST else 0)
 
     return sorted(findings, key=place)
+
+
+def completed(
+    result: xr.DataTree, text: str, groups: dict[str, xr.Dataset], findings: list[Finding]
+) -> xr.DataTree:  # fmt: skip
+    """A widened result with the groups of its assessment; `text` is why the innovations reject the model, or empty."""
+    said(result, sentence(text))
+    findings = in_order(findings + [Finding("widened", "fit", text)] * bool(text))
+    texts = {name: ("finding", np.array([getattr(f, name) for f in findings], str)) for name in Finding._fields}
+    for name, group in (groups | {"finding": xr.Dataset(texts)}).items():
+        result[name] = xr.DataTree(group)
+    result.attrs["assessed"] = 1
+    return result

@@ -18,7 +18,7 @@ import xarray as xr
 from scipy import special
 
 from probcal import linalg
-from probcal.analysis.fitted import Fitted
+from probcal.inference.fitted import Fitted
 from probcal.inference.pose import TAILED
 from probcal.inference.psis import smoothed
 from probcal.model import variants

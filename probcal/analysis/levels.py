@@ -15,9 +15,10 @@ import jax
 import numpy as np
 import xarray as xr
 
-from probcal.analysis.findings import PRACTICAL, Finding
-from probcal.analysis.fitted import Fitted
+from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import limit_of
+from probcal.inference.fitted import Fitted
+from probcal.inference.residuals import PRACTICAL
 from probcal.labels import listed
 from probcal.model.model import Data, Model
 from probcal.model.motions import by_component, linear_of

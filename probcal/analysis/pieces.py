@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.analysis.fitted import Fitted
+from probcal.inference.fitted import Fitted
 from probcal.model import variants
 from probcal.model.model import Model
 from probcal.problem import Problem

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal.analysis.fitted import Fitted, Judged
+from probcal.inference.fitted import Fitted, Judged
+from probcal.inference.residuals import all_gaussian, exact_kurtosis
 from probcal.model.model import At, Model
 from probcal.model.rows import standardised
-from probcal.noise import Bernoulli, Normal
 from probcal.results.read import each_track, saved_states
 from probcal.smoothing.draws import draw
 
@@ -83,28 +83,13 @@ def check_replicas(fit: Judged, drawn: FitDraws, key: jax.Array) -> Predictive:
     sensors = tuple(jnp.asarray(problem.measurements.sensor[index]) for index in problem.row_index)
     count = len(problem.network.sensors)
     found, fourth = _discrepancies(problem.model, fit.point.levels, drawn, sensors, count, key)
-    kurtosis = np.zeros(len(fit.data)) if gaussian else _exact(fit, fit.flat(fourth) - 3.0)
+    kurtosis = np.zeros(len(fit.data)) if gaussian else exact_kurtosis(fit, fit.flat(fourth) - 3.0)
     parts: tuple[list[Any], list[Any]] = ([], [])
     for sensor, values in zip(sensors, map(np.asarray, found), strict=True):
         above = (values[:, 1] > values[:, 0]).mean(0) + 0.5 * (values[:, 1] == values[:, 0]).mean(0)  # (S, 2, C)
         for k, part in enumerate(parts):
             part.append(above[np.asarray(sensor), k])
     return Predictive(fit.flat(parts[0]), fit.flat(parts[1]), kurtosis, drawn.z.shape[0])
-
-
-def all_gaussian(model: Model) -> bool:
-    """Whether the noise of every channel is Gaussian."""
-    return all(isinstance(noise, Normal) for noises in model.noises for noise in noises)
-
-
-def _exact(fit: Judged, kurtosis: np.ndarray) -> np.ndarray:
-    """Excess kurtosis (D,), that of yes-or-no data in closed form, 1 / (p q) - 6: replicas may lack a rare event."""
-    answers = [
-        np.broadcast_to([isinstance(noise, Bernoulli) for noise in noises], lin.weight.shape)
-        for noises, lin in zip(fit.problem.model.noises, fit.lins, strict=True)
-    ]
-    variance = fit.flat([lin.weight for lin in fit.lins])
-    return np.maximum(np.where(fit.flat(answers), 1 / np.maximum(variance, 1e-12) - 6, kurtosis), -2.0)
 
 
 def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> FitDraws:

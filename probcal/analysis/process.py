@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from probcal.analysis.findings import Finding
-from probcal.analysis.fitted import Fitted
+from probcal.inference.fitted import Fitted
 from probcal.model.motions import by_component, linear_of
 from probcal.motion import as_motion
 from probcal.motion.base import GAUSSIAN, Component, level_name

@@ -9,7 +9,7 @@ import jax
 import xarray as xr
 
 from probcal.analysis.findings import Finding
-from probcal.analysis.fitted import Fitted
+from probcal.inference.fitted import Fitted
 from probcal.results.read import summed_log_likelihood
 from probcal.smoothing.mode import log_likelihood
 

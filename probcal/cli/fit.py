@@ -24,6 +24,7 @@ from probcal.inference import METHODS, calibrate
 from probcal.inference.fit import linear_form
 from probcal.inference.manifest import remove_run
 from probcal.inference.progress import Monitor
+from probcal.inference.widen import judge_fit
 from probcal.results.alignment import KINDS
 from probcal.results.io import save
 from probcal.results.read import outliers, summary
@@ -103,6 +104,8 @@ def calibrated(
             near = truth if align is None else None  # of a truth in another frame no NEES
             named = problem if problem.scans is None else answer.problem
             tree = assess(named, tree, truth=near, key=seed, answer=answer)
+    elif linear_form(answer) and not monitor.signal:
+        tree = judge_fit(tree, answer)
     if monitor.signal:
         tree.attrs["interrupted"] = 1
         if assessed:

@@ -28,6 +28,7 @@ from probcal.inference.solve import solve
 from probcal.inference.sparse import SparsePosterior
 from probcal.inference.storage import Storage
 from probcal.inference.weighted import track_by_particles
+from probcal.inference.widen import judge_fit, judge_tracks
 from probcal.labels import NODE, START, listed
 from probcal.lazy import Later
 from probcal.particle.settings import Particles
@@ -89,18 +90,20 @@ def fit(
     the seconds (`Progress`). After `limit` seconds the search for other answers ends, and so do a climb and a sampler
     that are not done. Ctrl-C ends a fit in the same way: the best answer so far, or the draws so far, come back with
     the attribute `interrupted` and the status "not converged"; before there is one, and a second time, it raises. The
-    attributes `status` and `message` say what the fit is worth. Raises `InputError` for a prior that the method does
-    not take and `FitError` where a flat prior leaves a singular problem without any interval.
+    attributes `status` and `message` say what the fit is worth. Where the innovations reject the model, the sds,
+    intervals and draws of biases and states are widened by what they call for; `assess` looks for the cause, and sets
+    the attribute `assessed`. Raises `InputError` for a prior that the method does not take and `FitError` where a flat
+    prior leaves a singular problem without any interval.
 
     >>> found = fit(problem)
     >>> found.attrs["status"]
     'converged'
     """
-    found, _ = calibrate(
+    found, answer = calibrate(
         problem, method, prior=prior, key=key, start=start, starts=starts, monitor=Monitor(progress, limit), save=save,
         store=store, resume=resume, overwrite=overwrite,
     )  # fmt: skip
-    return found
+    return judge_fit(found, answer) if linear_form(answer) else found
 
 
 @float64
@@ -328,7 +331,8 @@ def track(
     """Tracks of other data with a calibration applied: a tree with group `track` (mean, sd, before).
 
     The biases are held at the calibrated means; the sd carries their covariance, of a fit in sparse form that of each
-    sensor by itself. Biases are matched by label. Without
+    sensor by itself. Biases are matched by label. Where the innovations reject the model the sds are widened by what
+    they call for, and the attribute `message` says so. Without
     a `smoother` each track is its mode and the Gaussian about it; `Particles(2000)` filters and smooths any motion, a
     road too, by draws that `key` seeds, and says in the attributes `status` and `message` whether some target's rows
     are explained by no path. Of detections that name no target the objects are found first (`track_objects`), as groups
@@ -359,7 +363,8 @@ def track(
         return track_by_particles(problem, smoother, found.z, found.covariance, found.levels, as_key(key))
     check_linear(problem)
     if too_large(problem.model):
-        return build_tracks(problem, bands(*_many_tracks(problem, found)))
+        tracks, before, after = _many_tracks(problem, found)
+        return judge_tracks(build_tracks(problem, bands(tracks, before)), problem, found, after)
     covariance = jnp.asarray(found.covariance)
     start = at_levels(problem.model, automatic_start(problem), jnp.asarray(found.levels))
     before = track_mode(problem, uncalibrated(start))
@@ -367,13 +372,15 @@ def track(
     if problem.model.tailed:
         _, before = settle(problem, before, jnp.zeros_like(covariance))
         problem, after = settle(problem, after, covariance)
-    return build_tracks(problem, bands(tracks_of(linearise(problem.model, after), covariance), before))
+    at = linearise(problem.model, after)
+    tree = build_tracks(problem, bands(tracks_of(at, covariance), before))
+    return judge_tracks(tree, problem, found, at)
 
 
-def _many_tracks(problem: Problem, found: Calibrated) -> tuple[list[Tracks], Point]:
-    """Tracks at a calibration where the response of all states to all biases does not fit, and those without it."""
+def _many_tracks(problem: Problem, found: Calibrated) -> tuple[list[Tracks], Point, Point]:
+    """Tracks at a calibration, and points without and with it, where the response of states to biases does not fit."""
     z = jnp.asarray(found.z)
     before = settle_each(problem.model, grid_start(problem, jnp.zeros_like(z), 30))
     after = settle_each(problem.model, grid_start(problem, z, 30))
     variances = settled_variances(problem.model, after, found.root)
-    return [Tracks(np.asarray(x), np.sqrt(own)) for x, own in zip(after.states, variances, strict=True)], before
+    return [Tracks(np.asarray(x), np.sqrt(own)) for x, own in zip(after.states, variances, strict=True)], before, after

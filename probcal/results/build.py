@@ -176,6 +176,7 @@ def _attrs(answer: Answer) -> dict[str, Any]:
         "intervals": intervals,
         "settings": f"{answer.method!r}, {answer.prior!r}", "interval_probability": INTERVAL,
         "results_version": RESULTS_VERSION, "motion": answer.motion, "interrupted": int(answer.interrupted),
+        "assessed": 0,
         "status": str(answer.status), "message": answer.message, "data": answer.problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
         **answer.posterior.attrs, **_epoch(answer.problem),

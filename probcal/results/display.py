@@ -63,6 +63,7 @@ def _parts(tree: xr.DataTree) -> tuple[str, str, Any]:
     attrs = tree.attrs
     head = f"{attrs['method']} ({attrs['prior']}): {attrs['status']}"
     head += ", estimate invalid: do not use these numbers" if attrs["status"] in INVALID else ""
+    head += "; not assessed: assess(problem, tree) checks it" if not attrs.get("assessed", 1) else ""
     return head, str(attrs.get("message", "")), frame[[name for name in SHOWN if name in frame]].head(ROWS)
 
 

@@ -132,6 +132,14 @@ class Calibrated:
         return self.spread.matrix() if isinstance(self.spread, SensorBlocks) else self.spread
 
     @property
+    def blocks(self) -> SensorBlocks:
+        """The covariance of z by sensor, of one held as a matrix the variances."""
+        if isinstance(self.spread, SensorBlocks):
+            return self.spread
+        M = len(self.z)
+        return SensorBlocks(M, np.arange(M)[:, None], np.diag(self.spread)[:, None, None])
+
+    @property
     def root(self) -> Any:
         """A root (M, R) of the covariance, sparse where sensors are independent."""
         if isinstance(self.spread, SensorBlocks):

@@ -6,25 +6,43 @@ The innovations of an epoch are whitened by the symmetric root of their covarian
 squares add up to the NIS of the epoch, and each stays with its sensor and channel.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import special
 
 from probcal import linalg
-from probcal.analysis.fitted import Fitted, Judged
+from probcal.inference.fitted import Fitted, Judged, JudgedLarge
+from probcal.lazy import Later
 from probcal.model.model import Data, Model
 from probcal.model.rows import Linearised, standardised
+from probcal.noise import Bernoulli, Normal
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Eliminated, Point, factors
 
+if TYPE_CHECKING:
+    import pandas as pd
+    from scipy import special
+else:
+    special = Later("scipy.special")
+
+PRACTICAL = 1.25  # factor from 1 within which a NIS beyond its limits is no finding
+LAGGED = 2.5  # sd of its lag-1 correlation from which a channel is called correlated, beside its Ljung-Box test
+NOTABLE = 0.1  # lag-1 correlation, and mean, of innovations within which neither is
 COLUMNS = 16  # bias directions that are filtered together
 LAGS = 10  # of the Ljung-Box statistic
 LONGEST = 200  # lags over which a correlation in time is followed
 FEWEST = 20  # data below which whiteness is not judged
+
+
+def codes(frame: pd.DataFrame, names: list[str]) -> tuple[np.ndarray, pd.DataFrame]:
+    """Number of each datum's group (D,), in order of appearance, and one row a group."""
+    group = frame.groupby(names, sort=False).ngroup().to_numpy()
+    return group, frame[names].drop_duplicates().reset_index(drop=True)
 
 
 class Filter(NamedTuple):
@@ -138,24 +156,94 @@ class Filtered(NamedTuple):
     roots: list[jax.Array]
 
 
-def innovations(fit: Fitted, kurtosis: np.ndarray) -> Filtered:
-    """Innovations of all data with the biases at their means, for noise of excess kurtosis (D,).
+def all_gaussian(model: Model) -> bool:
+    """Whether the noise of every channel is Gaussian."""
+    return all(isinstance(noise, Normal) for noises in model.noises for noise in noises)
+
+
+def exact_kurtosis(fit: Judged, kurtosis: np.ndarray) -> np.ndarray:
+    """Excess kurtosis (D,), that of yes-or-no data in closed form, 1 / (p q) - 6: replicas may lack a rare event."""
+    answers = [
+        np.broadcast_to([isinstance(noise, Bernoulli) for noise in noises], lin.weight.shape)
+        for noises, lin in zip(fit.problem.model.noises, fit.lins, strict=True)
+    ]
+    variance = fit.flat([lin.weight for lin in fit.lins])
+    return np.maximum(np.where(fit.flat(answers), 1 / np.maximum(variance, 1e-12) - 6, kurtosis), -2.0)
+
+
+def measured_kurtosis(fit: Judged) -> np.ndarray:
+    """Excess kurtosis (D,) of the standardised scores, measured over the data of each sensor's channel."""
+    if all_gaussian(fit.problem.model):
+        return np.zeros(len(fit.data))
+    value = fit.flat([standardised(lin.score, lin.weight) for lin in fit.lins])
+    group, _ = codes(fit.data, ["sensor", "channel"])
+    second, fourth = (np.bincount(group, value**k) / np.bincount(group) for k in (2, 4))
+    return exact_kurtosis(fit, (fourth / np.maximum(second, 1e-300) ** 2)[group] - 3.0)
+
+
+def root_of(covariance: np.ndarray) -> np.ndarray:
+    """The symmetric root (M, M) of a covariance, which does not turn with rounding; that of few draws is singular."""
+    values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(covariance)))
+    root: np.ndarray = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return root
+
+
+def innovations(fit: Fitted, kurtosis: np.ndarray, dz: np.ndarray | None = None) -> Filtered:
+    """Innovations of all data with the biases `dz` (M,) from their means, for noise of excess kurtosis (D,).
 
     A sum of squares over some data expects their number less what the biases used: over all data the sum of gamma,
     over a share of them the trace of B (G + A)^-1 B', B their responses to the biases.
     """
     model = fit.problem.model
     filters = prepare(fit.solved)
-    values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(fit.covariance)))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))  # that of few draws is singular
-    chunk = min(COLUMNS, model.biases)
+    root = root_of(fit.covariance)
+    chunk = max(min(COLUMNS, model.biases), 1)
     root = np.pad(root, ((0, 0), (0, -model.biases % chunk)))
-    roots = [jnp.asarray(part) for part in np.split(root, root.shape[1] // chunk, axis=1)]
-    still = [jnp.asarray(np.zeros((lin.bias.shape[0], lin.bias.shape[2]))) for lin in fit.lins]
-    found = [_innovations(model, fit.point, fit.lins, filters, still, part) for part in roots]
+    roots = [jnp.asarray(part) for part in np.split(root, max(root.shape[1] // chunk, 1), axis=1)]
+    moved = np.zeros(model.biases + 1) if dz is None else np.append(dz, 0.0)
+    shift = [jnp.asarray(moved[np.asarray(read)]) for read in model.read]
+    found = [_innovations(model, fit.point, fit.lins, filters, shift, part) for part in roots]
     value, _, kept = (fit.flat(parts) for parts in zip(*found[0], strict=True))
     used = np.sum([fit.flat([own for _, own, _ in part]) for part in found], axis=0)
     return Filtered(filters, Innovations(value, used, kurtosis * kept**4, expected_squares(fit, kept)), roots)
+
+
+def innovations_large(
+    fit: JudgedLarge, gamma: np.ndarray, shift: Sequence[np.ndarray] | None = None
+) -> Innovations:  # fmt: skip
+    """Innovations of a fit in sparse form, biases at their means or shifted (N, p) from row to row.
+
+    The degrees of freedom that the biases used, the sum of `gamma` (M,), are shared among the data by the variance
+    that the biases of the own sensor give each of them.
+    """
+    moved = [jnp.zeros((lin.bias.shape[0], lin.bias.shape[2])) for lin in fit.lins]
+    moved = moved if shift is None else [jnp.asarray(own) for own in shift]
+    found = innovations_at(fit.problem.model, fit.point, fit.lins, prepare(fit.solved), moved)
+    value, kept = (fit.flat(parts) for parts in zip(*found, strict=True))
+    told = np.maximum(fit.flat(_told(fit)), 0.0)
+    used = np.minimum(told * (gamma.sum() / max(told.sum(), 1e-300)), 0.9)
+    return Innovations(value, used, measured_kurtosis(fit) * kept**4, expected_squares(fit, kept))
+
+
+def innovations_given(fit: JudgedLarge) -> Innovations:
+    """Innovations of data that the biases of a fit in sparse form did not see: these add to what is expected."""
+    found = innovations_large(fit, np.zeros(fit.problem.model.biases))
+    return found._replace(used=-np.maximum(fit.flat(_told(fit)), 0.0))
+
+
+def _told(fit: JudgedLarge) -> list[np.ndarray]:
+    """Variance of each predicted value (N, C) of each block by the biases of its sensor, over that of its noise."""
+    M = fit.problem.model.biases
+    own, place = (np.append(values, 0) for values in fit.blocks.located())
+    found = []
+    for read, lin in zip(fit.problem.model.read, fit.lins, strict=True):
+        bias = np.asarray(read)
+        block, at = own[bias], place[bias]
+        same = (block[:, :, None] == block[:, None, :]) & (bias < M)[:, :, None] & (bias < M)[:, None, :]
+        matrix = np.where(same, fit.blocks.covariance[block[:, :, None], at[:, :, None], at[:, None, :]], 0.0)
+        along = np.asarray(lin.bias)
+        found.append(np.asarray(lin.weight) * np.einsum("ncp,npq,ncq->nc", along, matrix, along))
+    return found
 
 
 def moved_innovations(fit: Fitted, known: Filtered, shift: list[jax.Array]) -> np.ndarray:
@@ -238,6 +326,69 @@ def whiteness(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> Whiten
         return None
     statistic, wide = np.sum(pairs[:lags] * r[:lags] ** 2) * (n + 2) / n, 1.0 + lags**2 / (7.0 * n)
     return Whiteness(float(r[0]), float(np.mean(value)), float(special.chdtrc(lags / wide, statistic / wide)))
+
+
+class Channels(NamedTuple):
+    """The innovations of every sensor's channels, in order of appearance: which they are, and how they follow."""
+
+    labels: pd.DataFrame  # sensor and channel
+    group: np.ndarray  # (D,) number of each datum's channel
+    members: list[np.ndarray]  # data of each channel
+    autocorrelation: np.ndarray  # from one to the next; 0 where there are too few to be judged
+    mean: np.ndarray
+    white: np.ndarray  # Ljung-Box p-value; 1 where there are too few
+
+    @property
+    def names(self) -> list[str]:
+        """Sensor and channel in one word."""
+        return [".".join(pair) for pair in self.labels.to_numpy(str)]
+
+
+def channels_of(data: pd.DataFrame, found: Innovations) -> Channels:
+    """Whiteness of the innovations of every sensor's channels."""
+    group, labels = codes(data, ["sensor", "channel"])
+    target, time = data["target"].to_numpy(str), data["time"].to_numpy()
+    members = np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
+    extra = np.zeros((len(members), 3))
+    for k, mine in enumerate(members):
+        judged = enough(found.kurtosis[mine])
+        white = whiteness(found.value[mine], target[mine], time[mine]) if judged else None
+        extra[k] = (0.0, float(np.mean(found.value[mine])), 1.0) if white is None else white
+    return Channels(labels, group, members, *extra.T)
+
+
+class Scatter(NamedTuple):
+    """Of every sensor's channel: mean square of its innovations, and how many of them count as one.
+
+    A mean square below 1 counts as 1, unless the data scatter far less than that.
+    """
+
+    size: np.ndarray
+    memory: np.ndarray
+
+
+def scatter_of(data: pd.DataFrame, found: Innovations, members: Sequence[np.ndarray]) -> Scatter:
+    """Overdispersion and correlation in time of the innovations of each channel, by its `members` among the data."""
+    target, time = data["target"].to_numpy(str), data["time"].to_numpy()
+    size = np.array([found.spread(mine) for mine in members])
+    size = np.where(size < 1 / PRACTICAL, size, np.maximum(size, 1.0))
+    return Scatter(size, np.array([memory(found.value[own], target[own], time[own]) for own in members]))
+
+
+def inflation(fit: Judged, wide: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """How much wider (M,) the variance of a bias is than the model says, where channels are so much `wide`.
+
+    The mean of the channels that tell of it, by their information, and not less than the mean of all.
+    """
+    M, start, wide = fit.problem.model.biases, 0, np.maximum(wide, 1.0)
+    told, weighed = np.zeros(M + 1), np.zeros(M + 1)
+    for read, lin, (row, channel) in zip(fit.problem.model.read, fit.lins, fit.picks, strict=True):
+        own = (np.asarray(lin.weight)[:, :, None] * np.asarray(lin.bias) ** 2)[row, channel]  # (data, p)
+        bias, times = np.asarray(read)[row].ravel(), wide[group[start : start + len(row)]][:, None]
+        told += np.bincount(bias, own.ravel(), M + 1)
+        weighed += np.bincount(bias, (own * times).ravel(), M + 1)
+        start += len(row)
+    return np.maximum(weighed[:M] / np.maximum(told[:M], 1e-300), np.mean(wide[group]))
 
 
 def memory(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> float:

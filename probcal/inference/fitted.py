@@ -1,28 +1,39 @@
 """A fit taken up again: the problem at the point where a DataTree says that its fit ended, linearised there."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
-import xarray as xr
 
 from probcal import linalg
 from probcal.errors import InputError
+from probcal.inference.sparse import SparsePosterior
+from probcal.lazy import Later
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
 from probcal.problem import Epochs, Problem
 from probcal.results.answer import Answer
+from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import datum_of, gather, weight_name
 from probcal.results.read import each_track
 from probcal.results.schema import matrix_of
 from probcal.smoothing.grid import follow_states, track_mode
 from probcal.smoothing.information import at_levels
+from probcal.smoothing.joint import JointPrecision
 from probcal.smoothing.linearised import Linearisation, linearise
 from probcal.smoothing.mode import Eliminated, Point
 from probcal.smoothing.places import tilt_at
+from probcal.smoothing.sparse_mode import SparseSystem, system_at
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+else:
+    pd, xr = Later("pandas"), Later("xarray")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +77,27 @@ class Fitted(Judged):
     at: Linearisation
     prior: Precision
     covariance: np.ndarray  # (M, M) of z
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedLarge(Judged):
+    """A fit in sparse form taken up again."""
+
+    system: SparseSystem
+    blocks: SensorBlocks  # of the covariance of z
+
+
+def take_up_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> JudgedLarge:
+    """The fit of a problem in sparse form, as `take_up`."""
+    problem, data, picks = identified(problem, tree, answer)
+    posterior = None if answer is None else answer.posterior
+    if isinstance(posterior, SparsePosterior):
+        system = posterior.system
+    else:
+        point = point_of(problem, tree) if posterior is None else posterior.point
+        system = system_at(problem.model, JointPrecision.of(problem.model), point)
+    blocks = SensorBlocks.read(tree["calibration"].to_dataset(), problem.labels, problem.scales)
+    return JudgedLarge(problem, system.point, system.rows, system.solved, picks, data, system, blocks)
 
 
 def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) -> Fitted:

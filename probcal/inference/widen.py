@@ -1,0 +1,355 @@
+"""Intervals widened where the innovations say that the noise is larger, or longer remembered, than the model has it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.inference import residuals
+from probcal.inference.fitted import Fitted, Judged, JudgedLarge, take_up, take_up_large
+from probcal.inference.residuals import LAGGED, NOTABLE, PRACTICAL, Channels, Innovations
+from probcal.lazy import Later
+from probcal.model.model import Data, Model
+from probcal.model.motions import by_component, linear_of
+from probcal.model.rows import Linearised
+from probcal.motion import as_motion
+from probcal.motion.base import level_name
+from probcal.priors import Precision
+from probcal.problem import Problem
+from probcal.results.answer import Answer
+from probcal.results.blocks import SensorBlocks
+from probcal.results.groups import datum_of, node_of
+from probcal.results.read import Calibrated
+from probcal.smoothing import recursion as rec
+from probcal.smoothing.joint import JointPrecision
+from probcal.smoothing.linearised import Linearisation
+from probcal.smoothing.mode import Eliminated, Point, factors
+from probcal.smoothing.scans import recur_squared
+from probcal.smoothing.sparse_mode import system_at
+from probcal.status import Status
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+    from scipy import signal
+else:
+    pd, xr, signal = Later("pandas"), Later("xarray"), Later("scipy.signal")
+
+TOLD = 1.05  # times as wide, from which sds are widened
+REJECTED = 1e-3  # probability of the NIS of all data, or of the whiteness of any channel, of a model that is wrong
+CHUNKS = 8  # times `COLUMNS` simulated errors: the sd of a state is found to 6 % (128 columns, 4,000 Gaussian states)
+NUMBERS = 20_000_000  # most simulated data of all columns together
+SMALL = "small: the std or the process noise is too large, or the time has another unit"
+LARGE = "large: the std is too small, or the model is wrong"
+UNMOVED = 1e-3  # mean square of smoothed process noise below which the std is 30 times too large
+UNASSESSED = "`assess` has not run: it looks for the cause."
+
+
+class Rejection(NamedTuple):
+    """Why the innovations reject a model, and what they call for; the reason is empty where they do not."""
+
+    reason: str
+    inflation: np.ndarray  # (M,) of the part of the variance of each bias that comes from the data
+    scatter: residuals.Scatter  # of each channel
+    channels: Channels
+
+
+def rejection(fit: Judged, found: Innovations, channels: Channels) -> Rejection:
+    """The test of the innovations by their mean square, and of each channel by its correlation in time."""
+    scatter = residuals.scatter_of(fit.data, found, channels.members)
+    inflation = residuals.inflation(fit, scatter.size * scatter.memory, channels.group)
+    return Rejection(_reason(found, channels), inflation, scatter, channels)
+
+
+def _reason(found: Innovations, channels: Channels) -> str:
+    """The test of the innovations that rejects the model, in words; empty where none does."""
+    total = residuals.squares(found, np.zeros(len(found.value), int), 1, 2 * REJECTED)
+    if total.nis[0] > max(total.upper[0], PRACTICAL):
+        return f"their mean square is {total.nis[0]:.2g} (limit {total.upper[0]:.2g})"
+    lagged = channels.autocorrelation
+    notable = np.maximum(NOTABLE, LAGGED / np.sqrt(np.bincount(channels.group)))
+    red = (channels.white < REJECTED / len(lagged)) & (lagged > notable)
+    if red.any():
+        worst = int(np.argmax(np.where(red, lagged, -1.0)))
+        return f"those of {channels.names[worst]} follow each other ({lagged[worst]:.2f})"
+    return ""
+
+
+def scattered(fit: Judged, found: Innovations, high: bool) -> str:
+    """A sentence on innovations, of all data or of a sensor, that are far too small, or where `high` too large."""
+    group, labels = residuals.codes(fit.data, ["sensor"])
+    names = [f" of {name}" for name in labels["sensor"]]
+    whole = residuals.squares(found, np.zeros(len(group), int), 1, REJECTED)
+    part = residuals.squares(found, group, len(names), REJECTED / len(names))
+    if whole.nis[0] < min(whole.lower[0], 1 / PRACTICAL):
+        part, names = whole, [""]
+    few, many = part.nis < np.minimum(part.lower, 1 / PRACTICAL), part.nis > np.maximum(part.upper, PRACTICAL)
+    sentences, size = [], np.abs(np.log(np.maximum(part.nis, 1e-300)))
+    for out, limit, cause in ((few, part.lower, SMALL), (many & high, part.upper, LARGE)):
+        if out.any():
+            k, others = int(np.argmax(np.where(out, size, -1.0))), int(out.sum()) - 1
+            more = f" and {others} more sensors" if others else ""
+            numbers = f"(mean square {part.nis[k]:.2g}, limit {limit[k]:.2g})"
+            sentences.append(f"The innovations{names[k]} {numbers}{more} are too {cause}.")
+    return " ".join(sentences)
+
+
+def unmoved(fit: Fitted) -> str:
+    """A sentence on the component whose smoothed process noises are nearest to nothing, if less than `UNMOVED`.
+
+    Under the model a whitened noise has mean square one, of which smoothing leaves one less its variance.
+    """
+    problem, found = fit.problem, dict[str, float]()
+    parts = zip(problem.epochs, problem.model.recursions, fit.point.noises, fit.at.trajectories, strict=True)
+    for epochs, part, noises, own in parts:
+        expected = np.where(np.asarray(part.L).any(1), 1.0 - np.asarray(own.spread), 0.0)
+        for name in dict.fromkeys(epochs.target):
+            mine = (epochs.target == name) & ~np.asarray(part.first)
+            components = linear_of(as_motion(problem.target(name).motion))
+            for component, _, columns in by_component(components, problem.network.dimension):
+                told = float(expected[mine, columns].sum())
+                if told >= residuals.FEWEST:
+                    square = float(np.sum(np.asarray(noises)[mine, columns] ** 2)) / told
+                    drives = level_name(component).removesuffix("_std")
+                    found[f'the {drives} noise of target "{name}"'] = square
+    name, square = min(found.items(), key=lambda pair: pair[1], default=("", 1.0))
+    if square > UNMOVED:
+        return ""
+    return f"The data show {np.sqrt(square):.1g} of the std of {name}: check that std and the unit of the time."
+
+
+@jax.jit
+def _errors(
+    model: Model, lins: Sequence[Linearised], solved: Eliminated, noise: Data, biases: jax.Array
+) -> list[jax.Array]:  # fmt: skip
+    """Mean square (E, n) of the errors of the smoothed states of each recursion over K simulations.
+
+    `noise` (N, C, K) is that of unit-noise data, `biases` (M, K) are the errors of the biases in z.
+    """
+    unit = [lin._replace(state=jnp.sqrt(lin.weight)[:, :, None] * lin.state) for lin in lins]
+    columns = [
+        own - jnp.sqrt(lin.weight)[:, :, None] * along
+        for own, along, lin in zip(noise, model.by_bias(lins, biases), lins, strict=True)
+    ]
+    pulls = model.onto_states(unit, columns)
+    parts = zip(model.recursions, solved.parts, pulls, strict=True)
+    return [jnp.mean(rec.smooth(part.F, kept.gain, pull).states ** 2, 2) for part, kept, pull in parts]
+
+
+@jax.jit
+def before_data(model: Model, levels: jax.Array) -> list[jax.Array]:
+    """Variance (E, n) of every state before any data."""
+    roots = [(part.F, factors(part, levels)) for part in model.recursions]
+    return [jnp.diagonal(recur_squared(F, L @ L.mT), axis1=1, axis2=2) for F, L in roots]
+
+
+def _noises(fit: Judged, rejected: Rejection, rng: np.random.Generator) -> tuple[Data, Data]:
+    """Unit noise (N, C, K) of each block as the model has it, and with the size and memory that each channel shows."""
+    white = rng.standard_normal((len(fit.data), residuals.COLUMNS))
+    red = np.empty_like(white)
+    target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
+    for mine, size, memory in zip(rejected.channels.members, *rejected.scatter, strict=True):
+        order = mine[np.lexsort((time[mine], target[mine]))]
+        again = (memory - 1.0) / (memory + 1.0)  # autoregressive noise of which so many count as one
+        fresh = np.sqrt(1.0 - again**2) * white[order]
+        fresh[0] = white[order[0]]
+        red[order] = np.sqrt(size) * signal.lfilter([1.0], [1.0, -again], fresh, axis=0)
+    return _in_blocks(fit, white), _in_blocks(fit, red)
+
+
+def _in_blocks(fit: Judged, values: np.ndarray) -> Data:
+    """Values by datum (D, K) as those of the blocks (N, C, K), zero where nothing is measured."""
+    found, start = [], 0
+    for there, pick in zip(fit.problem.model.measured, fit.picks, strict=True):
+        block = np.zeros((*there.shape, values.shape[1]))
+        block[pick] = values[start : start + len(pick[0])]
+        start += len(pick[0])
+        found.append(jnp.asarray(block))
+    return tuple(found)
+
+
+def track_factors(
+    fit: Judged, rejected: Rejection, tracks: xr.DataTree, root: Any, wide: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Factors (time, component) of the sd of every target's states, by the name of its group; never beyond the prior.
+
+    The variance of a smoothed state grows by that of the errors which noise as the innovations show it, and biases
+    `wide` (M,) times as uncertain, make beyond those of the model: both are simulated with the smoother of the fit.
+    """
+    model, rng = fit.problem.model, np.random.default_rng(0)
+    chunks = int(np.clip(NUMBERS // (residuals.COLUMNS * max(len(fit.data), 1)), 1, CHUNKS))
+    more = [np.zeros(part.drift.shape) for part in model.recursions]
+    for _ in range(chunks):
+        biases = root @ rng.standard_normal((root.shape[1], residuals.COLUMNS))
+        plain, shown = _noises(fit, rejected, rng)
+        for sign, noise, moved in ((-1, plain, biases), (1, shown, wide[:, None] * biases)):
+            errors = _errors(model, fit.lins, fit.solved, noise, jnp.asarray(moved))
+            more = [own + sign * np.asarray(error) / chunks for own, error in zip(more, errors, strict=True)]
+    found = {}
+    for epochs, own, most in zip(fit.problem.epochs, more, before_data(model, fit.point.levels), strict=True):
+        for name in dict.fromkeys(map(str, epochs.target)):
+            mine = epochs.target == name
+            group = tracks[node_of(name)].to_dataset()
+            variance = group["sd"].values ** 2
+            grown = np.minimum(variance + np.maximum(own[mine], 0.0), np.maximum(np.asarray(most)[mine], variance))
+            found[node_of(name)] = np.sqrt(grown / np.where(variance > 0, variance, 1.0)).clip(1.0)
+    return found
+
+
+def widened(fit: Judged, rejected: Rejection, tree: xr.DataTree, root: Any) -> tuple[xr.DataTree, str]:
+    """A copy of a result whose biases and tracks have the variance that the innovations call for, and what was done.
+
+    `root` (M, R) is of the covariance of z. A bias takes the share gamma of its inflation, and no sd exceeds that of
+    the prior. Means keep their place; sd, interval, covariance and the spread of the draws grow together, and
+    "widened" of the groups says by which factor. A fit that is no answer stays as it is.
+    """
+    result = tree.copy()
+    if not rejected.reason or not Status(tree.attrs.get("status", Status.CONVERGED)).valid:
+        return result, ""
+    text, wide, told = f"the innovations reject the model: {rejected.reason}", np.ones(len(rejected.inflation)), 1.0
+    grown = []
+    if "calibration" in tree.children:
+        group = tree["calibration"].to_dataset()
+        wide = bias_factors(group, rejected.inflation, tree.attrs["precisions"] == "given")
+        if len(wide) and wide.max() >= TOLD:
+            told = float(wide.max())
+            _widen_biases(result, group, wide)
+            grown.append(f"biases are widened by up to {told:.2g} ({group['bias_label'].values[int(wide.argmax())]})")
+    tracks = track_factors(fit, rejected, tree["track"], root, wide) if "track" in tree.children else {}
+    largest = {name: float(own.max(initial=1.0)) for name, own in tracks.items()}
+    name, most = max(largest.items(), key=lambda pair: pair[1], default=("", 1.0))
+    if most >= TOLD:
+        told = max(told, most)
+        for own, factor in tracks.items():
+            _widen_track(result, own, factor)
+        target, verb = tree["track"][name].attrs["target"], "" if grown else "are widened "
+        grown.append(f"tracks {verb}by up to {most:.2g} ({target})")
+    result.attrs["widened"] = told
+    return result, f"{text}; the sd of the {', those of the '.join(grown)}" if grown else text
+
+
+def bias_factors(group: xr.Dataset, inflation: np.ndarray, given: bool) -> np.ndarray:
+    """Factors (M,) of the sd of the biases of a group `calibration`; never beyond the prior.
+
+    The sd of the prior is the scale, or what its precision says where that is `given`.
+    """
+    wide = np.sqrt(1.0 + group["gamma"].values * (inflation - 1.0))
+    precision = group["precision"].values if given else np.ones(len(wide))
+    with np.errstate(divide="ignore"):  # a flat prior has no sd
+        most = group["scale"].values / np.sqrt(precision) / group["sd"].values
+    found: np.ndarray = np.clip(wide, 1.0, np.maximum(most, 1.0))
+    return found
+
+
+def _widen_biases(result: xr.DataTree, group: xr.Dataset, wide: np.ndarray) -> None:
+    """Biases of a result with their sds times `wide` (M,)."""
+    mean = group["mean"].values
+    ends = {name: mean + wide * (group[name].values - mean) for name in ("lower", "upper")}
+    columns = {"sd": group["sd"].values * wide, **ends, "widened": wide}
+    if "block" in group:
+        scales = np.ones(len(wide))
+        spread = SensorBlocks.read(group, group["bias_label"].values.tolist(), scales).widened(wide).columns(scales)
+    else:
+        spread = {"covariance": (group["covariance"].dims, group["covariance"].values * np.outer(wide, wide))}
+    group = group.assign({name: ("bias_label", values) for name, values in columns.items()})
+    result["calibration"] = xr.DataTree(group.assign(spread))
+    draws = result["posterior"].to_dataset()
+    drawn = (draws["bias"] - draws["bias"].mean(("chain", "draw"))) * xr.DataArray(wide - 1.0, dims="bias_label")
+    result["posterior"] = xr.DataTree(draws.assign(bias=draws["bias"] + drawn))
+
+
+def _widen_track(result: xr.DataTree, name: str, wide: np.ndarray) -> None:
+    """A track of a result with its sds times `wide` (time, component), and the spread of its draws where it has any."""
+    group = result["track"][name].to_dataset(inherit=False)
+    factor = xr.DataArray(wide, dims=("time", "component"))
+    columns = {"sd": group["sd"] * factor, "widened": factor}
+    if "state" in group:
+        middle = group["state"].mean(("chain", "draw"))
+        columns["state"] = (middle + (group["state"] - middle) * factor).transpose(*group["state"].dims)
+    result[f"track/{name}"] = xr.DataTree(group.assign(columns))
+
+
+def unwidened(tree: xr.DataTree) -> xr.DataTree:
+    """A copy of a result as its method left it, without what its innovations made of it."""
+    result = tree.copy()
+    if told := result.attrs.pop("innovations", ""):
+        result.attrs["message"] = tree.attrs["message"].removesuffix(told).rstrip()
+    if result.attrs.pop("widened", None) is None:
+        return result
+    group = tree["calibration"].to_dataset()
+    if "widened" in group:
+        _widen_biases(result, group, 1.0 / group["widened"].values)
+        result["calibration"] = xr.DataTree(result["calibration"].to_dataset().drop_vars("widened"))
+    for name, node in tree["track"].children.items() if "track" in tree.children else ():
+        if "widened" in node:
+            _widen_track(result, name, 1.0 / node["widened"].values)
+            result[f"track/{name}"] = xr.DataTree(
+                result[f"track/{name}"].to_dataset(inherit=False).drop_vars("widened")
+            )
+    return result
+
+
+def said(tree: xr.DataTree, text: str) -> None:
+    """Add to the message of a result what its innovations say, so that it can be taken off again."""
+    text = text.strip()
+    if not text:
+        return
+    tree.attrs |= {"message": f"{tree.attrs.get('message', '')} {text}".strip(), "innovations": text}
+
+
+def sentence(text: str) -> str:
+    """What was done as a sentence; empty for nothing."""
+    return f"{text[0].upper()}{text[1:]}." if text else ""
+
+
+def judge_fit(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
+    """A copy of the tree of a fit with what its innovations say in its message, its intervals widened by that."""
+    if not Status(tree.attrs["status"]).valid:
+        return tree
+    if tree.attrs.get("sparse", 0):
+        large = take_up_large(answer.problem, tree, answer)
+        found = residuals.innovations_large(large, tree["calibration"].to_dataset()["gamma"].values)
+        return _judged(large, found, tree, large.blocks.root(), "", UNASSESSED)
+    fit = take_up(answer.problem, tree, answer)
+    found = residuals.innovations(fit, residuals.measured_kurtosis(fit)).innovations
+    return _judged(fit, found, tree, residuals.root_of(fit.covariance), unmoved(fit), UNASSESSED)
+
+
+def judge_tracks(
+    tree: xr.DataTree, problem: Problem, known: Calibrated, at: Linearisation | Point
+) -> xr.DataTree:  # fmt: skip
+    """A copy of tracks at a calibration, judged and widened likewise; `at` is the linearisation or, of many, the point.
+
+    The biases are taken where rows and calibration together put them, so that an error within the sds of the
+    calibration is no misfit. Of many biases it raises what the innovations are expected to scatter.
+    """
+    datum, picks = datum_of(problem)
+    data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
+    if isinstance(at, Linearisation):
+        root, open_ = known.root, Precision.single(jnp.zeros(problem.model.biases))
+        information = root.T @ np.asarray(at.information) @ root
+        values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(information)))
+        root = root @ (vectors / np.sqrt(1.0 + np.maximum(values, 0.0)))
+        fit = Fitted(problem, at.point, at.rows, at.solved, picks, data, at, open_, root @ root.T)
+        dz = fit.covariance @ np.asarray(at.solved.score)
+        found = residuals.innovations(fit, residuals.measured_kurtosis(fit), dz).innovations
+        return _judged(fit, found, tree, known.root)
+    system = system_at(problem.model, JointPrecision.of(problem.model), at)
+    large = JudgedLarge(problem, system.point, system.rows, system.solved, picks, data, system, known.blocks)
+    return _judged(large, residuals.innovations_given(large), tree, known.root)
+
+
+def _judged(
+    fit: Judged, found: Innovations, tree: xr.DataTree, root: Any, cause: str = "", more: str = ""
+) -> xr.DataTree:  # fmt: skip
+    """A copy of a result, judged by its innovations; if there is something to say its message ends with `more`."""
+    rejected = rejection(fit, found, residuals.channels_of(fit.data, found))
+    result, text = widened(fit, rejected, tree, root)
+    told = [part for part in (sentence(text), scattered(fit, found, not text), cause) if part]
+    said(result, " ".join([*told, more] if told else []))
+    return result
