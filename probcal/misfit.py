@@ -5,6 +5,7 @@ Causes are looked for from the special to the general: values that repeat, singl
 time, a sensor, channel or target whose mean square stands out, and there the factor of another unit.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,10 @@ STEP = 0.5  # share of a channel's squares about their mean that a step explains
 NEAR = 5  # data on either side of a step whose medians are compared
 SUDDEN = 6.0  # times the usual change of such medians, from which a step is one (1.3 % of random walks)
 LOOSE = 0.15  # relative tolerance of the log of a factor: a wrong unit bends the predictions too
+APART = 3.0  # log of a factor between units from which sizes of values tell it
+WITHIN = 0.7  # of such a log: distances differ by two from sensor to sensor
+HUGE = 1e300  # largest square: sums of it stay finite
+LOOSE_BIASES = "Use a prior, narrower scales, or fix some biases."
 UNEXPLAINED = "Check units, the time column, the target of each row, sentinels such as -9999 and the noise std."
 
 
@@ -34,22 +39,41 @@ class MisfitData(NamedTuple):
     unit: np.ndarray  # of the channel
 
 
-def misfit_text(mean: float, left: MisfitData) -> str:
-    """The mean square of a misfit, the worst datum, and the likely cause with its remedy."""
-    if (lost := np.isnan(left.square)).any():
-        first = int(np.argmax(lost))
-        return (
-            f"The fit explains nothing: the predictions of {lost.sum()} data are not numbers, the first"
-            f" {left.sensor[first]}.{left.channel[first]} at {left.time[first]:.6g} s. Check the sensor's function (a"
-            " division by zero, the root of a negative number), units, the start and sentinels such as -9999."
-        )
-    left = left._replace(square=np.minimum(left.square, 1e300))
-    worst = int(np.argmax(left.square))
-    name = f"{left.sensor[worst]}.{left.channel[worst]}"
-    cause = _repeated(left, worst) or _single(left) or _jump(left) or _group(left) or UNEXPLAINED
+def misfit_text(mean: float, points: Iterable[MisfitData]) -> str:
+    """The mean square of a misfit, the worst datum, and the likely cause with its remedy.
+
+    Of several points, asked for one by one, the first that shows a special cause counts, else the first. A mean that is
+    not finite says that the fit has no answer, and that the points have the biases as stated.
+    """
+    first, cause = None, ""
+    for left in points:
+        lost = np.isnan(left.square)
+        if first is None and lost.any():
+            return _lost(left, int(np.argmax(lost)), int(lost.sum()))
+        left = left._replace(square=np.nan_to_num(np.minimum(left.square, HUGE), nan=HUGE))
+        first = left if first is None else first
+        worst = int(np.argmax(left.square))
+        if cause := _repeated(left, worst) or _single(left) or _jump(left) or _sizes(left):
+            break
+    assert first is not None
+    worst = int(np.argmax(first.square))
+    said = f"The fit explains nothing: mean square a datum {mean:.2g}"
+    if not np.isfinite(mean):
+        stated = float(first.square.mean())
+        said = f"The fit found no finite answer: with the biases as stated the mean square a datum is {stated:.2g}"
+        cause = cause or (LOOSE_BIASES if stated < STANDS_OUT else "")
     return (
-        f"The fit explains nothing: mean square a datum {mean:.2g} where 1 is expected, worst {name} at"
-        f" {left.time[worst]:.6g} s. {cause}"
+        f"{said} where 1 is expected, worst {first.sensor[worst]}.{first.channel[worst]} at"
+        f" {first.time[worst]:.6g} s. {cause or _group(first) or UNEXPLAINED}"
+    )
+
+
+def _lost(left: MisfitData, first: int, count: int) -> str:
+    """What to check where predictions are no numbers, even with the biases as stated."""
+    return (
+        f"The fit explains nothing: the predictions of {count} data are not numbers, the first"
+        f" {left.sensor[first]}.{left.channel[first]} at {left.time[first]:.6g} s. Check the sensor's function (a"
+        " division by zero, the root of a negative number), units, the start and sentinels such as -9999."
     )
 
 
@@ -140,21 +164,41 @@ def _codes(*columns: np.ndarray) -> tuple[list[str], np.ndarray]:
 
 def _other_unit(left: MisfitData, mine: np.ndarray) -> str:
     """The unit that a constant factor between measured and predicted values tells; empty where none does."""
-    predicted = left.value[mine] - left.residual[mine]
-    own = str(left.unit[mine][0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        logs = np.log(left.value[mine] / predicted)
+        logs = np.log(left.value[mine] / (left.value[mine] - left.residual[mine]))
     logs = logs[np.isfinite(logs)]
-    if own not in UNITS or len(logs) < 0.8 * mine.sum():
+    if len(logs) < 0.8 * mine.sum():
         return ""
-    quantity, size = UNITS[own]
-    factors = {
-        unit: np.log(size / other) for unit, (kind, other) in UNITS.items() if kind == quantity and other != size
-    }
-    middle = float(np.median(logs))
-    if not factors:
-        return ""
-    unit = min(factors, key=lambda name: abs(factors[name] - middle))
-    loose = LOOSE * abs(factors[unit])
-    near = abs(middle - factors[unit]) < loose and float(np.median(np.abs(logs - middle))) < loose
+    own, middle = str(left.unit[mine][0]), float(np.median(logs))
+    unit, factor = _nearest_unit(own, middle)
+    near = max(abs(middle - factor), float(np.median(np.abs(logs - middle)))) < LOOSE * abs(factor)
     return f"{unit} instead of {own}" if near else ""
+
+
+def _sizes(left: MisfitData) -> str:
+    """A sensor whose values are larger or smaller than those of the others of its channel by the factor of a unit."""
+    names, code = _codes(left.sensor, left.channel)
+    _, first = np.unique(code, return_index=True)
+    channel = left.channel[first]
+    size = np.log([max(float(np.median(np.abs(left.value[code == k]))), 1e-300) for k in range(len(names))])
+    for k, name in enumerate(names):
+        others = size[(channel == channel[k]) & (np.arange(len(names)) != k)]
+        if len(others) < 2:
+            continue
+        away, own = float(size[k] - np.median(others)), str(left.unit[first[k]])
+        unit, factor = _nearest_unit(own, away)
+        if abs(factor) > APART and abs(away - factor) < WITHIN:
+            return (
+                f"Values of {name} are {np.exp(away):.2g} times those of the other sensors: they look like {unit}"
+                f" instead of {own}, convert them."
+            )
+    return ""
+
+
+def _nearest_unit(own: str, log: float) -> tuple[str, float]:
+    """The unit of the same quantity whose numbers are nearest to a factor, and the log of its own; 0 where none is."""
+    quantity, size = UNITS.get(own, ("", 1.0))
+    factors = {unit: float(np.log(size / other)) for unit, (kind, other) in UNITS.items() if kind == quantity}
+    factors = {unit: factor for unit, factor in factors.items() if factor}
+    unit = min(factors, key=lambda name: abs(factors[name] - log), default="")
+    return unit, factors.get(unit, 0.0)

@@ -5,8 +5,8 @@ Every method and verb answers or says one sentence.
 
 import numpy as np
 import pytest
-import xarray as xr
 import worlds
+import xarray as xr
 from contracts import check_tree
 
 import probcal

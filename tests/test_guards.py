@@ -208,6 +208,17 @@ def in_kilometres(data):
     data["residual"][own] = data["value"][own] - predicted
 
 
+def in_feet(data):
+    own = data["sensor"] == "rx1"
+    predicted = data["value"][own] - data["residual"][own]
+    data["value"][own] = predicted / 0.3048 * np.exp(0.05 * data["residual"][own] / 20.0)
+    data["residual"][own] = data["value"][own] - predicted
+
+
+def in_millimetres(data):
+    data["value"][data["sensor"] == "rx0"] *= 1e3
+
+
 def noisy(name, value):
     def change(data):
         data["residual"][data[name] == value] *= 8.0
@@ -226,18 +237,30 @@ def noisy(name, value):
             "The residuals of rx3.range jump at 200 s by at least 3e+03 m: leave out the rows on one side, or give the"
             " bias that changed drift=Drift((0, 200), scale=3e+03).",
         ),
-        (in_kilometres, "Most of it is in rx2 (mean square "),
-        (in_kilometres, "times that of the rest): its values look like km instead of m, convert them."),
+        (in_kilometres, "times those of the other sensors: they look like km instead of m, convert them."),
+        (in_millimetres, "times those of the other sensors: they look like mm instead of m, convert them."),
+        (in_feet, "times that of the rest): its values look like ft instead of m, convert them."),
         (noisy("sensor", "rx1"), "times that of the rest): check its units, clock, position and heading"),
         (noisy("target", "t1"), "times that of the rest): check the rows that name this target"),
     ],
 )
 def test_the_cause_of_a_misfit_is_read_from_its_residuals(change, says):
     left = remains(change)
-    text = misfit_text(float(left.square.mean()), left)
+    text = misfit_text(float(left.square.mean()), [left])
     assert text.startswith("The fit explains nothing: mean square a datum ")
     assert says in text, text
     assert text.count(". ") <= 1
+
+
+def test_a_misfit_without_a_finite_answer_is_read_with_the_biases_as_stated():
+    lost, plain = remains(), remains(marked)
+    lost = lost._replace(square=np.full_like(lost.square, np.nan), residual=np.full_like(lost.residual, np.nan))
+    text = misfit_text(np.nan, [plain])
+    assert "no finite answer: with the biases as stated the mean square a datum is 5" in text
+    assert "12 values of range are exactly -100000" in text
+    assert "12 values of range are exactly -100000" in misfit_text(1e4, [remains(), plain])  # the second shows a cause
+    assert "the predictions of 240 data are not numbers, the first rx0.range" in misfit_text(np.nan, [lost])
+    assert "Check units" in misfit_text(1e4, [remains(), lost])
 
 
 def test_random_walks_and_waves_of_residuals_are_no_jump():
@@ -251,7 +274,7 @@ def test_random_walks_and_waves_of_residuals_are_no_jump():
             data["residual"][data["sensor"] == "rx0"] = 30.0 * walk
 
         left = remains(change)
-        called += "jump" in misfit_text(float(left.square.mean()), left)
+        called += "jump" in misfit_text(float(left.square.mean()), [left])
     assert called <= 12
 
 
@@ -341,14 +364,15 @@ def test_a_scene_that_collapses_is_no_answer():
     assert "nats below its best on the way" in tree.attrs["message"]
 
 
-def test_predictions_that_are_not_numbers_are_named():
+def test_biases_that_are_not_numbers_are_named():
     network, table = gauges()
     problem = Problem(network, ConstantVelocity(0.5), table)
     with jax.enable_x64(True):
         point = automatic_start(problem)
         lost = point._replace(z=jnp.asarray(point.z).at[0].set(jnp.nan))
         said = misfit_sentence(problem, lost, float(mean_square(problem.model, lost)))
-    assert "are not numbers, the first" in said
+    assert "no finite answer: with the biases as stated the mean square a datum is 5.8" in said
+    assert said.endswith("Use a prior, narrower scales, or fix some biases.")
     assert "nan" not in said
 
 

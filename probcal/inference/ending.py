@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,11 +12,13 @@ from probcal.labels import listed
 from probcal.misfit import MisfitData, misfit_text
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, NormalPosterior, Posterior, Summary
+from probcal.results.answer import Answer, NormalPosterior, Posterior, Summary, uncalibrated
 from probcal.results.groups import datum_of, gather
 from probcal.smoothing.draws import residuals
+from probcal.smoothing.grid import track_mode
 from probcal.smoothing.information import squares_of
 from probcal.smoothing.mode import Point
+from probcal.starts import automatic_start
 from probcal.status import Status
 
 if TYPE_CHECKING:
@@ -143,6 +146,18 @@ def verdict(end: End) -> Status:
 
 def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
     """What a point that explains nothing leaves of the data, the likely cause and what to do."""
+    return misfit_text(square, (_remains(problem, at) for at in _points(problem, point, square)))
+
+
+def _points(problem: Problem, point: Point, square: float) -> Iterator[Point]:
+    """The point of a misfit where it is finite, and tracks with the biases as stated, which no wrong bias bends."""
+    if np.isfinite(square):
+        yield point
+    yield track_mode(problem, uncalibrated(automatic_start(problem)))
+
+
+def _remains(problem: Problem, point: Point) -> MisfitData:
+    """What a point leaves of every datum."""
     network, (datum, picks) = problem.network, datum_of(problem)
     names = {name: values for name, (_, values) in datum["coords"].items()}
     units = {
@@ -151,7 +166,7 @@ def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
         for channel, known in placed.type.expand(network.dimension)
     }
     sensor, channel, target = (np.asarray(names[name], str) for name in ("sensor", "channel", "target"))
-    left = MisfitData(
+    return MisfitData(
         square=gather(squares_of(problem.model, point), picks),
         residual=gather(residuals(problem.model, point).innovation, picks),
         value=datum["y"],
@@ -161,7 +176,6 @@ def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
         time=names["time"],
         unit=np.array([units[pair] for pair in zip(sensor, channel, strict=True)]),
     )
-    return misfit_text(square, left)
 
 
 def _message(
