@@ -114,6 +114,22 @@ def test_an_interrupted_climb_keeps_the_best_answer_so_far():
     assert np.isfinite(found["calibration"]["sd"]).all()
 
 
+@pytest.mark.ci
+@pytest.mark.parametrize("method", [pc.EA(form="sparse"), pc.EM(pc.Particles(50), iterations=60)])
+def test_climbs_in_sparse_form_and_by_particles_are_interrupted(method):
+    problem = worlds.linear("plane")[0]
+
+    def stop(at):
+        if at.phase == "climb" and at.done:
+            raise KeyboardInterrupt
+
+    found = pc.fit(problem, method, start=worlds.resting(problem), progress=stop)
+    assert (found.attrs["status"], found.attrs["interrupted"]) == ("not converged", 1)
+    assert found.attrs["message"].startswith("Interrupted after ")
+    assert found.attrs["message"].count("Interrupted") == 1
+    assert np.isfinite(found["calibration"]["sd"]).all()
+
+
 def ended(problem, phase, limit=300.0, **options):
     """The fit of a problem whose limit passes as a phase begins, its answer and the phases."""
     clock, phases = Clock(), []

@@ -73,6 +73,19 @@ def test_each_recording_is_fitted_as_alone_and_only_what_is_missing_again(model,
     assert table["status"].tolist()[-1] == "refused"
 
 
+@pytest.mark.ci
+def test_ctrl_c_leaves_the_table_of_what_is_finished(model, tmp_path, monkeypatch):
+    def interrupted(work, batches, **_):
+        yield 0, work(batches[0])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("probcal.cli.recordings.spread", interrupted)
+    code, _, complaint = call("fit", model, *days(model, 0, 1), *METHOD, "--out", tmp_path / "out")
+    assert code == 130
+    assert "interrupted; 1 of 2 recordings are finished, --resume goes on" in complaint
+    assert pd.read_csv(tmp_path / "out" / "fits.csv")["recording"].unique().tolist() == ["day0"]
+
+
 @pytest.mark.slow
 def test_recordings_spread_over_workers_and_killed_give_the_same_fits(model, tmp_path):
     words = ["fit", model, *days(model, 0, 1, 2, 3), *METHOD, "--out", tmp_path / "out", "--resume"]

@@ -186,6 +186,8 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
     if not (answer.status.valid and answer.posterior.sound):
         return answer
     problem, here, monitor = answer.problem.untilted, answer.posterior.point, context.monitor
+    if monitor.stopped:
+        return answer if answer.interrupted else _without(answer, "mirror images", monitor)
     monitor.enter("mirror images", answering=True)
     climb = SideClimb.dense(problem) if climb is None else climb
 
