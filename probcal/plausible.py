@@ -3,13 +3,13 @@
 A wrong unit or a sentinel is no outlier: robust noise explains it away, and the fit converges on nothing.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.network import Network
-from probcal.noise import Bernoulli
+from probcal.network import BiasRecord, Network
+from probcal.noise import Bernoulli, guess_of
 from probcal.table import Measurements, header, unit_factor
 
 EPOCHS = (("ns", 1e17), ("us", 1e14), ("ms", 1e11))  # a bare time from here on counts these since 1970
@@ -21,6 +21,26 @@ FAR = 1e6  # spreads from which any value is nonsense
 FEW = 8  # values below which a column has no spread
 FAINT, RANGE = 0.1, 30.0  # largest value of a column of powers in W, and the ratio to its smallest
 NARROW, WIDE = 1e-9, 1e6  # of the size of a column: smallest and largest std
+
+LOOSE = 1e6  # noise stds in a scale or survey: at 1e7 the sd of three nodes' common shift is 17 % off (radars)
+
+
+def check_scales(biases: Iterable[BiasRecord], network: Network) -> None:
+    """Raise `InputError` for a scale or survey so wide that it is lost in the rounding of what the rows tell."""
+    finest: dict[tuple[str, str], float] = {}
+    for placed in network.sensors:
+        for channel in placed.type.channels.values():
+            std = np.inf if isinstance(channel.noise, Bernoulli) else guess_of(channel.std)
+            for owner in (placed.name, placed.type.name, *(node.name for node in placed.nodes)):
+                key = (owner, channel.unit)
+                finest[key] = min(finest.get(key, np.inf), std)
+    for bias in biases:
+        std = finest.get((bias.owner, bias.unit), np.inf)
+        if bias.scale > LOOSE * std:
+            raise InputError(
+                f"the {bias.kind} of {bias.label} is {bias.scale:.6g} {bias.unit}, {bias.scale / std:.2g} times the"
+                f" noise of its sensors: more than the rounding of numbers allows; state {LOOSE * std:.3g} or less"
+            )
 
 
 def check_plausible(data: Measurements, network: Network) -> None:

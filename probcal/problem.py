@@ -37,7 +37,7 @@ from probcal.model.variants import aligned
 from probcal.motion import Known, Layout, LinearMotion, Static, Target, White, as_motion, labels_of
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, guess_of
-from probcal.plausible import check_plausible
+from probcal.plausible import check_plausible, check_scales
 from probcal.scans import Scans, assigned_rows, scans_of
 from probcal.sensor import Sensor
 from probcal.table import LARGEST, OBJECT, Measurements, Table, header, measure, read_table, unit_factor
@@ -126,6 +126,7 @@ class Problem:
         self.surveyed = np.array([bias.kind != "scale" for bias in self.biases], bool)
         self.epoch = _positive(epoch)
         check_plausible(whole, network)
+        check_scales(self.biases, network)
         self.measurements = self._at_epochs(whole)
         self.epoch_shift = float(np.abs(self.measurements.time - whole.time).max())  # s, of the rows to their epochs
         self.silent = _check_rows(self.measurements, network)
@@ -200,16 +201,20 @@ class Problem:
 
     @property
     def area(self) -> Area:
-        """Where a target starts of which nothing is stated."""
+        """Where a target starts of which nothing is stated: wider than the stated positions of the nodes are known.
+
+        A narrower start would hold the network in the place of a survey.
+        """
         ranged = any(
             channel.unit == "m"
             for s in self.network.sensors
             if len(s.nodes) == 1
             for channel in s.type.channels.values()
         )
-        return Area(
-            self.network.dimension, self.node_positions.mean(0), self.extent, DIFFUSE * (1.0 if ranged else FAR)
-        )
+        wide = DIFFUSE * (1.0 if ranged else FAR)
+        loose = max((bias.scale for bias in self.biases if bias.component == "position"), default=0.0)
+        extent = max(self.extent, loose * DIFFUSE / wide)
+        return Area(self.network.dimension, self.node_positions.mean(0), extent, wide)
 
     @property
     def extent(self) -> float:

@@ -16,6 +16,7 @@ from contracts import only
 
 import probcal
 from probcal import Bias, Channel, ConstantVelocity, Network, Node, Problem, geometry, sensor
+from probcal.errors import InputError
 from probcal.smoothing import recursion as rec
 
 LOSS = 1e-15
@@ -198,3 +199,27 @@ def test_fit(d, extent):
     spread = np.sqrt(np.diagonal(expected["covariances"], axis1=1, axis2=2))
     assert (only(tree)["sd"].values >= spread * (1 - 1e-6)).all()
     assert (np.abs(mean - offset) < 4.0 * sd).all()
+
+
+def spread(survey):
+    """Three nodes that know their own places to so many metres and see one target."""
+    nodes = [Node(f"n{k}", place, survey=survey) for k, place in enumerate([(0.0, 0.0), (90.0, 5.0), (30.0, 70.0)])]
+    network, times = Network([probcal.sensors.position.on(node) for node in nodes]), np.arange(4.0)
+    path = np.stack([10.0 + 4.0 * times, 20.0 + 2.0 * times], 1)
+    run = probcal.simulate(network, ConstantVelocity(1.0), times, key=0, biases={}, tracks={"target": path})
+    return Problem(network, ConstantVelocity(1.0), run.table)
+
+
+def test_the_start_of_a_target_does_not_hold_a_network_that_nothing_else_holds():
+    for survey in (1e4, 1e6):
+        problem = spread(survey)
+        group = probcal.fit(problem, probcal.MAP())["calibration"].to_dataset()
+        along = [m for m, bias in enumerate(problem.biases) if bias.axis == 0]
+        shift = np.sqrt(group["covariance"].values[np.ix_(along, along)].mean())
+        assert shift == pytest.approx(survey / np.sqrt(3), rel=3e-3)
+        assert group["gamma"].values == pytest.approx(2 / 3, abs=2e-3)
+    assert spread(1.0).area.extent == spread(1.0).extent
+    with pytest.raises(
+        InputError, match=r"the survey of n0\.position_x is 1e\+12 m, .* more than the rounding of numbers"
+    ):
+        spread(1e12)
