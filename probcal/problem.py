@@ -19,6 +19,7 @@ from probcal.labels import NOBODY
 from probcal.model.epochs import Epoch, merged
 from probcal.model.model import TILTED, Mixing, Model, Recursion, Tail, Tilt, at_rest
 from probcal.model.motions import (
+    CLEAR,
     DIFFUSE,
     FAR,
     Area,
@@ -213,7 +214,7 @@ class Problem:
         )
         wide = DIFFUSE * (1.0 if ranged else FAR)
         loose = max((bias.scale for bias in self.biases if bias.component == "position"), default=0.0)
-        extent = max(self.extent, loose * DIFFUSE / wide)
+        extent = max(self.extent, CLEAR * loose / wide)
         return Area(self.network.dimension, self.node_positions.mean(0), extent, wide)
 
     @property

@@ -216,8 +216,8 @@ def test_the_start_of_a_target_does_not_hold_a_network_that_nothing_else_holds()
         group = probcal.fit(problem, probcal.MAP())["calibration"].to_dataset()
         along = [m for m, bias in enumerate(problem.biases) if bias.axis == 0]
         shift = np.sqrt(group["covariance"].values[np.ix_(along, along)].mean())
-        assert shift == pytest.approx(survey / np.sqrt(3), rel=3e-3)
-        assert group["gamma"].values == pytest.approx(2 / 3, abs=2e-3)
+        assert shift == pytest.approx(survey / np.sqrt(3), rel=8e-3)
+        assert group["gamma"].values == pytest.approx(2 / 3, abs=5e-3)
     assert spread(1.0).area.extent == spread(1.0).extent
     with pytest.raises(
         InputError, match=r"the survey of n0\.position_x is 1e\+12 m, .* more than the rounding of numbers"

@@ -188,7 +188,7 @@ def eliminate_compressed(
 
 def _stacked(columns: tuple[jax.Array, jax.Array]) -> list[jax.Array]:
     """Columns (E, u, m) of all epochs below each other (E u, m)."""
-    return [own.reshape(-1, own.shape[2]) for own in columns]
+    return [own.reshape(own.shape[0] * own.shape[1], own.shape[2]) for own in columns]
 
 
 def _proposal(
