@@ -117,6 +117,11 @@ class Problem:
         fix: Mapping[str, float] | Iterable[str] = (),
         epoch: float | None = None,
     ):
+        if data is None:
+            raise InputError(
+                "Problem: the table of rows is missing; give Problem(network, motion, table), or"
+                " Problem(network, data=table) where no row has a target"
+            )
         whole = measure(read_table(data), network)
         network = network.with_floors(whole.floors)
         self.network = network

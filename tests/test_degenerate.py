@@ -136,6 +136,8 @@ def test_rows_without_a_target_stand_beside_those_of_one():
         Problem(network, motion, table.assign(target=None))
     with pytest.raises(InputError, match="stands for rows without a target"):
         Problem(network, motion, table.assign(target="no target"))
+    with pytest.raises(InputError, match="the table of rows is missing"):
+        Problem(network, table)
     with pytest.raises(InputError, match='target "tag" has no motion; give one, such as'):
         Problem(network, data=table)
 
