@@ -224,3 +224,10 @@ def test_of_a_motion_that_was_left_out_nothing_is_asked():
     tree = assess(problem, probcal.fit(problem, probcal.LeastSquares()))
     check = tree["level_check"].to_dataset() if "level_check" in tree.children else {"level": np.zeros(0, str)}
     assert not [name for name in np.asarray(check["level"]).tolist() if name.startswith("motion")]
+
+
+def test_a_level_that_is_far_off_may_be_another_fault():
+    level = levels.Level("radar.range_std", 0.5)
+    assert levels._sentence(level, 1.2, 0.1).endswith("1.20 ± 0.10 times the declared 0.5: declare Unknown(0.5)")
+    far = "far more than the declared 0.5: declare Unknown(0.5), unless a unit, a sensor or the motion is wrong"
+    assert levels._sentence(level, 5.0, 0.1).endswith(far)

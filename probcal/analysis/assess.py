@@ -118,9 +118,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     columns = [groups["verdict"][name].values.tolist() for name in ("bias_label", "verdict", "reason")]
     findings += alarms(*columns)
     if tree.attrs["status"] in INVALID:
-        text = (
-            f"the fit ended {tree.attrs['status']}, which is no answer: what is left of the data says nothing of them"
-        )
+        text = f"the fit ended {tree.attrs['status']}: the checks of its residuals and biases are not meaningful"
         kept = [
             f for f in findings if f.kind in ("wrapping", "nis" if _absurd(tree) else "outliers")
         ]  # likely causes; the message of a misfit has its own

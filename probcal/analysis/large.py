@@ -59,9 +59,7 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
         findings.append(Finding("halves", "fit", text))
     findings += mirror_findings(tree)
     if tree.attrs["status"] in INVALID:
-        text = (
-            f"the fit ended {tree.attrs['status']}, which is no answer: what is left of the data says nothing of them"
-        )
+        text = f"the fit ended {tree.attrs['status']}: the checks of its residuals and biases are not meaningful"
         findings = [Finding("status", "fit", text), *(f for f in findings if f.kind in ("wrapping", "nis"))]
     result, text = widened(fit, rejected, tree, fit.blocks.root())
     return completed(result, text, groups, findings)

@@ -308,6 +308,8 @@ def _sentence(level: Level, factor: float, sd: float) -> str:
     else:
         size = f"{factor:.2f} ± {sd:.2f} times {what}"
     remedy = "correct its std" if level.declared is None else f"declare Unknown({level.declared:g})"
+    if np.log(factor) >= FARTHEST:
+        remedy += ", unless a unit, a sensor or the motion is wrong"
     return f"{level.label}: the data ask for {size}: {remedy}"
 
 
