@@ -32,6 +32,7 @@ from probcal.smoothing.mode import Eliminated, Point, factors
 from probcal.smoothing.scans import recur_squared
 from probcal.smoothing.sparse_mode import system_at
 from probcal.status import Status
+from probcal.types import float64
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -220,7 +221,7 @@ def widened(fit: Judged, rejected: Rejection, tree: xr.DataTree, root: Any) -> t
             told = float(wide.max())
             _widen_biases(result, group, wide)
             grown.append(f"biases are widened by up to {told:.2g} ({group['bias_label'].values[int(wide.argmax())]})")
-    tracks = track_factors(fit, rejected, tree["track"], root, wide) if "track" in tree.children else {}
+    tracks = track_factors(fit, rejected, tree.children["track"], root, wide) if "track" in tree.children else {}
     largest = {name: float(own.max(initial=1.0)) for name, own in tracks.items()}
     name, most = max(largest.items(), key=lambda pair: pair[1], default=("", 1.0))
     if most >= TOLD:
@@ -265,7 +266,7 @@ def _widen_biases(result: xr.DataTree, group: xr.Dataset, wide: np.ndarray) -> N
 
 def _widen_track(result: xr.DataTree, name: str, wide: np.ndarray) -> None:
     """A track of a result with its sds times `wide` (time, component), and the spread of its draws where it has any."""
-    group = result["track"][name].to_dataset(inherit=False)
+    group = result.children["track"].children[name].to_dataset(inherit=False)
     factor = xr.DataArray(wide, dims=("time", "component"))
     columns = {"sd": group["sd"] * factor, "widened": factor}
     if "state" in group:
@@ -285,12 +286,11 @@ def unwidened(tree: xr.DataTree) -> xr.DataTree:
     if "widened" in group:
         _widen_biases(result, group, 1.0 / group["widened"].values)
         result["calibration"] = xr.DataTree(result["calibration"].to_dataset().drop_vars("widened"))
-    for name, node in tree["track"].children.items() if "track" in tree.children else ():
+    for name, node in tree.children["track"].children.items() if "track" in tree.children else ():
         if "widened" in node:
-            _widen_track(result, name, 1.0 / node["widened"].values)
-            result[f"track/{name}"] = xr.DataTree(
-                result[f"track/{name}"].to_dataset(inherit=False).drop_vars("widened")
-            )
+            _widen_track(result, name, 1.0 / node.to_dataset(inherit=False)["widened"].values)
+            own = result.children["track"].children[name].to_dataset(inherit=False)
+            result[f"track/{name}"] = xr.DataTree(own.drop_vars("widened"))
     return result
 
 
@@ -307,6 +307,7 @@ def sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}." if text else ""
 
 
+@float64
 def judge_fit(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
     """A copy of the tree of a fit with what its innovations say in its message, its intervals widened by that."""
     if not Status(tree.attrs["status"]).valid:
