@@ -130,6 +130,19 @@ def test_climbs_in_sparse_form_and_by_particles_are_interrupted(method):
     assert np.isfinite(found["calibration"]["sd"]).all()
 
 
+def test_ctrl_c_after_the_climb_is_said():
+    """Where the search for other answers has nothing left to leave out, the message names the interruption too."""
+
+    def stop(at):
+        if at.phase == "mirror images":
+            raise KeyboardInterrupt
+
+    problem = worlds.linear("plane")[0]
+    found = pc.fit(problem, pc.MAP(), start=worlds.resting(problem), progress=stop)
+    assert (found.attrs["status"], found.attrs["interrupted"]) == ("not converged", 1)
+    assert found.attrs["message"].startswith("Interrupted while other answers were looked for.")
+
+
 def ended(problem, phase, limit=300.0, **options):
     """The fit of a problem whose limit passes as a phase begins, its answer and the phases."""
     clock, phases = Clock(), []

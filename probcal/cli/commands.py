@@ -98,7 +98,8 @@ def fit_command(
     ] = False,
     overwrite: Overwrite = False,
     limit: Annotated[
-        float | None, typer.Option(help="s after which the search for other answers ends", show_default=False)
+        float | None,
+        typer.Option(help="s after which the search for other answers ends; checks follow", show_default=False),
     ] = None,
     scheduler: Scheduler = None,
     save: Annotated[

@@ -68,7 +68,8 @@ def conclude_at(
     status = verdict(end)
     message = _message(problem, point, status, end, low, far, iterations, summary.precisions)
     if cut and status is Status.NOT_CONVERGED:
-        message = f"{stopped} after {iterations} iterations, before it converged: this is the best estimate so far."
+        steps = f"{iterations} iteration{'s' * (iterations > 1)}"
+        message = f"{stopped} after {steps}, before it converged: this is the best estimate so far."
     if status is Status.SPENT and np.isfinite(trace[-2:]).all() and len(trace) > 1:
         message = (
             f"All {iterations} iterations were run, as asked; the last moved the objective by"

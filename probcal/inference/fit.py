@@ -163,7 +163,8 @@ def _interrupted(answer: Answer, monitor: Monitor) -> Answer:
     if not monitor.signal:
         return answer
     status = Status.NOT_CONVERGED if answer.status.settled else answer.status
-    return replace(answer, interrupted=True, status=status)
+    said = "" if monitor.stopped in answer.message else f"{monitor.stopped} while other answers were looked for."
+    return replace(answer, interrupted=True, status=status, message=f"{said} {answer.message}".strip())
 
 
 def _configured(
