@@ -10,16 +10,20 @@ from contracts import check_tree, close
 import probcal
 from probcal import ARD, EA, MAP, BernoulliGaussian, Gaussian, Horseshoe, Laplace, fit
 from probcal.errors import InputError
+from probcal.inference.ending import uncertain
 from probcal.inference.hierarchy import GammaPrecision, LaplaceMixture, RegularisedHorseshoe, SpikeAndSlab, hierarchy_of
 from probcal.inference.integrate import (
     CHAINS,
     KEPT,
     DenseLikelihood,
+    Integrated,
     Integration,
+    Moments,
     begin,
     joint_draws,
     likelihood,
     moments,
+    pooled,
     run_sweeps,
 )
 from probcal.inference.posed import Form, Natural
@@ -118,6 +122,30 @@ def test_expectation_propagation_agrees_too(prior, members):
     np.testing.assert_allclose((z.mean(0) - work.mean) / sd, 0, atol=0.25)  # of 100 Gaussians
     wanted = covariance / np.outer(*[np.sqrt(np.diag(covariance))] * 2)
     np.testing.assert_allclose(np.corrcoef(z.T), wanted, atol=0.12)
+
+
+def test_batches_agree_with_each_other_and_state_their_error():
+    """Scatter of four keys: within three of the errors stated, each below 3 %; thinned draws come from all batches."""
+    problem, _ = worlds.linear("plane")
+    found = [fit(problem, EA(), start=worlds.resting(problem), key=key) for key in range(4)]
+    mean, sd = (np.stack([tree["calibration"][name].values for tree in found]) for name in ("mean", "sd"))
+    errors = {name: max(tree.attrs[name] for tree in found) for name in ("mean_error", "sd_error")}
+    assert all(0 < error < 0.03 for error in errors.values())
+    assert (np.ptp(mean / sd.mean(0), axis=0) < 4 * errors["mean_error"]).all()
+    assert (np.ptp(sd / sd.mean(0), axis=0) < 4 * errors["sd_error"]).all()
+
+
+def test_errors_of_pooled_batches_are_stated_where_they_are_large():
+    one = Moments(np.zeros(2), np.eye(2), -np.ones(2), np.ones(2), np.ones(2))
+    other = one._replace(mean=np.array([0.0, 0.2]), covariance=np.diag([1.0, 1.44]))
+    total, mean_error, sd_error = pooled([one, other])
+    close(total.mean, [0.0, 0.1], 1e-12)
+    close(total.covariance, np.diag([1.0, 1.23]), 1e-12)
+    close(mean_error, [0.0, 0.1 / np.sqrt(1.23)], 1e-12)
+    close(sd_error, [0.0, 0.1 / np.sqrt(1.23)], 1e-12)
+    mixed = Integrated(None, None, total, None, {}, True, mean_error, sd_error)
+    assert "up to 0.09 sd of a mean and 9% of an sd, largest for b." in uncertain(("a", "b"), mixed)
+    assert uncertain(("a", "b"), mixed._replace(mean_error=0.0, sd_error=0.0)) == ""
 
 
 def test_one_gaussian_is_a_mixture_of_itself():

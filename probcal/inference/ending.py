@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 FAR = 10.0  # scales from the stated value beyond which an estimate is none
 FALL = 1.0  # nats below its best at which an evidence may end
+INEXACT = 0.03  # Monte Carlo error of a mean in sd, or of an sd over it, above which a message states it
 ABSURD = 100.0  # mean square a datum, 1 expected, beyond which a fit explains nothing
 
 
@@ -46,12 +48,27 @@ def conclude(
 
     Where precisions were integrated after it, `mixed` is what came of it; `stopped` says why it was ended early.
     """
-    return conclude_at(
+    answer = conclude_at(
         problem, method, prior, _posterior(problem, prior, state, how, mixed), trace, square, iterations,
         converged=bool(state.done) and (mixed is None or bool(mixed.settled)), refused=bool(state.refused),
         evidence=float(state.found.evidence),
         lost=fallen(prior, len(problem.levels), state.best, state.worth), stopped=stopped,
     )  # fmt: skip
+    said = uncertain(problem.labels, mixed) if mixed is not None and answer.status.valid else ""
+    return replace(answer, message=f"{answer.message} {said}".strip()) if said else answer
+
+
+def uncertain(labels: Sequence[str], mixed: Integrated) -> str:
+    """A sentence on the Monte Carlo error of integrated precisions, where it is large; else nothing."""
+    errors = np.broadcast_arrays(mixed.mean_error, mixed.sd_error, np.zeros(len(labels)))[:2]
+    mean, sd = (float(np.max(part, initial=0.0)) for part in errors)
+    if max(mean, sd) <= INEXACT:
+        return ""
+    worst = labels[int(np.argmax(np.maximum(*errors)))]
+    return (
+        f"Precisions are integrated by draws: their Monte Carlo error is up to {mean:.2f} sd of a mean and {sd:.0%} of"
+        f" an sd, largest for {worst}. Fit again with another key to see it, or take collapsed."
+    )
 
 
 def conclude_at(
