@@ -69,14 +69,14 @@ if TYPE_CHECKING:
         White,
     )
     from probcal.network import Network, Node, Path
-    from probcal.nodes import read_nodes, write_nodes
+    from probcal.nodes import read_nodes, write_network, write_nodes
     from probcal.noise import Bernoulli, Censored, Mixture, StudentT, Truncated, Unknown
     from probcal.particle.settings import Particles
     from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
     from probcal.problem import Problem
     from probcal.results.drifts import drift_table
     from probcal.results.io import load, save
-    from probcal.results.read import outliers, summary, tracks
+    from probcal.results.read import calibrated, outliers, summary, tracks
     from probcal.results.scores import add_scores, scores
     from probcal.roads import LeavingRoad, Road, RoadNetwork, match_track, read_roads
     from probcal.sensor import Bias, Channel, Drift, Sensor, SensorType, sensor
@@ -112,7 +112,7 @@ __all__ = lazy(
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"
         ),
         "probcal.network": "Network Node Path",
-        "probcal.nodes": "read_nodes write_nodes",
+        "probcal.nodes": "read_nodes write_network write_nodes",
         "probcal.noise": "Bernoulli Censored Mixture StudentT Truncated Unknown",
         "probcal.particle.settings": "Particles",
         "probcal.priors": "ARD BernoulliGaussian Flat Gaussian Horseshoe Laplace",
@@ -122,7 +122,7 @@ __all__ = lazy(
         "probcal.simulate": "Simulation Truth simulate",
         "probcal.table": "read_table",
         "probcal.results.io": "load save",
-        "probcal.results.read": "outliers summary tracks",
+        "probcal.results.read": "calibrated outliers summary tracks",
     },
     submodules="motion noise priors sensors",
 )

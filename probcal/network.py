@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -121,6 +122,7 @@ class Node:
                     f" np.deg2rad({value:g})"
                 )
         self.spread: dict[str, tuple[str, Bias]] = {}
+        self.sizes: dict[str, tuple[float, ...]] = {}  # standard deviations by axis, where these differ
         for kind, given in (("survey", survey), ("scale", scale)):
             entries: Mapping[str, Spread] = (
                 given if isinstance(given, Mapping) else {} if given is None else {"position": given}
@@ -160,6 +162,39 @@ class Node:
     def dimension(self) -> int:
         """Number of coordinates."""
         return len(self.position)
+
+    def labels(self, component: str) -> list[str]:
+        """Labels of the biases of a component, one per axis where it has axes."""
+        value = self.position if component == "position" else self.components[component]
+        axes = [f"_{axis}" for axis in AXES[: self.dimension]] if np.ndim(value) else [""]
+        return [f"{self.name}.{component}{axis}" for axis in axes]
+
+    def spreads(self, component: str) -> tuple[float, ...]:
+        """Standard deviations of the biases of a component, one per axis where it has axes."""
+        return self.sizes.get(component, (self.spread[component][1].scale,) * len(self.labels(component)))
+
+    def surveyed(self, values: Mapping[str, tuple[float, float]]) -> "Node":
+        """This node with other stated values, as (value, sd) by the label of a bias; each sd is a survey."""
+        node = copy(self)
+        node.components, node.spread, node.sizes = dict(self.components), dict(self.spread), dict(self.sizes)
+        for component, (_, bias) in self.spread.items():
+            labels = self.labels(component)
+            if not any(label in values for label in labels):
+                continue
+            own = self.position if component == "position" else np.atleast_1d(self.components[component])
+            stated: np.ndarray = np.array(
+                [values[k][0] if k in values else v for k, v in zip(labels, own, strict=True)]
+            )
+            sds = [values[k][1] if k in values else s for k, s in zip(labels, self.spreads(component), strict=True)]
+            node.spread[component] = ("survey", replace(bias, scale=max(sds)))
+            node.sizes[component] = tuple(sds)
+            if component != "position":
+                node.components[component] = stated if len(labels) > 1 else float(stated[0])
+                continue
+            node.position = stated
+            if self.path is not None:
+                node.path = replace(self.path, position=self.path.position + (stated - self.position))
+        return node
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -270,6 +305,22 @@ class Network:
         sensors = [replace(s, detection=detections.get(s.name, s.detection)) for s in self.sensors]
         return Network(sensors, frame=self.frame)
 
+    def surveyed(self, values: Mapping[str, tuple[float, float]]) -> "Network":
+        """The same network with other stated values, as (value, sd) by the label of a bias; each sd is a survey.
+
+        A bias that is not among them stays as it is declared, and so do the steps of a drifting one.
+        """
+        nodes = {node.name: node.surveyed(values) for node in self.nodes}
+        sensors = []
+        for placed in self.sensors:
+            known = dict(placed.known)
+            for name, bias in placed.type.biases.items():
+                label = f"{placed.type.name if bias.shared else placed.name}.{name}"
+                if label in values:
+                    known[name] = replace(bias, nominal=values[label][0], scale=values[label][1])
+            sensors.append(replace(placed, nodes=tuple(nodes[node.name] for node in placed.nodes), known=known))
+        return Network(sensors, frame=self.frame)
+
     def with_floors(self, floors: Mapping[tuple[int, str], float]) -> "Network":
         """This network with floors of what is heard, by number of the sensor type and channel; itself without any."""
         if not floors:
@@ -321,24 +372,22 @@ class Network:
             for component, (kind, bias) in node.spread.items():
                 if component not in read:
                     raise InputError(f'node "{node.name}": {component} has a {kind}, but none of its sensors reads it')
-                vector = component == "position" or np.ndim(node.components[component]) > 0
-                for axis in range(self.dimension if vector else 1):
-                    suffix = f"_{AXES[axis]}" if vector else ""
-                    label = f"{node.name}.{component}{suffix}"
-                    record = BiasRecord(
-                        label, bias.unit, bias.scale, 0.0, kind, node.name, component, axis, vector=vector
-                    )
+                labels, vector = node.labels(component), component == "position"
+                vector = vector or np.ndim(node.components[component]) > 0
+                for axis, (label, scale) in enumerate(zip(labels, node.spreads(component), strict=True)):
+                    record = BiasRecord(label, bias.unit, scale, 0.0, kind, node.name, component, axis, vector=vector)
                     records += [record, *record.steps(bias.drift)]
         return records
 
     def _sensor_biases(self) -> list[BiasRecord]:
         records: dict[str, BiasRecord] = {}
         for placed in self.sensors:
-            for name, bias in placed.type.biases.items():
-                owner = placed.type.name if bias.shared else placed.name
-                label = f"{owner}.{name}"
+            for name, declared in placed.type.biases.items():
+                owner = placed.type.name if declared.shared else placed.name
+                bias, kind = placed.known.get(name, declared), "survey" if name in placed.known else "scale"
                 record = BiasRecord(
-                    label, bias.unit, bias.scale, bias.nominal, "scale", owner, name, sensor_type=placed.type.name
-                )
+                    f"{owner}.{name}", bias.unit, bias.scale, bias.nominal, kind, owner, name,
+                    sensor_type=placed.type.name,
+                )  # fmt: skip
                 records |= {r.label: r for r in (record, *record.steps(bias.drift))}
         return list(records.values())

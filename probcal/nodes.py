@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -15,9 +16,9 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.files import parsed_json, write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place, earth_axes
-from probcal.labels import AXES, step_of
+from probcal.labels import AXES, step_of, unescaped
 from probcal.lazy import Later
-from probcal.network import ANGLES, POSE_UNITS, Node
+from probcal.network import ANGLES, POSE_UNITS, Network, Node
 from probcal.sensor import Bias
 from probcal.table import Table, csv_text, header, name_as_text, numbers, read_table, unit_factor
 
@@ -72,7 +73,7 @@ def read_nodes(
     Columns: `node` (or `name`); `x, y[, z]` in m or `latitude, longitude[, height]` in degrees and m; optional
     `heading`, `pitch`, `roll` in rad, `clock`, `time_offset` in s, `survey_<component>` and `scale_<component>` as of
     `Node`, and extra components as numbers. A header may carry a unit (`heading [deg]`); clock and extras keep theirs.
-    A blank cell leaves its component out; columns `sd_...` (of `write_nodes`) are not read.
+    A blank cell leaves its component out; columns `sd_...` and `note` (of `write_nodes`) are not read.
 
     Latitude and longitude become metres in a `LocalFrame` about `origin` (latitude, longitude[, height]; the mean of
     the nodes by default), kept as `.frame`. The heading counts from the node's own east, counter-clockwise (a compass
@@ -210,7 +211,7 @@ def _columns(table: Table, cells: pd.DataFrame, units: Mapping[str, str | None])
     found: dict[str, dict[str, list[Any]]] = {"": {}, "survey": {}, "scale": {}}
     first: dict[str, tuple[str, str]] = {}
     for name in cells.columns:
-        if name in (*LOCAL, *GEODETIC, "node", "name") or name.startswith("sd_"):
+        if name in (*LOCAL, *GEODETIC, "node", "name", "note") or name.startswith("sd_"):
             continue
         kind, _, component = name.partition("_")
         if kind not in KINDS or not component:
@@ -249,6 +250,69 @@ def _check_component(table: Table, name: str) -> None:
         )
 
 
+def write_network(path: str | PathLike[str], network: Network) -> Path:
+    """Write all that a network states as CSV, each number exact: a row per component of a node and bias of a sensor.
+
+    Columns: `name` (the label of the bias that it has or might have, such as `mast.position_x`), `of` (node, sensor or
+    sensor type), `unit`, `value` and `sd`, the survey, blank where a value is known exactly or only its scale is
+    declared. The position of a moving node is the start of its path. `calibrated` lays such a file on a network; its
+    sensor functions, scales and correlations are not in it. Raises `InputError` where it cannot be written.
+    """
+    rows: list[dict[str, Any]] = []
+    surveys = {bias.label: bias for bias in network.biases if bias.since is None}
+    for node in network.nodes:
+        for component in ("position", *node.components):
+            value = node.position if component == "position" else node.components[component]
+            unit = node.spread[component][1].unit if component in node.spread else POSE_UNITS.get(component, "1")
+            for label, number in zip(node.labels(component), np.atleast_1d(value).tolist(), strict=True):
+                rows.append({"name": label, "of": "node", "unit": unit, "value": float(number)})
+    types = {kind.name for kind in network.types}
+    for bias in surveys.values():
+        if bias.sensor_type:
+            of = "sensor type" if bias.owner in types else "sensor"
+            rows.append({"name": bias.label, "of": of, "unit": bias.unit, "value": bias.nominal})
+    for row in rows:
+        known = surveys.get(row["name"])
+        row["sd"] = known.scale if known is not None and known.kind == "survey" else None
+    return write_whole(path, csv_text(pd.DataFrame(rows)))
+
+
+def read_network(path: str | PathLike[str], network: Network) -> dict[str, tuple[float, float]]:
+    """Value and sd by label, of the biases of a network whose sds a file of `write_network` has.
+
+    Sensors and nodes that the network does not have are left out. Raises `InputError` naming file, row and name.
+    """
+    path = Path(path)
+    try:
+        table = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
+        rows = [(unescaped(row["name"]), row["unit"], float(row["value"]), row["sd"]) for row in table]
+        known = {
+            name: (unit, value, float(sd)) if sd.strip() else (unit, value, None) for name, unit, value, sd in rows
+        }
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
+        raise InputError(f"{path} is no file of write_network ({type(error).__name__}: {error})") from None
+    owners = {sensor.name for sensor in network.sensors} | {kind.name for kind in network.types}
+    owners |= {node.name for node in network.nodes}
+    biases = {bias.label: bias for bias in network.biases if bias.since is None}
+    stated = {f"{node.name}.{name}": value for node in network.nodes for name, value in node.numbers.items()}
+    found = {}
+    for name, (unit, value, sd) in known.items():
+        if name.rpartition(".")[0] not in owners:
+            continue
+        if not np.isfinite(value) or not (sd is None or (np.isfinite(sd) and sd > 0)):
+            raise InputError(f"{path}: {name} is {value:g} with sd {sd}; give finite numbers, an sd above 0 or none")
+        bias = biases.get(name)
+        if sd is not None and (bias is None or bias.unit != unit):
+            raise InputError(f"{path}: {name} in {unit} is no bias of the network; declare it, or leave its sd blank")
+        if sd is not None:
+            found[name] = (value, sd)
+        elif bias is None and not np.isclose(stated.get(name, value), value, rtol=1e-9, atol=1e-9):
+            raise InputError(f"{path}: {name} is {value:g}, the network states {stated[name]:g}; state the same")
+    return found
+
+
 class _Record(NamedTuple):
     """What is to be written of one node: name, position (d,), components, and spreads or sds by column name."""
 
@@ -270,6 +334,9 @@ def write_nodes(
     Nodes are written with their `survey_...` and `scale_...`, a fit as stated value + bias (its mean) with columns
     `sd_<bias>`. With a `frame` (that of `Nodes` from `read_nodes` by default) places are latitude and longitude, and
     GeoJSON can be written; without, metres. Nodes that move or drift are left out. Raises `InputError`.
+
+    Such a file is a map. Where a fit has biases of sensors, or nodes that are left out, a column `note` counts them;
+    `write_network` keeps them.
     """
     path = Path(path)
     if frame is None and isinstance(nodes, Nodes):
@@ -287,8 +354,21 @@ def write_nodes(
     cells = pd.DataFrame(_rows(records, frame))
     idle = [c for c in cells.columns if c.split(" ")[0] in OWN and (cells[c].abs() < 1e-12).all()]
     cells = cells.drop(columns=idle)
+    if isinstance(nodes, xr.DataTree) and (note := _left_out(nodes, len(records))):
+        cells["note"] = note
     text = _geojson(cells) if geojson else csv_text(cells)
     return write_whole(path, text)
+
+
+def _left_out(tree: xr.DataTree, written: int) -> str:
+    """The sentence that says what of a fit a map of its nodes lacks; empty where it lacks nothing."""
+    sensors = (
+        int((tree["calibration"]["sensor_type"] != "").sum()) if "sensor_type" in tree["calibration"].coords else 0
+    )
+    nodes = tree["constant_data"].sizes["node"] - written
+    counts = ((sensors, "biases of sensors"), (nodes, "nodes that move or drift"))
+    left = ", ".join(f"{what} ({count})" for count, what in counts if count)
+    return f"a map, without {left}; write_network keeps them" if left else ""
 
 
 def _stated(nodes: Iterable[Node]) -> list[_Record]:
@@ -299,6 +379,12 @@ def _stated(nodes: Iterable[Node]) -> list[_Record]:
                 raise InputError(
                     f'node "{node.name}" states {component} as a vector, which a file of nodes does not hold; keep such'
                     " nodes in Python"
+                )
+        for component in node.sizes:
+            if len(set(node.sizes[component])) > 1:
+                raise InputError(
+                    f'node "{node.name}" has a survey of {component} per axis, which a file of nodes does not hold;'
+                    " write the network with write_network"
                 )
         further = {f"{kind}_{component}": bias.scale for component, (kind, bias) in node.spread.items()}
         units = {component: bias.unit for component, (_, bias) in node.spread.items()}

@@ -277,6 +277,7 @@ class Sensor:
     nodes: tuple[Any, ...]
     name: str
     detection: Detection | None = None  # where its rows need not name a target
+    known: Mapping[str, Bias] = field(default_factory=dict)  # its biases that were calibrated: nominal is the value
 
 
 class _Probe:

@@ -3,22 +3,32 @@
 import json
 
 import committed
+import jax
 import numpy as np
 import pandas as pd
 import pyproj
 import pytest
+import worlds
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
 from probcal import (
+    MAP,
     Bias,
+    Gaussian,
     InputError,
     LocalFrame,
     Network,
     Node,
     Path,
+    Problem,
+    Static,
+    Target,
+    calibrated,
+    fit,
     read_nodes,
+    write_network,
     write_nodes,
 )
 from probcal.sensors import radar
@@ -204,6 +214,7 @@ def test_geojson_is_what_other_programs_read(tmp_path):
     assert feature["properties"] == {"node": "a", "heading [deg]": pytest.approx(90.0, abs=0.01)}
 
 
+NOTE = "a map, without biases of sensors (2), nodes that move or drift (1); write_network keeps them"
 HEADING = -0.7  # stated for `c` in tests/data/small.py
 
 
@@ -212,7 +223,10 @@ def test_the_nodes_of_a_fit_are_written_with_bias_and_sd(tmp_path):
     frame, tree = LocalFrame(60.0, 20.0), committed.tree("ea")
     cells = pd.read_csv(write_nodes(tmp_path / "fit.csv", tree)).set_index("node")
     mean, sd = (tree["calibration"][name].to_series() for name in ("mean", "sd"))
-    assert list(cells.columns) == ["x", "y", "heading [deg]", "sd_position_x", "sd_position_y", "sd_heading [deg]"]
+    assert cells.columns.tolist() == [
+        "x", "y", "heading [deg]", "sd_position_x", "sd_position_y", "sd_heading [deg]", "note",
+    ]  # fmt: skip
+    assert set(cells.pop("note")) == {NOTE}
     assert cells.index.tolist() == ["a", "c"]
     assert cells.loc["c", "x"] == pytest.approx(mean["c.position_x"], abs=1e-6)
     assert cells.loc["c", "y"] == pytest.approx(50 + mean["c.position_y"], abs=1e-6)
@@ -236,3 +250,92 @@ def test_the_frame_of_a_network_is_a_local_frame():
     assert Network([placed], frame=LocalFrame(48.0, 11.0)).frame == LocalFrame(48.0, 11.0)
     with pytest.raises(InputError, match=r"give a LocalFrame\(latitude, longitude"):
         Network([placed], frame=(48.0, 11.0))
+
+
+@pytest.mark.parametrize("name", ["extras", "mixed"])
+def test_a_calibrated_network_states_what_the_fit_found_and_its_file_loads_back(name, tmp_path):
+    """Nodes, one on a path, clocks, gains, and a bias shared by its type: `extras` and `mixed` have them."""
+    (problem, _), tree = worlds.linear(name), worlds.fitted(name)
+    group = tree["calibration"].to_dataset()
+    found = calibrated(problem.network, tree)
+    kept = {bias.label: bias for bias in found.biases if bias.label in problem.labels}
+    assert {bias.kind for bias in kept.values()} == {"survey"}
+    assert [kept[label].scale for label in problem.labels] == group["sd"].values.tolist()
+    before, after = (
+        {f"{n.name}.{c}": v for n in network.nodes for c, v in n.numbers.items()}
+        | {f"{n.name}.position_{axis}": v for n in network.nodes for axis, v in zip("xyz", n.position, strict=False)}
+        | {bias.label: bias.nominal for bias in network.biases if bias.sensor_type}
+        for network in (problem.network, found)
+    )
+    mean = group["mean"].to_series()
+    assert after == {label: value + mean.get(label, 0.0) for label, value in before.items()}
+    moved = Problem(found, problem.motion, problem.measurements.table, fix=problem.fixed)
+    point = worlds.resting(problem)
+    with jax.enable_x64(True):
+        old = problem.model.predict(point._replace(z=mean.to_numpy() / problem.scales))
+        for one, other in zip(old, moved.model.predict(point), strict=True):
+            np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)
+    path = write_network(tmp_path / "network.csv", found)
+    again = calibrated(problem.network, path)
+    assert again.biases == found.biases
+    for one, other in zip(found.nodes, again.nodes, strict=True):
+        assert (one.position == other.position).all()
+        assert one.components == other.components
+    assert write_network(tmp_path / "again.csv", again).read_text() == path.read_text()
+    cells = pd.read_csv(path).set_index("name")
+    assert cells.columns.tolist() == ["of", "unit", "value", "sd"]
+    assert cells["sd"].notna().sum() == len(problem.labels)
+    sensors = cells.loc[[label for label in problem.labels if label.startswith(("meter", "pair"))]]
+    assert set(sensors["of"]) <= {"sensor", "sensor type"}
+    assert set(write_nodes(tmp_path / "map.csv", tree).read_text().splitlines()[0].split(",")) >= {"note"}
+
+
+def test_a_second_fit_from_a_calibrated_network_is_the_fit_of_both_recordings(tmp_path):
+    """One bias, two targets of which each recording sees one: nothing is correlated, so that the two agree exactly."""
+    declared = Network([worlds.ruler.on(Node("n", (0.0, 3.0)))])
+    start = Target(Static(), {"position": ((1.0, 5.0), 0.4)})
+    rows = pd.DataFrame({"time": [0.0, 1.0] * 2, "sensor": "n", "target": ["a"] * 2 + ["b"] * 2,
+                         "height": [3.1, 2.6, 4.0, 3.3]})  # fmt: skip
+
+    def fitted(network, rows):
+        problem = Problem(network, {"a": start, "b": start}, rows)
+        return fit(problem, MAP(), prior=Gaussian(), start=worlds.resting(problem))
+
+    first = fitted(declared, rows[:2])
+    monday = calibrated(declared, write_network(tmp_path / "n.csv", calibrated(declared, first)))
+    second, both = calibrated(monday, fitted(monday, rows[2:])), calibrated(declared, fitted(declared, rows))
+    (one,), (other,) = second.biases, both.biases
+    assert one.nominal == pytest.approx(other.nominal, abs=1e-6)
+    assert one.scale == pytest.approx(other.scale, rel=1e-6)
+    assert one.scale < monday.biases[0].scale < declared.biases[0].scale
+
+
+def test_a_file_of_another_network_is_refused(tmp_path):
+    declared = Network([radar.on(Node("mast", (0.0, 40.0), heading=0.3, scale=2.0))])
+    text = write_network(tmp_path / "n.csv", declared.surveyed({"mast.position_x": (1.0, 0.5)})).read_text()
+    assert "mast.position_x,node,m,1.0,0.5" in text
+
+    def read(old, new):
+        (tmp_path / "n.csv").write_text(text.replace(old, new))
+        return calibrated(declared, tmp_path / "n.csv")
+
+    assert len(read("mast.position_x", "gone.position_x").biases) == len(declared.biases)
+    for old, new, message in [
+        ("mast.position_x", "mast.gain", r"mast\.gain in m is no bias of the network; declare it, or leave"),
+        ("m,1.0,0.5", "km,1.0,0.5", r"mast\.position_x in km is no bias of the network"),
+        ("1.0,0.5", "1.0,-0.5", "give finite numbers, an sd above 0 or none"),
+        ("rad,0.3", "rad,0.4", r"mast\.heading is 0\.4, the network states 0\.3; state the same"),
+        ("value", "number", r"is no file of write_network \(KeyError"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            read(old, new)
+    with pytest.raises(InputError, match=r"n\.csv: no such file"):
+        calibrated(declared, tmp_path / "none" / "n.csv")
+    with pytest.raises(InputError, match="has a survey of position per axis, which a file of nodes does not hold"):
+        write_nodes(tmp_path / "m.csv", declared.surveyed({"mast.position_x": (1.0, 0.5)}).nodes)
+    tree = committed.tree("ea")
+    with pytest.raises(InputError, match="calibrated: the fit and the network have no bias in common"):
+        calibrated(declared, tree)
+    tree.attrs["status"] = "diverged"
+    with pytest.raises(InputError, match="calibrated: the fit ended diverged, its estimate is invalid"):
+        calibrated(declared, tree)

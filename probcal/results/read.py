@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from probcal.errors import InputError, checked
 from probcal.labels import NOBODY
+from probcal.nodes import read_network
 from probcal.results.blocks import SensorBlocks, covariance_of
 from probcal.results.schema import MORE, SUMMARY
+from probcal.status import INVALID
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
+    from probcal.network import Network
     from probcal.problem import Problem
 
 
@@ -153,6 +157,64 @@ def held_by(calibration: xr.DataTree, labels: Sequence[str]) -> dict[str, float]
     constant = calibration["constant_data"].to_dataset()
     fixed = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
     return {label: value for label, value in fixed.items() if label in labels}
+
+
+def calibrated(network: Network, source: xr.DataTree | str | PathLike[str]) -> Network:
+    """The network with the values and sds that a fit found, in the place of those that it states.
+
+    Parameters
+    ----------
+    network
+        The sensors as they were declared for the fit; further ones stay as they are declared.
+    source
+        The result of `fit` or `load`, or a file of `write_network`.
+
+    Returns
+    -------
+    A network that states the calibrated places, components and sensor biases. The sd of each is a survey, whatever
+    the prior of the fit was; correlations are left out. A drifting bias has its value at the end of the data. A bias
+    that the fit held stays as declared: hold it again with `fix=`. Noise levels are not part of a network.
+
+    Raises
+    ------
+    InputError
+        Where the fit ended without an answer, or is of another network.
+
+    >>> sharper = calibrated(network, tree)
+    >>> sharper.labels == network.labels, {bias.kind for bias in sharper.biases}
+    (True, {'survey'})
+    """
+    if not hasattr(source, "children"):
+        return network.surveyed(read_network(source, network))
+    if source.attrs.get("status") in INVALID:
+        raise InputError(
+            f"calibrated: the fit ended {source.attrs['status']}, its estimate is invalid; fit again first"
+        )
+    from probcal.results.drifts import drift_table  # it loads pandas
+
+    group, constant = source["calibration"].to_dataset(), source["constant_data"].to_dataset()
+    found = {str(label): (float(m), float(s)) for label, m, s in
+             zip(group["bias_label"].values, group["mean"].values, group["sd"].values, strict=True)}  # fmt: skip
+    for row in drift_table(source).to_dict("records"):  # the last piece of each stays
+        found[row["bias"]] = (row["mean"], row["sd"])
+    names = zip(constant["stated_node"].values, constant["stated_component"].values, strict=True)
+    stated = {
+        f"{node}.{name}": float(value) for (node, name), value in zip(names, constant["stated"].values, strict=True)
+    }
+    for node, place in zip(constant["node"].values, constant["node_position"].values, strict=True):
+        stated |= {f"{node}.position_{axis}": float(x) for axis, x in zip(constant["axis"].values, place, strict=True)}
+    biases = [bias for bias in network.biases if bias.since is None and bias.label in found]
+    units = dict(zip(group["bias_label"].values.tolist(), group["unit"].values.tolist(), strict=True))
+    if not biases or any(bias.unit != units.get(bias.label, bias.unit) for bias in biases):
+        raise InputError(
+            "calibrated: the fit and the network have no bias in common, or in other units; declare the same"
+        )
+    values = {}
+    for bias in biases:
+        mean, sd = found[bias.label]
+        if sd > 0:
+            values[bias.label] = (mean + (bias.nominal if bias.sensor_type else stated[bias.label]), sd)
+    return network.surveyed(values)
 
 
 def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:

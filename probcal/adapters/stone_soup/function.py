@@ -202,7 +202,7 @@ class SensorFunction:
                 parts[name] = np.array(own if name in self.kind.vectors else own[0])
             poses.append(parts)
         biases = {
-            name: np.array(bias.nominal + self._bias((self._owner(name), name, 0), time))
+            name: np.array(self.placed.known.get(name, bias).nominal + self._bias((self._owner(name), name, 0), time))
             for name, bias in self.kind.biases.items()
         }
         return poses, biases
