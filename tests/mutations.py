@@ -38,6 +38,21 @@ MUTATIONS = [
     Mutation("smoothing/recursion.py", "noises + gain.drive @ states @ gain.drive.mT", "noises", "test_formulas.py"),
     Mutation("smoothing/recursion.py", "gain.gain @ innovation + force", "gain.gain @ innovation", "test_diffuse.py"),
     Mutation("smoothing/recursion.py", "return states @ earlier + back", "return states @ b + back", "test_diffuse.py"),
+    # results/alignment.py, plausible.py, rss/localise.py, analysis/changes.py, pieces.py
+    Mutation("results/alignment.py", "self.shift) @ self.rotation / self.scale", "self.shift) @ self.rotation", "test_alignment.py"),
+    Mutation("plausible.py", "GAP = 3.2e9", "GAP = 4e9", "test_plausible.py"),
+    Mutation("plausible.py", "TURNS = 20.0", "TURNS = 25.0", "test_plausible.py"),
+    Mutation("plausible.py", "APART = 20.0", "APART = 25.0", "test_plausible.py"),
+    Mutation("plausible.py", "FAR = 1e6", "FAR = 1e7", "test_plausible.py"),
+    Mutation("plausible.py", "FEW = 8", "FEW = 9", "test_plausible.py"),
+    Mutation("plausible.py", "FAINT, RANGE = 0.1, 30.0", "FAINT, RANGE = 1.0, 30.0", "test_plausible.py"),
+    Mutation("plausible.py", "FAINT, RANGE = 0.1, 30.0", "FAINT, RANGE = 0.1, 50.0", "test_plausible.py"),
+    Mutation("plausible.py", "NARROW, WIDE = 1e-9, 1e6", "NARROW, WIDE = 1e-10, 1e6", "test_plausible.py"),
+    Mutation("plausible.py", "NARROW, WIDE = 1e-9, 1e6", "NARROW, WIDE = 1e-9, 1e7", "test_plausible.py"),
+    Mutation("rss/localise.py", "own = w * dc**2 / about[:, None] if exponent is None else 0.0", "own = 0.0", "test_rss.py"),
+    Mutation("rss/localise.py", "np.minimum(slope, 0.0)", "slope", "test_rss.py"),
+    Mutation("analysis/changes.py", "np.sqrt(inflation[m] / contrast.information[0, 0])", "np.sqrt(1.0 / contrast.information[0, 0])", "test_changes.py"),
+    Mutation("analysis/pieces.py", "change.contrast.plausible / inflation", "change.contrast.square / inflation", "test_changes.py"),
     # analysis/shape.py
     Mutation("analysis/shape.py", "if not fall > MOST:", "if fall > MOST:", "test_guards.py"),
     # inference/hierarchy.py, orbits.py: scales of their own that move along
@@ -156,6 +171,9 @@ MUTATIONS = [
     Mutation("geodesy.py", "@ earth_axes(self.latitude, self.longitude).T", "@ earth_axes(self.latitude, self.longitude)", "test_nodes.py"),
     Mutation("nodes.py", "turn = np.arctan2(axes[:, 0, 1], axes[:, 0, 0])", "turn = -np.arctan2(axes[:, 0, 1], axes[:, 0, 0])", "test_nodes.py"),
     Mutation("nodes.py", "round(float(np.rad2deg(value)), 12)", "round(float(value), 12)", "test_nodes.py"),
+    Mutation("network.py", "self.path.position + (stated - self.position)", "self.path.position", "test_nodes.py"),
+    Mutation("network.py", "node.sizes[component] = tuple(sds)", "node.sizes[component] = (max(sds),) * len(sds)", "test_nodes.py"),
+    Mutation("results/io.py", "np.linalg.cholesky(unit + LOSS", "np.linalg.cholesky(unit + 4.0", "test_storage.py"),
     # geometry.py
     Mutation("geometry.py", "jnp.round(angle / period)", "jnp.floor(angle / period)", "test_catalogue.py"),
     Mutation("geometry.py", "jnp.stack([norm(line[:2]), line[2]])", "jnp.stack([norm(line), line[2]])", "test_catalogue.py"),

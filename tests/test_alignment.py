@@ -28,6 +28,7 @@ def test_what_moved_the_places_is_found(d, kind):
     assert found.scale == pytest.approx(factor)
     np.testing.assert_allclose(found.rotation, rotation(d), atol=1e-9)
     np.testing.assert_allclose(found(PLACES[:, :d]), true, atol=1e-9)
+    np.testing.assert_allclose(found.back(true), PLACES[:, :d], atol=1e-9)
 
 
 @pytest.mark.parametrize("d", [2, 3])

@@ -8,6 +8,7 @@ from terminal import call
 
 import probcal
 from probcal import EA, MAP, Bias, Channel, ConstantVelocity, InputError, Network, Node, Problem, changes, fit, sensor
+from probcal.analysis import pieces
 from probcal.plots import plot_changes
 from probcal.priors import Gaussian
 
@@ -83,6 +84,33 @@ def test_sentences_name_what_moved(pair):
     assert said[2:] == [
         f'"{name}" was not assessed: the declared noise is taken as right' for name in ("spring", "autumn")
     ]
+
+
+def test_what_the_innovations_widen_is_wider(pair):
+    """The noise of one recording is twice what its model says: sds and interval double, the change stays."""
+    wide = pair[1].copy(deep=True)
+    wide["verdict"] = xr.DataTree(xr.Dataset({
+        name: ("bias_label", np.full(COUNT, value, np.asarray(value).dtype))
+        for name, value in {"verdict": "determined", "reason": "", "inflation": 4.0}.items()
+    }))  # fmt: skip
+    plain, found = (changes(pair[0], other)["change"].to_dataset() for other in (pair[1], wide))
+    assert found["verdict"].values[2] == "moved"
+    assert found["change"].values[2] == plain["change"].values[2]
+    half = [(one["upper"] - one["lower"]).values[2] for one in (plain, found)]
+    for double, single in ((found["sd"].values, plain["sd"].values), (half[1], half[0])):
+        np.testing.assert_allclose(double, 2.0 * single)
+    np.testing.assert_allclose(found["t"].values[2], plain["t"].values[2] / 2.0)
+
+
+def test_a_change_of_the_order_of_its_scale_is_taken_first():
+    """A change of 100 scales explains more than one of 0.9, but nobody who declared that scale would expect it."""
+    per_piece, after = np.array([0.01, 100.0]), np.array([100.0, 0.9])
+    both = pieces.Pieces(np.diag(np.tile(per_piece, 2)), np.concatenate([np.zeros(2), per_piece * after]), np.eye(2),
+                         np.zeros(2))  # fmt: skip
+    found = pieces.changing(both, {"second": np.array([[0.0], [1.0]])}, {"second": np.ones(2)}, lambda _: 10.0)
+    assert [one.bias for one in found] == [1, 0]
+    np.testing.assert_allclose([one.square for one in found], [40.5, 50.0])
+    np.testing.assert_allclose([one.contrast.plausible for one in found], [45.0**2 / 50.5, 0.5**2 / 0.505])
 
 
 @pytest.mark.ci

@@ -7,7 +7,9 @@ import pandas as pd
 import pytest
 
 from probcal import ConstantVelocity, InputError, Network, Node, Problem
-from probcal.sensors import radar
+from probcal.plausible import check_plausible
+from probcal.sensors import radar, rss
+from probcal.table import measure, read_table
 
 ROWS = 36
 
@@ -98,3 +100,53 @@ def test_nonsense_is_refused_in_one_sentence(change, says):
 )  # fmt: skip
 def test_what_can_be_meant_passes(change):
     assert problem(change(table())).model.size > 0
+
+
+def spread_of(width):
+    """Ranges from 0 to `width` m: eight tenths of it lie between the quantiles that tell the spread."""
+    return lambda data: data.assign(range=np.linspace(0.0, width, len(data)))
+
+
+def powers(ratio, most):
+    return lambda data: pd.DataFrame(
+        {"time": np.arange(float(ROWS)), "sensor": "level", "level": np.geomspace(most / ratio, most, ROWS)}
+    )
+
+
+LIMITS = {  # the last that passes, the first that does not, of each limit in `probcal.plausible`
+    "GAP": (with_cell("time", 35, 3.1e9), with_cell("time", 35, 3.3e9), "after the row before it"),
+    "ms": (with_times(1.0, 0.9e11), with_times(1.0, 1.1e11), "looks like ms since 1970"),
+    "TURNS": (with_cell("azimuth", 5, 19.0), with_cell("azimuth", 5, -21.0), "rad looks like degrees"),
+    "APART": (
+        lambda d: with_cell("range", 35, 9999.0)(spread_of(670.0)(d)),
+        lambda d: with_cell("range", 35, 9999.0)(spread_of(550.0)(d)),
+        "looks like a mark for a missing value",
+    ),
+    "FAR": (
+        lambda d: with_cell("range", 35, 0.9e6 * 28.8)(spread_of(36.0)(d)),
+        lambda d: with_cell("range", 35, 1.1e6 * 28.8)(spread_of(36.0)(d)),
+        "is far from all others",
+    ),
+    "FEW": (
+        lambda d: d.assign(range=100.0, range_std=1e-9).head(7),
+        lambda d: d.assign(range=100.0, range_std=1e-9).head(8),
+        "many orders of magnitude smaller",
+    ),
+    "NARROW": (
+        lambda d: d.assign(range=100.0, range_std=1.1e-7), lambda d: d.assign(range=100.0, range_std=0.9e-7), "smaller",
+    ),
+    "WIDE": (
+        lambda d: d.assign(range=100.0, range_std=0.9e8), lambda d: d.assign(range=100.0, range_std=1.1e8), "larger",
+    ),
+    "RANGE": (powers(29.0, 0.09), powers(31.0, 0.09), "looks like power in W"),
+    "FAINT": (powers(40.0, 0.11), powers(40.0, 0.09), "looks like power in W"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("passes", "refused", "says"), LIMITS.values(), ids=LIMITS)
+def test_each_limit_lies_where_it_is_stated(passes, refused, says):
+    nodes = [Node(f"radar_{k}", (30.0 * k, 0.0)) for k in range(3)]
+    network = Network([*(radar.on(node) for node in nodes), rss.on(nodes[0], name="level")])
+    check_plausible(measure(read_table(passes(table())), network), network)
+    with pytest.raises(InputError, match=re.escape(says)):
+        check_plausible(measure(read_table(refused(table())), network), network)

@@ -156,6 +156,25 @@ def test_profiled_losses_are_those_of_a_full_search():
     assert abs(losses(at, place[None], "gml")[0] - sum(squares)) < 1e-6
 
 
+@pytest.mark.parametrize("exponent", [None, 2.0])
+def test_the_line_of_a_kind_is_that_of_least_squares(exponent):
+    """Intercept, slope and leverages by the hat matrix, at two places; a level that rises with the distance is flat."""
+    random = np.random.default_rng(3)
+    c, w = random.normal(size=(2, 7)), random.uniform(0.5, 2.0, (2, 7))
+    y = 3.0 - 4.0 * c[0] + random.normal(size=7)
+    found = localise_module._line(c, y, w, exponent)
+    X = np.stack([np.ones(7), c[0]], 1)[:, : 1 if exponent else 2]
+    left = y + (exponent or 0.0) * c[0]
+    hat = X @ np.linalg.solve(X.T @ (w[0][:, None] * X), X.T * w[0])
+    np.testing.assert_allclose(found.leverage[0], np.diag(hat), rtol=1e-9)
+    np.testing.assert_allclose(found.left[0], left - hat @ left, atol=1e-9)
+    if exponent is None:
+        assert found.slope[0] == pytest.approx(np.linalg.lstsq(X * w[0][:, None] ** 0.5, y * w[0] ** 0.5)[0][1])
+        rising = localise_module._line(c[:1], -y, w[:1], None)
+        assert (rising.slope[0], rising.rising[0]) == (0.0, pytest.approx(-found.slope[0]))
+        np.testing.assert_allclose(rising.left[0], -y + np.average(y, weights=w[0]))
+
+
 def test_the_information_is_that_of_the_whole_problem():
     """The Schur complement of the Fisher information of place, powers and exponents; the exponent known leaves more."""
     at = Snapshot(BOTH, mean_levels(), KIND, np.full(24, 2.0))
