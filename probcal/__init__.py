@@ -76,7 +76,7 @@ if TYPE_CHECKING:
     from probcal.problem import Problem
     from probcal.results.drifts import drift_table
     from probcal.results.io import load, save
-    from probcal.results.read import calibrated, outliers, summary, tracks
+    from probcal.results.read import outliers, summary, tracks, with_calibration
     from probcal.results.scores import add_scores, scores
     from probcal.roads import LeavingRoad, Road, RoadNetwork, match_track, read_roads
     from probcal.sensor import Bias, Channel, Drift, Sensor, SensorType, sensor
@@ -122,7 +122,7 @@ __all__ = lazy(
         "probcal.simulate": "Simulation Truth simulate",
         "probcal.table": "read_table",
         "probcal.results.io": "load save",
-        "probcal.results.read": "calibrated outliers summary tracks",
+        "probcal.results.read": "outliers summary tracks with_calibration",
     },
     submodules="motion noise priors sensors",
 )

@@ -255,8 +255,8 @@ def write_network(path: str | PathLike[str], network: Network) -> Path:
 
     Columns: `name` (the label of the bias that it has or might have, such as `mast.position_x`), `of` (node, sensor or
     sensor type), `unit`, `value` and `sd`, the survey, blank where a value is known exactly or only its scale is
-    declared. The position of a moving node is the start of its path. `calibrated` lays such a file on a network; its
-    sensor functions, scales and correlations are not in it. Raises `InputError` where it cannot be written.
+    declared. The position of a moving node is the start of its path. Sensor functions, scales and correlations are
+    not in it; `with_calibration` lays it on a declared network. Raises `InputError` where it cannot be written.
     """
     rows: list[dict[str, Any]] = []
     surveys = {bias.label: bias for bias in network.biases if bias.since is None}

@@ -25,9 +25,9 @@ from probcal import (
     Problem,
     Static,
     Target,
-    calibrated,
     fit,
     read_nodes,
+    with_calibration,
     write_network,
     write_nodes,
 )
@@ -257,7 +257,7 @@ def test_a_calibrated_network_states_what_the_fit_found_and_its_file_loads_back(
     """Nodes, one on a path, clocks, gains, and a bias shared by its type: `extras` and `mixed` have them."""
     (problem, _), tree = worlds.linear(name), worlds.fitted(name)
     group = tree["calibration"].to_dataset()
-    found = calibrated(problem.network, tree)
+    found = with_calibration(problem.network, tree)
     kept = {bias.label: bias for bias in found.biases if bias.label in problem.labels}
     assert {bias.kind for bias in kept.values()} == {"survey"}
     assert [kept[label].scale for label in problem.labels] == group["sd"].values.tolist()
@@ -276,7 +276,7 @@ def test_a_calibrated_network_states_what_the_fit_found_and_its_file_loads_back(
         for one, other in zip(old, moved.model.predict(point), strict=True):
             np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)
     path = write_network(tmp_path / "network.csv", found)
-    again = calibrated(problem.network, path)
+    again = with_calibration(problem.network, path)
     assert again.biases == found.biases
     for one, other in zip(found.nodes, again.nodes, strict=True):
         assert (one.position == other.position).all()
@@ -302,8 +302,11 @@ def test_a_second_fit_from_a_calibrated_network_is_the_fit_of_both_recordings(tm
         return fit(problem, MAP(), prior=Gaussian(), start=worlds.resting(problem))
 
     first = fitted(declared, rows[:2])
-    monday = calibrated(declared, write_network(tmp_path / "n.csv", calibrated(declared, first)))
-    second, both = calibrated(monday, fitted(monday, rows[2:])), calibrated(declared, fitted(declared, rows))
+    monday = with_calibration(declared, write_network(tmp_path / "n.csv", with_calibration(declared, first)))
+    second, both = (
+        with_calibration(monday, fitted(monday, rows[2:])),
+        with_calibration(declared, fitted(declared, rows)),
+    )
     (one,), (other,) = second.biases, both.biases
     assert one.nominal == pytest.approx(other.nominal, abs=1e-6)
     assert one.scale == pytest.approx(other.scale, rel=1e-6)
@@ -317,7 +320,7 @@ def test_a_file_of_another_network_is_refused(tmp_path):
 
     def read(old, new):
         (tmp_path / "n.csv").write_text(text.replace(old, new))
-        return calibrated(declared, tmp_path / "n.csv")
+        return with_calibration(declared, tmp_path / "n.csv")
 
     assert len(read("mast.position_x", "gone.position_x").biases) == len(declared.biases)
     for old, new, message in [
@@ -330,12 +333,12 @@ def test_a_file_of_another_network_is_refused(tmp_path):
         with pytest.raises(InputError, match=message):
             read(old, new)
     with pytest.raises(InputError, match=r"n\.csv: no such file"):
-        calibrated(declared, tmp_path / "none" / "n.csv")
+        with_calibration(declared, tmp_path / "none" / "n.csv")
     with pytest.raises(InputError, match="has a survey of position per axis, which a file of nodes does not hold"):
         write_nodes(tmp_path / "m.csv", declared.surveyed({"mast.position_x": (1.0, 0.5)}).nodes)
     tree = committed.tree("ea")
-    with pytest.raises(InputError, match="calibrated: the fit and the network have no bias in common"):
-        calibrated(declared, tree)
+    with pytest.raises(InputError, match="with_calibration: the fit and the network have no bias in common"):
+        with_calibration(declared, tree)
     tree.attrs["status"] = "diverged"
-    with pytest.raises(InputError, match="calibrated: the fit ended diverged, its estimate is invalid"):
-        calibrated(declared, tree)
+    with pytest.raises(InputError, match="with_calibration: the fit ended diverged, its estimate is invalid"):
+        with_calibration(declared, tree)

@@ -159,7 +159,8 @@ def held_by(calibration: xr.DataTree, labels: Sequence[str]) -> dict[str, float]
     return {label: value for label, value in fixed.items() if label in labels}
 
 
-def calibrated(network: Network, source: xr.DataTree | str | PathLike[str]) -> Network:
+@checked
+def with_calibration(network: Network, source: xr.DataTree | str | PathLike[str]) -> Network:
     """The network with the values and sds that a fit found, in the place of those that it states.
 
     Parameters
@@ -180,7 +181,7 @@ def calibrated(network: Network, source: xr.DataTree | str | PathLike[str]) -> N
     InputError
         Where the fit ended without an answer, or is of another network.
 
-    >>> sharper = calibrated(network, tree)
+    >>> sharper = with_calibration(network, tree)
     >>> sharper.labels == network.labels, {bias.kind for bias in sharper.biases}
     (True, {'survey'})
     """
@@ -188,7 +189,7 @@ def calibrated(network: Network, source: xr.DataTree | str | PathLike[str]) -> N
         return network.surveyed(read_network(source, network))
     if source.attrs.get("status") in INVALID:
         raise InputError(
-            f"calibrated: the fit ended {source.attrs['status']}, its estimate is invalid; fit again first"
+            f"with_calibration: the fit ended {source.attrs['status']}, its estimate is invalid; fit again first"
         )
     from probcal.results.drifts import drift_table  # it loads pandas
 
@@ -207,7 +208,7 @@ def calibrated(network: Network, source: xr.DataTree | str | PathLike[str]) -> N
     units = dict(zip(group["bias_label"].values.tolist(), group["unit"].values.tolist(), strict=True))
     if not biases or any(bias.unit != units.get(bias.label, bias.unit) for bias in biases):
         raise InputError(
-            "calibrated: the fit and the network have no bias in common, or in other units; declare the same"
+            "with_calibration: the fit and the network have no bias in common, or in other units; declare the same"
         )
     values = {}
     for bias in biases:
