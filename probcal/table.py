@@ -114,7 +114,7 @@ def _plain(frame: pd.DataFrame) -> pd.DataFrame:
             blank = [cell is np.ma.masked or (isinstance(cell, Decimal) and cell.is_snan()) for cell in column]
             cells = [None if gone else cell[()] if np.shape(cell) == () and isinstance(cell, np.ndarray) else cell
                      for cell, gone in zip(column, blank, strict=True)]  # fmt: skip
-            frame.isetitem(k, pd.Series(cells, dtype=object))
+            frame.isetitem(k, pd.Series(cells, dtype=object).array)
     return frame
 
 
@@ -223,7 +223,7 @@ def csv_text(frame: pd.DataFrame, *, header: bool = True) -> str:
     for k, dtype in enumerate(frame.dtypes):
         if not pd.api.types.is_numeric_dtype(dtype):
             own = frame.iloc[:, k].astype(object)
-            cells.isetitem(k, own.map(lambda cell: escaped(cell) if isinstance(cell, str) else cell))
+            cells.isetitem(k, own.map(lambda cell: escaped(cell) if isinstance(cell, str) else cell).array)
     return cells.to_csv(index=False, header=header)
 
 
