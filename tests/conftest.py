@@ -30,7 +30,7 @@ MOST_BYTES = 1_000_000_000  # of kernels kept there
 TOGETHER = {  # files that share worlds run in one worker, one after the other; these begin, the longest first
     "test_exact.py": "linear", "test_methods.py": "linear", "test_samplers.py": "linear", "test_svi.py": "linear",
     "test_drift.py": "linear", "test_kernels.py": "linear", "test_metamorphic.py": "bent", "test_bounds.py": "bent",
-    "test_sparse.py": "sparse", "test_halves.py": "sparse",
+    "test_degenerate.py": "linear", "test_sparse.py": "sparse", "test_halves.py": "sparse",
 }  # fmt: skip
 compiled: Counter[str] = Counter()  # kernels by test file, of this process and of the workers that have ended
 running = ["elsewhere"]  # the file whose test runs
