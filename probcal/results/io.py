@@ -131,7 +131,7 @@ def check_content(tree: xr.DataTree, path: Path) -> None:
     judged = {group: members for group, members in JUDGED.items() if group in tree.children}
     expected = [*NEEDED.items(), ("calibration", BLOCKS if sparse else WHOLE), *judged.items()]
     for group, members in expected:
-        node = tree[group] if group in tree.children else None
+        node = tree.children.get(group)
         if node is None or not set(members) <= set(node.variables):
             raise InputError(f"{path} is incomplete: its group {group} lacks what a fit holds; fit again")
         _check_members(node, members, f"{path}: {group}")
@@ -175,8 +175,8 @@ def _kind_of(values: np.ndarray) -> str:
 
 def _check_moments(tree: xr.DataTree, path: Path) -> None:
     """Raise `InputError` for labels that differ or repeat, intervals upside down, and covariances that are none."""
-    group, labels = tree["calibration"].to_dataset(), tree["calibration"]["bias_label"].values.tolist()
-    others = [tree["posterior"]["bias_label"].values.tolist()]
+    group, draws = tree["calibration"].to_dataset(), tree["posterior"].to_dataset()
+    labels, others = group["bias_label"].values.tolist(), [draws["bias_label"].values.tolist()]
     others += [] if "block" in group else [group["bias_label_other"].values.tolist()]
     if len(set(labels)) < len(labels) or any(other != labels for other in others):
         raise InputError(f"{path}: its biases have labels that differ or repeat; the file was changed, fit again")

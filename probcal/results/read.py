@@ -185,9 +185,9 @@ def with_calibration(network: Network, source: xr.DataTree | str | PathLike[str]
     >>> sharper.labels == network.labels, {bias.kind for bias in sharper.biases}
     (True, {'survey'})
     """
-    if not hasattr(source, "children"):
+    if isinstance(source, (str, PathLike)):
         return network.surveyed(read_network(source, network))
-    if source.attrs.get("status") in INVALID:
+    if str(source.attrs.get("status")) in INVALID:
         raise InputError(
             f"with_calibration: the fit ended {source.attrs['status']}, its estimate is invalid; fit again first"
         )
