@@ -190,6 +190,7 @@ SAMPLERS = {
 }
 
 DRAWN = ("every bias surveyed", "distances alone")  # problems that samplers are asked of too
+EACH = [pytest.param(name, marks=pytest.mark.ci if name == "distances alone" else pytest.mark.slow) for name in PROBLEMS]
 
 
 def of_stream(problem, tree):
@@ -220,8 +221,7 @@ VERBS = {
 }
 
 
-@pytest.mark.ci
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", EACH)
 def test_every_method_and_verb_answers_or_says_one_sentence(name, tmp_path):
     wrong = []
     problem = PROBLEMS[name]()
