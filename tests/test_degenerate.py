@@ -190,7 +190,9 @@ SAMPLERS = {
 }
 
 DRAWN = ("every bias surveyed", "distances alone")  # problems that samplers are asked of too
-EACH = [pytest.param(name, marks=pytest.mark.ci if name == "distances alone" else pytest.mark.slow) for name in PROBLEMS]
+EACH = [
+    pytest.param(name, marks=pytest.mark.ci if name == "distances alone" else pytest.mark.slow) for name in PROBLEMS
+]
 
 
 def of_stream(problem, tree):
