@@ -321,6 +321,15 @@ class Network:
             sensors.append(replace(placed, nodes=tuple(nodes[node.name] for node in placed.nodes), known=known))
         return Network(sensors, frame=self.frame)
 
+    @property
+    def stated(self) -> dict[str, float]:
+        """The value from which a bias counts, by its label: the nominal one of a sensor, the stated one of a node."""
+        found = {bias.label: bias.nominal for bias in self.biases if bias.sensor_type and bias.since is None}
+        for node in self.nodes:
+            for name, value in {"position": node.position, **node.components}.items():
+                found |= dict(zip(node.labels(name), np.atleast_1d(value).tolist(), strict=True))
+        return found
+
     def with_floors(self, floors: Mapping[tuple[int, str], float]) -> "Network":
         """This network with floors of what is heard, by number of the sensor type and channel; itself without any."""
         if not floors:

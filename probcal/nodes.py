@@ -260,12 +260,12 @@ def write_network(path: str | PathLike[str], network: Network) -> Path:
     """
     rows: list[dict[str, Any]] = []
     surveys = {bias.label: bias for bias in network.biases if bias.since is None}
+    stated = network.stated
     for node in network.nodes:
         for component in ("position", *node.components):
-            value = node.position if component == "position" else node.components[component]
             unit = node.spread[component][1].unit if component in node.spread else POSE_UNITS.get(component, "1")
-            for label, number in zip(node.labels(component), np.atleast_1d(value).tolist(), strict=True):
-                rows.append({"name": label, "of": "node", "unit": unit, "value": float(number)})
+            for label in node.labels(component):
+                rows.append({"name": label, "of": "node", "unit": unit, "value": float(stated[label])})
     types = {kind.name for kind in network.types}
     for bias in surveys.values():
         if bias.sensor_type:
@@ -296,7 +296,9 @@ def read_network(path: str | PathLike[str], network: Network) -> dict[str, tuple
     owners = {sensor.name for sensor in network.sensors} | {kind.name for kind in network.types}
     owners |= {node.name for node in network.nodes}
     biases = {bias.label: bias for bias in network.biases if bias.since is None}
-    stated = {f"{node.name}.{name}": value for node in network.nodes for name, value in node.numbers.items()}
+    stated = network.stated
+    if owners.isdisjoint(name.rpartition(".")[0] for name in known):
+        raise InputError(f"{path}: the network has none of its nodes and sensors; give the file of this network")
     found = {}
     for name, (unit, value, sd) in known.items():
         if name.rpartition(".")[0] not in owners:

@@ -241,9 +241,9 @@ class Problem:
         return positions_of(self.network)
 
     def rebuild(self, data: Any = None, **changes: Any) -> Problem:
-        """The same problem with other data or fixed biases."""
-        settings: dict[str, Any] = {"fix": self.fixed, "epoch": self.epoch} | changes
-        return Problem(self.network, self.motion, self.measurements.table if data is None else data, **settings)
+        """The same problem with other data, another network or other fixed biases."""
+        settings: dict[str, Any] = {"network": self.network, "fix": self.fixed, "epoch": self.epoch} | changes
+        return Problem(motion=self.motion, data=self.measurements.table if data is None else data, **settings)
 
     @property
     def scans(self) -> Scans | None:

@@ -13,7 +13,8 @@ from matplotlib import image
 from terminal import call
 
 import probcal
-from probcal.cli.models import load_model, load_problem, load_truth, prior_named
+from probcal.cli.models import load_model, load_problem, load_truth, on_network, prior_named
+from probcal.cli.options import network_file
 from probcal.inference import METHODS
 from probcal.results.read import each_track
 
@@ -61,7 +62,9 @@ def test_the_main_job_writes_a_table_a_report_and_a_tree(fitted):
     assert out.splitlines()[0].split()[-2:] == ["status", "verdict"]
     assert "position RMSE before" in out, "the truth stands beside the table"
     assert "estimated gauge.range_std" in out
-    assert sorted(path.name for path in folder.glob("[!.]*")) == ["fit.nc", "report.html", "summary.csv"]
+    assert sorted(path.name for path in folder.glob("[!.]*")) == [
+        "fit.nc", "network.csv", "report.html", "summary.csv",
+    ]  # fmt: skip
     summary = pd.read_csv(folder / "summary.csv")
     assert list(summary.columns[:8]) == ["bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma"]
     assert summary.columns[-2:].tolist() == ["verdict", "reason"]
@@ -78,6 +81,59 @@ def test_the_main_job_writes_a_table_a_report_and_a_tree(fitted):
 def test_a_fit_has_the_structure_of_the_committed_one(fitted):
     """Where this fails, a fit writes something else than the readers are tested on: see `committed.py`."""
     assert committed.structure(probcal.load(fitted[0])) == committed.structure(committed.tree("ea"))
+
+
+def test_a_fit_starts_from_the_network_of_another_and_its_truth_counts_from_there(fitted, tmp_path):
+    folder, module = fitted[0], load_model(MODEL)
+    _, problem = load_problem(MODEL, ROWS)
+    monday = on_network(problem, network_file(folder))
+    wanted = probcal.with_calibration(problem.network, probcal.load(folder))
+    assert (monday.network.stated, monday.network.biases) == (wanted.stated, wanted.biases)
+    assert (monday.fixed, monday.epoch, monday.labels) == (problem.fixed, problem.epoch, problem.labels)
+    assert on_network(problem, None) is problem
+    old, new = (load_truth(module, MODEL, ROWS, p, network=problem.network).biases for p in (problem, monday))
+    assert old == load_truth(module, MODEL, ROWS, problem).biases
+    moved = [label for label in old if label in wanted.stated and old[label] != new[label]]
+    assert len(moved) > 4
+    for label in old:
+        stated = [network.stated.get(label, 0.0) for network in (problem.network, wanted)]
+        assert stated[0] + old[label] == pytest.approx(stated[1] + new[label], abs=1e-12)
+    for command, text in (
+        (("fit", MODEL, ROWS, "--network", tmp_path), "network.csv: there is no such file; give the folder of a valid"),
+        (("check", MODEL, ROWS, "--network", ROWS), f"{ROWS} is no file of write_network"),
+        (
+            ("track", MODEL, ROWS, "--calibration", folder, "--network", folder),
+            f"{folder}: the fit started from another network; give --network as that fit had it",
+        ),
+    ):
+        code, _, err = call(*command)
+        assert (code, text in err, err.count("\n")) == (2, True, 1), err
+    other = probcal.load(folder)
+    other.attrs["network"] = "another"
+    with pytest.raises(probcal.InputError, match="started from different networks; give both one --network"):
+        probcal.changes(probcal.load(folder), other)
+
+
+@pytest.mark.ci
+def test_a_network_file_goes_from_fit_to_fit_to_track(fitted, tmp_path):
+    """The second fit counts its biases from the first; tracks follow only where they are given the same network."""
+    begin = ("--network", fitted[0])
+    code, out, err = call("fit", MODEL, ROWS, *begin, "--out", tmp_path / "two")
+    assert code == 0, err
+    first, second = probcal.load(fitted[0]), probcal.load(tmp_path / "two")
+    assert second.attrs["position_rmse_before"] == pytest.approx(first.attrs["position_rmse_after"], rel=0.05)
+    assert second.attrs["coverage"] > 0.5
+    done = call("track", MODEL, ROWS, *begin, "--calibration", tmp_path / "two", "--out", tmp_path / "t.csv")
+    assert done[0] == 0, done[2]
+    assert f"after {second.attrs['position_rmse_after']:.3f} m" in done[1]
+    code, _, err = call("track", MODEL, ROWS, "--calibration", tmp_path / "two", "--out", tmp_path / "t.csv")
+    assert (code, "the fit started from another network" in err) == (2, True)
+    third = on_network(load_problem(MODEL, ROWS)[1], network_file(tmp_path / "two")).network
+    assert third.stated == probcal.with_calibration(
+        on_network(load_problem(MODEL, ROWS)[1], network_file(fitted[0])).network, second
+    ).stated  # fmt: skip
+    code, out, err = call("check", MODEL, ROWS, *begin)
+    assert (code, "without a survey" in out) == (0, True), err
 
 
 @pytest.mark.slow

@@ -328,6 +328,7 @@ def test_a_file_of_another_network_is_refused(tmp_path):
         ("m,1.0,0.5", "km,1.0,0.5", r"mast\.position_x in km is no bias of the network"),
         ("1.0,0.5", "1.0,-0.5", "give finite numbers, an sd above 0 or none"),
         ("rad,0.3", "rad,0.4", r"mast\.heading is 0\.4, the network states 0\.3; state the same"),
+        ("mast.", "gone.", r"n\.csv: the network has none of its nodes and sensors; give the file"),
         ("value", "number", r"is no file of write_network \(KeyError"),
     ]:
         with pytest.raises(InputError, match=message):

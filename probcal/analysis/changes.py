@@ -118,6 +118,8 @@ def _check(name: str, tree: xr.DataTree) -> None:
 def _check_zero(pair: dict[str, xr.DataTree]) -> None:
     """Raise `InputError` where the fits count a bias from other stated values, or hold one that the other does not."""
     (one, first), (two, second) = ((name, tree["constant_data"].to_dataset()) for name, tree in pair.items())
+    if len({str(tree.attrs.get("network", "")) for tree in pair.values()}) > 1:
+        raise InputError(f'changes: "{one}" and "{two}" started from different networks; give both one --network')
     stated = [_stated(first), _stated(second)]
     for what in stated[0].keys() & stated[1].keys():
         a, b = (own[what] for own in stated)

@@ -11,11 +11,12 @@ import xarray as xr
 from probcal.analysis import bound_map, next_anchors, next_passes, next_sensors, observability
 from probcal.analysis.standpoint import standpoint
 from probcal.cli.files import can_plot, say_written, write_csv
-from probcal.cli.models import load_problem
+from probcal.cli.models import load_problem, on_network
 from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.inference.progress import Monitor
+from probcal.labels import NOBODY
 from probcal.problem import Problem
 from probcal.results.io import save
 from probcal.smoothing.joint import too_large
@@ -31,9 +32,12 @@ STATUS = {
 }
 
 
-def run(model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, Any], outputs: Outputs | None) -> int:
+def run(
+    model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, Any], network: Path | None,
+    outputs: Outputs | None,
+) -> int:  # fmt: skip
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
-    _, problem = load_problem(model, data, fix, given)
+    problem = on_network(load_problem(model, data, fix, given)[1], network)
     if too_large(problem.model):
         return _check_many(problem, model, outputs)
     with shown() as progress:
@@ -130,8 +134,9 @@ def _print_known(problem: Problem, tree: xr.DataTree) -> None:
     print("share: how much of the answer the data give under a prior of one scale; sd: the bound that goes with it")
     sensors = tree["sensor"].to_dataset().to_dataframe().sort_values("leverage")
     print("biases that the rows of each sensor determine: " + _listed(sensors["leverage"]))
-    targets = tree["target"].to_dataset()["leverage"].to_series().sort_values()
-    print(f"of each target: {_listed(targets)}; of the motion: {tree['target'].attrs['motion']:.2f}")
+    targets = tree["target"].to_dataset()["leverage"].to_series().sort_values().drop(NOBODY, errors="ignore")
+    listed = f"of each target: {_listed(targets)}; of" if len(targets) else "of"
+    print(f"{listed} the motion: {tree['target'].attrs['motion']:.2f}")
     print(_directions_text(tree))
 
 

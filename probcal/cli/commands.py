@@ -26,6 +26,13 @@ Fix = Annotated[list[str] | None, typer.Option(help="hold biases at 0, by label 
 Given = Annotated[
     list[str] | None, typer.Option("--set", help="an argument of problem(): swap=3,4 (repeat)", show_default=False)
 ]
+Network = Annotated[
+    Path | None,
+    typer.Option(
+        help="calibrated network to start from: folder of a fit, or its network.csv", callback=options.network_file,
+        show_default=False,
+    ),
+]  # fmt: skip
 LARGEST_SEED = 2**62
 TERMINATED = 143  # exit code of a command that SIGTERM ended
 SMOOTHERS = ("gaussian", "particles")
@@ -87,9 +94,10 @@ def fit_command(
     ] = None,
     fix: Fix = None,
     given: Given = None,
+    network: Network = None,
     starts: Annotated[int, options.count(1, "starts of the search; the best optimum is reported")] = 1,
     seed: Seed = 0,
-    out: Annotated[Path | None, typer.Option(help="folder for fit.nc, summary.csv, report.html")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for fit.nc, summary.csv, network.csv, report.html")] = None,
     chains: Annotated[int | None, options.count(1, "chains of a sampler")] = None,
     draws: Annotated[int | None, options.count(1, "draws of each chain after warm-up")] = None,
     warmup: Annotated[int | None, options.count(0, "steps of each chain before its draws")] = None,
@@ -134,7 +142,7 @@ def fit_command(
     check_limit(limit)
     chosen: dict[str, Any] = dict(
         method=method, prior=prior, fix=fix or (), given=arguments, starts=starts, seed=seed, sizes=sizes, kept=kept,
-        assessed=assessed, epoch=epoch, align=align, limit=limit,
+        assessed=assessed, epoch=epoch, align=align, limit=limit, network=network,
     )  # fmt: skip
     if recordings:
         options.check_files(model)
@@ -177,6 +185,7 @@ def check_command(
     data: Data = None,
     fix: Fix = None,
     given: Given = None,
+    network: Network = None,
     out: Annotated[Path | None, typer.Option(help="folder for check.nc, check.csv, check.png")] = None,
 ) -> None:
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
@@ -185,7 +194,7 @@ def check_command(
     results = None if out is None else outputs.replaceable(out, outputs.CHECK)
     from probcal.cli import check
 
-    raise typer.Exit(check.run(model, data, fix or (), arguments, results))
+    raise typer.Exit(check.run(model, data, fix or (), arguments, network, results))
 
 
 @app.command(name="track")
@@ -194,6 +203,7 @@ def track_command(
     data: Data = None,
     calibration: Annotated[Path | None, typer.Option(help="folder (or fit.nc) of a fit", show_default=False)] = None,
     given: Given = None,
+    network: Network = None,
     smoother: Annotated[str, typer.Option(help="gaussian, or particles: for any motion, roads too")] = "gaussian",
     particles: Annotated[int, options.count(2, "particles of each target")] = 1000,
     seed: Seed = 0,
@@ -211,7 +221,7 @@ def track_command(
     from probcal.cli import track
 
     raise typer.Exit(track.run(
-        model, data, arguments, calibration, results, smoother=smoother, particles=particles, seed=seed
+        model, data, arguments, network, calibration, results, smoother=smoother, particles=particles, seed=seed
     ))  # fmt: skip
 
 
@@ -245,6 +255,7 @@ def watch_command(
     keep: Annotated[str, typer.Option(help="tables to write besides: tracks,rows")] = "",
     fix: Fix = None,
     given: Given = None,
+    network: Network = None,
 ) -> None:
     """Calibrate a stream as it comes: a live table of biases, their history, and a state that survives a kill.
 
@@ -277,7 +288,7 @@ def watch_command(
                 raise InputError(f"--particles filters without {other}; give one of the two")
             method = ParticleFilter(particles, walks)
         raise typer.Exit(watch.run(
-            model, data, fix or (), arguments, method, calibration=calibration, targets=targets, follow=follow,
+            model, data, fix or (), arguments, network, method, calibration=calibration, targets=targets, follow=follow,
             outputs=results, every=every, kept=kept,
         ))  # fmt: skip
     finally:
@@ -401,6 +412,7 @@ def sbc_command(
     ] = None,
     fix: Fix = None,
     given: Given = None,
+    network: Network = None,
     runs: Annotated[int, options.count(2, "simulations")] = 200,
     seed: Seed = 0,
     posterior: Annotated[
@@ -430,7 +442,8 @@ def sbc_command(
 
         raise typer.Exit(
             sbc.run(
-                model, data, method=method, prior=prior, truths=truths, fix=fix or (), given=arguments, runs=runs,
+                model, data, method=method, prior=prior, truths=truths, fix=fix or (), given=arguments, network=network,
+                runs=runs,
                 seed=seed, posterior=posterior, full=full, outputs=results, resume=resume, overwrite=overwrite,
                 scheduler=scheduler,
             )

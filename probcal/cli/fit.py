@@ -1,4 +1,4 @@
-"""`fit`: calibrate, print one row a bias and what the fit is worth, write fit.nc, summary.csv and report.html."""
+"""`fit`: calibrate, print one row per bias and the verdict, write fit.nc, its tables, network.csv and report.html."""
 
 import importlib
 import signal
@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.cli.files import can_plot, report_of, say_written, write_csv
-from probcal.cli.models import load_problem, load_truth, prior_named
+from probcal.cli.models import load_problem, load_truth, noted, on_network, prior_named
 from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs
@@ -25,11 +25,13 @@ from probcal.inference.fit import linear_form
 from probcal.inference.manifest import remove_run
 from probcal.inference.progress import Monitor
 from probcal.inference.widen import judge_fit
+from probcal.network import Network
+from probcal.nodes import write_network
 from probcal.results.alignment import KINDS
 from probcal.results.io import save
-from probcal.results.read import outliers, summary
+from probcal.results.read import outliers, summary, with_calibration
 from probcal.results.schema import evidence_in
-from probcal.status import Status
+from probcal.status import INVALID, Status
 
 FINDINGS = 8  # sentences of an assessment that are printed
 MANY, SHOWN = 400, 40  # biases up to which all are printed, and of more so many
@@ -47,13 +49,13 @@ def run(
     began = time.perf_counter()
     with shown() as progress:
         monitor = Monitor(progress, limit, signals=ENDING)
-        tree = calibrated(
+        tree, network = calibrated(
             model, data, outputs=outputs, resume=resume, overwrite=overwrite, monitor=monitor, **options
         )  # fmt: skip
     print(table_text(tree))
     _print_verdict(tree, time.perf_counter() - began)
     if outputs is not None:
-        say_written(written(tree, outputs))
+        say_written(written(tree, network, outputs))
         if not can_plot():
             print('report.html is left out: pip install "probcal[plot]"')
     if monitor.signal:
@@ -77,16 +79,21 @@ def calibrated(
     starts: int, seed: int, outputs: Outputs | None, sizes: Mapping[str, int], resume: bool, overwrite: bool,
     kept: Sequence[str], assessed: bool, epoch: float | None = None, align: str | None = None,
     monitor: Monitor | None = None, limit: float | None = None, module: ModuleType | None = None,
-) -> xr.DataTree:  # fmt: skip
-    """The tree of a fit, assessed and scored; `module` is that of the model file where it is loaded already."""
+    network: Path | None = None,
+) -> tuple[xr.DataTree, Network]:  # fmt: skip
+    """The tree of a fit, assessed and scored, and its network; `module` is the model file where it is loaded already.
+
+    `network` is the file of a calibrated network that replaces the one of the model.
+    """
     known, implied = METHODS[method]
     value: Any = known
     value = replace(value, **sizes) if sizes else value
     began, monitor = time.perf_counter(), Monitor(limit=limit, signals=()) if monitor is None else monitor
     monitor.enter("start", value.name)
-    module, problem = load_problem(model, data, fix, given, epoch, module)
+    module, declared = load_problem(model, data, fix, given, epoch, module)
+    problem = on_network(declared, network)
     chosen = prior_named(module, value, implied, prior)
-    truth = load_truth(module, model, data, problem, given)
+    truth = load_truth(module, model, data, problem, given, declared.network)
     if align is not None and truth is None:
         raise InputError(f"--align {align}: there is no truth to lay the answer on; put one beside the data")
     store = None if outputs is None else outputs.folder / "draws"
@@ -119,13 +126,13 @@ def calibrated(
 
         with _safe(tree, outputs, False):
             add_scores(tree, truth, align=align)
-    return tree
+    return noted(tree, network), problem.network
 
 
-def written(tree: xr.DataTree, outputs: Outputs) -> list[Path]:
+def written(tree: xr.DataTree, network: Network, outputs: Outputs) -> list[Path]:
     """Write the files of a fit; the draws that it streamed are in them now and go."""
     with outputs.writing(tree.attrs["identity"]):
-        files = _write(tree, outputs)
+        files = _write(tree, network, outputs)
     if not tree.attrs.get("interrupted", 0):
         remove_run(outputs.folder / "draws", tree.attrs["identity"])
     return files
@@ -212,7 +219,7 @@ def _print_findings(tree: xr.DataTree) -> None:
         print(f"- and {len(sentences) - FINDINGS} more (group finding of fit.nc, report.html)")
 
 
-def _write(tree: xr.DataTree, outputs: Outputs) -> list[Path]:
+def _write(tree: xr.DataTree, network: Network, outputs: Outputs) -> list[Path]:
     out = outputs.folder
     save(tree, out / "fit.nc")
     files = [out / "fit.nc", out / "summary.csv"]
@@ -222,6 +229,10 @@ def _write(tree: xr.DataTree, outputs: Outputs) -> list[Path]:
         write_csv(outliers(tree), files[2])
     else:
         outputs.remove("outliers.csv")  # of an earlier fit
+    if tree.attrs["status"] in INVALID:
+        outputs.remove("network.csv")
+    else:
+        files.append(write_network(out / "network.csv", with_calibration(network, tree)))
     if can_plot():
         files.append(report_of(tree, out))
     return files

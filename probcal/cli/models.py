@@ -6,7 +6,7 @@ import inspect
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from socket import gethostname
@@ -17,7 +17,10 @@ from probcal.cli.options import check_files
 from probcal.errors import FitError, InputError, nearest
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from probcal.inference.run import Method
+    from probcal.network import Network
     from probcal.priors import Prior
     from probcal.problem import Problem
     from probcal.simulate import Truth
@@ -149,6 +152,39 @@ def load_problem(
     return module, problem
 
 
+def on_network(problem: "Problem", file: Path | None) -> "Problem":
+    """The problem on the calibrated network of a file; itself without one."""
+    from probcal.results.read import with_calibration
+
+    return problem if file is None else problem.rebuild(network=with_calibration(problem.network, file))
+
+
+def noted(tree: "xr.DataTree", file: Path | None) -> "xr.DataTree":
+    """The tree of a fit with a note of the calibrated network that it started from, as `load_fit` compares it."""
+    if file is not None:
+        tree.attrs["network"] = digest_of_file(file)
+    return tree
+
+
+def load_fit(calibration: Path, file: Path | None) -> "xr.DataTree":
+    """A saved fit to go on from, which started from the calibrated network of a file, or from none.
+
+    Raises `InputError` where it is invalid or counts its biases from another network.
+    """
+    from probcal.results.io import load
+    from probcal.status import INVALID
+
+    tree = load(calibration)
+    if (status := tree.attrs["status"]) in INVALID:
+        raise InputError(f"{calibration}: the fit ended {status}, its estimate is invalid; fit again first")
+    if tree.attrs.get("network", "") != ("" if file is None else digest_of_file(file)):
+        raise InputError(
+            f"{calibration}: the fit started from another network; give --network as that fit had it, or none if it"
+            " had none"
+        )
+    return tree
+
+
 def arguments(module: ModuleType, name: str) -> list[str] | None:
     """Names of the arguments of a function of a model file after its first; None where it takes any, or is none."""
     try:
@@ -170,11 +206,17 @@ def _recording(module: ModuleType, name: str, data: Path | None) -> tuple[Path |
 
 
 def load_truth(
-    module: ModuleType, model: Path, data: Path | None, problem: "Problem", given: Mapping[str, Any] | None = None
+    module: ModuleType,
+    model: Path,
+    data: Path | None,
+    problem: "Problem",
+    given: Mapping[str, Any] | None = None,
+    network: "Network | None" = None,
 ) -> "Truth | None":
     """The truth beside the data, else the model's own with those of the further arguments that it has.
 
-    It is checked before a fit rather than at its scores.
+    It is checked before a fit rather than at its scores. Its biases count from the network of the problem; `network`
+    is the one that the model declares, where that is another.
     """
     import numpy as np
 
@@ -187,6 +229,10 @@ def load_truth(
         truth = call(module, model, "truth", *_recording(module, "truth", data), **own)
         if not isinstance(truth, Truth | None):
             raise InputError(f"{model.name}: truth() returned {type(truth).__name__}; return a probcal.Truth or None")
+    if truth is not None and network is not None:
+        old, new = network.stated, problem.network.stated
+        biases = {label: value + (old.get(label, 0.0) - new.get(label, 0.0)) for label, value in truth.biases.items()}
+        truth = replace(truth, biases=biases)
     if truth is not None:
         truth.check_targets(problem.measurements.target_names)
         truth.positions(np.zeros(0), np.zeros(0, str), problem.network.dimension)

@@ -79,6 +79,14 @@ def check_fit(path: Path) -> None:
         raise InputError(f"{file} is not a fit written by probcal: there is no such file")
 
 
+def network_file(path: Path | None) -> Path | None:
+    """The file of a calibrated network, in the folder of a fit where that is given; raises `InputError` without one."""
+    file = path / "network.csv" if path is not None and exists(path) and path.is_dir() else path
+    if file is not None and not exists(file):
+        raise InputError(f"--network {file}: there is no such file; give the folder of a valid fit, or its network.csv")
+    return file
+
+
 def exists(path: Path) -> bool:
     """Whether a file or folder is there; a name that no file can have is not."""
     try:

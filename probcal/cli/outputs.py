@@ -9,7 +9,7 @@ from probcal.errors import InputError
 from probcal.files import Lock, Outputs, make_folder
 from probcal.inference.manifest import REMEDY, check_choice, stored_digest, stored_run
 
-FIT = ("fit.nc", "summary.csv", "outliers.csv", "report.html")
+FIT = ("fit.nc", "summary.csv", "outliers.csv", "network.csv", "report.html")
 SBC = ("sbc.nc", "sbc.csv", "sbc.png")
 STUDY = ("study.nc", "study.csv", "study.png")
 CHECK = ("check.nc", "check.csv", "check.png")

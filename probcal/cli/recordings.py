@@ -44,6 +44,8 @@ class Recordings:
     def identity(self, digest: str) -> dict[str, str]:
         """What the fit of a table is, by the names that an error gives it."""
         options = {name: repr(value) for name, value in sorted(self.options.items())}
+        if self.options["network"] is not None:
+            options["network"] = digest_of_file(self.options["network"])
         return {"version of probcal": version("probcal"), "model": self.model.digest, "data": digest} | options
 
     def kept(self, data: Path, digest: str) -> list[dict[str, Any]] | None:
@@ -74,13 +76,13 @@ class Recordings:
         note = outputs.folder / NOTE
         write_whole(note, json.dumps({"fit": self.identity(digest), "rows": None}))
         try:
-            tree = fit.calibrated(
+            tree, network = fit.calibrated(
                 self.model.path, data, module=self.model.module(), outputs=outputs, resume=going, overwrite=new,
                 **self.options,
             )  # fmt: skip
         except (InputError, FitError) as error:
             return [{"recording": data.stem, "status": REFUSED, "message": str(error)}]
-        fit.written(tree, outputs)
+        fit.written(tree, network, outputs)
         found = summary(tree)[["bias", "mean", "sd"]].to_dict("records")
         rows = [{"recording": data.stem, "status": tree.attrs["status"], **row} for row in found]
         write_whole(note, json.dumps({"fit": self.identity(digest), "rows": rows}))

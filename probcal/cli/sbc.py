@@ -9,7 +9,7 @@ import pandas as pd
 import xarray as xr
 
 from probcal.cli.files import can_plot, say_written, write_csv
-from probcal.cli.models import load_problem, prior_named
+from probcal.cli.models import load_problem, on_network, prior_named
 from probcal.cli.progress import shown
 from probcal.files import Outputs
 from probcal.inference import METHODS, sbc
@@ -21,7 +21,7 @@ from probcal.results.io import save
 
 def run(
     model: Path, data: Path | None, *, method: str, prior: str | None, truths: str | None, fix: Sequence[str],
-    given: Mapping[str, Any],
+    given: Mapping[str, Any], network: Path | None,
     runs: int, seed: int, posterior: bool, full: bool, outputs: Outputs | None,
     resume: bool, overwrite: bool, scheduler: str | None = None,
 ) -> int:  # fmt: skip
@@ -29,6 +29,7 @@ def run(
     value, implied = METHODS[method]
     value = value if full else short(value)
     module, problem = load_problem(model, data, fix, given)
+    problem = on_network(problem, network)
     chosen = prior_named(module, value, implied, prior)
     began = time.perf_counter()
     if outputs is not None and overwrite:

@@ -6,29 +6,24 @@ from pathlib import Path
 from typing import Any
 
 from probcal.cli.files import write_csv
-from probcal.cli.models import load_problem, load_truth
+from probcal.cli.models import load_fit, load_problem, load_truth, on_network
 from probcal.cli.progress import shown
-from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.inference import track
 from probcal.inference.progress import Monitor
 from probcal.particle.settings import Particles
-from probcal.results.io import load
 from probcal.results.read import tracks
 from probcal.results.scores import scores
 from probcal.status import INVALID
 
 
-def run(model: Path, data: Path | None, given: Mapping[str, Any], calibration: Path, outputs: Outputs, *,
-    smoother: str, particles: int, seed: int,
+def run(model: Path, data: Path | None, given: Mapping[str, Any], network: Path | None, calibration: Path,
+    outputs: Outputs, *, smoother: str, particles: int, seed: int,
 ) -> int:  # fmt: skip
     """Tracks of other data with a calibration applied: time, target, each state component with its sd."""
-    known = load(calibration)
-    if known.attrs.get("status") in INVALID:
-        raise InputError(
-            f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first"
-        )
+    known = load_fit(calibration, network)
     module, problem = load_problem(model, data, (), given)
+    problem = on_network(problem, network)
     truth = load_truth(module, model, data, problem, given)
     with shown() as progress:
         Monitor(progress).enter("tracks", "track")

@@ -18,7 +18,7 @@ from rich.live import Live
 from rich.table import Table as Shown
 
 from probcal.cli.files import can_plot
-from probcal.cli.models import load_problem
+from probcal.cli.models import load_fit, load_problem, noted, on_network
 from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs, write_whole
@@ -26,9 +26,8 @@ from probcal.inference.checkpoint import pack_state, unpack_state
 from probcal.inference.online import AugmentedFilter, Online, ParticleFilter, Update
 from probcal.inference.progress import Progress, handled
 from probcal.problem import Problem, check_linear
-from probcal.results.io import load, save
+from probcal.results.io import save
 from probcal.results.schema import ROPE
-from probcal.status import INVALID
 from probcal.table import Table, csv_text, read_lines
 
 BLOCK = 1 << 18  # bytes that are read at once
@@ -110,20 +109,16 @@ class Appended:
 
 
 def run(
-    model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, Any],
+    model: Path, data: Path | None, fix: Sequence[str], given: Mapping[str, Any], network: Path | None,
     method: AugmentedFilter | ParticleFilter, *, calibration: Path | None, targets: int, follow: bool,
     outputs: Outputs | None, every: float, kept: Sequence[str],
 ) -> int:  # fmt: skip
     """Filter the rows of a file, or of standard input, until they end or the process is told to end."""
-    known = None if calibration is None else load(calibration)
-    if known is not None and known.attrs.get("status") in INVALID:
-        raise InputError(
-            f"{calibration}: the fit ended {known.attrs['status']}, its estimate is invalid; fit again first"
-        )
+    known = None if calibration is None else load_fit(calibration, network)
     source = Source("standard input" if data is None else data.name)
     with shown() as say:
         say(Progress(f"watch: {source.name}", 0, 1, phase="start"))
-        problem = _declared(model, data, fix, given, source, follow)
+        problem = on_network(_declared(model, data, fix, given, source, follow), network)
     if isinstance(method, AugmentedFilter):
         check_linear(problem)
     online = Online(
@@ -151,7 +146,7 @@ def run(
     if online.end is None:
         raise InputError(f"{source.name} has no rows that could be taken")
     if outputs is not None:
-        save(online.tree(), outputs.folder / FIT)
+        save(noted(online.tree(), network), outputs.folder / FIT)
         if can_plot():
             _draw(outputs.folder)
         with outputs.writing():
