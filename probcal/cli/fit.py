@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.cli.files import can_plot, report_of, say_written, write_csv
-from probcal.cli.models import load_problem, load_truth, noted, on_network, prior_named
+from probcal.cli.models import load_problem, load_truth, note_network, on_network, prior_named
 from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs
@@ -126,7 +126,7 @@ def calibrated(
 
         with _safe(tree, outputs, False):
             add_scores(tree, truth, align=align)
-    return noted(tree, network), problem.network
+    return note_network(tree, network), problem.network
 
 
 def written(tree: xr.DataTree, network: Network, outputs: Outputs) -> list[Path]:

@@ -159,7 +159,7 @@ def on_network(problem: "Problem", file: Path | None) -> "Problem":
     return problem if file is None else problem.rebuild(network=with_calibration(problem.network, file))
 
 
-def noted(tree: "xr.DataTree", file: Path | None) -> "xr.DataTree":
+def note_network(tree: "xr.DataTree", file: Path | None) -> "xr.DataTree":
     """The tree of a fit with a note of the calibrated network that it started from, as `load_fit` compares it."""
     if file is not None:
         tree.attrs["network"] = digest_of_file(file)

@@ -18,7 +18,7 @@ from rich.live import Live
 from rich.table import Table as Shown
 
 from probcal.cli.files import can_plot
-from probcal.cli.models import load_fit, load_problem, noted, on_network
+from probcal.cli.models import load_fit, load_problem, note_network, on_network
 from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs, write_whole
@@ -146,7 +146,7 @@ def run(
     if online.end is None:
         raise InputError(f"{source.name} has no rows that could be taken")
     if outputs is not None:
-        save(noted(online.tree(), network), outputs.folder / FIT)
+        save(note_network(online.tree(), network), outputs.folder / FIT)
         if can_plot():
             _draw(outputs.folder)
         with outputs.writing():

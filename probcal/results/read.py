@@ -11,7 +11,6 @@ import numpy as np
 
 from probcal.errors import InputError, checked
 from probcal.labels import NOBODY
-from probcal.nodes import read_network
 from probcal.results.blocks import SensorBlocks, covariance_of
 from probcal.results.schema import MORE, SUMMARY
 from probcal.status import INVALID
@@ -186,6 +185,8 @@ def with_calibration(network: Network, source: xr.DataTree | str | PathLike[str]
     (True, {'survey'})
     """
     if isinstance(source, (str, PathLike)):
+        from probcal.nodes import read_network  # it loads jax, which a report does without
+
         return network.surveyed(read_network(source, network))
     if str(source.attrs.get("status")) in INVALID:
         raise InputError(
