@@ -13,7 +13,9 @@ from terminal import call, run
 
 from probcal import InputError, load
 from probcal.cli import recordings
-from probcal.cli.recordings import NOTE
+from probcal.cli.models import ModelFile
+from probcal.cli.recordings import NOTE, Recordings
+from probcal.inference.manifest import check_same
 
 DATA = Path(__file__).parent / "data"
 NUMBERS = ("mean", "sd", "lower", "upper", "gamma")
@@ -71,6 +73,18 @@ def test_each_recording_is_fitted_as_alone_and_only_what_is_missing_again(model,
     table = pd.read_csv(out / "fits.csv")
     assert table["recording"].unique().tolist() == ["day0", "day1", "day2", "day4"]
     assert table["status"].tolist()[-1] == "refused"
+
+
+def test_the_network_is_part_of_what_a_recording_is_resumed_with(tmp_path):
+    def identity(network):
+        return Recordings(ModelFile(tmp_path, ""), tmp_path, {"network": network}, True, False).identity("rows")
+
+    (tmp_path / "network.csv").write_text("one")
+    first = identity(tmp_path / "network.csv")
+    (tmp_path / "network.csv").write_text("two")
+    assert "network" not in identity(None)
+    with pytest.raises(InputError, match="the network has changed since the run there began"):
+        check_same(tmp_path, identity(tmp_path / "network.csv"), first)
 
 
 @pytest.mark.ci

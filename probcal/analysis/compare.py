@@ -26,7 +26,7 @@ TOTALS = (*EVIDENCES, "log_evidence_se", "seconds")
 TEXTS = ("method", "requested", "prior", "status", "message", "settings", "intervals", "approximate", "precisions")
 
 
-def compare(fits: Fits, *, names: Sequence[str] | None = None) -> xr.DataTree:
+def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
     """Put fits of the same data side by side, whatever their methods, priors and sensor models.
 
     `fits` are results of `fit` (or loaded ones), by name or in a sequence with `names`, which default to method and
@@ -77,6 +77,8 @@ def compare(fits: Fits, *, names: Sequence[str] | None = None) -> xr.DataTree:
 
 def fits_by_name(fits: Fits, names: Sequence[str] | None = None) -> dict[str, xr.DataTree]:
     """Fits by name; a fit without one is called by its method and prior, "EA (ARD)", numbered where that is taken."""
+    if isinstance(fits, xr.DataTree):
+        raise InputError("compare: fits is a single tree; give several in a list, compare([first, second])")
     if isinstance(fits, Mapping):
         if names is not None:
             raise InputError("compare: the fits have names already; give names to a sequence of fits only")

@@ -43,9 +43,9 @@ class Recordings:
 
     def identity(self, digest: str) -> dict[str, str]:
         """What the fit of a table is, by the names that an error gives it."""
-        options = {name: repr(value) for name, value in sorted(self.options.items())}
-        if self.options["network"] is not None:
-            options["network"] = digest_of_file(self.options["network"])
+        options = {name: repr(value) for name, value in sorted(self.options.items()) if name != "network"}
+        if (network := self.options["network"]) is not None:
+            options["network"] = digest_of_file(network)
         return {"version of probcal": version("probcal"), "model": self.model.digest, "data": digest} | options
 
     def kept(self, data: Path, digest: str) -> list[dict[str, Any]] | None:

@@ -318,6 +318,9 @@ def study(
     Raises `InputError` for an unknown method, settings whose biases differ and a folder that holds another study, and
     `FitError` where a cluster is lost on the way.
     """
+    if not callable(setting):
+        what = f"setting is of type {type(setting).__name__}"
+        raise InputError(f"study: {what}; give a function setting(run, ...) that returns a problem and its truth")
     check_scheduler(scheduler)
     chosen = _pairs(methods) if isinstance(methods, Mapping) else choose_methods(methods)
     numbers = list(range(int(runs))) if isinstance(runs, (int, np.integer)) else [int(number) for number in runs]

@@ -81,6 +81,8 @@ def load(path: str | PathLike[str]) -> xr.DataTree:
 
     Raises `InputError` where the file is damaged, foreign, or written by another version.
     """
+    if not isinstance(path, (str, PathLike)):
+        raise InputError(f"load: path is of type {type(path).__name__}; give the folder of a fit, or its fit.nc")
     path = Path(path)
     try:
         path = path / "fit.nc" if path.is_dir() else path
