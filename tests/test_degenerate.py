@@ -40,6 +40,7 @@ from probcal import (
     track,
     tracks,
 )
+from probcal.cli.check import print_known
 from probcal.errors import FitError, InputError
 from probcal.report import write_report
 
@@ -122,7 +123,7 @@ def test_distances_between_nodes_need_no_target(tmp_path):
         assert word not in found.attrs["message"]
 
 
-def test_rows_without_a_target_stand_beside_those_of_one():
+def test_rows_without_a_target_stand_beside_those_of_one(capsys):
     nodes = [Node("a", (0.0, 0.0), delay=0.0, scale=1.0), Node("b", (4.0, 0.0), delay=0.0, scale=1.0)]
     network = Network([span.on(*nodes), *(worlds.fix.on(node, name=f"{node.name}_fix") for node in nodes)])
     table = worlds.table_of(network, {"tag": [0.0, 1.0, 2.0]}, 1, missing=0.0)
@@ -140,6 +141,10 @@ def test_rows_without_a_target_stand_beside_those_of_one():
         Problem(network, table)
     with pytest.raises(InputError, match='target "tag" has no motion; give one, such as'):
         Problem(network, data=table)
+    print_known(apart, observability(apart, point=worlds.resting(apart)))
+    said = capsys.readouterr().out
+    assert "of each target: tag " in said
+    assert "no target" not in said
 
 
 def test_what_asks_for_a_target_says_that_there_is_none():

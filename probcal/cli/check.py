@@ -49,7 +49,7 @@ def run(
         monitor.enter("next measurements")
         plans = _planned(problem, start)
     tree.attrs["model"] = model.stem
-    _print_known(problem, tree)
+    print_known(problem, tree)
     _print_plans(plans)
     print(STATUS[tree.attrs["status"]])
     if outputs is not None:
@@ -67,7 +67,7 @@ def _check_many(problem: Problem, model: Path, outputs: Outputs | None) -> int:
         monitor.enter("determined directions")
         tree = observability(problem, point=start)
     tree.attrs["model"] = model.stem
-    _print_known(problem, tree)
+    print_known(problem, tree)
     try:
         with shown() as progress:
             Monitor(progress).enter("next measurements", "check")
@@ -116,7 +116,7 @@ def _survey_text(anchors: xr.Dataset) -> str:
     return f"{survey}: {gain:.2f} of the other biases"
 
 
-def _print_known(problem: Problem, tree: xr.DataTree) -> None:
+def print_known(problem: Problem, tree: xr.DataTree) -> None:
     """Data, biases (of many those that the data tell least of), sensors, targets and what is open."""
     data = problem.measurements
     print(

@@ -29,8 +29,8 @@ Given = Annotated[
 Network = Annotated[
     Path | None,
     typer.Option(
-        help="calibrated network to start from: folder of a fit, or its network.csv", callback=options.network_file,
-        show_default=False,
+        help="start from the network of a fit to other data: its folder, or its network.csv",
+        callback=options.network_file, show_default=False,
     ),
 ]  # fmt: skip
 LARGEST_SEED = 2**62
