@@ -41,7 +41,7 @@ from probcal.inference import identity
 from probcal.inference.fit import _check_store
 from probcal.inference.manifest import MANIFEST, remove_run, stored_run, write_manifest
 from probcal.inference.storage import Chunks, Records, Storage
-from probcal.results.io import SEAL, SMALL, check_content
+from probcal.results.io import SEAL, SMALL, _semi_definite, check_content
 
 RUN = {"method": "NUTS()", "seed": "1", "model": "abc"}
 
@@ -634,6 +634,12 @@ def test_what_a_fit_lacks_is_one_sentence(change, text, saved):
     change(tree)
     with pytest.raises(InputError, match=text):
         check_content(tree, Path("fit.nc"))
+
+
+def test_a_correlation_may_pass_1_by_rounding_only():
+    for correlation, fits in ((1.0, True), (1.0 + 1e-7, True), (1.0 + 1e-5, False), (-1.5, False)):
+        covariance = np.array([[4.0, 2.0 * correlation], [2.0 * correlation, 1.0]])
+        assert _semi_definite(covariance[None]) == fits, correlation
 
 
 def test_a_fit_in_sparse_form_is_one(saved):
