@@ -69,7 +69,7 @@ def misfit_text(mean: float, points: Iterable[MisfitData]) -> str:
 
 
 def _lost(left: MisfitData, first: int, count: int) -> str:
-    """What to check where predictions are no numbers, even with the biases as stated."""
+    """The advice where predictions are not numbers, even with the biases as stated."""
     return (
         f"The fit explains nothing: the predictions of {count} data are not numbers, the first"
         f" {left.sensor[first]}.{left.channel[first]} at {left.time[first]:.6g} s. Check the sensor's function (a"

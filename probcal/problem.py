@@ -207,7 +207,7 @@ class Problem:
 
     @property
     def area(self) -> Area:
-        """Where a target starts of which nothing is stated: wider than the stated positions of the nodes are known.
+        """The area in which a target without a stated start begins, wider than the nodes are known.
 
         A narrower start would hold the network in the place of a survey.
         """

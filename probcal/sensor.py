@@ -224,7 +224,7 @@ class SensorType:
 
     @property
     def reads_target(self) -> bool:
-        """Whether the function reads its target; the distance between two nodes, for one, does not."""
+        """True where the function reads its target; the distance between two nodes does not."""
         return bool(self.target_components)
 
     def on(self, *nodes: Any, name: str | None = None, detection: Detection | None = None) -> "Sensor":

@@ -47,9 +47,12 @@ def in_order(findings: list[Finding]) -> list[Finding]:
 
 
 def completed(
-    result: xr.DataTree, text: str, groups: dict[str, xr.Dataset], findings: list[Finding]
-) -> xr.DataTree:  # fmt: skip
-    """A widened result with the groups of its assessment; `text` is why the innovations reject the model, or empty."""
+    result: xr.DataTree,
+    text: str,
+    groups: dict[str, xr.Dataset],
+    findings: list[Finding],
+) -> xr.DataTree:
+    """A widened result with its assessment; `text` says why the innovations reject the model."""
     said(result, sentence(text))
     findings = in_order(findings + [Finding("widened", "fit", text)] * bool(text))
     texts = {name: ("finding", np.array([getattr(f, name) for f in findings], str)) for name in Finding._fields}

@@ -83,7 +83,7 @@ def _check_many(problem: Problem, model: Path, outputs: Outputs | None) -> int:
 
 
 def _planned(problem: Problem, start: Point) -> tuple[xr.Dataset | None, xr.Dataset, xr.Dataset]:
-    """What another pass, a survey and a further sensor would tell; no pass where no row has a target."""
+    """Plans of another pass, a survey and a further sensor; no pass where no row has a target."""
     passes = next_passes(problem, point=start) if problem.targets else None
     return passes, next_anchors(problem, point=start), next_sensors(problem, point=start)
 

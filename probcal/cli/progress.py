@@ -38,7 +38,7 @@ class Line:
         return str(self.at._replace(seconds=now - self._began, left=left))
 
     def due(self) -> bool:
-        """Whether a line is to be printed now, which then counts as printed."""
+        """True where a line is due now; it then counts as printed."""
         now, phase = self._clock(), self.at.phase
         if self._printed is None:
             wait = now - self._began >= FIRST
@@ -52,9 +52,9 @@ class Line:
 
 @contextmanager
 def shown() -> Iterator[OnProgress]:
-    """What shows progress: the phase, the time so far and an estimate of what is left, while a command works.
+    """Show the phase, the time so far and an estimate of the rest while a command works.
 
-    Meanwhile SIGTERM is as Ctrl-C.
+    Within it SIGTERM acts as Ctrl-C.
     """
     with handled(_terminate, [signal.SIGTERM]), _on_stderr() as line:
         yield line

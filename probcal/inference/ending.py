@@ -163,7 +163,7 @@ def verdict(end: End) -> Status:
 
 
 def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
-    """What a point that explains nothing leaves of the data, the likely cause and what to do."""
+    """The misfit of a point that explains nothing, the likely cause and what to do."""
     return misfit_text(square, (_remains(problem, at) for at in _points(problem, point, square)))
 
 
@@ -175,7 +175,7 @@ def _points(problem: Problem, point: Point, square: float) -> Iterator[Point]:
 
 
 def _remains(problem: Problem, point: Point) -> MisfitData:
-    """What a point leaves of every datum."""
+    """The residual of every datum at a point, and where it belongs."""
     network, (datum, picks) = problem.network, datum_of(problem)
     names = {name: values for name, (_, values) in datum["coords"].items()}
     units = {

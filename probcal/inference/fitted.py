@@ -38,7 +38,7 @@ else:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """What every check of a fit reads: its problem, where it ended, and its rows linearised there."""
+    """The problem of a fit, the point where it ended, and its rows linearised there, for every check."""
 
     problem: Problem
     point: Point
@@ -53,21 +53,11 @@ class Judged:
 
     @property
     def readers(self) -> np.ndarray:
-        """Which sensors read which bias, (sensors, M) boolean, sensors in the order of the network."""
+        """True where a sensor reads a bias, (sensors, M), sensors in the order of the network."""
         found = np.zeros((len(self.problem.network.sensors), self.problem.model.biases + 1), bool)
         for index, bias in zip(self.problem.row_index, self.problem.model.read, strict=True):
             found[self.problem.measurements.sensor[index][:, None], np.asarray(bias)] = True
         return found[:, :-1]
-
-    def share(self, group: np.ndarray, count: int) -> np.ndarray:
-        """Information (M, count) about each bias alone in groups (data,) of data, trajectories held."""
-        found, start, M = np.zeros((self.problem.model.biases + 1) * count), 0, self.problem.model.biases
-        for read, lin, (row, channel) in zip(self.problem.model.read, self.lins, self.picks, strict=True):
-            own = (np.asarray(lin.weight)[:, :, None] * np.asarray(lin.bias) ** 2)[row, channel]  # (data, p)
-            index = np.asarray(read)[row] * count + group[start : start + len(row)][:, None]
-            found += np.bincount(index.ravel(), own.ravel(), len(found))
-            start += len(row)
-        return found.reshape(M + 1, count)[:M]
 
 
 @dataclass(frozen=True, eq=False)

@@ -266,15 +266,7 @@ def judge_chains(
         return Status.MISFIT, " ".join([misfit_sentence(problem, mean, square), *said])
     good = _say_steps(run, said) and good
     if not run.method.exact:
-        khat = pareto_khat(_stats(run)["log_weight"].ravel())
-        fits = khat < K_HAT
-        worth = (
-            f"below {K_HAT:g}: it stands for the posterior"
-            if fits
-            else f"not below {K_HAT:g}: it does not fit the posterior; take nuts or collapsed"
-        )
-        said.append(f"Pareto k-hat of the guide is {khat:.2f}, {worth}.")
-        good = fits and good
+        good = _say_guide(run, said) and good
     if isinstance(prior, Flat) and (np.abs(run.z.mean((0, 1))[~problem.surveyed]) > FAR).any():
         said.append("Some biases lie far from the stated values: use a prior, or fix some.")
         return Status.DIVERGED, " ".join(said)
@@ -292,6 +284,16 @@ def _say_sides(run: SamplerRun, said: list[str]) -> bool:
         said.append("The chains hardly cross between the sides, so that their weights are not known; take more draws.")
         return False
     return True
+
+
+def _say_guide(run: SamplerRun, said: list[str]) -> bool:
+    """Add a sentence on the fit of a guide to the posterior; true where it fits."""
+    khat = pareto_khat(_stats(run)["log_weight"].ravel())
+    fits, worth = khat < K_HAT, f"below {K_HAT:g}: it stands for the posterior"
+    if not fits:
+        worth = f"not below {K_HAT:g}: it does not fit the posterior; take nuts or collapsed"
+    said.append(f"Pareto k-hat of the guide is {khat:.2f}, {worth}.")
+    return fits
 
 
 def _say_steps(run: SamplerRun, said: list[str]) -> bool:

@@ -16,7 +16,7 @@ from probcal.errors import InputError
 
 
 class Progress(NamedTuple):
-    """How far a call has come: the phase of a fit, the runs of `sbc`, the fits of a study; its text is one line.
+    """The steps done of a call, in a phase of a fit, runs of `sbc` or fits of a study; a line as text.
 
     `fit(problem, progress=print)` prints each.
     """
@@ -77,9 +77,12 @@ class Monitor:
     """
 
     def __init__(
-        self, progress: OnProgress | None = None, limit: float | None = None,
-        signals: Sequence[int] = (signal.SIGINT,), clock: Callable[[], float] = time.monotonic,
-    ):  # fmt: skip
+        self,
+        progress: OnProgress | None = None,
+        limit: float | None = None,
+        signals: Sequence[int] = (signal.SIGINT,),
+        clock: Callable[[], float] = time.monotonic,
+    ):
         check_limit(limit)
         self._progress, self._limit, self._signals, self._clock = progress, limit, signals, clock
         self._began = clock()
@@ -152,7 +155,7 @@ class Monitor:
 
     @contextmanager
     def leaving(self) -> Iterator[None]:
-        """What is within is left where a signal interrupts it; the call has its answer already."""
+        """Within it a signal ends the block only: the call has its answer already."""
 
         def leave(number: int, _: Any) -> None:
             self.signal = number

@@ -46,7 +46,7 @@ def codes(frame: pd.DataFrame, names: list[str]) -> tuple[np.ndarray, pd.DataFra
 
 
 class Filter(NamedTuple):
-    """What the covariance pass of one recursion leaves for any columns of data."""
+    """The covariance pass of one recursion, for any columns of data."""
 
     gain: rec.Gains
     mix: jax.Array  # (E, n, n) root V g V' root', S^-1/2 - I between data of an epoch
@@ -71,7 +71,7 @@ class Innovations(NamedTuple):
 
 
 def expected_squares(fit: Judged, kept: np.ndarray) -> np.ndarray:
-    """What is expected of the square of every innovation (D,), of which `kept` is the share of the datum's own noise.
+    """Expected square of every innovation (D,); `kept` is the fraction of the datum's own noise in it.
 
     A row of weight w counts as if its noise had the variance 1 / w, but scatters as declared.
     """
@@ -157,7 +157,7 @@ class Filtered(NamedTuple):
 
 
 def all_gaussian(model: Model) -> bool:
-    """Whether the noise of every channel is Gaussian."""
+    """True where the noise of every channel is Gaussian."""
     return all(isinstance(noise, Normal) for noises in model.noises for noise in noises)
 
 
@@ -209,8 +209,10 @@ def innovations(fit: Fitted, kurtosis: np.ndarray, dz: np.ndarray | None = None)
 
 
 def innovations_large(
-    fit: JudgedLarge, gamma: np.ndarray, shift: Sequence[np.ndarray] | None = None
-) -> Innovations:  # fmt: skip
+    fit: JudgedLarge,
+    gamma: np.ndarray,
+    shift: Sequence[np.ndarray] | None = None,
+) -> Innovations:
     """Innovations of a fit in sparse form, biases at their means or shifted (N, p) from row to row.
 
     The degrees of freedom that the biases used, the sum of `gamma` (M,), are shared among the data by the variance
@@ -285,7 +287,7 @@ def squares(found: Innovations, group: Any, count: int, rate: float) -> Squares:
 
 
 def enough(kurtosis: np.ndarray) -> bool:
-    """Whether data of such excess kurtosis (n,) tell as much of a mean as 20 Gaussian ones of a variance."""
+    """True where data of this excess kurtosis (n,) inform a mean as 20 Gaussian ones do a variance."""
     return bool(2.0 * len(kurtosis) >= FEWEST * (2.0 + np.mean(kurtosis)))
 
 
@@ -376,9 +378,9 @@ def scatter_of(data: pd.DataFrame, found: Innovations, members: Sequence[np.ndar
 
 
 def inflation(fit: Judged, wide: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """How much wider (M,) the variance of a bias is than the model says, where channels are so much `wide`.
+    """Factor (M,) of the variance of each bias, from the factors `wide` of the channels.
 
-    The mean of the channels that tell of it, by their information, and not less than the mean of all.
+    The mean over the channels that inform it, by information, and not less than the mean of all.
     """
     M, start, wide = fit.problem.model.biases, 0, np.maximum(wide, 1.0)
     told, weighed = np.zeros(M + 1), np.zeros(M + 1)
@@ -392,7 +394,7 @@ def inflation(fit: Judged, wide: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 def memory(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> float:
-    """How many innovations of one channel count as one: 1 + 2 sum of r_k over the first positive pairs of lags.
+    """Innovations of one channel that count as one: 1 + 2 sum of r_k over the first positive lag pairs.
 
     The initial positive sequence of Geyer (1992); 1 where the first correlation is not beyond 3 sd.
     """

@@ -1,6 +1,6 @@
 """Solve a problem by a method, from one start or several: the answer that `fit`, `study` and `sbc` read."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -52,21 +52,16 @@ def solve(
         method = sparse
         first = grid_start(problem, jnp.zeros(problem.model.biases), 30) if start is None else start
         return _in_sparse_form(problem, method, prior, first, context)
-    points = (
-        [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))] if start is None
-        else [_suited(given, problem, start)]
-    )  # fmt: skip
+    if start is None:
+        points = [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))]
+    else:
+        points = [_suited(given, problem, start)]
     if not monitor.stopped:
         points += further_starts(problem, starts - len(points), jax.random.fold_in(context.key, 1))
     climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint"), Gaussian())
     optima, unseen = list[Answer](), ""
     if method.climbs or len(points) > 1 or problem.levels or problem.model.tailed:
-        for k, point in enumerate(points):
-            if k and monitor.stopped:
-                break
-            if method.climbs:
-                monitor.enter(f"start {k + 1} of {len(points)}" if k else "climb", answering=True)
-            optima.append(climber.answer(problem, own, point, context))
+        optima = [climber.answer(problem, own, point, context) for _, point in _starts(points, method, monitor)]
         unseen = starts_unseen(len(optima), max(len(points), starts))
         points = [optimum.posterior.point for optimum in optima]
     best = max(range(len(optima)), key=lambda k: _rank(optima[k])) if optima else 0
@@ -80,6 +75,16 @@ def solve(
         return found
     beside = _beside_mirrors(found, method, context)
     return replace(beside, mirrors=(*beside.mirrors, *_beside_optima(beside, (found, *found.optima))))
+
+
+def _starts[T](places: Sequence[T], method: Method, monitor: Monitor) -> Iterator[tuple[int, T]]:
+    """Number and place of each start in turn, until the call is stopped."""
+    for k, place in enumerate(places):
+        if k and monitor.stopped:
+            return
+        if method.climbs:
+            monitor.enter(f"start {k + 1} of {len(places)}" if k else "climb", answering=True)
+        yield k, place
 
 
 def starts_unseen(climbed: int, wanted: int) -> str:
@@ -157,11 +162,7 @@ def _by_particles(
     begin = np.zeros(problem.model.biases) if start is None else np.asarray(start.z)
     places = [begin, *drawn.standard_normal((starts - 1, len(begin)))]
     answers = []
-    for k, z in enumerate(places):
-        if k and context.monitor.stopped:
-            break
-        if method.climbs:
-            context.monitor.enter(f"start {k + 1} of {starts}" if k else "climb", answering=True)
+    for k, z in _starts(places, method, context.monitor):
         key = context.key if k == 0 else jax.random.fold_in(context.key, 1 + k)
         point = Point((), (), jnp.asarray(z), jnp.zeros(len(problem.levels)))
         tries = [method.answer(problem, prior, point, context._replace(key=key))]
@@ -188,26 +189,8 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
     problem, here, monitor = answer.problem.untilted, answer.posterior.point, context.monitor
     if monitor.stopped:
         return answer if answer.interrupted else _without(answer, "mirror images", monitor)
-    monitor.enter("mirror images", answering=True)
-    climb = SideClimb.dense(problem) if climb is None else climb
-
-    def mode(point: Point, to: SideClimb = climb) -> tuple[Point, float]:
-        """The mode next to a point, where there is time for it."""
-        monitor.check()
-        return to.mode(point)
-
-    def answered(point: Point) -> Answer | None:
-        """The answer from a point, if there is a good one in the form of the first."""
-        try:
-            found = method.answer(problem, answer.prior, point, context)
-        except FitError:
-            return None
-        whole = found.status.valid and found.posterior.sound and not found.interrupted
-        return found if found.method == answer.method and whole else None
-
-    try:
-        sides = other_sides(problem, here, climb._replace(mode=mode))
-    except Stopped:
+    sides = _sides_in_time(problem, here, SideClimb.dense(problem) if climb is None else climb, monitor)
+    if sides is None:
         return _without(answer, "mirror images", monitor)
     places = [Mirrored(sides.name, 0.0, sides.point, np.zeros(0), sides.kind)] if sides.moved else []
     places = [other._replace(gain=other.gain + sides.gain) for other in (*places, *sides.others)]
@@ -217,7 +200,7 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
         fits, own = other.gain > -SAME, None
         if fits and not monitor.stopped:
             monitor.enter(f"mirror image {k + 1} of {len(places)}", answering=True)
-            own = answered(other.point)
+            own = _like_first(answer, problem, method, other.point, context)
         late = fits and own is None and bool(monitor.stopped)
         skipped += late
         if own is None:
@@ -247,6 +230,36 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
         message=f"{best.message} {unseen}".strip(),
     )  # fmt: skip
     return _without(best, f"{skipped} of {len(places)} mirror images" if skipped else "", monitor)
+
+
+def _sides_in_time(problem: Problem, here: Point, climb: SideClimb, monitor: Monitor) -> Sides | None:
+    """The other modes of a problem; None where the call is stopped while they are looked for."""
+
+    def mode(point: Point) -> tuple[Point, float]:
+        monitor.check()
+        return climb.mode(point)
+
+    monitor.enter("mirror images", answering=True)
+    try:
+        return other_sides(problem, here, climb._replace(mode=mode))
+    except Stopped:
+        return None
+
+
+def _like_first(
+    first: Answer,
+    problem: Problem,
+    method: Method,
+    point: Point,
+    context: Context,
+) -> Answer | None:
+    """The answer from a point, if it is valid, whole and in the form of the first."""
+    try:
+        found = method.answer(problem, first.prior, point, context)
+    except FitError:
+        return None
+    whole = found.status.valid and found.posterior.sound and not found.interrupted
+    return found if found.method == first.method and whole else None
 
 
 def _weight(answer: Answer) -> float:

@@ -23,7 +23,7 @@ from probcal.priors import Precision
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.blocks import SensorBlocks
-from probcal.results.groups import datum_of, node_of
+from probcal.results.groups import by_target, datum_of
 from probcal.results.read import Calibrated
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.joint import JointPrecision
@@ -31,7 +31,7 @@ from probcal.smoothing.linearised import Linearisation
 from probcal.smoothing.mode import Eliminated, Point, factors
 from probcal.smoothing.scans import recur_squared
 from probcal.smoothing.sparse_mode import system_at
-from probcal.status import Status
+from probcal.status import INVALID
 from probcal.types import float64
 
 if TYPE_CHECKING:
@@ -126,8 +126,12 @@ def unmoved(fit: Fitted) -> str:
 
 @jax.jit
 def _errors(
-    model: Model, lins: Sequence[Linearised], solved: Eliminated, noise: Data, biases: jax.Array
-) -> list[jax.Array]:  # fmt: skip
+    model: Model,
+    lins: Sequence[Linearised],
+    solved: Eliminated,
+    noise: Data,
+    biases: jax.Array,
+) -> list[jax.Array]:
     """Mean square (E, n) of the errors of the smoothed states of each recursion over K simulations.
 
     `noise` (N, C, K) is that of unit-noise data, `biases` (M, K) are the errors of the biases in z.
@@ -191,14 +195,12 @@ def track_factors(
         for sign, noise, moved in ((-1, plain, biases), (1, shown, wide[:, None] * biases)):
             errors = _errors(model, fit.lins, fit.solved, noise, jnp.asarray(moved))
             more = [own + sign * np.asarray(error) / chunks for own, error in zip(more, errors, strict=True)]
-    found = {}
-    for epochs, own, most in zip(fit.problem.epochs, more, before_data(model, fit.point.levels), strict=True):
-        for name in dict.fromkeys(map(str, epochs.target)):
-            mine = epochs.target == name
-            group = tracks[node_of(name)].to_dataset()
-            variance = group["sd"].values ** 2
-            grown = np.minimum(variance + np.maximum(own[mine], 0.0), np.maximum(np.asarray(most)[mine], variance))
-            found[node_of(name)] = np.sqrt(grown / np.where(variance > 0, variance, 1.0)).clip(1.0)
+    dims, found, most = ("time", "component"), {}, before_data(model, fit.point.levels)
+    for name, own in by_target(fit.problem, {"more": (dims, more), "most": (dims, most)}).items():
+        variance = tracks[name]["sd"].values ** 2
+        grown = variance + np.maximum(own["more"].values, 0.0)
+        grown = np.minimum(grown, np.maximum(own["most"].values, variance))
+        found[name] = np.sqrt(grown / np.where(variance > 0, variance, 1.0)).clip(1.0)
     return found
 
 
@@ -210,7 +212,7 @@ def widened(fit: Judged, rejected: Rejection, tree: xr.DataTree, root: Any) -> t
     "widened" of the groups says by which factor. A fit that is no answer stays as it is.
     """
     result = tree.copy()
-    if not rejected.reason or not Status(tree.attrs.get("status", Status.CONVERGED)).valid:
+    if not rejected.reason or tree.attrs.get("status") in INVALID:
         return result, ""
     text, wide, told = f"the innovations reject the model: {rejected.reason}", np.ones(len(rejected.inflation)), 1.0
     grown = []
@@ -303,14 +305,14 @@ def said(tree: xr.DataTree, text: str) -> None:
 
 
 def sentence(text: str) -> str:
-    """What was done as a sentence; empty for nothing."""
+    """The sentence of a clause; empty for none."""
     return f"{text[0].upper()}{text[1:]}." if text else ""
 
 
 @float64
 def judge_fit(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
     """A copy of the tree of a fit with what its innovations say in its message, its intervals widened by that."""
-    if not Status(tree.attrs["status"]).valid:
+    if tree.attrs["status"] in INVALID:
         return tree
     if tree.attrs.get("sparse", 0):
         large = take_up_large(answer.problem, tree, answer)
@@ -322,8 +324,11 @@ def judge_fit(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
 
 
 def judge_tracks(
-    tree: xr.DataTree, problem: Problem, known: Calibrated, at: Linearisation | Point
-) -> xr.DataTree:  # fmt: skip
+    tree: xr.DataTree,
+    problem: Problem,
+    known: Calibrated,
+    at: Linearisation | Point,
+) -> xr.DataTree:
     """A copy of tracks at a calibration, judged and widened likewise; `at` is the linearisation or, of many, the point.
 
     The biases are taken where rows and calibration together put them, so that an error within the sds of the
@@ -346,8 +351,13 @@ def judge_tracks(
 
 
 def _judged(
-    fit: Judged, found: Innovations, tree: xr.DataTree, root: Any, cause: str = "", more: str = ""
-) -> xr.DataTree:  # fmt: skip
+    fit: Judged,
+    found: Innovations,
+    tree: xr.DataTree,
+    root: Any,
+    cause: str = "",
+    more: str = "",
+) -> xr.DataTree:
     """A copy of a result, judged by its innovations; if there is something to say its message ends with `more`."""
     rejected = rejection(fit, found, residuals.channels_of(fit.data, found))
     result, text = widened(fit, rejected, tree, root)

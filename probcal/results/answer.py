@@ -235,7 +235,7 @@ class NormalPosterior(Posterior):
 
 
 def precisions_of(problem: Problem, prior: Prior) -> str:
-    """How a climb came by the precisions of the biases: "maximised", or "given" where it learns none."""
+    """The use of the precisions in a climb: "maximised", or "given" where it learns none."""
     return "maximised" if prior.learns and not problem.surveyed.all() else "given"
 
 

@@ -102,7 +102,7 @@ def load(path: str | PathLike[str]) -> xr.DataTree:
 
 
 def _sealed(path: Path) -> bool:
-    """Whether the digest behind the content matches it; a file that another program wrote has none."""
+    """True where the digest after the content matches it, or there is none, as of another program."""
     tail = len(SEAL) + hashlib.sha256().digest_size
     with path.open("rb") as file:
         left = file.seek(0, 2) - tail
@@ -199,7 +199,7 @@ def _check_moments(tree: xr.DataTree, path: Path) -> None:
 
 
 def _semi_definite(matrices: np.ndarray) -> bool:
-    """Whether matrices (B, M, M) are symmetric and positive semi-definite but for rounding."""
+    """True where matrices (B, M, M) are symmetric and positive semi-definite up to rounding."""
     size = np.sqrt(np.maximum(np.diagonal(matrices, axis1=1, axis2=2), np.finfo(float).tiny))
     unit = matrices / size[:, :, None] / size[:, None, :]
     if not (np.abs(unit - unit.swapaxes(1, 2)) <= LOSS).all():
