@@ -25,8 +25,8 @@ _looking = threading.Lock()
 def keep_kernels() -> None:
     """From the first call on, keep every kernel that jax compiles in the user's cache folder.
 
-    Nothing changes where jax has a folder already (`JAX_COMPILATION_CACHE_DIR`), where its cache is off, where
-    `PROBCAL_NO_CACHE` is set, and where the folder cannot be written.
+    Nothing changes where jax has a folder already (`JAX_COMPILATION_CACHE_DIR`), where its cache is
+    off, where `PROBCAL_NO_CACHE` is set, and where the folder cannot be written.
     """
     off = os.environ.get("PROBCAL_NO_CACHE") or not jax.config.jax_enable_compilation_cache
     if off or jax.config.jax_compilation_cache_dir:

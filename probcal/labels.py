@@ -16,7 +16,8 @@ FORMULA = ("=", "+", "-", "@")  # first characters of a cell that a spreadsheet 
 def check_name(what: str, name: str) -> None:
     """Raise `InputError` for a name that is blank or holds control characters, which a terminal would obey.
 
-    `what` names the thing. A name such as "'=a" is refused too: in a table it stands for "=a" (`escaped`).
+    `what` names the thing. A name such as "'=a" is refused too: in a table it stands for "=a"
+    (`escaped`).
     """
     if not name.strip():
         raise InputError(f'{what} has the blank name "{name}"; give it letters or digits')

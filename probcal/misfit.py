@@ -2,7 +2,8 @@
 
 A wrong sensor bends tracks and biases, so that every other sensor leaves large residuals too.
 Causes are looked for from the special to the general: values that repeat, single data, a jump in
-time, a sensor, channel or target whose mean square stands out, and there the factor of another unit.
+time, a sensor, channel or target whose mean square stands out, and there the factor of another
+unit.
 """
 
 from collections.abc import Iterable
@@ -42,8 +43,9 @@ class MisfitData(NamedTuple):
 def misfit_text(mean: float, points: Iterable[MisfitData]) -> str:
     """The mean square of a misfit, the worst datum, and the likely cause with its remedy.
 
-    Of several points, asked for one by one, the first that shows a special cause counts, else the first. A mean that is
-    not finite says that the fit has no answer, and that the points have the biases as stated.
+    Of several points, asked for one by one, the first that shows a special cause counts, else the
+    first. A mean that is not finite says that the fit has no answer, and that the points have the
+    biases as stated.
     """
     first, cause = None, ""
     for left in points:

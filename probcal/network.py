@@ -308,7 +308,8 @@ class Network:
     def surveyed(self, values: Mapping[str, tuple[float, float]]) -> "Network":
         """The same network with other stated values, as (value, sd) by the label of a bias; each sd is a survey.
 
-        A bias that is not among them stays as it is declared, and so do the steps of a drifting one.
+        A bias that is not among them stays as it is declared, and so do the steps of a drifting
+        one.
         """
         nodes = {node.name: node.surveyed(values) for node in self.nodes}
         sensors = []

@@ -98,9 +98,10 @@ class Problem:
     (where a target moves at v it is off by up to v epoch / 2). `silent` names the sensors without rows: `fit`
     refuses them, `track` does not. Raises `InputError` naming what is wrong.
 
-    A row whose sensor reads no target, such as a distance between two nodes, need not name one: its cell is blank, or
-    the column is left out. Where no row has a target the motion is None or left out, `Problem(network, data=table)`.
-    Inside, such rows share a target that is known for ever at the centre of the nodes; no track is reported of it.
+    A row whose sensor reads no target, such as a distance between two nodes, need not name one: its
+    cell is blank, or the column is left out. Where no row has a target the motion is None or left
+    out, `Problem(network, data=table)`. Inside, such rows share a target that is known for ever at
+    the centre of the nodes; no track is reported of it.
 
     >>> free = Problem(network, motion, run.table, fix="sonar_0.*")
     >>> free.model.biases, problem.model.biases

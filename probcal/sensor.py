@@ -359,9 +359,9 @@ def sensor(
 ) -> Callable[[Callable[..., Mapping[str, Any]]], SensorType]:
     """Declare a sensor type from a function `f(target, pose, *, bias=Bias(...))` that returns its channels.
 
-    The function sees one target and a pose for each of its nodes, and returns a dict of scalars by channel name;
-    keyword-only arguments are its biases. It is traced by jax: write `jnp.` for `np.` and `math.`, and
-    `jnp.where(condition, a, b)` for `if`.
+    The function sees one target and a pose for each of its nodes, and returns a dict of scalars by
+    channel name; keyword-only arguments are its biases. It is traced by jax: write `jnp.` for `np.`
+    and `math.`, and `jnp.where(condition, a, b)` for `if`.
 
     The target offers, in the common frame:
 
@@ -378,9 +378,10 @@ def sensor(
     - `local(point)`: a point in the node's own axes, from the node: x ahead, y left, z up;
     - `turn(vector)`: a vector in these axes.
 
-    `vectors` names the further components with one value per axis, as in `vectors=("wind",)`; position, velocity,
-    acceleration and moment need no name. `probcal.geometry` has `norm`, `bearing` and `elevation` with finite
-    gradients. Raises `InputError` naming function and argument.
+    `vectors` names the further components with one value per axis, as in `vectors=("wind",)`;
+    position, velocity, acceleration and moment need no name. `probcal.geometry` has `norm`,
+    `bearing` and `elevation` with finite gradients. Raises `InputError` naming function and
+    argument.
 
     >>> from probcal.geometry import norm
     >>> @sensor(range=Channel("m", std=0.5))

@@ -354,8 +354,8 @@ def _targets(
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Names of the targets, number of that of each row (N,), and which rows (N,) are detections that name none.
 
-    Detections have the target `OBJECT`, which stands for every object. Rows that name none and whose sensors are not
-    `reading` any (N,) have the target `NOBODY`.
+    Detections have the target `OBJECT`, which stands for every object. Rows that name none and
+    whose sensors are not `reading` any (N,) have the target `NOBODY`.
     """
     unnamed = np.where(detecting, OBJECT, np.where(reading, "target", NOBODY))
     if column is None:

@@ -3,18 +3,21 @@
 With s = 1 - [(G + I)^-1]_mm, G the information of the data in units of the declared scale (trajectories and other
 biases marginalised), how much the data narrow a bias, the first that applies:
 
-drifting     the halves of the recording differ on it beyond the limit, after what stronger changes explain
-conflicting  it lies beyond the limit of its survey (or of its scale under a prior that does not learn) and explains a
-             tenth of what the innovations have too much, or the targets disagree on it beyond the limit, after what
-             stronger changes explain
+drifting     the halves of the recording differ on it beyond the limit, after what stronger changes
+explain conflicting  it lies beyond the limit of its survey (or of its scale under a prior that does
+not learn) and explains a
+             tenth of what the innovations have too much, or the targets disagree on it beyond the
+             limit, after what stronger changes explain
 prior only   s < 0.05
 weak         s < 0.5 (information below 1), or one scale along a combination of biases that the data leave open would
-             put it more than 1.8 sd off, or it would move by more than one sd with the noise levels that the data ask
-             for or if the biases that drift were free to, or it lies beyond the limit of its survey by a misfit that is
-             mostly elsewhere, or it is another one in an answer that fits as well (a
-             mirror, all biases where a target touches it), or the answer is far from Gaussian, or the fit is no answer
-             (not converged, at bound, diverged), or the chains of the bias have not mixed, or it was pruned: held at
-             zero by a precision that was maximised; all are "conflicting" where the fit explains nothing (misfit)
+             put it more than 1.8 sd off, or it would move by more than one sd with the noise levels
+             that the data ask for or if the biases that drift were free to, or it lies beyond the
+             limit of its survey by a misfit that is mostly elsewhere, or it is another one in an
+             answer that fits as well (a mirror, all biases where a target touches it), or the
+             answer is far from Gaussian, or the fit is no answer (not converged, at bound,
+             diverged), or the chains of the bias have not mixed, or it was pruned: held at zero by
+             a precision that was maximised; all are "conflicting" where the fit explains nothing
+             (misfit)
 determined   none of these
 
 Limits have a false-alarm rate of 1 % over all biases together, and the standard deviations behind them carry the
@@ -69,7 +72,8 @@ def pull(z: np.ndarray, alpha: np.ndarray, gamma: np.ndarray, inflation: np.ndar
 def explained_part(z: np.ndarray, alpha: np.ndarray, gamma: np.ndarray, excess: float) -> np.ndarray:
     """Share (M,), one at most, of the excess chi-square of the innovations that each bias explains without its prior.
 
-    The squared distance from the prior, at the declared noise, is the chi-square that goes with that prior.
+    The squared distance from the prior, at the declared noise, is the chi-square that goes with
+    that prior.
     """
     return np.minimum(pull(z, alpha, gamma, np.ones(len(z))) ** 2 / max(excess, 1e-300), 1.0)
 

@@ -73,9 +73,10 @@ class EM(Maximiser):
     density changes by less than `tolerance`; 0 runs all `iterations`, as the papers do. Raises `InputError` for an
     E-step that is none.
 
-    `Particles(500)` as E-step is Paper A's algorithm: any motion, roads too; it stops where the biases only scatter
-    about a place. The intervals are by the slope of the score of the marginal likelihood over filters; `sd_error` is
-    the Monte Carlo error of each sd over the sd, and where it stays above 6 % the fit has not converged.
+    `Particles(500)` as E-step is Paper A's algorithm: any motion, roads too; it stops where the
+    biases only scatter about a place. The intervals are by the slope of the score of the marginal
+    likelihood over filters; `sd_error` is the Monte Carlo error of each sd over the sd, and where
+    it stays above 6 % the fit has not converged.
     """
 
     e_step: EStep | Particles = EXTENDED

@@ -46,7 +46,8 @@ def conclude(
 ) -> Answer:
     """The answer of a method whose outer loop ended in a state, whose data leave a mean square a datum.
 
-    Where precisions were integrated after it, `mixed` is what came of it; `stopped` says why it was ended early.
+    Where precisions were integrated after it, `mixed` is what came of it; `stopped` says why it was
+    ended early.
     """
     answer = conclude_at(
         problem, method, prior, _posterior(problem, prior, state, how, mixed), trace, square, iterations,

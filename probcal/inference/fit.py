@@ -79,21 +79,24 @@ def fit(
 ) -> xr.DataTree:
     """Calibrate: estimate the biases of a problem and the tracks of its targets.
 
-    `method` is a value (`EA()` by default); `prior` defaults to the method's own; `key` is a seed or jax key
-    of the draws and of further starts; `start` replaces the automatic start. `starts` runs the method from so many
-    starts, the further ones with two nodes swapped or a share of the biases drawn: the best optimum is reported,
-    all of them with their evidence in the group `optimum`. `save` names draws that the tree keeps beside those of the
-    biases and of the log-likelihood: "states" of every epoch (large), "predictive" replicas of the data. A
-    sampler (`Collapsed()`, `NUTS()`, `SVI()`) writes its draws to the folder `store` while it runs; `resume` goes on
-    where a killed run of the same model, data and settings stopped, with the draws of an uninterrupted one. A folder
-    that holds a run is refused without `resume` or `overwrite`. `progress` is called with the phase, the steps done and
-    the seconds (`Progress`). After `limit` seconds the search for other answers ends, and so do a climb and a sampler
-    that are not done. Ctrl-C ends a fit in the same way: the best answer so far, or the draws so far, come back with
-    the attribute `interrupted` and the status "not converged"; before there is one, and a second time, it raises. The
-    attributes `status` and `message` say what the fit is worth. Where the innovations reject the model, the sds,
-    intervals and draws of biases and states are widened by what they call for; `assess` looks for the cause, and sets
-    the attribute `assessed`. Raises `InputError` for a prior that the method does not take and `FitError` where a flat
-    prior leaves a singular problem without any interval.
+    `method` is a value (`EA()` by default); `prior` defaults to the method's own; `key` is a seed
+    or jax key of the draws and of further starts; `start` replaces the automatic start. `starts`
+    runs the method from so many starts, the further ones with two nodes swapped or a share of the
+    biases drawn: the best optimum is reported, all of them with their evidence in the group
+    `optimum`. `save` names draws that the tree keeps beside those of the biases and of the
+    log-likelihood: "states" of every epoch (large), "predictive" replicas of the data. A sampler
+    (`Collapsed()`, `NUTS()`, `SVI()`) writes its draws to the folder `store` while it runs;
+    `resume` goes on where a killed run of the same model, data and settings stopped, with the draws
+    of an uninterrupted one. A folder that holds a run is refused without `resume` or `overwrite`.
+    `progress` is called with the phase, the steps done and the seconds (`Progress`). After `limit`
+    seconds the search for other answers ends, and so do a climb and a sampler that are not done.
+    Ctrl-C ends a fit in the same way: the best answer so far, or the draws so far, come back with
+    the attribute `interrupted` and the status "not converged"; before there is one, and a second
+    time, it raises. The attributes `status` and `message` say what the fit is worth. Where the
+    innovations reject the model, the sds, intervals and draws of biases and states are widened by
+    what they call for; `assess` looks for the cause, and sets the attribute `assessed`. Raises
+    `InputError` for a prior that the method does not take and `FitError` where a flat prior leaves
+    a singular problem without any interval.
 
     >>> found = fit(problem)
     >>> found.attrs["status"]
@@ -331,13 +334,14 @@ def track(
 ) -> xr.DataTree:
     """Tracks of other data with a calibration applied: a tree with group `track` (mean, sd, before).
 
-    The biases are held at the calibrated means; the sd carries their covariance, of a fit in sparse form that of each
-    sensor by itself. Biases are matched by label. Where the innovations reject the model the sds are widened by what
-    they call for, and the attribute `message` says so. Without
-    a `smoother` each track is its mode and the Gaussian about it; `Particles(2000)` filters and smooths any motion, a
-    road too, by draws that `key` seeds, and says in the attributes `status` and `message` whether some target's rows
-    are explained by no path. Of detections that name no target the objects are found first (`track_objects`), as groups
-    `association` and `object`. Raises `InputError` if the calibration lacks a bias, and where a motion has no linear
+    The biases are held at the calibrated means; the sd carries their covariance, of a fit in sparse
+    form that of each sensor by itself. Biases are matched by label. Where the innovations reject
+    the model the sds are widened by what they call for, and the attribute `message` says so.
+    Without a `smoother` each track is its mode and the Gaussian about it; `Particles(2000)` filters
+    and smooths any motion, a road too, by draws that `key` seeds, and says in the attributes
+    `status` and `message` whether some target's rows are explained by no path. Of detections that
+    name no target the objects are found first (`track_objects`), as groups `association` and
+    `object`. Raises `InputError` if the calibration lacks a bias, and where a motion has no linear
     form and there is no smoother.
 
     >>> later = track(Problem(network, motion, run.table), tree)

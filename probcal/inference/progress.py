@@ -1,6 +1,7 @@
 """The course of a long call: how far it has come, and what ends it before it is done.
 
-A `Monitor` is the one place that knows both. A loop tells it where it stands, and asks whether it shall stop.
+A `Monitor` is the one place that knows both. A loop tells it where it stands, and asks whether it
+shall stop.
 """
 
 import math
@@ -72,8 +73,9 @@ class Stopped(Exception):
 class Monitor:
     """Reports how far a call has come, and says whether it shall stop: at a limit of time, or interrupted.
 
-    An interruption, Ctrl-C or a `progress` that raises `KeyboardInterrupt`, stops the loops once there is an answer to
-    keep. Before that, and a second time, it is raised. Raises `InputError` for a limit that is not positive.
+    An interruption, Ctrl-C or a `progress` that raises `KeyboardInterrupt`, stops the loops once
+    there is an answer to keep. Before that, and a second time, it is raised. Raises `InputError`
+    for a limit that is not positive.
     """
 
     def __init__(

@@ -31,7 +31,8 @@ def _smoothed(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     good = np.isfinite(k) & (sigma > 0) & ~same
     probability = (np.arange(0.5, tail) / tail)[None]
     shape, scale = np.where(good, k, 1.0)[:, None], np.where(good, sigma, 1.0)[:, None]
-    # in logarithms: quantiles of a very heavy tail overflow before they are cut to the largest ratio
+    # in logarithms: quantiles of a very heavy tail overflow before they are cut to the largest
+    # ratio
     flat = np.where(shape == 0, 1.0, shape)
     power = -flat * np.log1p(-probability)
     curved = np.maximum(power, 0.0) + np.log(-np.expm1(-np.abs(power))) - np.log(np.abs(flat))

@@ -215,8 +215,8 @@ def innovations_large(
 ) -> Innovations:
     """Innovations of a fit in sparse form, biases at their means or shifted (N, p) from row to row.
 
-    The degrees of freedom that the biases used, the sum of `gamma` (M,), are shared among the data by the variance
-    that the biases of the own sensor give each of them.
+    The degrees of freedom that the biases used, the sum of `gamma` (M,), are shared among the data
+    by the variance that the biases of the own sensor give each of them.
     """
     moved = [jnp.zeros((lin.bias.shape[0], lin.bias.shape[2])) for lin in fit.lins]
     moved = moved if shift is None else [jnp.asarray(own) for own in shift]

@@ -150,9 +150,9 @@ def sample(
 ) -> SamplerRun:
     """Draws of a method from the posterior of a problem.
 
-    `storage` keeps draws and state, and what it holds is gone on with; `monitor` may end it early. `fallback` takes
-    over where the frame does not fit and has its prior. Raises `FitError` where no draw is finite, `InputError` where a
-    stored chunk is damaged.
+    `storage` keeps draws and state, and what it holds is gone on with; `monitor` may end it early.
+    `fallback` takes over where the frame does not fit and has its prior. Raises `FitError` where no
+    draw is finite, `InputError` where a stored chunk is damaged.
     """
     began = time.perf_counter()
     keys = jax.random.split(key)
@@ -204,8 +204,8 @@ def drawn_by(
 ) -> tuple[Draw, int, str]:
     """Draws of all chains, chunk by chunk, steps from one to the next, and why they were ended early.
 
-    What a storage holds is gone on with. Raises `FitError` where no draw is finite, and where a limit of time leaves
-    none.
+    What a storage holds is gone on with. Raises `FitError` where no draw is finite, and where a
+    limit of time leaves none.
     """
     box = Chunks(Storage(None, "draws", {}) if storage is None else storage)
     state = runs.restored(box.state) if box.state is not None else runs.first()

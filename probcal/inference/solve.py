@@ -38,9 +38,9 @@ def solve(
 ) -> Answer:
     """The answer of a method, the best of several starts; its `optima` are all of them where there are several.
 
-    A sampler starts at the best joint mode under the declared scales where there are several starts, or noise levels
-    that are unknown. The context's key seeds draws and further starts; its monitor may end the search for other answers
-    than the first.
+    A sampler starts at the best joint mode under the declared scales where there are several
+    starts, or noise levels that are unknown. The context's key seeds draws and further starts; its
+    monitor may end the search for other answers than the first.
     """
     monitor = context.monitor
     monitor.enter("start", method.name)

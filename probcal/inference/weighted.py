@@ -258,9 +258,10 @@ class ScoreSlope(NamedTuple):
 def score_slope(paths: Paths, told: Louis, prior: np.ndarray, z: Any, levels: Any, key: jax.Array) -> ScoreSlope:
     """Information of the biases z (M,) under a prior of precision (M, M), by regression of scores on biases.
 
-    Louis' identity takes the difference of two large matrices. The score (Fisher's identity) at pairs of places
-    z + d and z - d, one sd apart in random orthogonal directions, needs no difference: its mean slope is minus the
-    information averaged over the posterior. Pairs are added until every sd is known to `SD_ERROR`.
+    Louis' identity takes the difference of two large matrices. The score (Fisher's identity) at
+    pairs of places z + d and z - d, one sd apart in random orthogonal directions, needs no
+    difference: its mean slope is minus the information averaged over the posterior. Pairs are added
+    until every sd is known to `SD_ERROR`.
     """
     paths, M = paths.along_paths(), len(z)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
@@ -287,7 +288,8 @@ def score_slope(paths: Paths, told: Louis, prior: np.ndarray, z: Any, levels: An
 def regressed_scores(away: np.ndarray, scores: np.ndarray, logs: np.ndarray, prior: np.ndarray) -> ScoreSlope:
     """Minus the slope of scores (K, M) on places (K, M), and what its error means for each sd under a prior (M, M).
 
-    Filters whose log-likelihoods, less those expected, lie far below the others' lost a target and count less.
+    Filters whose log-likelihoods, less those expected, lie far below the others' lost a target and
+    count less.
     """
     K, M = away.shape
     weight = np.exp(np.minimum(logs - np.median(logs) + LOST, 0.0))

@@ -103,7 +103,8 @@ def scattered(fit: Judged, found: Innovations, high: bool) -> str:
 def unmoved(fit: Fitted) -> str:
     """A sentence on the component whose smoothed process noises are nearest to nothing, if less than `UNMOVED`.
 
-    Under the model a whitened noise has mean square one, of which smoothing leaves one less its variance.
+    Under the model a whitened noise has mean square one, of which smoothing leaves one less its
+    variance.
     """
     problem, found = fit.problem, dict[str, float]()
     parts = zip(problem.epochs, problem.model.recursions, fit.point.noises, fit.at.trajectories, strict=True)
@@ -183,8 +184,9 @@ def track_factors(
 ) -> dict[str, np.ndarray]:
     """Factors (time, component) of the sd of every target's states, by the name of its group; never beyond the prior.
 
-    The variance of a smoothed state grows by that of the errors which noise as the innovations show it, and biases
-    `wide` (M,) times as uncertain, make beyond those of the model: both are simulated with the smoother of the fit.
+    The variance of a smoothed state grows by that of the errors which noise as the innovations show
+    it, and biases `wide` (M,) times as uncertain, make beyond those of the model: both are
+    simulated with the smoother of the fit.
     """
     model, rng = fit.problem.model, np.random.default_rng(0)
     chunks = int(np.clip(NUMBERS // (residuals.COLUMNS * max(len(fit.data), 1)), 1, CHUNKS))
@@ -207,9 +209,10 @@ def track_factors(
 def widened(fit: Judged, rejected: Rejection, tree: xr.DataTree, root: Any) -> tuple[xr.DataTree, str]:
     """A copy of a result whose biases and tracks have the variance that the innovations call for, and what was done.
 
-    `root` (M, R) is of the covariance of z. A bias takes the share gamma of its inflation, and no sd exceeds that of
-    the prior. Means keep their place; sd, interval, covariance and the spread of the draws grow together, and
-    "widened" of the groups says by which factor. A fit that is no answer stays as it is.
+    `root` (M, R) is of the covariance of z. A bias takes the share gamma of its inflation, and no
+    sd exceeds that of the prior. Means keep their place; sd, interval, covariance and the spread of
+    the draws grow together, and "widened" of the groups says by which factor. A fit that is no
+    answer stays as it is.
     """
     result = tree.copy()
     if not rejected.reason or tree.attrs.get("status") in INVALID:
@@ -331,8 +334,9 @@ def judge_tracks(
 ) -> xr.DataTree:
     """A copy of tracks at a calibration, judged and widened likewise; `at` is the linearisation or, of many, the point.
 
-    The biases are taken where rows and calibration together put them, so that an error within the sds of the
-    calibration is no misfit. Of many biases it raises what the innovations are expected to scatter.
+    The biases are taken where rows and calibration together put them, so that an error within the
+    sds of the calibration is no misfit. Of many biases it raises what the innovations are expected
+    to scatter.
     """
     datum, picks = datum_of(problem)
     data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})

@@ -27,8 +27,9 @@ class Known(Component):
 
     `track` is a DataFrame with the columns time, position_x, position_y[, position_z] and, where known, velocity_x,
     ... (or a pair of arrays, times (T,) in s and positions (T, d) in m); without velocities they are its differences.
-    `std` is that of the reported position on each axis in m, drawn anew at every epoch; 0 takes it as exact.
-    `noise=StudentT(4)` allows for outliers of the report; all axes of an epoch share its latent scale.
+    `std` is that of the reported position on each axis in m, drawn anew at every epoch; 0 takes it
+    as exact. `noise=StudentT(4)` allows for outliers of the report; all axes of an epoch share its
+    latent scale.
 
     >>> Known(([0.0, 10.0], [(0.0, 0.0), (50.0, 0.0)]), std=0.02).std
     0.02

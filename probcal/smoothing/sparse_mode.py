@@ -191,8 +191,8 @@ def find_sparse_mode(
 ) -> SparseMode:  # fmt: skip
     """Climb to the mode of the marginal density under precisions alpha (M,) until a step promises less than tolerance.
 
-    A step that does not bring its share of what it promises is halved. It ends where `told`, called with the number of
-    steps and the density, says so. Raises `numpy.linalg.LinAlgError` where the
+    A step that does not bring its share of what it promises is halved. It ends where `told`, called
+    with the number of steps and the density, says so. Raises `numpy.linalg.LinAlgError` where the
     precision is not positive definite: a flat prior on what no data tell.
     """
 
