@@ -30,7 +30,8 @@ class FitError(RuntimeError):
 
 
 def checked[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """Raise `InputError` for an argument that is missing or not of its declared class, for the classes of `GIVE`.
+    """Raise `InputError` for an argument that is missing or not of its declared class, for the
+    classes of `GIVE`.
 
     Classes are compared by name, so that no module is imported for the annotations.
     """

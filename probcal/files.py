@@ -51,7 +51,10 @@ def write_whole(path: str | PathLike[str], data: bytes | memoryview | str) -> Pa
 
 
 def parsed_json(content: bytes) -> Any:
-    """The value of a JSON text in UTF-8, with or without a byte order mark; raises `ValueError` for anything else."""
+    """The value of a JSON text in UTF-8, with or without a byte order mark.
+
+    Raises `ValueError` for anything else.
+    """
     try:
         return json.loads(content.decode("utf-8-sig"))
     except RecursionError:

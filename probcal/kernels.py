@@ -1,4 +1,5 @@
-"""Compiled kernels: kept in a folder between processes, and dropped before memory maps run out in one of them."""
+"""Compiled kernels: kept in a folder between processes, and dropped before memory maps run out in
+one of them."""
 
 import os
 import threading

@@ -1,4 +1,7 @@
-"""The labels of biases and what they are made of, and other names that stand in results; text only."""
+"""The labels of biases and what they are made of, and other names that stand in results.
+
+Text only.
+"""
 
 import unicodedata
 from collections.abc import Collection, Sequence
@@ -9,12 +12,14 @@ AXES = ("x", "y", "z")
 SCENE, PIECE, NODE, START = "scene", "piece", "node", "start"  # what an answer beside another differs by
 NOBODY = "no target"  # the target of rows that name none and whose sensor reads none
 
-UNPRINTED = ("Cc", "Cs", "Zl", "Zp")  # Unicode categories: control characters, half of a pair, ends of lines
+# Unicode categories: control characters, half of a pair, ends of lines
+UNPRINTED = ("Cc", "Cs", "Zl", "Zp")
 FORMULA = ("=", "+", "-", "@")  # first characters of a cell that a spreadsheet computes
 
 
 def check_name(what: str, name: str) -> None:
-    """Raise `InputError` for a name that is blank or holds control characters, which a terminal would obey.
+    """Raise `InputError` for a name that is blank or holds control characters, which a terminal
+    would obey.
 
     `what` names the thing. A name such as "'=a" is refused too: in a table it stands for "=a"
     (`escaped`).
@@ -28,7 +33,8 @@ def check_name(what: str, name: str) -> None:
 
 
 def escaped(text: str) -> str:
-    """A text as the cell of a table: one that a spreadsheet would compute gets an apostrophe in front.
+    """A text as the cell of a table: one that a spreadsheet would compute gets an apostrophe in
+    front.
 
     >>> escaped("=a.gain"), escaped("-1"), unescaped("'=a.gain")
     ("'=a.gain", '-1', '=a.gain')

@@ -18,7 +18,8 @@ FEW = 0.01  # share of all data up to which data are few
 STANDS_OUT = 10.0  # mean square of a group over that of the rest, from which it is named
 STEP = 0.5  # share of a channel's squares about their mean that a step explains to be named
 NEAR = 5  # data on either side of a step whose medians are compared
-SUDDEN = 6.0  # times the usual change of such medians, from which a step is one (1.3 % of random walks)
+# times the usual change of such medians, from which a step is one (1.3 % of random walks)
+SUDDEN = 6.0
 LOOSE = 0.15  # relative tolerance of the log of a factor: a wrong unit bends the predictions too
 APART = 3.0  # log of a factor between units from which sizes of values tell it
 WITHIN = 0.7  # of such a log: distances differ by two from sensor to sensor
@@ -165,7 +166,10 @@ def _codes(*columns: np.ndarray) -> tuple[list[str], np.ndarray]:
 
 
 def _other_unit(left: MisfitData, mine: np.ndarray) -> str:
-    """The unit that a constant factor between measured and predicted values tells; empty where none does."""
+    """The unit that a constant factor between measured and predicted values tells.
+
+    Empty where none does.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(left.value[mine] / (left.value[mine] - left.residual[mine]))
     logs = logs[np.isfinite(logs)]
@@ -178,7 +182,8 @@ def _other_unit(left: MisfitData, mine: np.ndarray) -> str:
 
 
 def _sizes(left: MisfitData) -> str:
-    """A sensor whose values are larger or smaller than those of the others of its channel by the factor of a unit."""
+    """A sensor whose values are larger or smaller than those of the others of its channel by the
+    factor of a unit."""
     names, code = _codes(left.sensor, left.channel)
     _, first = np.unique(code, return_index=True)
     channel = left.channel[first]
@@ -198,7 +203,10 @@ def _sizes(left: MisfitData) -> str:
 
 
 def _nearest_unit(own: str, log: float) -> tuple[str, float]:
-    """The unit of the same quantity whose numbers are nearest to a factor, and the log of its own; 0 where none is."""
+    """The unit of the same quantity whose numbers are nearest to a factor, and the log of its own.
+
+    0 where none is.
+    """
     quantity, size = UNITS.get(own, ("", 1.0))
     factors = {unit: float(np.log(size / other)) for unit, (kind, other) in UNITS.items() if kind == quantity}
     factors = {unit: factor for unit, factor in factors.items() if factor}

@@ -122,7 +122,8 @@ class Node:
                     f" np.deg2rad({value:g})"
                 )
         self.spread: dict[str, tuple[str, Bias]] = {}
-        self.sizes: dict[str, tuple[float, ...]] = {}  # standard deviations by axis, where these differ
+        # standard deviations by axis, where these differ
+        self.sizes: dict[str, tuple[float, ...]] = {}
         for kind, given in (("survey", survey), ("scale", scale)):
             entries: Mapping[str, Spread] = (
                 given if isinstance(given, Mapping) else {} if given is None else {"position": given}
@@ -174,7 +175,8 @@ class Node:
         return self.sizes.get(component, (self.spread[component][1].scale,) * len(self.labels(component)))
 
     def surveyed(self, values: Mapping[str, tuple[float, float]]) -> "Node":
-        """This node with other stated values, as (value, sd) by the label of a bias; each sd is a survey."""
+        """This node with other stated values, as (value, sd) by the label of a bias; each sd is a
+        survey."""
         node = copy(self)
         node.components, node.spread, node.sizes = dict(self.components), dict(self.spread), dict(self.sizes)
         for component, (_, bias) in self.spread.items():
@@ -306,7 +308,8 @@ class Network:
         return Network(sensors, frame=self.frame)
 
     def surveyed(self, values: Mapping[str, tuple[float, float]]) -> "Network":
-        """The same network with other stated values, as (value, sd) by the label of a bias; each sd is a survey.
+        """The same network with other stated values, as (value, sd) by the label of a bias; each sd
+        is a survey.
 
         A bias that is not among them stays as it is declared, and so do the steps of a drifting
         one.

@@ -22,11 +22,13 @@ FEW = 8  # values below which a column has no spread
 FAINT, RANGE = 0.1, 30.0  # largest value of a column of powers in W, and the ratio to its smallest
 NARROW, WIDE = 1e-9, 1e6  # of the size of a column: smallest and largest std
 
-LOOSE = 1e6  # noise stds in a scale or survey: at 1e7 the sd of three nodes' common shift is 17 % off (radars)
+# noise stds in a scale or survey: at 1e7 the sd of three nodes' common shift is 17 % off (radars)
+LOOSE = 1e6
 
 
 def check_scales(biases: Iterable[BiasRecord], network: Network) -> None:
-    """Raise `InputError` for a scale or survey so wide that it is lost in the rounding of what the rows tell."""
+    """Raise `InputError` for a scale or survey so wide that it is lost in the rounding of what the
+    rows tell."""
     finest: dict[tuple[str, str], float] = {}
     for placed in network.sensors:
         for channel in placed.type.channels.values():

@@ -29,7 +29,8 @@ WORDS = {  # unit: words that stand for it where the symbol is asked for, in the
 
 
 def meant_unit(unit: str) -> str | None:
-    """The symbol of a unit that is written as a word or in other letters, None where it is none of `WORDS`."""
+    """The symbol of a unit that is written as a word or in other letters, None where it is none of
+    `WORDS`."""
     if unit in WORDS:
         return None
     word = unit.strip().lower()
@@ -277,7 +278,8 @@ class Sensor:
     nodes: tuple[Any, ...]
     name: str
     detection: Detection | None = None  # where its rows need not name a target
-    known: Mapping[str, Bias] = field(default_factory=dict)  # its biases that were calibrated: nominal is the value
+    # its biases that were calibrated: nominal is the value
+    known: Mapping[str, Bias] = field(default_factory=dict)
 
 
 class _Probe:

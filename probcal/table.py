@@ -54,7 +54,8 @@ class Table:
     word: str = "row"
 
     def where(self, row: int) -> str:
-        """Name of a row in complaints: line of the file (the header is line 1), label or position in the frame."""
+        """Name of a row in complaints: line of the file (the header is line 1), label or position
+        in the frame."""
         return f"{self.source} {self.word} {self.lines[row]}"
 
 
@@ -107,7 +108,8 @@ def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
 
 
 def _plain(frame: pd.DataFrame) -> pd.DataFrame:
-    """Replace cells that pandas cannot compare: an array without axes is its value, masked and signalling NaN blank."""
+    """Replace cells that pandas cannot compare: an array without axes is its value, masked and
+    signalling NaN blank."""
     for k, dtype in enumerate(frame.dtypes):
         column = frame.iloc[:, k] if dtype.kind == "O" else ()
         if {*map(type, column)} & {np.ndarray, type(np.ma.masked), Decimal}:
@@ -218,7 +220,8 @@ def split_header(column: object) -> tuple[str, str | None]:
 
 
 def csv_text(frame: pd.DataFrame, *, header: bool = True) -> str:
-    """A table as CSV. Every writer of tables calls it: no text in it is a formula to a spreadsheet (`escaped`)."""
+    """A table as CSV. Every writer of tables calls it: no text in it is a formula to a spreadsheet
+    (`escaped`)."""
     cells = frame.rename(columns=lambda name: escaped(str(name)))
     for k, dtype in enumerate(frame.dtypes):
         if not pd.api.types.is_numeric_dtype(dtype):

@@ -24,7 +24,8 @@ LIBRARIES = ("probcal", "jax", "jaxlib", "numpy")  # packages whose lines are no
 
 
 def float64[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """Run a public entry point in double precision, its arguments checked, its kernels kept between processes."""
+    """Run a public entry point in double precision, its arguments checked, its kernels kept between
+    processes."""
     run = checked(function)
 
     @functools.wraps(function)
@@ -44,7 +45,10 @@ def float64[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 
 
 def untraceable(error: BaseException) -> str | None:
-    """The line of a user's file that jax cannot follow, with the remedy; None where no such line is to blame."""
+    """The line of a user's file that jax cannot follow, with the remedy.
+
+    None where no such line is to blame.
+    """
     remedy = next((text for kind, text in REMEDIES.items() if isinstance(error, kind)), None)
     own = [
         (frame.f_code.co_filename, line)

@@ -21,7 +21,7 @@ from probcal.analysis import (
     verdict,
 )
 from probcal.analysis.beside import mirror_doubts, mirror_findings
-from probcal.analysis.findings import Finding, alarms, completed
+from probcal.analysis.findings import Finding, alarms, completed, of_invalid
 from probcal.analysis.large import assess_large
 from probcal.analysis.pieces import Change, Pieces
 from probcal.analysis.verdict import RATE, limit_of
@@ -100,10 +100,7 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
         groups[f"{name}_check"], more = checks.squares_by(fit, found.innovations, name)
         findings += more
     findings += checks.outlying(fit, found.innovations)
-    residual = tree["residual"].to_dataset()
-    findings += [
-        Finding("wrapping", *pair) for pair in residuals.wrapping(fit, residual["after"].values, residual["std"].values)
-    ]
+    findings += checks.wrapping(fit, tree)
     findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups) + process.check_process_noise(fit, keys[2])
     bent = None if tree.attrs["status"] in INVALID else shape.check_shape(fit, tree)
     findings += [] if bent is None else [bent]
@@ -118,11 +115,8 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     columns = [groups["verdict"][name].values.tolist() for name in ("bias_label", "verdict", "reason")]
     findings += alarms(*columns)
     if tree.attrs["status"] in INVALID:
-        text = f"the fit ended {tree.attrs['status']}: the checks of its residuals and biases are not meaningful"
-        kept = [
-            f for f in findings if f.kind in ("wrapping", "nis" if _absurd(tree) else "outliers")
-        ]  # likely causes; the message of a misfit has its own
-        findings = [Finding("status", "fit", text), *kept]
+        # likely causes; the message of a misfit has its own
+        findings = of_invalid(tree, findings, ("wrapping", "nis" if _absurd(tree) else "outliers"))
     scaled = scaling.power_scaling(tree) if leave.weighable(tree) else None
     if scaled is not None:
         groups["sensitivity"] = scaled

@@ -21,6 +21,10 @@ NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal
 TOGETHER = 0.3  # share of outliers whose next lies off to the same side, from which something else is wrong
 SEVERAL = 2  # data of one target that are off at one time, and are then no outliers
 GAIN = 5.0  # nats that a calibration must win before it is a finding
+NEAR_TURN = 1.0  # rad of a full turn within which a residual tells of a missing wrap
+WIDE = np.pi / 3  # noise std in rad above which a wrapped angle is ambiguous
+FAR = 2 * np.pi / 3  # rad beyond which a wrapped residual may belong to the next turn
+SHARE = 0.01  # of a channel's data beyond which its residuals are
 
 
 def _sized(names: list[str], values: np.ndarray, order: np.ndarray) -> str:
@@ -120,6 +124,31 @@ def outlying(fit: Judged, found: residuals.Innovations) -> list[Finding]:
     named = listed([f"{name} {count}" for name, count in counts.items()], NAMES)
     text = f"single data lie more than {OUTLYING:g} std off: {named}; declare Channel(..., noise=StudentT(4))"
     return [Finding("outliers", next(iter(counts)), text)]
+
+
+def wrapping(fit: Judged, tree: xr.DataTree) -> list[Finding]:
+    """Findings on angles: residuals a turn off without `wrap`, or too wide with it."""
+    found, left = list[Finding](), tree["residual"].to_dataset()
+    innovation, std = left["after"].values, left["std"].values
+    for kind in fit.problem.network.types:
+        for name, channel in kind.expand(fit.problem.network.dimension):
+            ours = [s.name for s in fit.problem.network.sensors if s.type == kind]
+            mine = (fit.data["channel"] == name).to_numpy() & fit.data["sensor"].isin(ours).to_numpy()
+            turn = {"rad": 1.0, "deg": np.pi / 180}.get(channel.unit)
+            if turn is None or not mine.any():
+                continue
+            residual, spread = np.abs(innovation[mine]) * turn, std[mine] * turn
+            subject, off = f"{kind.name}.{name}", np.abs(residual - 2 * np.pi) < NEAR_TURN
+            if channel.period is None and off.any():
+                text = f"{off.sum()} of {len(off)} residuals lie a full turn off: declare wrap=True"
+            elif channel.period is not None and np.median(spread) > WIDE:
+                text = f"its noise std of {np.median(spread):.2f} rad is too wide for an angle: wrapping is ambiguous"
+            elif channel.period is not None and (residual > FAR).mean() > SHARE:
+                text = f"{(residual > FAR).sum()} of {len(off)} residuals lie beyond 120 deg: wrapping is ambiguous"
+            else:
+                continue
+            found.append(Finding("wrapping", subject, f"{subject}: {text}"))
+    return found
 
 
 def _unlike_replicas(kind: str, names: list[str], p: np.ndarray, draws: int) -> list[Finding]:

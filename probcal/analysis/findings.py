@@ -24,7 +24,8 @@ class Finding(NamedTuple):
 
 
 def alarms(labels: Sequence[str], verdicts: Sequence[str], reasons: Sequence[str]) -> list[Finding]:
-    """Findings on biases that drift or are in conflict: each reason once, with the biases that have it."""
+    """Findings on biases that drift or are in conflict: each reason once, with the biases that have
+    it."""
     owners = dict[tuple[str, str], list[str]]()
     for label, word, reason in zip(labels, verdicts, reasons, strict=True):
         owners.setdefault((word, reason), []).append(label)
@@ -33,6 +34,17 @@ def alarms(labels: Sequence[str], verdicts: Sequence[str], reasons: Sequence[str
         for (word, reason), own in owners.items()
         if word in ("drifting", "conflicting")
     ]
+
+
+def of_invalid(
+    tree: xr.DataTree,
+    findings: Sequence[Finding],
+    causes: Sequence[str],
+) -> list[Finding]:
+    """The findings on a fit that ended without an answer: a first sentence, and those of some kinds."""
+    ended = f"the fit ended {tree.attrs['status']}"
+    text = f"{ended}: the checks of its residuals and biases are not meaningful"
+    return [Finding("status", "fit", text), *(f for f in findings if f.kind in causes)]
 
 
 def in_order(findings: list[Finding]) -> list[Finding]:

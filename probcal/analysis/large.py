@@ -15,7 +15,7 @@ import xarray as xr
 
 from probcal.analysis import checks, pieces, verdict
 from probcal.analysis.beside import mirror_doubts, mirror_findings
-from probcal.analysis.findings import Finding, completed
+from probcal.analysis.findings import Finding, completed, of_invalid
 from probcal.analysis.halves import SAMPLED, Divided, Halves, drifts_of
 from probcal.identifiability.directions import shared_in_blocks
 from probcal.inference import residuals
@@ -49,9 +49,7 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
         groups[f"{name}_check"], more = checks.squares_by(fit, found, name)
         findings += more
     findings += checks.outlying(fit, found)
-    residual = tree["residual"].to_dataset()
-    turned = residuals.wrapping(fit, residual["after"].values, residual["std"].values)
-    findings += [Finding("wrapping", *pair) for pair in turned]
+    findings += checks.wrapping(fit, tree)
     rejected, declared = rejection(fit, found, channels), _declared(fit, tree, answer)
     groups["verdict"] = _verdicts(fit, tree, rejected, declared, found.excess, groups)
     if "halves" in groups and (unsolved := groups["halves"].attrs["unsolved"]):
@@ -59,8 +57,7 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
         findings.append(Finding("halves", "fit", text))
     findings += mirror_findings(tree)
     if tree.attrs["status"] in INVALID:
-        text = f"the fit ended {tree.attrs['status']}: the checks of its residuals and biases are not meaningful"
-        findings = [Finding("status", "fit", text), *(f for f in findings if f.kind in ("wrapping", "nis"))]
+        findings = of_invalid(tree, findings, ("wrapping", "nis"))
     result, text = widened(fit, rejected, tree, fit.blocks.root())
     return completed(result, text, groups, findings)
 

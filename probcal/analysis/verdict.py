@@ -36,7 +36,8 @@ from probcal.status import Status
 
 RATE = 0.01  # false alarms of each kind of check, all its comparisons together
 PRIOR_ONLY, WEAK = 0.05, 0.5
-PART = 0.1  # share of the chi-square of the innovations above its mean from which a bias is one of its causes
+# share of the chi-square of the innovations above its mean from which a bias is one of its causes
+PART = 0.1
 VERDICTS = ("determined", "prior only", "weak", "drifting", "conflicting")
 
 
@@ -47,7 +48,8 @@ class Grounds(NamedTuple):
     square: np.ndarray  # of halves alike, over its limit's chi-square, 0 where nothing can be told
     pull: np.ndarray  # sd from the prior, 0 where the prior follows the data
     limit: float  # of pull and of the root of `square`
-    part: Any = 1.0  # share of the chi-square that the innovations have too much which the bias alone explains
+    # share of the chi-square that the innovations have too much which the bias alone explains
+    part: Any = 1.0
 
 
 def contraction(information: np.ndarray) -> np.ndarray:
@@ -70,7 +72,8 @@ def pull(z: np.ndarray, alpha: np.ndarray, gamma: np.ndarray, inflation: np.ndar
 
 
 def explained_part(z: np.ndarray, alpha: np.ndarray, gamma: np.ndarray, excess: float) -> np.ndarray:
-    """Share (M,), one at most, of the excess chi-square of the innovations that each bias explains without its prior.
+    """Share (M,), one at most, of the excess chi-square of the innovations that each bias explains
+    without its prior.
 
     The squared distance from the prior, at the declared noise, is the chi-square that goes with
     that prior.

@@ -46,7 +46,8 @@ Scheduler = Annotated[
 
 
 def main() -> None:
-    """Entry point: one sentence on stderr and exit code 2 for bad input, 1 for a fit that left no answer.
+    """Entry point: one sentence on stderr and exit code 2 for bad input, 1 for a fit that left no
+    answer.
 
     Ctrl-C ends a command with 130, SIGTERM with 143.
     """

@@ -14,8 +14,10 @@ from probcal.inference.settings import check_setting
 from probcal.labels import check_name
 
 MOST_VALUES = 10_000  # of a setting of a study
-MOST = 10**6  # largest count that an option takes: of more draws or particles no machine has the memory
-LEAST_SIZE, MOST_SIZE = 1e-12, 1e12  # range of the size of a number that an option takes, in its unit
+# largest count that an option takes: of more draws or particles no machine has the memory
+MOST = 10**6
+LEAST_SIZE = 1e-12  # least size of a number that an option takes, in its unit
+MOST_SIZE = 1e12  # largest size of the same
 
 
 def count(least: int, text: str) -> Any:
@@ -24,7 +26,8 @@ def count(least: int, text: str) -> Any:
 
 
 def quantity(text: str, *, zero: bool = False, negative: bool = False) -> Any:
-    """An option that is a finite number of a sensible size, positive unless said otherwise, with its help text."""
+    """An option that is a finite number of a sensible size, positive unless said otherwise, with
+    its help text."""
 
     def check(option: typer.CallbackParam, value: float | None) -> float | None:
         fits = value is None or (LEAST_SIZE <= abs(value) <= MOST_SIZE and (negative or value > 0))

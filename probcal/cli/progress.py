@@ -16,7 +16,9 @@ from rich.text import Text
 from probcal.inference.progress import OnProgress, Progress, Terminated, handled
 
 FIRST = 5.0  # s to the first line in a file, and least between two where the phase changes
-GAP, SHARE, LONGEST = 20.0, 0.1, 600.0  # s to the next line of a phase: at least, as part of all so far, and at most
+GAP = 20.0  # s, least time to the next line of a phase
+SHARE = 0.1  # time to the next line over all time so far
+LONGEST = 600.0  # s, longest time to the next line
 
 
 class Line:

@@ -259,7 +259,10 @@ class EA(Maximiser):
         return Gaussian(correlation=prior.correlation) if self.integrates(prior) else prior
 
     def integration(self, problem: Problem, prior: Prior) -> Integration | None:
-        """The hierarchy of the prior, at the mode that the climb reached; None where it governs no bias."""
+        """The hierarchy of the prior, at the mode that the climb reached.
+
+        None where it governs no bias.
+        """
         if not self.integrates(prior) or problem.surveyed.all():
             return None
         form = Form(problem.model.biases, hierarchy_of(prior, problem))

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 FAR = 10.0  # scales from the stated value beyond which an estimate is none
 FALL = 1.0  # nats below its best at which an evidence may end
-INEXACT = 0.03  # Monte Carlo error of a mean in sd, or of an sd over it, above which a message states it
+# Monte Carlo error of a mean in sd, or of an sd over it, above which a message states it
+INEXACT = 0.03
 ABSURD = 100.0  # mean square a datum, 1 expected, beyond which a fit explains nothing
 
 
@@ -60,7 +61,10 @@ def conclude(
 
 
 def uncertain(labels: Sequence[str], mixed: Integrated) -> str:
-    """A sentence on the Monte Carlo error of integrated precisions, where it is large; else nothing."""
+    """A sentence on the Monte Carlo error of integrated precisions, where it is large.
+
+    Else nothing.
+    """
     errors = np.broadcast_arrays(mixed.mean_error, mixed.sd_error, np.zeros(len(labels)))[:2]
     mean, sd = (float(np.max(part, initial=0.0)) for part in errors)
     if max(mean, sd) <= INEXACT:
@@ -169,7 +173,8 @@ def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
 
 
 def _points(problem: Problem, point: Point, square: float) -> Iterator[Point]:
-    """The point of a misfit where it is finite, and tracks with the biases as stated, which no wrong bias bends."""
+    """The point of a misfit where it is finite, and tracks with the biases as stated, which no
+    wrong bias bends."""
     if np.isfinite(square):
         yield point
     yield track_mode(problem, uncalibrated(automatic_start(problem)))

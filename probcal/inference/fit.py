@@ -383,7 +383,8 @@ def track(
 
 
 def _many_tracks(problem: Problem, found: Calibrated) -> tuple[list[Tracks], Point, Point]:
-    """Tracks at a calibration, and points without and with it, where the response of states to biases does not fit."""
+    """Tracks at a calibration, and points without and with it, where the response of states to
+    biases does not fit."""
     z = jnp.asarray(found.z)
     before = settle_each(problem.model, grid_start(problem, jnp.zeros_like(z), 30))
     after = settle_each(problem.model, grid_start(problem, z, 30))

@@ -38,7 +38,8 @@ else:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """The problem of a fit, the point where it ended, and its rows linearised there, for every check."""
+    """The problem of a fit, the point where it ended, and its rows linearised there, for every
+    check."""
 
     problem: Problem
     point: Point

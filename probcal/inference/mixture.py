@@ -107,7 +107,8 @@ class MixturePosterior(Posterior):
 
     @property
     def attrs(self) -> Mapping[str, float]:
-        """The limit of inclusion, and the largest Monte Carlo errors: of a mean in sd, of an sd over it."""
+        """The limit of inclusion, and the largest Monte Carlo errors: of a mean in sd, of an sd
+        over it."""
         errors = {"mean_error": self.found.mean_error, "sd_error": self.found.sd_error}
         return {"rope": ROPE} | {name: float(np.max(error, initial=0.0)) for name, error in errors.items()}
 

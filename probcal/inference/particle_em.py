@@ -220,7 +220,8 @@ def _beginning(
 def climb_by_particles(
     problem: Problem, method: Maximiser, how: Particles, prior: Prior, z: Any, context: Context
 ) -> Answer:
-    """Run the loop from biases z (M,) and conclude: a Gaussian about them, its information by scores."""
+    """Run the loop from biases z (M,) and conclude: a Gaussian about them, its information by
+    scores."""
     check_method(method)
     check_learnt(problem)
     targets = prepared(problem, how)

@@ -28,7 +28,8 @@ from probcal.smoothing.mode import Point
 from probcal.status import Status
 
 RARE = 0.05  # share of leaps, or of swings, taken below which it is said
-K_HAT = 0.7  # Pareto k-hat from which importance weights, and so a guide, are unreliable (Vehtari et al. 2024)
+# Pareto k-hat from which importance weights, and so a guide, are unreliable (Vehtari et al. 2024)
+K_HAT = 0.7
 BFMI = 0.3  # below which the energy is not explored (Betancourt 2016)
 
 

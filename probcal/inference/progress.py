@@ -17,16 +17,22 @@ from probcal.errors import InputError
 
 
 class Progress(NamedTuple):
-    """The steps done of a call, in a phase of a fit, runs of `sbc` or fits of a study; a line as text.
+    """The steps done of a call, in a phase of a fit, runs of `sbc` or fits of a study.
+
+    A line as text.
 
     `fit(problem, progress=print)` prints each.
     """
 
     what: str  # the method, "runs", "fits" or "recordings"
     done: int
-    total: int  # 1 where the steps of a phase are not counted; it grows where draws have not mixed and are made anew
-    objective: float | None = None  # of a climb, or the mean log density of the last draws; None where there is none
-    phase: str = ""  # "start", "climb", "start 2 of 3", "mirror images", "checks", "warm-up", "draws"
+    # 1 where the steps of a phase are not counted; it grows where draws have not mixed and are made
+    # anew
+    total: int
+    # of a climb, or the mean log density of the last draws; None where there is none
+    objective: float | None = None
+    # "start", "climb", "start 2 of 3", "mirror images", "checks", "warm-up", "draws"
+    phase: str = ""
     seconds: float = 0.0  # since the call began
     left: float | None = None  # estimate of the seconds that are left; None where it is not known
     bound: bool = False  # whether a climb may end before `total`
@@ -71,7 +77,8 @@ class Stopped(Exception):
 
 
 class Monitor:
-    """Reports how far a call has come, and says whether it shall stop: at a limit of time, or interrupted.
+    """Reports how far a call has come, and says whether it shall stop: at a limit of time, or
+    interrupted.
 
     An interruption, Ctrl-C or a `progress` that raises `KeyboardInterrupt`, stops the loops once
     there is an answer to keep. Before that, and a second time, it is raised. Raises `InputError`
@@ -108,7 +115,8 @@ class Monitor:
             raise Stopped
 
     def silent(self) -> Self:
-        """One with the same limit that reports nothing and keeps nothing: for a start, which is no answer."""
+        """One with the same limit that reports nothing and keeps nothing: for a start, which is no
+        answer."""
         other = copy(self)
         other._progress = None
         return other
@@ -140,14 +148,18 @@ class Monitor:
             self.interrupt()
 
     def interrupt(self, number: int = signal.SIGINT, _: Any = None) -> None:
-        """The handler of a signal: stop the call where it has an answer; raise `KeyboardInterrupt` else, or again."""
+        """The handler of a signal: stop the call where it has an answer.
+
+        Raise `KeyboardInterrupt` else, or again.
+        """
         again, self.signal, self._at = bool(self.signal), number, self._at._replace(phase=STOPPING)
         if again or not self._answered:
             raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
     @contextmanager
     def interruptible(self) -> Iterator[None]:
-        """Within it signals interrupt the call, in the main thread, and where nobody else handles Ctrl-C."""
+        """Within it signals interrupt the call, in the main thread, and where nobody else handles
+        Ctrl-C."""
         with handled(self.interrupt, self._handled()):
             yield
 
@@ -169,7 +181,10 @@ class Monitor:
 
 @contextmanager
 def handled(handler: Callable[[int, Any], Any], signals: Sequence[int]) -> Iterator[None]:
-    """Within it a handler takes signals; another thread than the main one leaves them as they are."""
+    """Within it a handler takes signals.
+
+    Another thread than the main one leaves them as they are.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -238,7 +238,8 @@ class Propagation:
         return float(np.sqrt(np.mean(off**2)))
 
     def run(self, told: Callable[[int, float], bool] | None = None) -> None:
-        """Rounds until the means move by less than `CLOSE` sds in the root mean square, are spent, or `told` ends them.
+        """Rounds until the means move by less than `CLOSE` sds in the root mean square, are spent,
+        or `told` ends them.
 
         Between rounds the likelihood is taken anew at the mean.
         """

@@ -1,4 +1,4 @@
-"""Normalised innovations of the forward filter at a fit, with limits; whiteness and wrapped angles.
+"""Normalised innovations of the forward filter at a fit, with limits; whiteness.
 
 Every datum counts as its standardised score v = score / sqrt(information): for Gaussian noise residual / std, and for
 every family of mean 0 and variance 1 where the model is right. The filter is linearised at the fitted trajectory.
@@ -31,7 +31,8 @@ else:
     special = Later("scipy.special")
 
 PRACTICAL = 1.25  # factor from 1 within which a NIS beyond its limits is no finding
-LAGGED = 2.5  # sd of its lag-1 correlation from which a channel is called correlated, beside its Ljung-Box test
+# sd of its lag-1 correlation from which a channel is called correlated, beside its Ljung-Box test
+LAGGED = 2.5
 NOTABLE = 0.1  # lag-1 correlation, and mean, of innovations within which neither is
 COLUMNS = 16  # bias directions that are filtered together
 LAGS = 10  # of the Ljung-Box statistic
@@ -71,7 +72,8 @@ class Innovations(NamedTuple):
 
 
 def expected_squares(fit: Judged, kept: np.ndarray) -> np.ndarray:
-    """Expected square of every innovation (D,); `kept` is the fraction of the datum's own noise in it.
+    """Expected square of every innovation (D,); `kept` is the fraction of the datum's own noise in
+    it.
 
     A row of weight w counts as if its noise had the variance 1 / w, but scatters as declared.
     """
@@ -162,7 +164,8 @@ def all_gaussian(model: Model) -> bool:
 
 
 def exact_kurtosis(fit: Judged, kurtosis: np.ndarray) -> np.ndarray:
-    """Excess kurtosis (D,), that of yes-or-no data in closed form, 1 / (p q) - 6: replicas may lack a rare event."""
+    """Excess kurtosis (D,), that of yes-or-no data in closed form, 1 / (p q) - 6: replicas may lack
+    a rare event."""
     answers = [
         np.broadcast_to([isinstance(noise, Bernoulli) for noise in noises], lin.weight.shape)
         for noises, lin in zip(fit.problem.model.noises, fit.lins, strict=True)
@@ -172,7 +175,8 @@ def exact_kurtosis(fit: Judged, kurtosis: np.ndarray) -> np.ndarray:
 
 
 def measured_kurtosis(fit: Judged) -> np.ndarray:
-    """Excess kurtosis (D,) of the standardised scores, measured over the data of each sensor's channel."""
+    """Excess kurtosis (D,) of the standardised scores, measured over the data of each sensor's
+    channel."""
     if all_gaussian(fit.problem.model):
         return np.zeros(len(fit.data))
     value = fit.flat([standardised(lin.score, lin.weight) for lin in fit.lins])
@@ -182,14 +186,16 @@ def measured_kurtosis(fit: Judged) -> np.ndarray:
 
 
 def root_of(covariance: np.ndarray) -> np.ndarray:
-    """The symmetric root (M, M) of a covariance, which does not turn with rounding; that of few draws is singular."""
+    """The symmetric root (M, M) of a covariance, which does not turn with rounding; that of few
+    draws is singular."""
     values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(covariance)))
     root: np.ndarray = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     return root
 
 
 def innovations(fit: Fitted, kurtosis: np.ndarray, dz: np.ndarray | None = None) -> Filtered:
-    """Innovations of all data with the biases `dz` (M,) from their means, for noise of excess kurtosis (D,).
+    """Innovations of all data with the biases `dz` (M,) from their means, for noise of excess
+    kurtosis (D,).
 
     A sum of squares over some data expects their number less what the biases used: over all data the sum of gamma,
     over a share of them the trace of B (G + A)^-1 B', B their responses to the biases.
@@ -228,13 +234,15 @@ def innovations_large(
 
 
 def innovations_given(fit: JudgedLarge) -> Innovations:
-    """Innovations of data that the biases of a fit in sparse form did not see: these add to what is expected."""
+    """Innovations of data that the biases of a fit in sparse form did not see: these add to what is
+    expected."""
     found = innovations_large(fit, np.zeros(fit.problem.model.biases))
     return found._replace(used=-np.maximum(fit.flat(_told(fit)), 0.0))
 
 
 def _told(fit: JudgedLarge) -> list[np.ndarray]:
-    """Variance of each predicted value (N, C) of each block by the biases of its sensor, over that of its noise."""
+    """Variance of each predicted value (N, C) of each block by the biases of its sensor, over that
+    of its noise."""
     M = fit.problem.model.biases
     own, place = (np.append(values, 0) for values in fit.blocks.located())
     found = []
@@ -331,7 +339,8 @@ def whiteness(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> Whiten
 
 
 class Channels(NamedTuple):
-    """The innovations of every sensor's channels, in order of appearance: which they are, and how they follow."""
+    """The innovations of every sensor's channels, in order of appearance: which they are, and how
+    they follow."""
 
     labels: pd.DataFrame  # sensor and channel
     group: np.ndarray  # (D,) number of each datum's channel
@@ -370,7 +379,8 @@ class Scatter(NamedTuple):
 
 
 def scatter_of(data: pd.DataFrame, found: Innovations, members: Sequence[np.ndarray]) -> Scatter:
-    """Overdispersion and correlation in time of the innovations of each channel, by its `members` among the data."""
+    """Overdispersion and correlation in time of the innovations of each channel, by its `members`
+    among the data."""
     target, time = data["target"].to_numpy(str), data["time"].to_numpy()
     size = np.array([found.spread(mine) for mine in members])
     size = np.where(size < 1 / PRACTICAL, size, np.maximum(size, 1.0))
@@ -394,7 +404,8 @@ def inflation(fit: Judged, wide: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 def memory(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> float:
-    """Innovations of one channel that count as one: 1 + 2 sum of r_k over the first positive lag pairs.
+    """Innovations of one channel that count as one: 1 + 2 sum of r_k over the first positive lag
+    pairs.
 
     The initial positive sequence of Geyer (1992); 1 where the first correlation is not beyond 3 sd.
     """
@@ -407,33 +418,3 @@ def memory(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> float:
     r = np.concatenate([[1.0], r[: len(r) // 2 * 2 - 1]])
     couples = r.reshape(-1, 2).sum(1) * np.cumprod(np.append(pairs[: len(r) - 1], n)[1::2] >= FEWEST // 2)
     return float(max(2.0 * np.sum(couples * np.cumprod(couples > 0)) - 1.0, 1.0))
-
-
-NEAR_TURN = 1.0  # rad of a full turn within which a residual tells of a missing wrap
-WIDE = np.pi / 3  # noise std in rad above which a wrapped angle is ambiguous
-FAR = 2 * np.pi / 3  # rad beyond which a wrapped residual may belong to the next turn
-SHARE = 0.01  # of a channel's data beyond which its residuals are
-
-
-def wrapping(fit: Judged, innovation: np.ndarray, std: np.ndarray) -> list[tuple[str, str]]:
-    """Sentences (subject, sentence) on angles: residuals (D,) a turn off without `wrap`, or too wide with it."""
-    found = []
-    for kind in fit.problem.network.types:
-        for name, channel in kind.expand(fit.problem.network.dimension):
-            ours = [s.name for s in fit.problem.network.sensors if s.type == kind]
-            mine = (fit.data["channel"] == name).to_numpy() & fit.data["sensor"].isin(ours).to_numpy()
-            turn = {"rad": 1.0, "deg": np.pi / 180}.get(channel.unit)
-            if turn is None or not mine.any():
-                continue
-            residual, spread = np.abs(innovation[mine]) * turn, std[mine] * turn
-            subject, off = f"{kind.name}.{name}", np.abs(residual - 2 * np.pi) < NEAR_TURN
-            if channel.period is None and off.any():
-                text = f"{off.sum()} of {len(off)} residuals lie a full turn off: declare wrap=True"
-            elif channel.period is not None and np.median(spread) > WIDE:
-                text = f"its noise std of {np.median(spread):.2f} rad is too wide for an angle: wrapping is ambiguous"
-            elif channel.period is not None and (residual > FAR).mean() > SHARE:
-                text = f"{(residual > FAR).sum()} of {len(off)} residuals lie beyond 120 deg: wrapping is ambiguous"
-            else:
-                continue
-            found.append((subject, f"{subject}: {text}"))
-    return found

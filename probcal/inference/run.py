@@ -340,7 +340,9 @@ def stepped(method: Any, model: Model, prior: Prior, given: Given, state: State)
 def maximise(
     method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context, alpha: np.ndarray | None = None
 ) -> tuple[State, np.ndarray]:
-    """Run a method from a start until it is done, spent or stopped; the last state and the objectives.
+    """Run a method from a start until it is done, spent or stopped.
+
+    The last state and the objectives.
 
     It begins with precisions `alpha` (M,), those of the prior if None.
     """

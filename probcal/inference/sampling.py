@@ -202,7 +202,8 @@ class Runnable(Protocol):
 def drawn_by(
     method: Sampler, runs: Runnable, sides: int, monitor: Monitor, storage: Storage | None, threads: int | None
 ) -> tuple[Draw, int, str]:
-    """Draws of all chains, chunk by chunk, steps from one to the next, and why they were ended early.
+    """Draws of all chains, chunk by chunk, steps from one to the next, and why they were ended
+    early.
 
     What a storage holds is gone on with. Raises `FitError` where no draw is finite, and where a
     limit of time leaves none.

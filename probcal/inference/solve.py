@@ -93,7 +93,8 @@ def starts_unseen(climbed: int, wanted: int) -> str:
 
 
 def _without(answer: Answer, unseen: str, monitor: Monitor) -> Answer:
-    """The answer with a sentence on other answers that were not looked for, since the search was ended."""
+    """The answer with a sentence on other answers that were not looked for, since the search was
+    ended."""
     if not unseen:
         return answer
     said = f"{monitor.stopped} before {unseen} were looked at: there may be other answers."

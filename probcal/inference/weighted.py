@@ -49,7 +49,8 @@ SCATTER = 1.5  # mean square of what is left, 1 expected, from which another opt
 FEW = 5  # different smoothed particles at an epoch, below which their spread says nothing
 AHEAD = 1.0  # sd a bias of the Newton step, from which the fit is not at the top
 SURE = 6.0  # sd by which that mean square lies above 1 at least
-PAIRS = 8  # least pairs of filters about the end of a climb, whose scores give the information of the biases
+# least pairs of filters about the end of a climb, whose scores give the information of the biases
+PAIRS = 8
 FILTERED = 512  # most filters of these pairs
 SD_ERROR = 0.06  # relative Monte Carlo error of an sd at which no more are run: 2.5 of it are 15 %
 LOST = 3.0  # nats below the typical likelihood from which a filter counts less
@@ -248,7 +249,8 @@ def louis(paths: Paths, z: Any, levels: Any, key: jax.Array) -> Louis:
 
 
 class ScoreSlope(NamedTuple):
-    """The information of the biases by how the score of the marginal likelihood falls about a place."""
+    """The information of the biases by how the score of the marginal likelihood falls about a
+    place."""
 
     information: np.ndarray  # (M, M) of the data, trajectories integrated
     sd_error: np.ndarray  # (M,) Monte Carlo error of each sd of the posterior, over the sd
@@ -256,7 +258,8 @@ class ScoreSlope(NamedTuple):
 
 
 def score_slope(paths: Paths, told: Louis, prior: np.ndarray, z: Any, levels: Any, key: jax.Array) -> ScoreSlope:
-    """Information of the biases z (M,) under a prior of precision (M, M), by regression of scores on biases.
+    """Information of the biases z (M,) under a prior of precision (M, M), by regression of scores
+    on biases.
 
     Louis' identity takes the difference of two large matrices. The score (Fisher's identity) at
     pairs of places z + d and z - d, one sd apart in random orthogonal directions, needs no
@@ -286,7 +289,8 @@ def score_slope(paths: Paths, told: Louis, prior: np.ndarray, z: Any, levels: An
 
 
 def regressed_scores(away: np.ndarray, scores: np.ndarray, logs: np.ndarray, prior: np.ndarray) -> ScoreSlope:
-    """Minus the slope of scores (K, M) on places (K, M), and what its error means for each sd under a prior (M, M).
+    """Minus the slope of scores (K, M) on places (K, M), and what its error means for each sd under
+    a prior (M, M).
 
     Filters whose log-likelihoods, less those expected, lie far below the others' lost a target and
     count less.

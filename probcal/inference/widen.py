@@ -1,4 +1,5 @@
-"""Intervals widened where the innovations say that the noise is larger, or longer remembered, than the model has it."""
+"""Intervals widened where the innovations say that the noise is larger, or longer remembered, than
+the model has it."""
 
 from __future__ import annotations
 
@@ -42,8 +43,11 @@ else:
     pd, xr, signal = Later("pandas"), Later("xarray"), Later("scipy.signal")
 
 TOLD = 1.05  # times as wide, from which sds are widened
-REJECTED = 1e-3  # probability of the NIS of all data, or of the whiteness of any channel, of a model that is wrong
-CHUNKS = 8  # times `COLUMNS` simulated errors: the sd of a state is found to 6 % (128 columns, 4,000 Gaussian states)
+# probability of the NIS of all data, or of the whiteness of any channel, of a model that is wrong
+REJECTED = 1e-3
+# times `COLUMNS` simulated errors: the sd of a state is found to 6 % (128 columns, 4,000 Gaussian
+# states)
+CHUNKS = 8
 NUMBERS = 20_000_000  # most simulated data of all columns together
 SMALL = "small: the std or the process noise is too large, or the time has another unit"
 LARGE = "large: the std is too small, or the model is wrong"
@@ -52,7 +56,10 @@ UNASSESSED = "`assess` has not run: it looks for the cause."
 
 
 class Rejection(NamedTuple):
-    """Why the innovations reject a model, and what they call for; the reason is empty where they do not."""
+    """Why the innovations reject a model, and what they call for.
+
+    The reason is empty where they do not.
+    """
 
     reason: str
     inflation: np.ndarray  # (M,) of the part of the variance of each bias that comes from the data
@@ -61,7 +68,8 @@ class Rejection(NamedTuple):
 
 
 def rejection(fit: Judged, found: Innovations, channels: Channels) -> Rejection:
-    """The test of the innovations by their mean square, and of each channel by its correlation in time."""
+    """The test of the innovations by their mean square, and of each channel by its correlation in
+    time."""
     scatter = residuals.scatter_of(fit.data, found, channels.members)
     inflation = residuals.inflation(fit, scatter.size * scatter.memory, channels.group)
     return Rejection(_reason(found, channels), inflation, scatter, channels)
@@ -82,7 +90,8 @@ def _reason(found: Innovations, channels: Channels) -> str:
 
 
 def scattered(fit: Judged, found: Innovations, high: bool) -> str:
-    """A sentence on innovations, of all data or of a sensor, that are far too small, or where `high` too large."""
+    """A sentence on innovations, of all data or of a sensor, that are far too small, or where
+    `high` too large."""
     group, labels = residuals.codes(fit.data, ["sensor"])
     names = [f" of {name}" for name in labels["sensor"]]
     whole = residuals.squares(found, np.zeros(len(group), int), 1, REJECTED)
@@ -101,7 +110,8 @@ def scattered(fit: Judged, found: Innovations, high: bool) -> str:
 
 
 def unmoved(fit: Fitted) -> str:
-    """A sentence on the component whose smoothed process noises are nearest to nothing, if less than `UNMOVED`.
+    """A sentence on the component whose smoothed process noises are nearest to nothing, if less
+    than `UNMOVED`.
 
     Under the model a whitened noise has mean square one, of which smoothing leaves one less its
     variance.
@@ -155,7 +165,8 @@ def before_data(model: Model, levels: jax.Array) -> list[jax.Array]:
 
 
 def _noises(fit: Judged, rejected: Rejection, rng: np.random.Generator) -> tuple[Data, Data]:
-    """Unit noise (N, C, K) of each block as the model has it, and with the size and memory that each channel shows."""
+    """Unit noise (N, C, K) of each block as the model has it, and with the size and memory that
+    each channel shows."""
     white = rng.standard_normal((len(fit.data), residuals.COLUMNS))
     red = np.empty_like(white)
     target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
@@ -182,7 +193,8 @@ def _in_blocks(fit: Judged, values: np.ndarray) -> Data:
 def track_factors(
     fit: Judged, rejected: Rejection, tracks: xr.DataTree, root: Any, wide: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Factors (time, component) of the sd of every target's states, by the name of its group; never beyond the prior.
+    """Factors (time, component) of the sd of every target's states, by the name of its group; never
+    beyond the prior.
 
     The variance of a smoothed state grows by that of the errors which noise as the innovations show
     it, and biases `wide` (M,) times as uncertain, make beyond those of the model: both are
@@ -207,7 +219,8 @@ def track_factors(
 
 
 def widened(fit: Judged, rejected: Rejection, tree: xr.DataTree, root: Any) -> tuple[xr.DataTree, str]:
-    """A copy of a result whose biases and tracks have the variance that the innovations call for, and what was done.
+    """A copy of a result whose biases and tracks have the variance that the innovations call for,
+    and what was done.
 
     `root` (M, R) is of the covariance of z. A bias takes the share gamma of its inflation, and no
     sd exceeds that of the prior. Means keep their place; sd, interval, covariance and the spread of
@@ -270,7 +283,8 @@ def _widen_biases(result: xr.DataTree, group: xr.Dataset, wide: np.ndarray) -> N
 
 
 def _widen_track(result: xr.DataTree, name: str, wide: np.ndarray) -> None:
-    """A track of a result with its sds times `wide` (time, component), and the spread of its draws where it has any."""
+    """A track of a result with its sds times `wide` (time, component), and the spread of its draws
+    where it has any."""
     group = result.children["track"].children[name].to_dataset(inherit=False)
     factor = xr.DataArray(wide, dims=("time", "component"))
     columns = {"sd": group["sd"] * factor, "widened": factor}
@@ -314,7 +328,8 @@ def sentence(text: str) -> str:
 
 @float64
 def judge_fit(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
-    """A copy of the tree of a fit with what its innovations say in its message, its intervals widened by that."""
+    """A copy of the tree of a fit with what its innovations say in its message, its intervals
+    widened by that."""
     if tree.attrs["status"] in INVALID:
         return tree
     if tree.attrs.get("sparse", 0):
@@ -332,7 +347,9 @@ def judge_tracks(
     known: Calibrated,
     at: Linearisation | Point,
 ) -> xr.DataTree:
-    """A copy of tracks at a calibration, judged and widened likewise; `at` is the linearisation or, of many, the point.
+    """A copy of tracks at a calibration, judged and widened likewise.
+
+    `at` is the linearisation or, of many, the point.
 
     The biases are taken where rows and calibration together put them, so that an error within the
     sds of the calibration is no misfit. Of many biases it raises what the innovations are expected
@@ -362,7 +379,10 @@ def _judged(
     cause: str = "",
     more: str = "",
 ) -> xr.DataTree:
-    """A copy of a result, judged by its innovations; if there is something to say its message ends with `more`."""
+    """A copy of a result, judged by its innovations.
+
+    If there is something to say its message ends with `more`.
+    """
     rejected = rejection(fit, found, residuals.channels_of(fit.data, found))
     result, text = widened(fit, rejected, tree, root)
     told = [part for part in (sentence(text), scattered(fit, found, not text), cause) if part]

@@ -17,7 +17,9 @@ from probcal.noise import Bernoulli, Level, Normal, Unknown, guess_of
 
 DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
 FAR = 10.0  # times as wide where no sensor measures a range: bearings of a small array reach far beyond it
-CLEAR = 5.0  # sds of the least known node in an undeclared start: three nodes' common shift is then 0.7 % too sure
+# sds of the least known node in an undeclared start: three nodes' common shift is then 0.7 % too
+# sure
+CLEAR = 5.0
 
 
 class Area(NamedTuple):

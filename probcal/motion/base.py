@@ -108,7 +108,8 @@ class Component(ABC):
     memoryless: ClassVar[bool] = False  # drawn anew at every epoch around `means`; the others start from `start()`
     timed: ClassVar[bool] = False  # whether the means are those of a time, known at the rows of a table only
     static: ClassVar[bool] = False  # whether it never moves, so that all rows of a target form one epoch
-    next_order: ClassVar[str] = "a component of your own with one state more"  # declared where its noise has a memory
+    # declared where its noise has a memory
+    next_order: ClassVar[str] = "a component of your own with one state more"
 
     @abstractmethod
     def names(self) -> tuple[tuple[str, bool], ...]:

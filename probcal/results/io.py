@@ -36,7 +36,8 @@ else:
 SMALL = 1024  # bytes up to which an array of a file has no chunk of its own
 SEAL = b"probcal sha256:"  # behind the content of a file, before its digest
 ROUNDING = 1e-9  # by which a number of a fit may lie outside its range
-LOSS = 1e-6  # of a correlation matrix: asymmetry, and size of negative eigenvalues, that rounding leaves
+# of a correlation matrix: asymmetry, and size of negative eigenvalues, that rounding leaves
+LOSS = 1e-6
 
 
 @checked
@@ -151,7 +152,8 @@ def check_content(tree: xr.DataTree, path: Path) -> None:
 
 
 def _check_members(node: xr.DataTree, members: Mapping[str, Member], where: str) -> None:
-    """Raise `InputError` where a variable has other dimensions, another kind of values, or numbers out of range."""
+    """Raise `InputError` where a variable has other dimensions, another kind of values, or numbers
+    out of range."""
     for name, member in members.items():
         variable = node.variables[name]
         values, fault = variable.values, ""
@@ -176,7 +178,8 @@ def _kind_of(values: np.ndarray) -> str:
 
 
 def _check_moments(tree: xr.DataTree, path: Path) -> None:
-    """Raise `InputError` for labels that differ or repeat, intervals upside down, and covariances that are none."""
+    """Raise `InputError` for labels that differ or repeat, intervals upside down, and covariances
+    that are none."""
     group, draws = tree["calibration"].to_dataset(), tree["posterior"].to_dataset()
     labels, others = group["bias_label"].values.tolist(), [draws["bias_label"].values.tolist()]
     others += [] if "block" in group else [group["bias_label_other"].values.tolist()]

@@ -14,7 +14,8 @@ SUMMARY = ("bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma")
 
 
 class Member(NamedTuple):
-    """The form of a variable of a saved fit: its dimensions, the kind of its values, and the range of numbers."""
+    """The form of a variable of a saved fit: its dimensions, the kind of its values, and the range
+    of numbers."""
 
     dims: tuple[str, ...]
     kind: str = "numbers"  # or "texts", "flags", "any"
@@ -49,7 +50,8 @@ NEEDED = {  # what readers of a fit take for granted, by group
         "stated_node": Member(("value",), "texts"), "stated_component": Member(("value",), "texts"),
     },
 }  # fmt: skip
-WHOLE = {"covariance": Member(_PAIR, finite=True), "information": Member(_PAIR)}  # unless in sparse form
+# unless in sparse form
+WHOLE = {"covariance": Member(_PAIR, finite=True), "information": Member(_PAIR)}
 BLOCKS = {  # the same of a fit in sparse form
     "block": Member(_BIAS, least=0.0, finite=True), "block_place": Member(_BIAS, least=0.0, finite=True),
     "block_covariance": Member(("bias_label", "place"), finite=True),
