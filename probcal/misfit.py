@@ -135,10 +135,19 @@ def _group(left: MisfitData) -> str:
     """The sensor, channel or target whose mean square stands out most, and what to check there."""
     found = []
     for columns, check in (
-        ((left.target,), "the rows that name this target, its motion and its start, and that no two targets share it"),
+        (
+            (left.target,),
+            "the rows that name this target, its motion and its start, and that no two targets share it",
+        ),
         ((left.channel,), "the unit in its header, its std and its formula"),
-        ((left.sensor,), "its units, clock, position and heading, and the sensor that its rows name"),
-        ((left.sensor, left.channel), "its units, std and formula, and the sensor that its rows name"),
+        (
+            (left.sensor,),
+            "its units, clock, position and heading, and the sensor that its rows name",
+        ),
+        (
+            (left.sensor, left.channel),
+            "its units, std and formula, and the sensor that its rows name",
+        ),
     ):
         names, code = _codes(*columns)
         squares, counts = np.bincount(code, left.square), np.bincount(code)

@@ -41,7 +41,16 @@ from probcal.noise import Bernoulli, guess_of
 from probcal.plausible import check_plausible, check_scales
 from probcal.scans import Scans, assigned_rows, scans_of
 from probcal.sensor import Sensor
-from probcal.table import LARGEST, OBJECT, Measurements, Table, header, measure, read_table, unit_factor
+from probcal.table import (
+    LARGEST,
+    OBJECT,
+    Measurements,
+    Table,
+    header,
+    measure,
+    read_table,
+    unit_factor,
+)
 from probcal.types import float64
 
 if TYPE_CHECKING:

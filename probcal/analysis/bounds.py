@@ -177,7 +177,10 @@ def _tree(
     place = [np.sqrt(v[:, slice(*epochs.position)].sum(1)) for epochs, v in zip(problem.epochs, variances, strict=True)]
     spread = (("time", "component"), [np.sqrt(v) for v in variances])
     tracks = by_target(problem, {"sd": spread, "position_rmse": (("time",), place)})
-    groups = {"bias": bias, **{f"track/{name}": group for name, group in tracks.items() if name != node_of(NOBODY)}}
+    groups = {
+        "bias": bias,
+        **{f"track/{name}": group for name, group in tracks.items() if name != node_of(NOBODY)},
+    }
     message = _message(labels, bounded, sd > problem.scales[bounded])
     if covariance is None and not cholesky.exact():
         message += f" Variances are estimated from {cholesky.PROBES} draws; install probcal[sparse] for exact ones."

@@ -57,7 +57,9 @@ def squares_by(fit: Judged, found: residuals.Innovations, name: str) -> tuple[xr
 
 
 def by_channel(
-    found: residuals.Innovations, channels: residuals.Channels, replicas: predictive.Predictive | None
+    found: residuals.Innovations,
+    channels: residuals.Channels,
+    replicas: predictive.Predictive | None,
 ) -> tuple[xr.Dataset, list[Finding]]:
     """NIS, mean, correlation in time and predictive p-values of every sensor's channels, dimension `part`.
 

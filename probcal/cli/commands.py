@@ -77,7 +77,8 @@ def _print_version(asked: bool) -> None:
 @app.callback()
 def _options_of_all(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and end")
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and end"),
     ] = False,
 ) -> None: ...
 
@@ -91,7 +92,8 @@ def fit_command(
     ] = None,
     method: Method = "ea",
     prior: Annotated[
-        str | None, typer.Option(help=" | ".join(PRIORS) + "; the model's or the method's own if left out")
+        str | None,
+        typer.Option(help=" | ".join(PRIORS) + "; the model's or the method's own if left out"),
     ] = None,
     fix: Fix = None,
     given: Given = None,
@@ -103,23 +105,33 @@ def fit_command(
     draws: Annotated[int | None, options.count(1, "draws of each chain after warm-up")] = None,
     warmup: Annotated[int | None, options.count(0, "steps of each chain before its draws")] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="go on with the stopped run of a sampler, or with the recordings, in --out")
+        bool,
+        typer.Option(
+            "--resume",
+            help="go on with the stopped run of a sampler, or with the recordings, in --out",
+        ),
     ] = False,
     overwrite: Overwrite = False,
     limit: Annotated[
         float | None,
-        typer.Option(help="s after which the search for other answers ends; checks follow", show_default=False),
+        typer.Option(
+            help="s after which the search for other answers ends; checks follow",
+            show_default=False,
+        ),
     ] = None,
     scheduler: Scheduler = None,
     save: Annotated[
-        str, typer.Option(help="draws to keep in fit.nc besides those of the biases: states,predictive")
+        str,
+        typer.Option(help="draws to keep in fit.nc besides those of the biases: states,predictive"),
     ] = "",
     assessed: Annotated[
-        bool, typer.Option("--assess/--no-assess", help="a verdict per bias, and what the residuals say")
+        bool,
+        typer.Option("--assess/--no-assess", help="a verdict per bias, and what the residuals say"),
     ] = True,
     epoch: Annotated[float | None, options.quantity("bring rows to common epochs of so many s")] = None,
     align: Annotated[
-        str | None, typer.Option(help="rigid | similarity: how the answer is laid on a truth in another frame")
+        str | None,
+        typer.Option(help="rigid | similarity: how the answer is laid on a truth in another frame"),
     ] = None,
 ) -> None:
     """Calibrate: one row a bias, and where the truth is known the position error before and after.
@@ -230,21 +242,24 @@ def track_command(
 def watch_command(
     model: Model,
     data: Annotated[
-        Path | None, typer.Argument(help="table of rows (CSV) that may grow; standard input if left out")
+        Path | None,
+        typer.Argument(help="table of rows (CSV) that may grow; standard input if left out"),
     ] = None,
     follow: Annotated[bool, typer.Option("--follow", help="wait for more rows at the end of the file")] = False,
     calibration: Annotated[Path | None, typer.Option(help="folder (or fit.nc) of a fit to start from")] = None,
     out: Annotated[Path | None, typer.Option(help="folder for the state, the history of biases and fit.nc")] = None,
     by: Annotated[str | None, typer.Option(help="extended (if left out) | unscented | cubature")] = None,
     lag: Annotated[
-        int | None, options.count(0, "epochs that are linearised again, 32 if left out; 0 is the plain filter")
+        int | None,
+        options.count(0, "epochs that are linearised again, 32 if left out; 0 is the plain filter"),
     ] = None,
     particles: Annotated[
         int | None,
         options.count(2, "filter by so many particles: for roads and other motions of no linear form"),
     ] = None,
     walk: Annotated[
-        list[str] | None, typer.Option(help="biases that walk: PATTERN=STD over one second (repeat)")
+        list[str] | None,
+        typer.Option(help="biases that walk: PATTERN=STD over one second (repeat)"),
     ] = None,
     consider: Annotated[
         list[str] | None, typer.Option(help="biases that are not estimated, by pattern (repeat)")

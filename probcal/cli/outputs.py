@@ -49,7 +49,10 @@ def results_of_a_run(
         yield outputs
     except KeyboardInterrupt:
         if run := stored_run(store):
-            print(f"probcal: interrupted; {store} keeps {run}, --resume goes on with it", file=sys.stderr)
+            print(
+                f"probcal: interrupted; {store} keeps {run}, --resume goes on with it",
+                file=sys.stderr,
+            )
         raise
     finally:
         lock.release()

@@ -27,7 +27,12 @@ def run(model: Path, data: Path | None, given: Mapping[str, Any], network: Path 
     truth = load_truth(module, model, data, problem, given)
     with shown() as progress:
         Monitor(progress).enter("tracks", "track")
-        tree = track(problem, known, smoother=Particles(particles) if smoother == "particles" else None, key=seed)
+        tree = track(
+            problem,
+            known,
+            smoother=Particles(particles) if smoother == "particles" else None,
+            key=seed,
+        )
     frame = tracks(tree)
     out = outputs.folder / outputs.names[0]
     with outputs.writing():

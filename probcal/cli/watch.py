@@ -137,7 +137,12 @@ def run(
         outputs.begin()
         tables.open()
     watching = Watching(online, source, tables, every, kept, held)
-    with _input(data, source) as file, watching.shown() as show, _told_to_end(watching), suppress(KeyboardInterrupt):
+    with (
+        _input(data, source) as file,
+        watching.shown() as show,
+        _told_to_end(watching),
+        suppress(KeyboardInterrupt),
+    ):
         watching.follow(file, follow and data is not None, show)
     watching.store()
     print(watching.said())

@@ -95,7 +95,10 @@ class Monitor:
         check_limit(limit)
         self._progress, self._limit, self._signals, self._clock = progress, limit, signals, clock
         self._began = clock()
-        self._first, self._counted = (self._began, 0), ("", 0)  # from which the speed is measured; what was last
+        self._first, self._counted = (
+            (self._began, 0),
+            ("", 0),
+        )  # from which the speed is measured; what was last
         self._at = Progress("", 0, 1)
         self._answering = self._answered = False
         self.signal = 0  # number of the signal that interrupted the call
@@ -128,7 +131,15 @@ class Monitor:
         self._at = self._at._replace(phase=phase, what=self._at.what if what is None else what)
         self._report(Progress(self._at.what, 0, 1, None, phase, self._clock() - self._began))
 
-    def tell(self, what: str, done: int, total: int, objective: float | None = None, *, bound: bool = False) -> None:
+    def tell(
+        self,
+        what: str,
+        done: int,
+        total: int,
+        objective: float | None = None,
+        *,
+        bound: bool = False,
+    ) -> None:
         """A loop has done some steps of all; of a `bound` the time that is left is not known."""
         self._answered = self._answered or self._answering
         now, (before, last) = self._clock(), self._counted

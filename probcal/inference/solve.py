@@ -47,11 +47,9 @@ def solve(
     if method.by_particles:
         return _by_particles(problem, method, prior, context, start, starts)
     given, problem = problem, method.prepare(problem)
-    used = problem is given
     if (sparse := _sparsely(problem, method, prior, starts)) is not None:
-        method = sparse
         first = grid_start(problem, jnp.zeros(problem.model.biases), 30) if start is None else start
-        return _in_sparse_form(problem, method, prior, first, context)
+        return _in_sparse_form(problem, sparse, prior, first, context)
     if start is None:
         points = [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))]
     else:
@@ -64,14 +62,15 @@ def solve(
         optima = [climber.answer(problem, own, point, context) for _, point in _starts(points, method, monitor)]
         unseen = starts_unseen(len(optima), max(len(points), starts))
         points = [optimum.posterior.point for optimum in optima]
-    best = max(range(len(optima)), key=lambda k: _rank(optima[k])) if optima else 0
-    if optima and not method.climbs:  # with the precisions that its process noise has there
-        problem = optima[best].problem
-    found = optima[best] if method.climbs else method.answer(problem, prior, points[best], context)
-    motion = "used" if used else "left out"
+    best = max(range(len(optima)), key=lambda k: _rank(optima[k]), default=0)
+    if method.climbs:
+        found = optima[best]
+    else:  # with the precisions that its process noise has there
+        found = method.answer(optima[best].problem if optima else problem, prior, points[best], context)
+    several = tuple(optima) if len(points) > 1 else ()
+    found = replace(found, motion="used" if problem is given else "left out", optima=several, best=best)
     found = _without(found, unseen, monitor)
-    found = replace(found, motion=motion, optima=tuple(optima) if len(points) > 1 else (), best=best)
-    if not (method.climbs and used):
+    if not method.climbs or found.motion != "used":
         return found
     beside = _beside_mirrors(found, method, context)
     return replace(beside, mirrors=(*beside.mirrors, *_beside_optima(beside, (found, *found.optima))))
@@ -156,7 +155,12 @@ def _by_particles(
     near = problem if linear else problem.loosened()
     mirrors: tuple[Mirrored, ...] = ()
     if start is None and near is not None:
-        first = solve(near, MAP(trajectory="joint"), Gaussian(), context._replace(monitor=context.monitor.silent()))
+        first = solve(
+            near,
+            MAP(trajectory="joint"),
+            Gaussian(),
+            context._replace(monitor=context.monitor.silent()),
+        )
         start = first.posterior.point if first.status.valid and first.posterior.sound else None
         mirrors = first.mirrors if linear and start is not None and method.climbs else ()
     drawn = np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(context.key, 1))))

@@ -150,7 +150,16 @@ class Gibbs(Sampler):
             ).strip()
         ended = bias_status(problem, mixed, model.biases)
         return Answer(
-            problem, self, self, prior, posterior, status, message, ended, run.z.shape[1], interrupted=bool(stopped)
+            problem,
+            self,
+            self,
+            prior,
+            posterior,
+            status,
+            message,
+            ended,
+            run.z.shape[1],
+            interrupted=bool(stopped),
         )
 
     def keeps_states(self, model: Model) -> bool:

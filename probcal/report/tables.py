@@ -53,7 +53,13 @@ def biases(tree: xr.DataTree) -> tuple[list[str], list[dict[str, Any]]]:
     rows = []
     labels = group["bias_label"].values.tolist()
     reasons = judged["reason"].values.tolist() if judged is not None else [""] * len(labels)
-    said = dict(zip(shown.tolist(), said_once([labels[k] for k in shown], [reasons[k] for k in shown]), strict=True))
+    said = dict(
+        zip(
+            shown.tolist(),
+            said_once([labels[k] for k in shown], [reasons[k] for k in shown]),
+            strict=True,
+        )
+    )
     for k in shown.tolist():
         label = labels[k]
         one = {name: values[k] for name, values in table.items()}

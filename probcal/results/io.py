@@ -133,15 +133,12 @@ def check_content(tree: xr.DataTree, path: Path) -> None:
         raise InputError(f"{path} is incomplete: its group track lacks what a fit holds; fit again")
     judged = {group: members for group, members in JUDGED.items() if group in tree.children}
     expected = [*NEEDED.items(), ("calibration", BLOCKS if sparse else WHOLE), *judged.items()]
-    for group, members in expected:
-        node = tree.children.get(group)
+    parts = [(group, tree.children.get(group), members) for group, members in expected]
+    for name, node, members in [*parts, *((f"track/{node.name}", node, TRACKED) for node in tracks)]:
         if node is None or not set(members) <= set(node.variables):
+            group = name.partition("/")[0]
             raise InputError(f"{path} is incomplete: its group {group} lacks what a fit holds; fit again")
-        _check_members(node, members, f"{path}: {group}")
-    for node in tracks:
-        if not set(TRACKED) <= set(node.variables):
-            raise InputError(f"{path} is incomplete: its group track lacks what a fit holds; fit again")
-        _check_members(node, TRACKED, f"{path}: track/{node.name}")
+        _check_members(node, members, f"{path}: {name}")
     if missing := [name for name in ATTRIBUTES if name not in tree.attrs]:
         raise InputError(f"{path} is incomplete: it has no attribute {missing[0]}; fit again")
     if (status := tree.attrs["status"]) not in set(Status):
@@ -192,7 +189,10 @@ def _check_moments(tree: xr.DataTree, path: Path) -> None:
         )
     if "block" in group:
         try:
-            name, blocks = "block_covariance", SensorBlocks.read(group, labels, np.ones(len(labels))).covariance
+            name, blocks = (
+                "block_covariance",
+                SensorBlocks.read(group, labels, np.ones(len(labels))).covariance,
+            )
         except (IndexError, ValueError):
             raise InputError(f"{path}: calibration/block names no block; the file was changed, fit again") from None
     else:

@@ -28,6 +28,7 @@ _BIAS, _DATUM, _STATE = ("bias_label",), ("datum",), ("time", "component")
 _BIAS_TEXT, _DATUM_TEXT = Member(_BIAS, "texts"), Member(_DATUM, "texts")
 _PAIR = ("bias_label", "bias_label_other")
 _POSITIVE = Member(_BIAS, least=0.0, finite=True)
+_DATUM_SIZE = Member(_DATUM, least=0.0)
 NEEDED = {  # what readers of a fit take for granted, by group
     "posterior": {"bias": Member(("chain", "draw", "bias_label"), finite=True)},
     "calibration": {
@@ -41,8 +42,7 @@ NEEDED = {  # what readers of a fit take for granted, by group
         "time": Member(_DATUM, finite=True), "row": Member(_DATUM, "any"),
     },
     "residual": {
-        "before": Member(_DATUM), "after": Member(_DATUM), "std": Member(_DATUM, least=0.0),
-        "weight": Member(_DATUM, least=0.0),
+        "before": Member(_DATUM), "after": Member(_DATUM), "std": _DATUM_SIZE, "weight": _DATUM_SIZE,
     },
     "constant_data": {
         "node_position": Member(("node", "axis"), finite=True), "node_heading": Member(("node",), finite=True),
@@ -53,17 +53,24 @@ NEEDED = {  # what readers of a fit take for granted, by group
 # unless in sparse form
 WHOLE = {"covariance": Member(_PAIR, finite=True), "information": Member(_PAIR)}
 BLOCKS = {  # the same of a fit in sparse form
-    "block": Member(_BIAS, least=0.0, finite=True), "block_place": Member(_BIAS, least=0.0, finite=True),
+    "block": _POSITIVE,
+    "block_place": _POSITIVE,
     "block_covariance": Member(("bias_label", "place"), finite=True),
-}  # fmt: skip
+}
 TRACKED = {  # of each target
-    "mean": Member(_STATE), "sd": Member(_STATE, least=0.0), "before": Member(_STATE),
-    "time": Member(("time",), finite=True), "component": Member(("component",), "texts"),
-}  # fmt: skip
+    "mean": Member(_STATE),
+    "sd": Member(_STATE, least=0.0),
+    "before": Member(_STATE),
+    "time": Member(("time",), finite=True),
+    "component": Member(("component",), "texts"),
+}
 JUDGED = {  # where they are
     "verdict": {"verdict": _BIAS_TEXT, "reason": _BIAS_TEXT},
     "finding": {"sentence": Member(("finding",), "texts")},
-    "level": {"std": Member(("level",), least=0.0), "guess": Member(("level",), least=0.0, finite=True)},
+    "level": {
+        "std": Member(("level",), least=0.0),
+        "guess": Member(("level",), least=0.0, finite=True),
+    },
 }
 ATTRIBUTES = ("method", "prior", "seed", "status", "message", "intervals", "settings", "interval_probability", "data")
 ROPE = 0.1  # scales within which a bias is practically zero
