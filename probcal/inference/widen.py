@@ -211,7 +211,7 @@ def track_factors(
             more = [own + sign * np.asarray(error) / chunks for own, error in zip(more, errors, strict=True)]
     dims, found, most = ("time", "component"), {}, before_data(model, fit.point.levels)
     for name, own in by_target(fit.problem, {"more": (dims, more), "most": (dims, most)}).items():
-        variance = tracks[name]["sd"].values ** 2
+        variance = tracks[name].to_dataset()["sd"].values ** 2
         grown = variance + np.maximum(own["more"].values, 0.0)
         grown = np.minimum(grown, np.maximum(own["most"].values, variance))
         found[name] = np.sqrt(grown / np.where(variance > 0, variance, 1.0)).clip(1.0)
