@@ -367,6 +367,7 @@ class Stub:
     prior = None
     problem = SimpleNamespace(untilted=None)
     method: object = None
+    interrupted: bool = False
 
     @property
     def posterior(self):
@@ -394,7 +395,9 @@ def beside_others(monkeypatch, sides, ends, method=None):
         return end
 
     first = Stub(0.0, 100.0, method=method)
-    return solve._beside_mirrors(first, SimpleNamespace(answer=answer), None)
+    climb = SimpleNamespace(mode=None, _replace=lambda **_: None)
+    context = SimpleNamespace(monitor=Monitor())
+    return solve._beside_mirrors(first, SimpleNamespace(answer=answer), context, climb)
 
 
 def listed(found):
