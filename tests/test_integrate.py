@@ -85,6 +85,18 @@ def test_a_mixture_has_the_moments_of_the_posterior(prior):
     np.testing.assert_allclose(inside, 0.89, atol=0.05)
 
 
+def test_sweeps_go_on_without_another_burn_in():
+    """A sweep kept second without burn-in is the one kept first after a burn-in of one."""
+    form = Form(3, RegularisedHorseshoe(Horseshoe(), (0, 1, 2), (0, 1, 2)))
+    with jax.enable_x64(True):
+        known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision.single(jnp.ones(3)))
+        key = jax.random.key(0)
+        chains = begin(form, known, key)
+        (ends, both), (_, last) = (run_sweeps(form, known, chains, key, 2 - burn, burn) for burn in (0, 1))
+    np.testing.assert_array_equal(both.z[:, 1], last.z[:, 0])
+    np.testing.assert_array_equal(both.z[:, 1], ends[0])
+
+
 class Fixed(DenseLikelihood):
     """The hand-made likelihood, the same at any point."""
 
@@ -124,6 +136,7 @@ def test_expectation_propagation_agrees_too(prior, members):
     np.testing.assert_allclose(np.corrcoef(z.T), wanted, atol=0.12)
 
 
+@pytest.mark.ci
 def test_batches_agree_with_each_other_and_state_their_error():
     """Scatter of four keys: within three of the errors stated, each below 3 %; thinned draws come from all batches."""
     problem, _ = worlds.linear("plane")

@@ -37,8 +37,8 @@ CHAINS, BURN, FIRST, KEPT = (
 EVERY = 5  # kept draws between two whose conditional Gaussian enters the moments
 MOVES, NEAR = 6, 1.0  # most times that the point moves to the mean, and sd by which it may have moved at the last
 CLOSE = 0.015  # Monte Carlo error of each mean in sd, and of each sd over it, at which sweeps end
-FEWEST, BATCHES = 4, 24  # batches of kept sweeps that show this error, and the most
-WORK = 6000  # batches times squared biases at most: a batch of 16 biases takes 0.1 s, of 150 over 1 s
+FEWEST, BATCHES = 4, 27  # batches of kept sweeps that show this error, and the most
+WORK = 6700  # batches times squared biases at most: a batch of 16 biases takes 0.1 s, of 150 over 1 s
 HALVINGS = 40  # of the bracket of a quantile
 ATOM = 1e-9  # scales within which a quantile is that of the biases that are exactly zero
 
@@ -88,7 +88,7 @@ def integrate(
         return _propagated(how, model, known, start, key)
     chains, point = begin(how.form, known, jax.random.fold_in(key, 0)), start
     for turn in range(MOVES if search else 1):
-        chains, swept = run_sweeps(how.form, known, chains, jax.random.fold_in(key, turn + 2), FIRST)
+        chains, swept = run_sweeps(how.form, known, chains, jax.random.fold_in(key, turn + 2), FIRST, BURN)
         before = point.z
         point, known = recentred(how, model, point, known, swept.mean)
         moved = (np.asarray(point.z) - before) / np.maximum(swept.spread, 1e-9) if search else np.zeros(0)
@@ -105,7 +105,7 @@ def _by_batches(form: Form, model: Model, point: Point, known: Natural, chains: 
     """The mixture of batches of sweeps, taken until their means and sds agree, and its draws from all of them."""
     most, kept, found = int(np.clip(WORK // max(form.biases, 1) ** 2, 2, BATCHES)), list[Any](), list[Moments]()
     for k in range(most):
-        chains, swept = run_sweeps(form, known, chains, jax.random.fold_in(key, k), KEPT)
+        chains, swept = run_sweeps(form, known, chains, jax.random.fold_in(key, k), KEPT, 0 if k else BURN)
         kept.append(jax.device_get((swept.z, swept.phi)))
         found.append(jax.device_get(moments(form, known, swept.phi)))
         total, mean_error, sd_error = pooled(found)
@@ -256,17 +256,19 @@ class Swept(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="form")
-def run_sweeps(form: Form, known: Natural, chains: Any, key: jax.Array, count: int) -> tuple[Any, Swept]:
-    """`count` sweeps of every chain from where it stands, after those of the burn-in; also where the chains end."""
+def run_sweeps(
+    form: Form, known: Natural, chains: Any, key: jax.Array, count: int, burn: int = BURN
+) -> tuple[Any, Swept]:
+    """`count` sweeps of every chain from where it stands, after `burn` others; also where the chains end."""
 
     def chain(pair: tuple[Any, jax.Array]) -> tuple[Any, Any]:
         def one(k: jax.Array, state: Any) -> Any:
             (theta, phi), drawn = state
             at = gibbs_sweep(form, known, theta, phi, jax.random.fold_in(pair[1], k), backwards=False)
-            return at, jax.tree.map(lambda kept, leaf: kept.at[jnp.maximum(k - BURN, 0)].set(leaf), drawn, at)
+            return at, jax.tree.map(lambda kept, leaf: kept.at[jnp.maximum(k - burn, 0)].set(leaf), drawn, at)
 
         blank = jax.tree.map(lambda leaf: jnp.zeros((KEPT, *leaf.shape), leaf.dtype), pair[0])
-        return jax.lax.fori_loop(0, BURN + count, one, (pair[0], blank))
+        return jax.lax.fori_loop(0, burn + count, one, (pair[0], blank))
 
     ends, (z, phi) = jax.lax.map(chain, (chains, jax.random.split(key, CHAINS)))
     mean, square = jnp.sum(z, (0, 1)) / (CHAINS * count), jnp.sum(z**2, (0, 1)) / (CHAINS * count)
