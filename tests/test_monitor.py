@@ -67,9 +67,16 @@ def test_a_limit_is_positive(limit):
         Monitor(limit=limit)
 
 
-def test_ctrl_c_is_raised_until_there_is_an_answer_and_then_once_kept():
+@pytest.fixture
+def default_ctrl_c():
+    """The handler of a terminal; a test run in the background ignores Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield signal.default_int_handler
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_is_raised_until_there_is_an_answer_and_then_once_kept(default_ctrl_c):
     monitor = Monitor()
-    before = signal.getsignal(signal.SIGINT)
     with monitor.interruptible():
         monitor.enter("start", "EA")
         monitor.tell("MAP", 5, 200, -1.0)
@@ -83,7 +90,7 @@ def test_ctrl_c_is_raised_until_there_is_an_answer_and_then_once_kept():
         assert monitor.stopped == "Interrupted"
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is default_ctrl_c
 
 
 def test_a_handler_of_another_is_left_in_place():

@@ -411,8 +411,8 @@ def test_later_rows_of_a_road_may_not_lie_further_apart():
 
 
 ERRORS = [
-    (lambda p: track(p, calibrated(p), smoother="particles"), "give Particles\\(2000\\), or None for the Gaussian smo"),
-    (lambda p: particle_filter(p, 100), "particle_filter\\(particles=100\\): give Particles"),
+    (lambda p: track(p, calibrated(p), smoother="particles"), "smoother is the text .* as in Particles\\(2000\\)"),
+    (lambda p: particle_filter(p, 100), "particle_filter: particles is of type int"),
     (lambda p: particle_filter(p, runs=1), "at least 2 filters give an error"),
     (lambda p: EM("particles"), "Cubature\\(\\) or Particles\\(500\\)"),
     (lambda p: ParticleGibbs(particles=200), r"ParticleGibbs\(particles=200\): give settings such as Particles"),

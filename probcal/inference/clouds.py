@@ -45,8 +45,6 @@ def particle_filter(
     >>> found["smoothed/target"]["state"].dims
     ('particle', 'time', 'component')
     """
-    if not isinstance(particles, Particles):
-        raise InputError(f"particle_filter(particles={particles!r}): give Particles(1000)")
     if runs < 2:
         raise InputError(f"particle_filter(runs={runs}): at least 2 filters give an error")
     z, levels = np.zeros(problem.model.biases), np.zeros(len(problem.levels))

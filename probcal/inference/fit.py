@@ -363,8 +363,6 @@ def track(
     found = apply(problem, calibration)
     problem = found.problem
     if smoother is not None:
-        if not isinstance(smoother, Particles):
-            raise InputError(f"track(smoother={smoother!r}): give Particles(2000), or None for the Gaussian smoother")
         return track_by_particles(problem, smoother, found.z, found.covariance, found.levels, as_key(key))
     check_linear(problem)
     if too_large(problem.model):
