@@ -28,7 +28,8 @@ class World:
         nodes = []
         for node in self.nodes:
             turned = turn(node["position"], angle) + shift
-            nodes.append(node | {"position": turned, "heading": node.get("heading", 0.0) + angle})
+            heading = np.remainder(node.get("heading", 0.0) + angle, 2 * np.pi)
+            nodes.append(node | {"position": turned, "heading": heading})
         starts = {k: (turn(p, angle) + shift, turn(v, angle)) for k, (p, v) in self.starts.items()}
         return replace(self, nodes=tuple(nodes), starts=starts)
 

@@ -13,6 +13,7 @@ from sparse_worlds import LIBRARIES, drawn, drawn_in_space, ear, loud_ear
 import probcal as pc
 from probcal.errors import InputError
 from probcal.geometry import norm
+from probcal.inference import calibrate
 from probcal.inference.run import Context
 from probcal.inference.solve import solve
 from probcal.inference.sparse_gibbs import Gibbs, _Given, _SparseChains
@@ -68,7 +69,8 @@ def test_nothing_is_beside_the_gaussian_of_a_linear_world(name):
 def test_draws_of_a_linear_world_have_its_exact_moments(name, library):
     """Means within 5 standard errors of the dense joint Gaussian, sds within 5; gamma and tracks too."""
     problem, _ = worlds.linear(name)
-    tree = pc.fit(problem, Gibbs(chains=4, warmup=0, draws=250), prior=pc.Gaussian(), start=worlds.resting(problem))
+    method, start = Gibbs(chains=4, warmup=0, draws=250), worlds.resting(problem)
+    tree = calibrate(problem, method, prior=pc.Gaussian(), start=start)[0]
     group, whole = tree["calibration"].to_dataset(), worlds.exact(name)
     assert tree.attrs["status"] == "converged", tree.attrs["message"]
     exact = worlds.fitted(name)["calibration"].to_dataset()

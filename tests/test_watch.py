@@ -201,7 +201,7 @@ def test_what_is_wrong_is_said(model, table, tmp_path):
     wrong = {
         ("--keep", "x", "--out", tmp_path): 'keep "x" is not known; give tracks, rows or both, separated by a comma',
         ("--keep", "rows"): "--keep needs --out, the folder of the tables",
-        ("--walk", "n0.shift"): 'walk "n0.shift": write PATTERN=STD, the standard deviation over one second',
+        ("--walk", "n0.shift"): 'walk "n0.shift": write PATTERN=STD, the positive standard deviation over one second',
         ("--walk", "x.*=1.0"): 'walk "x.*" matches no bias',
         ("--consider", "y"): 'consider "y" matches no bias',
         ("--calibration", tmp_path / "none"): "is not a fit written by probcal",

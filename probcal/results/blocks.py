@@ -83,9 +83,10 @@ class SensorBlocks(NamedTuple):
         B, p = self.members.shape
         row = np.broadcast_to(self.members[:, :, None], (B, p, p))
         column = np.broadcast_to((p * np.arange(B)[:, None] + np.arange(p))[:, None, :], (B, p, p))
-        there = (row < self.biases) & (self.members < self.biases)[:, None, :]
-        values = np.linalg.cholesky(self.covariance)
-        return csc_array((values[there], (row[there], column[there])), (self.biases, B * p))
+        there = row < self.biases
+        values, vectors = np.linalg.eigh(np.where(there & there.mT, self.covariance, 0.0))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]  # of rank 0 too, as of chains that stand still
+        return csc_array((root[there], (row[there], column[there])), (self.biases, B * p))
 
 
 def covariance_of(group: xr.Dataset, labels: Sequence[str], whose: str) -> np.ndarray:
