@@ -192,8 +192,8 @@ def test_track_follows_the_fit_in_fixed_biases_levels_and_with_sensors_missing()
     again = probcal.track(whole, done)
     for (_, new), (_, old) in zip(each_track(again), each_track(done), strict=True):
         np.testing.assert_allclose(new["mean"].values, old["mean"].values, rtol=1e-3, atol=1e-3)
-        ratio = new["sd"].values / old["sd"].values  # the calibration that is applied was widened
-        assert ((ratio > 1 - 1e-3) & (ratio < done.attrs.get("widened", 1.0) + 1e-3)).all()
+        ratio = new["sd"].values / old["sd"].values  # each is widened by draws that know an sd to 6 %
+        np.testing.assert_allclose(ratio, 1.0, atol=0.12)
     part = probcal.Problem(built, motion, table[table["sensor"] != "c"])
     assert len(probcal.track(part, done).probcal.tracks()) == 16
     with pytest.raises(probcal.InputError, match='no row of sensor "c"'):

@@ -116,6 +116,7 @@ def _by_batches(form: Form, model: Model, point: Point, known: Natural, chains: 
     return Integrated(middle, known.information, total, z, phi, True, mean_error, sd_error)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is no answer, which the status says
 def pooled(found: Sequence[Moments]) -> tuple[Moments, np.ndarray, np.ndarray]:
     """Moments of equal batches together, and the errors (M,) of means, in sd, and of sds, over the sd."""
     mean, within, lower, upper, gamma = (np.stack(column) for column in zip(*found, strict=True))
