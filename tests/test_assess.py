@@ -810,9 +810,7 @@ def test_tracks_hold_where_noise_is_remembered():
         held[memory].append(np.mean(np.abs(track["mean"].values - path) < 1.598 * track["sd"].values))
         assert ("widened" in tree.attrs) == (memory > 0)
         biases = tree["calibration"].to_dataset()
-        before = biases["sd"] / biases.get(
-            "widened", 1.0
-        )  # a mixture of draws may pass the prior
+        before = biases["sd"] / biases.get("widened", 1.0)  # a mixture of draws may pass the prior
         assert (biases["sd"] <= np.maximum(biases["scale"], before) * (1 + 1e-9)).all()
     assert np.mean(held[2.0]) > 0.8
     assert np.mean(held[0.0]) > 0.85

@@ -240,8 +240,10 @@ def test_sigterm_before_an_answer_ends_a_command(model, tmp_path):
     told(process, "start, ")
     process.send_signal(signal.SIGTERM)
     _, complaint = process.communicate(timeout=100)
-    assert (process.returncode, complaint) == (143, "")
-    assert not (tmp_path / "out" / "fit.nc").exists()
+    assert process.returncode == 143
+    assert "Traceback" not in complaint
+    if (tmp_path / "out" / "fit.nc").exists():  # of a climb that had begun when the signal came
+        assert pc.load(tmp_path / "out").attrs["interrupted"]
 
 
 @pytest.mark.ci
