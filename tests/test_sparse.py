@@ -550,7 +550,7 @@ def test_check_of_a_large_network_says_what_is_open(monkeypatch, capsys, tmp_pat
     monkeypatch.setattr("probcal.cli.check.SHOWN", 5)
     given = {"side": 3, "targets": 1, "epochs": 40}
     outputs = Outputs(tmp_path, ("check.nc", "check.csv"))
-    ended = check.run(Path(__file__).parents[1] / "models" / "large_network.py", None, (), given, outputs)
+    ended = check.run(Path(__file__).parents[1] / "models" / "large_network.py", None, (), given, None, outputs)
     said = capsys.readouterr().out
     assert ended == 1
     assert "biases, those that the data tell least of" in said
