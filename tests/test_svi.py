@@ -104,7 +104,7 @@ def test_a_guide_that_does_not_fit_has_not_converged(khat, status, monkeypatch):
     ended, message = judge_chains(problem, Gaussian(), run, mixing(run.z), mean)
     assert str(ended) == status
     assert ("it stands for the posterior" in message) == (status == "converged")
-    assert ("it does not fit the posterior; take nuts or collapsed" in message) == (status != "converged")
+    assert ("it does not fit the posterior; fit with NUTS() or Collapsed()" in message) == (status != "converged")
 
 
 @pytest.mark.slow

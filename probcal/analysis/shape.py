@@ -30,7 +30,7 @@ def check_shape(fit: Fitted, tree: xr.DataTree) -> Finding | None:
         return None
     text = (
         f"the answer is far from Gaussian: at its draws the data fit {fall:.2g} nats a datum worse than at its mode"
-        f" ({LINEAR:g} at most if it were), so its intervals are none; state where the targets start, and compare with"
-        " NUTS()"
+        f" ({LINEAR:g} at most if it were), so its intervals are not valid; state where each target starts,"
+        " Target(motion, start=...), and compare with NUTS()"
     )
     return Finding("shape", "fit", text)

@@ -147,7 +147,8 @@ def _directions_text(tree: xr.DataTree) -> str:
         return f"the data determine every direction of the biases{' without a survey' if surveyed else ''}"
     group = tree["direction"].to_dataset()
     count = max(group.sizes["direction"], int(tree.attrs["weak"]))
-    lines = [f"{count} direction{'s' * (count > 1)} of the biases that the data hardly determine; remedies add up:"]
+    plural = "s" * (count > 1)
+    lines = [f"{count} direction{plural} of the biases that the data hardly determine; remedies add up (--fix LABEL):"]
     if count > group.sizes["direction"]:
         lines = [f"{count} directions of the biases that the data hardly determine, {LISTED} of them:"]
     for k in range(min(group.sizes["direction"], LISTED if count > group.sizes["direction"] else count)):

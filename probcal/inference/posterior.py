@@ -292,7 +292,7 @@ def _say_guide(run: SamplerRun, said: list[str]) -> bool:
     khat = pareto_khat(_stats(run)["log_weight"].ravel())
     fits, worth = khat < K_HAT, f"below {K_HAT:g}: it stands for the posterior"
     if not fits:
-        worth = f"not below {K_HAT:g}: it does not fit the posterior; take nuts or collapsed"
+        worth = f"not below {K_HAT:g}: it does not fit the posterior; fit with NUTS() or Collapsed()"
     said.append(f"Pareto k-hat of the guide is {khat:.2f}, {worth}.")
     return fits
 
