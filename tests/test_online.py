@@ -1,8 +1,14 @@
 """Filters of a stream against a naive filter in NumPy, the batch answer, and themselves in other order."""
 
 import copy
+import io
+import json
+import subprocess
 import sys
+from collections import Counter
+from dataclasses import dataclass
 from functools import cache
+from typing import ClassVar
 
 import jax
 import numpy as np
@@ -13,7 +19,7 @@ import xarray as xr
 
 import probcal as pc
 from probcal.errors import InputError
-from probcal.inference.checkpoint import pack_state, unpack_state
+from probcal.inference.checkpoint import pack_state, sealed, unpack_state
 from probcal.inference.relearnt import relearnt
 
 
@@ -362,13 +368,192 @@ def test_a_killed_filter_goes_on_as_if_it_had_not_been():
 def test_a_state_of_something_else_is_refused():
     online = filtered(pc.AugmentedFilter(lag=0))
     state = pack_state(online, {})
-    with pytest.raises(InputError, match="is no checkpoint of probcal watch"):
-        unpack_state(pc.Online(network(), MOTION), b"nothing", "x")
+    for content in (b"nothing", state[:-1], bytes([*state[:900], state[900] ^ 1, *state[901:]])):
+        with pytest.raises(InputError, match="is damaged, or no state of this version of probcal watch; move it away"):
+            unpack_state(pc.Online(network(), MOTION, pc.AugmentedFilter(lag=0)), content, "x")
     with pytest.raises(InputError, match="is the checkpoint of other settings"):
         unpack_state(pc.Online(network(), MOTION), state, "x")
-    other = pc.Online(network(), MOTION, pc.AugmentedFilter(lag=0), fix="n0.shift")
-    with pytest.raises(InputError, match="is the checkpoint of a network with other biases; give another --out"):
-        unpack_state(other, state, "x")
+
+
+def stage(std=1.0, place=0.0, heard=3.0, survey=None, function=lambda x: x, name="n1", noise=None):
+    """A network that differs in one declaration."""
+
+    @pc.sensor(east=pc.Channel("m", std, noise=noise or pc.StudentT(4.0)))
+    def gauge(target, pose, *, shift=pc.Bias("m", heard)):
+        return {"east": function(target.position[0] - pose.position[0]) + shift}
+
+    return pc.Network([
+        gauge.on(pc.Node("n0", (0.0, 5.0))), gauge.on(pc.Node(name, (10.0 + place, 5.0), survey=survey)),
+    ])  # fmt: skip
+
+
+LINE = pc.Target(pc.ConstantVelocity(0.5), MOTION["a"].start)
+
+
+@dataclass(frozen=True)
+class Louder(pc.StudentT):
+    """A family of a user: what it computes is no field."""
+
+    factor: ClassVar[float] = 1.0
+
+    def log_likelihood(self, y, predicted, std, period):
+        return self.factor * super().log_likelihood(y, predicted, std, period)
+
+
+class LouderStill(Louder):
+    factor = 2.0
+
+
+LouderStill.__name__ = "Louder"
+EDITS = {
+    "sensor gauge": [
+        dict(network=stage(std=2.0)), dict(network=stage(heard=4.0)), dict(network=stage(function=lambda x: 1.01 * x)),
+        dict(network=stage(noise=Louder(4.0))),
+    ],
+    "node n1": [dict(network=stage(place=1.0)), dict(network=stage(survey=0.1))],
+    "sensor n2": [dict(network=stage(name="n2"))],
+    "motion": [
+        dict(motion=pc.ConstantVelocity(0.5)), dict(motion=pc.Target(pc.ConstantVelocity(0.6), LINE.start)),
+        dict(motion=pc.Target(LINE.motion, LINE.start | {"velocity": ((1.0, 0.0), 2.0)})),
+        dict(motion=pc.Target(pc.ConstantAcceleration(0.5), LINE.start)),
+    ],
+    "fixed biases": [dict(fix="n0.shift"), dict(fix={"n0.shift": 1.0})],
+    "epoch": [dict(epoch=0.5)],
+    "number of targets": [dict(targets=4)],
+    "motion of a": [dict(motion=MOTION)],
+}  # fmt: skip
+
+
+def test_a_state_belongs_to_what_was_declared():
+    def begun(network=None, motion=LINE, **settings):
+        return pc.Online(network or stage(), motion, pc.AugmentedFilter(lag=0), **settings)
+
+    online = begun()
+    found = rows("a").drop(columns="north")
+    online.update(found[found["sensor"] != "n2"].dropna())
+    state = pack_state(online, {})
+    unpack_state(begun(stage(), pc.Target(pc.ConstantVelocity(0.5), LINE.start)), state, "x")
+    for name, edits in EDITS.items():
+        for edit in edits:
+            with pytest.raises(
+                InputError, match=f"x: the {name} has changed since the run there began; .* another --out"
+            ):
+                unpack_state(begun(**edit), state, "x")
+    tree = online.tree()
+    with pytest.raises(InputError, match="x: the calibration has changed"):
+        unpack_state(begun(calibration=tree), state, "x")
+    state = pack_state(one := begun(stage(noise=Louder(4.0))), {})
+    assert begun(stage(noise=LouderStill(4.0))).identity != one.identity
+    tree["calibration"]["mean"] = tree["calibration"]["mean"] + 1e-9
+    assert begun(calibration=tree).identity != begun(calibration=online.tree()).identity
+
+
+DECLARED = """
+import numpy as np
+import probcal as pc
+from probcal.roads import Road, RoadNetwork
+
+@pc.sensor(east=pc.Channel("m", pc.Unknown(1.0), noise=pc.Censored()))
+def gauge(target, pose, *, shift=pc.Bias("m", 2.0, drift=pc.Drift([0.0, 9.0], std=0.1))):
+    return {"east": target.position[0] - pose.position[0] + shift + np.arange(3.0).sum()}
+
+path = pc.Path([0.0, 9.0], [(0.0, 0.0), (5.0, 5.0)])
+network = pc.Network([gauge.on(pc.Node("n0", path=path)), gauge.on(pc.Node("n1", (0.0, 9.0), survey=0.1))])
+roads = RoadNetwork.from_lines({"west": [(-9.0, 0.0), (20.0, 0.0)], "east": [(20.0, 0.0), (90.0, 0.0)]})
+motion = {
+    "a": pc.Known(([0.0, 9.0], [(0.0, 0.0), (5.0, 5.0)]), std=0.1), "b": Road(roads, 0.1, (1.0, 0.2)),
+    "c": pc.ConstantVelocity(0.5, noise=pc.StudentT(4.0)) + pc.RandomWalk("power", "dB", 1.0, (0.0, 3.0)),
+}
+identity = pc.Online(network, motion, pc.ParticleFilter(10)).identity
+"""
+
+
+def test_what_was_declared_is_the_same_in_another_process():
+    here = {}
+    exec(DECLARED, here)
+    assert {"sensor n1", "node n0", "motion of b", "list of sensors"} <= set(here["identity"])
+    there = subprocess.run(
+        [sys.executable, "-c", DECLARED + "\nprint(identity)"], capture_output=True, text=True, check=True
+    )
+    assert there.stdout.strip() == str(here["identity"])
+
+
+def test_a_floor_of_the_first_rows_is_kept():
+    heard = rows("a").drop(columns="north")
+    heard = heard[heard["sensor"] != "n2"].dropna().assign(east=lambda frame: frame["east"].clip(lower=-4.0))
+
+    def begun():
+        return pc.Online(stage(noise=pc.Censored()), LINE, pc.AugmentedFilter(lag=0))
+
+    first, second = begun(), begun()
+    first.update(heard[:14])
+    unpack_state(second, pack_state(first, {}), "x")
+    assert len(first.arrivals.floors) == 1
+    assert first.arrivals.floors == second.arrivals.floors
+    for online in (first, second):
+        online.update(heard[14:])
+    pd.testing.assert_frame_equal(first.biases, second.biases, rtol=1e-9)
+
+
+def opened(state):
+    """JSON and arrays of a state."""
+    with np.load(io.BytesIO(state)) as file:
+        arrays = dict(file.items())
+    return json.loads(arrays.pop("said").tobytes()), arrays
+
+
+def closed(said, arrays):
+    """A state whose digest was computed anew."""
+    packed = io.BytesIO()
+    np.savez(packed, said=np.frombuffer(json.dumps(said).encode(), np.uint8), **arrays)
+    return sealed(packed.getvalue())
+
+
+def tampered(state):
+    """Name and bytes of states of which one member was changed."""
+    said, arrays = opened(state)
+    for name, array in arrays.items():
+        number = array.dtype.kind == "f"
+        broken = [None, array[..., None], array.astype(np.float32), array.astype("U")]
+        broken += [np.full_like(array, value) for value in (np.nan, -np.inf, np.inf)] if number else [array - 10**6]
+        for other in broken if array.size else broken[:2]:
+            kept = {key: own for key, own in arrays.items() if key != name}
+            yield name, closed(said, kept if other is None else kept | {name: other})
+    for name in said["members"]:
+        for value in (..., None, True, "x", -7, 1e999, 10**400, [], {}, [[]], {"x": 1e999}, {"x": ["y"], "time": [1]}):
+            if value == said["members"][name]:
+                continue
+            members = {key: own for key, own in said["members"].items() if key != name or value is not ...}
+            yield name, closed(said | {"members": members if value is ... else members | {name: value}}, arrays)
+    for name in ("version", "method", "identity", "members"):
+        for value in (None, 7, "x", [], {}):
+            yield name, closed(said | {name: value}, arrays)
+
+
+GOOD = {  # members of which other values make a filter: counts, times and what was found
+    "arrivals.counts", "arrivals.floors", "arrivals.origin", "arrivals.targets", "arrivals.duration", "doubts",
+    "points", "jumps", "time", "walked", "log_evidence", "epochs",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "method", [pc.AugmentedFilter(lag=8, jumps=pc.Jumps()), pc.ParticleFilter(20)], ids=["augmented", "particles"]
+)
+def test_a_changed_state_is_one_sentence_or_as_good(method):
+    whole, refused = filtered(method, rows()[:24], chunk=6), Counter()
+    state, fresh = pack_state(whole, {}), rows().assign(time=rows()["time"] + 50.0)
+    for name, other in tampered(state):
+        online = pc.Online(network(), MOTION, method, targets=3)
+        try:
+            unpack_state(online, other, "x")
+        except InputError as error:
+            refused["member " in str(error)] += 1
+            continue
+        assert name in GOOD
+        pd.testing.assert_frame_equal(online.biases, whole.biases)
+        online.update(fresh)
+    assert refused[True] > 200
+    assert refused[False] < 20  # of another version, or of something else
 
 
 def test_sparse_priors_are_laid_on_what_was_filtered():

@@ -16,7 +16,7 @@ from probcal.model.epochs import Epoch, merged
 from probcal.model.motions import Area, linear_of, start_of
 from probcal.motion import Target, as_motion
 from probcal.network import Network
-from probcal.noise import Normal
+from probcal.noise import Heard, Normal
 from probcal.problem import Problem, check_linear, declared_target
 from probcal.smoothing.grid import candidates
 from probcal.table import Table, header, measure, name_as_text, names_as_text
@@ -259,6 +259,20 @@ class Arrivals:
         self.area, self.tried = problem.area, candidates(problem)
         self.duration = float(np.ptp(problem.measurements.time)) or 1.0
 
+    @property
+    def floors(self) -> list[tuple[int, str, float]]:
+        """Number of the sensor type, channel and floor of what is heard, as the first rows have it."""
+        return [
+            (k, f"{name}_{AXES[0]}" if channel.per_axis else name, channel.noise.floor)
+            for k, kind in enumerate(self.network.types)
+            for name, channel in kind.channels.items()
+            if isinstance(channel.noise, Heard) and channel.noise.floor is not None
+        ]
+
+    @floors.setter
+    def floors(self, floors: Iterable[tuple[int, str, float]]) -> None:
+        self.network = self.network.with_floors({(k, name): floor for k, name, floor in floors})
+
     def _start(self, name: str) -> None:
         group = self._group(name)
         if group in self.starts:
@@ -279,13 +293,14 @@ class Arrivals:
 
     def motions(self, names: Iterable[Any]) -> dict[str, Target]:
         """The motion of each target, with its start."""
+        names = list(names)
+        for name in names:
+            self._start(str(name))
         return {str(n): Target(self.target(str(n)).motion, self.starts[self._group(str(n))]) for n in names}
 
     def _seat(self, template: Problem, names: Iterable[str]) -> None:
         """A slot for each new target, free or of the one that has been silent for longest; sets their motions."""
         names = [str(name) for name in names]
-        for name in names:
-            self._start(name)
         template.motion = self.motions([*names, *template.measurements.target_names])
         for name in names:
             if name in self.targets:

@@ -33,13 +33,15 @@ def check_choice(resume: bool, overwrite: bool) -> None:
         raise InputError("resume and overwrite exclude each other: go on with the run that is there, or replace it")
 
 
-def check_same(path: Path, identity: Mapping[str, str], there: Mapping[str, str]) -> None:
+def check_same(
+    path: str | PathLike[str], identity: Mapping[str, str], there: Mapping[str, str],
+    remedy: str = f"give another folder, or {OVERWRITE}",
+) -> None:  # fmt: skip
     """Raise `InputError` where the run in a folder is not the one to go on with, by the name of what differs."""
     for name in sorted(identity.keys() | there.keys(), key=[*identity, *there].index):
         if identity.get(name) != there.get(name):
             raise InputError(
-                f"{path}: the {name} has changed since the run there began; resume it as it began, give another"
-                f" folder, or {OVERWRITE}"
+                f"{path}: the {name} has changed since the run there began; resume it as it began, {remedy}"
             )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.inference.arrivals import Arrivals, Batch, padded
+from probcal.inference.identity import declared_identity
 from probcal.labels import NOBODY
 from probcal.lazy import Later
 from probcal.network import Network
@@ -225,7 +227,7 @@ class Online:
         held = {} if calibration is None else held_by(calibration, network.labels)
         fixed = held | fixed_biases(network, fix)
         self.arrivals = Arrivals(network, motion, fixed, targets, isinstance(self.method, AugmentedFilter), epoch)
-        self.calibration = calibration
+        self.network, self.calibration = network, calibration
         self.pending: pd.DataFrame | None = None
         self.cloud: Cloud | None = None
         self.recent: pd.DataFrame | None = None
@@ -243,6 +245,15 @@ class Online:
         self.doubts: Counter[str] = Counter()  # windows that did not rest, targets that began astray
 
     # what is known
+
+    @cached_property
+    def identity(self) -> dict[str, str]:
+        """Digests and settings of all that was declared, by name: what a stored state belongs to."""
+        arrivals = self.arrivals
+        return declared_identity(
+            self.network, arrivals.motion, self.calibration, prior=self.prior, epoch=arrivals.epoch,
+            fixed_biases=sorted(arrivals.fixed.items()), number_of_targets=arrivals.most,
+        )  # fmt: skip
 
     @property
     def counts(self) -> dict[str, int]:
