@@ -141,7 +141,8 @@ class Problem:
         self.scales = np.array([bias.scale for bias in self.biases])
         self.surveyed = np.array([bias.kind != "scale" for bias in self.biases], bool)
         self.epoch = _positive(epoch)
-        check_plausible(whole, network)
+        if not whole.table.admitted:
+            check_plausible(whole, network)
         check_scales(self.biases, network)
         self.measurements = self._at_epochs(whole)
         self.epoch_shift = float(np.abs(self.measurements.time - whole.time).max())  # s, of the rows to their epochs
@@ -280,7 +281,7 @@ class Problem:
         """The same problem with some rows of its table only: a mask or numbers (N,)."""
         table = self.measurements.table
         frame = table.frame.iloc[rows].reset_index(drop=True)
-        return self.rebuild(Table(frame, table.source, table.lines[rows], table.word))
+        return self.rebuild(replace(table, frame=frame, lines=table.lines[rows]))
 
     def redrawn(self, y: Sequence[Any]) -> Problem:
         """The same rows with other measured values: y (N, C) of each block, read where a value is measured.

@@ -46,12 +46,16 @@ NAMES = ("sensor", "target", "node", "name")  # columns whose cells are read as 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A table as read, not yet checked: the frame, its name, the line of each row and what a row is called."""
+    """A table as read, not yet checked: the frame, its name, the line of each row and what a row is called.
+
+    Rows that are `admitted` have passed the checks of `probcal.plausible` among others that the table lacks.
+    """
 
     frame: pd.DataFrame
     source: str
     lines: np.ndarray
     word: str = "row"
+    admitted: bool = False
 
     def where(self, row: int) -> str:
         """Name of a row in complaints: line of the file (the header is line 1), label or position
@@ -169,8 +173,11 @@ def _once(path: Path, columns: list[str]) -> list[str]:
     return columns
 
 
-def measure(table: Table, network: Network) -> Measurements:
-    """Check a table against a network; every complaint names file, row and column and says what to do."""
+def measure(table: Table, network: Network, *, repeated: bool = False) -> Measurements:
+    """Check a table against a network; every complaint names file, row and column and says what to do.
+
+    Data may come twice where rows may be `repeated`.
+    """
     names, units = header(table)
     frame = table.frame.set_axis(names, axis=1)
     for column in ("time", "sensor"):
@@ -206,7 +213,8 @@ def measure(table: Table, network: Network) -> Measurements:
     result = Measurements(
         time, sensor, target, target_names, channels, value, measured, std, own, table, weight, unnamed, floors
     )
-    _check_duplicates(result, network)
+    if not repeated:
+        _check_duplicates(result, network)
     return result
 
 
@@ -308,17 +316,27 @@ def _seconds(column: pd.Series) -> np.ndarray:
     """A column of durations in seconds, or of dates in seconds since the first one; NaN where it is neither."""
     if column.dtype.kind == "m":
         return column.dt.total_seconds().to_numpy(float)
+    try:
+        stamps = _dates(column)
+        return (stamps - stamps.min()).dt.total_seconds().to_numpy(float)
+    except (TypeError, ValueError, OverflowError):  # objects that are no dates, or dates too far apart
+        return np.full(len(column), np.nan)
+
+
+def _dates(column: pd.Series) -> pd.Series:
+    """Dates in UTC, blank where a cell is none."""
     if isinstance(column.dtype, pd.CategoricalDtype):
         column = column.astype(object)
     if column.dtype == object:  # a number among dates is none
         column = column.map(lambda cell: None if isinstance(cell, Number) else cell)
-    try:
-        stamps = pd.to_datetime(
-            column, errors="coerce", utc=True, format=None if column.dtype.kind == "M" else "ISO8601"
-        )
-        return (stamps - stamps.min()).dt.total_seconds().to_numpy(float)
-    except (TypeError, ValueError, OverflowError):  # objects that are no dates, or dates too far apart
-        return np.full(len(column), np.nan)
+    return pd.to_datetime(column, errors="coerce", utc=True, format=None if column.dtype.kind == "M" else "ISO8601")
+
+
+def first_date(table: Table) -> str:
+    """The date from which the times of a checked table are counted; empty where they are no dates."""
+    column = table.frame.iloc[:, header(table)[0].index("time")]
+    dated = column.dtype.kind != "m" and np.isnan(_floats(column)).all()
+    return str(_dates(column).min().isoformat()) if dated else ""
 
 
 def name_as_text(value: Any) -> str:

@@ -184,7 +184,7 @@ def test_late_and_repeated_rows_are_counted_and_left_out():
     twice = pd.concat([frame.iloc[[-1]].assign(time=20.0)] * 2)
     online.update(twice)
     clean.update(twice.iloc[:1])
-    assert online.counts == {"rows": len(frame) + 7, "late": 4, "duplicates": 2, "retired": 0}
+    assert online.counts == {"rows": len(frame) + 7, "late": 4, "duplicates": 2, "refused": 0, "retired": 0}
     np.testing.assert_allclose(clean.biases["mean"], online.biases["mean"], atol=1e-12)
 
 
@@ -532,7 +532,8 @@ def tampered(state):
 
 GOOD = {  # members of which other values make a filter: counts, times and what was found
     "arrivals.counts", "arrivals.floors", "arrivals.origin", "arrivals.targets", "arrivals.duration", "doubts",
-    "points", "jumps", "time", "walked", "log_evidence", "epochs",
+    "arrivals.earlier", "arrivals.first", "arrivals.latest", "arrivals.until", "points", "jumps", "time", "walked",
+    "log_evidence", "epochs",
 }  # fmt: skip
 
 
@@ -772,6 +773,162 @@ def test_a_filter_that_leaves_the_numbers_says_when(monkeypatch):
     lost.cloud = lost.cloud._replace(mean=np.full((20, 6), np.nan))
     with pytest.raises(InputError, match="no particle explains the rows at time 50"):
         lost.update(rows()[:6].assign(time=50.0))
+
+
+@pc.sensor(range=pc.Channel("m", 1.0), azimuth=pc.Channel("rad", 0.02, wrap=True), level=pc.Channel("dB", 1.0))
+def gauge(target, pose, *, offset=pc.Bias("m", 2.0)):
+    line = target.position - pose.position
+    away = (line**2).sum() ** 0.5
+    azimuth = jax.numpy.arctan2(line[1], line[0])
+    return {"range": away + offset, "azimuth": azimuth, "level": 60.0 - 20.0 * jax.numpy.log10(away)}
+
+
+@cache
+def gauges():
+    nodes = [pc.Node(f"g{k}", place) for k, place in enumerate([(0.0, 0.0), (40.0, 0.0), (0.0, 40.0)])]
+    network_ = pc.Network([gauge.on(node) for node in nodes])
+    run = pc.simulate(network_, pc.ConstantVelocity(0.3), np.arange(50.0), key=2)
+    return network_, run.table.sort_values("time", kind="stable", ignore_index=True)
+
+
+def with_cell(column, row, value):
+    def change(frame):
+        frame = frame.assign(range_std=frame.get("range_std", 1.0))
+        frame.loc[row, column] = value
+        return frame
+
+    return change
+
+
+NONSENSE = {  # a change of 150 rows, the rows that are refused, the words of the reason
+    "sentinel early": (with_cell("range", 4, -9999.0), [4], "-9999 looks like a mark for a missing value"),
+    "sentinel": (with_cell("level", 70, 9999.0), [70], "looks like a mark for a missing value"),
+    "sentinel last": (with_cell("azimuth", 149, -999.0), [149], 'row 149 column "azimuth": -999 looks like a mark'),
+    "far": (with_cell("range", 70, 1e12), [70], "is far from all others"),
+    "degrees": (with_cell("azimuth", 70, 90.0), [70], "90 rad looks like degrees; write the header as azimuth [deg]"),
+    "std": (with_cell("range_std", 70, 1e-12), [70], "many orders of magnitude smaller than the values"),
+    "epoch": (with_cell("time", 70, 1.7e12), [70], "looks like ms since 1970"),
+    "century": (with_cell("time", 149, 1e10), [149], "1e+10 s after the row before it in time"),
+    "past": (with_cell("time", 70, -1e10), [70], "1e+10 s before the row after it in time"),
+    "many": (
+        lambda d: d.assign(range=d["range"].where(d.index % 3 > 0, -9999.0)),
+        list(range(0, 150, 3)), "looks like a mark for a missing value",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", NONSENSE)
+def test_rows_that_cannot_be_meant_are_refused_and_the_rest_is_filtered(kind):
+    change, bad, says = NONSENSE[kind]
+    network_, frame = gauges()
+    changed = change(frame)
+    online = pc.Online(network_, pc.ConstantVelocity(0.3), pc.AugmentedFilter(lag=8))
+    update = online.update(changed)
+    assert update.refused["line"].tolist() == bad
+    assert update.refused["reason"].str.contains(says, regex=False).all()
+    assert online.counts["refused"] == len(bad)
+    other = pc.Online(network_, pc.ConstantVelocity(0.3), pc.AugmentedFilter(lag=8))
+    assert other.update(changed.drop(bad)).refused.empty
+    pd.testing.assert_frame_equal(online.biases, other.biases)
+    assert online.tree()["observed_data"].sizes["datum"] == 3 * (150 - len(bad))
+
+
+CELLS = [
+    ("range", -9999.0), ("level", 9999.0), ("azimuth", 90.0), ("range", 1e12), ("range_std", 1e-12), ("time", 1.7e12),
+    ("time", 1e10),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 100])
+def test_a_stream_refuses_the_same_rows_in_every_chunk_and_after_a_restart(chunk):
+    network_, frame = gauges()
+    changed, bad = frame, list(range(30, 30 + 11 * len(CELLS), 11))
+    for row, (column, value) in zip(bad, CELLS, strict=True):
+        changed = with_cell(column, row, value)(changed)
+    online, found = pc.Online(network_, pc.ConstantVelocity(0.3), pc.AugmentedFilter(lag=0)), []
+    for k in range(0, len(changed), chunk):
+        if k // chunk == 60 // chunk:  # as of a process that was killed
+            fresh = pc.Online(network_, pc.ConstantVelocity(0.3), pc.AugmentedFilter(lag=0))
+            unpack_state(fresh, pack_state(online, {}), "state")
+            online = fresh
+        found += online.update(changed.iloc[k : k + chunk]).refused["line"].tolist()
+    assert found == bad
+    assert online.counts["refused"] == len(bad)
+
+
+def test_a_column_of_degrees_or_powers_is_refused_whole():
+    network_, frame = gauges()
+    for changed, says in (
+        (frame.assign(azimuth=np.rad2deg(frame["azimuth"])), "looks like degrees"),
+        (frame.assign(level=np.geomspace(1e-4, 0.09, 150)), "looks like power in W, as all of the column"),
+    ):
+        online = pc.Online(network_, pc.ConstantVelocity(0.3), pc.AugmentedFilter(lag=0))
+        refused = online.update(changed).refused
+        assert refused["line"].tolist() == list(range(150))
+        assert refused["reason"].str.contains(says).all()
+        with pytest.raises(InputError, match=r"all 150 rows were refused; Update\.refused names the reasons"):
+            online.tree()
+
+
+def test_values_that_change_for_good_are_taken_after_some_rows():
+    network_, frame = gauges()
+    still = frame.assign(level=1e-7 * np.arange(150) % 7e-7)
+    later = frame.assign(time=frame["time"] + 50.0)
+    online = pc.Online(network_, pc.ConstantVelocity(0.3), pc.AugmentedFilter(lag=0))
+    assert online.update(still).refused.empty
+    found = [len(online.update(later.iloc[k : k + 5]).refused) for k in range(0, 150, 5)]
+    assert 0 < sum(found) < 40
+    assert not any(found[8:])
+
+
+def test_a_header_that_cannot_be_meant_is_one_sentence():
+    network_, frame = gauges()
+    kilometres = frame.assign(range=frame["range"] / 1e3, range_std=1.0).rename(columns={"range": "range [km]"})
+    online = pc.Online(network_, pc.ConstantVelocity(0.3), pc.AugmentedFilter(lag=0))
+    with pytest.raises(InputError, match=r'"range_std" has no unit beside "range \[km\]"'):
+        online.update(kilometres)
+
+
+def test_robust_channels_refuse_sentinels_too():
+    network_ = pc.Network([robust.on(pc.Node(f"n{k}", (10.0 * k, 5.0))) for k in range(3)])
+    frame = pc.simulate(network_, MOTION["a"], np.arange(20.0), key=1).table
+    frame.loc[59, "east"] = -9999.0
+    online = pc.Online(network_, MOTION["a"], pc.AugmentedFilter(lag=8))
+    assert online.update(frame).refused["line"].tolist() == [59]
+    assert online.tree().attrs["stream_refused"] == 1
+
+
+def dated(frame, start="2026-01-01T00:00Z"):
+    return frame.assign(time=pd.Timestamp(start) + pd.to_timedelta(frame["time"], unit="s"))
+
+
+@pytest.mark.parametrize("times", [lambda d: d, dated], ids=["seconds", "dates"])
+@pytest.mark.parametrize("epoch", [None, 2.0])
+def test_rows_that_a_fit_has_counted_are_refused(times, epoch):
+    frame = rows()
+    tree = pc.fit(pc.Problem(network(), MOTION, times(frame[10:40]), epoch=epoch), pc.EA())
+    online = pc.Online(network(), MOTION, pc.AugmentedFilter(lag=0), calibration=tree, epoch=epoch)
+    refused = online.update(times(frame)).refused
+    assert refused["line"].tolist() == list(range(10, 40))
+    assert refused["reason"].str.endswith("the calibration has counted this row").all()
+    other = pc.Online(network(), MOTION, pc.AugmentedFilter(lag=0), calibration=tree, epoch=epoch)
+    assert other.update(times(frame.assign(east=frame["east"] + 1e-9))).refused["line"].size < 30
+    whole = pc.Online(network(), MOTION, pc.AugmentedFilter(lag=0), calibration=tree)
+    assert whole.update(dated(frame, "2027-03-01T00:00Z")).refused.empty
+
+
+@pytest.mark.parametrize("times", [lambda d: d, dated], ids=["seconds", "dates"])
+def test_rows_that_a_stream_has_counted_are_refused_far_back(times, monkeypatch):
+    monkeypatch.setattr("probcal.inference.online.RECENT", 8)
+    frame, tree, lag = times(rows()), None, pc.AugmentedFilter(lag=4)
+    for seen, counted in ((20, 0), (35, 20), (len(frame), 35)):  # each goes on where the last stood
+        online = pc.Online(network(), MOTION, lag, calibration=tree, targets=3)
+        found = pd.concat([online.update(frame.iloc[k : min(k + 6, seen)]).refused for k in range(0, seen, 6)])
+        known = frame["time"][:seen] <= frame["time"][:counted].max() if counted else np.zeros(seen, bool)
+        assert found["line"].tolist() == np.flatnonzero(known).tolist()
+        tree = online.tree()
+    other = frame.assign(east=frame["east"] + 1.0, north=frame["north"] + 1.0)
+    assert pc.Online(network(), MOTION, lag, calibration=tree, targets=3).update(other).refused.empty
 
 
 @pc.sensor(east=pc.Channel("m", 1.0, noise=pc.StudentT(4.0)), north=pc.Channel("m", 2.0, noise=pc.StudentT(4.0)))

@@ -190,6 +190,56 @@ def test_rows_that_cannot_be_taken_are_put_aside(model, table, tmp_path):
     assert "1 duplicates, 2 left out (see refused.csv)" in printed
 
 
+def test_a_row_that_cannot_be_meant_is_put_aside_wherever_it_stands(model, table, tmp_path):
+    model.write_text(MODEL.replace("std=1.0)", "std=1.0, noise=StudentT(4.0))").replace("Target,", "StudentT, Target,"))
+    text = lines()
+    for k in (5, 42, 80):
+        time_, sensor, _, north = text[k].split(",")
+        text[k] = f"{time_},{sensor},-9999,{north}"
+    text[20] = "9,n7,1.0,2.0\n"
+    table.write_text("".join(text))
+    code, printed, _ = call("watch", model, table, "--out", tmp_path / "out", "--lag", "8")
+    assert code == 0
+    refused = pd.read_csv(tmp_path / "out" / "refused.csv").sort_values("line")
+    assert refused["line"].tolist() == [6, 21, 43, 81]
+    assert refused["reason"].iloc[3].startswith('rows.csv row 81 column "east": -9999 looks like a mark for a missing')
+    assert "4 left out (see refused.csv)" in printed
+    assert pc.load(tmp_path / "out").attrs["stream_refused"] == 3
+
+
+def test_a_first_table_of_nonsense_ends_in_one_sentence(model, table, tmp_path):
+    text = lines()
+    (tmp_path / "own.csv").write_text("".join(text))
+    model.write_text(MODEL.replace("motion, data)", f"motion, {str(tmp_path / 'own.csv')!r})"))
+    stamps = [f"{1.7e12 + k:.0f},{line.partition(',')[2]}" for k, line in enumerate(text[1:])]
+    table.write_text("".join([text[0], *stamps]))
+    code, _, said = call("watch", model, table)
+    assert code == 2
+    assert "the first 50 rows cannot be taken: rows.csv row 2 column" in said.replace("\n", " ")
+    assert "looks like ms since 1970; write the header as time [ms]" in said.replace("\n", " ")
+
+
+@pytest.mark.parametrize("since", [None, "2026-05-01T00:00:00Z"], ids=["seconds", "dates"])
+def test_rows_of_the_calibration_are_not_counted_again(model, table, tmp_path, since, monkeypatch):
+    monkeypatch.setattr("probcal.inference.online.RECENT", 10)
+    text = lines()
+    if since is not None:
+        stamps = [pd.Timestamp(since) + pd.Timedelta(line.partition(",")[0] + "s") for line in text[1:]]
+        rest = [line.partition(",")[2] for line in text[1:]]
+        text = [text[0], *(f"{t.isoformat()},{own}" for t, own in zip(stamps, rest, strict=True))]
+    table.write_text("".join(text[:61]))
+    options = ("watch", model, table, "--lag", "8", "--out")
+    assert call(*options, tmp_path / "one")[0] == 0
+    code, _, said = call(*options, tmp_path / "again", "--calibration", tmp_path / "one")
+    assert code == 2
+    assert "rows.csv: the calibration has counted all its rows; watch rows that came later" in said.replace("\n", " ")
+    table.write_text("".join(text))
+    code, printed, _ = call(*options, tmp_path / "two", "--calibration", tmp_path / "one")
+    assert code == 0
+    assert "60 left out (see refused.csv)" in printed
+    assert pd.read_csv(tmp_path / "two" / "refused.csv")["line"].tolist() == list(range(2, 62))
+
+
 def test_rows_are_filtered_at_common_epochs(model, table):
     model.write_text(MODEL.replace("motion, data)", "motion, data, epoch=2.0)"))
     code, printed, _ = call("watch", model, table, "--lag", "8")
@@ -225,7 +275,7 @@ def test_what_is_wrong_is_said(model, table, tmp_path):
     table.write_text("time,sensor,east,north\n" + "1,n9,2.0,3.0\n" * 60)
     code, _, printed = call("watch", good, table)
     assert code == 2
-    assert 'the first 50 rows cannot be taken: rows.csv row 51: sensor "n9" is not in' in printed
+    assert 'the first 50 rows cannot be taken: rows.csv row 2: sensor "n9" is not in' in printed
     table.write_text("time,sensor,east,north\n")
     code, _, printed = call("watch", good, table)
     assert code == 2

@@ -22,7 +22,9 @@ from probcal.cli.models import load_fit, load_problem, note_network, on_network
 from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs, write_whole
+from probcal.inference.arrivals import refused_rows
 from probcal.inference.checkpoint import pack_state, unpack_state
+from probcal.inference.counted import COUNTED
 from probcal.inference.online import AugmentedFilter, Online, ParticleFilter, Update
 from probcal.inference.progress import Progress, handled
 from probcal.problem import Problem, check_linear
@@ -33,6 +35,7 @@ from probcal.table import Table, csv_text, read_lines
 BLOCK = 1 << 18  # bytes that are read at once
 TRIED = 50  # first lines of which a model is made that has no data of its own, and that may be refused
 REST = 0.2  # s between two looks at a file that does not grow
+NAMED = 3  # rows left out that are named on stderr where no folder takes their table
 LISTED = 40  # biases of the live table; of more those that are largest in their sds
 DRAWN = 1000  # times of a history that is drawn
 PICTURE = "biases.png"
@@ -149,6 +152,11 @@ def run(
     if online.message:
         print(online.message)
     if online.end is None:
+        if watching.refused > watching.unfit:
+            raise InputError(
+                f"{source.name}: the calibration has counted all its rows; watch rows that came later, or leave"
+                " --calibration out"
+            )
         raise InputError(f"{source.name} has no rows that could be taken")
     if outputs is not None:
         save(note_network(online.tree(), network), outputs.folder / FIT)
@@ -174,6 +182,8 @@ class Watching:
     kept: Sequence[str]  # "tracks", "rows"
     held: pd.DataFrame  # tracks at the last time, of which more rows may come
     refused: int = 0
+    unfit: int = 0  # of these, rows that no calibration has counted
+    why: str = ""  # the first reason of those
     used: int = 0
     stored: float = field(default_factory=time.monotonic)
     begun: float = field(default_factory=time.monotonic)
@@ -209,11 +219,11 @@ class Watching:
     def filter(self, lines: bytes) -> None:
         """Filter some lines; those that cannot be taken are put aside."""
         table = read_lines(self.source.header, lines, self.source.name, self.source.line)
-        before = self.refused
+        before = self.unfit
         if len(table.frame):
             self._take(table)
-        if self.refused - before == len(table.frame) > 0 and self.online.end is None:
-            raise InputError(self._why)
+        if self.unfit - before == len(table.frame) > 0 and self.online.end is None:
+            raise InputError(self._none_taken)
         if self.tables is not None and "rows" in self.kept:
             head = b"" if self.tables.length.get(ROWS) else self.source.header.rstrip(b"\r") + b"\n"
             self.tables.write(ROWS, head + lines)
@@ -235,7 +245,9 @@ class Watching:
         except InputError as error:
             rows = len(table.frame)
             if rows == 1:
-                self._refuse(table, str(error))
+                self._refuse(refused_rows(table.lines, [str(error)]))
+                if self.unfit >= TRIED and self.online.end is None:
+                    raise InputError(self._none_taken) from None
                 return
             for some in (slice(0, rows // 2), slice(rows // 2, rows)):
                 part = Table(table.frame.iloc[some].reset_index(drop=True), table.source, table.lines[some], table.word)
@@ -243,19 +255,26 @@ class Watching:
             return
         self.note(update)
 
-    def _refuse(self, table: Table, why: str) -> None:
-        self.refused += 1
-        self._why = why
-        if self.refused == TRIED and self.online.end is None:
-            raise InputError(f"the first {TRIED} rows cannot be taken: {why}")
+    def _refuse(self, rows: pd.DataFrame) -> None:
+        """Put rows with their reasons aside."""
         if self.tables is not None:
-            self.tables.add(REFUSED, pd.DataFrame({"line": table.lines, "reason": why}))
-        elif self.refused <= 3:
-            print(f"left out: {why}", file=sys.stderr)
+            self.tables.add(REFUSED, rows)
+        else:
+            for why in rows["reason"].head(max(NAMED - self.refused, 0)):
+                print(f"left out: {why}", file=sys.stderr)
+        self.refused += len(rows)
+        others = rows["reason"][~rows["reason"].str.endswith(COUNTED)]
+        self.unfit += len(others)
+        self.why = self.why or next(iter(others), "")
+
+    @property
+    def _none_taken(self) -> str:
+        return self.why if self.unfit < TRIED else f"the first {TRIED} rows cannot be taken: {self.why}"
 
     def note(self, update: Update) -> None:
         """Add what an update made known to the tables."""
         self.used = self.online.counts["rows"]
+        self._refuse(update.refused)
         if self.tables is None:
             return
         if "tracks" in self.kept and len(update.tracks):

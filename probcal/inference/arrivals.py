@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.inference.counted import COUNTED, STREAMS, Counted, Stream, first_key
 from probcal.labels import AXES, NOBODY
 from probcal.lazy import Later
 from probcal.model.epochs import Epoch, merged
@@ -17,6 +19,7 @@ from probcal.model.motions import Area, linear_of, start_of
 from probcal.motion import Target, as_motion
 from probcal.network import Network
 from probcal.noise import Heard, Normal
+from probcal.plausible import implausible
 from probcal.problem import Problem, check_linear, declared_target
 from probcal.smoothing.grid import candidates
 from probcal.table import Table, header, measure, name_as_text, names_as_text
@@ -52,11 +55,12 @@ class CarriedTarget:
 class Arrivals:
     """What turns rows into epochs.
 
-    A row that is earlier than the time up to which its target was filtered is late (where biases move, than that of any
-    target), one that repeats time, sensor, target and channels of another is a duplicate; both are left out and
-    counted. With an `epoch` (s) rows count as of the nearest multiple of it. Rows of one call, and those that are still
-    in the window, are brought into order. A new target takes a free slot, or that of the target that has been
-    silent for longest.
+    A row that cannot be meant (`probcal.plausible`, beside the last values of each column) or that the calibration
+    has counted is refused. A row that is earlier than the time up to which its target was filtered is late (where
+    biases move, than that of any target), one that repeats time, sensor, target and channels of another is a
+    duplicate; both are left out and counted. With an `epoch` (s) rows count as of the nearest multiple of it. Rows of
+    one call, and those that are still in the window, are brought into order. A new target takes a free slot, or that of
+    the target that has been silent for longest.
     """
 
     network: Network
@@ -65,6 +69,7 @@ class Arrivals:
     most: int  # targets that are carried at once
     linear: bool = True  # whether every motion must have a linear form
     epoch: float | None = None  # s, length of common epochs; without it rows keep their times
+    counted: Counted | None = None  # rows that the calibration has counted
     counts: Counter[str] = field(default_factory=Counter)
     targets: dict[str, CarriedTarget] = field(default_factory=dict)
     origin: str = ""  # the date of time 0, where times are dates
@@ -75,14 +80,18 @@ class Arrivals:
     tried: np.ndarray | None = None  # (places, d) that are tried for a new target
     template: Problem | None = None
     sizes: tuple[int, ...] = ()  # rows of an epoch of each block, padded
+    earlier: Mapping[str, np.ndarray] = field(default_factory=dict)  # last values of each column, and last times
+    first: int | None = None  # key of the first row that was taken
+    latest: float = -np.inf  # s, of the rows that were taken
+    until: float = -np.inf  # s, up to which the calibration has counted this recording
 
     def copy(self) -> Arrivals:
         """As it stands now: what rows change is copied."""
         targets = {name: replace(own) for name, own in self.targets.items()}
         return replace(self, counts=self.counts.copy(), targets=targets, starts=dict(self.starts))
 
-    def admit(self, table: Table, pending: pd.DataFrame | None, since: float) -> pd.DataFrame:
-        """Rows of a table behind those pending, in order, without repeated ones and those before a time.
+    def admit(self, table: Table, pending: pd.DataFrame | None, since: float) -> tuple[pd.DataFrame, pd.DataFrame]:
+        """Rows of a table behind those pending, in order, without repeated ones and those before a time; those refused.
 
         Raises `InputError` for a column that is missing or not understood.
         """
@@ -106,11 +115,14 @@ class Arrivals:
             raise InputError(f"{table.source}: an online filter takes rows that name their target, no detections")
         else:
             frame["target"] = np.where(blind, NOBODY, ONLY)
+        reasons = self._reasons(replace(table, frame=frame), units["time"])
+        taken = ~np.isin(np.arange(len(frame)), list(reasons))
         data = [c for c in frame.columns if c not in ("time", "sensor", "target")]
         filled = frame[data].notna().to_numpy()
         power = np.int64(1) << (np.arange(len(data), dtype=np.int64) % 63)
         frame["cells"] = filled @ power  # which are filled, as a number
         frame["line"] = table.lines
+        frame = frame[taken].reset_index(drop=True)
         codes, kinds = pd.factorize(frame["target"])
         known = [self.targets[name].time if name in self.targets else -np.inf for name in kinds]
         last = np.array(known, float)[codes]
@@ -128,7 +140,44 @@ class Arrivals:
         self.counts["rows"] += len(table.frame)
         self.counts["late"] += int(late.sum())
         self.counts["duplicates"] += int(again.sum() + twice.sum())
-        return whole[~twice].sort_values("time", kind="stable", ignore_index=True)
+        self.counts["refused"] += len(reasons)
+        refused = refused_rows(table.lines[~taken], [reasons[row] for row in sorted(reasons)])
+        return whole[~twice].sort_values("time", kind="stable", ignore_index=True), refused
+
+    def _reasons(self, table: Table, unit: str | None) -> dict[int, str]:
+        """Rows that cannot be meant or are counted already, each with its reason; `unit` is that of their times."""
+        if table.frame.empty:
+            return {}
+        network = self._placed
+        data = measure(table, network, repeated=True)
+        reasons, self.earlier = implausible(data, network, self.earlier, unit)
+        taken = data.measured.any(1) & ~np.isin(np.arange(len(data.time)), list(reasons))
+        if self.counted is not None:
+            known = self.counted.rows(data, network, self.origin) | (data.time <= self.until)
+            while self.first is None and (taken & ~known).any():
+                row = int((taken & ~known).argmax())
+                until = self.counted.until(data, network, row, self.origin)
+                if until <= self.until:
+                    break
+                self.until, known = until, known | (data.time <= until)
+            reasons |= {row: f"{table.where(row)}: {COUNTED}" for row in np.flatnonzero(taken & known).tolist()}
+            taken &= ~known
+        if taken.any() and self.first is None:
+            self.first = first_key(data, network, int(taken.argmax()))
+        self.latest = max(self.latest, data.time[taken].max(initial=-np.inf))
+        return reasons
+
+    def noted(self) -> dict[str, str]:
+        """Attributes of a tree that name the rows that it has counted."""
+        streams = [] if self.counted is None else [*self.counted.streams]
+        if self.first is not None:
+            streams.append(Stream(self.first, self.latest, self.origin, 0.0))
+        return {STREAMS: json.dumps(streams)} | ({"time_origin": self.origin} if self.origin else {})
+
+    @property
+    def _placed(self) -> Network:
+        """The network, with the floors of its channels as the first rows have them."""
+        return self.network if self.template is None else self.template.network
 
     def _in_seconds(self, table: Table, names: list[str], units: Mapping[str, str | None]) -> pd.DataFrame:
         """The frame with time in seconds: as they are, or since the first date of the stream."""
@@ -166,7 +215,7 @@ class Arrivals:
         """Rows in order as epochs, None where all are blank; raises `InputError` naming a row that cannot be taken."""
         own = frame.drop(columns=["cells", "line"])
         table = Table(own, source, frame["line"].to_numpy())
-        network = self.network if self.template is None else self.template.network
+        network = self._placed
         data = measure(table, network)
         if not data.measured.any():
             if self.template is None:
@@ -213,8 +262,8 @@ class Arrivals:
         if self.template is None:
             self._freeze(
                 Problem(
-                    self.network, self.motion, Table(frame, source, np.arange(len(frame))), fix=self.fixed,
-                    epoch=self.epoch,
+                    self.network, self.motion, Table(frame, source, np.arange(len(frame)), admitted=True),
+                    fix=self.fixed, epoch=self.epoch,
                 )
             )  # fmt: skip
         for name in data.target_names:
@@ -226,8 +275,9 @@ class Arrivals:
     def rebuild(self) -> None:
         """The template from its samples: one row of each sensor type that sees each form of a motion."""
         assert self.samples is not None
-        kept = self.samples.drop(columns=["_kind", "_group"])
-        template = Problem(self.network, self.motions(kept["target"]), kept, fix=self.fixed, epoch=self.epoch)
+        kept = self.samples.drop(columns=["_kind", "_group"]).reset_index(drop=True)
+        table = Table(kept, "data", np.arange(len(kept)), admitted=True)
+        template = Problem(self.network, self.motions(kept["target"]), table, fix=self.fixed, epoch=self.epoch)
         if self.linear:
             check_linear(template)
             self._check_gaussian(template)
@@ -344,6 +394,11 @@ class Arrivals:
     def axes(self) -> list[str]:
         """Names of the axes."""
         return list(AXES[: self.network.dimension])
+
+
+def refused_rows(lines: Sequence[Any] | np.ndarray = (), reasons: Sequence[str] = ()) -> pd.DataFrame:
+    """The table of rows that a stream leaves out: line of each and the reason."""
+    return pd.DataFrame({"line": np.asarray(lines, None if len(lines) else int), "reason": np.asarray(reasons, object)})
 
 
 def _held(epochs: Any) -> Epoch:

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError, nearest
-from probcal.inference.arrivals import Arrivals, Batch, padded
+from probcal.inference.arrivals import Arrivals, Batch, padded, refused_rows
+from probcal.inference.counted import Counted
 from probcal.inference.identity import declared_identity
 from probcal.labels import NOBODY
 from probcal.lazy import Later
@@ -177,6 +178,7 @@ class Update(NamedTuple):
     jumps: tuple[Jump, ...]
     passes: int  # most times that a window was linearised again
     settled: bool  # all windows came to rest; each new target was placed; enough of the first particles are left
+    refused: pd.DataFrame  # line and reason of rows that were left out
 
 
 class Online:
@@ -184,10 +186,10 @@ class Online:
 
     `motion` is one motion for all targets, or a mapping by name, as in `Problem`; a target of which no start is
     declared starts where the first rows let it. The prior of the biases is Gaussian, of the declared scales, or
-    `calibration`, a tree of an earlier fit: biases that it held fixed stay so. `epoch` puts rows at common epochs of
-    that length in s, as in `Problem`. `targets` are carried at once; of a new one beyond them that which has
-    been silent for longest is given up. Unknown noise levels are held at their guess, or at what `calibration` has.
-    Raises `InputError` for what cannot be calibrated online.
+    `calibration`, a tree of an earlier fit: biases that it held fixed stay so, and rows that it has counted are
+    refused. `epoch` puts rows at common epochs of that length in s, as in `Problem`. `targets` are carried at once; of
+    a new one beyond them that which has been silent for longest is given up. Unknown noise levels are held at their
+    guess, or at what `calibration` has. Raises `InputError` for what cannot be calibrated online.
 
     >>> online = Online(network, motion, AugmentedFilter(lag=0))
     >>> news = online.update(run.table)
@@ -226,7 +228,9 @@ class Online:
             raise InputError(f"Online(epoch={epoch!r}): give the length of common epochs in s, or leave it out")
         held = {} if calibration is None else held_by(calibration, network.labels)
         fixed = held | fixed_biases(network, fix)
-        self.arrivals = Arrivals(network, motion, fixed, targets, isinstance(self.method, AugmentedFilter), epoch)
+        counted = None if calibration is None else Counted.of(calibration)
+        linear = isinstance(self.method, AugmentedFilter)
+        self.arrivals = Arrivals(network, motion, fixed, targets, linear, epoch, counted)
         self.network, self.calibration = network, calibration
         self.pending: pd.DataFrame | None = None
         self.cloud: Cloud | None = None
@@ -257,8 +261,8 @@ class Online:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Rows that came, and how many of them were late or repeated; targets that were given up."""
-        return {name: self.arrivals.counts[name] for name in ("rows", "late", "duplicates", "retired")}
+        """Rows that came, and how many of them were late, repeated or refused; targets that were given up."""
+        return {name: self.arrivals.counts[name] for name in ("rows", "late", "duplicates", "refused", "retired")}
 
     @property
     def message(self) -> str:
@@ -283,6 +287,8 @@ class Online:
     @property
     def _problem(self) -> Problem:
         if self.arrivals.template is None:
+            if refused := self.counts["refused"]:
+                raise InputError(f"nothing is known: all {refused} rows were refused; Update.refused names the reasons")
             raise InputError("nothing is known before the first rows; call update(rows)")
         return self.arrivals.template
 
@@ -355,16 +361,18 @@ class Online:
     def update(self, rows: Any) -> Update:
         """Filter a table of rows: a path, a DataFrame, in any order.
 
-        Raises `InputError` naming a row that cannot be taken; nothing of the table is used then.
+        Rows that cannot be meant, such as a mark for a missing value or degrees for radians, are left out and named
+        in `Update.refused`. Raises `InputError` naming a row that cannot be read; nothing of the table is used then.
         """
         table = read_table(rows)
         with self._unchanged_if_refused():
-            frame = self.arrivals.admit(table, self.pending, self.walked if self._moves else -np.inf)
+            frame, refused = self.arrivals.admit(table, self.pending, self.walked if self._moves else -np.inf)
             batch = None if frame.empty else self.arrivals.compiled(frame, table.source)
             if batch is None:
-                return self._nothing()
+                return self._nothing()._replace(refused=refused)
             self.prepare()
-            return self._filter(frame, batch, everything=False)
+            update = self._filter(frame, batch, everything=False)
+            return update._replace(refused=pd.concat([refused, update.refused], ignore_index=True))
 
     @float64
     def finish(self) -> Update:
@@ -388,7 +396,7 @@ class Online:
             raise
 
     def _nothing(self) -> Update:
-        return Update(self.time, 0, self._tracks([]), (), 0, True)
+        return Update(self.time, 0, self._tracks([]), (), 0, True, refused_rows())
 
     @property
     def _moves(self) -> bool:
@@ -515,7 +523,8 @@ class Online:
         tracks = self._tracks(frames)
         there = tracks["target"] != NOBODY
         settled = self.doubts.total() == doubts
-        return Update(self.time, begun, tracks[there].reset_index(drop=True), tuple(jumps), most, settled)
+        tracks = tracks[there].reset_index(drop=True)
+        return Update(self.time, begun, tracks, tuple(jumps), most, settled, refused_rows())
 
     def _populate(self, problem: Problem, method: ParticleFilter) -> None:
         """Particles with the slots of every form of a motion."""
@@ -556,7 +565,8 @@ class Online:
         self.pending = frame.iloc[:0]
         self.recent = frame[batch.row >= 0].tail(RECENT).reset_index(drop=True)
         self.lately = self._tracks(frames)
-        return Update(self.time, K, self.lately, (), 0, particles.ancestors(self.cloud) >= ANCESTORS)
+        settled = particles.ancestors(self.cloud) >= ANCESTORS
+        return Update(self.time, K, self.lately, (), 0, settled, refused_rows())
 
     def _window(self, left: int) -> tuple[int, int, int]:
         """Epochs of the next call, what they are padded to, and into how many parts it falls."""

@@ -86,9 +86,9 @@ def calibration_tree(online: Online) -> xr.DataTree:
     assert frame is not None
     own = frame.drop(columns=["cells", "line"])
     motions = online.arrivals.motions(dict.fromkeys(own["target"]))
-    if online.counts["rows"] > len(frame):  # these do not begin where the targets did
+    if online.counts["rows"] - online.counts["refused"] > len(frame):  # these do not begin where the targets did
         motions = {name: Target(target.motion) for name, target in motions.items()}
-    table = Table(own, "the last rows", frame["line"].to_numpy())
+    table = Table(own, "the last rows", frame["line"].to_numpy(), admitted=True)
     problem = Problem(template.network, motions, table, fix=template.fixed, epoch=template.epoch)
     z, root = np.asarray(online.end.mean), np.asarray(online.end.root)
     levels = jnp.asarray(online.levels(problem))
@@ -115,6 +115,7 @@ def calibration_tree(online: Online) -> xr.DataTree:
     )  # fmt: skip
     tree = build(answer, (), jax.random.key(0), ())
     tree.attrs.update({f"stream_{name}": count for name, count in online.counts.items()}, seed=0)
+    tree.attrs.update(online.arrivals.noted())
     return tree
 
 

@@ -28,6 +28,7 @@ from probcal.results.schema import BOUND, EVIDENCE, INTERVAL, RESULTS_VERSION
 from probcal.smoothing.draws import many_data, residuals
 from probcal.smoothing.mirrors import SAME
 from probcal.smoothing.mode import Point
+from probcal.table import first_date
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -179,7 +180,7 @@ def _attrs(answer: Answer) -> dict[str, Any]:
         "assessed": 0,
         "status": str(answer.status), "message": answer.message, "data": answer.problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
-        **answer.posterior.attrs, **_epoch(answer.problem),
+        **answer.posterior.attrs, **_epoch(answer.problem), **_origin(answer.problem),
         **({"places": "integrated"} if answer.problem.tilted else {}),
     }  # fmt: skip
     if found.evidence is not None:
@@ -220,6 +221,12 @@ def build_tracks(problem: Problem, tracks: Sequence[Band]) -> xr.DataTree:
 def _epoch(problem: Problem) -> dict[str, float]:
     """Length of common epochs in s and the largest shift of a row to one; nothing where rows keep their times."""
     return {} if problem.epoch is None else {"epoch": problem.epoch, "epoch_shift": problem.epoch_shift}
+
+
+def _origin(problem: Problem) -> dict[str, str]:
+    """The date of time 0; nothing where times are no dates."""
+    date = first_date(problem.measurements.table)
+    return {"time_origin": date} if date else {}
 
 
 def add_optima(tree: xr.DataTree, answers: Sequence[Answer], best: int) -> xr.DataTree:
