@@ -1,10 +1,14 @@
 """`probcal watch`: files that grow, standard input, rows that cannot be taken, and processes that are killed."""
 
 import io
+import json
+import re
 import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -280,6 +284,147 @@ def test_what_is_wrong_is_said(model, table, tmp_path):
     code, _, printed = call("watch", good, table)
     assert code == 2
     assert "rows.csv has no rows that could be taken" in printed
+
+
+def edited(text):
+    """Rows of the same length, one cell of which differs."""
+    return text.replace(",n0,", ",n1,", 1)
+
+
+def test_a_stream_goes_on_in_the_file_that_it_began_in(model, table, tmp_path):
+    out, text = tmp_path / "out", "".join(lines())
+    options = ("watch", model, table, "--out", out, "--lag", "0")
+    assert call(*options)[0] == 0
+    for other, why in {
+        edited(text): "its first 81 lines are not those that were read; it is another file, or was edited: restore it",
+        text.replace(
+            "east,north", "north,east"
+        ): "its header has changed since it was read; restore it, or give another --out",
+    }.items():
+        assert len(other) == len(text)
+        table.write_text(other + text[-30:])
+        code, _, said = call(*options)
+        assert code == 2
+        assert f"{table}: {why}" in said
+    table.write_text(text)
+    assert call(*options)[0] == 0
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_last_line_without_an_end_is_taken_once(end, model, table, tmp_path):
+    out, text = tmp_path / "out", lines()
+    options = ("watch", model, table, "--out", out, "--lag", "0", "--keep", "rows")
+    for count in (41, 41, 61, 81):
+        content = "".join(text[:count]).replace("\n", end).encode()
+        table.write_bytes(content.rstrip())
+        code, printed, _ = call(*options)
+        assert code == 0
+        assert f"{count - 1} rows" in printed
+        assert "left out" not in printed
+        assert (out / "rows.csv").read_bytes().split() == content.split()
+    table.write_bytes(table.read_bytes() + f"{end}50,n7,1.0,2.0{end}".encode())
+    assert call(*options)[0] == 0
+    assert pd.read_csv(out / "refused.csv")["line"].tolist() == [82]
+
+
+def test_a_state_of_another_model_is_refused(model, table, tmp_path):
+    out = tmp_path / "out"
+    options = ("watch", model, table, "--out", out, "--lag", "0")
+    assert call(*options)[0] == 0
+    network = pc.write_network(tmp_path / "network.csv", pc.load(out) and place(model).network)
+    for old, new, name in (
+        ("place[1])", "1.01 * place[1])", "sensor plain"), ("std=1.0", "std=2.0", "sensor plain"),
+        ("10.0 * k", "11.0 * k", "node n1"), ('"m", 2.0', '"m", 3.0', "sensor plain"), ("(0.5)", "(0.6)", "motion"),
+    ):  # fmt: skip
+        model.write_text(MODEL.replace(old, new))
+        code, _, said = call(*options)
+        assert code == 2
+        assert f"{out / 'watch.npz'}: the {name} has changed since the run there began" in said
+        assert "give another --out, or move it away" in said
+    model.write_text(MODEL)
+    network.write_text(network.read_text().replace("n1.shift,sensor,m,0.0,", "n1.shift,sensor,m,1.0,0.5"))
+    code, _, said = call(*options, "--network", network)
+    assert code == 2
+    assert "the sensor n1 has changed" in said
+    code, _, said = call(*options, "--calibration", out)
+    assert code == 2
+    assert "the calibration has changed" in said
+    assert call(*options)[0] == 0
+
+
+def place(model):
+    found = {}
+    exec(model.read_text(), found)
+    return found["problem"](pd.DataFrame({"time": [0.0], "sensor": ["n0"], "east": [1.0], "north": [1.0]}))
+
+
+def test_a_damaged_state_or_table_is_one_sentence(model, table, tmp_path):
+    out = tmp_path / "out"
+    options = ("watch", model, table, "--out", out, "--lag", "0")
+    assert call(*options)[0] == 0
+    state, history = out / "watch.npz", out / "biases.csv"
+    whole, note = state.read_bytes(), out / ".probcal.json"
+    for path, content, why in (
+        (state, whole[:-9], "is damaged, or no state of this version of probcal watch; move it away to begin anew"),
+        (state, b"", "is damaged, or no state of this version of probcal watch; move it away to begin anew"),
+        (history, history.read_bytes()[:-9], "is shorter than watch.npz says; restore it, or move watch.npz away"),
+    ):
+        before = path.read_bytes()
+        path.write_bytes(content)
+        note.write_text(json.dumps({name: ["", ""] for name in json.loads(note.read_text())}))  # as a kill leaves it
+        code, _, said = call(*options)
+        assert code == 2
+        assert f"{path} {why}" in said
+        path.write_bytes(before)
+    assert call(*options)[0] == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limits of files")
+def test_a_full_disk_is_one_sentence_and_the_state_stays_whole(model, table, tmp_path, monkeypatch):
+    """Files of a process may have this many bytes: what is too long for one is written to its limit, then fails."""
+    import resource
+
+    monkeypatch.setattr("probcal.cli.watch.BLOCK", 300)
+    options = ("watch", model, table, "--lag", "0", "--every", "0", "--keep", "tracks,rows", "--out")
+    assert call(*options, tmp_path / "whole")[0] == 0
+    sizes = {path.name: path.stat().st_size for path in (tmp_path / "whole").iterdir()}
+    out, failed, soft = tmp_path / "out", set(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size in sorted({*sizes.values(), 400, 1200}):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size - 1, soft[1]))
+        try:
+            code, _, said = call(*options, out)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, soft)
+        if code:
+            assert code == 2
+            assert re.fullmatch(r"probcal: \S+ cannot be written: File too large\n", said.splitlines(True)[-1])
+            failed.add(Path(said.splitlines()[-1].split()[1]).name)
+        assert not list(out.glob("*.part"))
+    assert {"tracks.csv", "watch.npz", "fit.nc"} <= failed
+    assert call(*options, out)[0] == 0
+    for name in ("tracks.csv", "rows.csv"):
+        assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    pd.testing.assert_frame_equal(last(out), last(tmp_path / "whole"))
+
+
+def test_progress_of_a_file_has_rows_rate_and_share(model, table, monkeypatch):
+    @contextmanager
+    def shown():
+        yield seen.append
+
+    seen = []
+    monkeypatch.setattr("probcal.cli.watch.shown", shown)
+    monkeypatch.setattr("probcal.cli.watch.BLOCK", 700)
+    assert call("watch", model, table, "--lag", "0")[0] == 0
+    first, begun, *blocks, end = map(str, seen)
+    assert first.startswith("watch: rows.csv, start, ")
+    assert begun.startswith("watch: rows.csv, first rows, ")
+    assert len(blocks) > 2
+    assert re.fullmatch(
+        r"watch: \d+ rows up to time \d+ s, [\d,]+ rows per s, \d+% of rows.csv, \d+ s, about \d+ s left", blocks[0]
+    )
+    assert "80 rows up to time 39 s" in end
+    assert "100% of rows.csv" in end
 
 
 def started(*arguments):

@@ -1,5 +1,6 @@
 """`watch`: a stream calibrated as it comes, with a live table, a history on disk and a state that survives a kill."""
 
+import hashlib
 import os
 import signal
 import sys
@@ -21,9 +22,9 @@ from probcal.cli.files import can_plot
 from probcal.cli.models import load_fit, load_problem, note_network, on_network
 from probcal.cli.progress import shown
 from probcal.errors import InputError
-from probcal.files import Outputs, write_whole
+from probcal.files import Outputs, cannot_write, write_whole
+from probcal.inference import checkpoint
 from probcal.inference.arrivals import refused_rows
-from probcal.inference.checkpoint import pack_state, unpack_state
 from probcal.inference.counted import COUNTED
 from probcal.inference.online import AugmentedFilter, Online, ParticleFilter, Update
 from probcal.inference.progress import Progress, handled
@@ -42,6 +43,11 @@ PICTURE = "biases.png"
 STATE, HISTORY, JUMPS, TRACKS, REFUSED, ROWS, FIT = (
     "watch.npz", "biases.csv", "jumps.csv", "tracks.csv", "refused.csv", "rows.csv", "fit.nc"
 )  # fmt: skip
+TABLES = (HISTORY, JUMPS, TRACKS, REFUSED, ROWS)
+BESIDE = {  # what a state says of source and tables
+    "length": checkpoint.named(checkpoint.whole), "offset": checkpoint.whole, "line": checkpoint.whole,
+    "header": checkpoint.text, "digest": checkpoint.text, "held": checkpoint.optional(checkpoint.TRACKS),
+}  # fmt: skip
 
 
 @dataclass
@@ -54,6 +60,24 @@ class Source:
     line: int = 2
     rest: bytes = b""  # of a line that has not ended
     ended: bool = False
+    cut: bool = False  # whether the last line that was taken had no end yet
+    digest: Any = field(default_factory=hashlib.sha256)  # of the bytes before the offset
+
+    def skip(self, file: Any, path: Path, digest: str) -> None:
+        """Go on behind the bytes that were taken, of that digest; raises `InputError` where others stand there."""
+        if self.offset > os.fstat(file.fileno()).st_size:
+            raise InputError(f"{path} is shorter than what was read of it; it is another file: give another --out")
+        if file.readline().rstrip(b"\n") != self.header:
+            raise InputError(f"{path}: its header has changed since it was read; restore it, or give another --out")
+        file.seek(0)
+        while block := file.read(min(self.offset - file.tell(), BLOCK)):
+            self.digest.update(block)
+            self.cut = not block.endswith(b"\n")
+        if self.digest.hexdigest() != digest:
+            raise InputError(
+                f"{path}: its first {self.line - 1} lines are not those that were read; it is another file, or was"
+                " edited: restore it, or give another --out"
+            )
 
     def take(self, file: Any) -> bytes:
         """Whole lines that have come, at most a block of them."""
@@ -64,7 +88,7 @@ class Source:
         lines = whole + cut
         if not self.header and lines:
             self.header, _, lines = lines.partition(b"\n")
-            self.offset += len(self.header) + 1
+            self._count(self.header + b"\n")
         return lines
 
     def peek(self, file: Any) -> bytes:
@@ -76,12 +100,22 @@ class Source:
     def last(self) -> bytes:
         """What stands behind the last line end, where no more will come."""
         rest, self.rest = self.rest, b""
-        return rest + b"\n" if rest.strip() else b""
+        return rest if rest.strip() else b""
+
+    def ends(self, lines: bytes) -> bytes:
+        """The end, which came since, of a line that had none when it was taken."""
+        end = lines[: lines.find(b"\n") + 1] if self.cut else b""
+        return b"" if end.strip() else end
 
     def taken(self, lines: bytes) -> None:
         """These lines were filtered."""
-        self.offset += len(lines)
+        self._count(lines)
         self.line += lines.count(b"\n")
+        self.cut = not lines.endswith(b"\n")
+
+    def _count(self, content: bytes) -> None:
+        self.offset += len(content)
+        self.digest.update(content)
 
 
 @dataclass
@@ -93,10 +127,13 @@ class Appended:
 
     def open(self) -> None:
         """Take away what was written after the last state, of a run that was killed."""
-        for name in (HISTORY, JUMPS, TRACKS, REFUSED, ROWS):
-            path = self.folder / name
-            if path.exists() and path.stat().st_size > self.length.get(name, 0):
-                os.truncate(path, self.length.get(name, 0))
+        for name in TABLES:
+            path, length = self.folder / name, self.length.get(name, 0)
+            size = path.stat().st_size if path.exists() else 0
+            if size < length:
+                raise InputError(f"{path} is shorter than {STATE} says; restore it, or move {STATE} away to begin anew")
+            if size > length:
+                self._cut(path, length)
 
     def add(self, name: str, frame: pd.DataFrame) -> None:
         """Rows at the end of a table."""
@@ -105,10 +142,23 @@ class Appended:
         self.write(name, csv_text(frame, header=not self.length.get(name)).encode())
 
     def write(self, name: str, content: bytes) -> None:
-        """Bytes at the end of a file."""
-        with (self.folder / name).open("ab") as file:
-            file.write(content)
-        self.length[name] = self.length.get(name, 0) + len(content)
+        """Bytes at the end of a file: all of them or, where they cannot be written, none."""
+        path, length = self.folder / name, self.length.get(name, 0)
+        try:
+            with path.open("ab") as file:
+                file.write(content)
+        except OSError as error:
+            with suppress(InputError):
+                self._cut(path, length)
+            raise cannot_write(path, error) from None
+        self.length[name] = length + len(content)
+
+    @staticmethod
+    def _cut(path: Path, length: int) -> None:
+        try:
+            os.truncate(path, length)
+        except OSError as error:
+            raise cannot_write(path, error) from None
 
 
 def run(
@@ -128,20 +178,23 @@ def run(
         problem.network, problem.motion, method, calibration=known, fix=problem.fixed, epoch=problem.epoch,
         targets=targets,
     )  # fmt: skip
-    tables, held = None if outputs is None else Appended(outputs.folder), pd.DataFrame()
+    tables, held, digest = None if outputs is None else Appended(outputs.folder), pd.DataFrame(), ""
     if outputs is not None:
         assert tables is not None
         state = outputs.folder / STATE
         if state.exists():
-            beside = unpack_state(online, state.read_bytes(), str(state))
-            tables.length, held = beside["length"], pd.DataFrame(beside["held"])
+            said = checkpoint.unpack_state(online, state.read_bytes(), str(state))
+            beside = checkpoint.read_members(said, BESIDE, str(state))
+            tables.length, held = beside["length"], held if beside["held"] is None else beside["held"]
             if data is not None:
-                source.offset, source.line, source.header = beside["offset"], beside["line"], beside["header"].encode()
+                digest, source.header = beside["digest"], beside["header"].encode()
+                source.offset, source.line = beside["offset"], beside["line"]
         outputs.begin()
         tables.open()
-    watching = Watching(online, source, tables, every, kept, held)
+    size = 0 if data is None or follow else data.stat().st_size
+    watching = Watching(online, source, tables, every, kept, held, size)
     with (
-        _input(data, source) as file,
+        _input(data, source, digest) as file,
         watching.shown() as show,
         _told_to_end(watching),
         suppress(KeyboardInterrupt),
@@ -181,6 +234,7 @@ class Watching:
     every: float  # s between two states
     kept: Sequence[str]  # "tracks", "rows"
     held: pd.DataFrame  # tracks at the last time, of which more rows may come
+    size: int = 0  # bytes of a file that does not grow
     refused: int = 0
     unfit: int = 0  # of these, rows that no calibration has counted
     why: str = ""  # the first reason of those
@@ -190,6 +244,9 @@ class Watching:
     busy: bool = False  # with rows or tables, which are taken and written whole
     ending: bool = False
     unstored: bool = False
+
+    def __post_init__(self):
+        self.first = self.online.counts["rows"], self.source.offset  # at the beginning of this run
 
     def follow(self, file: Any, grows: bool, show: Callable[[str], None]) -> None:
         """Take lines until there are no more, or for as long as the file may grow."""
@@ -218,7 +275,9 @@ class Watching:
 
     def filter(self, lines: bytes) -> None:
         """Filter some lines; those that cannot be taken are put aside."""
-        table = read_lines(self.source.header, lines, self.source.name, self.source.line)
+        end = self.source.ends(lines)
+        first = self.source.line + end.count(b"\n")
+        table = read_lines(self.source.header, lines[len(end) :], self.source.name, first)
         before = self.unfit
         if len(table.frame):
             self._take(table)
@@ -304,9 +363,10 @@ class Watching:
         ])  # fmt: skip
         beside = {
             "length": self.tables.length, "offset": self.source.offset, "line": self.source.line,
-            "header": self.source.header.decode(), "held": {str(n): self.held[n].tolist() for n in self.held},
+            "header": self.source.header.decode(), "digest": self.source.digest.hexdigest(),
+            "held": None if self.held.empty else self.held,
         }  # fmt: skip
-        write_whole(self.tables.folder / STATE, pack_state(self.online, beside))
+        write_whole(self.tables.folder / STATE, checkpoint.pack_state(self.online, beside))
 
     def said(self) -> str:
         """One line on where it stands."""
@@ -325,13 +385,25 @@ class Watching:
             parts.append(f"{number} jump{'s' * (number > 1)}, the last of {last.label} at {last.since:g} s")
         return ", ".join(parts)
 
+    def progress(self, phase: str) -> Progress:
+        """Rows so far, their rate, and how much of a file that does not grow was read."""
+        seconds, (rows, offset) = time.monotonic() - self.begun, self.first
+        parts, left = [f"watch: {self.said()}"], None
+        if (came := self.online.counts["rows"] - rows) and not phase:
+            parts.append(f"{came / max(seconds, 1e-9):,.0f} rows per s")
+        if self.size and self.source.offset > offset:
+            parts.append(f"{self.source.offset / self.size:.0%} of {self.source.name}")
+            left = seconds * (self.size - self.source.offset) / (self.source.offset - offset)
+        return Progress(", ".join(parts), 0, 1, phase=phase, seconds=seconds, left=left)
+
     @contextmanager
     def shown(self) -> Iterator[Callable[[str], None]]:
         """A live table on a terminal, else progress on stderr; to be called with the phase."""
         console = Console()
         if not console.is_terminal:
             with shown() as say:
-                yield lambda phase: say(Progress(f"watch: {self.said()}", 0, 1, phase=phase))
+                say(Progress(f"watch: {self.source.name}", 0, 1, phase="first rows"))
+                yield lambda phase: say(self.progress(phase))
             return
         with Live(console=console, refresh_per_second=4, transient=True) as live:
             yield lambda _: live.update(_table(self)) if self.online.end is not None else None
@@ -389,8 +461,8 @@ def _declared(
         header, *lines = head.splitlines(keepends=True) or [b""]
         for line in lines[:TRIED]:
             rows = Path(folder) / source.name
-            rows.write_bytes(header + line)
             try:
+                write_whole(rows, header + line)
                 return load_problem(model, rows, fix, given)[1]
             except InputError as error:
                 why = error
@@ -398,7 +470,8 @@ def _declared(
 
 
 @contextmanager
-def _input(data: Path | None, source: Source) -> Iterator[Any]:
+def _input(data: Path | None, source: Source, digest: str = "") -> Iterator[Any]:
+    """The file, or standard input, behind what was taken of it, which has a digest."""
     if data is None:
         yield sys.stdin.buffer
         return
@@ -407,9 +480,8 @@ def _input(data: Path | None, source: Source) -> Iterator[Any]:
     except OSError as error:
         raise InputError(f"{data}: cannot be read ({error.strerror or error})") from None
     with file:
-        if source.offset > os.fstat(file.fileno()).st_size:
-            raise InputError(f"{data} is shorter than what was read of it; it is another file: give another --out")
-        file.seek(source.offset)
+        if source.offset:
+            source.skip(file, data, digest)
         yield file
 
 

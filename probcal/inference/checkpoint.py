@@ -145,6 +145,7 @@ VECTOR = many(number, np.array)
 COUNTS = named(whole, Counter)
 ROW: dict[str, Kind] = {"time": number, "sensor": text, "target": text}
 ROWS = frame(cell, **ROW, cells=whole, line=whole)
+TRACKS = frame(level, time=number, target=text)
 SEEN = record(pair, text, whole, number)  # sensor, cells and own time of a row
 MEMBERS: dict[str, Kind] = {  # of an `Online`, by path: those of its arrivals come first and make its problem
     "arrivals.counts": COUNTS,
@@ -162,7 +163,7 @@ MEMBERS: dict[str, Kind] = {  # of an `Online`, by path: those of its arrivals c
     "points": many(record(pair, record(pair, number, text), record(pair, VECTOR, VECTOR)), dict),
     "pending": optional(ROWS),
     "recent": optional(ROWS),
-    "lately": optional(frame(level, time=number, target=text)),
+    "lately": optional(TRACKS),
     "log_evidence": number,
     "epochs": whole,
     "time": moment,
