@@ -121,6 +121,10 @@ def test_lines_are_counted_on_after_a_restart(model, table, tmp_path):
     assert call("watch", model, table, "--out", out, "--lag", "0")[0] == 0
     assert pd.read_csv(out / "refused.csv")["line"].tolist() == [32]
     assert last(out)["rows"].eq(80).all()
+    assert (
+        "80 rows up to time 39 s, 1 left out (see refused.csv)"
+        in call("watch", model, table, "--out", out, "--lag", "0")[1]
+    )
 
 
 def test_particles_go_on_where_they_were(model, table, tmp_path):

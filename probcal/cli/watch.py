@@ -47,6 +47,7 @@ TABLES = (HISTORY, JUMPS, TRACKS, REFUSED, ROWS)
 BESIDE = {  # what a state says of source and tables
     "length": checkpoint.named(checkpoint.whole), "offset": checkpoint.whole, "line": checkpoint.whole,
     "header": checkpoint.text, "digest": checkpoint.text, "held": checkpoint.optional(checkpoint.TRACKS),
+    "refused": checkpoint.whole,
 }  # fmt: skip
 
 
@@ -179,6 +180,7 @@ def run(
         targets=targets,
     )  # fmt: skip
     tables, held, digest = None if outputs is None else Appended(outputs.folder), pd.DataFrame(), ""
+    refused = 0
     if outputs is not None:
         assert tables is not None
         state = outputs.folder / STATE
@@ -186,13 +188,14 @@ def run(
             said = checkpoint.unpack_state(online, state.read_bytes(), str(state))
             beside = checkpoint.read_members(said, BESIDE, str(state))
             tables.length, held = beside["length"], held if beside["held"] is None else beside["held"]
+            refused = beside["refused"]
             if data is not None:
                 digest, source.header = beside["digest"], beside["header"].encode()
                 source.offset, source.line = beside["offset"], beside["line"]
         outputs.begin()
         tables.open()
     size = 0 if data is None or follow else data.stat().st_size
-    watching = Watching(online, source, tables, every, kept, held, size)
+    watching = Watching(online, source, tables, every, kept, held, size, refused)
     with (
         _input(data, source, digest) as file,
         watching.shown() as show,
@@ -235,8 +238,8 @@ class Watching:
     kept: Sequence[str]  # "tracks", "rows"
     held: pd.DataFrame  # tracks at the last time, of which more rows may come
     size: int = 0  # bytes of a file that does not grow
-    refused: int = 0
-    unfit: int = 0  # of these, rows that no calibration has counted
+    refused: int = 0  # rows left out, of the runs before a restart too
+    unfit: int = 0  # of this run, rows left out that no calibration has counted
     why: str = ""  # the first reason of those
     used: int = 0
     stored: float = field(default_factory=time.monotonic)
@@ -364,7 +367,7 @@ class Watching:
         beside = {
             "length": self.tables.length, "offset": self.source.offset, "line": self.source.line,
             "header": self.source.header.decode(), "digest": self.source.digest.hexdigest(),
-            "held": None if self.held.empty else self.held,
+            "held": None if self.held.empty else self.held, "refused": self.refused,
         }  # fmt: skip
         write_whole(self.tables.folder / STATE, checkpoint.pack_state(self.online, beside))
 
