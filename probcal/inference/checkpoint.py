@@ -252,17 +252,16 @@ def read_members(said: Any, kinds: Mapping[str, Kind], source: str) -> dict[str,
 def _opened(content: bytes, source: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """JSON and arrays of a state."""
     left = len(content) - len(sealed(b""))
-    if left < 0 or sealed(content[:left]) != content:
-        raise InputError(f"{source} is damaged, or no state of this version of probcal watch; {REMEDY}")
     try:
+        if left < 0 or sealed(content[:left]) != content:
+            raise ValueError("wrong digest")
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = dict(file.items())
         said = json.loads(arrays.pop("said").tobytes())
-        version = said["version"]
-    except Exception as error:  # whatever NumPy and zipfile say of foreign bytes
-        raise InputError(f"{source} is no state of probcal watch ({error}); {REMEDY}") from None
-    if version != VERSION:
-        raise InputError(f"{source} was written by another version of probcal; {REMEDY}")
+        if said["version"] != VERSION:
+            raise ValueError("other version")
+    except Exception:  # whatever NumPy and zipfile say of foreign bytes
+        raise InputError(f"{source} is damaged, or no state of this version of probcal watch; {REMEDY}") from None
     return said, arrays
 
 
