@@ -208,6 +208,43 @@ def _information_of(family: AdditiveNoise) -> float:
     return float(np.trapezoid(np.where(inside, slope**2 * density * np.cosh(t), 0.0), t))
 
 
+@lru_cache
+def normal_scores(family: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals over the std (increasing), and the standard normal deviates with the same tail probabilities.
+
+    A family that is not additive has no such residual: its deviates are zero.
+    """
+    from scipy import special
+
+    t = np.linspace(-FARTHEST, FARTHEST, 20_001)
+    e = np.sinh(t)
+    if not isinstance(family, AdditiveNoise):
+        return e, np.zeros_like(e)
+    if isinstance(family, Normal | Heard):
+        return e, e
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        points = jnp.asarray(e)
+        none = jnp.zeros_like(points)
+        density = np.exp(np.asarray(family.log_likelihood(points, none, jnp.ones_like(points), None)))
+    mass = density * np.cosh(t)
+    below = np.concatenate([[0.0], np.cumsum(0.5 * (mass[1:] + mass[:-1]))])
+    above = np.concatenate([np.cumsum((0.5 * (mass[1:] + mass[:-1]))[::-1])[::-1], [0.0]])
+    lower, total = below < above, max(below[-1], 1e-300)
+    tail = np.maximum(np.where(lower, below, above) / total, 1e-300)
+    return e, np.maximum.accumulate(np.where(lower, 1.0, -1.0) * special.ndtri(tail))
+
+
+def gate_limits(family: Any, odds: float) -> tuple[float, float]:
+    """Residuals over the std beyond which a datum lies with probability `odds`; infinite for odds of 0."""
+    from scipy import special
+
+    e, score = normal_scores(family)
+    limit = -special.ndtri(0.5 * odds) if odds > 0 else np.inf
+    if score[-1] <= limit:
+        return -np.inf, np.inf
+    return float(np.interp(-limit, score, e)), float(np.interp(limit, score, e))
+
+
 @dataclass(frozen=True)
 class Normal(AdditiveNoise):
     """Additive Gaussian noise of standard deviation `std`."""

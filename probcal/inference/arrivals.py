@@ -14,7 +14,7 @@ from probcal.errors import InputError
 from probcal.inference.counted import COUNTED, STREAMS, Counted, Stream, first_key
 from probcal.labels import AXES, NOBODY
 from probcal.lazy import Later
-from probcal.model.epochs import Epoch, merged
+from probcal.model.epochs import Epoch, merged, slots
 from probcal.model.motions import Area, linear_of, start_of
 from probcal.motion import Target, as_motion
 from probcal.network import Network
@@ -39,6 +39,8 @@ class Batch(NamedTuple):
     time: np.ndarray  # (K,)
     target: np.ndarray  # (K,) names
     row: np.ndarray  # (rows,) of the frame: the epoch of each
+    owners: tuple[np.ndarray, ...]  # (K, D, 2) of each recursion: number of the channel, -1 for none, row of the frame
+    numbers: tuple[np.ndarray, ...]  # (K, D, 2) likewise: measured value, std of its noise
 
 
 @dataclass
@@ -242,10 +244,23 @@ class Arrivals:
         place[order] = np.arange(len(time))
         starts = np.cumsum([0, *(len(part.time) for part in model.recursions)])
         row = np.full(len(frame), -1)
-        for block_rows, block, r in zip(found.rows, model.rows, model.recursion, strict=True):
-            row[np.flatnonzero(seen)[block_rows]] = place[starts[r] + np.asarray(block.epoch)]
+        owners: list[list[np.ndarray]] = [[np.zeros((len(time), 0, 2), int)] for _ in model.recursions]
+        numbers: list[list[np.ndarray]] = [[np.zeros((len(time), 0, 2))] for _ in model.recursions]
+        first = np.cumsum([0, *(len(s.type.expand(network.dimension)) for s in network.sensors)])
+        for block_rows, block, r, size in zip(found.rows, model.rows, model.recursion, self.sizes, strict=True):
+            mine, epoch = np.flatnonzero(seen)[block_rows], place[starts[r] + np.asarray(block.epoch)]
+            row[mine] = epoch
+            there, C = np.asarray(block.mask) > 0, block.mask.shape[1]
+            at = epoch, slots(epoch, len(time))
+            pair = first[data.sensor[block_rows]][:, None] + np.arange(C), np.broadcast_to(mine[:, None], there.shape)
+            measured = np.asarray(block.y), np.asarray(block.std)
+            for whole, none, columns in ((owners, -1, pair), (numbers, 0.0, measured)):
+                cells = np.full((len(time), size, C, 2), none)
+                cells[at] = np.where(there[:, :, None], np.stack(columns, 2), none)
+                whole[r].append(cells.reshape(len(time), size * C, 2))
         epochs = _held(merged(model, template.model.rows, self.sizes))
-        return Batch(epochs, time[order], np.concatenate(found.target)[order], row)
+        cells_of = [tuple(np.concatenate(parts, 1) for parts in whole) for whole in (owners, numbers)]
+        return Batch(epochs, time[order], np.concatenate(found.target)[order], row, *cells_of)
 
     def _provide(self, frame: pd.DataFrame, data: Any, source: str) -> None:
         """A template with every sensor type and every form of a motion that the rows have."""

@@ -19,6 +19,7 @@ from probcal.errors import InputError
 from probcal.inference.arrivals import CarriedTarget
 from probcal.inference.manifest import check_same
 from probcal.inference.online import Jump, Online, ParticleFilter
+from probcal.inference.surveillance import LEVELS, Event, Sums
 from probcal.lazy import Later
 from probcal.model.motions import Area
 from probcal.results.io import SEAL
@@ -60,6 +61,13 @@ def whole(value: Any) -> int:
     """A count, an index or bits."""
     if type(value) is not int or not 0 <= value < LARGEST:
         raise ValueError("an integer from 0")
+    return value
+
+
+def flag(value: Any) -> bool:
+    """True or false."""
+    if not isinstance(value, bool):
+        raise ValueError("true or false")
     return value
 
 
@@ -170,6 +178,15 @@ MEMBERS: dict[str, Kind] = {  # of an `Online`, by path: those of its arrivals c
     "walked": moment,
     "since": many(moment),
     "jumps": many(record(Jump, text, *[number] * 6)),
+    "last": optional(ROWS),
+    "check.sums": many(record(Sums, many(many(number)), many(optional(number)), many(whole), many(number), number)),
+    "check.seen": many(whole, np.array),
+    "check.held": many(whole, np.array),
+    "check.recent": many(many(flag)),
+    "check.changed": named(whole),
+    "check.lost": named(whole),
+    "check.events": many(record(Event, text, text, text, number, optional(number), number)),
+    "check.cause": text,
 }
 RANGES: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {  # by leaf: whether it, and that before rows, are sound
     "root": lambda leaf, _: np.isfinite(np.square(leaf)) & (np.square(leaf).sum(-1, keepdims=True) > 0),
@@ -230,7 +247,8 @@ def unpack_state(online: Online, content: bytes, source: str) -> Any:
         online.prepare()
     for path, value in members.items():
         if not path.startswith("arrivals."):
-            setattr(online, path, value)
+            *owner, name = path.split(".")
+            setattr(reduce(getattr, owner, online), name, value)
     _restore(online, arrays, source)
     _check(online, source)
     return said.get("beside")
@@ -290,6 +308,13 @@ def _check(online: Online, source: str) -> None:
     for name in ("pending", "recent"):
         if (getattr(online, name) is None) != (template is None):
             raise _changed(source, name, "is absent, or should be")
+    check, channels = online.check, len(online.check.names)
+    if {len(own) for own in (check.sums, check.seen, check.held, check.recent)} != {channels}:
+        raise _changed(source, "check.sums", f"does not hold {channels} channels")
+    if any({len(own.half), len(own.count) - 1, len(own.square) - 1} != {LEVELS} for own in check.sums):
+        raise _changed(source, "check.sums", f"does not hold sums of {LEVELS} lengths")
+    if not {*check.lost, *check.changed} <= {*check.owners} or any(k >= len(check.events) for k in check.lost.values()):
+        raise _changed(source, "check.lost", "names a sensor that the network does not have")
     if template is None:
         return
     seats = [(own.recursion, own.slot) for own in arrivals.targets.values()]

@@ -15,11 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal import linalg
 from probcal.errors import InputError, nearest
 from probcal.inference.arrivals import Arrivals, Batch, padded, refused_rows
 from probcal.inference.counted import Counted
 from probcal.inference.identity import declared_identity
-from probcal.labels import NOBODY
+from probcal.inference.surveillance import Change, StreamData, Surveillance, data_in_order
+from probcal.inference.widen import widening
+from probcal.labels import NOBODY, label_parts
 from probcal.lazy import Later
 from probcal.network import Network
 from probcal.online import belief as beliefs
@@ -34,6 +37,7 @@ from probcal.problem import Problem, fixed_biases
 from probcal.results.answer import HALF
 from probcal.results.read import apply, held_by
 from probcal.smoothing.grid import NEAR
+from probcal.status import Status
 from probcal.table import read_table
 from probcal.types import float64
 
@@ -92,8 +96,9 @@ class AugmentedFilter:
     wants targets whose start is declared or whose first rows give their place, and says with `Update.settled` where one
     had neither. `walk` gives biases, by label or
     pattern, the std of a random walk over one second, in their unit; others are constant. Those in `consider` are not
-    estimated: their uncertainty counts, their value stays (Schmidt 1966). `jumps` finds biases that jump. Raises
-    `InputError` for a setting that is none.
+    estimated: their uncertainty counts, their value stays (Schmidt 1966). `jumps` finds biases that jump. `gate` is
+    the probability of a datum of the right model to be left out as an outlier; 0 takes all. Raises `InputError` for a
+    setting that is none.
 
     >>> AugmentedFilter(lag=0, walk={"*.heading": 1e-4}).by
     'extended'
@@ -106,8 +111,10 @@ class AugmentedFilter:
     jumps: Jumps | None = None
     passes: int = 10
     tolerance: float = 0.02
+    gate: float = 1e-6
 
     def __post_init__(self):
+        _check_gate(self)
         if self.by not in RULES:
             raise InputError(
                 f'AugmentedFilter(by="{self.by}"): give one of {", ".join(RULES)}{nearest(self.by, RULES)}'
@@ -133,7 +140,7 @@ class ParticleFilter:
     that of `AugmentedFilter`. Particles are resampled where the effective number of them falls below `threshold` of
     them; `seed` seeds all draws. The biases of a long stream rest on ever fewer of the first particles, so that its
     intervals get too narrow: where fewer than 50 are left `Update.settled` is false. `AugmentedFilter` has no such
-    limit. Raises `InputError` for a setting that is none.
+    limit. `gate` is that of `AugmentedFilter`. Raises `InputError` for a setting that is none.
 
     >>> ParticleFilter(500).threshold
     0.5
@@ -143,6 +150,7 @@ class ParticleFilter:
     walk: Any = ()
     threshold: float = 0.5
     seed: int = 0
+    gate: float = 1e-6
 
     lag: ClassVar[int] = 0
     by: ClassVar[str] = "extended"
@@ -150,6 +158,7 @@ class ParticleFilter:
     jumps: ClassVar[Jumps | None] = None
 
     def __post_init__(self):
+        _check_gate(self)
         if not (isinstance(self.count, int) and self.count > 1):
             raise InputError(f"ParticleFilter(count={self.count!r}): give 2 or more, some hundred as a rule")
         if not (isinstance(self.threshold, (int, float)) and 0 <= self.threshold <= 1):
@@ -234,7 +243,8 @@ class Online:
         self.network, self.calibration = network, calibration
         self.pending: pd.DataFrame | None = None
         self.cloud: Cloud | None = None
-        self.recent: pd.DataFrame | None = None
+        self.recent: pd.DataFrame | None = None  # the last rows that the model explains
+        self.last: pd.DataFrame | None = None  # the last rows of any kind
         self.lately: pd.DataFrame | None = None  # tracks of the last rows, by particles
         self.points: dict[tuple[float, str], tuple[Any, Any]] = {}
         self.belief: Any = None  # `Augmented` up to the rows that were filtered for good
@@ -247,6 +257,7 @@ class Online:
         self.since: list[float] = []
         self.jumps: list[Jump] = []
         self.doubts: Counter[str] = Counter()  # windows that did not rest, targets that began astray
+        self.check = Surveillance(network, float(self.method.gate))
 
     # what is known
 
@@ -266,6 +277,11 @@ class Online:
 
     @property
     def message(self) -> str:
+        """What speaks against the answer, and what to do; empty where nothing does."""
+        return f"{self.doubtful} {self.check.text()}".strip()
+
+    @property
+    def doubtful(self) -> str:
         """Why intervals may be too narrow; empty where nothing speaks against them."""
         found, windows, astray = [], self.doubts["windows"], self.doubts["targets"]
         if windows:
@@ -278,6 +294,13 @@ class Online:
         if self.cloud is not None and (left := particles.ancestors(self.cloud)) < ANCESTORS:
             found.append(f"{left} of the first particles are left: take more, or AugmentedFilter() where it serves.")
         return f"Intervals may be too narrow. {' '.join(found)}" if found else ""
+
+    @property
+    def status(self) -> Status:
+        """Status of the calibration, by the rules of fits."""
+        if self.check.unexplained:
+            return Status.MISFIT
+        return Status.NOT_CONVERGED if self.doubtful else Status.CONVERGED
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -298,10 +321,11 @@ class Online:
         """Each bias as all rows so far have it, those in the window too: label, unit, mean, sd, interval, gamma."""
         problem, end = self._problem, self.end
         z, root = np.asarray(end.mean), np.asarray(end.root)
-        sd = np.sqrt((root**2).sum(1))
         before = np.sqrt(
             np.diag(np.linalg.inv(np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix())))
         )
+        sd = np.sqrt((root**2).sum(1))
+        sd = sd * widening(sd, before, self.inflation)
         scales = problem.scales
         return pd.DataFrame(
             {
@@ -315,6 +339,25 @@ class Online:
             },
             index=pd.Index(problem.labels, name="bias"),
         )
+
+    @property
+    def inflation(self) -> np.ndarray:
+        """Factor (M,) of the part of the variance of each bias that comes from the data, as the innovations have it.
+
+        The largest of the channels that read it, and not less than the mean of all.
+        """
+        wide, seen = self.check.wide, self.check.seen - self.check.held
+        factor = np.full(len(self.labels), float(np.average(wide, weights=seen)) if seen.any() else 1.0)
+        for k in np.flatnonzero(wide > 1.0):
+            mine = self._read_by(self.check.owners[k])
+            factor[mine] = np.maximum(factor[mine], wide[k])
+        return factor
+
+    def _read_by(self, sensor: str) -> np.ndarray:
+        """Numbers of the biases that a sensor reads and no other shares by its type."""
+        placed = next(own for own in self.arrivals.network.sensors if own.name == sensor)
+        owners = {placed.name, *(node.name for node in placed.nodes)}
+        return np.flatnonzero([label_parts(label)[0] in owners for label in self.labels])
 
     @float64
     def under(self, prior: Prior, *, key: int = 0) -> pd.DataFrame:
@@ -388,7 +431,8 @@ class Online:
     @contextmanager
     def _unchanged_if_refused(self) -> Iterator[None]:
         """Where what is inside raises, or is broken off, the filter stays as it was: no row counts twice or by half."""
-        own, beside = self.__dict__ | {"doubts": self.doubts.copy()}, self.arrivals.copy()
+        own = self.__dict__ | {"doubts": self.doubts.copy(), "check": self.check.copy()}
+        beside = self.arrivals.copy()
         try:
             yield
         except BaseException:
@@ -433,7 +477,9 @@ class Online:
         for pattern in self.method.consider:
             considered[_chosen(problem.labels, pattern, "consider")] = True
         self.given = FilterGiven(jnp.asarray(levels), jnp.asarray(walk), jnp.asarray(considered))
-        self.form = FilterForm(self.method.by, bool(walk.any()), bool(considered.any()), not self.method.lag)
+        self.form = FilterForm(
+            self.method.by, bool(walk.any()), bool(considered.any()), not self.method.lag, float(self.method.gate)
+        )
 
     def levels(self, problem: Problem) -> np.ndarray:
         """Log factors (H,) of the unknown noise levels: as the calibration has them, else those of their guesses."""
@@ -464,10 +510,20 @@ class Online:
         points = self._points(batch)
         elapsed = np.diff(batch.time, prepend=self.walked if np.isfinite(self.walked) else batch.time[0])
         most, doubts = 0, self.doubts.total()
+        change, placed, left_out = (
+            None,
+            0,
+            list[StreamData](),
+        )  # `change`: epoch and sensor whose biases begin anew there
         while begun < K:
-            left = K - begun
+            if change is not None and change.epoch == begun:
+                self._begin_anew(change)
+                change = None
+            left = (K if change is None else change.epoch) - begun
             count, size, segments = self._window(left)
-            self.doubts["targets"] += self._place(batch, points, begun, count)
+            new = max(begun, placed)
+            self.doubts["targets"] += self._place(batch, points, new, begun + count - new)
+            placed = max(placed, begun + count)
             window = Window(
                 padded(_part(batch.epochs, begun, begun + count), size),
                 _long(elapsed[begun : begun + count], size),
@@ -476,7 +532,7 @@ class Online:
             model = problem.model
             if self.method.lag == 0:
                 ends, left_over = run_plain(self.form, model, self.given, self.belief, window)
-                stack = jax.tree.map(lambda leaf: np.asarray(leaf)[None], ends)
+                stack, kept = jax.tree.map(lambda leaf: np.asarray(leaf)[None], ends), left_over.kept
                 xs, sds, done = left_over.x, left_over.sd, np.array([count])
                 evidence = np.array([_evidence(left_over.kept)])
             else:
@@ -485,12 +541,18 @@ class Online:
                     segments,
                 )  # fmt: skip
                 stack, xs, sds = jax.tree.map(np.asarray, passed.beliefs), passed.smoothed.x, passed.smoothed.sd
+                kept, forced = passed.data, points.verdict
                 points = jax.tree.map(lambda old, new, a=begun, n=count: _over(old, new, a, n), points, passed.points)
+                points = points._replace(verdict=forced)
                 done = np.minimum(np.arange(1, segments + 1) * (size // segments), count)
                 evidence = np.asarray(passed.log_evidence)
                 most = max(most, int(passed.passes))
                 self.doubts["windows"] += not passed.moved <= self.method.tolerance
-            lag = 0 if everything and count == left else self.method.lag
+            data = self._data(batch, begun, count, kept)
+            if change is None and (found := self._changed(data, batch, begun, points)) is not None:
+                change = found if self.method.jumps is None else None
+                continue
+            lag = 0 if (everything or change is not None) and count == left else self.method.lag
             jump = self._jump(stack, done, batch.time[begun : begun + count])
             leaving = jump[0] if jump is not None else int(np.searchsorted(done, count - lag, side="right")) - 1
             if leaving < 0:
@@ -503,19 +565,25 @@ class Online:
                 )
             if jump is not None:
                 self.belief = beliefs.jumped(self.belief, jnp.asarray(jump[1]), jump[3], jump[4])
+                self.check.explain(
+                    [s for s in self.check.changed if jump[1] % problem.model.biases in self._read_by(s)]
+                )
                 jumps.append(jump[2])
                 self.since = [float(batch.time[begun + int(done[leaving]) - 1])] * self._starts
             taken = int(done[leaving])
+            gone = StreamData(*(column[data.epoch < taken] for column in data))
+            self.check.add(gone)
+            left_out.append(StreamData(*(column[gone.held] for column in gone)))
             self.log_evidence += float(evidence[: leaving + 1].sum())
             frames.append(self._rows_of(batch, begun, taken, xs, sds))
             self.walked = float(batch.time[begun + taken - 1])
             begun += taken
             self._renew()
-            if count == left and jump is None:
+            if count == left and jump is None and change is None:
                 break
         self.arrivals.settled(batch, frame, begun)
         self.pending = frame[batch.row >= begun].reset_index(drop=True)
-        self.recent = frame[batch.row >= 0].tail(RECENT).reset_index(drop=True)
+        self._remember(frame, batch, np.concatenate([*(part.row for part in left_out), data.row[data.held]]))
         self._keep(batch, points, begun)
         self.time = max(self.time, float(batch.time[-1]))
         self.end = self.belief if begun == K else jax.tree.map(lambda leaf: leaf[-1], stack)
@@ -525,6 +593,77 @@ class Online:
         settled = self.doubts.total() == doubts
         tracks = tracks[there].reset_index(drop=True)
         return Update(self.time, begun, tracks, tuple(jumps), most, settled, refused_rows())
+
+    def _data(self, batch: Batch, begun: int, count: int, kept: Sequence[Any]) -> StreamData:
+        """The data of `count` epochs as a pass left them."""
+        parts = []
+        for own, owner, numbers in zip(kept, batch.owners, batch.numbers, strict=True):
+            epoch, datum = np.nonzero((owner[begun : begun + count, :, 0] >= 0) & (np.asarray(own.spread)[:count] > 0))
+            of = begun + epoch, datum
+            told = (np.asarray(column)[epoch, datum] for column in (own.residual, own.spread, own.reach, own.held))
+            parts.append(StreamData(
+                owner[of][:, 0], epoch, owner[of][:, 1], batch.time[of[0]], batch.target[of[0]], *numbers[of].T, *told
+            ))  # fmt: skip
+        return data_in_order(parts)
+
+    def _changed(self, data: StreamData, batch: Batch, begun: int, points: Any) -> Change | None:
+        """A sensor that changed among the epochs from `begun` on, to be filtered again: where jumps are looked for with
+        all of its data."""
+        jumps = self.method.jumps is not None
+        while (found := self.check.change(data)) is not None:
+            if not self.check.begin_anew(found, jumps):
+                continue
+            if jumps:
+                self._admit(batch, points.verdict, found.sensor, begun + found.epoch)
+            return found._replace(epoch=begun + found.epoch)
+        return None
+
+    def _admit(self, batch: Batch, verdict: Sequence[np.ndarray], sensor: str, epoch: int) -> None:
+        """Let the data of a sensor in from an epoch on."""
+        for own, owner in zip(verdict, batch.owners, strict=True):
+            own[epoch:][self.check.owners[owner[epoch:, :, 0]] == sensor] = beliefs.ADMIT
+
+    def _begin_anew(self, change: Change) -> None:
+        """The biases of a sensor as uncertain as its change calls for."""
+        belief, slots = beliefs.dispersed(self.belief, self.belief.slots, self._step_of(change))
+        self.belief = belief._replace(slots=slots)
+
+    def _spread(self, change: Change) -> Cloud:
+        """The same in every particle."""
+        assert self.cloud is not None
+        step = self._step_of(change)
+        root = jax.vmap(lambda own: linalg.tria(jnp.concatenate([own, step], 1)))(self.cloud.root)
+        return self.cloud._replace(root=root)
+
+    def _step_of(self, change: Change) -> jax.Array:
+        """Covariance columns (M, q) of a step of the biases that a sensor reads."""
+        own = self._read_by(change.sensor)
+        columns = np.zeros((len(self.labels), len(own)))
+        columns[own, np.arange(len(own))] = max(change.size, 1.0)
+        return jnp.asarray(columns)
+
+    def _explained(self, batch: Batch) -> Any:
+        """The epochs of a batch without the rows of sensors that are left out."""
+        if not self.check.lost:
+            return batch.epochs
+        begun, rows = [0] * len(batch.owners), list[Any]()
+        parts: Any = batch.epochs.rows
+        for seen, r in zip(parts, self._problem.model.recursion, strict=True):
+            mask = np.asarray(seen.mask)
+            size = mask.shape[1] * mask.shape[2]
+            owner = batch.owners[r][:, begun[r] : begun[r] + size, 0].reshape(mask.shape)
+            begun[r] += size
+            lost = np.isin(self.check.owners[owner], list(self.check.lost))
+            rows.append(seen._replace(mask=np.where((owner >= 0) & lost, 0.0, mask)))
+        return batch.epochs._replace(rows=tuple(rows))
+
+    def _remember(self, frame: pd.DataFrame, batch: Batch, held: np.ndarray) -> None:
+        """Keep the last rows of which nothing was held back (of a frame, by number)."""
+        there = batch.row >= 0
+        good = there & ~np.isin(np.arange(len(frame)), held)
+        self.last = frame[there].tail(RECENT).reset_index(drop=True)
+        if self.recent is None or good.any():
+            self.recent = frame[good if good.any() else there].tail(RECENT).reset_index(drop=True)
 
     def _populate(self, problem: Problem, method: ParticleFilter) -> None:
         """Particles with the slots of every form of a motion."""
@@ -538,7 +677,7 @@ class Online:
     def _by_particles(self, frame: pd.DataFrame, batch: Batch, method: ParticleFilter) -> Update:
         """Filter epochs by particles."""
         assert self.cloud is not None
-        K, begun, frames = len(batch.time), 0, []
+        K, begun, frames, left_out = len(batch.time), 0, [], list[StreamData]()
         elapsed = np.diff(batch.time, prepend=self.walked if np.isfinite(self.walked) else batch.time[0])
         while begun < K:
             count, size, _ = self._window(K - begun)
@@ -546,6 +685,7 @@ class Online:
             cloud, left = particles.run_particles(
                 self._problem.model, self.given, self.cloud, padded(_part(batch.epochs, begun, begun + count), size),
                 _long(elapsed[begun : begun + count], size), key, walks=bool(method.walk), threshold=method.threshold,
+                odds=float(method.gate),
             )  # fmt: skip
             evidence = np.asarray(left.log_evidence)[:count]
             if not np.isfinite(evidence).all():
@@ -554,6 +694,12 @@ class Online:
                     f"no particle explains the rows at time {when:g}; take more, or state where the targets start"
                 )
             self.cloud = cloud
+            data = self._data(batch, begun, count, left.kept)
+            while (found := self.check.change(data)) is not None:  # its rows are behind: nothing is filtered again
+                if self.check.begin_anew(found, False):
+                    self.cloud = self._spread(found)
+            self.check.add(data)
+            left_out.append(StreamData(*(column[data.held] for column in data)))
             self.log_evidence += float(evidence.sum())
             frames.append(self._rows_of(batch, begun, count, left.x, left.sd))
             begun, self.epochs = begun + count, self.epochs + count
@@ -563,7 +709,7 @@ class Online:
         self.walked = self.time = max(self.time, float(batch.time[-1]))
         self.arrivals.settled(batch, frame, K)
         self.pending = frame.iloc[:0]
-        self.recent = frame[batch.row >= 0].tail(RECENT).reset_index(drop=True)
+        self._remember(frame, batch, np.concatenate([part.row for part in left_out]))
         self.lately = self._tracks(frames)
         settled = particles.ancestors(self.cloud) >= ANCESTORS
         return Update(self.time, K, self.lately, (), 0, settled, refused_rows())
@@ -590,7 +736,10 @@ class Online:
             old = self.points.get((float(batch.time[k]), str(batch.target[k])))
             if old is not None:
                 xs[recursion[k]][k], z[k], there[k] = old[0], old[1], True
-        found: Any = RowPoints(tuple(xs), z, there)  # type: ignore[arg-type]
+        verdict = tuple(np.zeros(owner.shape[:2], np.int8) for owner in batch.owners)
+        for sensor in self.check.changed if self.method.jumps is not None else ():
+            self._admit(batch, verdict, sensor, 0)
+        found: Any = RowPoints(tuple(xs), z, there, verdict)  # type: ignore[arg-type]
         return found
 
     def _place(self, batch: Batch, points: Any, begun: int, count: int) -> int:
@@ -598,14 +747,14 @@ class Online:
 
         How many of them a plain filter cannot begin there: neither their first rows nor a start give their place.
         """
-        astray = 0
+        astray, epochs = 0, self._explained(batch)
         problem, belief, K = self._problem, self.belief, len(batch.time)
-        xs, z, there = points
+        xs, z, there, _ = points
         recursion, first = np.asarray(batch.epochs.recursion), np.asarray(batch.epochs.first)
         for k in (begun + np.flatnonzero((first & ~there)[begun : begun + count])).tolist():
             r, name = int(recursion[k]), batch.target[k]
             mine = np.flatnonzero((batch.target == name) & (np.arange(K) >= k))[: self._looked_at(batch, k)]
-            few = padded(jax.tree.map(lambda leaf, mine=mine: leaf[mine], batch.epochs), FIRST)
+            few = padded(jax.tree.map(lambda leaf, mine=mine: leaf[mine], epochs), FIRST)
             span = problem.epochs[r].position
             x = place_new(problem.model, self.given, belief, few, r, span, self.arrivals.tried)
             if self.method.lag:
@@ -698,6 +847,14 @@ class Online:
         if not frames:
             return pd.DataFrame({"time": np.zeros(0), "target": np.zeros(0, str)})
         return pd.concat(frames, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)
+
+
+def _check_gate(method: Any) -> None:
+    """Raise `InputError` unless the gate of a filter is a probability of rare data."""
+    if not (isinstance(method.gate, (int, float)) and 0 <= method.gate <= 0.01):
+        raise InputError(
+            f"{type(method).__name__}(gate={method.gate!r}): give the probability of a datum to be left out, 0 to 0.01"
+        )
 
 
 def _walks(name: str, given: Any) -> tuple[tuple[str, float], ...]:

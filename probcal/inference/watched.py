@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.inference.mistakes import mistake
+from probcal.inference.widen import widened_by
 from probcal.motion import Target
 from probcal.priors import Prior
 from probcal.problem import Problem
@@ -20,11 +22,11 @@ from probcal.smoothing.grid import track_mode
 from probcal.smoothing.linearised import LaplaceApproximation
 from probcal.smoothing.mode import Point
 from probcal.starts import automatic_start
-from probcal.status import Status
 from probcal.table import Table
 from probcal.types import float64
 
 if TYPE_CHECKING:
+    import pandas as pd
     import xarray as xr
 
     from probcal.inference.online import Online
@@ -81,15 +83,11 @@ class FilteredPosterior(StreamPosterior):
 @float64
 def calibration_tree(online: Online) -> xr.DataTree:
     """The tree of what a filter knows."""
-    template = online._problem
-    frame = online.recent
-    assert frame is not None
-    own = frame.drop(columns=["cells", "line"])
-    motions = online.arrivals.motions(dict.fromkeys(own["target"]))
-    if online.counts["rows"] - online.counts["refused"] > len(frame):  # these do not begin where the targets did
-        motions = {name: Target(target.motion) for name, target in motions.items()}
-    table = Table(own, "the last rows", frame["line"].to_numpy(), admitted=True)
-    problem = Problem(template.network, motions, table, fix=template.fixed, epoch=template.epoch)
+    assert online.recent is not None
+    if online.check.unexplained and online.last is not None:
+        names = dict.fromkeys(name.rsplit(".", 1)[0] for name in online.check.unexplained)
+        online.check.cause = mistake(_of_last(online, online.last), list(names))
+    problem = _of_last(online, online.recent)
     z, root = np.asarray(online.end.mean), np.asarray(online.end.root)
     levels = jnp.asarray(online.levels(problem))
     sampled = any(form is not None for form in problem.model.sampled)
@@ -110,13 +108,25 @@ def calibration_tree(online: Online) -> xr.DataTree:
     posterior = replace(posterior, filtered=tracks) if sampled else posterior
     method = Watched(online.method)
     answer = Answer(
-        problem, method, method, online.prior, posterior, Status.NOT_CONVERGED if online.message else Status.CONVERGED,
-        online.message, ("",) * len(problem.labels), online.counts["rows"],
+        problem, method, method, online.prior, posterior, online.status, online.message,
+        ("",) * len(problem.labels), online.counts["rows"],
     )  # fmt: skip
     tree = build(answer, (), jax.random.key(0), ())
+    tree = widened_by(tree, problem, point.levels, online.inflation)
     tree.attrs.update({f"stream_{name}": count for name, count in online.counts.items()}, seed=0)
     tree.attrs.update(online.arrivals.noted())
     return tree
+
+
+def _of_last(online: Online, frame: pd.DataFrame) -> Problem:
+    """The problem of the last rows of a stream."""
+    template = online._problem
+    own = frame.drop(columns=["cells", "line"])
+    motions = online.arrivals.motions(dict.fromkeys(own["target"]))
+    if online.counts["rows"] - online.counts["refused"] > len(frame):  # these do not begin where the targets did
+        motions = {name: Target(target.motion) for name, target in motions.items()}
+    table = Table(own, "the last rows", frame["line"].to_numpy(), admitted=True)
+    return Problem(template.network, motions, table, fix=template.fixed, epoch=template.epoch)
 
 
 def _filtered(online: Online, problem: Problem) -> list[Tracks]:

@@ -252,16 +252,38 @@ def widened(fit: Judged, rejected: Rejection, tree: xr.DataTree, root: Any) -> t
     return result, f"{text}; the sd of the {', those of the '.join(grown)}" if grown else text
 
 
+def widened_by(tree: xr.DataTree, problem: Problem, levels: jax.Array, inflation: np.ndarray) -> xr.DataTree:
+    """A result whose biases have the variance that `inflation` (M,) calls for, and its tracks their mean."""
+    if not (inflation > 1.0).any():
+        return tree
+    group = tree["calibration"].to_dataset()
+    wide = bias_factors(group, inflation, False)
+    _widen_biases(tree, group, wide)
+    most = by_target(problem, {"most": (("time", "component"), before_data(problem.model, levels))})
+    for name, own in most.items():
+        sd = tree["track"][name].to_dataset()["sd"].values
+        factors = widening(sd, np.sqrt(own["most"].values), np.full(sd.shape, float(np.mean(inflation))))
+        _widen_track(tree, name, np.where(sd > 0, factors, 1.0))
+    tree.attrs["widened"] = float(wide.max())
+    return tree
+
+
 def bias_factors(group: xr.Dataset, inflation: np.ndarray, given: bool) -> np.ndarray:
     """Factors (M,) of the sd of the biases of a group `calibration`; never beyond the prior.
 
     The sd of the prior is the scale, or what its precision says where that is `given`.
     """
-    wide = np.sqrt(1.0 + group["gamma"].values * (inflation - 1.0))
-    precision = group["precision"].values if given else np.ones(len(wide))
+    precision = group["precision"].values if given else np.ones(len(inflation))
     with np.errstate(divide="ignore"):  # a flat prior has no sd
-        most = group["scale"].values / np.sqrt(precision) / group["sd"].values
-    found: np.ndarray = np.clip(wide, 1.0, np.maximum(most, 1.0))
+        before = group["scale"].values / np.sqrt(precision)
+    return widening(group["sd"].values, before, inflation, group["gamma"].values)
+
+
+def widening(sd: np.ndarray, before: np.ndarray, inflation: np.ndarray, gamma: np.ndarray | None = None) -> np.ndarray:
+    """Factors (M,) of sds, of whose variance the share gamma grows by `inflation`; never beyond the sds before data."""
+    share = np.clip(1.0 - (sd / before) ** 2, 0.0, 1.0) if gamma is None else gamma
+    wide = np.sqrt(1.0 + share * (inflation - 1.0))
+    found: np.ndarray = np.clip(wide, 1.0, np.maximum(before / sd, 1.0))
     return found
 
 

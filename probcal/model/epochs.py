@@ -285,15 +285,22 @@ def merged(model: Any, fill: tuple[Rows, ...], sizes: tuple[int, ...]) -> Epoch:
     return Epoch(**shared, target=tuple(targets), move=tuple(moves), rows=tuple(rows))
 
 
+def slots(epoch: np.ndarray, count: int) -> np.ndarray:
+    """Place (N,) of each row among those of its epoch (N,), of `count` epochs."""
+    taken = np.bincount(epoch, minlength=count)
+    order = np.argsort(epoch, kind="stable")
+    found = np.empty(len(epoch), int)
+    found[order] = np.arange(len(epoch)) - np.repeat(np.cumsum(taken) - taken, taken)
+    return found
+
+
 def padded_rows(data: Rows, epoch: np.ndarray, count: int, size: int, fill: Rows, block: Block) -> Seen:
     """Rows of a block by epoch (N,), `size` to each of `count`."""
     taken = np.bincount(epoch, minlength=count)
     most = int(taken.max(initial=0))
     if most > size:
         raise InputError(f"an epoch has {most} rows of sensor {block.type.name}, but its size is {size}; give more")
-    order = np.argsort(epoch, kind="stable")
-    slot = np.empty(len(epoch), int)
-    slot[order] = np.arange(len(epoch)) - np.repeat(np.cumsum(taken) - taken, taken)
+    slot = slots(epoch, count)
 
     def put(name: str) -> np.ndarray:
         values, first = np.asarray(getattr(data, name)), np.asarray(getattr(fill, name))[0]

@@ -44,11 +44,23 @@ class Augmented(NamedTuple):
 
 
 class WhiteRow(NamedTuple):
-    """One datum as a filter takes it: value = x'hx + z'hz + e, e ~ N(0, 1)."""
+    """One datum as a filter takes it: value = x'hx + z'hz + e, e ~ N(0, 1).
+
+    Its residual over the std of its noise is `shift` plus the innovation of that over `ratio`; a
+    datum whose residual lies beyond `low` or `high` is held back.
+    """
 
     value: jax.Array  # ()
     hx: jax.Array  # (n,) of its target
     hz: jax.Array  # (M,)
+    shift: jax.Array  # ()
+    ratio: jax.Array  # ()
+    low: jax.Array  # ()
+    high: jax.Array  # ()
+    verdict: jax.Array  # () DECIDE, ADMIT or HOLD
+
+
+DECIDE, ADMIT, HOLD = 0, 1, 2  # whether a datum is held back: by its residual, never, always
 
 
 class KeptDatum(NamedTuple):
@@ -61,6 +73,10 @@ class KeptDatum(NamedTuple):
     innovation: jax.Array  # () standardised, with x and z uncertain
     variance: jax.Array  # () of the innovation over that of the noise
     moved: jax.Array  # (M,) by how much the mean of z moved
+    residual: jax.Array  # () over the std of noise, state and biases together
+    spread: jax.Array  # () this std over that of the noise; 0 where there is no datum
+    reach: jax.Array  # () std of its prediction by biases of one scale, over that of the noise
+    held: jax.Array  # () whether it was held back: it changed nothing then
 
 
 def empty(z: jax.Array, root: jax.Array, sizes: tuple[tuple[int, int], ...], bias: jax.Array) -> Augmented:
@@ -91,7 +107,10 @@ def moved_on(own: Slots, move: Move) -> Slots:
 
 
 def seen(belief: Augmented, own: Slots, row: WhiteRow) -> tuple[Augmented, Slots, KeptDatum]:
-    """Belief and target after a datum of it: both updates by Potter's square root (Bierman 1977, II.7)."""
+    """Belief and target after a datum of it: both updates by Potter's square root (Bierman 1977, II.7).
+
+    A datum that is held back changes nothing.
+    """
     v = row.hx @ own.R
     std = jnp.sqrt(1.0 + jnp.sum(v**2))
     gain = own.R @ v / std
@@ -116,8 +135,18 @@ def seen(belief: Augmented, own: Slots, row: WhiteRow) -> tuple[Augmented, Slots
         own.R - gain[:, None] * (v / (1.0 + std))[None, :],
         own.shift - gain[:, None] * shift[None, :],
     )
-    kept = KeptDatum(row.hx / std, gain, c, g, innovation / jnp.sqrt(variance), variance * std**2, pull * innovation)
-    return Augmented(belief.mean + pull * innovation, root, belief.slots, candidates), after, kept
+    spread = jnp.sqrt(1.0 + (variance * std**2 - 1.0) / row.ratio**2)
+    residual = (row.shift + innovation * std / row.ratio) / spread
+    outside = (residual < row.low) | (residual > row.high)
+    held = (row.verdict == HOLD) | ((row.verdict == DECIDE) & outside)
+    reach = jnp.sqrt(jnp.sum(row.hz**2)) / row.ratio
+    datum = KeptDatum(
+        row.hx / std, gain, c, g, innovation / jnp.sqrt(variance), variance * std**2, pull * innovation,
+        residual, spread, reach, held,
+    )  # fmt: skip
+    none = jax.tree.map(jnp.zeros_like, datum)._replace(residual=residual, spread=spread, reach=reach, held=held)
+    found = Augmented(belief.mean + pull * innovation, root, belief.slots, candidates), after, datum
+    return jax.tree.map(lambda new, old: jnp.where(held, old, new), found, (belief, own, none))
 
 
 def not_estimated(belief: Augmented, kept: KeptDatum, considered: jax.Array) -> Augmented:

@@ -23,6 +23,7 @@ class FilterForm:
     walks: bool = False  # whether some biases walk
     considers: bool = False  # whether some are not estimated
     plain: bool = False  # whether points are known of states alone: rows are linearised at the biases of the belief
+    odds: float = 0.0  # probability of a datum that the model holds back
 
 
 class FilterGiven(NamedTuple):
@@ -39,6 +40,7 @@ class RowPoints(NamedTuple):
     x: tuple[jax.Array, ...]  # (n,) of each recursion
     z: jax.Array  # (M,)
     there: jax.Array  # ()
+    verdict: tuple[jax.Array, ...]  # (D,) of the data of each recursion: DECIDE, ADMIT or HOLD
 
 
 class EpochStep(NamedTuple):
@@ -92,12 +94,12 @@ def _epoch(
     at = About(jnp.where(points.there, points.x[r], middle.x), z)
 
     def by_derivatives() -> list[WhiteRow]:
-        return linearised(model, epoch, r, at, given.levels)
+        return linearised(model, epoch, r, at, given.levels, form.odds)
 
     blocks = by_derivatives() if rule is None else jax.lax.cond(
-        points.there, by_derivatives, lambda: regressed(model, epoch, r, belief, before, given.levels, rule)
+        points.there, by_derivatives, lambda: regressed(model, epoch, r, belief, before, given.levels, rule, form.odds)
     )  # fmt: skip
-    rows = jax.tree.map(lambda *parts: jnp.concatenate(parts), *blocks)
+    rows = jax.tree.map(lambda *parts: jnp.concatenate(parts), *blocks)._replace(verdict=points.verdict[r])
     if form.considers:
         belief, kept = _considering(given, _with(belief, r, target, before), rows, r, target)
         mine = one(belief.slots[r], target)

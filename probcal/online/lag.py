@@ -14,10 +14,11 @@ import jax.numpy as jnp
 
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
-from probcal.online.belief import Augmented
+from probcal.online.belief import ADMIT, DECIDE, HOLD, Augmented, KeptDatum
 from probcal.online.filtering import EpochStep, FilterForm, FilterGiven, RowPoints, epoch_step, window_evidence
 
 HALVE = 6  # passes after which a point goes half of its way only
+FIRM = 4  # passes after which the data that are held back stay the same
 
 
 class Window(NamedTuple):
@@ -41,7 +42,7 @@ class WindowPass(NamedTuple):
     beliefs: Augmented  # at the end of each segment, leading
     smoothed: SmoothedStates
     points: RowPoints  # (W,) leading: where the rows were linearised
-    innovation: tuple[jax.Array, ...]  # (W, D) standardised, of each recursion
+    data: tuple[KeptDatum, ...]  # (W, D) of each recursion, without their arrays
     log_evidence: jax.Array  # (S,) of each segment
     passes: jax.Array  # ()
     moved: jax.Array  # () by how many sd a point moved in the last pass
@@ -63,6 +64,11 @@ def run_forward(
     parts = jax.tree.map(lambda leaf: leaf.reshape(segments, W // segments, *leaf.shape[1:]), tuple(window))
     _, (beliefs, left) = jax.lax.scan(segment, belief, parts)
     return beliefs, jax.tree.map(lambda leaf: leaf.reshape(W, *leaf.shape[2:]), left)
+
+
+def bare(kept: KeptDatum) -> KeptDatum:
+    """Data without the arrays that only the smoother needs."""
+    return kept._replace(hx=kept.hx[..., :0], gain=kept.gain[..., :0], g=kept.g[..., :0], moved=kept.moved[..., :0])
 
 
 def last(beliefs: Augmented) -> Augmented:
@@ -136,6 +142,11 @@ def run_window(
     def body(carry: tuple) -> tuple:
         k, points, _, _ = carry
         beliefs, steps, found = passed(points)
+        firm = k + 1 >= FIRM
+        verdict = tuple(
+            jnp.where((before == DECIDE) & firm, jnp.where(kept.held, HOLD, ADMIT), before).astype(jnp.int8)
+            for before, kept in zip(points.verdict, steps.kept, strict=True)
+        )
         end = last(beliefs)
         spread = jnp.sqrt(jnp.sum(end.root**2, 1))
         share = jnp.where(k < HALVE, 1.0, 0.5)
@@ -150,8 +161,8 @@ def run_window(
             moves.append(jnp.max(jnp.where(known[:, None] & (sd > 0), off, 0.0), initial=0.0))
         fresh = jnp.any(there & ~known)
         moved = jnp.where(fresh, jnp.inf, jnp.max(jnp.stack(moves)))
-        left = (beliefs, found, tuple(kept.innovation for kept in steps.kept), _evidence(steps, segments))
-        return k + 1, RowPoints(tuple(xs), z, there), moved, left
+        left = (beliefs, found, tuple(bare(kept) for kept in steps.kept), _evidence(steps, segments))
+        return k + 1, RowPoints(tuple(xs), z, there, verdict), moved, left
 
     shapes = jax.eval_shape(lambda points: body((0, points, 0.0, None))[3], window.points)
     nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
@@ -174,7 +185,6 @@ def run_plain(
 
     def one(b: Augmented, inputs: tuple) -> tuple[Augmented, EpochStep]:
         after, left = epoch_step(form, model, given, b, *inputs)
-        kept = tuple(own._replace(hx=own.hx[:, :0], gain=own.gain[:, :0], g=own.g[:, :0]) for own in left.kept)
-        return after, left._replace(after=(), kept=kept)
+        return after, left._replace(after=(), kept=tuple(bare(kept) for kept in left.kept))
 
     return jax.lax.scan(one, belief, tuple(window))

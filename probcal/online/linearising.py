@@ -12,6 +12,7 @@ from probcal.model.epochs import Epoch
 from probcal.model.model import Model
 from probcal.model.rows import Block, Linearised, Rows
 from probcal.model.sigma import Rule
+from probcal.noise import gate_limits
 from probcal.online.belief import Augmented, Slots, WhiteRow
 
 FLOOR = 1e-10  # least variance along an axis of the sigma points
@@ -40,7 +41,7 @@ def here(model: Model, epoch: Epoch, r: int) -> list[tuple[int, Block, Rows]]:
     return found
 
 
-def linearised(model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array) -> list[WhiteRow]:
+def linearised(model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array, odds: float = 0.0) -> list[WhiteRow]:
     """The data of an epoch of recursion r about a point, (P C,) of each block: by derivatives.
 
     A datum has the expected information, or the step weight of its noise family where that is less: one that lies far
@@ -51,12 +52,13 @@ def linearised(model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array)
         lin = waist.linearise(block, data, at.x[None], at.z, levels, expected=True)
         predicted = waist.predict(block, data, at.x[None], at.z)
         _, step = waist.weigh(block, data, predicted, waist.noise_std(data, levels), expected=False)
-        found.append(_rows(block, data, lin._replace(weight=jnp.minimum(lin.weight, step)), at))
+        lin = lin._replace(weight=jnp.minimum(lin.weight, step))
+        found.append(_rows(block, data, lin, at, predicted, waist.noise_std(data, levels), odds))
     return found
 
 
 def regressed(
-    model: Model, epoch: Epoch, r: int, belief: Augmented, own: Slots, levels: jax.Array, rule: Rule
+    model: Model, epoch: Epoch, r: int, belief: Augmented, own: Slots, levels: jax.Array, rule: Rule, odds: float = 0.0
 ) -> list[WhiteRow]:
     """The data of an epoch of recursion r regressed on state and biases over a belief, (P C,) of each block.
 
@@ -79,12 +81,14 @@ def regressed(
         own_xz = jnp.where(free[:, None, :], cross[used][:, which].transpose(1, 0, 2), 0.0)
         own_z = jnp.where(free[:, :, None] & free[:, None, :], biases[which[:, :, None], which[:, None, :]], 0.0)
         whole = jnp.concatenate([jnp.concatenate([own_x, own_xz], 2), jnp.concatenate([own_xz.mT, own_z], 2)], 1)
-        found.append(_rows(block, data, _regress(block, data, at, whole, rule, levels), at))
+        found.append(_rows(block, data, *_regress(block, data, at, whole, rule, levels), odds))
     return found
 
 
-def _regress(block: Block, data: Rows, at: About, covariance: jax.Array, rule: Rule, levels: jax.Array) -> Linearised:
-    """Rows regressed over what they read: covariance (P, u + p, u + p)."""
+def _regress(
+    block: Block, data: Rows, at: About, covariance: jax.Array, rule: Rule, levels: jax.Array
+) -> tuple[Linearised, About, jax.Array, jax.Array]:
+    """Rows regressed over what they read, covariance (P, u + p, u + p); where, their predicted values and stds."""
     used, size = np.asarray(block.used, int), covariance.shape[1]
     kappa = rule(size)
     axes = np.concatenate([np.eye(size), -np.eye(size)]) * np.sqrt(size + kappa)
@@ -111,10 +115,13 @@ def _regress(block: Block, data: Rows, at: About, covariance: jax.Array, rule: R
     score, information = waist.weigh(block, data, reference + mean, std, expected=True)
     information = jnp.minimum(information, waist.weigh(block, data, reference + mean, std, expected=False)[1])
     by = jnp.einsum("pcu,puv->pcv", slope, vectors.mT / root[:, :, None])
-    return Linearised(score, information, by[:, :, : len(used)], by[:, :, len(used) :])
+    lin = Linearised(score, information, by[:, :, : len(used)], by[:, :, len(used) :])
+    return lin, at, reference + mean, std
 
 
-def _rows(block: Block, data: Rows, lin: Linearised, at: About) -> WhiteRow:
+def _rows(
+    block: Block, data: Rows, lin: Linearised, at: About, predicted: jax.Array, std: jax.Array, odds: float
+) -> WhiteRow:
     """Whitened data (P C,) of a block linearised about a point; zero where nothing was measured."""
     there = (data.mask > 0) & (lin.weight > 0)
     weight = jnp.where(there, lin.weight, 1.0)
@@ -127,5 +134,20 @@ def _rows(block: Block, data: Rows, lin: Linearised, at: About) -> WhiteRow:
     place = jnp.arange(P)[:, None, None], jnp.arange(C)[None, :, None], read[:, None, :]
     hz = jnp.zeros((P, C, M + 1)).at[place].add(bias)[:, :, :M]
     value = jnp.where(there, lin.score / weight, 0.0) + hx @ at.x + hz @ at.z
-    scaled = WhiteRow(root * value, root[:, :, None] * hx, root[:, :, None] * hz)
+    residual = jnp.where(there, waist.innovation(block, data, predicted) / std, 0.0)
+    ratio = jnp.where(there, root * std, 1.0)
+    low, high = (jnp.broadcast_to(jnp.asarray(limit), there.shape) for limit in _limits(block, odds))
+    floors = np.array([getattr(channel.noise, "floor", None) is not None for channel in block.channels])
+    if floors.any():  # a value at the floor says nothing of how far below it the prediction may lie
+        floor = np.array([getattr(channel.noise, "floor", None) or 0.0 for channel in block.channels])
+        high = jnp.where(floors & ((data.y - floor) / std <= high), jnp.inf, high)
+    shift = residual - jnp.where(there, lin.score / jnp.sqrt(weight), 0.0) / ratio
+    scaled = WhiteRow(
+        root * value, root[:, :, None] * hx, root[:, :, None] * hz, shift, ratio, low, high, jnp.zeros((P, C), jnp.int8)
+    )
     return jax.tree.map(lambda leaf: leaf.reshape(P * C, *leaf.shape[2:]), scaled)
+
+
+def _limits(block: Block, odds: float) -> np.ndarray:
+    """Residuals (2, C) over the std beyond which a datum of each channel is held back."""
+    return np.array([gate_limits(channel.noise, odds) for channel in block.channels]).T

@@ -17,6 +17,7 @@ from probcal import linalg
 from probcal.model import rows as waist
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
+from probcal.online.belief import WhiteRow
 from probcal.online.filtering import FilterGiven
 from probcal.online.linearising import About, here, linearised
 from probcal.particle.resampling import chosen_at
@@ -39,6 +40,7 @@ class CloudPass(NamedTuple):
     sd: tuple[jax.Array, ...]  # (n,)
     log_evidence: jax.Array  # () up to nothing: log density of the rows given those before
     ess: jax.Array  # () effective number of particles before they are resampled
+    kept: tuple["Foreseen", ...]  # (D,) of each recursion
 
 
 def first_cloud(states: State, z: jax.Array, root: jax.Array, count: int) -> Cloud:
@@ -66,6 +68,58 @@ def bias_moments(cloud: Cloud) -> tuple[jax.Array, jax.Array]:
     return mean, within + (away.T * weight[None, :]) @ away
 
 
+class Foreseen(NamedTuple):
+    """Data (D,) as all particles together predict them."""
+
+    residual: jax.Array  # over the std of noise, state and biases together
+    spread: jax.Array  # this std over that of the noise; 0 where there is no datum
+    reach: jax.Array  # std of the prediction by biases of one scale, over that of the noise
+    held: jax.Array  # whether it is held back
+
+
+def foreseen(
+    model: Model, given: FilterGiven, cloud: Cloud, root: jax.Array, epoch: Epoch, r: int, keys: jax.Array, odds: float
+) -> tuple[Foreseen, Epoch]:
+    """Data of an epoch of recursion r before they are used, and the epoch without those that are held back."""
+
+    def particle(key: jax.Array, x: State, z: jax.Array, own: jax.Array) -> tuple[jax.Array, jax.Array, WhiteRow]:
+        if model.sampled[r] is not None or model.recursions[r].tails:
+            after = model.step(key, x, epoch, given.levels)[r]
+            mean = model.vectors(r, jax.tree.map(lambda leaf: leaf[epoch.target[r]][None], after))[0]
+            L = jnp.zeros((mean.shape[0], 1))
+        else:
+            mean, L = _moved(given, epoch, r, x)
+        parts = linearised(model, epoch, r, About(mean, z), given.levels, odds)
+        row = jax.tree.map(lambda *parts: jnp.concatenate(parts), *parts)
+        off = row.shift + (row.value - row.hx @ mean - row.hz @ z) / row.ratio
+        wide = jnp.sum((row.hx @ L) ** 2, 1) + jnp.sum((row.hz @ own) ** 2, 1)
+        return off, 1.0 + wide / row.ratio**2, row
+
+    off, wide, row = jax.vmap(particle)(keys, cloud.states, cloud.mean, root)
+    weight = jnp.exp(cloud.log_weight)
+    middle = weight @ off
+    spread = jnp.sqrt(weight @ (wide + (off - middle[None]) ** 2))
+    first = jax.tree.map(lambda leaf: leaf[0], row)
+    there = jnp.any(first.hx != 0, 1) | jnp.any(first.hz != 0, 1)
+    residual = middle / spread
+    held = there & ((residual < first.low) | (residual > first.high))
+    reach = jnp.sqrt(jnp.sum(first.hz**2, 1)) / first.ratio
+    rows, begun = list(epoch.rows), 0
+    for b, _, data in here(model, epoch, r):
+        size = data.mask.size
+        out = held[begun : begun + size].reshape(data.mask.shape)
+        rows[b] = rows[b]._replace(mask=jnp.where(out, 0.0, rows[b].mask))
+        begun += size
+    return Foreseen(residual, jnp.where(there, spread, 0.0), reach, held), epoch._replace(rows=tuple(rows))
+
+
+def _moved(given: FilterGiven, epoch: Epoch, r: int, x: State) -> tuple[jax.Array, jax.Array]:
+    """Mean (n,) and root of the covariance (n, n) of the state of one particle at an epoch of a linear motion."""
+    move = epoch.move[r]
+    level = jnp.concatenate([jnp.exp(given.levels), jnp.ones(1)])[move.level]
+    return move.F @ x[r][epoch.target[r]] + move.drift, move.L * level[None, :]
+
+
 def _drawn(
     model: Model, given: FilterGiven, epoch: Epoch, r: int, key: jax.Array, x: State, z: jax.Array, root: jax.Array
 ) -> tuple[State, jax.Array]:
@@ -75,9 +129,7 @@ def _drawn(
     """
     if model.sampled[r] is not None or model.recursions[r].tails:
         return model.step(key, x, epoch, given.levels), jnp.zeros(())
-    move, target = epoch.move[r], epoch.target[r]
-    level = jnp.concatenate([jnp.exp(given.levels), jnp.ones(1)])[move.level]
-    mean, L = move.F @ x[r][target] + move.drift, move.L * level[None, :]
+    target, (mean, L) = epoch.target[r], _moved(given, epoch, r, x)
     J, pull = jnp.eye(L.shape[1]), jnp.zeros(L.shape[1])
     for row in linearised(model, epoch, r, About(mean, z), given.levels):
         by = row.hx @ L
@@ -132,10 +184,10 @@ def _weighed(
     return mean, after, total
 
 
-@partial(jax.jit, static_argnames=("walks", "threshold"))
+@partial(jax.jit, static_argnames=("walks", "threshold", "odds"))
 def run_particles(
     model: Model, given: FilterGiven, cloud: Cloud, epochs: Epoch, elapsed: jax.Array, key: jax.Array, *,
-    walks: bool, threshold: float,
+    walks: bool, threshold: float, odds: float,
 ) -> tuple[Cloud, CloudPass]:  # fmt: skip
     """The cloud after a stack of epochs; those that pad it (recursion -1) change nothing."""
     N, R = cloud.log_weight.shape[0], len(model.recursions)
@@ -151,14 +203,19 @@ def run_particles(
                 root = jax.vmap(lambda own: linalg.tria(jnp.concatenate([own, std], 1)))(root)
 
             def of(r: int) -> Any:
+                own_data, used = foreseen(model, given, cloud, root, epoch, r, keys[:N], odds)
+
                 def particle(key: jax.Array, x: State, z: jax.Array, own: jax.Array) -> Any:
-                    after, drawn = _drawn(model, given, epoch, r, key, x, z, own)
-                    mean, root, told = _weighed(model, given, epoch, r, after, z, own)
+                    after, drawn = _drawn(model, given, used, r, key, x, z, own)
+                    mean, root, told = _weighed(model, given, used, r, after, z, own)
                     return after, mean, root, drawn + told
 
-                return jax.vmap(particle)(keys[:N], cloud.states, cloud.mean, root)
+                kept = tuple(own_data if k == r else no_data[k] for k in range(R))
+                return *jax.vmap(particle)(keys[:N], cloud.states, cloud.mean, root), kept
 
-            states, mean, root, gain = jax.lax.switch(epoch.recursion, [partial(of, r) for r in range(R)])
+            sizes = [sum(data.mask.size for _, _, data in here(model, epoch, r)) for r in range(R)]
+            no_data = [Foreseen(*(jnp.zeros(size),) * 3, jnp.zeros(size, bool)) for size in sizes]
+            states, mean, root, gain, kept = jax.lax.switch(epoch.recursion, [partial(of, r) for r in range(R)])
             log_weight = cloud.log_weight + jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
             total = jax.scipy.special.logsumexp(log_weight)
             log_weight = log_weight - total
@@ -182,6 +239,7 @@ def run_particles(
                 tuple(sds),
                 total,
                 ess,
+                kept,
             )
 
         cloud, key = carry
