@@ -266,6 +266,9 @@ def watch_command(
     ] = None,
     jumps: Annotated[float | None, options.quantity("find biases that jump, with so many false alarms an hour")] = None,
     within: Annotated[float, options.quantity("s within which a jump must be found")] = 60.0,
+    gate: Annotated[
+        float, options.quantity("probability of a datum of the right model to be left out; 0 takes all", zero=True)
+    ] = 1e-6,
     targets: Annotated[int, options.count(1, "targets that are carried at once")] = 16,
     every: Annotated[float, options.quantity("s between two states that are stored", zero=True)] = 1.0,
     keep: Annotated[str, typer.Option(help="tables to write besides: tracks,rows")] = "",
@@ -297,12 +300,14 @@ def watch_command(
         found = None if jumps is None else Jumps(false_alarms=jumps, within=within)
         method: AugmentedFilter | ParticleFilter
         if particles is None:
-            method = AugmentedFilter(by or "extended", 32 if lag is None else lag, walks, tuple(consider or ()), found)
+            method = AugmentedFilter(
+                by or "extended", 32 if lag is None else lag, walks, tuple(consider or ()), found, gate=gate
+            )
         else:
             others = {"--by": by, "--lag": lag, "--consider": consider, "--jumps": jumps}
             if other := next((name for name, value in others.items() if value is not None), None):
                 raise InputError(f"--particles filters without {other}; give one of the two")
-            method = ParticleFilter(particles, walks)
+            method = ParticleFilter(particles, walks, gate=gate)
         raise typer.Exit(watch.run(
             model, data, fix or (), arguments, network, method, calibration=calibration, targets=targets, follow=follow,
             outputs=results, every=every, kept=kept,

@@ -39,6 +39,7 @@ REST = 0.2  # s between two looks at a file that does not grow
 NAMED = 3  # rows left out that are named on stderr where no folder takes their table
 LISTED = 40  # biases of the live table; of more those that are largest in their sds
 DRAWN = 1000  # times of a history that is drawn
+ALARMS = {"changed": "jumped", "lost": "conflicting", "drifts": "drifting"}  # verdicts by what befell a sensor
 PICTURE = "biases.png"
 STATE, HISTORY, JUMPS, TRACKS, REFUSED, ROWS, FIT = (
     "watch.npz", "biases.csv", "jumps.csv", "tracks.csv", "refused.csv", "rows.csv", "fit.nc"
@@ -204,10 +205,11 @@ def run(
     ):
         watching.follow(file, follow and data is not None, show)
     watching.store()
+    tree = None if online.end is None else online.tree()  # which looks for the cause of a misfit
     print(watching.said())
     if online.message:
         print(online.message)
-    if online.end is None:
+    if tree is None:
         if watching.refused > watching.unfit:
             raise InputError(
                 f"{source.name}: the calibration has counted all its rows; watch rows that came later, or leave"
@@ -215,7 +217,7 @@ def run(
             )
         raise InputError(f"{source.name} has no rows that could be taken")
     if outputs is not None:
-        save(note_network(online.tree(), network), outputs.folder / FIT)
+        save(note_network(tree, network), outputs.folder / FIT)
         if can_plot():
             _draw(outputs.folder)
         with outputs.writing():
@@ -224,7 +226,7 @@ def run(
     else:
         with pd.option_context("display.max_rows", None, "display.width", 160):
             print(judged(online).to_string(float_format=lambda value: f"{value:.4g}"))
-    return 0
+    return int(online.alarmed)
 
 
 @dataclass
@@ -379,7 +381,7 @@ class Watching:
         parts = [f"{counts['rows']:,} rows up to time {self.online.time:g} s"]
         parts += [f"{counts[name]:,} {name}" for name in ("late", "duplicates") if counts[name]]
         if self.online.message:
-            parts.append("intervals may be too narrow")
+            parts.append(str(self.online.status) if not self.online.status.settled else "with a warning")
         if self.refused:
             parts.append(f"{self.refused:,} left out" + ("" if self.tables is None else f" (see {REFUSED})"))
         if self.online.jumps:
@@ -413,11 +415,18 @@ class Watching:
 
 
 def judged(online: Online) -> pd.DataFrame:
-    """The biases with a verdict: biased, zero (within a tenth of a scale), open, or not known yet."""
+    """The biases with a verdict: biased, zero (within a tenth of a scale), open, or not known yet.
+
+    Of a sensor with an alarm: conflicting, jumped or drifting.
+    """
     frame = online.biases
     away = (frame["lower"] > 0) | (frame["upper"] < 0)
     near = (frame["lower"] > -ROPE * frame["scale"]) & (frame["upper"] < ROPE * frame["scale"])
     words = np.select([frame["gamma"] < 0.5, away, near], ["not known yet", "biased", "zero"], "open")
+    for event in online.check.events:
+        words[online.read_by(event.sensor)] = ALARMS[event.kind]
+    for name in online.check.unexplained:
+        words[online.read_by(name.rpartition(".")[0])] = ALARMS["lost"]
     return frame.drop(columns="scale").assign(verdict=words)
 
 

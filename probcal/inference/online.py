@@ -272,8 +272,9 @@ class Online:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Rows that came, and how many of them were late, repeated or refused; targets that were given up."""
-        return {name: self.arrivals.counts[name] for name in ("rows", "late", "duplicates", "refused", "retired")}
+        """Rows that came, how many of them were late, repeated or refused; outliers; targets that were given up."""
+        names = ("rows", "late", "duplicates", "refused", "retired")
+        return {name: self.arrivals.counts[name] for name in names} | {"outliers": int(self.check.held.sum())}
 
     @property
     def message(self) -> str:
@@ -294,6 +295,11 @@ class Online:
         if self.cloud is not None and (left := particles.ancestors(self.cloud)) < ANCESTORS:
             found.append(f"{left} of the first particles are left: take more, or AugmentedFilter() where it serves.")
         return f"Intervals may be too narrow. {' '.join(found)}" if found else ""
+
+    @property
+    def alarmed(self) -> bool:
+        """Whether the answer is none, or a sensor changed, drifts or was left out for a time."""
+        return not self.status.valid or bool(self.check.events)
 
     @property
     def status(self) -> Status:
@@ -349,11 +355,11 @@ class Online:
         wide, seen = self.check.wide, self.check.seen - self.check.held
         factor = np.full(len(self.labels), float(np.average(wide, weights=seen)) if seen.any() else 1.0)
         for k in np.flatnonzero(wide > 1.0):
-            mine = self._read_by(self.check.owners[k])
+            mine = self.read_by(self.check.owners[k])
             factor[mine] = np.maximum(factor[mine], wide[k])
         return factor
 
-    def _read_by(self, sensor: str) -> np.ndarray:
+    def read_by(self, sensor: str) -> np.ndarray:
         """Numbers of the biases that a sensor reads and no other shares by its type."""
         placed = next(own for own in self.arrivals.network.sensors if own.name == sensor)
         owners = {placed.name, *(node.name for node in placed.nodes)}
@@ -565,9 +571,7 @@ class Online:
                 )
             if jump is not None:
                 self.belief = beliefs.jumped(self.belief, jnp.asarray(jump[1]), jump[3], jump[4])
-                self.check.explain(
-                    [s for s in self.check.changed if jump[1] % problem.model.biases in self._read_by(s)]
-                )
+                self.check.explain([s for s in self.check.changed if jump[1] % problem.model.biases in self.read_by(s)])
                 jumps.append(jump[2])
                 self.since = [float(batch.time[begun + int(done[leaving]) - 1])] * self._starts
             taken = int(done[leaving])
@@ -592,7 +596,7 @@ class Online:
         there = tracks["target"] != NOBODY
         settled = self.doubts.total() == doubts
         tracks = tracks[there].reset_index(drop=True)
-        return Update(self.time, begun, tracks, tuple(jumps), most, settled, refused_rows())
+        return Update(self.time, begun, tracks, tuple(jumps), most, settled, self._outliers(frame, left_out))
 
     def _data(self, batch: Batch, begun: int, count: int, kept: Sequence[Any]) -> StreamData:
         """The data of `count` epochs as a pass left them."""
@@ -605,6 +609,17 @@ class Online:
                 owner[of][:, 0], epoch, owner[of][:, 1], batch.time[of[0]], batch.target[of[0]], *numbers[of].T, *told
             ))  # fmt: skip
         return data_in_order(parts)
+
+    def _outliers(self, frame: pd.DataFrame, parts: Sequence[StreamData]) -> pd.DataFrame:
+        """Line and reason of data of a frame that were held back for good."""
+        lines, reasons = list[Any](), list[str]()
+        for row, k, value, residual in ((*of,) for part in parts for of in zip(
+            part.row, part.channel, part.value, part.residual, strict=True
+        )):  # fmt: skip
+            lines.append(frame["line"].iloc[row])
+            name = f"{self.check.owners[k]}.{self.check.names[k]}"
+            reasons.append(f"{name} of {value:.6g} lies {abs(residual):.3g} sd from its prediction: left out")
+        return refused_rows(lines, reasons)
 
     def _changed(self, data: StreamData, batch: Batch, begun: int, points: Any) -> Change | None:
         """A sensor that changed among the epochs from `begun` on, to be filtered again: where jumps are looked for with
@@ -637,7 +652,7 @@ class Online:
 
     def _step_of(self, change: Change) -> jax.Array:
         """Covariance columns (M, q) of a step of the biases that a sensor reads."""
-        own = self._read_by(change.sensor)
+        own = self.read_by(change.sensor)
         columns = np.zeros((len(self.labels), len(own)))
         columns[own, np.arange(len(own))] = max(change.size, 1.0)
         return jnp.asarray(columns)
@@ -712,7 +727,7 @@ class Online:
         self._remember(frame, batch, np.concatenate([part.row for part in left_out]))
         self.lately = self._tracks(frames)
         settled = particles.ancestors(self.cloud) >= ANCESTORS
-        return Update(self.time, K, self.lately, (), 0, settled, refused_rows())
+        return Update(self.time, K, self.lately, (), 0, settled, self._outliers(frame, left_out))
 
     def _window(self, left: int) -> tuple[int, int, int]:
         """Epochs of the next call, what they are padded to, and into how many parts it falls."""
