@@ -184,7 +184,14 @@ def test_late_and_repeated_rows_are_counted_and_left_out():
     twice = pd.concat([frame.iloc[[-1]].assign(time=20.0)] * 2)
     online.update(twice)
     clean.update(twice.iloc[:1])
-    assert online.counts == {"rows": len(frame) + 7, "late": 4, "duplicates": 2, "refused": 0, "retired": 0}
+    assert online.counts == {
+        "rows": len(frame) + 7,
+        "late": 4,
+        "duplicates": 2,
+        "refused": 0,
+        "retired": 0,
+        "outliers": 0,
+    }
     np.testing.assert_allclose(clean.biases["mean"], online.biases["mean"], atol=1e-12)
 
 
@@ -533,7 +540,8 @@ def tampered(state):
 GOOD = {  # members of which other values make a filter: counts, times and what was found
     "arrivals.counts", "arrivals.floors", "arrivals.origin", "arrivals.targets", "arrivals.duration", "doubts",
     "arrivals.earlier", "arrivals.first", "arrivals.latest", "arrivals.until", "points", "jumps", "time", "walked",
-    "log_evidence", "epochs",
+    "log_evidence", "epochs", "last", "check.sums", "check.seen", "check.held", "check.recent", "check.changed",
+    "check.lost", "check.events", "check.cause",
 }  # fmt: skip
 
 
@@ -874,7 +882,7 @@ def test_values_that_change_for_good_are_taken_after_some_rows():
     network_, frame = gauges()
     still = frame.assign(level=1e-7 * np.arange(150) % 7e-7)
     later = frame.assign(time=frame["time"] + 50.0)
-    online = pc.Online(network_, pc.ConstantVelocity(0.3), pc.AugmentedFilter(lag=0))
+    online = pc.Online(network_, pc.ConstantVelocity(0.3), pc.AugmentedFilter(lag=0, gate=0.0))
     assert online.update(still).refused.empty
     found = [len(online.update(later.iloc[k : k + 5]).refused) for k in range(0, 150, 5)]
     assert 0 < sum(found) < 40

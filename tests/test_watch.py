@@ -236,7 +236,7 @@ def test_rows_of_the_calibration_are_not_counted_again(model, table, tmp_path, s
         rest = [line.partition(",")[2] for line in text[1:]]
         text = [text[0], *(f"{t.isoformat()},{own}" for t, own in zip(stamps, rest, strict=True))]
     table.write_text("".join(text[:61]))
-    options = ("watch", model, table, "--lag", "8", "--out")
+    options = ("watch", model, table, "--lag", "8", "--gate", "0", "--out")
     assert call(*options, tmp_path / "one")[0] == 0
     code, _, said = call(*options, tmp_path / "again", "--calibration", tmp_path / "one")
     assert code == 2

@@ -83,6 +83,7 @@ class FilteredPosterior(StreamPosterior):
 @float64
 def calibration_tree(online: Online) -> xr.DataTree:
     """The tree of what a filter knows."""
+    assert online._problem is not None  # raises before the first rows
     assert online.recent is not None
     if online.check.unexplained and online.last is not None:
         names = dict.fromkeys(name.rsplit(".", 1)[0] for name in online.check.unexplained)

@@ -139,8 +139,8 @@ def _rows(
     low, high = (jnp.broadcast_to(jnp.asarray(limit), there.shape) for limit in _limits(block, odds))
     floors = np.array([getattr(channel.noise, "floor", None) is not None for channel in block.channels])
     if floors.any():  # a value at the floor says nothing of how far below it the prediction may lie
-        floor = np.array([getattr(channel.noise, "floor", None) or 0.0 for channel in block.channels])
-        high = jnp.where(floors & ((data.y - floor) / std <= high), jnp.inf, high)
+        floor = np.array([[getattr(channel.noise, "floor", None) or 0.0 for channel in block.channels]])
+        high = jnp.where(floors[None] & ((data.y - floor) / std <= high), jnp.inf, high)
     shift = residual - jnp.where(there, lin.score / jnp.sqrt(weight), 0.0) / ratio
     scaled = WhiteRow(
         root * value, root[:, :, None] * hx, root[:, :, None] * hz, shift, ratio, low, high, jnp.zeros((P, C), jnp.int8)
