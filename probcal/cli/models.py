@@ -172,11 +172,10 @@ def load_fit(calibration: Path, file: Path | None) -> "xr.DataTree":
     Raises `InputError` where it is invalid or counts its biases from another network.
     """
     from probcal.results.io import load
-    from probcal.status import INVALID
+    from probcal.results.read import check_valid
 
     tree = load(calibration)
-    if (status := tree.attrs["status"]) in INVALID:
-        raise InputError(f"{calibration}: the fit ended {status}, its estimate is invalid; fit again first")
+    check_valid(tree, str(calibration))
     if tree.attrs.get("network", "") != ("" if file is None else digest_of_file(file)):
         raise InputError(
             f"{calibration}: the fit started from another network; give --network as that fit had it, or none if it"

@@ -184,7 +184,6 @@ MEMBERS: dict[str, Kind] = {  # of an `Online`, by path: those of its arrivals c
     "check.held": many(whole, np.array),
     "check.recent": many(many(flag)),
     "check.changed": named(whole),
-    "check.lost": named(whole),
     "check.events": many(record(Event, text, text, text, number, optional(number), number)),
     "check.cause": text,
 }
@@ -313,8 +312,8 @@ def _check(online: Online, source: str) -> None:
         raise _changed(source, "check.sums", f"does not hold {channels} channels")
     if any({len(own.half), len(own.count) - 1, len(own.square) - 1} != {LEVELS} for own in check.sums):
         raise _changed(source, "check.sums", f"does not hold sums of {LEVELS} lengths")
-    if not {*check.lost, *check.changed} <= {*check.owners} or any(k >= len(check.events) for k in check.lost.values()):
-        raise _changed(source, "check.lost", "names a sensor that the network does not have")
+    if not {*check.changed, *(own.sensor for own in check.events)} <= {*check.owners}:
+        raise _changed(source, "check.events", "names a sensor that the network does not have")
     if template is None:
         return
     seats = [(own.recursion, own.slot) for own in arrivals.targets.values()]

@@ -556,7 +556,7 @@ class Online:
                 self.doubts["windows"] += not passed.moved <= self.method.tolerance
             data = self._data(batch, begun, count, kept)
             if change is None and (found := self._changed(data, batch, begun, points)) is not None:
-                change = found if self.method.jumps is None else None
+                change = found
                 continue
             lag = 0 if (everything or change is not None) and count == left else self.method.lag
             jump = self._jump(stack, done, batch.time[begun : begun + count])
@@ -571,12 +571,14 @@ class Online:
                 )
             if jump is not None:
                 self.belief = beliefs.jumped(self.belief, jnp.asarray(jump[1]), jump[3], jump[4])
-                self.check.explain([s for s in self.check.changed if jump[1] % problem.model.biases in self.read_by(s)])
                 jumps.append(jump[2])
                 self.since = [float(batch.time[begun + int(done[leaving]) - 1])] * self._starts
             taken = int(done[leaving])
             gone = StreamData(*(column[data.epoch < taken] for column in data))
             self.check.add(gone)
+            if jump is not None:
+                m = jump[1] % problem.model.biases
+                self.check.explain({own for own in self.check.owners if m in self.read_by(own)}, jump[2].since)
             left_out.append(StreamData(*(column[gone.held] for column in gone)))
             self.log_evidence += float(evidence[: leaving + 1].sum())
             frames.append(self._rows_of(batch, begun, taken, xs, sds))
@@ -639,7 +641,10 @@ class Online:
             own[epoch:][self.check.owners[owner[epoch:, :, 0]] == sensor] = beliefs.ADMIT
 
     def _begin_anew(self, change: Change) -> None:
-        """The biases of a sensor as uncertain as its change calls for."""
+        """The biases of a sensor as uncertain as its change calls for; a jump that may begin now where these are tested."""
+        if self.method.jumps is not None:
+            self._renew_oldest()
+            return
         belief, slots = beliefs.dispersed(self.belief, self.belief.slots, self._step_of(change))
         self.belief = belief._replace(slots=slots)
 
@@ -805,11 +810,15 @@ class Online:
             return
         every = self.method.jumps.within / self.method.jumps.starts
         if self.walked - max(self.since) >= every:
-            oldest = int(np.argmin(self.since))
-            M = self._problem.model.biases
-            columns = np.repeat(np.arange(self._starts) == oldest, M)
-            self.belief = beliefs.renewed(self.belief, jnp.asarray(columns))
-            self.since = [*self.since[:oldest], self.walked, *self.since[oldest + 1 :]]
+            self._renew_oldest()
+
+    def _renew_oldest(self) -> None:
+        """Let the oldest candidates begin anew."""
+        oldest = int(np.argmin(self.since))
+        M = self._problem.model.biases
+        columns = np.repeat(np.arange(self._starts) == oldest, M)
+        self.belief = beliefs.renewed(self.belief, jnp.asarray(columns))
+        self.since = [*self.since[:oldest], self.walked, *self.since[oldest + 1 :]]
 
     def _jump(self, stack: Augmented, done: np.ndarray, times: np.ndarray) -> Any:
         """The first part at the end of which some candidate exceeds the bound, it, the `Jump`, size and variance."""

@@ -7,7 +7,7 @@ of a stream, whatever its length, share one false-alarm rate.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -136,7 +136,6 @@ class Surveillance:
     held: np.ndarray = field(default_factory=lambda: np.zeros(0, int))  # of them held back
     recent: list[list[bool]] = field(default_factory=list)  # the last of each channel: held back
     changed: dict[str, int] = field(default_factory=dict)  # data of a sensor since it changed
-    lost: dict[str, int] = field(default_factory=dict)  # event of each sensor whose rows are left out now
     events: list[Event] = field(default_factory=list)
     cause: str = ""  # of data that the model does not explain, where it was looked for
 
@@ -194,7 +193,6 @@ class Surveillance:
         for k in mine:
             self.recent[k] = []
         if again or not change.size <= LARGEST:
-            self.lost[name] = len(self.events)
             self.events.append(Event("lost", name, "", change.since, None, change.size))
             return False
         self.changed[name] = 0
@@ -204,10 +202,15 @@ class Surveillance:
             self.sums[k] = Sums()
         return True
 
-    def explain(self, sensors: Sequence[str]) -> None:
-        """The change of some sensors was found to be the jump of a bias."""
+    def explain(self, sensors: Set[str], since: float) -> None:
+        """A jump of a bias from a time on explains what the innovations of some sensors showed since."""
         for name in sensors:
             self.changed.pop(name, None)
+        for k in np.flatnonzero(np.isin(self.owners, list(sensors))):
+            self.sums[k] = Sums()
+        self.events = [
+            own for own in self.events if not (own.kind == "drifts" and own.sensor in sensors and own.until >= since)
+        ]
 
     # data that were filtered for good
 
@@ -228,14 +231,24 @@ class Surveillance:
             if name in self.changed:
                 self.changed[name] += int(mine.sum())
             if name in self.lost and len(self.recent[k]) == RUN - 1 and sum(self.recent[k]) <= RUN - HELD:
-                self.events[self.lost.pop(name)].until = float(times[-1])
+                self._open("lost", name).until = float(times[-1])
 
     def _drift(self, name: str, channel: str, at: float, shift: float) -> None:
-        old = next((e for e in self.events if (e.kind, e.sensor, e.channel) == ("drifts", name, channel)), None)
+        same = "drifts", name, channel
+        old = next((own for own in self.events if (own.kind, own.sensor, own.channel) == same), None)
         if old is None:
             self.events.append(Event("drifts", name, channel, at, at, shift))
         else:
             old.until, old.size = at, shift
+
+    @property
+    def lost(self) -> list[str]:
+        """Sensors whose rows are left out now."""
+        return [own.sensor for own in self.events if own.kind == "lost" and own.until is None]
+
+    def _open(self, kind: str, name: str) -> Event:
+        """The event of a sensor that goes on."""
+        return next(own for own in self.events if (own.kind, own.sensor, own.until) == (kind, name, None))
 
     # what they show
 

@@ -188,10 +188,7 @@ def with_calibration(network: Network, source: xr.DataTree | str | PathLike[str]
         from probcal.nodes import read_network  # it loads jax, which a report does without
 
         return network.surveyed(read_network(source, network))
-    if str(source.attrs.get("status")) in INVALID:
-        raise InputError(
-            f"with_calibration: the fit ended {source.attrs['status']}, its estimate is invalid; fit again first"
-        )
+    check_valid(source, "with_calibration")
     from probcal.results.drifts import drift_table  # it loads pandas
 
     group, constant = source["calibration"].to_dataset(), source["constant_data"].to_dataset()
@@ -219,12 +216,19 @@ def with_calibration(network: Network, source: xr.DataTree | str | PathLike[str]
     return network.surveyed(values)
 
 
+def check_valid(calibration: xr.DataTree, name: str) -> None:
+    """Raise `InputError` where a calibration ended without an answer."""
+    if (status := str(calibration.attrs.get("status"))) in INVALID:
+        raise InputError(f"{name}: the fit ended {status}, its estimate is invalid; fit again first")
+
+
 def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
     """What a fit found, for another problem of its network; biases and levels are matched by label.
 
     Biases that the fit held are held; a level that it did not estimate stays at its guess. Raises `InputError` if the
-    calibration lacks a bias.
+    calibration lacks a bias, or ended without an answer.
     """
+    check_valid(calibration, "calibration")
     held = held_by(calibration, problem.labels)
     problem = problem.rebuild(fix=problem.fixed | held) if held else problem
     group, labels = calibration["calibration"].to_dataset(), list(problem.labels)
