@@ -641,7 +641,7 @@ class Online:
             own[epoch:][self.check.owners[owner[epoch:, :, 0]] == sensor] = beliefs.ADMIT
 
     def _begin_anew(self, change: Change) -> None:
-        """The biases of a sensor as uncertain as its change calls for; a jump that may begin now where these are tested."""
+        """The biases of a sensor as uncertain as its change calls for; where jumps are tested, one that begins now."""
         if self.method.jumps is not None:
             self._renew_oldest()
             return

@@ -208,9 +208,9 @@ class Surveillance:
             self.changed.pop(name, None)
         for k in np.flatnonzero(np.isin(self.owners, list(sensors))):
             self.sums[k] = Sums()
-        self.events = [
-            own for own in self.events if not (own.kind == "drifts" and own.sensor in sensors and own.until >= since)
-        ]
+        shown = [own for own in self.events if own.kind == "drifts" and own.sensor in sensors]
+        explained = [own for own in shown if own.until is not None and own.until >= since]
+        self.events = [own for own in self.events if own not in explained]
 
     # data that were filtered for good
 
