@@ -540,8 +540,7 @@ def tampered(state):
 GOOD = {  # members of which other values make a filter: counts, times and what was found
     "arrivals.counts", "arrivals.floors", "arrivals.origin", "arrivals.targets", "arrivals.duration", "doubts",
     "arrivals.earlier", "arrivals.first", "arrivals.latest", "arrivals.until", "points", "jumps", "time", "walked",
-    "log_evidence", "epochs", "last", "check.sums", "check.seen", "check.held", "check.recent", "check.changed",
-    "check.events", "check.cause",
+    "log_evidence", "epochs", "last", "check.changed", "check.events", "check.cause",
 }  # fmt: skip
 
 

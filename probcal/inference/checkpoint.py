@@ -19,7 +19,7 @@ from probcal.errors import InputError
 from probcal.inference.arrivals import CarriedTarget
 from probcal.inference.manifest import check_same
 from probcal.inference.online import Jump, Online, ParticleFilter
-from probcal.inference.surveillance import LEVELS, Event, Sums
+from probcal.inference.surveillance import BATCH, Event
 from probcal.lazy import Later
 from probcal.model.motions import Area
 from probcal.results.io import SEAL
@@ -179,10 +179,6 @@ MEMBERS: dict[str, Kind] = {  # of an `Online`, by path: those of its arrivals c
     "since": many(moment),
     "jumps": many(record(Jump, text, *[number] * 6)),
     "last": optional(ROWS),
-    "check.sums": many(record(Sums, many(many(number)), many(optional(number)), many(whole), many(number), number)),
-    "check.seen": many(whole, np.array),
-    "check.held": many(whole, np.array),
-    "check.recent": many(many(flag)),
     "check.changed": named(whole),
     "check.events": many(record(Event, text, text, text, number, optional(number), number)),
     "check.cause": text,
@@ -193,6 +189,9 @@ RANGES: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {  # by leaf: wheth
     "bias": lambda leaf, before: leaf == before,
     "origin": lambda leaf, _: (leaf >= 0) & (leaf < len(leaf)),
     "log_weight": lambda leaf, _: (leaf < 1e-6) & np.isfinite(leaf.max()),
+    **dict.fromkeys(("seen", "held", "number", "square", "median"), lambda leaf, _: leaf >= 0),
+    "fill": lambda leaf, _: (leaf >= 0) & (leaf < BATCH),
+    "recent": lambda leaf, _: np.abs(leaf) <= 1,
 }
 
 
@@ -201,7 +200,7 @@ def pack_state(online: Online, beside: dict[str, Any]) -> bytes:
     found: dict[str, Any] = {path: reduce(getattr, path.split("."), online) for path in MEMBERS}
     found["points"] = list(found["points"].items())
     head = {"version": VERSION, "method": repr(online.method), "identity": online.identity}
-    trees = {name: getattr(online, name) for name in ("belief", "end", "cloud")}
+    trees = {name: getattr(online, name) for name in ("belief", "end", "cloud")} | {"tallies": online.check.tallies}
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _leaves(trees)}
     if online.arrivals.tried is not None:
         arrays["tried"] = online.arrivals.tried
@@ -286,7 +285,7 @@ def _restore(online: Online, arrays: Mapping[str, np.ndarray], source: str) -> N
     """Put the stored arrays in the place of those of a filter that has just begun, whose form they must have."""
     if online.belief is None:
         return
-    trees = {"belief": online.belief, "end": online.belief, "cloud": online.cloud}
+    trees = {"belief": online.belief, "end": online.belief, "cloud": online.cloud, "tallies": online.check.tallies}
     before = {name: np.asarray(leaf) for name, leaf in _leaves(trees)}
     if other := sorted(before.keys() ^ arrays.keys()):
         raise _changed(source, other[0], "is missing" if other[0] in before else "is not known")
@@ -297,6 +296,7 @@ def _restore(online: Online, arrays: Mapping[str, np.ndarray], source: str) -> N
         if not (np.isfinite(leaf).all() or last == "log_weight") or not np.all(RANGES.get(last, _any)(leaf, first)):
             raise _changed(source, name, "holds numbers that no filter has")
     found = jax.tree.unflatten(jax.tree.structure(trees), [arrays[name] for name in before])
+    online.check.tallies = found.pop("tallies")
     for name, tree in found.items():
         setattr(online, name, tree)
 
@@ -307,11 +307,7 @@ def _check(online: Online, source: str) -> None:
     for name in ("pending", "recent"):
         if (getattr(online, name) is None) != (template is None):
             raise _changed(source, name, "is absent, or should be")
-    check, channels = online.check, len(online.check.names)
-    if {len(own) for own in (check.sums, check.seen, check.held, check.recent)} != {channels}:
-        raise _changed(source, "check.sums", f"does not hold {channels} channels")
-    if any({len(own.half), len(own.count) - 1, len(own.square) - 1} != {LEVELS} for own in check.sums):
-        raise _changed(source, "check.sums", f"does not hold sums of {LEVELS} lengths")
+    check = online.check
     if not {*check.changed, *(own.sensor for own in check.events)} <= {*check.owners}:
         raise _changed(source, "check.events", "names a sensor that the network does not have")
     if template is None:

@@ -274,7 +274,7 @@ class Online:
     def counts(self) -> dict[str, int]:
         """Rows that came, how many of them were late, repeated or refused; outliers; targets that were given up."""
         names = ("rows", "late", "duplicates", "refused", "retired")
-        return {name: self.arrivals.counts[name] for name in names} | {"outliers": int(self.check.held.sum())}
+        return {name: self.arrivals.counts[name] for name in names} | {"outliers": self.check.outliers}
 
     @property
     def message(self) -> str:
@@ -352,7 +352,7 @@ class Online:
 
         The largest of the channels that read it, and not less than the mean of all.
         """
-        wide, seen = self.check.wide, self.check.seen - self.check.held
+        wide, seen = self.check.wide, self.check.tallies.seen - self.check.tallies.held
         factor = np.full(len(self.labels), float(np.average(wide, weights=seen)) if seen.any() else 1.0)
         for k in np.flatnonzero(wide > 1.0):
             mine = self.read_by(self.check.owners[k])

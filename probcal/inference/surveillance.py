@@ -8,9 +8,9 @@ of a stream, whatever its length, share one false-alarm rate.
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
-from copy import deepcopy
+from copy import copy
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -58,71 +58,104 @@ class Change(NamedTuple):
     size: float  # scales of its biases
 
 
-@dataclass
+@dataclass(frozen=True)
 class Event:
-    """What happened to a sensor: it "changed" (its biases began anew), was "lost" (its rows are left out), "drifts"."""
+    """What befell a sensor: it "changed" (its biases began anew), was "lost" (its rows are left out), or "drifts"."""
 
     kind: str
     sensor: str
     channel: str
-    since: float  # s
-    until: float | None  # s; None while it goes on
-    size: float  # scales of a change, mean of the innovations of a drift
+    since: float  # s, of the first
+    until: float | None  # s, of the last; None while rows are left out
+    size: float  # of the last: scales of a change, mean of the innovations of a drift
 
 
-@dataclass
-class Sums:
-    """Innovations of one channel, alone (0) and in sums of 32, 64, ... of them."""
+class Tallies(NamedTuple):
+    """What is kept of each of K channels; sums are of 32, 64, ... innovations over the root of their number."""
 
-    waiting: list[list[float]] = field(default_factory=list)  # innovation and whether it was held back
-    half: list[float | None] = field(default_factory=lambda: [None] * LEVELS)  # a sum that waits for another
-    count: list[int] = field(default_factory=lambda: [0] * (LEVELS + 1))
-    square: list[float] = field(default_factory=lambda: [0.0] * (LEVELS + 1))  # of each over the root of its number
-    median: float = 0.0  # sum of the medians of the sizes of the smallest sums
+    seen: np.ndarray  # (K,) data
+    held: np.ndarray  # (K,) of them held back
+    recent: np.ndarray  # (K, RUN - 1) the last, newest last: 1 held back, 0 not, -1 none
+    waiting: np.ndarray  # (K, BATCH) innovations of the next sum
+    out: np.ndarray  # (K, BATCH) whether they were held back
+    fill: np.ndarray  # (K,) how many they are
+    half: np.ndarray  # (K, LEVELS) sums that wait for another of their length
+    pending: np.ndarray  # (K, LEVELS) whether there is one
+    number: np.ndarray  # (K, 1 + LEVELS) single innovations, and sums of each length
+    square: np.ndarray  # (K, 1 + LEVELS) sums of their squares
+    median: np.ndarray  # (K,) sum of the medians of the sizes of 32
 
-    def add(self, value: float, held: bool, channels: int) -> float:
-        """Take an innovation; the mean of a sum that is too far from zero, else 0."""
-        self.waiting.append([value, float(held)])
-        if len(self.waiting) < BATCH:
-            return 0.0
-        values, out = np.array(self.waiting).T
-        self.waiting, admitted = [], values[out == 0]
-        self.median += float(np.median(np.abs(values)))
-        self.count[0] += len(admitted)
-        self.square[0] += float(np.sum(admitted**2))
-        return self._carried(float(admitted.sum() / np.sqrt(max(len(admitted), 1))), channels)
+    @classmethod
+    def none(cls, channels: int) -> Tallies:
+        """Before any data."""
+        batch, lengths = (channels, BATCH), (channels, LEVELS)
+        counts = np.zeros((channels, 1 + LEVELS), int)
+        return cls(
+            np.zeros(channels, int), np.zeros(channels, int), np.full((channels, RUN - 1), -1), np.zeros(batch),
+            np.zeros(batch, bool), np.zeros(channels, int), np.zeros(lengths), np.zeros(lengths, bool), counts,
+            np.zeros(counts.shape), np.zeros(channels),
+        )  # fmt: skip
 
-    def _carried(self, total: float, channels: int) -> float:
-        """A sum of the smallest length added to the longer ones; the mean of one that is too far from zero."""
-        shift = 0.0
-        for k in range(LEVELS):
-            self.count[k + 1] += 1
-            self.square[k + 1] += total**2
-            mean = total / np.sqrt(BATCH << k)
-            limit = -special.ndtri(0.5 * _rate(channels, k, self.count[k + 1]))
-            if abs(total) > limit and abs(mean) > SHIFT:
+    def copy(self) -> Tallies:
+        """As they stand now."""
+        return Tallies(*(own.copy() for own in self))
+
+    def forget(self, k: int) -> None:
+        """Let the sums of a channel begin anew."""
+        for own in self[3:]:
+            own[k] = 0
+
+    def add(self, k: int, values: np.ndarray, held: np.ndarray) -> tuple[int, float] | None:
+        """Take innovations (n,) of a channel in order; number and mean of the last sum too far from zero."""
+        shift, n = None, 0
+        while n < len(values):
+            fill = int(self.fill[k])
+            some = slice(n, n + BATCH - fill)
+            taken = len(values[some])
+            self.waiting[k, fill : fill + taken], self.out[k, fill : fill + taken] = values[some], held[some]
+            self.fill[k] = (fill + taken) % BATCH
+            n += taken
+            if fill + taken == BATCH and (mean := self._summed(k)):
+                shift = n - 1, mean
+        return shift
+
+    def _summed(self, k: int) -> float:
+        """A sum of the smallest length added to the longer ones; the mean of one that is too far from zero, else 0."""
+        admitted = self.waiting[k][~self.out[k]]
+        self.median[k] += np.median(np.abs(self.waiting[k]))
+        self.number[k, 0] += len(admitted)
+        self.square[k, 0] += np.sum(admitted**2)
+        total, shift = float(admitted.sum()) / np.sqrt(max(len(admitted), 1)), 0.0
+        for level in range(LEVELS):
+            self.number[k, level + 1] += 1
+            self.square[k, level + 1] += total**2
+            mean, rate = total / np.sqrt(BATCH << level), _rate(len(self.fill), level, self.number[k, level + 1])
+            if abs(mean) > SHIFT and abs(total) > -special.ndtri(0.5 * rate):
                 shift = mean
-            other, self.half[k] = self.half[k], None if self.half[k] is not None else total
-            if other is None:
+            self.pending[k, level] = not self.pending[k, level]
+            if self.pending[k, level]:
+                self.half[k, level] = total
                 break
-            total = (total + other) / np.sqrt(2.0)
-        return float(shift)
+            total = (total + float(self.half[k, level])) / np.sqrt(2.0)
+        return shift
 
-    def wide(self, channels: int) -> float:
-        """Factor of the variance of the noise that the innovations call for, 1 where they are as declared."""
-        found = 1.0
-        for k, (count, square) in enumerate(zip(self.count, self.square, strict=True)):
-            factor, likely = square / max(count, 1), _rate(channels, k, 1 + int(np.log2(max(count, 1))))
-            if count >= FEWEST and factor > PRACTICAL and special.chdtrc(count, square) < likely:
-                found = max(found, factor)
-        if self.count[1] and (robust := (self.median / self.count[1] / MEDIAN) ** 2) > max(found, PRACTICAL**2):
-            found = robust  # of innovations so large that many are held back
-        return found
+    @property
+    def wide(self) -> np.ndarray:
+        """Factor (K,) of the variance of each channel's noise that its innovations call for, 1 as declared."""
+        factor = self.square / np.maximum(self.number, 1)
+        octave = 1 + np.log2(np.maximum(self.number, 1)).astype(int)
+        likely = special.chdtrc(np.maximum(self.number, 1), self.square)
+        called = (self.number >= FEWEST) & (factor > PRACTICAL)
+        called &= likely < _rate(len(self.fill), np.arange(1 + LEVELS), octave)
+        found = np.where(called, factor, 1.0).max(1, initial=1.0)
+        robust = (self.median / np.maximum(self.number[:, 1], 1) / MEDIAN) ** 2
+        # of innovations so large that many are held back
+        return np.where(robust > np.maximum(found, PRACTICAL**2), robust, found)
 
 
-def _rate(channels: int, level: int, number: int) -> float:
-    """The share of a test in the false-alarm rate: these of all levels and numbers add up to it."""
-    return RATE / max(channels, 1) * (6.0 / np.pi**2) ** 2 / ((level + 1) ** 2 * number**2)
+def _rate(channels: int, level: Any, number: Any) -> Any:
+    """The share of a test in the false-alarm rate: those of all channels, levels and numbers add up to it."""
+    return RATE / max(channels, 1) * (6.0 / np.pi**2) ** 2 / ((level + 1.0) ** 2 * np.square(np.asarray(number, float)))
 
 
 @dataclass
@@ -131,12 +164,8 @@ class Surveillance:
 
     network: Network
     odds: float  # probability of a datum of the right model to be held back
-    sums: list[Sums] = field(default_factory=list)
-    seen: np.ndarray = field(default_factory=lambda: np.zeros(0, int))  # data of each channel
-    held: np.ndarray = field(default_factory=lambda: np.zeros(0, int))  # of them held back
-    recent: list[list[bool]] = field(default_factory=list)  # the last of each channel: held back
     changed: dict[str, int] = field(default_factory=dict)  # data of a sensor since it changed
-    events: list[Event] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)  # one of each kind, sensor and channel
     cause: str = ""  # of data that the model does not explain, where it was looked for
 
     def __post_init__(self) -> None:
@@ -145,14 +174,19 @@ class Surveillance:
         self.owners = np.repeat(np.array(names, str), [len(part) for part in parts])  # sensor of each channel
         self.names = [name for part in parts for name, _ in part]
         self.forms = [channel for part in parts for _, channel in part]
-        count = len(self.names)
-        if not self.sums:
-            self.sums, self.recent = [Sums() for _ in range(count)], [[] for _ in range(count)]
-            self.seen, self.held = np.zeros(count, int), np.zeros(count, int)
+        self.tallies = Tallies.none(len(self.names))
 
     def copy(self) -> Surveillance:
         """As it stands now."""
-        return deepcopy(self)
+        other = copy(self)
+        other.changed, other.events, other.tallies = dict(self.changed), [*self.events], self.tallies.copy()
+        return other
+
+    def _note(self, kind: str, sensor: str, channel: str, since: float, until: float | None, size: float) -> None:
+        """An event, joined with those of its kind before."""
+        same = [own for own in self.events if (own.kind, own.sensor, own.channel) == (kind, sensor, channel)]
+        self.events = [own for own in self.events if own not in same]
+        self.events.append(Event(kind, sensor, channel, min([since, *(own.since for own in same)]), until, size))
 
     # sensors that change
 
@@ -163,13 +197,14 @@ class Surveillance:
             if self.owners[k] in self.lost:
                 continue
             mine = np.flatnonzero(data.channel == k)
-            flags = np.array([*self.recent[k], *data.held[mine]])
+            before = self.tallies.recent[k][self.tallies.recent[k] >= 0]
+            flags = np.array([*before, *data.held[mine]])
             if len(flags) < RUN:
                 continue
             runs = np.convolve(flags, np.ones(RUN, int), "valid")
             full = np.flatnonzero(runs >= HELD)
             if len(full):
-                first = int(full[0]) + int(np.argmax(flags[full[0] :])) - len(self.recent[k])
+                first = int(full[0]) + int(np.argmax(flags[full[0] :])) - len(before)
                 found.append((data.epoch[mine[max(first, 0)]], str(self.owners[k]), mine[max(first, 0) :]))
         for epoch, sensor, mine in sorted(found, key=lambda one: one[:2]):
             since = data.time[mine[0]]
@@ -187,27 +222,25 @@ class Surveillance:
 
         With `jumps` its rows are let in until the jump of a bias is found.
         """
-        name = change.sensor
-        mine = np.flatnonzero(self.owners == name)
+        name, mine = change.sensor, np.flatnonzero(self.owners == change.sensor)
         again = self.changed.get(name, AGAIN) < AGAIN or (jumps and name in self.changed)
-        for k in mine:
-            self.recent[k] = []
+        self.tallies.recent[mine] = -1
         if again or not change.size <= LARGEST:
-            self.events.append(Event("lost", name, "", change.since, None, change.size))
+            self._note("lost", name, "", change.since, None, change.size)
             return False
         self.changed[name] = 0
         if not jumps:
-            self.events.append(Event("changed", name, "", change.since, change.since, change.size))
-        for k in mine:
-            self.sums[k] = Sums()
+            self._note("changed", name, "", change.since, change.since, change.size)
+        for k in mine.tolist():
+            self.tallies.forget(k)
         return True
 
     def explain(self, sensors: Set[str], since: float) -> None:
         """A jump of a bias from a time on explains what the innovations of some sensors showed since."""
         for name in sensors:
             self.changed.pop(name, None)
-        for k in np.flatnonzero(np.isin(self.owners, list(sensors))):
-            self.sums[k] = Sums()
+        for k in np.flatnonzero(np.isin(self.owners, list(sensors))).tolist():
+            self.tallies.forget(k)
         shown = [own for own in self.events if own.kind == "drifts" and own.sensor in sensors]
         explained = [own for own in shown if own.until is not None and own.until >= since]
         self.events = [own for own in self.events if own not in explained]
@@ -216,107 +249,89 @@ class Surveillance:
 
     def add(self, data: StreamData) -> None:
         """Count data in, and look for drifts."""
-        count = len(self.names)
-        self.seen += np.bincount(data.channel, minlength=count)
-        self.held += np.bincount(data.channel, data.held, minlength=count).astype(int)
+        count, kept = len(self.names), self.tallies
+        kept.seen[:] += np.bincount(data.channel, minlength=count)
+        kept.held[:] += np.bincount(data.channel, data.held, minlength=count).astype(int)
         for k in np.unique(data.channel).tolist():
             mine, name = data.channel == k, str(self.owners[k])
             held, times = data.held[mine], data.time[mine]
-            self.recent[k] = [*self.recent[k], *held.tolist()][1 - RUN :]
+            kept.recent[k] = np.concatenate([kept.recent[k], held])[1 - RUN :]
             e, score = normal_scores(self.forms[k].noise)
-            if score[-1] > 0:
-                for value, out, at in zip(np.interp(data.residual[mine], e, score), held, times, strict=True):
-                    if shift := self.sums[k].add(float(value), bool(out), count):
-                        self._drift(name, self.names[k], float(at), shift)
+            if score[-1] > 0 and (drift := kept.add(k, np.interp(data.residual[mine], e, score), held)):
+                self._note("drifts", name, self.names[k], *(float(times[drift[0]]),) * 2, drift[1])
             if name in self.changed:
                 self.changed[name] += int(mine.sum())
-            if name in self.lost and len(self.recent[k]) == RUN - 1 and sum(self.recent[k]) <= RUN - HELD:
-                self._open("lost", name).until = float(times[-1])
-
-    def _drift(self, name: str, channel: str, at: float, shift: float) -> None:
-        same = "drifts", name, channel
-        old = next((own for own in self.events if (own.kind, own.sensor, own.channel) == same), None)
-        if old is None:
-            self.events.append(Event("drifts", name, channel, at, at, shift))
-        else:
-            old.until, old.size = at, shift
+            if name in self.lost and kept.recent[k].min() >= 0 and kept.recent[k].sum() <= RUN - HELD:
+                self._note("lost", name, "", np.inf, float(times[-1]), 0.0)
 
     @property
     def lost(self) -> list[str]:
         """Sensors whose rows are left out now."""
         return [own.sensor for own in self.events if own.kind == "lost" and own.until is None]
 
-    def _open(self, kind: str, name: str) -> Event:
-        """The event of a sensor that goes on."""
-        return next(own for own in self.events if (own.kind, own.sensor, own.until) == (kind, name, None))
-
     # what they show
 
     @property
     def wide(self) -> np.ndarray:
         """Factor of the variance of each channel that the innovations call for."""
-        return np.array([own.wide(len(self.names)) for own in self.sums])
+        return self.tallies.wide
 
     @property
     def unexplained(self) -> list[str]:
         """Channels whose data the model does not explain."""
-        out = (self.seen >= 2 * RUN) & (self.held > UNEXPLAINED * self.seen)
-        out |= np.isin(self.owners, list(self.lost)) & (self.held > 0)
+        seen, held = self.tallies.seen, self.tallies.held
+        out = (seen >= 2 * RUN) & (held > UNEXPLAINED * seen)
+        out |= np.isin(self.owners, list(self.lost)) & (held > 0)
         return [f"{self.owners[k]}.{self.names[k]}" for k in np.flatnonzero(out)]
 
     @property
-    def surprising(self) -> int:
-        """Data that were held back, where they are more than a sound stream has; else 0."""
-        out, expected = int(self.held.sum()), float(self.seen.sum()) * self.odds
-        return out if out and special.pdtrc(out - 1, expected) < RATE else 0
+    def outliers(self) -> int:
+        """Data that were left out."""
+        return int(self.tallies.held.sum())
+
+    @property
+    def seen(self) -> int:
+        """Data that came."""
+        return int(self.tallies.seen.sum())
 
     def text(self) -> str:
         """What it found, in sentences; empty where nothing speaks against the model."""
         if names := self.unexplained:
-            share = self.held.sum() / max(self.seen.sum(), 1)
             return (
-                f"The model does not explain {listed(names)}: {share:.0%} of all data lie beyond its noise and were"
-                f" left out. {self.cause or UNKNOWN}"
+                f"The model does not explain {listed(names)}: {self.outliers / max(self.seen, 1):.0%} of all data lie"
+                f" beyond its noise and were left out. {self.cause or UNKNOWN}"
             )
-        said = []
-        for name, own in self._by_sensor("changed").items():
+        said = [self._said(own) for own in self.events]
+        if self.outliers and special.pdtrc(self.outliers - 1, self.seen * self.odds) < RATE:
             said.append(
-                f"{name} changed at {_times(own)}, by about {own[-1].size:.2g} scales of its biases: they begin anew"
-                " there. Take AugmentedFilter(jumps=Jumps()), --jumps 0.1, to find the bias that jumped."
-            )
-        for name, own in self._by_sensor("lost").items():
-            said.append(f"Nothing explains the rows of {name} from {_times(own)} on: they were left out for a time.")
-        for name, own in self._by_sensor("drifts").items():
-            said.append(
-                f"The innovations of {name}.{own[0].channel} have mean {own[0].size:.2g} up to {own[0].until:.6g} s:"
-                f" a bias of {name} drifts or has jumped; take AugmentedFilter(walk=...), --walk."
-            )
-        if out := self.surprising:
-            said.append(
-                f"{out} of {self.seen.sum()} data were left out: outliers, beyond odds of {self.odds:g}."
+                f"{self.outliers} of {self.seen} data were left out: outliers, beyond odds of {self.odds:g}."
                 " Declare Channel(..., noise=StudentT(4)) where they are to be expected."
             )
         wide = self.wide
         if wide.max(initial=1.0) > 1.0:
             k = int(np.argmax(wide))
             said.append(
-                f"The innovations of {self.owners[k]}.{self.names[k]} scatter as if its"
-                f" variance were {wide[k]:.2g} times as large: intervals are widened."
+                f"The innovations of {self.owners[k]}.{self.names[k]} scatter as if its variance were {wide[k]:.2g}"
+                " times as large: intervals are widened."
             )
         return " ".join(said)
 
-    def _by_sensor(self, kind: str) -> dict[str, list[Event]]:
-        """Events of a kind by their sensor."""
-        return {
-            own.sensor: [e for e in self.events if (e.kind, e.sensor) == (kind, own.sensor)]
-            for own in self.events
-            if own.kind == kind
-        }
-
-
-def _times(events: Sequence[Event]) -> str:
-    """When events began."""
-    return f"{', '.join(f'{own.since:.6g}' for own in events[:3])}{', ...' if len(events) > 3 else ''} s"
+    @staticmethod
+    def _said(event: Event) -> str:
+        """The sentence of an event."""
+        name, since, until = event.sensor, event.since, event.until
+        when = f"{since:.6g} s" if until in (None, since) else f"{since:.6g} to {until:.6g} s"
+        if event.kind == "changed":
+            return (
+                f"{name} changed at {when}, by about {event.size:.2g} scales of its biases: they begin anew there. Take"
+                " AugmentedFilter(jumps=Jumps()), --jumps 0.1, to find the bias that jumped."
+            )
+        if event.kind == "lost":
+            return f"Nothing explains the rows of {name} from {when}: they were left out."
+        return (
+            f"The innovations of {name}.{event.channel} have mean {event.size:.2g} at {when}: a bias of {name} drifts"
+            " or has jumped; take AugmentedFilter(walk=...), --walk."
+        )
 
 
 def data_in_order(parts: Sequence[StreamData]) -> StreamData:
