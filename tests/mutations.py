@@ -107,7 +107,7 @@ MUTATIONS = [
     Mutation("inference/propagate.py", "middle) - self.sites.pull\n", "middle)\n", "test_integrate.py"),
     Mutation("inference/propagate.py", "odds + 0.5 * jnp.log(", "0.5 * jnp.log(", "test_integrate.py"),
     # inference/widen.py
-    Mutation("inference/widen.py", "1.0 + group[\"gamma\"].values * (inflation - 1.0)", "inflation", "test_assess.py"),
+    Mutation("inference/widen.py", "1.0 + share * (inflation - 1.0)", "inflation", "test_assess.py"),
     Mutation("inference/widen.py", "more = [own + sign * ", "more = [own + ", "test_assess.py"),
     # smoothing/information.py
     Mutation("smoothing/linearised.py", "0.5 * (solved.logdet + biases.log_determinant())", "0.5 * solved.logdet", "test_exact.py"),

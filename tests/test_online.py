@@ -540,7 +540,8 @@ def tampered(state):
 GOOD = {  # members of which other values make a filter: counts, times and what was found
     "arrivals.counts", "arrivals.floors", "arrivals.origin", "arrivals.targets", "arrivals.duration", "doubts",
     "arrivals.earlier", "arrivals.first", "arrivals.latest", "arrivals.until", "points", "jumps", "time", "walked",
-    "log_evidence", "epochs", "last", "check.changed", "check.events", "check.cause",
+    "log_evidence", "epochs", "last", "check.changed", "check.targets", "check.snapshots",
+    "check.windows", "check.restarts", "check.events", "check.cause",
 }  # fmt: skip
 
 

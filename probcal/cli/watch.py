@@ -424,7 +424,8 @@ def judged(online: Online) -> pd.DataFrame:
     near = (frame["lower"] > -ROPE * frame["scale"]) & (frame["upper"] < ROPE * frame["scale"])
     words = np.select([frame["gamma"] < 0.5, away, near], ["not known yet", "biased", "zero"], "open")
     for event in online.check.events:
-        words[online.read_by(event.sensor)] = ALARMS[event.kind]
+        alone = np.flatnonzero(frame.index == event.channel)
+        words[alone if len(alone) else online.read_by(event.sensor)] = ALARMS[event.kind]
     for name in online.check.unexplained:
         words[online.read_by(name.rpartition(".")[0])] = ALARMS["lost"]
     return frame.drop(columns="scale").assign(verdict=words)

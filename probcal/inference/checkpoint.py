@@ -38,23 +38,23 @@ REMEDY = "move it away to begin anew, or give another --out"
 Kind = Callable[[Any], Any]  # the value of a JSON member as the filter holds it; raises `ValueError` for another kind
 
 
-def number(value: Any) -> float:
+def real(value: Any) -> float:
     """A finite number."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(float(value)):
         raise ValueError("a finite number")
     return float(value)
 
 
-def positive(value: Any) -> float:
+def positive_real(value: Any) -> float:
     """A positive number."""
-    if not number(value) > 0:
+    if not real(value) > 0:
         raise ValueError("a positive number")
     return float(value)
 
 
 def moment(value: Any) -> float:
     """A time in s, -inf before the first row."""
-    return -np.inf if value == -np.inf else number(value)
+    return -np.inf if value == -np.inf else real(value)
 
 
 def whole(value: Any) -> int:
@@ -149,38 +149,42 @@ def pair(*parts: Any) -> tuple[Any, ...]:
     return parts
 
 
-VECTOR = many(number, np.array)
+VECTOR = many(real, np.array)
 COUNTS = named(whole, Counter)
-ROW: dict[str, Kind] = {"time": number, "sensor": text, "target": text}
+ROW: dict[str, Kind] = {"time": real, "sensor": text, "target": text}
 ROWS = frame(cell, **ROW, cells=whole, line=whole)
-TRACKS = frame(level, time=number, target=text)
-SEEN = record(pair, text, whole, number)  # sensor, cells and own time of a row
+TRACKS = frame(level, time=real, target=text)
+SEEN = record(pair, text, whole, real)  # sensor, cells and own time of a row
 MEMBERS: dict[str, Kind] = {  # of an `Online`, by path: those of its arrivals come first and make its problem
     "arrivals.counts": COUNTS,
     "arrivals.targets": named(record(CarriedTarget, whole, whole, moment, many(SEEN, tuple))),
     "arrivals.origin": text,
-    "arrivals.area": optional(record(Area, whole, VECTOR, positive, positive)),
-    "arrivals.duration": positive,
-    "arrivals.floors": many(record(pair, whole, text, number)),
+    "arrivals.area": optional(record(Area, whole, VECTOR, positive_real, positive_real)),
+    "arrivals.duration": positive_real,
+    "arrivals.floors": many(record(pair, whole, text, real)),
     "arrivals.earlier": named(VECTOR),
     "arrivals.first": optional(whole),
     "arrivals.latest": moment,
     "arrivals.until": moment,
     "arrivals.samples": optional(frame(cell, **ROW, _kind=text, _group=text)),
     "doubts": COUNTS,
-    "points": many(record(pair, record(pair, number, text), record(pair, VECTOR, VECTOR)), dict),
+    "points": many(record(pair, record(pair, real, text), record(pair, VECTOR, VECTOR)), dict),
     "pending": optional(ROWS),
     "recent": optional(ROWS),
     "lately": optional(TRACKS),
-    "log_evidence": number,
+    "log_evidence": real,
     "epochs": whole,
     "time": moment,
     "walked": moment,
     "since": many(moment),
-    "jumps": many(record(Jump, text, *[number] * 6)),
+    "jumps": many(record(Jump, text, *[real] * 6)),
     "last": optional(ROWS),
     "check.changed": named(whole),
-    "check.events": many(record(Event, text, text, text, number, optional(number), number)),
+    "check.events": many(record(Event, text, text, text, real, optional(real), real)),
+    "check.targets": named(many(flag)),
+    "check.snapshots": many(record(pair, real, VECTOR, VECTOR)),
+    "check.windows": whole,
+    "check.restarts": whole,
     "check.cause": text,
 }
 RANGES: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {  # by leaf: whether it, and that before rows, are sound
@@ -308,11 +312,13 @@ def _check(online: Online, source: str) -> None:
         if (getattr(online, name) is None) != (template is None):
             raise _changed(source, name, "is absent, or should be")
     check = online.check
-    if not {*check.changed, *(own.sensor for own in check.events)} <= {*check.owners}:
+    if not {*check.changed, *(own.sensor for own in check.events)} <= {*check.owners, ""}:
         raise _changed(source, "check.events", "names a sensor that the network does not have")
     if template is None:
         return
     seats = [(own.recursion, own.slot) for own in arrivals.targets.values()]
+    if any({len(mean), len(variance)} != {template.model.biases} for _, mean, variance in check.snapshots):
+        raise _changed(source, "check.snapshots", "holds snapshots of other biases")
     R, sizes = len(template.epochs), [part.drift.shape[1] for part in template.model.recursions]
     if len(set(seats)) < len(seats) or any(r >= R or slot >= arrivals.most for r, slot in seats):
         raise _changed(source, "arrivals.targets", "holds targets that have no place in the filter")

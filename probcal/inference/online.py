@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -20,8 +20,8 @@ from probcal.errors import InputError, nearest
 from probcal.inference.arrivals import Arrivals, Batch, padded, refused_rows
 from probcal.inference.counted import Counted
 from probcal.inference.identity import declared_identity
-from probcal.inference.surveillance import Change, StreamData, Surveillance, data_in_order
-from probcal.inference.widen import widening
+from probcal.inference.surveillance import ChangePoint, StreamData, Surveillance, data_in_order
+from probcal.inference.widen import widening_factors
 from probcal.labels import NOBODY, label_parts
 from probcal.lazy import Later
 from probcal.network import Network
@@ -331,7 +331,7 @@ class Online:
             np.diag(np.linalg.inv(np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix())))
         )
         sd = np.sqrt((root**2).sum(1))
-        sd = sd * widening(sd, before, self.inflation)
+        sd = sd * widening_factors(sd, before, self.inflation)
         scales = problem.scales
         return pd.DataFrame(
             {
@@ -483,6 +483,7 @@ class Online:
         for pattern in self.method.consider:
             considered[_chosen(problem.labels, pattern, "consider")] = True
         self.given = FilterGiven(jnp.asarray(levels), jnp.asarray(walk), jnp.asarray(considered))
+        self.check.reads = {name: frozenset(self.read_by(name).tolist()) for name in self.check.reads}
         self.form = FilterForm(
             self.method.by, bool(walk.any()), bool(considered.any()), not self.method.lag, float(self.method.gate)
         )
@@ -508,7 +509,9 @@ class Online:
 
     # epochs through the filter
 
-    def _filter(self, frame: pd.DataFrame, batch: Batch, *, everything: bool) -> Update:
+    def _filter(
+        self, frame: pd.DataFrame, batch: Batch, *, everything: bool, restarted: Set[str] = frozenset()
+    ) -> Update:
         if isinstance(self.method, ParticleFilter):
             return self._by_particles(frame, batch, self.method)
         problem = self._problem
@@ -523,7 +526,9 @@ class Online:
         )  # `change`: epoch and sensor whose biases begin anew there
         while begun < K:
             if change is not None and change.epoch == begun:
-                self._begin_anew(change)
+                if change.target:
+                    break
+                jumps += self._begin_anew(change)
                 change = None
             left = (K if change is None else change.epoch) - begun
             count, size, segments = self._window(left)
@@ -555,7 +560,7 @@ class Online:
                 most = max(most, int(passed.passes))
                 self.doubts["windows"] += not passed.moved <= self.method.tolerance
             data = self._data(batch, begun, count, kept)
-            if change is None and (found := self._changed(data, batch, begun, points)) is not None:
+            if change is None and (found := self._changed(data, begun, restarted)) is not None:
                 change = found
                 continue
             lag = 0 if (everything or change is not None) and count == left else self.method.lag
@@ -585,6 +590,7 @@ class Online:
             self.walked = float(batch.time[begun + taken - 1])
             begun += taken
             self._renew()
+            self._follow()
             if count == left and jump is None and change is None:
                 break
         self.arrivals.settled(batch, frame, begun)
@@ -598,7 +604,37 @@ class Online:
         there = tracks["target"] != NOBODY
         settled = self.doubts.total() == doubts
         tracks = tracks[there].reset_index(drop=True)
-        return Update(self.time, begun, tracks, tuple(jumps), most, settled, self._outliers(frame, left_out))
+        news = Update(self.time, begun, tracks, tuple(jumps), most, settled, self._outliers(frame, left_out))
+        if change is None or change.epoch > begun:
+            return news
+        return self._joined(news, self._restarted(change.name, everything, restarted))
+
+    def _restarted(self, name: str, everything: bool, restarted: Set[str]) -> Update:
+        """Filter on with a target that begins anew, as one that has just come."""
+        assert self.pending is not None
+        self.check.restarts += 1
+        self.check.targets.pop(name, None)
+        own = self.arrivals.targets[name]
+        own.time, own.keys = -np.inf, ()
+        self.points = {key: point for key, point in self.points.items() if key[1] != name}
+        batch = self.arrivals.compiled(self.pending, "the window")
+        assert batch is not None
+        return self._filter(self.pending, batch, everything=everything, restarted={*restarted, name})
+
+    @staticmethod
+    def _joined(first: Update, second: Update) -> Update:
+        """Two updates as one."""
+        return Update(
+            second.time, first.epochs + second.epochs, pd.concat([first.tracks, second.tracks], ignore_index=True),
+            first.jumps + second.jumps, max(first.passes, second.passes), first.settled and second.settled,
+            pd.concat([first.refused, second.refused], ignore_index=True),
+        )  # fmt: skip
+
+    def _follow(self) -> None:
+        """Look for biases that moved although they are constant."""
+        mean, root = np.asarray(self.belief.mean), np.asarray(self.belief.root)
+        still = (np.asarray(self.given.walk) == 0) & ~np.asarray(self.given.considered)
+        self.check.follow(self.labels, self.walked, mean, (root**2).sum(1), still)
 
     def _data(self, batch: Batch, begun: int, count: int, kept: Sequence[Any]) -> StreamData:
         """The data of `count` epochs as a pass left them."""
@@ -606,7 +642,9 @@ class Online:
         for own, owner, numbers in zip(kept, batch.owners, batch.numbers, strict=True):
             epoch, datum = np.nonzero((owner[begun : begun + count, :, 0] >= 0) & (np.asarray(own.spread)[:count] > 0))
             of = begun + epoch, datum
-            told = (np.asarray(column)[epoch, datum] for column in (own.residual, own.spread, own.reach, own.held))
+            told = (
+                np.asarray(column)[epoch, datum] for column in (own.residual, own.spread, own.lead, own.slope, own.held)
+            )
             parts.append(StreamData(
                 owner[of][:, 0], epoch, owner[of][:, 1], batch.time[of[0]], batch.target[of[0]], *numbers[of].T, *told
             ))  # fmt: skip
@@ -623,44 +661,49 @@ class Online:
             reasons.append(f"{name} of {value:.6g} lies {abs(residual):.3g} sd from its prediction: left out")
         return refused_rows(lines, reasons)
 
-    def _changed(self, data: StreamData, batch: Batch, begun: int, points: Any) -> Change | None:
-        """A sensor that changed among the epochs from `begun` on, to be filtered again: where jumps are looked for with
-        all of its data."""
-        jumps = self.method.jumps is not None
-        while (found := self.check.change(data)) is not None:
-            if not self.check.begin_anew(found, jumps):
-                continue
-            if jumps:
-                self._admit(batch, points.verdict, found.sensor, begun + found.epoch)
-            return found._replace(epoch=begun + found.epoch)
+    def _changed(self, data: StreamData, begun: int, restarted: Set[str]) -> ChangePoint | None:
+        """A sensor or target that changed among the epochs from `begun` on, to be filtered again from there."""
+        names = {str(name) for name in np.unique(data.target)} - restarted - {NOBODY}
+        restarts = {name for name in names if "position" not in self.arrivals.target(name).start}
+        while (found := self.check.change(data, restarts)) is not None:
+            label = self.labels[found.bias] if found.bias >= 0 else ""
+            if found.target or self.check.begin_anew(found, label, self.method.jumps is not None):
+                return found._replace(epoch=begun + found.epoch)
         return None
 
-    def _admit(self, batch: Batch, verdict: Sequence[np.ndarray], sensor: str, epoch: int) -> None:
-        """Let the data of a sensor in from an epoch on."""
-        for own, owner in zip(verdict, batch.owners, strict=True):
-            own[epoch:][self.check.owners[owner[epoch:, :, 0]] == sensor] = beliefs.ADMIT
+    def _begin_anew(self, change: ChangePoint) -> tuple[Jump, ...]:
+        """The bias that jumped where it is now, or all that a sensor reads as uncertain as its change calls for.
 
-    def _begin_anew(self, change: Change) -> None:
-        """The biases of a sensor as uncertain as its change calls for; where jumps are tested, one that begins now."""
-        if self.method.jumps is not None:
-            self._renew_oldest()
-            return
-        belief, slots = beliefs.dispersed(self.belief, self.belief.slots, self._step_of(change))
+        The jump, where jumps are looked for.
+        """
+        columns, shift = self._step_of(change)
+        belief, slots = beliefs.dispersed(self.belief, self.belief.slots, jnp.asarray(columns), jnp.asarray(-shift))
         self.belief = belief._replace(slots=slots)
+        if self.method.jumps is None or change.bias < 0:
+            return ()
+        candidates = self.belief.candidates.bias.shape[0]
+        self.belief = beliefs.renewed(self.belief, jnp.ones(candidates, bool))
+        self.since = [self.walked] * self._starts
+        scale, odds = self._problem.scales[change.bias], 0.5 * (3.0 * change.size / change.sd) ** 2
+        size, sd = float(change.size * scale), float(change.sd * scale)
+        return (
+            Jump(self.labels[change.bias], change.since, change.found, size, sd, odds, change.found - change.since),
+        )
 
-    def _spread(self, change: Change) -> Cloud:
+    def _spread(self, change: ChangePoint) -> Cloud:
         """The same in every particle."""
         assert self.cloud is not None
-        step = self._step_of(change)
-        root = jax.vmap(lambda own: linalg.tria(jnp.concatenate([own, step], 1)))(self.cloud.root)
-        return self.cloud._replace(root=root)
+        columns, shift = self._step_of(change)
+        root = jax.vmap(lambda own: linalg.tria(jnp.concatenate([own, columns], 1)))(self.cloud.root)
+        return self.cloud._replace(root=root, mean=self.cloud.mean + shift[None])
 
-    def _step_of(self, change: Change) -> jax.Array:
-        """Covariance columns (M, q) of a step of the biases that a sensor reads."""
-        own = self.read_by(change.sensor)
-        columns = np.zeros((len(self.labels), len(own)))
-        columns[own, np.arange(len(own))] = max(change.size, 1.0)
-        return jnp.asarray(columns)
+    def _step_of(self, change: ChangePoint) -> tuple[np.ndarray, np.ndarray]:
+        """Covariance columns (M, q) and mean (M,) of a step of the biases."""
+        own = [change.bias] if change.bias >= 0 else self.read_by(change.name)
+        columns, shift = np.zeros((len(self.labels), len(own))), np.zeros(len(self.labels))
+        columns[own, np.arange(len(own))] = change.sd if change.bias >= 0 else max(change.size, 1.0)
+        shift[own] = change.size if change.bias >= 0 else 0.0
+        return columns, shift
 
     def _explained(self, batch: Batch) -> Any:
         """The epochs of a batch without the rows of sensors that are left out."""
@@ -715,8 +758,8 @@ class Online:
                 )
             self.cloud = cloud
             data = self._data(batch, begun, count, left.kept)
-            while (found := self.check.change(data)) is not None:  # its rows are behind: nothing is filtered again
-                if self.check.begin_anew(found, False):
+            while (found := self.check.change(data, frozenset())) is not None:  # its rows are behind
+                if self.check.begin_anew(found, self.labels[found.bias] if found.bias >= 0 else "", False):
                     self.cloud = self._spread(found)
             self.check.add(data)
             left_out.append(StreamData(*(column[data.held] for column in data)))
@@ -757,8 +800,6 @@ class Online:
             if old is not None:
                 xs[recursion[k]][k], z[k], there[k] = old[0], old[1], True
         verdict = tuple(np.zeros(owner.shape[:2], np.int8) for owner in batch.owners)
-        for sensor in self.check.changed if self.method.jumps is not None else ():
-            self._admit(batch, verdict, sensor, 0)
         found: Any = RowPoints(tuple(xs), z, there, verdict)  # type: ignore[arg-type]
         return found
 

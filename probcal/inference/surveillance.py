@@ -24,6 +24,11 @@ RUN, HELD = 10, 8  # data of a channel in a row, and how many of them held back 
 SHARED = 0.75  # share of the data of other sensors, held back meanwhile, from which the target changed
 LARGEST = 20.0  # scales of its biases that a sensor may change by; rows that are further off measure something else
 AGAIN = 40  # data of a channel after its change within which a second change says that nothing explains them
+CONSISTENT = 0.6  # sd of a jump over its size up to which the jump of one bias explains the data of a sensor
+TARGETS = 64  # targets whose last data are remembered
+SNAPSHOTS = 16  # moments with which biases are compared
+KNOWN = 0.25  # variance of a bias in scales from which its moves are looked at: the start is not linear
+LEARNT = 0.02  # share of the variance that must be lost between two moments
 RATE = 1e-3  # probability that a sound stream of any length is called drifting, or widened
 BATCH, LEVELS = 32, 20  # innovations of the smallest sum, and doublings of it (3e7 innovations)
 SHIFT = 0.05  # mean of innovations within which a channel does not drift
@@ -45,17 +50,22 @@ class StreamData(NamedTuple):
     std: np.ndarray  # of the noise
     residual: np.ndarray  # over the std of noise, state and biases together
     spread: np.ndarray  # this std over that of the noise
-    reach: np.ndarray  # std of the prediction by biases of one scale, over that of the noise
+    lead: np.ndarray  # bias on which the prediction depends most
+    slope: np.ndarray  # change of the prediction, over the std of the noise, by one scale of that
     held: np.ndarray  # held back
 
 
-class Change(NamedTuple):
-    """A sensor that changed."""
+class ChangePoint(NamedTuple):
+    """A sensor that changed, or a target whose track was lost."""
 
-    sensor: str
+    name: str
     epoch: int  # of the window, from which on
     since: float  # s
-    size: float  # scales of its biases
+    found: float  # s, of the last datum that shows it
+    target: bool = False
+    bias: int = -1  # that jumped; -1 where the jump of none explains the data
+    size: float = 0.0  # in scales
+    sd: float = 0.0  # in scales
 
 
 @dataclass(frozen=True)
@@ -64,7 +74,7 @@ class Event:
 
     kind: str
     sensor: str
-    channel: str
+    channel: str  # or the label of a bias
     since: float  # s, of the first
     until: float | None  # s, of the last; None while rows are left out
     size: float  # of the last: scales of a change, mean of the innovations of a drift
@@ -166,6 +176,10 @@ class Surveillance:
     odds: float  # probability of a datum of the right model to be held back
     changed: dict[str, int] = field(default_factory=dict)  # data of a sensor since it changed
     events: list[Event] = field(default_factory=list)  # one of each kind, sensor and channel
+    targets: dict[str, list[bool]] = field(default_factory=dict)  # the last data of each: held back
+    snapshots: list[tuple[float, np.ndarray, np.ndarray]] = field(default_factory=list)  # time, mean, variance of z
+    windows: int = 0  # after which biases were looked at
+    restarts: int = 0  # targets that were lost and begun anew
     cause: str = ""  # of data that the model does not explain, where it was looked for
 
     def __post_init__(self) -> None:
@@ -175,11 +189,13 @@ class Surveillance:
         self.names = [name for part in parts for name, _ in part]
         self.forms = [channel for part in parts for _, channel in part]
         self.tallies = Tallies.none(len(self.names))
+        self.reads: dict[str, Set[int]] = dict.fromkeys(names, frozenset())  # biases that each sensor reads
 
     def copy(self) -> Surveillance:
         """As it stands now."""
         other = copy(self)
         other.changed, other.events, other.tallies = dict(self.changed), [*self.events], self.tallies.copy()
+        other.targets, other.snapshots = dict(self.targets), [*self.snapshots]
         return other
 
     def _note(self, kind: str, sensor: str, channel: str, since: float, until: float | None, size: float) -> None:
@@ -190,55 +206,65 @@ class Surveillance:
 
     # sensors that change
 
-    def change(self, data: StreamData) -> Change | None:
-        """The first sensor of a window whose data are held back one after another, while those of others are not."""
+    def change(self, data: StreamData, restarts: Set[str]) -> ChangePoint | None:
+        """The first sensor of a window that changed, or target that was lost; `restarts` are those that may begin anew.
+
+        Its data are held back one after another: those of one sensor, or those of all that see a target.
+        """
+        targets = [self._lost_target(data, name) for name in np.unique(data.target[data.held]) if name in restarts]
+        if targets := [own for own in targets if own is not None]:
+            return min(targets, key=lambda own: own.epoch)
         found = []
         for k in np.unique(data.channel[data.held]).tolist():
-            if self.owners[k] in self.lost:
-                continue
             mine = np.flatnonzero(data.channel == k)
             before = self.tallies.recent[k][self.tallies.recent[k] >= 0]
-            flags = np.array([*before, *data.held[mine]])
-            if len(flags) < RUN:
-                continue
-            runs = np.convolve(flags, np.ones(RUN, int), "valid")
-            full = np.flatnonzero(runs >= HELD)
-            if len(full):
-                first = int(full[0]) + int(np.argmax(flags[full[0] :])) - len(before)
-                found.append((data.epoch[mine[max(first, 0)]], str(self.owners[k]), mine[max(first, 0) :]))
+            run = _run(before, data.held[mine])
+            if run is not None and self.owners[k] not in self.lost:
+                found.append((data.epoch[mine[run]], str(self.owners[k]), mine[run:]))
         for epoch, sensor, mine in sorted(found, key=lambda one: one[:2]):
             since = data.time[mine[0]]
             during = (data.time >= since) & np.isin(data.target, data.target[mine])
             others = during & (self.owners[data.channel] != sensor)
-            if others.sum() >= HELD and data.held[others].mean() > SHARED:
-                continue
-            own = during & (self.owners[data.channel] == sensor) & data.held & (data.reach > 0)
-            size = float(np.median(np.abs(data.residual * data.spread)[own] / data.reach[own])) if own.any() else np.inf
-            return Change(sensor, int(epoch), float(since), size)
+            if others.sum() < HELD or data.held[others].mean() <= SHARED:
+                own = during & (self.owners[data.channel] == sensor) & data.held
+                return ChangePoint(
+                    sensor, int(epoch), float(since), float(data.time[own].max()), False, *_jump(data, own)
+                )
         return None
 
-    def begin_anew(self, change: Change, jumps: bool) -> bool:
-        """Note a change; whether the biases of the sensor are to begin anew, and not its rows to be left out.
+    def _lost_target(self, data: StreamData, name: str) -> ChangePoint | None:
+        """A target whose data are held back, whichever sensor has them; of one sensor, if it has just begun."""
+        mine, before = np.flatnonzero(data.target == name), np.array(self.targets.get(name, ()), bool)
+        run = _run(before[1 - RUN :], data.held[mine])
+        if run is None:
+            return None
+        mine = mine[run:]
+        owners, held = self.owners[data.channel[mine]], data.held[mine]
+        names = np.unique(owners)
+        fresh = len(before) + run < RUN
+        if not all(held[owners == own].mean() > SHARED for own in names) or (len(names) == 1 and not fresh):
+            return None
+        return ChangePoint(name, int(data.epoch[mine[0]]), float(data.time[mine[0]]), float(data.time[mine[-1]]), True)
 
-        With `jumps` its rows are let in until the jump of a bias is found.
+    def begin_anew(self, change: ChangePoint, label: str, jumps: bool) -> bool:
+        """Note the change of a sensor; whether its biases are to begin anew, and not its rows to be left out.
+
+        `label` is that of the bias that jumped. With `jumps` such a jump is part of the model.
         """
-        name, mine = change.sensor, np.flatnonzero(self.owners == change.sensor)
-        again = self.changed.get(name, AGAIN) < AGAIN or (jumps and name in self.changed)
+        name, mine = change.name, np.flatnonzero(self.owners == change.name)
         self.tallies.recent[mine] = -1
-        if again or not change.size <= LARGEST:
+        if self.changed.get(name, AGAIN) < AGAIN or (change.bias < 0 and not change.size <= LARGEST):
             self._note("lost", name, "", change.since, None, change.size)
             return False
         self.changed[name] = 0
-        if not jumps:
-            self._note("changed", name, "", change.since, change.since, change.size)
-        for k in mine.tolist():
-            self.tallies.forget(k)
+        if not (jumps and label):
+            self._note("changed", name, label, change.since, change.since, change.size)
+        self.explain({name}, change.since)
         return True
 
     def explain(self, sensors: Set[str], since: float) -> None:
         """A jump of a bias from a time on explains what the innovations of some sensors showed since."""
-        for name in sensors:
-            self.changed.pop(name, None)
+        self.snapshots = []
         for k in np.flatnonzero(np.isin(self.owners, list(sensors))).tolist():
             self.tallies.forget(k)
         shown = [own for own in self.events if own.kind == "drifts" and own.sensor in sensors]
@@ -261,8 +287,37 @@ class Surveillance:
                 self._note("drifts", name, self.names[k], *(float(times[drift[0]]),) * 2, drift[1])
             if name in self.changed:
                 self.changed[name] += int(mine.sum())
+                if self.changed[name] >= AGAIN:
+                    del self.changed[name]
             if name in self.lost and kept.recent[k].min() >= 0 and kept.recent[k].sum() <= RUN - HELD:
                 self._note("lost", name, "", np.inf, float(times[-1]), 0.0)
+
+        for name in np.unique(data.target).tolist():
+            own = data.held[data.target == name].tolist()
+            self.targets[name] = [*self.targets.pop(name, ()), *own][-RUN:]
+        for name in list(self.targets)[:-TARGETS]:
+            del self.targets[name]
+
+    def follow(
+        self, labels: Sequence[str], time: float, mean: np.ndarray, variance: np.ndarray, still: np.ndarray
+    ) -> None:
+        """Look for biases (M,), in scales, that moved by more than what was learnt of them since explains.
+
+        Between two moments the mean of a constant bias changes by a normal step whose variance is that lost meanwhile.
+        `still` marks biases that are constant and estimated.
+        """
+        self.windows += 1
+        rate = _rate(max(len(labels), 1) * SNAPSHOTS, 0, self.windows)
+        for then, first, before in self.snapshots:
+            lost = np.maximum(before - variance, 0.0) * self.wide.max(initial=1.0)
+            told = still & (before < KNOWN) & (lost > LEARNT * variance)
+            step = np.where(told, (mean - first) / np.sqrt(np.where(told, lost, 1.0)), 0.0)
+            for m in np.flatnonzero(np.abs(step) > -special.ndtri(0.5 * rate)).tolist():
+                readers = [own for own in dict.fromkeys(self.owners.tolist()) if m in self.reads[own]]
+                self._note("drifts", readers[0] if readers else "", labels[m], then, time, float(step[m]))
+        self.snapshots.append((time, mean, variance))
+        if len(self.snapshots) > SNAPSHOTS:
+            del self.snapshots[1 : SNAPSHOTS // 2 : 2]
 
     @property
     def lost(self) -> list[str]:
@@ -307,6 +362,8 @@ class Surveillance:
                 f"{self.outliers} of {self.seen} data were left out: outliers, beyond odds of {self.odds:g}."
                 " Declare Channel(..., noise=StudentT(4)) where they are to be expected."
             )
+        if self.restarts:
+            said.append(f"{self.restarts} target{'s' * (self.restarts > 1)} were lost and begun anew.")
         wide = self.wide
         if wide.max(initial=1.0) > 1.0:
             k = int(np.argmax(wide))
@@ -322,16 +379,46 @@ class Surveillance:
         name, since, until = event.sensor, event.since, event.until
         when = f"{since:.6g} s" if until in (None, since) else f"{since:.6g} to {until:.6g} s"
         if event.kind == "changed":
+            what = f"{event.channel} jumped" if event.channel else f"{name} changed"
             return (
-                f"{name} changed at {when}, by about {event.size:.2g} scales of its biases: they begin anew there. Take"
-                " AugmentedFilter(jumps=Jumps()), --jumps 0.1, to find the bias that jumped."
+                f"{what} at {when}, by {event.size:.2g} scales, and begins anew there. Take"
+                " AugmentedFilter(jumps=Jumps()), --jumps 0.1, where jumps are to be expected."
             )
         if event.kind == "lost":
             return f"Nothing explains the rows of {name} from {when}: they were left out."
-        return (
-            f"The innovations of {name}.{event.channel} have mean {event.size:.2g} at {when}: a bias of {name} drifts"
-            " or has jumped; take AugmentedFilter(walk=...), --walk."
-        )
+        if event.channel.startswith(f"{name}.") or not name or "." in event.channel:
+            what = f"{event.channel} moved by {abs(event.size):.2g} sd of what was learnt of it from {when}: it"
+        else:
+            what = f"The innovations of {name}.{event.channel} have mean {event.size:.2g} at {when}: a bias of {name}"
+        return f"{what} drifts or has jumped; take AugmentedFilter(walk=...), --walk."
+
+
+def _run(before: np.ndarray, held: np.ndarray) -> int | None:
+    """The first of data (n,) that are held back one after another, with those before them; None where none are."""
+    flags = np.concatenate([before, held]).astype(bool)
+    if len(flags) < RUN:
+        return None
+    full = np.flatnonzero(np.convolve(flags, np.ones(RUN, int), "valid") >= HELD)
+    return max(int(full[0]) + int(np.argmax(flags[full[0] :])) - len(before), 0) if len(full) else None
+
+
+def _jump(data: StreamData, own: np.ndarray) -> tuple[int, float, float]:
+    """The bias whose jump explains data, its size and sd in scales; else -1 and the scales that they call for."""
+    off = (data.residual * data.spread)[own]
+    lead, slope = data.lead[own], data.slope[own]
+    there = slope != 0
+    if not there.any():
+        return -1, np.inf, np.inf
+    bias = int(np.bincount(lead[there]).argmax())
+    mine = there & (lead == bias)
+    sizes = off[mine] / slope[mine]
+    size = float(np.median(sizes))
+    # wide, so that the data which show the jump count once
+    sd = 3.0 * max(float(np.median(np.abs(sizes - size))) / MEDIAN, float(np.median(1.0 / np.abs(slope[mine]))))
+    if mine.mean() > 0.5 and sd < CONSISTENT * abs(size):
+        return bias, size, sd
+    size = float(np.median(np.abs(off[there] / slope[there])))
+    return -1, size, size
 
 
 def data_in_order(parts: Sequence[StreamData]) -> StreamData:

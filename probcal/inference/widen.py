@@ -262,7 +262,7 @@ def widened_by(tree: xr.DataTree, problem: Problem, levels: jax.Array, inflation
     most = by_target(problem, {"most": (("time", "component"), before_data(problem.model, levels))})
     for name, own in most.items():
         sd = tree["track"][name].to_dataset()["sd"].values
-        factors = widening(sd, np.sqrt(own["most"].values), np.full(sd.shape, float(np.mean(inflation))))
+        factors = widening_factors(sd, np.sqrt(own["most"].values), np.full(sd.shape, float(np.mean(inflation))))
         _widen_track(tree, name, np.where(sd > 0, factors, 1.0))
     tree.attrs["widened"] = float(wide.max())
     return tree
@@ -276,10 +276,12 @@ def bias_factors(group: xr.Dataset, inflation: np.ndarray, given: bool) -> np.nd
     precision = group["precision"].values if given else np.ones(len(inflation))
     with np.errstate(divide="ignore"):  # a flat prior has no sd
         before = group["scale"].values / np.sqrt(precision)
-    return widening(group["sd"].values, before, inflation, group["gamma"].values)
+    return widening_factors(group["sd"].values, before, inflation, group["gamma"].values)
 
 
-def widening(sd: np.ndarray, before: np.ndarray, inflation: np.ndarray, gamma: np.ndarray | None = None) -> np.ndarray:
+def widening_factors(
+    sd: np.ndarray, before: np.ndarray, inflation: np.ndarray, gamma: np.ndarray | None = None
+) -> np.ndarray:
     """Factors (M,) of sds, of whose variance the share gamma grows by `inflation`; never beyond the sds before data."""
     share = np.clip(1.0 - (sd / before) ** 2, 0.0, 1.0) if gamma is None else gamma
     wide = np.sqrt(1.0 + share * (inflation - 1.0))

@@ -75,7 +75,8 @@ class KeptDatum(NamedTuple):
     moved: jax.Array  # (M,) by how much the mean of z moved
     residual: jax.Array  # () over the std of noise, state and biases together
     spread: jax.Array  # () this std over that of the noise; 0 where there is no datum
-    reach: jax.Array  # () std of its prediction by biases of one scale, over that of the noise
+    lead: jax.Array  # () bias on which it depends most
+    slope: jax.Array  # () change of its prediction, over the std of the noise, by one scale of that
     held: jax.Array  # () whether it was held back: it changed nothing then
 
 
@@ -139,12 +140,15 @@ def seen(belief: Augmented, own: Slots, row: WhiteRow) -> tuple[Augmented, Slots
     residual = (row.shift + innovation * std / row.ratio) / spread
     outside = (residual < row.low) | (residual > row.high)
     held = (row.verdict == HOLD) | ((row.verdict == DECIDE) & outside)
-    reach = jnp.sqrt(jnp.sum(row.hz**2)) / row.ratio
+    lead = jnp.argmax(jnp.abs(row.hz)) if row.hz.size else jnp.zeros((), int)
+    slope = (row.hz[lead] if row.hz.size else 0.0) / row.ratio
     datum = KeptDatum(
         row.hx / std, gain, c, g, innovation / jnp.sqrt(variance), variance * std**2, pull * innovation,
-        residual, spread, reach, held,
+        residual, spread, lead, slope, held,
     )  # fmt: skip
-    none = jax.tree.map(jnp.zeros_like, datum)._replace(residual=residual, spread=spread, reach=reach, held=held)
+    none = jax.tree.map(jnp.zeros_like, datum)._replace(
+        residual=residual, spread=spread, lead=lead, slope=slope, held=held
+    )
     found = Augmented(belief.mean + pull * innovation, root, belief.slots, candidates), after, datum
     return jax.tree.map(lambda new, old: jnp.where(held, old, new), found, (belief, own, none))
 

@@ -66,7 +66,7 @@ def run_forward(
     return beliefs, jax.tree.map(lambda leaf: leaf.reshape(W, *leaf.shape[2:]), left)
 
 
-def bare(kept: KeptDatum) -> KeptDatum:
+def without_arrays(kept: KeptDatum) -> KeptDatum:
     """Data without the arrays that only the smoother needs."""
     return kept._replace(hx=kept.hx[..., :0], gain=kept.gain[..., :0], g=kept.g[..., :0], moved=kept.moved[..., :0])
 
@@ -161,7 +161,7 @@ def run_window(
             moves.append(jnp.max(jnp.where(known[:, None] & (sd > 0), off, 0.0), initial=0.0))
         fresh = jnp.any(there & ~known)
         moved = jnp.where(fresh, jnp.inf, jnp.max(jnp.stack(moves)))
-        left = (beliefs, found, tuple(bare(kept) for kept in steps.kept), _evidence(steps, segments))
+        left = (beliefs, found, tuple(without_arrays(kept) for kept in steps.kept), _evidence(steps, segments))
         return k + 1, RowPoints(tuple(xs), z, there, verdict), moved, left
 
     shapes = jax.eval_shape(lambda points: body((0, points, 0.0, None))[3], window.points)
@@ -185,6 +185,6 @@ def run_plain(
 
     def one(b: Augmented, inputs: tuple) -> tuple[Augmented, EpochStep]:
         after, left = epoch_step(form, model, given, b, *inputs)
-        return after, left._replace(after=(), kept=tuple(bare(kept) for kept in left.kept))
+        return after, left._replace(after=(), kept=tuple(without_arrays(kept) for kept in left.kept))
 
     return jax.lax.scan(one, belief, tuple(window))

@@ -73,7 +73,8 @@ class Foreseen(NamedTuple):
 
     residual: jax.Array  # over the std of noise, state and biases together
     spread: jax.Array  # this std over that of the noise; 0 where there is no datum
-    reach: jax.Array  # std of the prediction by biases of one scale, over that of the noise
+    lead: jax.Array  # bias on which it depends most
+    slope: jax.Array  # change of its prediction, over the std of the noise, by one scale of that
     held: jax.Array  # whether it is held back
 
 
@@ -103,14 +104,16 @@ def foreseen(
     there = jnp.any(first.hx != 0, 1) | jnp.any(first.hz != 0, 1)
     residual = middle / spread
     held = there & ((residual < first.low) | (residual > first.high))
-    reach = jnp.sqrt(jnp.sum(first.hz**2, 1)) / first.ratio
+    some = first.hz.shape[1] > 0
+    lead = jnp.argmax(jnp.abs(first.hz), 1) if some else jnp.zeros(len(residual), int)
+    slope = jnp.take_along_axis(first.hz, lead[:, None], 1)[:, 0] / first.ratio if some else jnp.zeros(len(residual))
     rows, begun = list(epoch.rows), 0
     for b, _, data in here(model, epoch, r):
         size = data.mask.size
         out = held[begun : begun + size].reshape(data.mask.shape)
         rows[b] = rows[b]._replace(mask=jnp.where(out, 0.0, rows[b].mask))
         begun += size
-    return Foreseen(residual, jnp.where(there, spread, 0.0), reach, held), epoch._replace(rows=tuple(rows))
+    return Foreseen(residual, jnp.where(there, spread, 0.0), lead, slope, held), epoch._replace(rows=tuple(rows))
 
 
 def _moved(given: FilterGiven, epoch: Epoch, r: int, x: State) -> tuple[jax.Array, jax.Array]:
@@ -214,7 +217,9 @@ def run_particles(
                 return *jax.vmap(particle)(keys[:N], cloud.states, cloud.mean, root), kept
 
             sizes = [sum(data.mask.size for _, _, data in here(model, epoch, r)) for r in range(R)]
-            no_data = [Foreseen(*(jnp.zeros(size),) * 3, jnp.zeros(size, bool)) for size in sizes]
+            no_data = [
+                Foreseen(jnp.zeros(n), jnp.zeros(n), jnp.zeros(n, int), jnp.zeros(n), jnp.zeros(n, bool)) for n in sizes
+            ]
             states, mean, root, gain, kept = jax.lax.switch(epoch.recursion, [partial(of, r) for r in range(R)])
             log_weight = cloud.log_weight + jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
             total = jax.scipy.special.logsumexp(log_weight)
