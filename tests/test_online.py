@@ -541,7 +541,7 @@ GOOD = {  # members of which other values make a filter: counts, times and what 
     "arrivals.counts", "arrivals.floors", "arrivals.origin", "arrivals.targets", "arrivals.duration", "doubts",
     "arrivals.earlier", "arrivals.first", "arrivals.latest", "arrivals.until", "points", "jumps", "time", "walked",
     "log_evidence", "epochs", "last", "check.changed", "check.targets", "check.snapshots",
-    "check.windows", "check.restarts", "check.events", "check.cause",
+    "check.moments", "check.restarts", "check.events", "check.cause",
 }  # fmt: skip
 
 

@@ -183,7 +183,7 @@ MEMBERS: dict[str, Kind] = {  # of an `Online`, by path: those of its arrivals c
     "check.events": many(record(Event, text, text, text, real, optional(real), real)),
     "check.targets": named(many(flag)),
     "check.snapshots": many(record(pair, real, VECTOR, VECTOR)),
-    "check.windows": whole,
+    "check.moments": whole,
     "check.restarts": whole,
     "check.cause": text,
 }

@@ -53,6 +53,7 @@ PLAIN = (1, 32, 512)  # epochs of a call of the plain filter
 ANCESTORS = 50  # particles of the start of which some must be left for intervals to be worth what they say
 RECENT = 300  # rows that are kept for the tree
 MANY = 3000  # biases beyond which the dense covariance of the filter is no use
+LOOK = 8  # epochs between two moments at which a plain filter compares the biases
 SEGMENTS = 4  # parts of a lag, at the ends of which a window may be left
 
 
@@ -542,9 +543,11 @@ class Online:
             )
             model = problem.model
             if self.method.lag == 0:
-                ends, left_over = run_plain(self.form, model, self.given, self.belief, window)
+                ends, left_over, moments = run_plain(self.form, model, self.given, self.belief, window)
                 stack, kept = jax.tree.map(lambda leaf: np.asarray(leaf)[None], ends), left_over.kept
                 xs, sds, done = left_over.x, left_over.sd, np.array([count])
+                looked = np.unique(np.append(np.arange(LOOK - 1, count, LOOK), count - 1))
+                history = [np.asarray(part)[looked] for part in moments]
                 evidence = np.array([_evidence(left_over.kept)])
             else:
                 passed = run_window(
@@ -557,6 +560,7 @@ class Online:
                 points = points._replace(verdict=forced)
                 done = np.minimum(np.arange(1, segments + 1) * (size // segments), count)
                 evidence = np.asarray(passed.log_evidence)
+                looked, history = done - 1, [stack.mean, np.square(stack.root).sum(2)]
                 most = max(most, int(passed.passes))
                 self.doubts["windows"] += not passed.moved <= self.method.tolerance
             data = self._data(batch, begun, count, kept)
@@ -579,6 +583,8 @@ class Online:
                 jumps.append(jump[2])
                 self.since = [float(batch.time[begun + int(done[leaving]) - 1])] * self._starts
             taken = int(done[leaving])
+            looked = looked[looked < taken]
+            self._follow(*(part[: len(looked)] for part in history), batch.time[begun + looked])
             gone = StreamData(*(column[data.epoch < taken] for column in data))
             self.check.add(gone)
             if jump is not None:
@@ -590,7 +596,6 @@ class Online:
             self.walked = float(batch.time[begun + taken - 1])
             begun += taken
             self._renew()
-            self._follow()
             if count == left and jump is None and change is None:
                 break
         self.arrivals.settled(batch, frame, begun)
@@ -630,11 +635,11 @@ class Online:
             pd.concat([first.refused, second.refused], ignore_index=True),
         )  # fmt: skip
 
-    def _follow(self) -> None:
-        """Look for biases that moved although they are constant."""
-        mean, root = np.asarray(self.belief.mean), np.asarray(self.belief.root)
+    def _follow(self, means: np.ndarray, variances: np.ndarray, times: np.ndarray) -> None:
+        """Look for biases that moved although they are constant, by their moments (S, M) at some times."""
         still = (np.asarray(self.given.walk) == 0) & ~np.asarray(self.given.considered)
-        self.check.follow(self.labels, self.walked, mean, (root**2).sum(1), still)
+        steps = zip(times.tolist(), means, variances, strict=True)
+        self.check.follow(self.labels, steps, still)
 
     def _data(self, batch: Batch, begun: int, count: int, kept: Sequence[Any]) -> StreamData:
         """The data of `count` epochs as a pass left them."""

@@ -7,7 +7,7 @@ of a stream, whatever its length, share one false-alarm rate.
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Iterable, Sequence, Set
 from copy import copy
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -31,6 +31,7 @@ KNOWN = 0.25  # variance of a bias in scales from which its moves are looked at:
 LEARNT = 0.02  # share of the variance that must be lost between two moments
 RATE = 1e-3  # probability that a sound stream of any length is called drifting, or widened
 BATCH, LEVELS = 32, 20  # innovations of the smallest sum, and doublings of it (3e7 innovations)
+SHORT = (8, 16)  # innovations of the shortest sums, those that came last
 SHIFT = 0.05  # mean of innovations within which a channel does not drift
 FEWEST = 8  # sums of one length that show a variance
 MEDIAN = 0.6745  # of the size of a standard normal
@@ -127,7 +128,23 @@ class Tallies(NamedTuple):
             n += taken
             if fill + taken == BATCH and (mean := self._summed(k)):
                 shift = n - 1, mean
+        if mean := self._lately(k):
+            shift = len(values) - 1, mean
         return shift
+
+    def _lately(self, k: int) -> float:
+        """Mean of the last 8, 16 or more innovations of a channel where it is too far from zero, else 0."""
+        fill = int(self.fill[k])
+        last = self.waiting[k, :fill][~self.out[k, :fill]]
+        sums = [(m, float(last[-m:].sum())) for m in SHORT if len(last) >= m]
+        number, total = len(last), float(last.sum())
+        for level in np.flatnonzero(self.pending[k]).tolist():
+            number, total = number + (BATCH << level), total + float(self.half[k, level]) * np.sqrt(BATCH << level)
+            sums.append((number, total))
+        rate = _rate(len(self.fill) * LEVELS, 0, 1 + int(self.number[k, 0] + fill) // SHORT[0])
+        limit = -special.ndtri(0.5 * rate)
+        far = [total / n for n, total in sums if abs(total) > limit * np.sqrt(n) and abs(total / n) > SHIFT]
+        return max(far, key=abs, default=0.0)
 
     def _summed(self, k: int) -> float:
         """A sum of the smallest length added to the longer ones; the mean of one that is too far from zero, else 0."""
@@ -178,7 +195,7 @@ class Surveillance:
     events: list[Event] = field(default_factory=list)  # one of each kind, sensor and channel
     targets: dict[str, list[bool]] = field(default_factory=dict)  # the last data of each: held back
     snapshots: list[tuple[float, np.ndarray, np.ndarray]] = field(default_factory=list)  # time, mean, variance of z
-    windows: int = 0  # after which biases were looked at
+    moments: int = 0  # at which biases were looked at
     restarts: int = 0  # targets that were lost and begun anew
     cause: str = ""  # of data that the model does not explain, where it was looked for
 
@@ -299,25 +316,27 @@ class Surveillance:
             del self.targets[name]
 
     def follow(
-        self, labels: Sequence[str], time: float, mean: np.ndarray, variance: np.ndarray, still: np.ndarray
+        self, labels: Sequence[str], steps: Iterable[tuple[float, np.ndarray, np.ndarray]], still: np.ndarray
     ) -> None:
-        """Look for biases (M,), in scales, that moved by more than what was learnt of them since explains.
+        """Look for biases, in scales, that moved by more than what was learnt of them since explains.
 
         Between two moments the mean of a constant bias changes by a normal step whose variance is that lost meanwhile.
-        `still` marks biases that are constant and estimated.
+        `steps` are moments with means and variances (M,); `still` marks biases that are constant and estimated.
         """
-        self.windows += 1
-        rate = _rate(max(len(labels), 1) * SNAPSHOTS, 0, self.windows)
-        for then, first, before in self.snapshots:
-            lost = np.maximum(before - variance, 0.0) * self.wide.max(initial=1.0)
-            told = still & (before < KNOWN) & (lost > LEARNT * variance)
-            step = np.where(told, (mean - first) / np.sqrt(np.where(told, lost, 1.0)), 0.0)
-            for m in np.flatnonzero(np.abs(step) > -special.ndtri(0.5 * rate)).tolist():
-                readers = [own for own in dict.fromkeys(self.owners.tolist()) if m in self.reads[own]]
-                self._note("drifts", readers[0] if readers else "", labels[m], then, time, float(step[m]))
-        self.snapshots.append((time, mean, variance))
-        if len(self.snapshots) > SNAPSHOTS:
-            del self.snapshots[1 : SNAPSHOTS // 2 : 2]
+        inflation = self.wide.max(initial=1.0)
+        for time, mean, variance in steps:
+            self.moments += 1
+            limit = -special.ndtri(0.5 * _rate(max(len(labels), 1) * SNAPSHOTS, 0, self.moments))
+            for then, first, before in self.snapshots:
+                learnt = np.maximum(before - variance, 0.0) * inflation
+                told = still & (before < KNOWN) & (learnt > LEARNT * variance)
+                step = np.where(told, (mean - first) / np.sqrt(np.where(told, learnt, 1.0)), 0.0)
+                for m in np.flatnonzero(np.abs(step) > limit).tolist():
+                    readers = [own for own, read in self.reads.items() if m in read]
+                    self._note("drifts", readers[0] if readers else "", labels[m], then, time, float(step[m]))
+            self.snapshots.append((time, mean, variance))
+            if len(self.snapshots) > SNAPSHOTS:
+                del self.snapshots[1 : SNAPSHOTS // 2 : 2]
 
     @property
     def lost(self) -> list[str]:

@@ -180,11 +180,16 @@ def _evidence(steps: EpochStep, segments: int) -> jax.Array:
 @partial(jax.jit, static_argnames="form")
 def run_plain(
     form: FilterForm, model: Model, given: FilterGiven, belief: Augmented, window: Window
-) -> tuple[Augmented, EpochStep]:
-    """The plain filter over a stack of epochs; of each epoch mean and sd of its target and the innovations."""
+) -> tuple[Augmented, EpochStep, tuple[jax.Array, jax.Array]]:
+    """The plain filter over a stack of epochs; of each epoch mean and sd of its target, its data, and the biases.
 
-    def one(b: Augmented, inputs: tuple) -> tuple[Augmented, EpochStep]:
+    The biases are means and variances (W, M).
+    """
+
+    def one(b: Augmented, inputs: tuple) -> tuple[Augmented, tuple[EpochStep, tuple[jax.Array, jax.Array]]]:
         after, left = epoch_step(form, model, given, b, *inputs)
-        return after, left._replace(after=(), kept=tuple(without_arrays(kept) for kept in left.kept))
+        left = left._replace(after=(), kept=tuple(without_arrays(kept) for kept in left.kept))
+        return after, (left, (after.mean, jnp.sum(after.root**2, 1)))
 
-    return jax.lax.scan(one, belief, tuple(window))
+    end, (steps, biases) = jax.lax.scan(one, belief, tuple(window))
+    return end, steps, biases
