@@ -584,7 +584,7 @@ class Online:
                 self.since = [float(batch.time[begun + int(done[leaving]) - 1])] * self._starts
             taken = int(done[leaving])
             looked = looked[looked < taken]
-            self._follow(*(part[: len(looked)] for part in history), batch.time[begun + looked])
+            self._follow(batch.time[begun + looked], *(part[: len(looked)] for part in history))
             gone = StreamData(*(column[data.epoch < taken] for column in data))
             self.check.add(gone)
             if jump is not None:
@@ -635,10 +635,10 @@ class Online:
             pd.concat([first.refused, second.refused], ignore_index=True),
         )  # fmt: skip
 
-    def _follow(self, means: np.ndarray, variances: np.ndarray, times: np.ndarray) -> None:
+    def _follow(self, times: np.ndarray, means: Any, variances: Any) -> None:
         """Look for biases that moved although they are constant, by their moments (S, M) at some times."""
         still = (np.asarray(self.given.walk) == 0) & ~np.asarray(self.given.considered)
-        steps = zip(times.tolist(), means, variances, strict=True)
+        steps = zip(times.tolist(), np.asarray(means), np.asarray(variances), strict=True)
         self.check.follow(self.labels, steps, still)
 
     def _data(self, batch: Batch, begun: int, count: int, kept: Sequence[Any]) -> StreamData:

@@ -27,6 +27,7 @@ AGAIN = 40  # data of a channel after its change within which a second change sa
 CONSISTENT = 0.6  # sd of a jump over its size up to which the jump of one bias explains the data of a sensor
 TARGETS = 64  # targets whose last data are remembered
 SNAPSHOTS = 16  # moments with which biases are compared
+APART = 4  # of the comparisons with them, which overlap, that count as tests of their own
 KNOWN = 0.25  # variance of a bias in scales from which its moves are looked at: the start is not linear
 LEARNT = 0.02  # share of the variance that must be lost between two moments
 RATE = 1e-3  # probability that a sound stream of any length is called drifting, or widened
@@ -325,8 +326,10 @@ class Surveillance:
         """
         inflation = self.wide.max(initial=1.0)
         for time, mean, variance in steps:
+            if self.snapshots and self.snapshots[-1][0] == time:
+                continue
             self.moments += 1
-            limit = -special.ndtri(0.5 * _rate(max(len(labels), 1) * SNAPSHOTS, 0, self.moments))
+            limit = -special.ndtri(0.5 * _rate(max(len(labels), 1) * APART, 0, self.moments))
             for then, first, before in self.snapshots:
                 learnt = np.maximum(before - variance, 0.0) * inflation
                 told = still & (before < KNOWN) & (learnt > LEARNT * variance)
