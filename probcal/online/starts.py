@@ -1,7 +1,8 @@
 """Where a target that has just come can be: the place that explains its first rows best, of many that are tried.
 
 Everything else of its state is at the start that is declared, and the noise is widened by what is not known of the
-biases, with the robust loss of the batch start.
+biases, with the robust loss of the batch start. Residuals count by the std of their noise, whatever its family: the
+weights of heavy tails are the same at all places that are far off.
 """
 
 from functools import partial
@@ -38,8 +39,8 @@ def place_new(
             rows = linearised(model, epoch, r, About(x, belief.mean), given.levels)
             parts = []
             for row in rows:
-                wide = jnp.sqrt(1.0 + jnp.sum((row.hz @ belief.root) ** 2, 1))
-                off = (row.value - row.hx @ x - row.hz @ belief.mean) / wide
+                wide = row.ratio * jnp.sqrt(1.0 + jnp.sum((row.hz @ belief.root) ** 2, 1) / row.ratio**2)
+                off = (row.ratio * row.shift + row.value - row.hx @ x - row.hz @ belief.mean) / wide
                 parts.append((off, row.hx[:, entries] / wide[:, None]))
             off, slope = zip(*parts, strict=True)
             there = epoch.recursion >= 0
