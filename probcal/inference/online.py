@@ -53,6 +53,7 @@ PLAIN = (1, 32, 512)  # epochs of a call of the plain filter
 ANCESTORS = 50  # particles of the start of which some must be left for intervals to be worth what they say
 RECENT = 300  # rows that are kept for the tree
 MANY = 3000  # biases beyond which the dense covariance of the filter is no use
+RESTLESS = 0.1  # sd by which the points of a window may move in its last pass without a doubt of its intervals
 LOOK = 8  # epochs between two moments at which a plain filter compares the biases
 SEGMENTS = 4  # parts of a lag, at the ends of which a window may be left
 
@@ -562,7 +563,7 @@ class Online:
                 evidence = np.asarray(passed.log_evidence)
                 looked, history = done - 1, [stack.mean, np.square(stack.root).sum(2)]
                 most = max(most, int(passed.passes))
-                self.doubts["windows"] += not passed.moved <= self.method.tolerance
+                self.doubts["windows"] += not passed.moved <= max(self.method.tolerance, RESTLESS)
             data = self._data(batch, begun, count, kept)
             if change is None and (found := self._changed(data, begun, restarted)) is not None:
                 change = found
