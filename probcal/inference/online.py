@@ -682,6 +682,7 @@ class Online:
 
         The jump, where jumps are looked for.
         """
+        self.check.snapshots = []
         columns, shift = self._step_of(change)
         belief, slots = beliefs.dispersed(self.belief, self.belief.slots, jnp.asarray(columns), jnp.asarray(-shift))
         self.belief = belief._replace(slots=slots)

@@ -256,11 +256,12 @@ class Surveillance:
         run = _run(before[1 - RUN :], data.held[mine])
         if run is None:
             return None
-        mine = mine[run:]
+        mine = mine[run : run + 3 * RUN]
         owners, held = self.owners[data.channel[mine]], data.held[mine]
         names = np.unique(owners)
         fresh = len(before) + run < RUN
-        if not all(held[owners == own].mean() > SHARED for own in names) or (len(names) == 1 and not fresh):
+        most = np.mean([held[owners == own].mean() > 0.5 for own in names]) > SHARED and held.mean() > SHARED
+        if not most or (len(names) == 1 and not fresh):
             return None
         return ChangePoint(name, int(data.epoch[mine[0]]), float(data.time[mine[0]]), float(data.time[mine[-1]]), True)
 
@@ -421,7 +422,11 @@ def _run(before: np.ndarray, held: np.ndarray) -> int | None:
     if len(flags) < RUN:
         return None
     full = np.flatnonzero(np.convolve(flags, np.ones(RUN, int), "valid") >= HELD)
-    return max(int(full[0]) + int(np.argmax(flags[full[0] :])) - len(before), 0) if len(full) else None
+    if not len(full):
+        return None
+    run = flags[full[0] : full[0] + RUN].astype(int)
+    wrong = np.cumsum(run) - run + np.cumsum((1 - run)[::-1])[::-1]  # held before each datum, not held from it on
+    return max(int(full[0]) + int(np.argmin(wrong)) - len(before), 0)
 
 
 def _jump(data: StreamData, own: np.ndarray) -> tuple[int, float, float]:
