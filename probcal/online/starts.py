@@ -77,3 +77,15 @@ def place_new(
     best = jnp.argmin(losses)
     (place, _, _), _ = jax.lax.scan(better, (tried[best], losses[best], jnp.asarray(1e-3)), None, length=REFINED)
     return resting.at[entries].set(place)
+
+
+@partial(jax.jit, static_argnames=("r", "odds"))
+def outlying(
+    model: Model, given: FilterGiven, belief: Augmented, epoch: Epoch, x: jax.Array, r: int, odds: float
+) -> jax.Array:
+    """Whether data (D,) of one epoch lie beyond the gate about a state, as the biases are known."""
+    rows = linearised(model, epoch, r, About(x, belief.mean), given.levels, odds)
+    row = jax.tree.map(lambda *parts: jnp.concatenate(parts), *rows)
+    off = row.shift + (row.value - row.hx @ x - row.hz @ belief.mean) / row.ratio
+    residual = off / jnp.sqrt(1.0 + jnp.sum((row.hz @ belief.root) ** 2, 1) / row.ratio**2)
+    return (residual < row.low) | (residual > row.high)
