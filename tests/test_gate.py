@@ -183,7 +183,13 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize("name", MISTAKES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in ("millimetres", "exchanged from 175 s on") else pytest.param(name, marks=pytest.mark.ci)
+        for name in MISTAKES
+    ],
+)
 def test_a_mistake_is_no_answer_and_is_named(name):
     change, said = MISTAKES[name]
     online, _ = streamed(change(passes()))
@@ -279,6 +285,7 @@ def problem(data=None):
 """
 
 
+@pytest.mark.ci
 def test_a_watch_ends_with_its_status(tmp_path):
     model = tmp_path / "model.py"
     model.write_text(MODEL.format(tests=str(next(p for p in sys.path if p.endswith("tests")))))

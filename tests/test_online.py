@@ -313,7 +313,9 @@ def test_a_window_of_everything_ends_at_the_batch_answer():
     np.testing.assert_allclose(online.biases["sd"], group["sd"].values, rtol=2e-3)
 
 
-@pytest.mark.parametrize("name", worlds.LINEAR)
+@pytest.mark.parametrize(
+    "name", [name if name == "mixed" else pytest.param(name, marks=pytest.mark.ci) for name in worlds.LINEAR]
+)
 def test_every_linear_world_ends_at_its_exact_posterior(name):
     """In 2-D and 3-D, with sensors of two nodes, moving nodes, drifts, targets of several motions, blank rows."""
     world, motion, table, fixed = worlds.LINEAR[name]()

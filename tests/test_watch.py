@@ -19,6 +19,8 @@ from terminal import call
 import probcal as pc
 from probcal.plots import plot_history
 
+pytestmark = pytest.mark.ci
+
 MODEL = """
 from probcal import Bias, Channel, ConstantVelocity, Network, Node, Problem, Target, sensor
 
@@ -445,7 +447,6 @@ def wait_for(path, least=1):
     raise AssertionError(f"{path} did not come")
 
 
-@pytest.mark.ci
 def test_a_killed_watch_goes_on_and_counts_every_row_once(model, table, tmp_path):
     out, text = tmp_path / "out", lines()
     options = (model, table, "--out", out, "--lag", "8", "--every", "0")

@@ -31,7 +31,7 @@ from probcal.online.belief import Augmented
 from probcal.online.filtering import RULES, FilterForm, FilterGiven, RowPoints
 from probcal.online.lag import Window, run_plain, run_window
 from probcal.online.particles import Cloud
-from probcal.online.starts import FIRST, outlying, place_new
+from probcal.online.starts import FIRST, outside_gate, place_new
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem, fixed_biases
 from probcal.results.answer import HALF
@@ -826,10 +826,11 @@ class Online:
             span = problem.epochs[r].position
             x = place_new(problem.model, self.given, belief, few, r, span, self.arrivals.tried)
             if self.method.gate and (batch.owners[r][k, :, 0] >= 0).sum() > problem.network.dimension + 1:
-                alone = few._replace(recursion=np.where(np.arange(FIRST) == 0, few.recursion, -1))
+                first_one: Any = np.where(np.arange(FIRST) == 0, few.recursion, -1)
+                alone = few._replace(recursion=first_one)
                 first_of = jax.tree.map(lambda leaf: leaf[0], few)
                 at = place_new(problem.model, self.given, belief, alone, r, span, self.arrivals.tried)
-                far = outlying(problem.model, self.given, belief, first_of, at, r, float(self.method.gate))
+                far = outside_gate(problem.model, self.given, belief, first_of, at, r, float(self.method.gate))
                 verdict[r][k] = np.where(np.asarray(far), beliefs.HOLD, beliefs.DECIDE)  # its prior lets all in
             if self.method.lag:
                 xs[r][mine], z[mine], there[mine] = np.asarray(x), np.asarray(belief.mean), True

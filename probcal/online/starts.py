@@ -80,7 +80,7 @@ def place_new(
 
 
 @partial(jax.jit, static_argnames=("r", "odds"))
-def outlying(
+def outside_gate(
     model: Model, given: FilterGiven, belief: Augmented, epoch: Epoch, x: jax.Array, r: int, odds: float
 ) -> jax.Array:
     """Whether data (D,) of one epoch lie beyond the gate about a state, as the biases are known."""
