@@ -175,9 +175,11 @@ def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
 def _points(problem: Problem, point: Point, square: float) -> Iterator[Point]:
     """The point of a misfit where it is finite, and tracks with the biases as stated, which no
     wrong bias bends."""
-    if np.isfinite(square):
+    drawn = any(part.L.shape[1] == 0 for part in problem.model.recursions)  # a motion of no linear form has no start
+    if np.isfinite(square) or drawn:
         yield point
-    yield track_mode(problem, uncalibrated(automatic_start(problem)))
+    if not drawn:
+        yield track_mode(problem, uncalibrated(automatic_start(problem)))
 
 
 def _remains(problem: Problem, point: Point) -> MisfitData:

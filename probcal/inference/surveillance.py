@@ -409,7 +409,7 @@ class Surveillance:
             )
         if event.kind == "lost":
             return f"Nothing explains the rows of {name} from {when}: they were left out."
-        if event.channel.startswith(f"{name}.") or not name or "." in event.channel:
+        if "." in event.channel:  # a bias
             what = f"{event.channel} moved by {abs(event.size):.2g} sd of what was learnt of it from {when}: it"
         else:
             what = f"The innovations of {name}.{event.channel} have mean {event.size:.2g} at {when}: a bias of {name}"

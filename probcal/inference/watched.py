@@ -83,15 +83,14 @@ class FilteredPosterior(StreamPosterior):
 @float64
 def calibration_tree(online: Online) -> xr.DataTree:
     """The tree of what a filter knows."""
-    assert online._problem is not None  # raises before the first rows
-    assert online.recent is not None
-    if online.check.unexplained and online.last is not None:
+    sampled = any(motion is not None for motion in online._problem.model.sampled)
+    if online.check.unexplained and online.last is not None and not sampled:
         names = dict.fromkeys(name.rsplit(".", 1)[0] for name in online.check.unexplained)
         online.check.cause = mistake(_of_last(online, online.last), list(names))
+    assert online.recent is not None
     problem = _of_last(online, online.recent)
     z, root = np.asarray(online.end.mean), np.asarray(online.end.root)
     levels = jnp.asarray(online.levels(problem))
-    sampled = any(form is not None for form in problem.model.sampled)
     if sampled:
         problem, tracks = problem.seen(), _filtered(online, problem)
         states = tuple(jnp.asarray(track.mean) for track in tracks)
