@@ -2,13 +2,16 @@
 
     uv run python benchmarks/soak.py 10_000_000
     uv run python benchmarks/soak.py 200_000 --compare
+    uv run python benchmarks/soak.py 1_000_000 --jumps 3 --outliers 0.01 --until 0.95
 
 Two targets pass five radars again and again, each time under new names; the rows are written piece by piece into a
 temporary folder. The process is killed (SIGKILL) at random moments of the first half, some of them while it starts, and
 started again at once; the second half runs through, so that its memory can be followed. Printed are rows a second,
 memory (VmRSS) after a tenth of the rows and at the end, its slope in the last process, and what the outputs say of
 rows counted and repeated. With `--compare` tracks and rows are written too, nothing may be missing in them, and the
-biases must be those of a run that was never killed. Compiled kernels are kept in the user's cache between starts.
+biases must be those of a run that was never killed. With `--jumps` so many biases jump, one radar each, which must be
+named in jumps.csv with their times and no others, and rows are written too; `--outliers` is the fraction of the data
+that are 10 to 1,000 sd off. Compiled kernels are kept in the user's cache between starts.
 """
 
 import argparse
@@ -29,6 +32,10 @@ PASS = RADARS * TARGETS * SCANS  # rows
 HEADING, OFFSET, RANGE, AZIMUTH = np.deg2rad(3.0), 10.0, 10.0, np.deg2rad(1.0)
 LOOK = 0.2  # s between two looks at the memory
 TIGHT = 1e-6  # sd
+JUMP = 8.0, 40.0  # sd of the noise, smallest and largest jump
+GROSS = 10.0, 1000.0  # sd of the noise, smallest and largest outlier
+WITHIN = 60.0  # s within which a jump must be named
+FAR = 4.0  # sd from which a bias is wrong
 MODEL = '''"""Five radars on a ring, and targets that pass."""
 
 from dataclasses import replace
@@ -52,7 +59,28 @@ def problem(data=None):
 '''
 
 
-def passing(number: int, rng: np.random.Generator, bias: np.ndarray) -> pd.DataFrame:
+@dataclass
+class Truth:
+    """Biases at the beginning, (2, RADARS), which of them jump, and the fraction of the data that are outliers."""
+
+    bias: np.ndarray
+    jumps: list[tuple[float, tuple[int, int], float]]  # s, number of the bias, size
+    outliers: float
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Biases (T, 2, RADARS) at times."""
+        found = np.repeat(self.bias[None], len(t), 0)
+        for since, which, size in self.jumps:
+            found[(t >= since, *which)] += size
+        return found
+
+
+def spread(rng: np.random.Generator, limits: tuple[float, float], shape: int | tuple[int, ...]) -> np.ndarray:
+    """Numbers of either sign, uniform in the logarithm of their size."""
+    return rng.choice([-1.0, 1.0], shape) * np.exp(rng.uniform(*np.log(limits), shape))
+
+
+def passing(number: int, rng: np.random.Generator, truth: Truth) -> pd.DataFrame:
     """Rows of one pass of both targets."""
     turn = 2 * np.pi * np.arange(RADARS) / RADARS
     places = 3000.0 * np.stack([np.cos(turn), np.sin(turn)], 1)
@@ -61,8 +89,13 @@ def passing(number: int, rng: np.random.Generator, bias: np.ndarray) -> pd.DataF
     speed = rng.uniform(5.0, 20.0, TARGETS)[:, None] * np.stack([np.cos(course), np.sin(course)], 1)
     path = rng.uniform(-800.0, 800.0, (TARGETS, 2)) + speed * (t[:, None, None] - t.mean())  # (SCANS, TARGETS, 2)
     line = path[:, :, None] - places  # (SCANS, TARGETS, RADARS, 2)
-    ranges = np.hypot(line[..., 0], line[..., 1]) + bias[1] + RANGE * rng.standard_normal(line.shape[:3])
-    azimuths = np.arctan2(line[..., 1], line[..., 0]) - bias[0] + AZIMUTH * rng.standard_normal(line.shape[:3])
+    bias = truth.at(number * (SCANS - 1 + GAP) + t)[:, :, None]
+    ranges = np.hypot(line[..., 0], line[..., 1]) + bias[:, 1] + RANGE * rng.standard_normal(line.shape[:3])
+    azimuths = np.arctan2(line[..., 1], line[..., 0]) - bias[:, 0] + AZIMUTH * rng.standard_normal(line.shape[:3])
+    if truth.outliers:
+        for values, std in ((ranges, RANGE), (azimuths, AZIMUTH)):
+            gross = rng.random(values.shape) < truth.outliers
+            values[gross] += std * spread(rng, GROSS, int(gross.sum()))
     scan, target, sensor = (index.ravel() for index in np.indices(line.shape[:3]))
     return pd.DataFrame(
         {
@@ -75,16 +108,25 @@ def passing(number: int, rng: np.random.Generator, bias: np.ndarray) -> pd.DataF
     )
 
 
-def write(path: Path, rows: int, seed: int) -> pd.Series:
-    """A table of so many rows, pass by pass; the true biases."""
+def write(path: Path, rows: int, seed: int, jumps: int, outliers: float) -> tuple[pd.Series, pd.Series]:
+    """A table of so many rows, pass by pass; the true biases at its end, and when which of them jumped."""
     rng = np.random.default_rng(seed)
     bias = np.array([HEADING, OFFSET])[:, None] * rng.standard_normal((2, RADARS))
+    truth = Truth(bias, [], outliers)
+    if jumps:
+        radars, kinds = rng.choice(RADARS, jumps, replace=False), rng.integers(2, size=jumps)
+        sizes = np.array([AZIMUTH, RANGE])[kinds] * spread(rng, JUMP, jumps)
+        passes = rows / PASS * np.sort(rng.uniform(0.1, 0.9, jumps)) // 1
+        times = passes * (SCANS - 1 + GAP) + rng.integers(SCANS // 4, 3 * SCANS // 4, jumps)
+        which = list(zip(kinds.tolist(), radars.tolist(), strict=True))
+        truth.jumps = list(zip(times.tolist(), which, sizes.tolist(), strict=True))
     with path.open("w") as file:
         for number in range(-(-rows // PASS)):
-            frame = passing(number, rng, bias).head(rows - number * PASS)
+            frame = passing(number, rng, truth).head(rows - number * PASS)
             frame.to_csv(file, index=False, header=number == 0)
-    names = [f"r{n}.{kind}" for kind in ("heading", "range_offset") for n in range(RADARS)]
-    return pd.Series(bias.ravel(), names)
+    names = np.array([[f"r{n}.{kind}" for n in range(RADARS)] for kind in ("heading", "range_offset")])
+    since = pd.Series({str(names[which]): at for at, which, _ in truth.jumps}, dtype=float)
+    return pd.Series(truth.at(np.array([np.inf]))[0].ravel(), names.ravel()), since
 
 
 @dataclass
@@ -97,6 +139,7 @@ class Run:
     lag: int
     keep: str
     log: Path
+    jumps: bool = False  # whether jumps are looked for
     begun: float = field(default_factory=time.monotonic)
     seen: list[tuple[int, float, int, float]] = field(default_factory=list)  # process, s, rows, MB
     starts: int = 0
@@ -105,6 +148,7 @@ class Run:
         """A process that goes on where the last one stood."""
         probcal = Path(sys.executable).parent / "probcal"
         command = [probcal, "watch", self.model, self.data, "--out", self.out, "--lag", str(self.lag)]
+        command += ["--jumps", "0.1", "--within", f"{WITHIN:g}"] if self.jumps else []
         self.starts += 1
         with self.log.open("ab") as log:
             return subprocess.Popen(
@@ -146,8 +190,10 @@ class Run:
         self.ended(process)
 
     def ended(self, process: subprocess.Popen[bytes]) -> None:
-        """Complain of a process that failed."""
-        if process.returncode:
+        """Complain of a process that failed; one that ends with an alarm says so."""
+        if process.returncode == 1:
+            print(self.log.read_text().split("\nwritten")[0].splitlines()[-1])
+        elif process.returncode:
             raise SystemExit(f"probcal watch ended {process.returncode}:\n{self.log.read_text()[-4000:]}")
 
 
@@ -169,7 +215,20 @@ def final(out: Path) -> pd.DataFrame:
     return frame[frame["rows"] == frame["rows"].iloc[-1]].drop_duplicates("bias", keep="last").set_index("bias")
 
 
-def said(run: Run, rows: int) -> list[str]:
+def named(out: Path, since: pd.Series) -> list[str]:
+    """What is wrong with the jumps that were named; nothing where they are those that happened."""
+    path = out / "jumps.csv"
+    found = pd.read_csv(path).set_index("label") if path.exists() else pd.DataFrame({"since": [], "found": []})
+    print(found.assign(true=since.reindex(found.index)).to_string())
+    wrong = [f"the jump of {label} at {since[label]:g} s is not named" for label in since.index.difference(found.index)]
+    for label, own in found.iterrows():
+        off = own["since"] - since.get(label, np.nan)
+        if not abs(off) <= WITHIN:
+            wrong.append(f"a jump of {label} is named at {own['since']:g} s, where it has none")
+    return wrong
+
+
+def said(run: Run, rows: int, outliers: bool) -> list[str]:
     """What is wrong with the outputs; nothing where all is well."""
     history = pd.read_csv(run.out / "biases.csv")
     text = run.log.read_text()
@@ -180,7 +239,10 @@ def said(run: Run, rows: int) -> list[str]:
         wrong.append("the history goes back")
     if history.groupby("bias").size().nunique() > 1:
         wrong.append("the history is not whole")
-    wrong += re.findall(r"[\d,]+ (?:late|duplicates|left out)", text)
+    wrong += re.findall(r"[\d,]+ (?:late|duplicates)", text)
+    refused = run.out / "refused.csv"
+    if refused.exists() and not outliers:
+        wrong.append(f"{len(pd.read_csv(refused))} rows are left out")
     if "tracks" in run.keep:
         tracks, data = pd.read_csv(run.out / "tracks.csv"), pd.read_csv(run.data)
         keys = ["target", "time"]
@@ -219,6 +281,8 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--until", type=float, default=0.5, help="share of the rows within which it is killed")
+    parser.add_argument("--jumps", type=int, default=0, help="biases that jump, one radar each, at most five")
+    parser.add_argument("--outliers", type=float, default=0.0, help="fraction of the data")
     parser.add_argument("--compare", action="store_true", help="with a run that is never killed")
     chosen = parser.parse_args()
     rng = np.random.default_rng(chosen.seed)
@@ -227,22 +291,27 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "passes.py").write_text(MODEL)
-        truth = write(folder / "rows.csv", chosen.rows, chosen.seed)
+        truth, since = write(folder / "rows.csv", chosen.rows, chosen.seed, chosen.jumps, chosen.outliers)
         print(f"{chosen.rows:,} rows, {(folder / 'rows.csv').stat().st_size / 1e6:.0f} MB", flush=True)
-        keep = "tracks,rows" if chosen.compare else ""
+        keep = "tracks,rows" if chosen.compare else "rows" if chosen.jumps else ""
 
         def watch(out: str, kills: list[tuple[float, float]]) -> Run:
-            run = Run(folder / "passes.py", folder / "rows.csv", folder / out, chosen.lag, keep, folder / f"{out}.log")
+            log = folder / f"{out}.log"
+            run = Run(folder / "passes.py", folder / "rows.csv", folder / out, chosen.lag, keep, log, chosen.jumps > 0)
             run.whole(chosen.rows, kills)
             seconds = time.monotonic() - run.begun
             print(f"{out}: {run.starts} starts, {seconds:.0f} s, {chosen.rows / seconds:,.0f} rows/s, starts included")
             print(memory(run, chosen.rows))
-            print("outputs:", "; ".join(said(run, chosen.rows)) or "every row once", flush=True)
+            print("outputs:", "; ".join(said(run, chosen.rows, chosen.outliers > 0)) or "every row once", flush=True)
             return run
 
-        found = final(watch("killed", kills).out)
+        out = watch("killed", kills).out
+        found = final(out)
+        if chosen.jumps:
+            print("jumps:", "; ".join(named(out, since)) or "all named, and no others", flush=True)
         off = ((found["mean"] - truth[found.index]) / found["sd"]).abs()
-        print(f"off the truth by {off.max():.1f} sd at most; gamma at least {found['gamma'].min():.4f}")
+        far = "" if off.max() < FAR else " (WRONG)"
+        print(f"off the truth by {off.max():.1f} sd at most{far}; gamma at least {found['gamma'].min():.4f}")
         if chosen.compare:
             other = final(watch("never killed", []).out).loc[found.index]
             apart = ((found["mean"] - other["mean"]) / other["sd"]).abs().max()

@@ -22,8 +22,8 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ from probcal.results.answer import HALF
 
 SIDE = 100.0  # m, of the square of the gauges
 STD = {"range": 1.0, "azimuth": 0.02, "elevation": 0.02}  # m, rad
+AXES = ("position_x", "position_y", "position_z")
 SCALE = {"range_offset": 2.0, "heading": 0.05}  # m, rad
 DRIVE = 0.3  # m s^-3/2, of the target
 CLOSE, APART = 8.0, 20.0  # m, least distances of a target from a gauge and of two gauges
@@ -123,7 +124,7 @@ def stream(
         table[name] = (value + noise).ravel()
         if name != "range":
             table[name] = around(table[name])
-    tracks = pd.DataFrame({"time": t, "target": targets, **dict(zip(("px", "py", "pz"), x.T, strict=False))})
+    tracks = pd.DataFrame({"time": t, "target": targets, **dict(zip(AXES, x.T, strict=False))})
     return Stream(network, table.head(rows), bias, tracks)
 
 
@@ -257,21 +258,19 @@ FAULTS = {
 }  # fmt: skip
 
 
-def fed(online: Online, table: pd.DataFrame, size: int) -> None:
-    """Filter rows some at a time; what cannot be taken together is taken by halves, as `probcal watch` does."""
-    for k in range(0, len(table), size):
-        take(online, table.iloc[k : k + size])
-    online.finish()
+def fed(online: Online, table: pd.DataFrame, size: int) -> pd.DataFrame:
+    """Filter rows some at a time; their tracks. Rows that cannot be taken are left out, as `probcal watch` does."""
+    tracks = [own for k in range(0, len(table), size) for own in taken(online, table.iloc[k : k + size])]
+    return pd.concat([*tracks, online.finish().tracks], ignore_index=True)
 
 
-def take(online: Online, rows: pd.DataFrame) -> None:
-    """Filter rows, or what can be taken of them."""
+def taken(online: Online, rows: pd.DataFrame) -> list[pd.DataFrame]:
+    """Tracks of rows, or of the halves that can be taken of them."""
     try:
-        online.update(rows)
+        return [online.update(rows).tracks]
     except InputError:
         half = len(rows) // 2
-        for part in (rows.iloc[:half], rows.iloc[half:]) if half else ():
-            take(online, part)
+        return [own for part in (rows.iloc[:half], rows.iloc[half:]) if half for own in taken(online, part)]
 
 
 def faulty(seed: int) -> dict[str, Any]:
@@ -320,17 +319,125 @@ def faults(chosen: argparse.Namespace) -> None:
     print(f"{time.perf_counter() - begun:.0f} s; failed, exit 0 and told are more than {WRONG:g} sd off")
 
 
+def heavy(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Noise of four degrees of freedom."""
+    return rng.standard_t(4.0, shape)
+
+
+CASES: dict[str, tuple[float, AugmentedFilter, dict[str, Any]]] = {  # share of the runs, filter, of the stream
+    "as it comes": (1.0, AugmentedFilter(), {}),
+    "lag 0": (0.5, AugmentedFilter(lag=0), {}),
+    "StudentT(4)": (0.25, AugmentedFilter(), {"kind": kind_of(2, StudentT(4.0)), "draw": heavy}),
+    "3-D": (0.25, AugmentedFilter(), {"kind": kind_of(3, Normal())}),
+    "walk": (0.25, AugmentedFilter(walk={"*.range_offset": WALK}), {}),
+    "jumps": (0.25, AugmentedFilter(jumps=Jumps()), {}),
+}
+
+
+def walked(rng: np.random.Generator, own: Stream) -> None:
+    """Let range offsets walk."""
+    second = own.table["time"].to_numpy(int)
+    for name in own.table["sensor"].unique():
+        steps = WALK * rng.standard_normal(second.max() + 1)
+        steps[0] = 0.0
+        mine = (own.table["sensor"] == name).to_numpy()
+        own.table.loc[mine, "range"] += np.cumsum(steps)[second[mine]]
+        own.truth[f"{name}.range_offset"] += steps.sum()
+
+
+def sound(chosen: argparse.Namespace) -> None:
+    """Streams of the right model: what is said against them, and what their intervals hold."""
+    for case in chosen.cases or CASES:
+        share, method, drawn = CASES[case]
+        runs, said, bias, state, seen, out = int(np.ceil(share * chosen.runs)), list[str](), [], [], 0, 0
+        widest = []
+        for run in range(runs):
+            rng = np.random.default_rng((chosen.seed, run))
+            own = stream(rng, chosen.rows, 3, True, few=False, **drawn)
+            if method.walk:
+                walked(rng, own)
+            online = Online(own.network, pc.ConstantVelocity(DRIVE), method)
+            tracks = fed(online, own.table, len(own.table))
+            found = online.biases
+            bias.append(((found["mean"] - pd.Series(own.truth)[found.index]) / found["sd"]).to_numpy())
+            both = own.tracks.merge(tracks, on=["time", "target"], suffixes=("", "_mean"))
+            places = [name for name in AXES if name in own.tracks]
+            off = [(both[f"{name}_mean"] - both[name]) / both[f"{name}_sd"] for name in places]
+            state.append(np.concatenate(off))
+            seen, out = seen + int(online.check.seen.sum()), out + online.counts["outliers"]
+            widest.append(float(online.inflation.max()))
+            if online.alarmed or online.message or online.jumps:
+                said.append(f"run {run}: {online.message} {len(online.jumps)} jumps")
+        print(
+            f"{case}: {runs} streams of {chosen.rows} rows; {len(said)} with a message;"
+            f" {out} data left out, {seen * method.gate:.1f} expected;"
+            f" biases {held(bias)}; tracks {held(state)}; widened {np.mean(np.array(widest) > 1.0):.1%}",
+            *said, sep="\n    ", flush=True,
+        )  # fmt: skip
+    if chosen.before:
+        speeds(chosen)
+
+
+def held(z: list[np.ndarray]) -> str:
+    """Share within 89 % intervals and rms of z, run by run, with the standard error over runs."""
+    inside = np.array([np.mean(np.abs(own) < HALF) for own in z])
+    error = inside.std(ddof=1) / np.sqrt(len(z)) if len(z) > 1 else np.nan
+    return f"{100 * inside.mean():.1f} ± {100 * error:.1f} %, rms z {np.sqrt(np.mean(np.concatenate(z) ** 2)):.2f}"
+
+
+def speeds(chosen: argparse.Namespace) -> None:
+    """Rows a second of two versions by turns."""
+    here = Path(__file__).resolve().parent.parent
+    rates: dict[tuple[str, str], list[float]] = {}
+    for _ in range(TURNS):
+        for name, folder in (("before", chosen.before.resolve()), ("now", here)):
+            command = [sys.executable, __file__, "rate", "--rows", str(chosen.rows)]
+            done = subprocess.run(command, env=os.environ | {"PYTHONPATH": str(folder)}, capture_output=True, text=True)
+            if done.returncode:
+                raise SystemExit(f"{name}: {done.stderr[-2000:]}")
+            for way, rate in json.loads(done.stdout).items():
+                rates.setdefault((way, name), []).append(rate)
+    for way in sorted({way for way, _ in rates}):
+        before, now = (float(np.median(rates[way, name])) for name in ("before", "now"))
+        print(f"{way}: {before:,.0f} rows/s before, {now:,.0f} now: {now / before - 1:+.1%} (medians of {TURNS} turns)")
+
+
+def rate(chosen: argparse.Namespace) -> None:
+    """Rows a second, as JSON, by lag and by the rows that come at once."""
+    rates = {}
+    for lag in (0, 32):
+        for size in (CHUNK, chosen.rows):
+            took = []
+            for run in range(TIMED):
+                own = stream(np.random.default_rng(run), chosen.rows, 3, True, few=False)
+                online = Online(own.network, pc.ConstantVelocity(DRIVE), AugmentedFilter(lag=lag))
+                begun = time.perf_counter()
+                fed(online, own.table, size)
+                took.append(time.perf_counter() - begun)
+            rates[f"lag {lag}, {size} rows at once"] = chosen.rows / float(np.median(took[1:]))
+    print(json.dumps(rates))
+
+
 def main() -> None:
     """One of the commands."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(required=True)
-    own = verbs.add_parser("faults", help=(faults.__doc__ or "").split("\n")[0])
-    own.set_defaults(run=faults)
-    own.add_argument("--runs", type=int, default=2000)
-    own.add_argument("--seed", type=int, default=0)
+
+    def verb(function: Callable[[argparse.Namespace], None], **numbers: int) -> argparse.ArgumentParser:
+        own = verbs.add_parser(function.__name__, help=(function.__doc__ or "").split("\n")[0])
+        own.set_defaults(run=function)
+        for name, value in numbers.items():
+            own.add_argument(f"--{name}", type=int, default=value)
+        return own
+
+    own = verb(faults, runs=2000, seed=0)
     own.add_argument("--kinds", nargs="*", choices=list(FAULTS), default=[])
     own.add_argument("--verbose", action="store_true", help="name every run")
     own.add_argument("--said", action="store_true", help="name wrong runs with a message too")
+    own = verb(sound, runs=200, rows=2700, seed=0)
+    own.add_argument("--before", type=Path, help="worktree of an earlier commit, for rows a second")
+    own.add_argument("--cases", nargs="*", choices=list(CASES), default=[])
+    verb(rate, rows=2700)
     chosen = parser.parse_args()
     warnings.simplefilter("ignore")
     chosen.run(chosen)
