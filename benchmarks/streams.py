@@ -364,7 +364,7 @@ def sound(chosen: argparse.Namespace) -> None:
             places = [name for name in AXES if name in own.tracks]
             off = [(both[f"{name}_mean"] - both[name]) / both[f"{name}_sd"] for name in places]
             state.append(np.concatenate(off))
-            seen, out = seen + int(online.check.seen.sum()), out + online.counts["outliers"]
+            seen, out = seen + online.check.seen, out + online.counts["outliers"]
             widest.append(float(online.inflation.max()))
             if online.alarmed or online.message or online.jumps:
                 said.append(f"run {run}: {online.message} {len(online.jumps)} jumps")
