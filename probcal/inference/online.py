@@ -826,11 +826,14 @@ class Online:
             span = problem.epochs[r].position
             x = place_new(problem.model, self.given, belief, few, r, span, self.arrivals.tried)
             if self.method.gate and (batch.owners[r][k, :, 0] >= 0).sum() > problem.network.dimension + 1:
-                first_one: Any = np.where(np.arange(FIRST) == 0, few.recursion, -1)
-                alone = few._replace(recursion=first_one)
                 first_of = jax.tree.map(lambda leaf: leaf[0], few)
-                at = place_new(problem.model, self.given, belief, alone, r, span, self.arrivals.tried)
-                far = outside_gate(problem.model, self.given, belief, first_of, at, r, float(self.method.gate))
+                gate = float(self.method.gate)
+                far = outside_gate(problem.model, self.given, belief, first_of, x, r, gate)
+                if len(mine) > 1 and np.asarray(far).any():  # of a place between those of several epochs
+                    first_one: Any = np.where(np.arange(FIRST) == 0, few.recursion, -1)
+                    alone = few._replace(recursion=first_one)
+                    at = place_new(problem.model, self.given, belief, alone, r, span, self.arrivals.tried)
+                    far = outside_gate(problem.model, self.given, belief, first_of, at, r, gate)
                 verdict[r][k] = np.where(np.asarray(far), beliefs.HOLD, beliefs.DECIDE)  # its prior lets all in
             if self.method.lag:
                 xs[r][mine], z[mine], there[mine] = np.asarray(x), np.asarray(belief.mean), True

@@ -331,13 +331,17 @@ class Surveillance:
                 continue
             self.moments += 1
             limit = -special.ndtri(0.5 * _rate(max(len(labels), 1) * APART, 0, self.moments))
-            for then, first, before in self.snapshots:
-                learnt = np.maximum(before - variance, 0.0) * inflation
-                told = still & (before < KNOWN) & (learnt > LEARNT * variance)
-                step = np.where(told, (mean - first) / np.sqrt(np.where(told, learnt, 1.0)), 0.0)
-                for m in np.flatnonzero(np.abs(step) > limit).tolist():
-                    readers = [own for own, read in self.reads.items() if m in read]
-                    self._note("drifts", readers[0] if readers else "", labels[m], then, time, float(step[m]))
+            if not self.snapshots:
+                self.snapshots = [(time, mean, variance)]
+                continue
+            times, first, before = (np.array(column) for column in zip(*self.snapshots, strict=True))
+            learnt = np.maximum(before - variance, 0.0) * inflation
+            told = still & (before < KNOWN) & (learnt > LEARNT * variance)
+            step = np.where(told, (mean - first) / np.sqrt(np.where(told, learnt, 1.0)), 0.0)
+            for then, m in np.argwhere(np.abs(step) > limit).tolist():
+                readers = [own for own, read in self.reads.items() if m in read]
+                since, size = float(times[then]), float(step[then, m])
+                self._note("drifts", readers[0] if readers else "", labels[m], since, time, size)
             self.snapshots.append((time, mean, variance))
             if len(self.snapshots) > SNAPSHOTS:
                 del self.snapshots[1 : SNAPSHOTS // 2 : 2]
