@@ -82,7 +82,7 @@ def _pairs(problem: Problem, suspects: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _values(y: np.ndarray, unit: str, period: float | None) -> Iterator[tuple[str, np.ndarray]]:
-    """What the values of a channel (N,) may have been meant to be, and the words for it."""
+    """Each possible mistake in the values of a channel (N,): its sentence, and the values without it."""
     if period is not None:
         yield "look like compass bearings: declare Channel(..., wrap=True, compass=True)", period / 4 - y
         yield "look reversed: change their sign", -y

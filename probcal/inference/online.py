@@ -280,7 +280,7 @@ class Online:
 
     @property
     def message(self) -> str:
-        """What speaks against the answer, and what to do; empty where nothing does."""
+        """Reasons against the answer, each with its remedy; empty if there are none."""
         return f"{self.doubtful} {self.check.text()}".strip()
 
     @property
@@ -300,7 +300,7 @@ class Online:
 
     @property
     def alarmed(self) -> bool:
-        """Whether the answer is none, or a sensor changed, drifts or was left out for a time."""
+        """True if the answer is not valid, or if a sensor changed, drifts or was left out for a time."""
         return not self.status.valid or bool(self.check.events)
 
     @property
@@ -521,11 +521,8 @@ class Online:
         points = self._points(batch)
         elapsed = np.diff(batch.time, prepend=self.walked if np.isfinite(self.walked) else batch.time[0])
         most, doubts = 0, self.doubts.total()
-        change, placed, left_out = (
-            None,
-            0,
-            list[StreamData](),
-        )  # `change`: epoch and sensor whose biases begin anew there
+        change: ChangePoint | None = None  # the next one, up to which epochs are filtered for good
+        placed, left_out = 0, list[StreamData]()
         while begun < K:
             if change is not None and change.epoch == begun:
                 if change.target:

@@ -72,7 +72,7 @@ class ChangePoint(NamedTuple):
 
 @dataclass(frozen=True)
 class Event:
-    """What befell a sensor: it "changed" (its biases began anew), was "lost" (its rows are left out), or "drifts"."""
+    """An event of a sensor: it "changed" (its biases began anew), is "lost" (its rows are left out), or "drifts"."""
 
     kind: str
     sensor: str
