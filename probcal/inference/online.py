@@ -31,7 +31,7 @@ from probcal.online.belief import Augmented
 from probcal.online.filtering import RULES, FilterForm, FilterGiven, RowPoints
 from probcal.online.lag import Window, run_plain, run_window
 from probcal.online.particles import Cloud
-from probcal.online.starts import FIRST, outside_gate, place_new
+from probcal.online.starts import FIRST, place_new
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem, fixed_biases
 from probcal.results.answer import HALF
@@ -821,17 +821,11 @@ class Online:
             mine = np.flatnonzero((batch.target == name) & (np.arange(K) >= k))[: self._looked_at(batch, k)]
             few = padded(jax.tree.map(lambda leaf, mine=mine: leaf[mine], epochs), FIRST)
             span = problem.epochs[r].position
-            x = place_new(problem.model, self.given, belief, few, r, span, self.arrivals.tried)
-            if self.method.gate and (batch.owners[r][k, :, 0] >= 0).sum() > problem.network.dimension + 1:
-                first_of = jax.tree.map(lambda leaf: leaf[0], few)
-                gate = float(self.method.gate)
-                far = outside_gate(problem.model, self.given, belief, first_of, x, r, gate)
-                if len(mine) > 1 and np.asarray(far).any():  # of a place between those of several epochs
-                    first_one: Any = np.where(np.arange(FIRST) == 0, few.recursion, -1)
-                    alone = few._replace(recursion=first_one)
-                    at = place_new(problem.model, self.given, belief, alone, r, span, self.arrivals.tried)
-                    far = outside_gate(problem.model, self.given, belief, first_of, at, r, gate)
-                verdict[r][k] = np.where(np.asarray(far), beliefs.HOLD, beliefs.DECIDE)  # its prior lets all in
+            many = (batch.owners[r][k, :, 0] >= 0).sum() > problem.network.dimension + 1
+            gate = float(self.method.gate)
+            x, far = place_new(problem.model, self.given, belief, few, r, span, self.arrivals.tried, gate)
+            if gate and many:  # its prior lets all in
+                verdict[r][k] = np.where(np.asarray(far), beliefs.HOLD, beliefs.DECIDE)
             if self.method.lag:
                 xs[r][mine], z[mine], there[mine] = np.asarray(x), np.asarray(belief.mean), True
             elif "position" not in self.arrivals.target(str(name)).start:

@@ -59,6 +59,13 @@ class WhiteRow(NamedTuple):
     high: jax.Array  # ()
     verdict: jax.Array  # () DECIDE, ADMIT or HOLD
 
+    def leading(self) -> tuple[jax.Array, jax.Array]:
+        """Of several data (D,): the bias on which each depends most, and the change of its prediction by one scale."""
+        if not self.hz.size:
+            return jnp.zeros(self.value.shape, int), jnp.zeros(self.value.shape)
+        lead = jnp.argmax(jnp.abs(self.hz), 1)
+        return lead, jnp.take_along_axis(self.hz, lead[:, None], 1)[:, 0] / self.ratio
+
 
 DECIDE, ADMIT, HOLD = 0, 1, 2  # whether a datum is held back: by its residual, never, always
 
@@ -75,9 +82,9 @@ class KeptDatum(NamedTuple):
     moved: jax.Array  # (M,) by how much the mean of z moved
     residual: jax.Array  # () over the std of noise, state and biases together
     spread: jax.Array  # () this std over that of the noise; 0 where there is no datum
-    lead: jax.Array  # () bias on which it depends most
-    slope: jax.Array  # () change of its prediction, over the std of the noise, by one scale of that
     held: jax.Array  # () whether it was held back: it changed nothing then
+    lead: jax.Array | None = None  # () bias on which it depends most
+    slope: jax.Array | None = None  # () change of its prediction, over the std of the noise, by one scale of that
 
 
 def empty(z: jax.Array, root: jax.Array, sizes: tuple[tuple[int, int], ...], bias: jax.Array) -> Augmented:
@@ -114,17 +121,22 @@ def seen(belief: Augmented, own: Slots, row: WhiteRow) -> tuple[Augmented, Slots
     """
     v = row.hx @ own.R
     std = jnp.sqrt(1.0 + jnp.sum(v**2))
-    gain = own.R @ v / std
     c = (row.value - row.hx @ own.m) / std
     g = (row.hz + row.hx @ own.B) / std
     u = g @ belief.root
     variance = 1.0 + jnp.sum(u**2)
-    pull = belief.root @ u / variance  # gain of z
     innovation = c - g @ belief.mean
+    spread = jnp.sqrt(1.0 + (variance * std**2 - 1.0) / row.ratio**2)
+    residual = (row.shift + innovation * std / row.ratio) / spread
+    held = (row.verdict == HOLD) | ((row.verdict == DECIDE) & ((residual < row.low) | (residual > row.high)))
+    free = jnp.where(held, 0.0, 1.0)
+    c, innovation = jnp.where(held, 0.0, c), jnp.where(held, 0.0, innovation)
+    gain = free * (own.R @ v) / std
+    pull = free * (belief.root @ u) / variance  # gain of z
     root = belief.root - pull[:, None] * (u / (1.0 + 1.0 / jnp.sqrt(variance)))[None, :]
     told = belief.candidates
     shift = (row.hz[told.bias] + row.hx @ own.shift) / std
-    change = shift - g @ told.response  # of the innovation by a jump of unit size
+    change = free * (shift - g @ told.response)  # of the innovation by a jump of unit size
     candidates = told._replace(
         response=told.response + pull[:, None] * change[None, :],
         information=told.information + change**2 / variance,
@@ -136,21 +148,11 @@ def seen(belief: Augmented, own: Slots, row: WhiteRow) -> tuple[Augmented, Slots
         own.R - gain[:, None] * (v / (1.0 + std))[None, :],
         own.shift - gain[:, None] * shift[None, :],
     )
-    spread = jnp.sqrt(1.0 + (variance * std**2 - 1.0) / row.ratio**2)
-    residual = (row.shift + innovation * std / row.ratio) / spread
-    outside = (residual < row.low) | (residual > row.high)
-    held = (row.verdict == HOLD) | ((row.verdict == DECIDE) & outside)
-    lead = jnp.argmax(jnp.abs(row.hz)) if row.hz.size else jnp.zeros((), int)
-    slope = (row.hz[lead] if row.hz.size else 0.0) / row.ratio
     datum = KeptDatum(
-        row.hx / std, gain, c, g, innovation / jnp.sqrt(variance), variance * std**2, pull * innovation,
-        residual, spread, lead, slope, held,
+        free * row.hx / std, gain, c, free * g, innovation / jnp.sqrt(variance), free * variance * std**2,
+        pull * innovation, residual, spread, held,
     )  # fmt: skip
-    none = jax.tree.map(jnp.zeros_like, datum)._replace(
-        residual=residual, spread=spread, lead=lead, slope=slope, held=held
-    )
-    found = Augmented(belief.mean + pull * innovation, root, belief.slots, candidates), after, datum
-    return jax.tree.map(lambda new, old: jnp.where(held, old, new), found, (belief, own, none))
+    return Augmented(belief.mean + pull * innovation, root, belief.slots, candidates), after, datum
 
 
 def not_estimated(belief: Augmented, kept: KeptDatum, considered: jax.Array) -> Augmented:

@@ -113,6 +113,8 @@ def _epoch(
         belief = _with(core._replace(slots=belief.slots), r, target, mine)
     reach = mine.B @ belief.root
     sd = jnp.sqrt(jnp.sum(mine.R**2, 1) + jnp.sum(reach**2, 1))
+    lead, slope = rows.leading()
+    kept = kept._replace(lead=lead, slope=slope)
     return belief, (mine.m + mine.B @ belief.mean, sd, mine._replace(shift=mine.shift[:, :0]), kept)
 
 

@@ -136,11 +136,7 @@ def _rows(
     value = jnp.where(there, lin.score / weight, 0.0) + hx @ at.x + hz @ at.z
     residual = jnp.where(there, waist.innovation(block, data, predicted) / std, 0.0)
     ratio = jnp.where(there, root * std, 1.0)
-    low, high = (jnp.broadcast_to(jnp.asarray(limit), there.shape) for limit in _limits(block, odds))
-    floors = np.array([getattr(channel.noise, "floor", None) is not None for channel in block.channels])
-    if floors.any():  # a value at the floor says nothing of how far below it the prediction may lie
-        floor = np.array([[getattr(channel.noise, "floor", None) or 0.0 for channel in block.channels]])
-        high = jnp.where(floors[None] & ((data.y - floor) / std <= high), jnp.inf, high)
+    low, high = _limits(block, data, std, odds)
     shift = residual - jnp.where(there, lin.score / jnp.sqrt(weight), 0.0) / ratio
     scaled = WhiteRow(
         root * value, root[:, :, None] * hx, root[:, :, None] * hz, shift, ratio, low, high, jnp.zeros((P, C), jnp.int8)
@@ -148,6 +144,45 @@ def _rows(
     return jax.tree.map(lambda leaf: leaf.reshape(P * C, *leaf.shape[2:]), scaled)
 
 
-def _limits(block: Block, odds: float) -> np.ndarray:
-    """Residuals (2, C) over the std beyond which a datum of each channel is held back."""
-    return np.array([gate_limits(channel.noise, odds) for channel in block.channels]).T
+def _limits(block: Block, data: Rows, std: jax.Array, odds: float) -> tuple[jax.Array, jax.Array]:
+    """Residuals (P, C) over the std beyond which data of a block are held back."""
+    found = np.array([gate_limits(channel.noise, odds) for channel in block.channels]).T
+    low, high = (jnp.broadcast_to(jnp.asarray(limit), std.shape) for limit in found)
+    floors = np.array([getattr(channel.noise, "floor", None) is not None for channel in block.channels])
+    if floors.any():  # a value at the floor says nothing of how far below it the prediction may lie
+        floor = np.array([[getattr(channel.noise, "floor", None) or 0.0 for channel in block.channels]])
+        high = jnp.where(floors[None] & ((data.y - floor) / std <= high), jnp.inf, high)
+    return low, high
+
+
+def limits(model: Model, epoch: Epoch, r: int, levels: jax.Array, odds: float) -> tuple[jax.Array, jax.Array]:
+    """Residuals (D,) over the std beyond which the data of an epoch are held back."""
+    parts = [_limits(block, data, waist.noise_std(data, levels), odds) for _, block, data in here(model, epoch, r)]
+    low, high = (jnp.concatenate([own.ravel() for own in column]) for column in zip(*parts, strict=True))
+    return low, high
+
+
+def residuals_widened(
+    model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array, root: jax.Array, *, slopes: bool
+) -> tuple[jax.Array, jax.Array]:
+    """Residuals (D,) over the std of noise and biases of covariance root root', and their slopes (D, n) by the state.
+
+    Without `slopes`, no columns.
+    """
+    covariance = jnp.pad(root @ root.T, (0, 1))  # of a bias that is fixed 0
+    offs, by_state = [], []
+    for _, block, data in here(model, epoch, r):
+        derive = waist.linearise if slopes else waist.linearise_biases
+        lin = derive(block, data, at.x[None], at.z, levels, expected=True)
+        predicted, std = waist.predict(block, data, at.x[None], at.z), waist.noise_std(data, levels)
+        _, step = waist.weigh(block, data, predicted, std, expected=False)
+        there = (data.mask > 0) & (lin.weight > 0) & (step > 0)
+        read = data.bias[data.sensor]
+        spread = covariance[read[:, :, None], read[:, None, :]]
+        wide = jnp.sqrt(std**2 + jnp.einsum("pcu,puv,pcv->pc", lin.bias, spread, lin.bias))
+        offs.append(jnp.where(there, waist.innovation(block, data, predicted) / wide, 0.0).ravel())
+        slope = jnp.where(there[:, :, None], lin.state / wide[:, :, None], 0.0).reshape(there.size, -1)
+        if slopes:
+            slope = jnp.zeros((there.size, at.x.shape[0])).at[:, np.asarray(block.used, int)].set(slope)
+        by_state.append(slope)
+    return jnp.concatenate(offs), jnp.concatenate(by_state)

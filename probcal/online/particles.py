@@ -104,9 +104,7 @@ def foreseen(
     there = jnp.any(first.hx != 0, 1) | jnp.any(first.hz != 0, 1)
     residual = middle / spread
     held = there & ((residual < first.low) | (residual > first.high))
-    some = first.hz.shape[1] > 0
-    lead = jnp.argmax(jnp.abs(first.hz), 1) if some else jnp.zeros(len(residual), int)
-    slope = jnp.take_along_axis(first.hz, lead[:, None], 1)[:, 0] / first.ratio if some else jnp.zeros(len(residual))
+    lead, slope = first.leading()
     rows, begun = list(epoch.rows), 0
     for b, _, data in here(model, epoch, r):
         size = data.mask.size

@@ -15,7 +15,7 @@ from probcal.model.epochs import Epoch
 from probcal.model.model import Model
 from probcal.online.belief import Augmented
 from probcal.online.filtering import FilterGiven
-from probcal.online.linearising import About, linearised
+from probcal.online.linearising import About, limits, residuals_widened
 from probcal.smoothing.grid import ROBUST
 
 FIRST = 8  # epochs of a new target that are looked at
@@ -23,69 +23,73 @@ AT_ONCE = 64  # places that are tried together
 REFINED = 12  # damped steps from the best of them
 
 
-@partial(jax.jit, static_argnames=("r", "span"))
+@partial(jax.jit, static_argnames=("r", "span", "odds"))
 def place_new(
-    model: Model, given: FilterGiven, belief: Augmented, epochs: Epoch, r: int, span: tuple[int, int], tried: jax.Array
-) -> jax.Array:
-    """State (n,) whose place explains the epochs (FIRST leading) of a target best; the first has its start."""
+    model: Model,
+    given: FilterGiven,
+    belief: Augmented,
+    epochs: Epoch,
+    r: int,
+    span: tuple[int, int],
+    tried: jax.Array,
+    odds: float = 0.0,
+) -> tuple[jax.Array, jax.Array]:
+    """State (n,) whose place explains the epochs (FIRST leading) of a target best; the first has its start.
+
+    And which data (D,) of the first lie beyond the gate about that place, and about the one near it that explains the
+    first best: the target moves on.
+    """
     move = jax.tree.map(lambda leaf: leaf[0], epochs.move[r])
     resting, entries = move.drift, jnp.arange(*span)
     spread = jnp.sqrt(jnp.sum(move.L**2, 1))[entries]
+    first = jax.tree.map(lambda leaf: leaf[:1], epochs)
 
-    def terms(place: jax.Array) -> tuple[jax.Array, jax.Array]:
-        x = resting.at[entries].set(place)
+    def about(place: jax.Array) -> About:
+        return About(resting.at[entries].set(place), belief.mean)
 
+    def terms(place: jax.Array, some: Epoch, slopes: bool) -> tuple[jax.Array, jax.Array]:
         def of(epoch: Epoch) -> tuple[jax.Array, jax.Array]:
-            rows = linearised(model, epoch, r, About(x, belief.mean), given.levels)
-            parts = []
-            for row in rows:
-                wide = row.ratio * jnp.sqrt(1.0 + jnp.sum((row.hz @ belief.root) ** 2, 1) / row.ratio**2)
-                off = (row.ratio * row.shift + row.value - row.hx @ x - row.hz @ belief.mean) / wide
-                parts.append((off, row.hx[:, entries] / wide[:, None]))
-            off, slope = zip(*parts, strict=True)
+            off, slope = residuals_widened(model, epoch, r, about(place), given.levels, belief.root, slopes=slopes)
             there = epoch.recursion >= 0
-            return jnp.where(there, jnp.concatenate(off), 0.0), jnp.where(there, jnp.concatenate(slope), 0.0)
+            return jnp.where(there, off, 0.0), jnp.where(there, slope, 0.0)
 
-        off, slope = jax.vmap(of)(epochs)
-        return off.ravel(), slope.reshape(-1, len(entries))
+        off, slope = jax.vmap(of)(some)
+        return off.ravel(), slope.reshape(off.size, -1)
 
-    def loss(place: jax.Array) -> jax.Array:
-        off, _ = terms(place)
+    def loss(place: jax.Array, some: Epoch) -> jax.Array:
+        off, _ = terms(place, some, slopes=False)
         known = 0.5 * jnp.sum(((place - resting[entries]) / spread) ** 2)
         total = jnp.sum(0.5 * (ROBUST + 1) * jnp.log1p(off**2 / ROBUST)) + known
         return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
-    def better(carry: tuple, _: None) -> tuple:
-        place, value, damping = carry
-        off, slope = terms(place)
-        weight = (ROBUST + 1) / (ROBUST + off**2)
-        information = (slope.T * weight[None, :]) @ slope + jnp.diag(spread**-2)
-        pull = slope.T @ (weight * off) - (place - resting[entries]) / spread**2
-        damped = information + damping * jnp.diag(jnp.diagonal(information))
-        after = place + linalg.solve_positive(damped, pull)
-        lower = loss(after)
-        good = lower < value
-        state = (
-            jnp.where(good, after, place),
-            jnp.where(good, lower, value),
-            jnp.where(good, damping / 10, damping * 10),
-        )
-        return state, None
+    def refined(place: jax.Array, value: jax.Array, some: Epoch) -> jax.Array:
+        def better(carry: tuple, _: None) -> tuple:
+            place, value, damping = carry
+            off, slope = terms(place, some, slopes=True)
+            slope = slope[:, entries]
+            weight = (ROBUST + 1) / (ROBUST + off**2)
+            information = (slope.T * weight[None, :]) @ slope + jnp.diag(spread**-2)
+            pull = slope.T @ (weight * off) - (place - resting[entries]) / spread**2
+            damped = information + damping * jnp.diag(jnp.diagonal(information))
+            after = place + linalg.solve_positive(damped, pull)
+            lower = loss(after, some)
+            good = lower < value
+            state = (
+                jnp.where(good, after, place),
+                jnp.where(good, lower, value),
+                jnp.where(good, damping / 10, damping * 10),
+            )
+            return state, None
+
+        return jax.lax.scan(better, (place, value, jnp.asarray(1e-3)), None, length=REFINED)[0][0]
 
     tried = jnp.concatenate([tried, resting[entries][None]])
-    losses = jax.lax.map(loss, tried, batch_size=AT_ONCE)
+    losses = jax.lax.map(lambda place: loss(place, epochs), tried, batch_size=AT_ONCE)
     best = jnp.argmin(losses)
-    (place, _, _), _ = jax.lax.scan(better, (tried[best], losses[best], jnp.asarray(1e-3)), None, length=REFINED)
-    return resting.at[entries].set(place)
-
-
-@partial(jax.jit, static_argnames=("r", "odds"))
-def outside_gate(
-    model: Model, given: FilterGiven, belief: Augmented, epoch: Epoch, x: jax.Array, r: int, odds: float
-) -> jax.Array:
-    """Whether data (D,) of one epoch lie beyond the gate about a state, as the biases are known."""
-    rows = linearised(model, epoch, r, About(x, belief.mean), given.levels, odds)
-    row = jax.tree.map(lambda *parts: jnp.concatenate(parts), *rows)
-    off = row.shift + (row.value - row.hx @ x - row.hz @ belief.mean) / row.ratio
-    residual = off / jnp.sqrt(1.0 + jnp.sum((row.hz @ belief.root) ** 2, 1) / row.ratio**2)
-    return (residual < row.low) | (residual > row.high)
+    place = refined(tried[best], losses[best], epochs)
+    if not odds:
+        return about(place).x, jnp.zeros(0, bool)
+    near = refined(place, loss(place, first), first)
+    low, high = limits(model, jax.tree.map(lambda leaf: leaf[0], first), r, given.levels, odds)
+    far = [(off < low) | (off > high) for off, _ in (terms(at, first, slopes=False) for at in (place, near))]
+    return about(place).x, far[0] & far[1]
