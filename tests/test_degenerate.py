@@ -177,7 +177,6 @@ METHODS = {
     "EA, maximised": EA(precisions="maximised"),
     "EA, sparse": EA(form="sparse"),
     "as printed": EA.as_printed(),
-    "smoothed": EA.as_printed(trajectory="smoothed", iterations=5),
     "EMEA": EMEA(iterations=5),
     "EM": EM(),
     "MAP": MAP(),

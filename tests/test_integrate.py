@@ -255,7 +255,6 @@ def test_an_estimate_far_beyond_its_scale_is_none():
     ("ask", "text"),
     [
         (lambda: EA(precisions="both"), 'EA\\(precisions="both"\\): give one of integrated, maximised'),
-        (lambda: EA(trajectory="smoothed"), "counts the data twice"),
         (lambda: Horseshoe(by="nod"), 'Horseshoe\\(by="nod"\\).*did you mean "node"'),
         (
             lambda: fit(worlds.linear("plane")[0], EA(precisions="maximised"), prior=Horseshoe()),

@@ -1,5 +1,6 @@
 """The page of benchmarks keeps what stands outside its markers, and says what failed."""
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -77,3 +78,11 @@ def test_every_script_of_the_page_is_there():
         named = [word for own in (part.given, part.quick) for word in own if word.endswith(".py")]
         assert named
         assert all((page.ROOT / name).is_file() for name in named)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["guides", "paper_b", "paris"])
+def test_what_only_a_paper_needs_runs(name):
+    script = Path(__file__).parents[1] / "benchmarks" / "papers" / f"{name}.py"
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout != "") == (0, True), done.stderr

@@ -4,7 +4,9 @@ Numbers of runs are chosen so that a comparison fails by chance with a probabili
 some dozens of means); what size of a defect it would see stands with each test. All are of fixed keys.
 """
 
+import sys
 from functools import cache, partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -31,7 +33,6 @@ from probcal import (
 )
 from probcal.noise import StudentT
 from probcal.particle import resampling, settings
-from probcal.particle.additive import smoothed_sum
 from probcal.particle.conditional import conditional_path, conditional_paths
 from probcal.particle.ensemble import (
     ensemble,
@@ -46,6 +47,9 @@ from probcal.particle.filtering import run_filter
 from probcal.particle.proposals import check_proposal
 from probcal.particle.settings import SMOOTHERS, Particles
 from probcal.particle.targets import along_targets, place_by_epoch, targets_of, weigh_rows
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "papers"))
+from paris import smoothed_sum
 
 pytest.importorskip("cuthbert", reason="cuthbert is not installed: uv sync --group test")
 

@@ -31,7 +31,6 @@ METHODS = {
     "ea-maximised": KnownMethod("EA", False, _LEARNT),
     "ea-printed": KnownMethod("EA", False, _LEARNT),
     "ea-em": KnownMethod("EA", False, _LEARNT),
-    "paper-b": KnownMethod("EA", False, _LEARNT),
     "em-ea": KnownMethod("EM-EA", False, _LEARNT),
     "em": KnownMethod("EM", False, _FIXED),
     "em-ml": KnownMethod("EM", False, _FIXED),
@@ -49,6 +48,4 @@ METHODS = {
     "self-config": KnownMethod("self-configuration", False, _INTEGRATED),
     "self-config-beliefs": KnownMethod("self-configuration", False, _INTEGRATED),
     "svi": KnownMethod("SVI", True, _SAMPLED),
-    "svi-mean-field": KnownMethod("SVI", True, _SAMPLED),
-    "svi-low-rank": KnownMethod("SVI", True, _SAMPLED),
 }

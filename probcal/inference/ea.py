@@ -31,10 +31,10 @@ from probcal.inference.sparse import FORMS, PRODUCTS
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
-from probcal.smoothing.information import paper_b, update_levels
+from probcal.smoothing.information import update_levels
 from probcal.smoothing.linearised import laplace_of
 from probcal.smoothing.marginal import find_marginal_mode
-from probcal.smoothing.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, mixing_gain, smooth_tracks
+from probcal.smoothing.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, mixing_gain
 
 RULES = ("mackay", "em")
 MODES = ("joint", "marginal")
@@ -44,11 +44,10 @@ FEW = 2  # of the marginal mode, each of which costs several joint ones, where p
 MANY = 500  # biases beyond which precisions are integrated by expectation propagation in the place of sweeps
 BETTER, GAIN = 5, 0.1  # most times that a climb begins again from better precisions, and nats that make them so
 PRECISIONS = ("integrated", "maximised")
-TRAJECTORIES = (*MODES, "smoothed")
 
 
 @partial(jax.jit, static_argnames=("prior", "rule"))
-def _learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -> tuple[Model, State]:
+def learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -> tuple[Model, State]:
     """Model and state with precisions and levels that follow from what the last iteration found, if there was one."""
     fresh = jnp.isneginf(state.objective)
     alpha = learn(
@@ -88,7 +87,7 @@ def _alone(model: Model, prior: Prior, trajectory: str) -> bool:
 
 def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, trajectory: str) -> State:
     """New precisions and levels, then the mode and the evidence at that mode: all of one state belongs together."""
-    model, state = _learnt(model, prior, given, state, rule)
+    model, state = learnt(model, prior, given, state, rule)
     now = given.prior._replace(alpha=state.alpha)
     few = (prior.learns or model.tailed) and trajectory == "marginal"
     steps = FEW if few else STEPS if prior.proper else UNHELD
@@ -122,19 +121,6 @@ def _density(model: Model, prior: Prior, given: Given, point: Point) -> jax.Arra
     return mixing_gain(model) - cost(model, point, held) - jnp.sum(penalty)
 
 
-def _iterate_paper_b(model: Model, prior: Prior, given: Given, state: State, rule: str) -> State:
-    """Smooth at the current biases, then their posterior (16)-(17) for the precisions (25) of Paper B."""
-    model, state = _learnt(model, prior, given, state, rule)
-    point = smooth_tracks(model, state.point)
-    found, step = paper_b(model, point, given.prior._replace(alpha=state.alpha))
-    refused = state.refused & ~jnp.all(jnp.isfinite(step))
-    step = jnp.where(jnp.isfinite(step), jnp.clip(step, -1.0, 1.0), 0.0)
-    done = (jnp.abs(found.evidence - state.objective) < given.tolerance) & (jnp.max(jnp.abs(step)) < 1e-3)
-    point = point._replace(z=point.z + step)
-    state = state._replace(point=point, found=found, objective=found.evidence, refused=refused, done=done)
-    return valued(prior, given, state)
-
-
 @dataclass(frozen=True)
 class EA(Maximiser):
     """Evidence approximation with trajectories marginalised: the default.
@@ -150,13 +136,12 @@ class EA(Maximiser):
     `trajectory` says what the reported point is: "marginal" the mode of the biases with the trajectory integrated
     (Laplace, see `smoothing.marginal`; the places of targets at rest by quadrature where Laplace is wrong, on a ring or
     on either side of a line, see `smoothing.places`), "joint" that of biases and trajectory together, which shrinks a
-    scene whose size only the motion tells, "smoothed" Paper B as printed: the smoothed density of each epoch alone
-    stands for the trajectory (R-bar, 10-17), so that the data count twice. `EA.as_printed()` is the joint mode with
-    precisions maximised. `update` of maximised precisions is "mackay" (Paper B 25) or "em" (Paper C 40; the same fixed
-    points, slower). `tolerance` is the change of log evidence, in nats, at which it stops; `iterations` caps the outer
-    loop. `form` "auto" takes the dense form where its matrices need up to 240 MB, unless an epoch sees less than a
-    quarter of more than 500 biases, the sparse one else (see `inference.sparse`); "dense" and "sparse" take that one,
-    "matrix-free" is for `MAP`.
+    scene whose size only the motion tells. `EA.as_printed()` is the joint mode with precisions maximised; Paper B as
+    printed is in `benchmarks/papers/paper_b.py`. `update` of maximised precisions is "mackay" (Paper B 25) or "em"
+    (Paper C 40; the same fixed points, slower). `tolerance` is the change of log evidence, in nats, at which it stops;
+    `iterations` caps the outer loop. `form` "auto" takes the dense form where its matrices need up to 240 MB, unless an
+    epoch sees less than a quarter of more than 500 biases, the sparse one else (see `inference.sparse`); "dense" and
+    "sparse" take that one, "matrix-free" is for `MAP`.
     Raises `InputError` for another update, trajectory, form or kind of precisions.
 
     >>> type(EA().first_prior()), type(EA.as_printed().first_prior())
@@ -179,15 +164,10 @@ class EA(Maximiser):
     )
 
     def __post_init__(self):
-        known = {"update": RULES, "trajectory": TRAJECTORIES, "precisions": PRECISIONS, "form": FORMS}
+        known = {"update": RULES, "trajectory": MODES, "precisions": PRECISIONS, "form": FORMS}
         for field, words in known.items():
             if getattr(self, field) not in words:
                 raise InputError(f'EA({field}="{getattr(self, field)}"): give one of {", ".join(words)}')
-        if self.trajectory == "smoothed" and self.precisions == "integrated":
-            raise InputError(
-                'EA(trajectory="smoothed") counts the data twice, of which no posterior can be made: add'
-                ' precisions="maximised"'
-            )
 
     @classmethod
     def as_printed(cls, **settings: Any) -> "EA":
@@ -270,8 +250,7 @@ class EA(Maximiser):
 
     def note(self, prior: Prior) -> str:
         """What the intervals are worth with these settings and a prior."""
-        twice = "; the data count twice (Paper B as printed)" if self.trajectory == "smoothed" else ""
-        return self.intervals if self.integrates(prior) else self.plugged + twice
+        return self.intervals if self.integrates(prior) else self.plugged
 
     def remark(self, prior: Prior) -> str:
         """That precisions were maximised though it was not asked for."""
@@ -301,9 +280,7 @@ class EA(Maximiser):
         return _eliminated(model, start) if self.trajectory == "joint" and same else ()
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
-        """Mode (or smoothed trajectory), evidence, new precisions."""
-        if self.trajectory == "smoothed":
-            return _iterate_paper_b(model, prior, given, state, self.update)
+        """Mode, evidence, new precisions."""
         return _iterate(model, prior, given, state, self.update, self.trajectory)
 
 

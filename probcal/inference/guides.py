@@ -58,56 +58,6 @@ class Guide(ABC):
 
 
 @dataclass(frozen=True)
-class MeanField(Guide):
-    """Independent normals."""
-
-    def first(self, size, key):
-        """Nothing."""
-        return ()
-
-    def turned(self, rest, n):
-        """The draws themselves."""
-        return n
-
-    def pulled(self, rest, n):
-        """That of unit normals."""
-        return -n
-
-    def volume(self, rest, n):
-        """Zero."""
-        return jnp.zeros(n.shape[0])
-
-
-@dataclass(frozen=True)
-class LowRank(Guide):
-    """A normal with f = I + U U', U (D, rank): a diagonal covariance and one of low rank, in scaled entries."""
-
-    rank: int
-
-    def first(self, size, key):
-        """Small random directions: at zero they have no slope. U is kept times the root of D."""
-        return (0.1 * jax.random.normal(key, (size, self.rank)),)
-
-    def _directions(self, rest: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-        U = rest[0] / np.sqrt(rest[0].shape[0])
-        return U, jnp.eye(self.rank) + U.T @ U
-
-    def turned(self, rest, n):
-        """The draws, widened along the directions."""
-        U, _ = self._directions(rest)
-        return n + (n @ U) @ U.T
-
-    def pulled(self, rest, n):
-        """By the identity of Woodbury."""
-        U, gram = self._directions(rest)
-        return linalg.solve_positive(gram, (n @ U).T).T @ U.T - n
-
-    def volume(self, rest, n):
-        """Log determinant of I + U'U."""
-        return jnp.broadcast_to(linalg.inverse_and_logdet(self._directions(rest)[1])[1], n.shape[:1])
-
-
-@dataclass(frozen=True)
 class Structured(Guide):
     """Full rank over the first `head` entries, each with a skewness and tails of its own; normals for the rest.
 

@@ -33,7 +33,6 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
     "ea-maximised": (EA(precisions="maximised"), None),
     "ea-printed": (EA.as_printed(), None),
     "ea-em": (EA.as_printed(update="em", iterations=2000), None),
-    "paper-b": (EA.as_printed(trajectory="smoothed", iterations=25), None),
     "em-ea": (EMEA(), None),
     "em": (EM(), None),
     "em-ml": (EM(), Flat()),
@@ -51,8 +50,6 @@ METHODS: dict[str, tuple[Method, Prior | None]] = {
     "self-config": (SelfConfiguration(EA()), None),
     "self-config-beliefs": (SelfConfiguration(EA(), start="beliefs"), None),
     "svi": (SVI(), None),
-    "svi-mean-field": (SVI(guide="mean-field"), None),
-    "svi-low-rank": (SVI(guide="low-rank"), None),
 }
 
 

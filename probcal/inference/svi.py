@@ -1,4 +1,4 @@
-"""Variational inference: a Gaussian guide fitted to the joint posterior, in the coordinates of the frame or plain ones.
+"""Variational inference: a Gaussian guide fitted to the joint posterior in the coordinates of its reference.
 
 Each chain is one optimisation from its own start; r_hat over them says whether they agree. The gradient is that of
 the reparametrised bound without the score of the guide, whose variance vanishes where the guide fits (Roeder, Wu,
@@ -13,20 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from probcal import linalg
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError
 from probcal.inference.coordinates import Free, parts
-from probcal.inference.guides import Guide, GuideParameters, LowRank, MeanField, Structured
+from probcal.inference.guides import Guide, GuideParameters, Structured
 from probcal.inference.hierarchy import Phi
-from probcal.inference.posed import Form, Posed, log_prior, prior_precision, whiten
+from probcal.inference.posed import Form, Posed, prior_precision
 from probcal.inference.sampler import Sample, Sampler
 from probcal.priors import Horseshoe, Prior
-from probcal.smoothing.frame import log_joint, place, unit_normals
-from probcal.smoothing.mode import Point, factors, mixed_density
-from probcal.smoothing.recursion import trajectory
 
-GUIDES = ("structured", "mean-field", "low-rank")
-NARROW = 0.1  # scale of plain coordinates to start from
 DECAY, SQUARE = 0.9, 0.999  # of Adam: memory of the gradients and of their squares
 STEEP = 2.0  # steps are at most slope / STEEP long: a coordinate of unit spread settles instead of swinging
 SMOOTH = 0.95  # of the running bound
@@ -44,44 +38,12 @@ class Optimisation(NamedTuple):
     key: jax.Array
 
 
-class Plain(NamedTuple):
-    """What plain coordinates stand for."""
-
-    theta: jax.Array
-    phi: Phi
-    point: Point
-    density: jax.Array  # of the coordinates
-
-
-def noncentred(form: Form, posed: Posed, free: Free) -> Plain:
-    """Biases, hyper-parameters and trajectories of non-centred coordinates that know nothing of the frame.
-
-    eta is theta over its prior sd (a declared scale where the prior is flat), eps the whitened noises of the problem.
-    """
-    model = posed.model
-    phi, hyper = form.hierarchy.constrain(free.phi)
-    matrix, alpha = _prior_matrix(form, posed, phi)
-    theta, volume = whiten(matrix, alpha, jnp.zeros_like(alpha), free.eta)
-    levels = theta[form.biases :]
-    tracks = zip(model.recursions, free.eps, strict=True)
-    states = tuple(trajectory(p.F, factors(p, levels), p.drift[:, :, None], u[:, :, None])[:, :, 0] for p, u in tracks)
-    point = Point(states, free.eps, theta[: form.biases], levels)
-    density = hyper + volume + log_prior(form, posed, theta, phi) + mixed_density(model, point)
-    return Plain(theta, phi, point, jnp.where(jnp.isfinite(density), density, -jnp.inf))
-
-
-def _prior_matrix(form: Form, posed: Posed, phi: Phi) -> tuple[jax.Array, jax.Array]:
-    """Coupling (Q, Q) and precisions (Q,) of theta, one where flat."""
-    alpha, coupling = prior_precision(form, posed, phi)
-    return coupling, jnp.where(alpha > 0, alpha, 1.0)
-
-
 @dataclass(frozen=True)
 class SVI(Sampler):
     """A Gaussian approximation of the joint posterior by stochastic variational inference, quicker than `NUTS`.
 
-    `guide`: "structured" (in the frame's coordinates: full rank over biases and hyper-parameters, given which each
-    trajectory has a block-tridiagonal precision), "mean-field" or "low-rank" (in plain coordinates, for comparison).
+    The guide has full rank over biases and hyper-parameters, given which each trajectory has a block-tridiagonal
+    precision: that of the linearised problem. Guides of other families are in `benchmarks/papers/guides.py`.
     Each of `chains` takes `warmup` Adam steps of length `rate` with `particles` draws each, then `draws` from its
     guide. Sample statistics: `log_weight`, log p - log q of each draw, and `elbo`, the running lower bound of the log
     evidence along the warm-up, spread over the draws. Raises `InputError` for settings outside their ranges.
@@ -90,7 +52,6 @@ class SVI(Sampler):
     chains: int = 4
     warmup: int = 800
     draws: int = 500
-    guide: str = "structured"
     rate: float = 0.05
     particles: int = 4
 
@@ -104,8 +65,6 @@ class SVI(Sampler):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.guide not in GUIDES:
-            raise InputError(f'SVI(guide="{self.guide}"): unknown guide{nearest(self.guide, GUIDES)}')
         if not (self.warmup >= 1 and self.particles >= 1 and np.isfinite(self.rate) and self.rate > 0):
             raise InputError(
                 f"SVI(warmup={self.warmup}, rate={self.rate}, particles={self.particles}): at least one step of at"
@@ -113,19 +72,15 @@ class SVI(Sampler):
             )
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Optimisation:
-        """An optimisation that starts at phi and the frame's posterior, or narrowly around theta and phi."""
+        """An optimisation that starts at phi and the posterior of the reference."""
+        eps = tuple(jnp.zeros_like(x) for x in posed.frame.point.states)
+        return self.begun(form, posed, Free(form.hierarchy.relax(phi), jnp.zeros_like(theta), eps), 0.0, key)
+
+    def begun(self, form: Form, posed: Posed, mean: Free, log_scale: float, key: jax.Array) -> Optimisation:
+        """An optimisation whose guide starts at a mean, with one log scale for all coordinates."""
         keys = jax.random.split(key)
-        if self.guide == "structured":
-            eps = tuple(jnp.zeros_like(x) for x in posed.frame.point.states)
-            mean, log_scale = Free(form.hierarchy.relax(phi), jnp.zeros_like(theta), eps), 0.0
-        else:
-            resting = tuple(jnp.zeros_like(x) for x in posed.frame.point.states)
-            coupling, alpha = _prior_matrix(form, posed, phi)
-            eta = linalg.factor(coupling + jnp.diag(alpha)).T @ theta
-            noises = place(posed.model, posed.frame, theta, resting).noises
-            mean, log_scale = Free(form.hierarchy.relax(phi), eta, noises), float(np.log(NARROW))
         flat = ravel_pytree(mean)[0]
-        rest = self._guide(form, posed).first(flat.shape[0], keys[0])
+        rest = self.guide(form, posed).first(flat.shape[0], keys[0])
         fitted = GuideParameters(flat, jnp.full_like(flat, log_scale), rest)
         zero = jax.tree.map(jnp.zeros_like, fitted)
         return Optimisation(
@@ -138,7 +93,7 @@ class SVI(Sampler):
         moved = jax.lax.cond(
             chain.steps < self.warmup, lambda: self._improved(form, posed, chain, keys[0]), lambda: chain
         )
-        guide = self._guide(form, posed)
+        guide = self.guide(form, posed)
         n = jax.random.normal(keys[1], (1, moved.fitted.mean.shape[0]))
         sample, density = self._sample(form, posed, guide.place(moved.fitted, n)[0])
         drawn = jnp.clip(moved.steps - self.warmup, 0, self.draws - 1)
@@ -150,7 +105,7 @@ class SVI(Sampler):
 
     def _improved(self, form: Form, posed: Posed, chain: Optimisation, key: jax.Array) -> Optimisation:
         """One step of Adam up the bound; a gradient that is not finite is left out."""
-        guide, fitted = self._guide(form, posed), chain.fitted
+        guide, fitted = self.guide(form, posed), chain.fitted
         half = jax.random.normal(key, ((self.particles + 1) // 2, fitted.mean.shape[0]))
         n = jnp.concatenate([half, -half])[: self.particles]
         density = self._density(form, posed)
@@ -176,35 +131,39 @@ class SVI(Sampler):
         found = jax.tree.map(lambda new, old: jnp.where(sound, new, old), found, chain)
         return found._replace(trace=found.trace.at[chain.steps].set(found.bound))
 
-    def _guide(self, form: Form, posed: Posed) -> Guide:
-        free = _template(form, posed)
-        size = sum(leaf.size for leaf in jax.tree.leaves(free))
-        if self.guide == "structured":
-            return Structured(size - sum(e.size for e in free.eps))
-        return MeanField() if self.guide == "mean-field" else LowRank(round(float(np.sqrt(size))))
+    def guide(self, form: Form, posed: Posed) -> Guide:
+        """The family of densities."""
+        free = self.template(form, posed)
+        return Structured(sum(leaf.size for leaf in jax.tree.leaves(free)) - sum(e.size for e in free.eps))
+
+    def drawn(self, form: Form, posed: Posed, free: Free) -> tuple[Sample, jax.Array]:
+        """What coordinates stand for, and their log density up to a constant."""
+        found = parts(form, posed, free)
+        return Sample(found.theta, free.eps, found.phi, found.joint, {}), found.density
+
+    def template(self, form: Form, posed: Posed) -> Free:
+        """Coordinates of the right shapes."""
+        kind = form.hierarchy
+        phi = jax.eval_shape(lambda: kind.relax(kind.draw(jax.random.PRNGKey(0))))
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), phi)
+        return Free(
+            zeros, jnp.zeros_like(posed.frame.theta), tuple(jnp.zeros_like(x) for x in posed.frame.point.states)
+        )
 
     def _density(self, form: Form, posed: Posed) -> Any:
         """Log density of flat coordinates."""
-        back = ravel_pytree(_template(form, posed))[1]
-        of = parts if self.guide == "structured" else noncentred
+        back = ravel_pytree(self.template(form, posed))[1]
 
         def density(x: jax.Array) -> jax.Array:
-            found = of(form, posed, back(x))
-            return found.density + _constant(form, posed, found.phi)
+            sample, value = self.drawn(form, posed, back(x))
+            return value + _constant(form, posed, sample.phi)
 
         return density
 
     def _sample(self, form: Form, posed: Posed, x: jax.Array) -> tuple[Sample, jax.Array]:
-        """What coordinates stand for, and their log density."""
-        free = ravel_pytree(_template(form, posed))[1](x)
-        if self.guide == "structured":
-            found = parts(form, posed, free)
-            density = found.density + _constant(form, posed, found.phi)
-            return Sample(found.theta, free.eps, found.phi, found.joint, {}), density
-        at = noncentred(form, posed, free)
-        eps = unit_normals(posed.model, posed.frame, at.point)
-        joint = log_joint(posed.model, posed.frame, at.theta, eps)
-        return Sample(at.theta, eps, at.phi, joint, {}), at.density + _constant(form, posed, at.phi)
+        """What flat coordinates stand for, and their log density."""
+        sample, density = self.drawn(form, posed, ravel_pytree(self.template(form, posed))[1](x))
+        return sample, density + _constant(form, posed, sample.phi)
 
 
 def _constant(form: Form, posed: Posed, phi: Phi) -> jax.Array:
@@ -215,11 +174,3 @@ def _constant(form: Form, posed: Posed, phi: Phi) -> jax.Array:
     alpha, _ = prior_precision(form, posed, phi)
     normal = jnp.sum(alpha > 0) + sum(x.size for x in posed.frame.point.states)
     return 0.5 * posed.first.logdet - 0.5 * np.log(2 * np.pi) * normal
-
-
-def _template(form: Form, posed: Posed) -> Free:
-    """Coordinates of the right shapes."""
-    kind = form.hierarchy
-    phi = jax.eval_shape(lambda: kind.relax(kind.draw(jax.random.PRNGKey(0))))
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), phi)
-    return Free(zeros, jnp.zeros_like(posed.frame.theta), tuple(jnp.zeros_like(x) for x in posed.frame.point.states))

@@ -1,48 +1,12 @@
-"""What follows from a point: Paper B's evidence as printed, noise levels, and the mean square of what is left."""
+"""What follows from a point: noise levels, and the mean square of what is left."""
 
 import jax
 import jax.numpy as jnp
 
-from probcal import linalg
 from probcal.model.model import Data, Model
-from probcal.priors import Precision
 from probcal.smoothing import recursion as rec
-from probcal.smoothing.linearised import LaplaceApproximation, linearise
-from probcal.smoothing.mode import Point, compress, factors, log_likelihood
-
-
-def paper_b(model: Model, point: Point, prior: Precision) -> tuple[LaplaceApproximation, jax.Array]:
-    """Paper B (10)-(17), (22)-(23) at smoothed trajectories: the posterior of z, and the step to its mean.
-
-    The smoothed density of each epoch alone is taken as the prior of its state, R-bar = R + H_x P H_x'; what
-    epochs share is dropped and the data count twice. By Woodbury no matrix of the size of the data is formed.
-    """
-    lins = model.linearise(point, expected=True)
-    compressed = compress(model, lins)
-    information, score = compressed.information, compressed.score
-    likelihood, logdet = log_likelihood(model, point), jnp.zeros(())
-    parts = zip(model.recursions, compressed.states, compressed.crosses, strict=True)
-    for r, (part, (J, pull), cross) in enumerate(parts):
-        L = factors(part, point.levels)
-        P, _ = rec.covariances(part.F, L, rec.gains(part.F, L, J, model.entries(r)))
-        values, vectors = linalg.spectrum(P)
-        half = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
-        inner = jnp.eye(P.shape[-1])[None] + half.mT @ J @ half
-        inverse = jax.vmap(linalg.inverse_cholesky)(inner)
-        seen, pulled = inverse @ (half.mT @ cross), (inverse @ (half.mT @ pull[:, :, None]))[:, :, 0]
-        information = information - jnp.einsum("eni,enj->ij", seen, seen)
-        score = score - jnp.einsum("eni,en->i", seen, pulled)
-        likelihood = likelihood + 0.5 * jnp.sum(pulled**2)
-        logdet = logdet - 2.0 * jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=1, axis2=2)))
-    information = 0.5 * (information + information.T)
-    covariance, spread = linalg.inverse_and_logdet(information + prior.matrix())
-    slope = score - prior.pull(point.z)
-    step = covariance @ slope
-    own = 0.5 * prior.log_determinant() - 0.5 * prior.square(point.z)
-    evidence = likelihood + own + 0.5 * slope @ step - 0.5 * (logdet + spread)
-    evidence = evidence - 0.5 * jnp.sum((point.levels / model.level_spread) ** 2)
-    gamma = jnp.clip(1.0 - prior.alpha * jnp.diagonal(covariance), 0.0, 1.0)
-    return LaplaceApproximation(information, covariance, gamma, evidence), step
+from probcal.smoothing.linearised import linearise
+from probcal.smoothing.mode import Point, factors
 
 
 @jax.jit

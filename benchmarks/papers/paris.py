@@ -1,4 +1,10 @@
-"""Sums over the epochs of a target, smoothed while it is filtered: PaRIS (Olsson, Westerborn 2017)."""
+"""Sums over the epochs of a target, smoothed while it is filtered: PaRIS (Olsson, Westerborn 2017).
+
+    uv run python benchmarks/papers/paris.py
+
+Two gauges with known biases see a target; the sum of its positions, by 100 runs of 200 particles, beside the sum of
+the exactly smoothed track.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +13,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+import probcal as pc
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
 from probcal.particle.backward import sampler_of
 from probcal.particle.filtering import built
 from probcal.particle.settings import Particles
+from probcal.particle.targets import targets_of
 
 Functional = Callable[[State, State, Epoch], Any]  # the state before, that at an epoch, and the epoch: a pytree
 
@@ -60,3 +69,33 @@ def smoothed_sum(
 
 def _row(tree: Any, k: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[k], tree)
+
+
+@pc.sensor(x=pc.Channel("m", std=1.0), y=pc.Channel("m", std=1.0))
+def fix(target, pose, *, east=pc.Bias("m", 1e-6)):
+    """A position; its bias is known to be none."""
+    line = target.position - pose.position
+    return dict(x=line[0] + east, y=line[1])
+
+
+def main() -> None:
+    """Print the sum by particles, its standard error and the exact one."""
+    network = pc.Network([fix.on(pc.Node(f"n{k}", place)) for k, place in enumerate([(0, 0), (5, 0)])])
+    motion = pc.Target(pc.ConstantVelocity(0.8), {"position": ((1.0, -1.0), 6.0), "velocity": ((0.3, 0.3), 1.5)})
+    table = pc.simulate(network, motion, np.arange(8.0), key=0, biases={}).table
+    exact = pc.tracks(pc.fit(pc.Problem(network, motion, table), pc.MAP()))["position_x"].sum()
+    with jax.enable_x64(True):
+        model = pc.Problem(network, motion, table).model
+        (targets,) = targets_of(model)
+        at, how = (jnp.zeros(model.biases), jnp.zeros(0)), Particles(200)
+
+        def once(key: jax.Array) -> jax.Array:
+            own = jax.tree.map(lambda leaf: leaf[0], (targets.epochs, targets.there))
+            return smoothed_sum(targets.model, *own, *at, key, how, lambda a, b, e: b[0][0, 0])[0]
+
+        found = np.asarray(jax.lax.map(jax.jit(once), jax.random.split(jax.random.key(0), 100)))
+    print(f"sum of positions {found.mean():.3f} ± {found.std() / 10:.3f} by particles, {exact:.3f} exactly")
+
+
+if __name__ == "__main__":
+    main()
