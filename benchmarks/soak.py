@@ -10,8 +10,9 @@ started again at once; the second half runs through, so that its memory can be f
 memory (VmRSS) after a tenth of the rows and at the end, its slope in the last process, and what the outputs say of
 rows counted and repeated. With `--compare` tracks and rows are written too, nothing may be missing in them, and the
 biases must be those of a run that was never killed. With `--jumps` so many biases jump, one radar each, which must be
-named in jumps.csv with their times, and no more others than 0.1 an hour, and rows are written too; `--outliers` is the fraction of the data
-that are 10 to 1,000 sd off. Compiled kernels are kept in the user's cache between starts.
+named in jumps.csv with their times; others no more often than the rate that the filter is given allows. Rows are
+written then too; `--outliers` is the fraction of the data that are 10 to 1,000 sd off. Compiled kernels are kept in the
+user's cache between starts.
 """
 
 import argparse
