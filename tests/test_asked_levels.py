@@ -59,6 +59,7 @@ def evidence(**stds):
     return float(probcal.fit(problem, MAP(trajectory="joint")).attrs["log_evidence"])
 
 
+@pytest.mark.ci
 def test_slope_and_curvature_are_those_of_the_evidence():
     problem, _ = world()
     fit = take_up(problem, probcal.fit(problem, MAP(trajectory="joint")))
@@ -79,6 +80,7 @@ def test_slope_and_curvature_are_those_of_the_evidence():
     np.testing.assert_allclose(precision, curvature, rtol=0.06)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("name", "times"),
     [
@@ -102,7 +104,7 @@ def test_a_level_that_is_declared_wrong_is_named_with_what_the_data_ask_for(name
     assert (others["square"] < check["square"].sel(level=label)).all()
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_levels_in_the_table_and_unknown_ones_have_their_place():
     _, table = world()
     table = table.assign(rate_std=0.2)
@@ -121,7 +123,7 @@ def test_levels_in_the_table_and_unknown_ones_have_their_place():
     assert "level" not in tree["finding"]["kind"].values
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_levels_that_are_right_are_left_alone():
     """Chi-squares of 30 recordings over three levels: their mean within 3 standard errors of one."""
     squares = []
@@ -135,7 +137,7 @@ def test_levels_that_are_right_are_left_alone():
     assert stats.kstest(squares, stats.chi2(1).cdf).pvalue > 1e-3
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_network_whose_size_the_declared_motion_sets_hangs_on_it():
     network = plaza.network(scale=1.0)
     problem = Problem(network, ConstantVelocity(1.0), plaza.HERE / "plaza_ranges.csv")

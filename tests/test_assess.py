@@ -97,6 +97,7 @@ def linear(request):
     return assessed(request.param)
 
 
+@pytest.mark.ci
 def test_innovations_are_those_of_a_loop_filter(linear):
     """NIS of every epoch, the biases held at the fit; and the degrees of freedom that they used."""
     _, tree, naive, out = linear
@@ -148,6 +149,7 @@ def test_a_sensor_left_out_has_the_exact_predictive_density(linear):
     assert check.attrs["refits"] == "full"
 
 
+@pytest.mark.ci
 def test_one_step_refits_agree_on_a_linear_problem(linear, monkeypatch):
     problem, tree, _, out = linear
     monkeypatch.setattr(leave, "WORK", 0.0)
@@ -495,7 +497,7 @@ def test_limits_of_squares_hold_their_rate_for_heavy_and_light_tails():
         assert stats.binom.ppf(1e-4, 2000, 0.05) <= out <= stats.binom.isf(1e-4, 2000, 0.05)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_rows_of_half_the_weight_scatter_as_declared():
     network, motion = radars(), ConstantVelocity(0.5)
     table = simulate(network, motion, np.arange(60.0), key=5, share=0.0, tracks={"car": TRACKS["car"]}).table
@@ -555,6 +557,7 @@ def test_every_kind_of_noise_and_correlated_surveys():
     assert set(out["verdict"]["verdict"].values) <= {"determined", "prior only", "weak", "drifting", "conflicting"}
 
 
+@pytest.mark.ci
 def test_a_flat_prior_and_another_method():
     problem, _ = worlds.linear("plane")
     tree = probcal.fit(problem, MAP(), prior=Flat(), start=worlds.resting(problem))
@@ -694,6 +697,7 @@ def test_halves_hold_their_false_alarm_rate():
 # Widening: what the innovations call for, of biases and tracks
 
 
+@pytest.mark.ci
 def test_a_fit_is_judged_by_its_innovations_and_assessed_as_before(judged):
     """`fit` widens biases, tracks and draws once, says that `assess` has not run, and what that finds is the same."""
     tree, out, problem = judged("noisy")
@@ -720,6 +724,7 @@ def test_a_fit_is_judged_by_its_innovations_and_assessed_as_before(judged):
     assert "innovations" not in sound.attrs["message"]
 
 
+@pytest.mark.ci
 def test_a_fit_says_what_cannot_be_meant(judged):
     """A std a hundred times too large, and a time in milliseconds."""
     problem = judged("true")[2]
@@ -789,7 +794,7 @@ def test_tracks_take_the_variance_of_larger_noise_and_no_more_than_their_prior()
                     assert ratio.mean() == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_tracks_hold_where_noise_is_remembered():
     """89 % intervals of tracks hold 0.80 at least with noise of a memory of 2 s, as those of white noise do."""
     places = {f"a{k}": place for k, place in enumerate([(0, 0), (10, 0), (10, 8), (0, 8), (5, 9)])}

@@ -66,6 +66,7 @@ def test_scans_are_what_a_sensor_reports_at_one_time():
     assert problem(table.assign(target="a").drop(index=1)).scans is None
 
 
+@pytest.mark.ci
 def test_what_is_simulated_has_the_rates_that_were_declared():
     table = drawn().table
     scans = problem(table).scans
@@ -248,6 +249,7 @@ def test_a_row_with_a_name_is_not_assigned_again():
     assert set(both.measurements.target_names) == {"t0", "a"}
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 def test_biases_are_found_with_the_objects(seed):
     """Two radars that share no names: each bias within 4 sds of the truth, no wider than twice the labelled fit."""

@@ -167,6 +167,7 @@ def errors(drawn, mean, sd):
 # against these
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["plain", "crossing"])
 def test_density_of_every_association_is_that_of_a_dense_gaussian(name):
     e = enumerated(name)
@@ -211,6 +212,7 @@ def test_one_scan_is_drawn_exactly():
     assert (np.abs(found - p) <= SIGMAS * np.sqrt(p / 20_000) + 1e-4).all()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["plain", "crossing"])
 def test_draws_have_the_posterior_of_all_associations(name):
     """Some 40 expectations of 2800 draws within 5 Monte Carlo errors: false alarm 2e-5."""
@@ -223,12 +225,13 @@ def test_draws_have_the_posterior_of_all_associations(name):
         assert crossed.min() > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "schedule",
     [
         pytest.param((TRACK,) * 5, id="tracks alone"),
         pytest.param((TRACK, TRACK, ONE_SCAN, ONE_SCAN, ONE_SCAN), id="scan by scan"),
-        pytest.param((SWAP, TRACK, ALL_SCANS, TRACK, ALL_SCANS), id="no single scan", marks=pytest.mark.ci),
+        pytest.param((SWAP, TRACK, ALL_SCANS, TRACK, ALL_SCANS), id="no single scan", marks=pytest.mark.slow),
     ],
 )
 def test_draws_are_right_with_moves_left_out(schedule):
@@ -246,10 +249,11 @@ def test_one_kernel_serves_every_association_and_recording_of_a_form():
     assert run_pass._cache_size() == size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(ALL_SCANS, marks=pytest.mark.ci),
+        pytest.param(ALL_SCANS, marks=pytest.mark.slow),
         *(pytest.param(kind, marks=pytest.mark.slow) for kind in (ONE_SCAN, SWAP, TRACK)),
     ],
 )
@@ -274,7 +278,7 @@ def test_a_move_alone_leaves_exact_draws_as_they_are(kind):
     assert np.abs((each.mean(0) - mean[unsure]) / error).max() < SIGMAS
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_prior_with_hyper_parameters_is_integrated():
     """A Laplace density of the shift, by sums over a grid; false alarm 2e-5."""
     e, s = enumerated("plain"), np.linspace(-8.0, 8.0, 4001)
@@ -348,6 +352,7 @@ def test_with_bent_sensors_draws_have_the_density_that_is_declared():
 # the verb
 
 
+@pytest.mark.ci
 def test_associations_objects_and_biases_are_sampled_together():
     """Which rows belong together, by the public verb, within 5 Monte Carlo errors: false alarm 1e-5."""
     e = enumerated("crossing")

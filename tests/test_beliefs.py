@@ -205,6 +205,7 @@ def space_radar(target, pose):
     return dict(range=norm(line), azimuth=bearing(line), elevation=elevation(line))
 
 
+@pytest.mark.ci
 def test_what_a_sensor_knows_goes_along_with_it():
     """Wherever it stands in space and however it is turned, it measures the same of what it knows."""
     scale = {"position": 30.0, "heading": 1.0, "pitch": 0.3, "roll": 0.3}

@@ -129,6 +129,7 @@ def squarer(target, pose, *, offset=Bias("1", 2.0)):
     return {"level": 0.5 * offset**2 + target.position[0]}
 
 
+@pytest.mark.ci
 def test_the_trajectory_is_eliminated_from_the_averaged_system():
     """y = b^2/2 + x + e: van Trees gives E[b^2]/R for b, as E[b] = 0; eliminating x draw by draw E[b^2]/(R + P).
 
@@ -191,7 +192,7 @@ def test_a_bias_without_a_bound_is_named_and_left_out():
     assert (sd < [3.0, 10.0]).all()
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_tracks_are_taken_as_they_are_given():
     """A target without a track takes the motion; one with gaps is refused; velocities come from differences."""
     network = Network([sensors.doppler.on(Node(f"d{k}", (50.0 * k, 10.0 * k**2))) for k in range(3)])
@@ -287,9 +288,10 @@ def test_errors_of_maximum_likelihood_at_low_noise_reach_the_parametric_bound():
     assert np.abs(ratio - 1).max() < 0.05, dict(zip(problem.labels, ratio.round(3), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "world", [pytest.param(plane(), id="plane", marks=pytest.mark.slow),
-              pytest.param(waves(), id="waves", marks=pytest.mark.ci),
+              pytest.param(waves(), id="waves", marks=pytest.mark.slow),
               pytest.param(space(), id="space", marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_a_turned_and_moved_world_has_the_same_bounds(world):

@@ -347,6 +347,7 @@ RECORDINGS = {"sflab": "sflab_mic_toa/dataset_1_exp2.mat", "robots": "mrclam/MRC
               "bearing_beacons": "roh_bearing", "harbour": "autoferry_radar/scenario2_detections.json"}  # fmt: skip
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("file", sorted((File(__file__).parents[1] / "models").glob("*.py")), ids=lambda p: p.stem)
 def test_every_model_file_declares_a_problem(file, monkeypatch):
     monkeypatch.syspath_prepend(file.parent)
@@ -502,6 +503,7 @@ FORMULAS = {
 }  # fmt: skip
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", DIMENSIONS)
 def test_every_formula_is_that_of_its_source(name):
     """Values and signs: true = stated + bias in the whole path, against numpy and scipy; derivatives of the values.

@@ -157,6 +157,7 @@ def test_without_an_assessment_there_is_no_verdict(tmp_path):
     assert "verdict" not in probcal.load(tmp_path / "fit").children
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["ea", "collapsed"])
 def test_a_report_is_written_from_a_saved_fit(name, tmp_path):
     shutil.copy(committed.DATA / f"{name}.nc", tmp_path / "fit.nc")
@@ -383,6 +384,7 @@ def test_other_bad_arguments(model, rows, tmp_path):
         assert "Invalid value" in err
 
 
+@pytest.mark.ci
 def test_arguments_of_a_model_come_from_the_command_line(rows, tmp_path):
     path = tmp_path / "wide.py"
     text = SMALL.replace("STD", "1.0").replace("SCALE", "2.0")

@@ -134,7 +134,7 @@ def test_local_workers_that_do_not_start_are_one_sentence(monkeypatch):
         list(spread(double, [1], scheduler="local"))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_table_and_picture_are_written_while_a_study_runs(tmp_path):
     outputs, now, told = Outputs(tmp_path, ("study.nc", "study.csv", "study.png")), [0.0], []
     tell = partly(outputs, told.append, lambda: now[0])
@@ -211,7 +211,7 @@ def cluster():
         yield client
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_client_is_taken_and_left_open(cluster):
     assert sorted(spread(double, [1, 2, 3], scheduler=cluster)) == [(0, 2), (1, 4), (2, 6)]
     with pytest.raises(InputError, match="the batch is refused"):
@@ -310,7 +310,7 @@ def done_in(out):
         return 0
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_killed_worker_and_a_restarted_client_change_no_number(model, whole, tmp_path):
     """Separate worker processes: one is killed, then the client; a second client goes on with what is missing."""
     out, chance = tmp_path / "out", random.Random(1)
@@ -334,7 +334,7 @@ def test_a_killed_worker_and_a_restarted_client_change_no_number(model, whole, t
     assert not [*out.rglob("*.partial"), *out.rglob("*.part")]
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_lost_scheduler_is_one_sentence_and_a_rerun_goes_on(model, whole, tmp_path):
     out = tmp_path / "out"
     with Machines(tmp_path, 2) as machines:

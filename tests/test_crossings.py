@@ -63,6 +63,7 @@ def on_the_wrong_side(problem, label, shift):
         return track_mode(problem, start._replace(z=jnp.asarray(z)))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("form", ["dense", *(pytest.param(f, marks=pytest.mark.ci) for f in ("sparse", "matrix-free"))])
 def test_a_node_that_stands_on_the_other_side_is_found(form):
     """The path bends by 4 m, which tells the sides apart; every climb begins on the stated one."""
@@ -73,7 +74,7 @@ def test_a_node_that_stands_on_the_other_side_is_found(form):
     assert tree.attrs["status"] == "converged"
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("loose", [("b0",), tuple(f"b{k}" for k in range(7))], ids=["one", "all"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_sides_are_told_apart_by_the_default(seed, loose):
@@ -87,7 +88,7 @@ def test_sides_are_told_apart_by_the_default(seed, loose):
             assert sd < 1.0
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["tdoa", "ranger"])
 @pytest.mark.parametrize("shift", [0.0, -56.0])
 def test_an_anchor_above_or_below_the_flight_is_found(kind, shift):
@@ -123,7 +124,7 @@ def test_climbs_that_come_back_are_few(monkeypatch):
         assert len(climbs) == 1 + mirrors.TRIED
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_nodes_cross_together():
     """Of three on the wrong side those that fit better without the others go in one climb."""
     with jax.enable_x64(True):
@@ -137,6 +138,7 @@ def test_nodes_cross_together():
         assert abs(mean - shift) < 4 * sd
 
 
+@pytest.mark.ci
 def test_where_nothing_tells_the_sides_apart_both_are_told():
     """A straight path, and a survey of 20 m: one bias is weak, the others stand, and the map shows the other place."""
     problem = beside(1, 0.0, scale=20.0)
@@ -178,6 +180,7 @@ def test_chains_cross_with_a_node_alone(seed, method):
     assert bias(tree, "b0.position_y")[1] > 4.0
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("bend", [0.0, 2.0])
 def test_a_side_that_maximised_precisions_keep_in_is_left(bend):
     """It stood out by 70 sd, `converged`, though the stated place fits better or as well."""

@@ -97,6 +97,7 @@ def test_where_no_bias_has_a_scale_the_default_method_is_the_gaussian():
             np.testing.assert_allclose(found["calibration"][name], known["calibration"][name], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.ci
 def test_distances_between_nodes_need_no_target(tmp_path):
     problem = apart()
     data = problem.measurements
@@ -194,9 +195,6 @@ SAMPLERS = {
 }
 
 DRAWN = ("every bias surveyed", "distances alone")  # problems that samplers are asked of too
-EACH = [
-    pytest.param(name, marks=pytest.mark.ci if name == "distances alone" else pytest.mark.slow) for name in PROBLEMS
-]
 
 
 def of_stream(problem, tree):
@@ -227,7 +225,8 @@ VERBS = {
 }
 
 
-@pytest.mark.parametrize("name", EACH)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROBLEMS)
 def test_every_method_and_verb_answers_or_says_one_sentence(name, tmp_path):
     wrong = []
     problem = PROBLEMS[name]()

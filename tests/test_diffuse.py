@@ -169,6 +169,7 @@ def constellation(d, extent):
     return stations, measured, offset, Problem(network, ConstantVelocity(extent / 500), pd.DataFrame(table))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("extent", [1e4, 1e6], ids="{:.0e}".format)
 @pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.ci)])
 def test_fit(d, extent):

@@ -285,7 +285,7 @@ def test_fixed_steps_and_steps_before_the_data_count_in_the_values():
     assert set(found["bias"]) == {"b.position_x", "b.position_y"}
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_drifting_sensor_is_checked_whole():
     """Noise spoilt after the step is the sensor's, though its first piece is fine; and its node may be written."""
     network, motion = watched()

@@ -44,7 +44,7 @@ def test_plaza_is_calibrated_from_the_command_line(tmp_path):
     assert (tracks["position_x_sd"] > 0).all()
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_freed_beacons_are_weak_and_the_dilation_is_named():
     code, out, err = call("fit", FREE)
     assert code == 0, err

@@ -94,6 +94,7 @@ def test_epochs_come_in_time_order_and_hold_every_row_once():
         problem.model.epochs(sizes=(0,) * len(problem.model.blocks))
 
 
+@pytest.mark.ci
 def test_rows_that_came_later_take_the_same_kernel(kept_kernels):
     """A filter compiled for the first rows goes on, epoch by epoch, with those of a table that came after."""
     network, motion, table, fixed = worlds.mixed()
@@ -131,6 +132,7 @@ def test_later_rows_that_are_none_are_refused():
         problem.later(table.tail(1).assign(target="plane", time=9.0))
 
 
+@pytest.mark.ci
 def test_the_density_of_a_step_is_that_of_its_draws():
     """`log_step` against the moments of the motion; a motion without density is refused."""
     problem = worlds.linear("plane")[0]
@@ -154,6 +156,7 @@ def test_the_density_of_a_step_is_that_of_its_draws():
             singular.log_step(x, x, epoch, levels)
 
 
+@pytest.mark.ci
 def test_steps_have_the_moments_of_the_motion():
     """Mean and covariance of 4000 drawn steps; false alarms 1e-6 by normal limits."""
     problem = worlds.linear("mixed")[0]
@@ -183,7 +186,7 @@ def systematic(key, log_weights, particles, n):
     return chosen.astype(int), jnp.zeros(n), jax.tree.map(lambda leaf: leaf[chosen], particles)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plane", "mixed"])
 def test_the_particle_filter_of_cuthbert_takes_a_model(name):
     """Its three callables are methods of `Model`: evidence and last means are those of the Kalman filter.

@@ -43,6 +43,7 @@ def names(tmp_path_factory):
     }  # fmt: skip
 
 
+@pytest.mark.ci
 def test_intervals_of_the_example_hold_the_truth_as_often_as_they_say(names):
     """Of 40 intervals of 89 % in 20 recordings 31 or more hold it: false-alarm rate 1 % (binomial)."""
     network, motion, biases, path = (names[name] for name in ("network", "motion", "biases", "path"))
@@ -54,6 +55,7 @@ def test_intervals_of_the_example_hold_the_truth_as_often_as_they_say(names):
     assert held >= 31
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("path", SHOWN, ids=lambda path: path.stem)
 def test_the_examples_of_a_module_run(path, names):
     module = importlib.import_module(".".join(["probcal", *path.relative_to(ROOT).with_suffix("").parts]))

@@ -53,6 +53,7 @@ def test_a_bias_whose_chains_disagree_is_not_mixed():
     assert set(found[:1] + found[2:]) == {"estimated", "survey"}
 
 
+@pytest.mark.ci
 def test_a_wider_process_noise_costs_its_logarithm_and_leaves_the_trajectory_alone():
     """Two epochs of a ruler: four noises of unit prior at the start, four of the unknown level after it."""
     network = Network([ruler.on(Node("a", (0.0, 0.0)))])
@@ -105,6 +106,7 @@ def test_a_row_with_a_std_of_its_own_does_not_feel_the_unknown_level():
     np.testing.assert_allclose(found.ravel(), [0.5, 6.0], rtol=1e-6)
 
 
+@pytest.mark.ci
 def test_levels_border_a_frame_by_differences_of_its_likelihood():
     """Of a quadratic log-likelihood of three biases and two levels the differences give its matrix and slope."""
     random = np.random.default_rng(0)

@@ -122,6 +122,7 @@ def test_an_outlier_is_a_blank_cell(method):
     assert with_all.counts["outliers"] == 0
 
 
+@pytest.mark.ci
 def test_an_outlier_is_named_with_its_line():
     frame = passes().copy()
     frame.loc[400, "range"] += 60.0
@@ -137,6 +138,7 @@ def test_an_outlier_is_named_with_its_line():
     assert clean.status == "converged"
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("method", [LAGGED, PLAIN], ids=str)
 def test_a_sensor_that_jumps_begins_anew(method):
     frame = passes().copy()
@@ -183,6 +185,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "name",
     [
@@ -203,6 +206,7 @@ def test_a_mistake_is_no_answer_and_is_named(name):
         pc.track(pc.Problem(gauges(), pc.ConstantVelocity(0.5), passes()[:150]), tree)
 
 
+@pytest.mark.ci
 def test_a_ramp_and_more_noise_are_told():
     frame = passes(12).copy()
     mine = frame["sensor"] == "g1"

@@ -290,6 +290,7 @@ def test_a_misfit_names_the_worst_datum():
     assert abs(clean["calibration"]["mean"].values[1] - 3.0) < 1.0
 
 
+@pytest.mark.ci
 def test_a_search_that_never_moved_is_refused_and_one_at_the_mode_is_not():
     network, table = gauges()
     with jax.enable_x64(True):
@@ -311,6 +312,7 @@ def test_a_search_that_never_moved_is_refused_and_one_at_the_mode_is_not():
         assert Status(probcal.fit(problem, method, start=resting(problem)).attrs["status"]).settled
 
 
+@pytest.mark.ci
 def test_the_promise_of_a_step_is_what_it_keeps_on_a_linear_problem():
     """A step to the mode of a quadratic cost promises the whole decrease: where it is refused, that tells why."""
     problem, _ = linear("plane")
@@ -521,6 +523,7 @@ def test_a_hyper_prior_may_cost_evidence():
     assert strict.attrs["status"] == "converged"
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("stated", [False, True])
 def test_an_answer_far_from_gaussian_is_weak(stated):
     """Four direction finders on 20 m and a target 1 km away: its range is a factor, unless stated."""

@@ -30,6 +30,7 @@ def assessed(form, problem):
     return pc.assess(problem, pc.fit(problem, pc.MAP(form=form), prior=pc.Gaussian()))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 @pytest.mark.parametrize("names", [(), ("b", "e")], ids=["still", "two drift"])
 def test_halves_are_those_of_the_dense_form(library, names, monkeypatch):
@@ -49,7 +50,7 @@ def test_halves_are_those_of_the_dense_form(library, names, monkeypatch):
     assert drift[1].sum() == len(names)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_draws_say_what_solves_do(monkeypatch):
     """Of a network in 3-D: sds within the error of 128 draws; what they cannot tell is left out."""
     problem = drawn_in_space()[0]
@@ -66,7 +67,7 @@ def test_draws_say_what_solves_do(monkeypatch):
     assert len(by_draws["bias_label"]) >= 3
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("prior", [pc.Horseshoe(), pc.Flat()], ids=["mixture", "flat"])
 def test_a_drift_is_named_under_other_priors(prior):
     """Of precisions that are integrated, and without any: b drifts, nothing else does."""
@@ -103,7 +104,7 @@ def test_more_suspects_than_are_looked_at_are_a_finding(monkeypatch):
     assert any("were looked at" in text for text in checked["finding"]["sentence"].values)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_bias_without_a_level_of_its_own_is_left_out():
     """What only one half tells is no difference."""
     table = drawn()[0].measurements.table.frame

@@ -136,7 +136,7 @@ def test_expectation_propagation_agrees_too(prior, members):
     np.testing.assert_allclose(np.corrcoef(z.T), wanted, atol=0.12)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_batches_agree_with_each_other_and_state_their_error():
     """Scatter of four keys: within three of the errors stated, each below 3 %; thinned draws come from all batches."""
     problem, _ = worlds.linear("plane")

@@ -57,6 +57,7 @@ def on_the_wrong_side(problem, seed):
         return track_mode(problem, reflect(problem, start, line, [mine], np.asarray(start.z)))
 
 
+@pytest.mark.ci
 def test_the_other_side_is_found_with_its_nodes():
     problem, _ = networks.setting(0, "line", share=1.0)
     with jax.enable_x64(True):
@@ -90,7 +91,7 @@ def test_a_limit_ends_the_search_for_mirror_images():
     assert list(phases) == ["start", "climb", "mirror images", "mirror image 1 of 1"]
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "form"), [("line", "auto"), ("ceiling", "auto"), ("ceiling", "sparse"), ("ceiling", "matrix-free")]
 )
@@ -130,6 +131,7 @@ def test_a_piece_on_the_wrong_side_is_turned():
     assert off(only(tree)["mean"].values, path) < 4
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("seed", "form"), [(1, "sparse"), pytest.param(3, "sparse", marks=pytest.mark.ci), (1, "matrix-free")]
 )
@@ -167,7 +169,7 @@ def crossing(seed):
     return Problem(network, ConstantVelocity(0.5), drawn.table[kept]), paths
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "form"), [(2, "dense"), (2, "sparse"), (2, "matrix-free"), (44, "dense")])
 def test_a_short_piece_of_one_of_two_targets_is_turned(seed, form):
     """Ten seconds at the beginning of a track: planes through other beacons cut long pieces that fit much worse.
@@ -182,6 +184,7 @@ def test_a_short_piece_of_one_of_two_targets_is_turned(seed, form):
         assert off(track["mean"].values, path[there]) < 4
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("method", "prior"),
     [

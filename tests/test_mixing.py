@@ -69,7 +69,7 @@ def drawn(method=METHOD, **options):
     return probcal.fit(problem, method, prior=Gaussian(), start=resting(problem), key=5, **options)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_what_has_not_mixed_is_drawn_anew_and_resumed(tmp_path, monkeypatch):
     assert drawn().attrs["thin"] == 1
     monkeypatch.setattr(sampling, "settled", lambda *_: False)

@@ -69,8 +69,9 @@ def test_the_sparse_form_ends_where_the_dense_one_does(library, dense, monkeypat
         np.testing.assert_allclose(other["sd"], one["sd"], rtol=1e-5 if library is Cholmod else 0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "form", [pytest.param("dense", marks=pytest.mark.slow), pytest.param("sparse", marks=pytest.mark.ci)]
+    "form", [pytest.param("dense", marks=pytest.mark.slow), pytest.param("sparse", marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize("prior", [pc.Horseshoe(), pc.BernoulliGaussian()], ids=lambda prior: type(prior).__name__)
 def test_propagation_agrees_with_sweeps_over_all_biases(prior, form, monkeypatch):
@@ -90,6 +91,7 @@ def test_propagation_agrees_with_sweeps_over_all_biases(prior, form, monkeypatch
     assert np.mean((b["lower"].values <= true) & (true <= b["upper"].values)) > 0.75
 
 
+@pytest.mark.ci
 def test_draws_have_the_means_and_sds(dense):
     group, draws = dense["calibration"].to_dataset(), fitted(pc.MAP(form="sparse"), pc.Gaussian())["posterior"]["bias"]
     flat = draws.values.reshape(-1, draws.shape[-1])
@@ -182,6 +184,7 @@ def by_products(A, states, members):
     return Products(held, mirrored(places, A[i, j]), states, members)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 @pytest.mark.parametrize("seed", range(3))
 def test_products_do_what_a_factor_does(seed, library):
@@ -205,6 +208,7 @@ def test_products_do_what_a_factor_does(seed, library):
         found.inverse_entries()
 
 
+@pytest.mark.ci
 def test_products_of_some_columns_are_those_of_each(monkeypatch):
     """Where there is room for the bases of a few draws only, as many are made and as well."""
     A, members = thing(20, 10, np.random.default_rng(0))
@@ -235,6 +239,7 @@ def test_products_that_are_not_positive_or_do_not_end_are_no_answer(monkeypatch)
         by_products(A, 20, members).draw(np.random.default_rng(0), 1)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("least", [1e-3, 1e-5, 1e-7])
 def test_draws_resolve_directions_that_data_leave_to_a_wide_prior(least, monkeypatch):
     """Of a spectrum with a tail towards zero: a root to 0.1 %, a log determinant to 1e-4 nats, also in few columns.
@@ -259,6 +264,7 @@ def test_draws_resolve_directions_that_data_leave_to_a_wide_prior(least, monkeyp
         np.testing.assert_allclose(form, true[: len(form)], atol=1e-4)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 def test_a_fit_without_factors_of_the_biases_ends_where_the_dense_one_does(library, dense, monkeypatch):
     """Means within 1e-4 sds, sds, gamma and evidence within 6 of their standard errors, which are small."""
@@ -499,7 +505,7 @@ def unanchored():
     return network, run.table
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_what_all_sensors_share_is_open_in_both_forms():
     """A translation and a rotation of all nodes, one with the information the dense form has."""
     problem = pc.Problem(unanchored()[0], MOTION["car"], unanchored()[1])
@@ -522,6 +528,7 @@ def test_a_network_that_ran_along_what_no_row_tells_is_no_answer():
         assert "along translation of all nodes along x, which no row fixes: it is invalid" in tree.attrs["message"]
 
 
+@pytest.mark.ci
 def test_observability_of_many_biases_is_that_of_few(monkeypatch):
     """Shares, sds, leverages, tracks and what is open, without a matrix of all biases."""
     pytest.importorskip("sparsax", reason="sparsax is an extra")
@@ -541,6 +548,7 @@ def test_observability_of_many_biases_is_that_of_few(monkeypatch):
     assert set(found["direction"]["direction"].values) == set(wanted["direction"]["direction"].values)
 
 
+@pytest.mark.ci
 def test_check_of_a_large_network_says_what_is_open(monkeypatch, capsys, tmp_path):
     """The command line with the sparse form: biases that the data tell least of, directions, status, files."""
     pytest.importorskip("sparsax", reason="sparsax is an extra")
@@ -575,6 +583,7 @@ def test_few_of_many_biases_at_an_epoch_take_the_sparse_form(monkeypatch):
     assert not gains_by_sparse(*settings)
 
 
+@pytest.mark.ci
 def test_a_fit_of_many_data_keeps_what_a_mail_holds(monkeypatch, tmp_path):
     """Above `LARGE` data: the log-likelihood in sum, residuals and tracks to a small part of noise and sd."""
     problem = worlds.small()
@@ -602,6 +611,7 @@ def test_a_fit_of_many_data_keeps_what_a_mail_holds(monkeypatch, tmp_path):
     assert any("too many for a fit to keep it" in text for text in both["finding"]["sentence"].values)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 @pytest.mark.parametrize("kind", ["posterior", "hybrid", "parametric"])
 def test_bounds_by_sparse_factors_are_those_of_the_dense_form(kind, library, monkeypatch):
@@ -675,6 +685,7 @@ def all_seen():
         return whole, automatic_start(whole)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 def test_passes_of_a_large_network_tell_what_those_of_a_small_one_do(library, monkeypatch):
     """To 1e-6 where every sensor reaches; one that lies beyond their reach tells nothing."""
@@ -708,6 +719,7 @@ def test_a_pass_is_seen_by_the_sensors_that_it_comes_near_to(library, monkeypatc
     assert 0 < gains[0] < gains[1] < gains[2]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 def test_sensors_of_a_large_network_tell_what_those_of_a_small_one_do(library, monkeypatch):
     """To 1e-6, of both types, with a bias that all of a type share and biases of their own, targets at rest too."""
@@ -750,6 +762,7 @@ def both_forms(problem, point, monkeypatch, reached=100.0, **asked):
     return gains
 
 
+@pytest.mark.ci
 def test_planning_takes_second_nodes_whose_spread_another_sensor_reads(monkeypatch):
     """And nodes that move, biases that are fixed, a network small beside its ranges, a name that is taken."""
     nodes = [pc.Node("new 0", (0.0, 0.0), scale={"position": 1.0}), pc.Node("b", (20.0, 0.0), scale={"heading": 0.05})]
@@ -809,6 +822,7 @@ def test_what_needs_the_dense_form_says_so_where_there_is_no_room(asked, monkeyp
         asked(drawn()[0])
 
 
+@pytest.mark.ci
 def test_bounds_that_rounding_hides_are_none(monkeypatch):
     def singular(*_):
         raise np.linalg.LinAlgError("not positive definite")
