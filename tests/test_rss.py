@@ -374,7 +374,7 @@ def test_levels_of_a_tone_and_of_what_a_band_leaves():
 
 
 def test_wav_files_become_a_table(tmp_path, capsys):
-    from probcal.cli import levels
+    from probcal.rss import levels
 
     rate, t = 2000, np.arange(4000) / 2000
     both = np.stack([0.5 * np.sin(2 * np.pi * 100 * t), 0.05 * np.sin(2 * np.pi * 100 * t)], 1)

@@ -402,7 +402,7 @@ def levels_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the table")] = False,
 ) -> None:
     """Levels: from raw samples to received signal strength in dB, a table for `fit`."""
-    from probcal.cli import levels
+    from probcal.rss import levels
 
     levels.run(recordings, out, band, window, start, column, overwrite)
 

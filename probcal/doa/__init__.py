@@ -1,7 +1,7 @@
 """Bearings only: single-sensor tracks up to scale, and sensors matched by them (the DOA self-calibration paper)."""
 
-from probcal.doa.array import Array, match
-from probcal.doa.modified import SensorTrack, bearing_track
-from probcal.doa.triangles import Similarity, similarity, turn_of
+from probcal.starts.array import Array, match
+from probcal.starts.modified import SensorTrack, bearing_track
+from probcal.starts.triangles import Similarity, similarity, turn_of
 
 __all__ = ["Array", "SensorTrack", "Similarity", "bearing_track", "match", "similarity", "turn_of"]

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probcal.doa.modified import SensorTrack, step
-from probcal.doa.triangles import similarity, turn_of
 from probcal.errors import InputError
+from probcal.starts.modified import SensorTrack, step
+from probcal.starts.triangles import similarity, turn_of
 
 POINTS = 20  # times at which two tracks are compared
 
