@@ -6,6 +6,7 @@ In examples `network`, `motion`, `run`, `problem` and `tree` are those of the RE
 from typing import TYPE_CHECKING
 
 from probcal.lazy import lazy
+from probcal.wings import NAMES
 
 if TYPE_CHECKING:
     from probcal import motion, noise, priors, sensors
@@ -117,12 +118,12 @@ __all__ = lazy(
         "probcal.particle.settings": "Particles",
         "probcal.priors": "ARD BernoulliGaussian Flat Gaussian Horseshoe Laplace",
         "probcal.problem": "Problem",
-        "probcal.roads": "LeavingRoad Road RoadNetwork match_track read_roads",
         "probcal.sensor": "Bias Channel Drift Sensor SensorType sensor",
         "probcal.simulate": "Simulation Truth simulate",
         "probcal.table": "read_table",
         "probcal.results.io": "load save",
         "probcal.results.read": "outliers summary tracks with_calibration",
-    },
+    }
+    | NAMES,
     submodules="motion noise priors sensors",
 )

@@ -7,6 +7,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
+from probcal.wings import installed, loaded
+
 
 class LazyPackage(ModuleType):
     """A package that loads a public name, or a submodule, when it is asked for."""
@@ -15,7 +17,7 @@ class LazyPackage(ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         if name in self._homes:
-            value = getattr(import_module(self._homes[name]), name)
+            value = getattr(loaded(self._homes[name], name), name)
             setattr(self, name, value)
             return value
         if name == "__version__":
@@ -41,11 +43,15 @@ class LazyPackage(ModuleType):
 
 
 def lazy(package: str, homes: Mapping[str, str], submodules: str = "") -> list[str]:
-    """Make a package lazy and return its `__all__`: `homes` gives the public names of each module, by spaces."""
+    """Make a package lazy and return its `__all__`: `homes` gives the public names of each module, by spaces.
+
+    Names whose wing is not installed are left out of `__all__`.
+    """
     module = sys.modules[package]
-    module.__dict__["_homes"] = {name: home for home, names in homes.items() for name in names.split()}
+    found = {name: home for home, names in homes.items() for name in names.split()}
+    module.__dict__["_homes"] = found
     module.__class__ = LazyPackage
-    return sorted([*module.__dict__["_homes"], *submodules.split()])
+    return sorted([*(name for name, home in found.items() if installed(home)), *submodules.split()])
 
 
 class Later:

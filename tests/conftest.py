@@ -22,6 +22,7 @@ from xdist.scheduler import LoadFileScheduling
 from probcal import kernels
 from probcal.smoothing import cholesky
 from probcal.smoothing.cholesky import Cholmod
+from probcal.wings import installed
 
 BUDGET = 9600  # kernels of a whole default run, all workers together (some 9100 to 9500 by which takes which file)
 MOST_MAPS = 20_000  # memory maps of a process, which may have 65530: past them XLA fails without a word
@@ -32,6 +33,24 @@ TOGETHER = {  # files that share worlds run in one worker, one after the other; 
     "test_drift.py": "linear", "test_kernels.py": "linear", "test_metamorphic.py": "bent", "test_bounds.py": "bent",
     "test_degenerate.py": "linear", "test_sparse.py": "sparse", "test_halves.py": "sparse",
 }  # fmt: skip
+NEEDS = {  # wings that all tests of a file need: it is not collected where one is missing. A test takes `needs`
+    "../README.md": "roads",
+    "test_adapters_files.py": "adapters",
+    "test_adapters_ros.py": "adapters",
+    "test_adapters_stone_soup.py": "adapters",
+    "test_doa.py": "doa",
+    "test_particle_methods.py": "roads",
+    "test_roads.py": "roads",
+    "test_rss.py": "rss",
+}
+
+
+def missing(wings):
+    """Those of some wings that are not installed."""
+    return [wing for wing in wings if not installed(f"probcal.{wing}")]
+
+
+collect_ignore = [file for file, wings in NEEDS.items() if missing(wings.split())]
 compiled: Counter[str] = Counter()  # kernels by test file, of this process and of the workers that have ended
 running = ["elsewhere"]  # the file whose test runs
 
@@ -70,6 +89,9 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.path.name == "README.md":
             item.add_marker("ci")
+        needed = [wing for mark in item.iter_markers("needs") for wing in mark.args]
+        if gone := missing(needed):
+            item.add_marker(pytest.mark.skip(reason=f"wings not installed: {', '.join(gone)}"))
     order = list(TOGETHER)
     items.sort(key=lambda item: order.index(item.path.name) if item.path.name in TOGETHER else len(order))
 

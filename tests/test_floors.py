@@ -9,22 +9,24 @@ from mutations import MUTATIONS, places
 
 import probcal
 from probcal.inference.methods import METHODS as BY_NAME
+from probcal.wings import WINGS
 
 ROOT = Path(probcal.__file__).parent
 FLOORS = {
     0: (
         "linalg", "devices", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files",
-        "status",
+        "status", "wings",
     ),
     1: ("sensor", "motion", "priors", "noise", "detection"),
     2: ("sensors",),
-    3: ("geodesy", "misfit", "network", "table", "nodes", "plausible", "roads"),
+    3: ("geodesy", "misfit", "network", "table", "nodes", "plausible"),
     4: ("model", "problem", "scans", "simulate"),
-    5: ("smoothing", "particle", "doa", "starts", "rss", "association", "online"),
+    5: ("smoothing", "particle", "starts", "association", "online"),
     6: ("identifiability", "results"),
     7: ("inference",),
     8: ("analysis",),
-    9: ("adapters", "cli", "report", "plots", "diagnostics"),
+    9: ("cli", "report", "plots", "diagnostics"),
+    10: WINGS,
 }  # fmt: skip
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
 METHODS = tuple(
@@ -110,9 +112,35 @@ def test_imports_keep_the_floors(module):
     high = [
         f"line {line}: imports {name or 'probcal itself'} (floor {floor(name) if name else 'of everything'})"
         for name, line in own(module, MODULES[module])
-        if not name or (floor(name) is not None and floor(name) > floor(module))
+        if not name or (floor(name) is not None and floor(name) > floor(module) and not wing(name))  # wings: below
     ]
     assert not high, f"{module} is on floor {floor(module)}, {'; '.join(high)}"
+
+
+def wing(module):
+    return module.split(".")[0] if module.split(".")[0] in WINGS else ""
+
+
+BETWEEN = set[tuple[str, str]]()  # wings that may import another
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda m: m or "probcal")
+def test_no_wing_is_imported_by_the_core_nor_by_another(module):
+    """Imports in functions and for type checkers count, and modules that are named in a text.
+
+    The public names of two packages state those of wings for type checkers.
+    """
+    found = {(wing(module), wing(name), line) for name, line in own(module, MODULES[module]) if wing(name)}
+    if module in ("", "plots"):
+        block = next(node for node in ast.parse(MODULES[module].read_text()).body if isinstance(node, ast.If))
+        assert ast.unparse(block.test) == "TYPE_CHECKING"
+        found = {one for one in found if not block.lineno <= one[2] <= block.end_lineno}
+    if module != "wings":
+        texts = [(node.value, node.lineno) for node in ast.walk(ast.parse(MODULES[module].read_text()))
+                 if isinstance(node, ast.Constant) and str(node.value).removeprefix("probcal.") in MODULES]  # fmt: skip
+        found |= {(wing(module), wing(name[8:]), line) for name, line in texts if wing(name[8:])}
+    others = [f"line {line}: {other}" for here, other, line in found if here != other and (here, other) not in BETWEEN]
+    assert not others, f"{module or 'probcal'} imports a wing, {'; '.join(others)}: reach it by name (probcal/wings.py)"
 
 
 @pytest.mark.parametrize("module", METHODS + SHARED)

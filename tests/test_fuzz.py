@@ -18,6 +18,7 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import probcal
 from probcal import (
     ConstantVelocity,
     InputError,
@@ -32,7 +33,6 @@ from probcal import (
 )
 from probcal.cli import commands
 from probcal.cli.models import load_model, load_problem, load_truth
-from probcal.roads import read_roads
 from probcal.simulate import truth_beside
 from probcal.table import measure
 
@@ -129,8 +129,14 @@ def test_bytes(content, name, folder):
     check_nodes(written(folder, "n.geojson", content))
     refused(lambda: Truth(path))
     refused(lambda: load(path))
-    refused(lambda: read_roads(written(folder, "n.geojson", content), crs="local"))
-    refused(lambda: read_roads(written(folder, "n.graphml", content)))
+
+
+@pytest.mark.needs("roads")
+@fuzz
+@given(content=st.binary(max_size=300))
+def test_bytes_as_roads(content, folder):
+    refused(lambda: probcal.read_roads(written(folder, "n.geojson", content), crs="local"))
+    refused(lambda: probcal.read_roads(written(folder, "n.graphml", content)))
 
 
 @st.composite
@@ -290,14 +296,15 @@ def test_geojson(data, folder):
     check_nodes(written(folder, "n.json", json.dumps(data.draw(JSON))))
 
 
+@pytest.mark.needs("roads")
 @fuzz
 @given(data=st.data())
 def test_roads(data, folder):
     line = {"type": "LineString", "coordinates": [[0, 0], [60, 0]]}
     content = {"type": "FeatureCollection", "features": [{"geometry": line, "properties": {"name": "a", "oneway": 1}}]}
     spoil(data, content)
-    refused(lambda: read_roads(written(folder, "n.geojson", json.dumps(content)), crs="local"))
-    refused(lambda: read_roads(written(folder, "n.json", json.dumps(data.draw(JSON)))))
+    refused(lambda: probcal.read_roads(written(folder, "n.geojson", json.dumps(content)), crs="local"))
+    refused(lambda: probcal.read_roads(written(folder, "n.json", json.dumps(data.draw(JSON)))))
 
 
 def test_nested_and_overlong_json_is_refused(folder):

@@ -27,7 +27,6 @@ from probcal import (
     simulate,
 )
 from probcal.geometry import norm
-from probcal.rss import with_silence
 
 FLOOR, STD = -2.0, 0.7
 PREDICTED = np.array([-12.0, -4.0, -2.3, -1.0, 1.0, 9.0])
@@ -247,11 +246,14 @@ def test_cells_below_a_limit_are_read(tmp_path):
     assert blank.measured.all()
 
 
+@pytest.mark.needs("rss")
 def test_who_listened_and_heard_nothing_gets_a_row():
     """What falls silent is put back, but for times at which nobody heard anything; a column without rows stays."""
     network, motion, run = heard(Censored(HEARS), 3)
     listening = Network([radio(Censored(HEARS, blanks=True)).on(node) for node in network.nodes])
     log = run.table[run.table["level"] > HEARS]
+    from probcal.rss import with_silence
+
     whole = with_silence(log, listening)
     known = run.table[run.table["time"].isin(log["time"])]
     assert len(log) < len(whole) == len(known)

@@ -1,14 +1,17 @@
 """The commands, their options and the checks of these; nothing heavy is imported before they hold."""
 
 import sys
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from probcal import wings
 from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.cli import files, options, outputs
+from probcal.cli.arguments import LARGEST_SEED, Data, Fix, Given, Method, Model, Network, Overwrite, Scheduler, Seed
 from probcal.cli.names import METHODS, ORACLE, PRIORS
 from probcal.errors import FitError, InputError, nearest
 from probcal.files import Lock
@@ -19,30 +22,9 @@ app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
 )  # fmt: skip
 
-Model = Annotated[Path, typer.Argument(help="model file that defines problem(data=None)", show_default=False)]
-Data = Annotated[Path | None, typer.Argument(help="table of rows (CSV); the model's own data if left out")]
-Method = Annotated[str, typer.Option(help=" | ".join(METHODS))]
-Fix = Annotated[list[str] | None, typer.Option(help="hold biases at 0, by label or pattern (repeat)")]
-Given = Annotated[
-    list[str] | None, typer.Option("--set", help="an argument of problem(): swap=3,4 (repeat)", show_default=False)
-]
-Network = Annotated[
-    Path | None,
-    typer.Option(
-        help="start from the network of a fit to other data: its folder, or its network.csv",
-        callback=options.network_file, show_default=False,
-    ),
-]  # fmt: skip
-LARGEST_SEED = 2**62
 TERMINATED = 143  # exit code of a command that SIGTERM ended
 SMOOTHERS = ("gaussian", "particles")
 KEPT = ("tracks", "rows")  # tables of a watch besides its history
-Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="seed of everything random")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace the run in --out: the files that probcal wrote")]
-Scheduler = Annotated[
-    str | None,
-    typer.Option(help='spread over a dask cluster: "local", or the address of its scheduler, tcp://host:8786'),
-]
 
 
 def main() -> None:
@@ -391,22 +373,6 @@ def changes_command(
     raise typer.Exit(changes.run(first, second, name, results))
 
 
-@app.command(name="levels")
-def levels_command(
-    recordings: Annotated[list[Path], typer.Argument(help="WAV files, each named like its sensor", show_default=False)],
-    out: Annotated[Path, typer.Option(help="table to write (CSV): time, sensor and the column")],
-    band: Annotated[str | None, typer.Option(help="frequencies that pass, in Hz: 50,500")] = None,
-    window: Annotated[float, options.quantity("s of one row")] = 0.5,
-    start: Annotated[float, options.quantity("s at which the recordings begin", zero=True, negative=True)] = 0.0,
-    column: Annotated[str, typer.Option(help="name of the channel")] = "level",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the table")] = False,
-) -> None:
-    """Levels: from raw samples to received signal strength in dB, a table for `fit`."""
-    from probcal.rss import levels
-
-    levels.run(recordings, out, band, window, start, column, overwrite)
-
-
 @app.command(name="report")
 def report_command(
     folder: Annotated[Path, typer.Argument(help="folder of a fit", show_default=False)],
@@ -469,3 +435,20 @@ def sbc_command(
                 scheduler=scheduler,
             )
         )  # fmt: skip
+
+
+def _missing(module: str, name: str) -> Callable[[typer.Context], None]:
+    """The command that raises `WingMissing`, whatever its arguments."""
+
+    def command(context: typer.Context) -> None:
+        wings.loaded(module, f"probcal {name}")
+
+    return command
+
+
+for _name, _module in wings.COMMANDS.items():
+    if wings.installed(_module):
+        app.command(name=_name)(getattr(wings.loaded(_module, _name), f"{_name}_command"))
+    else:
+        any_arguments = {"allow_extra_args": True, "ignore_unknown_options": True}
+        app.command(name=_name, hidden=True, context_settings=any_arguments)(_missing(_module, _name))

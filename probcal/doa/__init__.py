@@ -1,7 +1,8 @@
 """Bearings only: single-sensor tracks up to scale, and sensors matched by them (the DOA self-calibration paper)."""
 
+from probcal.doa.smoother import bearing_track
 from probcal.starts.array import Array, match
-from probcal.starts.modified import SensorTrack, bearing_track
+from probcal.starts.modified import SensorTrack
 from probcal.starts.triangles import Similarity, similarity, turn_of
 
 __all__ = ["Array", "SensorTrack", "Similarity", "bearing_track", "match", "similarity", "turn_of"]

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from probcal.lazy import lazy
+from probcal.wings import PICTURES
 
 if TYPE_CHECKING:
     from probcal.plots.assess import plot_changes, plot_halves, plot_left_out, plot_nis, plot_shrinkage
@@ -39,8 +40,8 @@ __all__ = lazy(
         "probcal.plots.map": "plot_map",
         "probcal.plots.objects": "plot_objects",
         "probcal.plots.observability": "draw_check plot_directions plot_passes plot_spectrum",
-        "probcal.roads.plots": "plot_particles plot_roads",
         "probcal.plots.sbc": "draw_sbc plot_coverage plot_ranks",
         "probcal.plots.study": "draw_study plot_study",
-    },
+    }
+    | PICTURES,
 )

@@ -4,12 +4,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from probcal.doa import Array, SensorTrack, bearing_track, match
 from probcal.errors import InputError
 from probcal.geometry import attitude
 from probcal.labels import AXES
 from probcal.problem import Problem
 from probcal.smoothing.mode import Point
+from probcal.starts.array import Array, match
+from probcal.starts.modified import SensorTrack, straight_track
 from probcal.starts.recognise import Directions, kinds, members, seen_directions
 
 WIDE = 0.3  # rad, spread of a heading from which the grid alone is not trusted
@@ -238,7 +239,7 @@ def _straight(seen: list[Directions]) -> Iterator[dict[str, SensorTrack]]:
             turned = np.ptp(np.unwrap(angles[:, 0])) / np.median(s.std[mine, 0])
             if turned < TURNED:
                 continue
-            track = bearing_track(s.time[mine], angles[:, 0] if angles.shape[1] == 1 else angles, s.std[mine])
+            track = straight_track(s.time[mine], angles[:, 0] if angles.shape[1] == 1 else angles, s.std[mine])
             found[s.node] = track
             bent = max(bent, 2 * track.cost / mine.sum() / angles.shape[1])
         if bent > BENT and parts < PIECES:

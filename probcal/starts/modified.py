@@ -12,6 +12,7 @@ import numpy as np
 from probcal.errors import InputError
 
 PLANE = [0, 2, 3, 5]  # of the six in space, with q = e = 0
+GAMMA = 0.1  # 1/s, prior sd of the radial speed over the range
 STEEP = 1e-6  # cosine of the elevation below which the azimuth has no meaning
 
 
@@ -30,68 +31,7 @@ class SensorTrack(NamedTuple):
     cost: float
 
 
-def bearing_track(
-    time: np.ndarray,
-    angles: np.ndarray,
-    std: np.ndarray | float,
-    *,
-    gamma: float = 0.1,
-    distance: float | None = None,
-    noise: float = 0.0,
-    remove_bias: bool = True,
-    smooth: bool = True,
-    iterations: int = 10,
-) -> SensorTrack:
-    """Extended Kalman filter and smoother in modified polar or spherical coordinates (DOA paper, section 2 and 4).
-
-    Times (T,) in s, increasing; angles (T,) azimuths, or (T, 2) azimuths and elevations, in rad in the sensor's own
-    axes, NaN where missing; their standard deviation. The first two times with a bearing start the filter (4): rates
-    from their difference, rho 0 with standard deviation `gamma` in 1/s, range `distance` in m (1: the unit of what
-    follows). `noise` is that of the acceleration, in m s^-3/2 (of `distance`; in units of the range where there is
-    none).
-
-    With `smooth` the answer is that of an iterated smoother (Gauss-Newton), which starts at the straight path of all
-    bearings; without process noise that path is the answer. Without `smooth` it is the printed filter, `remove_bias`
-    adding the second-order term to its predicted 1/r. Raises `InputError` for times that do not increase and fewer than
-    two bearings.
-
-    >>> t = np.arange(20.0)
-    >>> found = bearing_track(t, np.arctan2(10.0, t - 5.0), 1e-4)  # a target at 1 m/s, 10 m to the north
-    >>> bool(np.allclose(found.place[:, 0] / found.place[:, 1], (t - 5.0) / 10.0, atol=1e-3))
-    True
-    """
-    time, angles = np.asarray(time, float), np.asarray(angles, float)
-    if time.ndim != 1 or angles.shape[:1] != time.shape or not (np.diff(time) > 0).all():
-        raise InputError("bearing_track: times (T,) must increase, angles are (T,) or (T, 2)")
-    if angles.ndim == 2 and angles.shape[1] != 2:
-        raise InputError(
-            f"bearing_track: angles are (T,) azimuths or (T, 2) azimuths and elevations, got {angles.shape}"
-        )
-    flat = angles.ndim == 1
-    wide = np.stack([angles, np.zeros_like(angles)], 1) if flat else angles
-    there = np.isfinite(wide).all(1)
-    if there.sum() < 2:
-        raise InputError(f"bearing_track: {int(there.sum())} bearing(s) give no track; give two or more")
-    first = int(np.flatnonzero(there)[0])
-    time, wide, there = time[first:], wide[first:], there[first:]
-    given = np.asarray(std, float)
-    sigma = np.broadcast_to(given[:, None] if given.ndim == 1 else given, (len(angles), 2))[first:]
-    kept = PLANE if flat else list(range(6))
-    run = _Run(time, wide, there, sigma, kept, gamma, 1.0 if distance is None else distance, noise, remove_bias)
-    if not smooth:
-        state, covariance = run.forward(None)
-    else:
-        state, covariance = run.straight()
-        for _ in range(iterations if noise else 0):
-            reference = state
-            state, covariance = run.backward(*run.forward(reference), reference)
-            if np.abs(state - reference).max() < 1e-9:
-                break
-    place, jacobian = _places(state, kept)
-    return SensorTrack(time, state, covariance, place, jacobian @ covariance @ jacobian.mT, run.cost(state))
-
-
-class _Axes(NamedTuple):
+class Axes(NamedTuple):
     """Line of sight u and its tangents along azimuth and elevation, each (..., 3), and the cosine of the elevation."""
 
     u: np.ndarray
@@ -100,11 +40,12 @@ class _Axes(NamedTuple):
     level: np.ndarray
 
 
-def _axes(azimuth: np.ndarray, elevation: np.ndarray) -> _Axes:
+def axes_of(azimuth: np.ndarray, elevation: np.ndarray) -> Axes:
+    """The axes at angles (...) in rad."""
     cb, sb, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     zero = np.zeros_like(cb)
     ce = np.where(np.abs(ce) < STEEP, STEEP, ce)
-    return _Axes(
+    return Axes(
         np.stack([ce * cb, ce * sb, se], -1),
         np.stack([-sb, cb, zero], -1),
         np.stack([-se * cb, -se * sb, ce], -1),
@@ -112,17 +53,17 @@ def _axes(azimuth: np.ndarray, elevation: np.ndarray) -> _Axes:
     )
 
 
-def _whole(state: np.ndarray, kept: list[int]) -> np.ndarray:
+def all_six(state: np.ndarray, kept: list[int]) -> np.ndarray:
     """All six coordinates (..., 6) of a state (..., n)."""
-    whole = np.zeros((*state.shape[:-1], 6))
-    whole[..., kept] = state
-    return whole
+    found = np.zeros((*state.shape[:-1], 6))
+    found[..., kept] = state
+    return found
 
 
-def _velocity(x: np.ndarray) -> tuple[_Axes, np.ndarray, np.ndarray, np.ndarray]:
+def velocity_of(x: np.ndarray) -> tuple[Axes, np.ndarray, np.ndarray, np.ndarray]:
     """Axes, velocity over range (3,), and the derivatives (3, 6) of line of sight and velocity by the state (6,)."""
     w, q, rho, b, e, _ = x
-    axes = _axes(b, e)
+    axes = axes_of(b, e)
     velocity = rho * axes.u + w * axes.b + q * axes.e
     inward = np.array([-axes.b[1], axes.b[0], 0.0])  # derivative of the tangent along azimuth, by azimuth
     se = np.sin(e)
@@ -134,7 +75,7 @@ def _velocity(x: np.ndarray) -> tuple[_Axes, np.ndarray, np.ndarray, np.ndarray]
     return axes, velocity, sight, moved
 
 
-def _back(
+def back(
     p: np.ndarray, velocity: np.ndarray, inverse: float, dp: np.ndarray, dv: np.ndarray, ds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """State (6,) of a place p (3,) in units of 1 / `inverse`, and its derivatives, from those of p, velocity and s."""
@@ -142,7 +83,7 @@ def _back(
     u = p / size
     e = np.arcsin(np.clip(u[2], -1.0, 1.0))
     b = np.arctan2(u[1], u[0])
-    axes = _axes(b, e)
+    axes = axes_of(b, e)
     turned = velocity / size
     along = u @ dp / size  # relative change of the size
     du = (dp - np.outer(u, u @ dp)) / size
@@ -163,38 +104,18 @@ def _back(
 
 def step(state: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Modified spherical state (6,) after `dt` s of a straight path, and its Jacobian (6, 6); exact."""
-    axes, velocity, sight, moved = _velocity(state)
+    axes, velocity, sight, moved = velocity_of(state)
     unit = np.zeros(6)
     unit[5] = 1.0
-    found, slope = _back(axes.u + dt * velocity, velocity, state[5], sight + dt * moved, moved, unit)
+    found, slope = back(axes.u + dt * velocity, velocity, state[5], sight + dt * moved, moved, unit)
     found[3] = state[3] + (found[3] - state[3] + np.pi) % (2 * np.pi) - np.pi
     return found, slope
 
 
-def _driven(state: np.ndarray, dt: float, noise: float) -> np.ndarray:
-    """Covariance (6, 6) that white acceleration of density `noise` has put into a state after `dt` s."""
-    if noise == 0.0:
-        return np.zeros((6, 6))
-    axes, velocity, _, _ = _velocity(state)
-    by = np.concatenate([np.eye(3), np.zeros((3, 3))], 1), np.concatenate([np.zeros((3, 3)), np.eye(3)], 1)
-    _, slope = _back(axes.u, velocity, state[5], *by, np.zeros(6))
-    drive = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) * (noise * state[5]) ** 2
-    return slope @ np.kron(drive, np.eye(3)) @ slope.T
-
-
-def _curved(state: np.ndarray, covariance: np.ndarray, dt: float) -> float:
-    """What the second-order term adds to the predicted 1/r: the bias of a filter of the first order."""
-    c = dt * state[:3] + np.array([0.0, 0.0, 1.0])
-    squared = c @ c
-    slope = -dt * c * squared**-1.5
-    bend = dt**2 * (3 * np.outer(c, c) * squared**-2.5 - np.eye(3) * squared**-1.5)
-    return float(0.5 * state[5] * np.trace(bend @ covariance[:3, :3]) + slope @ covariance[:3, 5])
-
-
-def _places(state: np.ndarray, kept: list[int]) -> tuple[np.ndarray, np.ndarray]:
+def places_of_states(state: np.ndarray, kept: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Places (T, d) and their Jacobians (T, d, n) by the state, in the unit of the range."""
-    whole = _whole(state, kept)
-    axes = _axes(whole[:, 3], whole[:, 4])
+    whole = all_six(state, kept)
+    axes = axes_of(whole[:, 3], whole[:, 4])
     distance = 1.0 / whole[:, 5]
     place = distance[:, None] * axes.u
     slope = np.zeros((len(state), 3, 6))
@@ -205,8 +126,8 @@ def _places(state: np.ndarray, kept: list[int]) -> tuple[np.ndarray, np.ndarray]
     return place[:, :d], slope[:, :d][:, :, kept]
 
 
-class _Run(NamedTuple):
-    """What a filter needs: data, and how it starts."""
+class Bearings(NamedTuple):
+    """Bearings of one target by one sensor, and the assumptions about range and radial speed at the start."""
 
     time: np.ndarray
     angles: np.ndarray
@@ -215,8 +136,6 @@ class _Run(NamedTuple):
     kept: list[int]
     gamma: float
     distance: float
-    noise: float
-    remove_bias: bool
 
     @property
     def seen(self) -> list[int]:
@@ -225,18 +144,19 @@ class _Run(NamedTuple):
 
     def cost(self, state: np.ndarray) -> float:
         """Half the weighted sum of squares of the bearings."""
-        left = self._innovation(state[:, self.seen], self.angles[:, : len(self.seen)])
+        left = self.innovation(state[:, self.seen], self.angles[:, : len(self.seen)])
         return float(0.5 * np.sum((left / self.sigma[:, : len(self.seen)])[self.there] ** 2))
 
     @staticmethod
-    def _innovation(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    def innovation(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
+        """Measured less predicted angles, in rad from -pi to pi."""
         return (measured - predicted + np.pi) % (2 * np.pi) - np.pi
 
     def start(self) -> tuple[int, np.ndarray, np.ndarray]:
         """Sample of the second bearing, and the state and covariance there (4)."""
         a, k = np.flatnonzero(self.there)[:2]
         dt = self.time[k] - self.time[a]
-        turned = self._innovation(self.angles[a], self.angles[k]) / dt
+        turned = self.innovation(self.angles[a], self.angles[k]) / dt
         x = np.array([turned[0], turned[1], 0.0, self.angles[k, 0], self.angles[k, 1], 1.0 / self.distance])
         P = np.zeros((6, 6))
         level = max(np.cos(self.angles[k, 1]), STEEP)
@@ -251,16 +171,16 @@ class _Run(NamedTuple):
 
     def _seen_from(self, x: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Angles (T, 2) after t (T,) s of a straight path from the state x (6,), and their derivatives (T, 2, 6)."""
-        axes, velocity, sight, moved = _velocity(x)
+        axes, velocity, sight, moved = velocity_of(x)
         p = axes.u + t[:, None] * velocity
-        at = _axes(np.arctan2(p[:, 1], p[:, 0]), np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
+        at = axes_of(np.arctan2(p[:, 1], p[:, 0]), np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
         dp = (sight + t[:, None, None] * moved) / np.sqrt((p**2).sum(1))[:, None, None]
         slope = np.stack([(at.b[:, None] @ dp)[:, 0] / at.level[:, None], (at.e[:, None] @ dp)[:, 0]], 1)
         return np.stack([np.arctan2(p[:, 1], p[:, 0]), np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))], 1), slope
 
     def _linear(self, t: np.ndarray) -> np.ndarray:
         """State (6,) of the straight path that the lines of sight miss least: linear, so that it needs no start."""
-        u = _axes(self.angles[self.there, 0], self.angles[self.there, 1]).u
+        u = axes_of(self.angles[self.there, 0], self.angles[self.there, 1]).u
         dt = t[self.there] / max(float(np.abs(t).max()), 1e-300)
         across = np.eye(3) - u[:, :, None] * u[:, None, :]
         rows = np.concatenate([across, dt[:, None, None] * across], 2).reshape(-1, 6)
@@ -271,7 +191,7 @@ class _Run(NamedTuple):
         path = path * (np.sign(ahead.sum()) or 1.0)
         size = max(float(np.linalg.norm(path[:3])), 1e-12)
         b, e = np.arctan2(path[1], path[0]), np.arctan2(path[2], np.hypot(path[0], path[1]))
-        axes, velocity = _axes(b, e), path[3:] / size / max(float(np.abs(t).max()), 1e-300)
+        axes, velocity = axes_of(b, e), path[3:] / size / max(float(np.abs(t).max()), 1e-300)
         return np.array([velocity @ axes.b, velocity @ axes.e, velocity @ axes.u, b, e, 1.0])
 
     def straight(self) -> tuple[np.ndarray, np.ndarray]:
@@ -279,7 +199,7 @@ class _Run(NamedTuple):
         k0, first, _ = self.start()
         t = self.time - self.time[k0]
         free = [i for i in self.kept if i != 5]
-        found = [self._climb(x, t, free) for x in (self._linear(t), _whole(first, self.kept))]
+        found = [self._climb(x, t, free) for x in (self._linear(t), all_six(first, self.kept))]
         x, J, _ = min(found, key=lambda f: f[2])
         covariance = np.zeros((6, 6))
         covariance[np.ix_(free, free)] = np.linalg.pinv(J, hermitian=True)
@@ -300,7 +220,7 @@ class _Run(NamedTuple):
         def look(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
             angles, slope = self._seen_from(x, t[there])
             sigma = self.sigma[there][:, columns]
-            left = self._innovation(angles[:, columns], self.angles[there][:, columns]) / sigma
+            left = self.innovation(angles[:, columns], self.angles[there][:, columns]) / sigma
             H = (slope[:, columns][:, :, free] / sigma[..., None]).reshape(-1, len(free))
             J, score = H.T @ H, H.T @ left.ravel()
             rho = free.index(2)
@@ -324,61 +244,40 @@ class _Run(NamedTuple):
                     break
         return x, J, cost
 
-    def _step(self, x: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Predicted state, its Jacobian, and the process noise there."""
-        whole, slope = step(_whole(x, self.kept), dt)
-        Q = _driven(whole, dt, self.noise)
-        own = np.ix_(self.kept, self.kept)
-        return whole[self.kept], slope[own], Q[own]
 
-    def forward(self, reference: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Filtered states (T, n) and covariances; linearised at `reference` (T, n) where there is one.
+def bearings_of(
+    time: np.ndarray, angles: np.ndarray, std: np.ndarray | float, gamma: float, distance: float | None
+) -> Bearings:
+    """The arguments of `bearing_track`, checked; raises `InputError` for times that do not increase, or one bearing."""
+    time, angles = np.asarray(time, float), np.asarray(angles, float)
+    if time.ndim != 1 or angles.shape[:1] != time.shape or not (np.diff(time) > 0).all():
+        raise InputError("bearing_track: times (T,) must increase, angles are (T,) or (T, 2)")
+    if angles.ndim == 2 and angles.shape[1] != 2:
+        raise InputError(
+            f"bearing_track: angles are (T,) azimuths or (T, 2) azimuths and elevations, got {angles.shape}"
+        )
+    flat = angles.ndim == 1
+    wide = np.stack([angles, np.zeros_like(angles)], 1) if flat else angles
+    there = np.isfinite(wide).all(1)
+    if there.sum() < 2:
+        raise InputError(f"bearing_track: {int(there.sum())} bearing(s) give no track; give two or more")
+    first = int(np.flatnonzero(there)[0])
+    given = np.asarray(std, float)
+    sigma = np.broadcast_to(given[:, None] if given.ndim == 1 else given, (len(angles), 2))[first:]
+    kept = PLANE if flat else list(range(6))
+    return Bearings(
+        time[first:], wide[first:], there[first:], sigma, kept, gamma, 1.0 if distance is None else distance
+    )
 
-        Samples before the start are those of its own path.
-        """
-        k0, x, P = self.start()
-        n, T = len(x), len(self.time)
-        states, covariances = np.full((T, n), np.nan), np.zeros((T, n, n))
-        states[k0], covariances[k0] = x, P
-        H = np.eye(n)[self.seen]
-        for k in range(k0 + 1, T):
-            dt = self.time[k] - self.time[k - 1]
-            at = states[k - 1] if reference is None else reference[k - 1]
-            moved, F, Q = self._step(at, dt)
-            x = moved + F @ (states[k - 1] - at)
-            P = F @ covariances[k - 1] @ F.T + Q
-            if reference is None and self.remove_bias:
-                whole = np.zeros((6, 6))
-                whole[np.ix_(self.kept, self.kept)] = covariances[k - 1]
-                x[-1] += _curved(_whole(at, self.kept), whole, dt)
-            if self.there[k]:
-                R = np.diag(self.sigma[k, : len(self.seen)] ** 2)
-                K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
-                x = x + K @ self._innovation(x[self.seen], self.angles[k, : len(self.seen)])
-                P = (np.eye(n) - K @ H) @ P @ (np.eye(n) - K @ H).T + K @ R @ K.T
-            states[k], covariances[k] = x, P
-        for k in range(k0 - 1, -1, -1):
-            states[k], F, _ = self._step(states[k + 1], self.time[k] - self.time[k + 1])
-            covariances[k] = F @ covariances[k + 1] @ F.T
-        return states, covariances
 
-    def backward(
-        self, filtered: np.ndarray, covariances: np.ndarray, reference: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Smoothed states (T, n) and covariances, from filtered ones (Rauch, Tung, Striebel)."""
-        k0, _, _ = self.start()
-        states, spreads = filtered.copy(), covariances.copy()
-        for k in range(len(self.time) - 2, -1, -1):
-            dt = self.time[k + 1] - self.time[k]
-            if k < k0:
-                states[k], F, _ = self._step(states[k + 1], -dt)
-                spreads[k] = F @ spreads[k + 1] @ F.T
-                continue
-            at = filtered[k] if reference is None else reference[k]
-            moved, F, Q = self._step(at, dt)
-            mean, P = moved + F @ (filtered[k] - at), F @ covariances[k] @ F.T + Q
-            size = np.sqrt(np.maximum(np.diagonal(P), 1e-300))
-            G = (np.linalg.pinv(P / np.outer(size, size), hermitian=True) / np.outer(size, size) @ F @ covariances[k]).T
-            states[k] = filtered[k] + G @ (states[k + 1] - mean)
-            spreads[k] = covariances[k] + G @ (spreads[k + 1] - P) @ G.T
-        return states, spreads
+def track_of(bearings: Bearings, state: np.ndarray, covariance: np.ndarray) -> SensorTrack:
+    """The track of states (T, n) in modified coordinates and their covariances (T, n, n)."""
+    place, jacobian = places_of_states(state, bearings.kept)
+    spread = jacobian @ covariance @ jacobian.mT
+    return SensorTrack(bearings.time, state, covariance, place, spread, bearings.cost(state))
+
+
+def straight_track(time: np.ndarray, angles: np.ndarray, std: np.ndarray | float) -> SensorTrack:
+    """The straight path at constant speed that fits all bearings best; arguments as in `doa.bearing_track`."""
+    bearings = bearings_of(time, angles, std, GAMMA, None)
+    return track_of(bearings, *bearings.straight())

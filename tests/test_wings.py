@@ -1,0 +1,81 @@
+"""The core imports no wing, and does without each: what it leaves out, and what it says."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from without_wings import ROOT, package_without
+
+import probcal
+from probcal.status import Status
+from probcal.wings import COMMANDS, NAMES, PICTURES, WINGS, WingMissing, installed, loaded
+
+ALONE = """
+import contextlib, importlib, io, pkgutil, sys
+import numpy as np
+import pytest
+import probcal as pc
+from probcal import sensors
+for module in pkgutil.walk_packages(pc.__path__, "probcal."):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+from probcal.cli import main
+sys.argv = ["probcal", "--help"]
+with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
+    main()
+nodes = [pc.Node(name, place, scale={"position": 1.0}) for name, place in (("a", (0, 0)), ("b", (9, 0)), ("c", (0, 9)))]
+network, motion = pc.Network([sensors.ranger.on(node) for node in nodes]), pc.ConstantVelocity(1.0)
+path = np.stack([np.linspace(1, 8, 8), np.linspace(2, 5, 8)], 1)
+run = pc.simulate(network, motion, np.arange(8.0), key=1, tracks={"t": path})
+print(pc.__file__, pc.fit(pc.Problem(network, motion, run.table), pc.EA()).attrs["status"])
+print(*pc.__all__, *pc.plots.__all__, *said.getvalue().split())
+sys.exit(pytest.main(sys.argv_of_tests))
+"""
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("wing", WINGS)
+def test_the_core_does_without_a_wing(wing, tmp_path):
+    """All that is left is imported, says its help, fits, and collects its tests."""
+    environment = os.environ | {"PYTHONPATH": str(package_without(tmp_path, wing))}
+    quickly = ["--collect-only", "-qq", "-n", "0", "-p", "no:cacheprovider", "--assert=plain"]
+    tests = [str(ROOT / "tests"), "-c", str(ROOT / "pyproject.toml"), *quickly]
+    code = ALONE.replace("sys.argv_of_tests", repr(tests))
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment, check=False,
+        timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    where, names = done.stdout.splitlines()[:2]
+    assert where.split()[0] == str(tmp_path / "probcal" / "__init__.py")
+    assert where.removeprefix(where.split()[0] + " ") in set(Status)
+    gone = [
+        name for table in (NAMES, PICTURES) for home, own in table.items() if of(home, wing) for name in own.split()
+    ]
+    gone += [name for name, home in COMMANDS.items() if of(home, wing)]
+    assert not set(gone) & set(names.split())
+
+
+def of(module, wing):
+    return module.split(".")[1] == wing
+
+
+def test_what_is_of_a_wing_that_is_missing_says_so(monkeypatch):
+    monkeypatch.setattr("probcal.wings.WINGS", (*WINGS, "sails"))
+    assert not installed("probcal.sails.canvas")
+    monkeypatch.setitem(probcal._homes, "hoist", "probcal.sails.canvas")
+    with pytest.raises(WingMissing, match=r"^hoist needs the folder probcal/sails, which is not installed$"):
+        probcal.hoist  # noqa: B018
+    with pytest.raises(ImportError, match="the folder probcal/sails, which is not installed"):
+        from probcal import hoist  # noqa: F401
+    assert loaded("probcal.labels", "labels").__name__ == "probcal.labels"
+
+
+def test_every_wing_is_a_folder_of_the_package():
+    """`WINGS` lists them all; one that is missing here was taken out on purpose."""
+    folders = {path.parent.name for path in Path(probcal.__file__).parent.glob("*/__init__.py")}
+    assert folders >= {wing for wing in WINGS if installed(f"probcal.{wing}")}
+    homes = {home.split(".")[1] for table in (NAMES, PICTURES) for home in table}
+    assert homes | {home.split(".")[1] for home in COMMANDS.values()} <= set(WINGS)
