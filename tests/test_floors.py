@@ -247,6 +247,7 @@ def test_only_linalg_factorises(module):
     assert not found, f"{module}: {'; '.join(found)}: factorisations belong into linalg.py"
 
 
+@pytest.mark.needs(*WINGS)
 def test_every_mutation_still_has_its_line():
     """The table of `mutations.py` follows the code: each old text stands in the package once."""
     lost = [m.old for m in MUTATIONS if len(places(m)) != 1]
