@@ -212,7 +212,7 @@ def test_one_scan_is_drawn_exactly():
     assert (np.abs(found - p) <= SIGMAS * np.sqrt(p / 20_000) + 1e-4).all()
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plain", "crossing"])
 def test_draws_have_the_posterior_of_all_associations(name):
     """Some 40 expectations of 2800 draws within 5 Monte Carlo errors: false alarm 2e-5."""
@@ -352,7 +352,7 @@ def test_with_bent_sensors_draws_have_the_density_that_is_declared():
 # the verb
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_associations_objects_and_biases_are_sampled_together():
     """Which rows belong together, by the public verb, within 5 Monte Carlo errors: false alarm 1e-5."""
     e = enumerated("crossing")

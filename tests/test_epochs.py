@@ -132,7 +132,7 @@ def test_later_rows_that_are_none_are_refused():
         problem.later(table.tail(1).assign(target="plane", time=9.0))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_the_density_of_a_step_is_that_of_its_draws():
     """`log_step` against the moments of the motion; a motion without density is refused."""
     problem = worlds.linear("plane")[0]
@@ -156,7 +156,7 @@ def test_the_density_of_a_step_is_that_of_its_draws():
             singular.log_step(x, x, epoch, levels)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_steps_have_the_moments_of_the_motion():
     """Mean and covariance of 4000 drawn steps; false alarms 1e-6 by normal limits."""
     problem = worlds.linear("mixed")[0]

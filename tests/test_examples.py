@@ -43,7 +43,7 @@ def names(tmp_path_factory):
     }  # fmt: skip
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_intervals_of_the_example_hold_the_truth_as_often_as_they_say(names):
     """Of 40 intervals of 89 % in 20 recordings 31 or more hold it: false-alarm rate 1 % (binomial)."""
     network, motion, biases, path = (names[name] for name in ("network", "motion", "biases", "path"))

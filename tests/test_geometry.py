@@ -67,7 +67,7 @@ def test_what_is_no_rotation_is_refused(given, says):
         attitude(given)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension", [1, 2, 3])
 def test_a_length_has_a_slope_everywhere_and_hides_no_gap(dimension):
     vector = np.random.default_rng(0).normal(size=dimension)

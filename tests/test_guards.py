@@ -312,7 +312,7 @@ def test_a_search_that_never_moved_is_refused_and_one_at_the_mode_is_not():
         assert Status(probcal.fit(problem, method, start=resting(problem)).attrs["status"]).settled
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_the_promise_of_a_step_is_what_it_keeps_on_a_linear_problem():
     """A step to the mode of a quadratic cost promises the whole decrease: where it is refused, that tells why."""
     problem, _ = linear("plane")

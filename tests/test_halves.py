@@ -30,7 +30,7 @@ def assessed(form, problem):
     return pc.assess(problem, pc.fit(problem, pc.MAP(form=form), prior=pc.Gaussian()))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 @pytest.mark.parametrize("names", [(), ("b", "e")], ids=["still", "two drift"])
 def test_halves_are_those_of_the_dense_form(library, names, monkeypatch):

@@ -190,7 +190,7 @@ def test_other_data_take_the_place_of_the_tables():
             seeded({"y_radar": np.zeros(3)})
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_autoguides_and_log_likelihoods_of_numpyro_take_it():
     problem = small()
     with jax.enable_x64(True), jax.numpy_rank_promotion("allow"):  # numpyro's guides promote ranks
@@ -314,7 +314,7 @@ def test_numpyros_kernels_and_guides_agree_with_the_samplers_from_a_start():
     assert set(az.summary(tree, var_names=["bias"]).index) == {f"bias[{label}]" for label in problem.labels}
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_guide_of_full_rank_from_a_start_has_the_moments_of_the_posterior():
     problem = small()
     own = az.extract(probcal.fit(problem, probcal.NUTS(draws=500), prior=Gaussian(), key=1), var_names="bias").values

@@ -201,6 +201,7 @@ def test_rows_of_one_time_may_come_one_by_one():
     np.testing.assert_allclose(together.biases["sd"], alone.biases["sd"], rtol=1e-9)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("lag", "chunk"), [(0, 1), (0, 7), (8, 3)])
 def test_rows_at_common_epochs_are_those_of_their_times(lag, chunk):
     frame = rows()
@@ -246,6 +247,7 @@ def test_a_target_that_is_silent_gives_up_its_slot():
         online.update(pd.concat([frame.assign(target=name, time=frame["time"] + 100.0) for name in "efg"]))
 
 
+@pytest.mark.ci
 def test_a_jump_is_what_a_further_state_of_the_filter_says():
     one = rows("a", 0.0)
     online = filtered(pc.AugmentedFilter(lag=0, jumps=pc.Jumps(within=1e4, starts=1, false_alarms=1e-9)), one[:15], 15)
@@ -283,6 +285,7 @@ def jumping(size):
     return frame.assign(east=frame["east"] + np.where(later, size, 0.0))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("lag", [0, 8])
 def test_a_jump_is_found_soon_and_none_where_there_is_none(lag):
     method = pc.AugmentedFilter(lag=lag, jumps=pc.Jumps(within=40.0))
@@ -313,6 +316,7 @@ def test_a_window_of_everything_ends_at_the_batch_answer():
     np.testing.assert_allclose(online.biases["sd"], group["sd"].values, rtol=2e-3)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "name", [name if name == "mixed" else pytest.param(name, marks=pytest.mark.ci) for name in worlds.LINEAR]
 )
@@ -361,6 +365,7 @@ def test_a_plain_filter_says_where_a_target_was_not_placed():
         assert pc.Online(network_, motion, pc.AugmentedFilter(lag=lag)).update(first).settled is settled
 
 
+@pytest.mark.ci
 def test_a_killed_filter_goes_on_as_if_it_had_not_been():
     frame = rows()
     for method in (pc.AugmentedFilter(lag=8), pc.ParticleFilter(50), pc.AugmentedFilter(lag=0, jumps=pc.Jumps())):
@@ -547,6 +552,7 @@ GOOD = {  # members of which other values make a filter: counts, times and what 
 }  # fmt: skip
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "method", [pc.AugmentedFilter(lag=8, jumps=pc.Jumps()), pc.ParticleFilter(20)], ids=["augmented", "particles"]
 )
@@ -567,6 +573,7 @@ def test_a_changed_state_is_one_sentence_or_as_good(method):
     assert refused[False] < 20  # of another version, or of something else
 
 
+@pytest.mark.ci
 def test_sparse_priors_are_laid_on_what_was_filtered():
     whole = pc.Problem(network(), MOTION, rows())
     online = filtered(pc.AugmentedFilter(lag=0))
@@ -611,6 +618,7 @@ def test_biases_that_a_calibration_held_stay_held():
     assert other.arrivals.fixed == {"n0.shift": 0.5, "n0.lift": 0.5}
 
 
+@pytest.mark.ci
 def test_the_tree_serves_track_and_a_further_stream(tmp_path):
     online = filtered(pc.AugmentedFilter(lag=0))
     tree = pc.load(pc.save(online.tree(), tmp_path / "fit.nc"))
@@ -625,6 +633,7 @@ def test_the_tree_serves_track_and_a_further_stream(tmp_path):
     assert (further.biases["sd"] < online.biases["sd"]).all()
 
 
+@pytest.mark.ci
 def test_particles_approach_the_exact_filter():
     one = rows("a")[:9]
     exact = filtered(pc.AugmentedFilter(lag=0), one).biases
@@ -698,6 +707,7 @@ def test_blank_rows_are_no_rows():
     pd.testing.assert_frame_equal(online.biases, other.biases)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("method", [pc.AugmentedFilter(lag=0), pc.ParticleFilter(50)], ids=["augmented", "particles"])
 def test_the_last_rows_of_a_tree_are_those_that_say_something(method):
     frame = rows()
@@ -899,6 +909,7 @@ def test_a_header_that_cannot_be_meant_is_one_sentence():
         online.update(kilometres)
 
 
+@pytest.mark.ci
 def test_robust_channels_refuse_sentinels_too():
     network_ = pc.Network([robust.on(pc.Node(f"n{k}", (10.0 * k, 5.0))) for k in range(3)])
     frame = pc.simulate(network_, MOTION["a"], np.arange(20.0), key=1).table
@@ -912,6 +923,7 @@ def dated(frame, start="2026-01-01T00:00Z"):
     return frame.assign(time=pd.Timestamp(start) + pd.to_timedelta(frame["time"], unit="s"))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("times", [lambda d: d, dated], ids=["seconds", "dates"])
 @pytest.mark.parametrize("epoch", [None, 2.0])
 def test_rows_that_a_fit_has_counted_are_refused(times, epoch):
@@ -927,6 +939,7 @@ def test_rows_that_a_fit_has_counted_are_refused(times, epoch):
     assert whole.update(dated(frame, "2027-03-01T00:00Z")).refused.empty
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("times", [lambda d: d, dated], ids=["seconds", "dates"])
 def test_rows_that_a_stream_has_counted_are_refused_far_back(times, monkeypatch):
     monkeypatch.setattr("probcal.inference.online.RECENT", 8)

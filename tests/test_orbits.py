@@ -50,6 +50,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_an_orbit_is_a_group_that_leaves_what_the_sensors_see(case):
     problem, _, made, orbits = posed(*case)
@@ -74,7 +75,7 @@ def test_an_orbit_is_a_group_that_leaves_what_the_sensors_see(case):
                     np.testing.assert_allclose(np.sin(gone) if d == 2 else gone, 0.0, atol=1e-9)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_its_volume_is_the_determinant_of_its_derivative(case):
     problem, _, made, orbits = posed(*case)
@@ -111,13 +112,14 @@ def made_volume(problem, made, theta, orbit, r):
     return float(volume(problem.model, made.frame, moved) - volume(problem.model, made.frame, theta))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "prior", "runs"),
     [
         ((2, False, False), Horseshoe(), 1000),
         pytest.param((3, False, True), Horseshoe(), 400, marks=pytest.mark.slow),
-        pytest.param((2, False, False), probcal.Gaussian(), 1000, marks=pytest.mark.ci),
-        pytest.param((2, False, False), ARD(2.0, 2.0, by="node"), 1000, marks=pytest.mark.ci),
+        pytest.param((2, False, False), probcal.Gaussian(), 1000, marks=pytest.mark.slow),
+        pytest.param((2, False, False), ARD(2.0, 2.0, by="node"), 1000, marks=pytest.mark.slow),
         pytest.param((2, False, False), Laplace(), 1000, marks=pytest.mark.slow),
     ],
 )

@@ -85,6 +85,7 @@ def same(found, exact, *, shift, ratio):
     assert (np.abs(np.log(mine["sd"] / theirs["sd"])) < np.log(ratio)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("m_step", ["averaged", "mean", "paths"])
 def test_em_by_particles_ends_where_the_exact_answer_is(linear, m_step):
     """One run of 60 iterations each; the noise of 400 particles is below 0.1 sd, the limit three times that."""
@@ -205,6 +206,7 @@ def test_the_first_path_is_a_draw_like_any_other():
     assert 0.7 < (z**2).mean() < 1.35
 
 
+@pytest.mark.ci
 def test_the_state_that_stands_for_particles_on_a_road_is_like_them_in_all_it_is():
     """Not only in its place: no further, in sd, than particles are on average, however uneven their weights."""
     network, motion = offsets(), crossing("road")
@@ -352,8 +354,9 @@ def crossing(kind):
     return (road if kind == "road" else LeavingRoad(road, 0.5, 0.05, 0.05)) + RandomWalk("power", "dB", 0.5, (4.0, 2.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind", [pytest.param("leaving", marks=pytest.mark.ci), pytest.param("road", marks=pytest.mark.slow)]
+    "kind", [pytest.param("leaving", marks=pytest.mark.slow), pytest.param("road", marks=pytest.mark.slow)]
 )
 def test_a_network_is_calibrated_from_targets_on_roads(kind):
     """Two targets at times of their own; the places of two sensors, 3 sd about the truth (NEES below 3 in 1e-4)."""
@@ -431,7 +434,7 @@ def test_what_particles_cannot_is_said(linear, call, text):
         call(linear[0])
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_particle_gibbs_and_nuts_agree_on_yes_and_no():
     """Presence sensors beside a way: means within 0.35 sd, sds within 20 %, of some hundred effective draws each."""
     sys.path.insert(0, str(ROOT / "models"))
@@ -448,7 +451,7 @@ def test_particle_gibbs_and_nuts_agree_on_yes_and_no():
     same(gibbs, nuts, shift=0.35, ratio=1.2)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_the_command_line_fits_and_tracks_by_particles(tmp_path):
     model = str(ROOT / "models" / "road_microphones.py")
     base = [sys.executable, "-m", "probcal.cli"]
@@ -473,7 +476,7 @@ def test_the_command_line_fits_and_tracks_by_particles(tmp_path):
     assert '--smoother "particle" is not known' in done.stderr
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_study_takes_methods_by_particles_and_refuses_others_on_roads():
     sys.path.insert(0, str(ROOT / "models"))
     import road_microphones

@@ -75,7 +75,7 @@ def test_slice_steps_leave_a_density_alone():
     assert np.corrcoef(start, moved)[0, 1] < 0.5, "it moves"
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("prior", [*PRIORS, BernoulliGaussian()], ids=lambda p: f"{type(p).__name__}-{p}"[:24])
 def test_updates_leave_the_joint_prior_of_scales_and_biases_alone(prior):
     """phi from its prior and z given phi; phi updated given z must have the prior's law again (Geweke 2004)."""

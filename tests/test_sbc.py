@@ -256,7 +256,7 @@ def test_other_measured_values():
 # verdicts
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_method_that_is_exact_is_uniform():
     """MAP on a linear network, 40 runs; coverage within 4 standard errors."""
     tree = sbc(linear(), MAP(), prior=Gaussian(), runs=40, threads=2)
@@ -275,7 +275,7 @@ def test_noise_taken_20_per_cent_too_small_is_caught():
     assert "not uniform: log likelihood" in tree.attrs["verdict"]
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_coverage_under_another_prior():
     """EA learns its precisions; truths that are mostly zero: the non-zero ones are counted apart."""
     tree = sbc(linear(), EA(), prior=None, runs=12, simulate_from=BernoulliGaussian(share=0.3), threads=2)
@@ -391,7 +391,7 @@ def fitted():
     return problem, fit(problem, MAP(), prior=Gaussian(), save=("states",))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_around_the_data(fitted):
     """Truths from the posterior, every row measured twice: uniform for an exact method, from data or from a fit."""
     problem, tree = fitted

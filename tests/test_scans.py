@@ -70,7 +70,7 @@ def test_it_follows_the_backend_unless_told(monkeypatch):
     assert not scans.in_parallel()
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_fit_with_epochs_in_parallel_is_the_same(monkeypatch):
     """Means and sds of all biases to 1e-8 sds."""
     problem, _ = worlds.linear("plane")

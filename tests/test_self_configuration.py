@@ -69,7 +69,7 @@ def check(tree, biases):
         assert abs(mean - value) < 4 * sd, label
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_radar_turned_anyhow_and_far_from_where_it_is_stated():
     """Hundreds of metres off, its heading anywhere: the biases within four sds, in one round or two."""
     biases = {"east.position_x": -320.0, "east.position_y": 410.0, "east.heading": 2.4}

@@ -239,7 +239,7 @@ def test_products_that_are_not_positive_or_do_not_end_are_no_answer(monkeypatch)
         by_products(A, 20, members).draw(np.random.default_rng(0), 1)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("least", [1e-3, 1e-5, 1e-7])
 def test_draws_resolve_directions_that_data_leave_to_a_wide_prior(least, monkeypatch):
     """Of a spectrum with a tail towards zero: a root to 0.1 %, a log determinant to 1e-4 nats, also in few columns.

@@ -30,6 +30,7 @@ def density_of(problem, point):
     return JointDensity.of(problem.model, joint, point, variables_of(joint, point))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("made", [drawn, pytest.param(drawn_in_space, marks=pytest.mark.ci)])
 def test_the_joint_density_is_that_of_its_point_and_its_slope_that_of_differences(made):
     """Of moving targets, one at rest, bent sensors, in 2-D and 3-D: value to 1e-9, slope to 1e-5 of differences."""
@@ -49,6 +50,7 @@ def test_the_joint_density_is_that_of_its_point_and_its_slope_that_of_difference
             assert slope[k] == pytest.approx(other, rel=1e-5, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plane", "extras", "drifting"])
 def test_nothing_is_beside_the_gaussian_of_a_linear_world(name):
     """The rest is zero wherever one looks, and every turn is taken."""
@@ -64,6 +66,7 @@ def test_nothing_is_beside_the_gaussian_of_a_linear_world(name):
         assert np.abs(density.rest(at)[1]).max() < 1e-6 * np.abs(density.matrix).max()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 @pytest.mark.parametrize("name", ["plane", "drifting"])
 def test_draws_of_a_linear_world_have_its_exact_moments(name, library):
@@ -89,7 +92,7 @@ def test_draws_of_a_linear_world_have_its_exact_moments(name, library):
         np.testing.assert_allclose(other["sd"].values[free] / one["sd"].values[free], 1.0, atol=5 * error)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("prior", [pc.Horseshoe(), pc.Gaussian()], ids=["horseshoe", "gaussian"])
 def test_the_density_of_a_draw_is_the_joint_one_at_its_point(prior):
     """To 1e-9: what simulation-based calibration ranks a truth by."""
@@ -149,6 +152,7 @@ def bent(target, pose, *, gain=pc.Bias("1", 1.0)):
     return dict(level=norm(pose.local(target.position)) * jnp.exp(gain))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("away", [0.0, 0.6])
 def test_a_bias_that_bends_what_is_measured_has_its_posterior(away):
     """One bias, known targets: mean and sd by quadrature within 5 standard errors, wherever the Gaussian is taken."""
@@ -228,6 +232,7 @@ def chains_of(problem, method, joint):
     return _SparseChains(method, form, first, problem.model, joint, mode.system, jax.random.key(0))
 
 
+@pytest.mark.ci
 def test_draws_of_states_that_take_much_room_are_not_kept(monkeypatch):
     """Their moments are, the same as with them; draws of states are refused in one sentence."""
     problem = drawn()[0]
@@ -246,6 +251,7 @@ def test_draws_of_states_that_take_much_room_are_not_kept(monkeypatch):
         pc.fit(problem, Gibbs(**SHORT), save=("states",))
 
 
+@pytest.mark.slow
 def test_an_interrupted_longer_run_leaves_the_draws_before_it():
     """Stopped in the first longer chunk: draws, tracks and gamma are those of a run without patience."""
     problem = worlds.linear("plane")[0]
@@ -277,6 +283,7 @@ def test_a_chain_leaves_where_the_model_has_no_density():
         assert not np.array_equal(at, density.at)
 
 
+@pytest.mark.ci
 def test_chains_that_take_no_turn_are_no_answer(monkeypatch):
     turned = _Given.turned
 
