@@ -36,8 +36,8 @@ def place_new(
 ) -> tuple[jax.Array, jax.Array]:
     """State (n,) whose place explains the epochs (FIRST leading) of a target best; the first has its start.
 
-    And which data (D,) of the first lie beyond the gate about that place, and about the one near it that explains the
-    first best: the target moves on.
+    And which data (D,) of the first lie beyond the gate both about that place and about the one that explains the first
+    best: the target moves on.
     """
     move = jax.tree.map(lambda leaf: leaf[0], epochs.move[r])
     resting, entries = move.drift, jnp.arange(*span)
@@ -56,11 +56,14 @@ def place_new(
         off, slope = jax.vmap(of)(some)
         return off.ravel(), slope.reshape(off.size, -1)
 
-    def loss(place: jax.Array, some: Epoch) -> jax.Array:
+    def loss(place: jax.Array, some: Epoch) -> tuple[jax.Array, jax.Array]:
+        """Of all epochs and of the first alone."""
         off, _ = terms(place, some, slopes=False)
         known = 0.5 * jnp.sum(((place - resting[entries]) / spread) ** 2)
-        total = jnp.sum(0.5 * (ROBUST + 1) * jnp.log1p(off**2 / ROBUST)) + known
-        return jnp.where(jnp.isfinite(total), total, jnp.inf)
+        each = 0.5 * (ROBUST + 1) * jnp.log1p(off**2 / ROBUST)
+        totals = jnp.sum(each) + known, jnp.sum(each[: off.size // some.recursion.size]) + known
+        whole, alone = (jnp.where(jnp.isfinite(total), total, jnp.inf) for total in totals)
+        return whole, alone
 
     def refined(place: jax.Array, value: jax.Array, some: Epoch) -> jax.Array:
         def better(carry: tuple, _: None) -> tuple:
@@ -72,7 +75,7 @@ def place_new(
             pull = slope.T @ (weight * off) - (place - resting[entries]) / spread**2
             damped = information + damping * jnp.diag(jnp.diagonal(information))
             after = place + linalg.solve_positive(damped, pull)
-            lower = loss(after, some)
+            lower, _ = loss(after, some)
             good = lower < value
             state = (
                 jnp.where(good, after, place),
@@ -84,12 +87,12 @@ def place_new(
         return jax.lax.scan(better, (place, value, jnp.asarray(1e-3)), None, length=REFINED)[0][0]
 
     tried = jnp.concatenate([tried, resting[entries][None]])
-    losses = jax.lax.map(lambda place: loss(place, epochs), tried, batch_size=AT_ONCE)
-    best = jnp.argmin(losses)
+    losses, alone = jax.lax.map(lambda place: loss(place, epochs), tried, batch_size=AT_ONCE)
+    best, nearest = jnp.argmin(losses), jnp.argmin(alone)
     place = refined(tried[best], losses[best], epochs)
     if not odds:
         return about(place).x, jnp.zeros(0, bool)
-    near = refined(place, loss(place, first), first)
+    near = refined(tried[nearest], alone[nearest], first)
     low, high = limits(model, jax.tree.map(lambda leaf: leaf[0], first), r, given.levels, odds)
     far = [(off < low) | (off > high) for off, _ in (terms(at, first, slopes=False) for at in (place, near))]
     return about(place).x, far[0] & far[1]
