@@ -226,6 +226,7 @@ def test_the_state_that_stands_for_particles_on_a_road_is_like_them_in_all_it_is
     assert (np.sum(off**2 / np.maximum(variance, 1e-12), 1) <= mean.shape[1] + 1e-6).all()
 
 
+@pytest.mark.ci
 def test_particle_gibbs_draws_the_exact_posterior(linear):
     problem, exact = linear
     found = fit(problem, ParticleGibbs(chains=2, warmup=100, draws=500, particles=Particles(60)), prior=Gaussian())
@@ -236,6 +237,7 @@ def test_particle_gibbs_draws_the_exact_posterior(linear):
     assert float(stats["acceptance_rate"].mean()) > 0.2
 
 
+@pytest.mark.ci
 def test_a_run_of_particle_gibbs_goes_on_where_it_was_stopped(linear, tmp_path):
     """The draws of a run in two pieces are those of one run."""
     problem, _ = linear
@@ -255,6 +257,7 @@ def test_a_run_of_particle_gibbs_goes_on_where_it_was_stopped(linear, tmp_path):
     np.testing.assert_array_equal(whole["posterior"]["bias"], again["posterior"]["bias"])
 
 
+@pytest.mark.ci
 def test_em_ea_by_particles_prunes_what_is_zero(linear):
     problem, _ = linear
     found = fit(problem, EMEA(Particles(100), iterations=20))
@@ -262,7 +265,7 @@ def test_em_ea_by_particles_prunes_what_is_zero(linear):
     assert ((found["calibration"]["gamma"] >= 0) & (found["calibration"]["gamma"] <= 1)).all()
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_an_unknown_noise_level_is_found_by_particles():
     """sd of a level from 24 data of two axes and three sensors is 9 %; limits four of them, false alarms below 1e-3."""
     network, motion = offsets(), Target(ConstantVelocity(Unknown(0.2, 5.0)), START)
@@ -274,6 +277,7 @@ def test_an_unknown_noise_level_is_found_by_particles():
     assert abs(np.log(by_particles / exact)) < 0.3
 
 
+@pytest.mark.ci
 def test_filtered_and_smoothed_particles_are_a_tree(linear, tmp_path):
     """Weights sum to one, means are those of the smoother, and the likelihood is exact within four of its errors."""
     problem, exact = linear

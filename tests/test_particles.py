@@ -198,6 +198,7 @@ def near(drawn, exact, slack=0.0, errors=5.0):
 # evidence
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("name", "proposal"),
     [("linear", "bootstrap"), ("linear", "extended"), pytest.param("joint", "auto", marks=pytest.mark.ci)],
@@ -230,7 +231,7 @@ def test_the_evidence_of_a_scene_that_is_not_linear_is_that_of_quadrature(propos
     assert abs(ratio.mean() - 1) < 4.5 * ratio.std(ddof=1) / np.sqrt(len(ratio))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_heavy_tails_have_one_evidence_by_either_proposal():
     """1,000 filters of 300 particles each way: sees 10 % between them; false alarms 1e-5."""
     problem, found = wild(), []
@@ -249,13 +250,14 @@ def test_heavy_tails_have_one_evidence_by_either_proposal():
 
 
 BOTH = [("linear", "backward"), ("linear", "marginal"), ("glider", "backward"), ("joint", "marginal")]
+FEW = [pytest.param(*pair, marks=() if pair == BOTH[0] else pytest.mark.ci) for pair in BOTH]
 OTHERS = [
-    pytest.param(name, smoother, marks=pytest.mark.ci)
+    pytest.param(name, smoother, marks=pytest.mark.slow)
     for name in ("linear", "glider", "joint") for smoother in SMOOTHERS if (name, smoother) not in BOTH
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "smoother"), [*BOTH, *OTHERS])
+@pytest.mark.parametrize(("name", "smoother"), [*FEW, *OTHERS])
 def test_smoothed_means_and_sds_are_exact(name, smoother):
     """200 runs of 200 particles; rows missing, epochs without any, targets of unequal length, two recursions.
 
@@ -348,12 +350,13 @@ def steps_of(before, after, epoch):
     return {"place": new[0, 0], "product": later * new[0, 0] * old[0, 0], "step": later * (new[0] - old[0])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("smoother", "draws"),
     [
         ("backward", 2),
-        pytest.param("backward", 1, marks=pytest.mark.ci),
-        pytest.param("exact", 2, marks=pytest.mark.ci),
+        pytest.param("backward", 1, marks=pytest.mark.slow),
+        pytest.param("exact", 2, marks=pytest.mark.slow),
     ],
 )
 def test_a_sum_smoothed_on_the_way_is_exact(smoother, draws):
@@ -391,6 +394,7 @@ def test_a_sum_smoothed_on_the_way_is_exact(smoother, draws):
 # conditional filters
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("name", "proposal"), [("linear", "extended"), ("linear", "bootstrap")])
 def test_a_kernel_leaves_exact_paths_exact(name, proposal):
     """20,000 paths of the exact posterior, four steps of 4 particles each: means, variances, products of neighbours.
@@ -469,6 +473,7 @@ def renewed(targets, key, how, runs):
     return jax.lax.map(one, jax.random.split(key, runs), batch_size=500)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("made", "proposal"),
     [(restless, "auto"), (ranging, "laplace"), pytest.param(ranging, "auto", marks=pytest.mark.ci)],
@@ -510,6 +515,7 @@ def expectations(model, targets, z, levels, key, how, runs):
     return jax.lax.map(one, jax.random.split(key, runs), batch_size=10)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["linear", "glider"])
 def test_score_information_and_slope_are_those_of_the_marginal_likelihood(name):
     """Fisher's and Louis' identities: 100 runs of 300 particles against the dense evidence, which is quadratic in z.
@@ -673,6 +679,7 @@ def test_places_fall_on_particles_with_weight():
 # targets
 
 
+@pytest.mark.ci
 def test_targets_hold_every_row_once_and_find_back_to_their_epochs():
     """Two worlds, and one whose second target has a single epoch."""
     w = world("linear")

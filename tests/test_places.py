@@ -70,7 +70,9 @@ def offset(world):
     return float(drawn.mean()), float(drawn.std())
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.ci), pytest.param(2, marks=pytest.mark.ci)])
+@pytest.mark.parametrize(
+    "seed", [pytest.param(0, marks=pytest.mark.ci), *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 def test_tags_that_one_or_two_hear_are_integrated(seed, monkeypatch):
     """Rings and pairs of places: MAP is the mode of a grid, from which Laplace's formula is far."""
     world = tags(seed, hears=[1, 2] * 8)
@@ -94,6 +96,7 @@ def consistent(problem, z=None):
     return find_mode(model, start, flat, 200, 1e-10, joint=z is None).point
 
 
+@pytest.mark.ci
 def test_the_slope_is_that_of_the_height():
     """Central differences of what is added, over the offset."""
     problem = pc.Problem(*tags(3, hears=[1, 2, 3]))
@@ -139,6 +142,7 @@ def test_a_linear_problem_gains_nothing():
         np.testing.assert_allclose(getattr(found, name), 0.0, atol=2e-3, err_msg=name)
 
 
+@pytest.mark.ci
 def test_a_tag_that_all_hear_well_is_left_to_laplace():
     """Where many see a place sharply there is nothing to add, nor where the target moves or is known."""
     rng = np.random.default_rng(0)
@@ -175,7 +179,7 @@ def line_of_anchors(seed=3):
     return pc.Problem(network, motion, pd.DataFrame(rows), fix=["*.offset"])
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_the_other_side_is_seen_where_places_are_integrated():
     problem = line_of_anchors()
     tree = pc.assess(problem, pc.fit(problem, pc.MAP()))
@@ -185,7 +189,7 @@ def test_the_other_side_is_seen_where_places_are_integrated():
     assert tree["verdict"]["verdict"].sel(bias_label="a2.position_y") == "weak"
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_tree_with_integrated_places_is_judged_alike_with_and_without_its_answer():
     network, motion, table = tags(0, [2, 3, 2, 3, 1, 2])
     problem = pc.Problem(network, motion, table)
