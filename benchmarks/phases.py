@@ -343,7 +343,7 @@ def main() -> None:
         "--functions", type=int, default=0, metavar="N", help="list the N functions with the most processor seconds"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all measurements there")
-    parser.add_argument("--limit", type=float, default=1800, help="seconds of one fit")
+    parser.add_argument("--limit", type=float, default=3600, help="seconds after which a fit is stopped")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the recordings")
     parser.add_argument("--here", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--begun", type=float, default=0.0, help=argparse.SUPPRESS)
