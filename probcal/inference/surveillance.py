@@ -31,6 +31,7 @@ APART = 4  # of the comparisons with them, which overlap, that count as tests of
 KNOWN = 0.25  # variance of a bias in scales from which its moves are looked at: the start is not linear
 LEARNT = 0.02  # share of the variance that must be lost between two moments
 RATE = 1e-3  # probability that a sound stream of any length is called drifting, or widened
+ALONE = 3.29  # sd beyond which a single test has that rate: no test of several has a smaller limit
 BATCH, LEVELS = 32, 20  # innovations of the smallest sum, and doublings of it (3e7 innovations)
 SHORT = (8, 16)  # innovations of the shortest sums, those that came last
 SHIFT = 0.05  # mean of innovations within which a channel does not drift
@@ -150,16 +151,17 @@ class Tallies(NamedTuple):
     def _summed(self, k: int) -> float:
         """A sum of the smallest length added to the longer ones; the mean of one that is too far from zero, else 0."""
         admitted = self.waiting[k][~self.out[k]]
-        self.median[k] += np.median(np.abs(self.waiting[k]))
+        self.median[k] += np.sort(np.abs(self.waiting[k]))[BATCH // 2 - 1 : BATCH // 2 + 1].mean()
         self.number[k, 0] += len(admitted)
         self.square[k, 0] += np.sum(admitted**2)
         total, shift = float(admitted.sum()) / np.sqrt(max(len(admitted), 1)), 0.0
         for level in range(LEVELS):
             self.number[k, level + 1] += 1
             self.square[k, level + 1] += total**2
-            mean, rate = total / np.sqrt(BATCH << level), _rate(len(self.fill), level, self.number[k, level + 1])
-            if abs(mean) > SHIFT and abs(total) > -special.ndtri(0.5 * rate):
-                shift = mean
+            mean = total / np.sqrt(BATCH << level)
+            if abs(total) > ALONE and abs(mean) > SHIFT:
+                rate = _rate(len(self.fill), level, self.number[k, level + 1])
+                shift = mean if abs(total) > -special.ndtri(0.5 * rate) else shift
             self.pending[k, level] = not self.pending[k, level]
             if self.pending[k, level]:
                 self.half[k, level] = total
