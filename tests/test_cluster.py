@@ -19,11 +19,11 @@ from worlds import heights
 
 from probcal import MAP, FitError, Gaussian, InputError, load_study, sbc, study
 from probcal.cli.models import ModelFile
-from probcal.cli.study import PARTLY, partly
 from probcal.files import Outputs
 from probcal.inference import spread as spreading
 from probcal.inference.progress import Progress
 from probcal.inference.spread import spread
+from probcal.studies.run_study import PARTLY, partly
 
 MODEL = '''
 """Two rulers and a thing that rises and falls; every setting takes a while."""

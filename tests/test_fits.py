@@ -9,10 +9,10 @@ import xarray as xr
 
 from probcal import InputError, load_study
 from probcal.diagnostics import study_table
-from probcal.inference.fits import BATCH, open_fits
 from probcal.inference.manifest import stored_run
 from probcal.inference.storage import Storage
 from probcal.plots import plot_study
+from probcal.studies.fits import BATCH, open_fits
 
 METHODS, LABELS = ["ml", "em"], ("a.x", "b.y", "b.z")
 RUN = {"list of methods": "ml, em"}

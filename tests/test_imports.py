@@ -17,7 +17,7 @@ from probcal import analysis, inference, plots
 from probcal.cli.names import METHODS, ORACLE, PRIORS, SAVE
 from probcal.inference.fit import SAVE as SAVE_OF_FITS
 from probcal.inference.sampler import Sampler
-from probcal.inference.study import ORACLE as ORACLE_OF_STUDIES
+from probcal.studies.study import ORACLE as ORACLE_OF_STUDIES
 from probcal.wings import installed
 
 ROOT = Path(__file__).parents[1]
@@ -188,7 +188,7 @@ def test_type_checkers_see_the_names_that_are_loaded(package):
 
 def test_the_import_of_a_module_leaves_its_name_to_the_function():
     code = (
-        "import probcal.sensor, probcal.analysis.compare, probcal.inference.sbc\n"
+        "import probcal.sensor, probcal.analysis.compare, probcal.studies.sbc\n"
         "import probcal\nfrom probcal import simulate, linalg\n"
         "from probcal.analysis import compare\nfrom probcal.inference import sbc\n"
         "found = (probcal.sensor, probcal.analysis.compare, compare, sbc, simulate, linalg, probcal.sensors)\n"

@@ -14,11 +14,11 @@ from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.leaps import Place
 from probcal.inference.orbits import orbits_of, roam
 from probcal.inference.posed import Form, Posed, prior_precision
-from probcal.inference.prior_draws import draw_prior
 from probcal.motion import RandomWalk
 from probcal.sensors import doa, ranger
 from probcal.smoothing.frame import frame_at, log_weight, place, unit_normals, volume
 from probcal.starts import automatic_start
+from probcal.studies.prior_draws import draw_prior
 
 
 @cache

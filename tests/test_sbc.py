@@ -47,19 +47,19 @@ from probcal import (
     simulate,
 )
 from probcal.cli.models import load_model
-from probcal.inference import uniformity
 from probcal.inference.chains import Sample
 from probcal.inference.collapsed import Collapsed
-from probcal.inference.coverage import coverage_table
 from probcal.inference.gibbs import reversible_sweeps
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.nuts import NUTS
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Form
-from probcal.inference.prior_draws import draw_prior
-from probcal.inference.sbc import _check_quantities, sbc, short
-from probcal.plots.sbc import draw_sbc, plot_ranks
 from probcal.priors import BernoulliGaussian
+from probcal.studies import uniformity
+from probcal.studies.coverage import coverage_table
+from probcal.studies.plot_sbc import draw_sbc, plot_ranks
+from probcal.studies.prior_draws import draw_prior
+from probcal.studies.sbc import _check_quantities, sbc, short
 
 START = {"position": ((0.0, 0.0), 5.0), "velocity": ((1.0, 0.5), 0.5)}
 HORSESHOE, SPIKE = Horseshoe(), BernoulliGaussian()
@@ -479,7 +479,7 @@ def test_a_run_without_posterior_is_counted_apart(monkeypatch):
             raise FitError("no covariance")
         return given(*arguments)
 
-    module = importlib.import_module("probcal.inference.sbc")  # the name in the package is the function
+    module = importlib.import_module("probcal.studies.sbc")  # the name in the package is the function
     given = module.pool_of
     monkeypatch.setattr(module, "pool_of", fails)
     tree = sbc(linear(), MAP(), prior=Gaussian(), runs=6, threads=1)

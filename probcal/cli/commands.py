@@ -323,7 +323,7 @@ def study_command(
     if resume and out is None:
         raise InputError("study: --resume needs --out DIR, the folder of the fits to go on with")
     with outputs.results_of_a_run(out, outputs.STUDY, "runs", resume=resume, overwrite=overwrite) as results:
-        from probcal.cli import study
+        from probcal.studies import run_study as study
 
         raise typer.Exit(
             study.run(
@@ -425,7 +425,7 @@ def sbc_command(
     options.check_files(model, data)
     arguments = options.given(given or ())
     with outputs.results_of_a_run(out, outputs.SBC, "runs", resume=resume, overwrite=overwrite) as results:
-        from probcal.cli import sbc
+        from probcal.studies import run_sbc as sbc
 
         raise typer.Exit(
             sbc.run(

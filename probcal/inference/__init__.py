@@ -6,10 +6,8 @@ from probcal.lazy import lazy
 
 if TYPE_CHECKING:
     from probcal.inference.clouds import particle_filter
-    from probcal.inference.coverage import coverage_table
     from probcal.inference.evidence import Evidence, log_evidence
     from probcal.inference.fit import calibrate, fit, track
-    from probcal.inference.fits import load_study
     from probcal.inference.methods import (
         EA,
         EM,
@@ -25,26 +23,28 @@ if TYPE_CHECKING:
     )
     from probcal.inference.model import numpyro_model
     from probcal.inference.run import Method
-    from probcal.inference.sbc import sbc
     from probcal.inference.selfconfig import SelfConfiguration
-    from probcal.inference.study import ORACLE, study
     from probcal.inference.svi import SVI
     from probcal.smoothing.esteps import Cubature, EStep, Extended, Unscented
+    from probcal.studies.coverage import coverage_table
+    from probcal.studies.fits import load_study
+    from probcal.studies.sbc import sbc
+    from probcal.studies.study import ORACLE, study
 
 __all__ = lazy(
     __name__,
     {
         "probcal.inference.clouds": "particle_filter",
-        "probcal.inference.coverage": "coverage_table",
+        "probcal.studies.coverage": "coverage_table",
         "probcal.inference.evidence": "Evidence log_evidence",
         "probcal.inference.fit": "calibrate fit track",
-        "probcal.inference.fits": "load_study",
+        "probcal.studies.fits": "load_study",
         "probcal.inference.methods": "EA EM EMEA MAP METHODS NUTS Collapsed Gibbs LeastSquares ParticleGibbs table",
         "probcal.inference.model": "numpyro_model",
         "probcal.inference.run": "Method",
-        "probcal.inference.sbc": "sbc",
+        "probcal.studies.sbc": "sbc",
         "probcal.inference.selfconfig": "SelfConfiguration",
-        "probcal.inference.study": "ORACLE study",
+        "probcal.studies.study": "ORACLE study",
         "probcal.inference.svi": "SVI",
         "probcal.smoothing.esteps": "Cubature EStep Extended Unscented",
     },

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from probcal.plots.map import plot_map
     from probcal.plots.objects import plot_objects
     from probcal.plots.observability import draw_check, plot_directions, plot_passes, plot_spectrum
-    from probcal.plots.sbc import draw_sbc, plot_coverage, plot_ranks
-    from probcal.plots.study import draw_study, plot_study
     from probcal.roads.plots import plot_particles, plot_roads
+    from probcal.studies.plot_sbc import draw_sbc, plot_coverage, plot_ranks
+    from probcal.studies.plot_study import draw_study, plot_study
 
 __all__ = lazy(
     __name__,
@@ -40,8 +40,8 @@ __all__ = lazy(
         "probcal.plots.map": "plot_map",
         "probcal.plots.objects": "plot_objects",
         "probcal.plots.observability": "draw_check plot_directions plot_passes plot_spectrum",
-        "probcal.plots.sbc": "draw_sbc plot_coverage plot_ranks",
-        "probcal.plots.study": "draw_study plot_study",
+        "probcal.studies.plot_sbc": "draw_sbc plot_coverage plot_ranks",
+        "probcal.studies.plot_study": "draw_study plot_study",
     }
     | PICTURES,
 )

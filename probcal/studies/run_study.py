@@ -14,10 +14,10 @@ from probcal.cli.progress import shown
 from probcal.diagnostics import grid_of, study_table
 from probcal.errors import InputError
 from probcal.files import Outputs
-from probcal.inference import load_study, study
 from probcal.inference.progress import OnProgress, Progress
-from probcal.inference.study import choose_methods
 from probcal.results.io import save
+from probcal.studies.fits import load_study
+from probcal.studies.study import choose_methods, study
 
 PARTLY = 30.0  # s after which table and picture are made anew while fits go on
 SHARE = 20.0  # times as long as they took, where that is longer

@@ -16,7 +16,6 @@ import xarray as xr
 from probcal.devices import over_devices
 from probcal.errors import InputError, nearest
 from probcal.inference.ending import conclude
-from probcal.inference.fits import Fits, open_fits
 from probcal.inference.identity import identity, problem_digest
 from probcal.inference.integrate import Integrated, Integration, integrate
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
@@ -46,6 +45,7 @@ from probcal.simulate import Truth
 from probcal.smoothing.information import mean_square
 from probcal.smoothing.mode import Point
 from probcal.starts import automatic_start
+from probcal.studies.fits import Fits, open_fits
 
 CHECKED = 20  # stored problems that a resumed study makes anew, to see whether the model is still the same
 ORACLE = "oracle"  # MAP whose prior knows which biases are zero

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
 from probcal.errors import InputError, nearest
-from probcal.inference.uniformity import band
 from probcal.plots.base import BEFORE, colour, new_axes, plain_text, write_figure
+from probcal.studies.uniformity import band
 
 COLUMNS = 5
 WIDTH, HEIGHT = 13.0, 2.3  # of the picture and of a row of panels, inches

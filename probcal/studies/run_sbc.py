@@ -12,11 +12,11 @@ from probcal.cli.files import can_plot, say_written, write_csv
 from probcal.cli.models import load_problem, on_network, prior_named
 from probcal.cli.progress import shown
 from probcal.files import Outputs
-from probcal.inference import METHODS, sbc
-from probcal.inference.coverage import coverage_table
-from probcal.inference.sbc import short
+from probcal.inference import METHODS
 from probcal.priors import PRIORS
 from probcal.results.io import save
+from probcal.studies.coverage import coverage_table
+from probcal.studies.sbc import sbc, short
 
 
 def run(
@@ -59,7 +59,7 @@ def _write(tree: xr.DataTree, table: pd.DataFrame, out: Path) -> None:
     save(tree, files[0])
     write_csv(table, files[1])
     if can_plot():
-        from probcal.plots.sbc import draw_sbc  # the plot packages are an extra
+        from probcal.studies.plot_sbc import draw_sbc  # the plot packages are an extra
 
         files.append(out / "sbc.png")
         draw_sbc(tree, files[-1])

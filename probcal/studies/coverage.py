@@ -7,8 +7,8 @@ import pandas as pd
 import xarray as xr
 
 from probcal.errors import checked
-from probcal.inference.uniformity import p_value, shape, share, spread_p_value
 from probcal.labels import listed
+from probcal.studies.uniformity import p_value, shape, share, spread_p_value
 
 ALARM = 0.01  # probability of a false alarm, over all quantities together
 

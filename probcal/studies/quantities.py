@@ -22,13 +22,13 @@ from probcal.inference.posed import Form, Posed, log_prior
 from probcal.inference.posterior import Chains
 from probcal.inference.sampling import SamplerRun
 from probcal.inference.sparse_gibbs import SparseChains
-from probcal.inference.uniformity import NOMINAL, randomised_rank
 from probcal.lazy import Later
 from probcal.model.model import At, Model
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.frame import volume
 from probcal.smoothing.mode import Point, log_likelihood, mixed_density
+from probcal.studies.uniformity import NOMINAL, randomised_rank
 
 if TYPE_CHECKING:
     from arviz_stats.base import array_stats

@@ -21,20 +21,16 @@ import numpy as np
 import xarray as xr
 
 from probcal.errors import FitError, InputError
-from probcal.inference.coverage import judge_coverage
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.methods import NUTS, check_problem, choose_prior
 from probcal.inference.posed import Form
-from probcal.inference.prior_draws import check_drawable, draw_data, draw_prior, far_start
 from probcal.inference.progress import Monitor, OnProgress
-from probcal.inference.quantities import TAKEN, Points, Pool, Trial, pool_of, ranked
 from probcal.inference.run import Context, Method
 from probcal.inference.sampler import Sampler
 from probcal.inference.solve import solve
 from probcal.inference.spread import check_scheduler, spread
 from probcal.inference.storage import Records, Storage
-from probcal.inference.uniformity import NOMINAL
 from probcal.model import variants
 from probcal.priors import Precision, Prior
 from probcal.problem import Problem
@@ -43,6 +39,10 @@ from probcal.simulate import Key, as_key
 from probcal.smoothing.grid import follow_states
 from probcal.smoothing.information import at_levels
 from probcal.smoothing.mode import Point, find_mode
+from probcal.studies.coverage import judge_coverage
+from probcal.studies.prior_draws import check_drawable, draw_data, draw_prior, far_start
+from probcal.studies.quantities import TAKEN, Points, Pool, Trial, pool_of, ranked
+from probcal.studies.uniformity import NOMINAL
 from probcal.types import float64
 
 BATCH = 5  # runs of one file

@@ -1,0 +1,1 @@
+"""Many fits: studies over simulated runs, and simulation-based calibration of a method."""
