@@ -46,14 +46,10 @@ if TYPE_CHECKING:
         ParticleGibbs,
         SelfConfiguration,
         Unscented,
-        coverage_table,
         fit,
-        load_study,
         log_evidence,
         numpyro_model,
         particle_filter,
-        sbc,
-        study,
         track,
     )
     from probcal.inference.associations import sample_associations
@@ -82,6 +78,10 @@ if TYPE_CHECKING:
     from probcal.roads import LeavingRoad, Road, RoadNetwork, match_track, read_roads
     from probcal.sensor import Bias, Channel, Drift, Sensor, SensorType, sensor
     from probcal.simulate import Simulation, Truth, simulate
+    from probcal.studies.coverage import coverage_table
+    from probcal.studies.fits import load_study
+    from probcal.studies.sbc import sbc
+    from probcal.studies.study import study
     from probcal.table import read_table
 
 __version__: str  # of the installed package, read when it is asked for
@@ -105,7 +105,7 @@ __all__ = lazy(
         "probcal.geodesy": "LocalFrame",
         "probcal.inference": (
             "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended Gibbs LeastSquares ParticleGibbs SelfConfiguration "
-            "Unscented coverage_table fit load_study log_evidence numpyro_model particle_filter sbc study track"
+            "Unscented fit log_evidence numpyro_model particle_filter track"
         ),
         "probcal.inference.associations": "sample_associations",
         "probcal.inference.online": "AugmentedFilter Jumps Online ParticleFilter",

@@ -10,15 +10,23 @@ from types import ModuleType
 
 from probcal.errors import InputError
 
-WINGS = ("adapters", "doa", "roads", "rss")
+WINGS = ("adapters", "doa", "roads", "rss", "studies")
 NAMES = {  # public names of `probcal` by module
     "probcal.roads": "LeavingRoad Road RoadNetwork match_track read_roads",
+    "probcal.studies.coverage": "coverage_table",
+    "probcal.studies.fits": "load_study",
+    "probcal.studies.sbc": "sbc",
+    "probcal.studies.study": "study",
 }
 PICTURES = {  # public names of `probcal.plots` by module
     "probcal.roads.plots": "plot_particles plot_roads",
+    "probcal.studies.plot_sbc": "draw_sbc plot_coverage plot_ranks",
+    "probcal.studies.plot_study": "draw_study plot_study",
 }
 COMMANDS = {  # commands of the command line; the module of each defines NAME_command
     "levels": "probcal.rss.command",
+    "sbc": "probcal.studies.commands",
+    "study": "probcal.studies.commands",
 }
 
 

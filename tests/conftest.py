@@ -22,7 +22,7 @@ from xdist.scheduler import LoadFileScheduling
 from probcal import kernels
 from probcal.smoothing import cholesky
 from probcal.smoothing.cholesky import Cholmod
-from probcal.wings import installed
+from probcal.wings import WingMissing, installed
 
 BUDGET = 9600  # kernels of a whole default run, all workers together (some 9100 to 9500 by which takes which file)
 MOST_MAPS = 20_000  # memory maps of a process, which may have 65530: past them XLA fails without a word
@@ -33,7 +33,8 @@ TOGETHER = {  # files that share worlds run in one worker, one after the other; 
     "test_drift.py": "linear", "test_kernels.py": "linear", "test_metamorphic.py": "bent", "test_bounds.py": "bent",
     "test_degenerate.py": "linear", "test_sparse.py": "sparse", "test_halves.py": "sparse",
 }  # fmt: skip
-NEEDS = {  # wings that all tests of a file need: it is not collected where one is missing. A test takes `needs`
+NEEDS = {  # wings that all tests of a file need: it is not collected where one is missing. Other
+    # tests say so by the marker `needs`, or skip themselves where they ask for a name of one
     "../README.md": "roads",
     "test_adapters_files.py": "adapters",
     "test_adapters_ros.py": "adapters",
@@ -42,6 +43,10 @@ NEEDS = {  # wings that all tests of a file need: it is not collected where one 
     "test_particle_methods.py": "roads",
     "test_roads.py": "roads",
     "test_rss.py": "rss",
+    "test_sbc.py": "studies",
+    "test_cluster.py": "studies",
+    "test_fits.py": "studies",
+    "test_studies.py": "studies",
 }
 
 
@@ -82,6 +87,15 @@ def trim(folder, most):
             break
         path.unlink(missing_ok=True)
         left -= stat.st_size
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call():
+    """A test that asks for a public name of a wing that is not installed is skipped."""
+    try:
+        return (yield)
+    except WingMissing as gone:
+        pytest.skip(str(gone))
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -10,6 +10,8 @@ import pytest
 
 from probcal import cli
 
+INSTALLED = {command.name for command in cli.app.registered_commands if not command.hidden}  # other wings are missing
+
 
 def call(*arguments):
     """A command in this process, so that its kernels are shared: exit code, stdout, stderr."""

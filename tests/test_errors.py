@@ -44,7 +44,6 @@ from probcal import (
     sensor,
     sensors,
     simulate,
-    study,
     track,
     write_nodes,
 )
@@ -277,7 +276,6 @@ CASES = [
     # inference, command line
     (lambda _: load(calibrated("a")), "load: path is of type DataTree; give the folder of a fit, or its fit.nc"),
     (lambda _: compare(calibrated("a"), calibrated("a")), "compare: fits is a single tree; give several in a list"),
-    (lambda _: study(problem(), {}), "study: setting is of type Problem; give a function setting(run, ...) that ret"),
     (lambda _: fit(problem(), key=2**63), "key=9223372036854775808: a seed is a whole number below 2**63"),
     (lambda _: fit(problem(), EA), "fit: method is the class EA itself; give a method, such as EA() or MAP()"),
     (lambda _: fit(problem(), start=np.zeros(3)), "fit: start is of type ndarray; give a Point, as probcal.starts."),

@@ -247,6 +247,7 @@ def test_sigterm_before_an_answer_ends_a_command(model, tmp_path):
 
 
 @pytest.mark.ci
+@pytest.mark.needs("studies")
 def test_an_interrupted_study_says_what_it_keeps(model, tmp_path):
     model.write_text(MODEL + STUDY)
     process = started("study", model, "--methods", "ml", "--runs", 100_000, "--out", tmp_path / "out")

@@ -424,6 +424,7 @@ def calibrated(problem):
     return xr.DataTree.from_dict({"calibration": group, "constant_data": xr.Dataset()})
 
 
+OF_WINGS = {"study": ("studies",), "sbc": ("studies",)}
 GAUSSIAN = {
     "fit": lambda p: probcal.fit(p, probcal.EA()),
     "fit by a sampler": lambda p: probcal.fit(p, probcal.NUTS()),
@@ -445,7 +446,10 @@ GAUSSIAN = {
 }
 
 
-@pytest.mark.parametrize("ask", GAUSSIAN.values(), ids=GAUSSIAN.keys())
+@pytest.mark.parametrize(
+    "ask",
+    [pytest.param(ask, id=name, marks=pytest.mark.needs(*OF_WINGS.get(name, ()))) for name, ask in GAUSSIAN.items()],
+)
 def test_what_needs_a_linear_form_says_so(ask):
     problem = Problem(PLANE, LINEAR | {"two": Glider()}, table_of())
     assert [form is None for form in problem.model.linear] == [False, True]

@@ -18,7 +18,6 @@ from probcal.motion import RandomWalk
 from probcal.sensors import doa, ranger
 from probcal.smoothing.frame import frame_at, log_weight, place, unit_normals, volume
 from probcal.starts import automatic_start
-from probcal.studies.prior_draws import draw_prior
 
 
 @cache
@@ -113,6 +112,7 @@ def made_volume(problem, made, theta, orbit, r):
 
 
 @pytest.mark.slow
+@pytest.mark.needs("studies")
 @pytest.mark.parametrize(
     ("case", "prior", "runs"),
     [
@@ -125,6 +125,8 @@ def made_volume(problem, made, theta, orbit, r):
 )
 def test_a_draw_of_the_posterior_stays_one(case, prior, runs):
     """Truths from the prior, each with its own data, and ten proposals an orbit: together still the prior."""
+    from probcal.studies.prior_draws import draw_prior
+
     problem, _, made, orbits = posed(*case)
     with jax.enable_x64(True):
         form = Form(problem.model.biases, hierarchy_of(prior, problem))

@@ -14,6 +14,7 @@ from worlds import heights
 
 import probcal
 from probcal import EA, EMEA, MAP, Flat, load_study, study
+from probcal.cli import names
 from probcal.cli.options import parse_values
 from probcal.diagnostics import study_table
 from probcal.errors import InputError
@@ -21,6 +22,7 @@ from probcal.inference.fit import calibrate
 from probcal.inference.run import State, stepped
 from probcal.plots import plot_study
 from probcal.status import Status
+from probcal.studies.study import ORACLE
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import radars
@@ -232,3 +234,13 @@ def test_trial_is_reproduced_at_three_shares(scenario):
     if scenario == "C2":  # where ML runs away it says so
         ml = found.sel(estimator="ml")
         assert (ml["status"].values[ml["bias_rmse"].values > 5] == "diverged").all()
+
+
+def test_a_setting_that_is_no_function_is_refused():
+    problem, _ = heights(0, size=2)
+    with pytest.raises(InputError, match=r"study: setting is of type Problem; give a function setting\(run, "):
+        study(problem, {})
+
+
+def test_the_command_line_names_the_oracle():
+    assert names.ORACLE == ORACLE

@@ -33,8 +33,8 @@ def main() -> int:
     more = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else []
     with tempfile.TemporaryDirectory() as folder:
         path = package_without(Path(folder), *WINGS)
-        environment = os.environ | {"PYTHONPATH": str(path)}
-        command = [sys.executable, "-P", "-m", "pytest", *files, *more]
+        environment = os.environ | {"PYTHONPATH": str(path), "PYTHONSAFEPATH": "1"}  # not the package of this folder
+        command = [sys.executable, "-m", "pytest", *files, *more]
         return subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
 
 

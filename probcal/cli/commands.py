@@ -11,8 +11,8 @@ import typer
 from probcal import wings
 from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.cli import files, options, outputs
-from probcal.cli.arguments import LARGEST_SEED, Data, Fix, Given, Method, Model, Network, Overwrite, Scheduler, Seed
-from probcal.cli.names import METHODS, ORACLE, PRIORS
+from probcal.cli.arguments import Data, Fix, Given, Method, Model, Network, Overwrite, Scheduler, Seed
+from probcal.cli.names import METHODS, PRIORS
 from probcal.errors import FitError, InputError, nearest
 from probcal.files import Lock
 from probcal.inference.progress import Terminated, check_limit
@@ -299,40 +299,6 @@ def watch_command(
             lock.release()
 
 
-@app.command(name="study")
-def study_command(
-    model: Model,
-    setting: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="values of an argument of setting(): share=0:1:0.1, scenario=C1,C2"),
-    ] = None,
-    methods: Annotated[str, typer.Option(help=", ".join([*METHODS, ORACLE]))] = f"ml,em-ea,ea,{ORACLE}",
-    runs: Annotated[int, options.count(1, "simulated runs of every setting")] = 20,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="number of the first run")] = 0,
-    out: Annotated[
-        Path | None, typer.Option(help="folder for study.nc, study.csv, study.png, and finished fits")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="go on with the finished fits in --out")] = False,
-    overwrite: Overwrite = False,
-    scheduler: Scheduler = None,
-) -> None:
-    """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
-    chosen = options.method_names(methods)
-    grid = options.grid(setting or ())
-    options.check_files(model)
-    if resume and out is None:
-        raise InputError("study: --resume needs --out DIR, the folder of the fits to go on with")
-    with outputs.results_of_a_run(out, outputs.STUDY, "runs", resume=resume, overwrite=overwrite) as results:
-        from probcal.studies import run_study as study
-
-        raise typer.Exit(
-            study.run(
-                model, grid, chosen, runs=runs, seed=seed, outputs=results, resume=resume, overwrite=overwrite,
-                scheduler=scheduler,
-            )
-        )  # fmt: skip
-
-
 @app.command(name="compare")
 def compare_command(
     folders: Annotated[list[Path], typer.Argument(help="folders (or fit.nc) of fits to the same data")],
@@ -386,55 +352,6 @@ def report_command(
     from probcal.cli import report
 
     raise typer.Exit(report.run(folder, results, static=static))
-
-
-@app.command(name="sbc")
-def sbc_command(
-    model: Model,
-    data: Data = None,
-    method: Method = "ea",
-    prior: Annotated[str | None, typer.Option(help=" | ".join(PRIORS) + "; the method's own if left out")] = None,
-    truths: Annotated[
-        str | None, typer.Option("--from", help="prior that the truths are drawn from; that of the fit if left out")
-    ] = None,
-    fix: Fix = None,
-    given: Given = None,
-    network: Network = None,
-    runs: Annotated[int, options.count(2, "simulations")] = 200,
-    seed: Seed = 0,
-    posterior: Annotated[
-        bool, typer.Option("--posterior", help="draw the truths from the posterior of the data instead of the prior")
-    ] = False,
-    full: Annotated[
-        bool, typer.Option("--full", help="run samplers as long as a fit would, not just long enough for ranks")
-    ] = False,
-    out: Annotated[Path | None, typer.Option(help="folder for sbc.nc, sbc.csv, sbc.png, and finished runs")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="go on with the finished runs in --out")] = False,
-    overwrite: Overwrite = False,
-    scheduler: Scheduler = None,
-) -> None:
-    """Check a method on a model by simulation: do its intervals hold the truth as often as they say?"""
-    if method not in METHODS:
-        raise InputError(f'sbc: no method is called "{method}"{nearest(method, METHODS)}')
-    for name in (prior, truths):
-        if name is not None and name not in PRIORS:
-            raise InputError(f'sbc: no prior is called "{name}"{nearest(name, PRIORS)}')
-    options.check_taken(method, prior)
-    if resume and out is None:
-        raise InputError("sbc: --resume needs --out DIR, the folder of the runs to go on with")
-    options.check_files(model, data)
-    arguments = options.given(given or ())
-    with outputs.results_of_a_run(out, outputs.SBC, "runs", resume=resume, overwrite=overwrite) as results:
-        from probcal.studies import run_sbc as sbc
-
-        raise typer.Exit(
-            sbc.run(
-                model, data, method=method, prior=prior, truths=truths, fix=fix or (), given=arguments, network=network,
-                runs=runs,
-                seed=seed, posterior=posterior, full=full, outputs=results, resume=resume, overwrite=overwrite,
-                scheduler=scheduler,
-            )
-        )  # fmt: skip
 
 
 def _missing(module: str, name: str) -> Callable[[typer.Context], None]:

@@ -1,4 +1,4 @@
-"""Inference: `fit(problem, method)` for every method, `track` for other data, `study` over runs."""
+"""Inference: `fit(problem, method)` for every method, `track` for other data."""
 
 from typing import TYPE_CHECKING
 
@@ -26,25 +26,17 @@ if TYPE_CHECKING:
     from probcal.inference.selfconfig import SelfConfiguration
     from probcal.inference.svi import SVI
     from probcal.smoothing.esteps import Cubature, EStep, Extended, Unscented
-    from probcal.studies.coverage import coverage_table
-    from probcal.studies.fits import load_study
-    from probcal.studies.sbc import sbc
-    from probcal.studies.study import ORACLE, study
 
 __all__ = lazy(
     __name__,
     {
         "probcal.inference.clouds": "particle_filter",
-        "probcal.studies.coverage": "coverage_table",
         "probcal.inference.evidence": "Evidence log_evidence",
         "probcal.inference.fit": "calibrate fit track",
-        "probcal.studies.fits": "load_study",
         "probcal.inference.methods": "EA EM EMEA MAP METHODS NUTS Collapsed Gibbs LeastSquares ParticleGibbs table",
         "probcal.inference.model": "numpyro_model",
         "probcal.inference.run": "Method",
-        "probcal.studies.sbc": "sbc",
         "probcal.inference.selfconfig": "SelfConfiguration",
-        "probcal.studies.study": "ORACLE study",
         "probcal.inference.svi": "SVI",
         "probcal.smoothing.esteps": "Cubature EStep Extended Unscented",
     },

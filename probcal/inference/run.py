@@ -2,7 +2,7 @@
 
 A method is a frozen dataclass that inherits `Maximiser` or `sampler.Sampler`. A `Maximiser` has `iterate`, a pure step
 of its outer loop, and where needed `close`, what it computes at the end of a chunk; `maximise` drives one fit and
-`inference.study` many at once.
+a study many at once.
 """
 
 from abc import ABC, abstractmethod

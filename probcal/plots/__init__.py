@@ -40,8 +40,6 @@ __all__ = lazy(
         "probcal.plots.map": "plot_map",
         "probcal.plots.objects": "plot_objects",
         "probcal.plots.observability": "draw_check plot_directions plot_passes plot_spectrum",
-        "probcal.studies.plot_sbc": "draw_sbc plot_coverage plot_ranks",
-        "probcal.studies.plot_study": "draw_study plot_study",
     }
     | PICTURES,
 )

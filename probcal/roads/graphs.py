@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,9 +12,6 @@ from probcal.errors import InputError
 from probcal.roads.checks import as_points
 from probcal.roads.coordinates import Projection
 from probcal.roads.extra import networkx, shapely
-
-if TYPE_CHECKING:
-    from probcal.roads.network import RoadNetwork
 
 NEAR = 1.0  # m that the geometry of an edge may end away from its node
 YES, BACKWARD, NO = ("yes", "true", "1"), ("-1", "reverse", "reversed"), ("no", "false", "0", "none", "nan", "")
@@ -117,21 +114,21 @@ def pieces_of(graph: Any, to_metres: Projection, dimension: int | None) -> EdgeL
     return EdgeList(labels, lines, ends_used.reshape(-1, 2), nodes[used], oneway, bridges)
 
 
-def as_graph(network: RoadNetwork) -> Any:
-    """networkx MultiGraph of a network, with x, y[, z] of the nodes and name, geometry, oneway and length of edges."""
+def as_graph(edges: EdgeList, lengths: np.ndarray) -> Any:
+    """networkx MultiGraph of edges and lengths (E,): x, y[, z] of nodes; name, geometry, oneway, length of edges."""
     graph = networkx.MultiGraph()
-    for k, place in enumerate(network.nodes):
+    for k, place in enumerate(edges.nodes):
         graph.add_node(k, **dict(zip("xyz", map(float, place), strict=False)))
-    for e, name in enumerate(network.names):
-        start, end = map(int, network.ends[e])
+    for e, name in enumerate(edges.names):
+        start, end = map(int, edges.ends[e])
         graph.add_edge(
             start,
             end,
             name=name,
-            geometry=shapely.LineString(network.lines[e]),
-            oneway=bool(network.oneway[e]),
-            length=float(network.lengths[e]),
-            **({"bridge": "yes"} if name in network.bridges else {}),
+            geometry=shapely.LineString(edges.lines[e]),
+            oneway=bool(edges.oneway[e]),
+            length=float(lengths[e]),
+            **({"bridge": "yes"} if name in edges.bridges else {}),
         )
     return graph
 

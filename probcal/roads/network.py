@@ -106,7 +106,8 @@ class RoadNetwork:
 
     def to_graph(self) -> Any:
         """networkx MultiGraph with x, y[, z] of nodes, and name, geometry, oneway and length of edges."""
-        return as_graph(self)
+        edges = EdgeList([*self.names], [*self.lines], self.ends, self.nodes, [*self.oneway], [*self.bridges])
+        return as_graph(edges, self.lengths)
 
     @property
     def dimension(self) -> int:
