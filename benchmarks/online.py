@@ -33,9 +33,9 @@ import pandas as pd
 
 import probcal as pc
 from probcal.cli.models import load_problem
-from probcal.inference.online import AugmentedFilter, Jumps, Online
 from probcal.results.answer import HALF
 from probcal.sensors import radar
+from probcal.stream.online import AugmentedFilter, Jumps, Online
 
 RING, RANGE, AZIMUTH = 3000.0, 10.0, np.deg2rad(3.0)
 HEADING, OFFSET = np.deg2rad(3.0), 10.0  # scales of the biases

@@ -33,9 +33,9 @@ import pandas as pd
 import probcal as pc
 from probcal.errors import InputError
 from probcal.geometry import bearing, elevation, norm
-from probcal.inference.online import AugmentedFilter, Jumps, Online
 from probcal.noise import Normal, StudentT
 from probcal.results.answer import HALF
+from probcal.stream.online import AugmentedFilter, Jumps, Online
 
 SIDE = 100.0  # m, of the square of the gauges
 STD = {"range": 1.0, "azimuth": 0.02, "elevation": 0.02}  # m, rad

@@ -53,7 +53,6 @@ if TYPE_CHECKING:
         track,
     )
     from probcal.inference.associations import sample_associations
-    from probcal.inference.online import AugmentedFilter, Jumps, Online, ParticleFilter
     from probcal.motion import (
         ConstantAcceleration,
         ConstantVelocity,
@@ -78,6 +77,7 @@ if TYPE_CHECKING:
     from probcal.roads import LeavingRoad, Road, RoadNetwork, match_track, read_roads
     from probcal.sensor import Bias, Channel, Drift, Sensor, SensorType, sensor
     from probcal.simulate import Simulation, Truth, simulate
+    from probcal.stream.online import AugmentedFilter, Jumps, Online, ParticleFilter
     from probcal.studies.coverage import coverage_table
     from probcal.studies.fits import load_study
     from probcal.studies.sbc import sbc
@@ -108,7 +108,7 @@ __all__ = lazy(
             "Unscented fit log_evidence numpyro_model particle_filter track"
         ),
         "probcal.inference.associations": "sample_associations",
-        "probcal.inference.online": "AugmentedFilter Jumps Online ParticleFilter",
+        "probcal.stream.online": "AugmentedFilter Jumps Online ParticleFilter",
         "probcal.motion": (
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"
         ),

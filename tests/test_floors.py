@@ -21,11 +21,11 @@ FLOORS = {
     2: ("sensors",),
     3: ("geodesy", "misfit", "network", "table", "nodes", "plausible"),
     4: ("model", "problem", "scans", "simulate"),
-    5: ("smoothing", "particle", "starts", "association", "online"),
+    5: ("smoothing", "particle", "starts", "association"),
     6: ("identifiability", "results"),
     7: ("inference",),
     8: ("analysis",),
-    9: ("cli", "report", "plots", "diagnostics"),
+    9: ("stream", "cli", "report", "plots", "diagnostics"),
     10: WINGS,
 }  # fmt: skip
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}

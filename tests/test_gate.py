@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 import probcal as pc
 from probcal.cli.commands import app
 from probcal.errors import InputError
-from probcal.inference.checkpoint import pack_state, unpack_state
-from probcal.inference.surveillance import Tallies
 from probcal.noise import gate_limits, normal_scores
+from probcal.stream.checkpoint import pack_state, unpack_state
+from probcal.stream.surveillance import Tallies
 
 PLAIN = pc.AugmentedFilter(lag=0)
 LAGGED = pc.AugmentedFilter(lag=8)

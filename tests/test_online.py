@@ -19,8 +19,8 @@ import xarray as xr
 
 import probcal as pc
 from probcal.errors import InputError
-from probcal.inference.checkpoint import pack_state, sealed, unpack_state
-from probcal.inference.relearnt import relearnt
+from probcal.stream.checkpoint import pack_state, sealed, unpack_state
+from probcal.stream.relearnt import relearnt
 
 
 @pc.sensor(east=pc.Channel("m", 1.0), north=pc.Channel("m", 2.0))
@@ -262,7 +262,7 @@ def test_a_jump_is_what_a_further_state_of_the_filter_says():
         assert told.score[m] / precision == pytest.approx(mean[-1] / scale, abs=1e-7)
         assert precision**-0.5 == pytest.approx(P[-1, -1] ** 0.5 / scale, rel=1e-7)
         with jax.enable_x64(True):
-            from probcal.online.belief import jumped
+            from probcal.stream.filters.belief import jumped
 
             after = jumped(online.belief, np.asarray(m), told.score[m] / precision, 1.0 / precision)
         after = jax.tree.map(np.asarray, after)
@@ -745,8 +745,8 @@ def test_a_table_that_breaks_off_midway_leaves_nothing_behind(lag, monkeypatch):
             raise KeyboardInterrupt
         return run(*given)
 
-    monkeypatch.setattr("probcal.inference.online.PLAIN", (1, 32))
-    monkeypatch.setattr("probcal.inference.online.BULK", 2)
+    monkeypatch.setattr("probcal.stream.online.PLAIN", (1, 32))
+    monkeypatch.setattr("probcal.stream.online.BULK", 2)
     with monkeypatch.context() as patched:
         patched.setattr(online, "_rows_of", stops)
         with pytest.raises(KeyboardInterrupt):
@@ -779,7 +779,7 @@ def test_detections_without_a_name_are_refused():
 
 
 def test_too_many_biases_are_refused(monkeypatch):
-    monkeypatch.setattr(sys.modules["probcal.inference.online"], "MANY", 3)
+    monkeypatch.setattr(sys.modules["probcal.stream.online"], "MANY", 3)
     with pytest.raises(InputError, match="6 biases are too many for an online filter, which takes 3"):
         filtered(pc.AugmentedFilter(lag=0))
 
@@ -942,7 +942,7 @@ def test_rows_that_a_fit_has_counted_are_refused(times, epoch):
 @pytest.mark.ci
 @pytest.mark.parametrize("times", [lambda d: d, dated], ids=["seconds", "dates"])
 def test_rows_that_a_stream_has_counted_are_refused_far_back(times, monkeypatch):
-    monkeypatch.setattr("probcal.inference.online.RECENT", 8)
+    monkeypatch.setattr("probcal.stream.online.RECENT", 8)
     frame, tree, lag = times(rows()), None, pc.AugmentedFilter(lag=4)
     for seen, counted in ((20, 0), (35, 20), (len(frame), 35)):  # each goes on where the last stood
         online = pc.Online(network(), MOTION, lag, calibration=tree, targets=3)

@@ -32,7 +32,7 @@ from probcal import (
     simulate,
 )
 from probcal.noise import StudentT
-from probcal.particle import resampling, settings
+from probcal.particle import settings
 from probcal.particle.conditional import conditional_path, conditional_paths
 from probcal.particle.ensemble import (
     ensemble,
@@ -47,6 +47,7 @@ from probcal.particle.filtering import run_filter
 from probcal.particle.proposals import check_proposal
 from probcal.particle.settings import SMOOTHERS, Particles
 from probcal.particle.targets import along_targets, place_by_epoch, targets_of, weigh_rows
+from probcal.smoothing import resampling
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "papers"))
 from paris import smoothed_sum

@@ -105,7 +105,7 @@ def test_a_file_that_grows_is_read_on(model, table, tmp_path):
 
 def test_a_scan_in_two_blocks_is_one_state_of_its_target(model, table, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    monkeypatch.setattr("probcal.cli.watch.BLOCK", 53)
+    monkeypatch.setattr("probcal.stream.watch.BLOCK", 53)
     assert call("watch", model, table, "--out", out, "--keep", "tracks", "--lag", "0")[0] == 0
     tracks = pd.read_csv(out / "tracks.csv")
     assert tracks["time"].tolist() == list(range(40))
@@ -167,7 +167,7 @@ def test_rows_at_which_a_watch_is_told_to_end_are_taken_whole(model, table, tmp_
         return update(self, rows)
 
     options = ("watch", model, table, "--out", out, "--lag", "0", "--keep", "rows")
-    monkeypatch.setattr("probcal.cli.watch.BLOCK", 200)
+    monkeypatch.setattr("probcal.stream.watch.BLOCK", 200)
     with monkeypatch.context() as patched:
         patched.setattr(pc.Online, "update", told)
         code, printed, _ = call(*options)
@@ -231,7 +231,7 @@ def test_a_first_table_of_nonsense_ends_in_one_sentence(model, table, tmp_path):
 
 @pytest.mark.parametrize("since", [None, "2026-05-01T00:00:00Z"], ids=["seconds", "dates"])
 def test_rows_of_the_calibration_are_not_counted_again(model, table, tmp_path, since, monkeypatch):
-    monkeypatch.setattr("probcal.inference.online.RECENT", 10)
+    monkeypatch.setattr("probcal.stream.online.RECENT", 10)
     text = lines()
     if since is not None:
         stamps = [pd.Timestamp(since) + pd.Timedelta(line.partition(",")[0] + "s") for line in text[1:]]
@@ -390,7 +390,7 @@ def test_a_full_disk_is_one_sentence_and_the_state_stays_whole(model, table, tmp
     """Files of a process may have this many bytes: what is too long for one is written to its limit, then fails."""
     import resource
 
-    monkeypatch.setattr("probcal.cli.watch.BLOCK", 300)
+    monkeypatch.setattr("probcal.stream.watch.BLOCK", 300)
     options = ("watch", model, table, "--lag", "0", "--every", "0", "--keep", "tracks,rows", "--out")
     assert call(*options, tmp_path / "whole")[0] == 0
     sizes = {path.name: path.stat().st_size for path in (tmp_path / "whole").iterdir()}
@@ -419,8 +419,8 @@ def test_progress_of_a_file_has_rows_rate_and_share(model, table, monkeypatch):
         yield seen.append
 
     seen = []
-    monkeypatch.setattr("probcal.cli.watch.shown", shown)
-    monkeypatch.setattr("probcal.cli.watch.BLOCK", 700)
+    monkeypatch.setattr("probcal.stream.watch.shown", shown)
+    monkeypatch.setattr("probcal.stream.watch.BLOCK", 700)
     assert call("watch", model, table, "--lag", "0")[0] == 0
     first, begun, *blocks, end = map(str, seen)
     assert first.startswith("watch: rows.csv, start, ")

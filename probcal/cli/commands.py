@@ -276,8 +276,8 @@ def watch_command(
     results = None if out is None else outputs.replaceable(out, outputs.WATCH)
     lock = None if out is None else Lock(out, 0.0)
     try:
-        from probcal.cli import watch
-        from probcal.inference.online import AugmentedFilter, Jumps, ParticleFilter
+        from probcal.stream import watch
+        from probcal.stream.online import AugmentedFilter, Jumps, ParticleFilter
 
         found = None if jumps is None else Jumps(false_alarms=jumps, within=within)
         method: AugmentedFilter | ParticleFilter

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
 from probcal.particle.proposals import gained, propagated
-from probcal.particle.resampling import multinomial
 from probcal.particle.settings import Particles
+from probcal.smoothing.resampling import multinomial
 
 
 def conditional_path(

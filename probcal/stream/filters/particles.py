@@ -17,10 +17,10 @@ from probcal import linalg
 from probcal.model import rows as waist
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
-from probcal.online.belief import WhiteRow
-from probcal.online.filtering import FilterGiven
-from probcal.online.linearising import About, here, linearised
-from probcal.particle.resampling import chosen_at
+from probcal.smoothing.resampling import chosen_at
+from probcal.stream.filters.belief import WhiteRow
+from probcal.stream.filters.filtering import FilterGiven
+from probcal.stream.filters.linearising import About, here, linearised
 
 
 class Cloud(NamedTuple):

@@ -17,27 +17,27 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError, nearest
-from probcal.inference.arrivals import Arrivals, Batch, padded, refused_rows
-from probcal.inference.counted import Counted
 from probcal.inference.identity import declared_identity
-from probcal.inference.surveillance import ChangePoint, StreamData, Surveillance, data_in_order
 from probcal.inference.widen import widening_factors
 from probcal.labels import NOBODY, label_parts
 from probcal.lazy import Later
 from probcal.network import Network
-from probcal.online import belief as beliefs
-from probcal.online import particles
-from probcal.online.belief import Augmented
-from probcal.online.filtering import RULES, FilterForm, FilterGiven, RowPoints
-from probcal.online.lag import Window, run_plain, run_window
-from probcal.online.particles import Cloud
-from probcal.online.starts import FIRST, place_new
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem, fixed_biases
 from probcal.results.answer import HALF
 from probcal.results.read import apply, held_by
 from probcal.smoothing.grid import NEAR
 from probcal.status import Status
+from probcal.stream.arrivals import Arrivals, Batch, padded, refused_rows
+from probcal.stream.counted import Counted
+from probcal.stream.filters import belief as beliefs
+from probcal.stream.filters import particles
+from probcal.stream.filters.belief import Augmented
+from probcal.stream.filters.filtering import RULES, FilterForm, FilterGiven, RowPoints
+from probcal.stream.filters.lag import Window, run_plain, run_window
+from probcal.stream.filters.particles import Cloud
+from probcal.stream.filters.starts import FIRST, place_new
+from probcal.stream.surveillance import ChangePoint, StreamData, Surveillance, data_in_order
 from probcal.table import read_table
 from probcal.types import float64
 
@@ -376,7 +376,7 @@ class Online:
         where biases walk, jumped or are only considered, or the stream began from an earlier calibration: there is no
         prior of them that could be replaced.
         """
-        from probcal.inference.relearnt import relearnt
+        from probcal.stream.relearnt import relearnt
 
         if self.method.walk or self.method.consider or self.jumps or self.calibration is not None:
             raise InputError(
@@ -397,7 +397,7 @@ class Online:
 
         Raises `InputError` before the first rows.
         """
-        from probcal.inference.watched import calibration_tree
+        from probcal.stream.watched import calibration_tree
 
         return calibration_tree(self)
 

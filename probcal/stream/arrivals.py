@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.counted import COUNTED, STREAMS, Counted, Stream, first_key
 from probcal.labels import AXES, NOBODY
 from probcal.lazy import Later
 from probcal.model.epochs import Epoch, merged, slots
@@ -22,6 +21,7 @@ from probcal.noise import Heard, Normal
 from probcal.plausible import implausible
 from probcal.problem import Problem, check_linear, declared_target
 from probcal.smoothing.grid import candidates
+from probcal.stream.counted import COUNTED, STREAMS, Counted, Stream, first_key
 from probcal.table import Table, header, measure, name_as_text, names_as_text
 
 if TYPE_CHECKING:

@@ -23,14 +23,14 @@ from probcal.cli.models import load_fit, load_problem, note_network, on_network
 from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs, cannot_write, write_whole
-from probcal.inference import checkpoint
-from probcal.inference.arrivals import refused_rows
-from probcal.inference.counted import COUNTED
-from probcal.inference.online import AugmentedFilter, Online, ParticleFilter, Update
 from probcal.inference.progress import Progress, handled
 from probcal.problem import Problem, check_linear
 from probcal.results.io import save
 from probcal.results.schema import ROPE
+from probcal.stream import checkpoint
+from probcal.stream.arrivals import refused_rows
+from probcal.stream.counted import COUNTED
+from probcal.stream.online import AugmentedFilter, Online, ParticleFilter, Update
 from probcal.table import Table, csv_text, read_lines
 
 BLOCK = 1 << 18  # bytes that are read at once

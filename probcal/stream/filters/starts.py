@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from probcal import linalg
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
-from probcal.online.belief import Augmented
-from probcal.online.filtering import FilterGiven
-from probcal.online.linearising import About, limits, residuals_widened
 from probcal.smoothing.grid import ROBUST
+from probcal.stream.filters.belief import Augmented
+from probcal.stream.filters.filtering import FilterGiven
+from probcal.stream.filters.linearising import About, limits, residuals_widened
 
 FIRST = 8  # epochs of a new target that are looked at
 AT_ONCE = 64  # places that are tried together

@@ -13,7 +13,7 @@ from probcal.model.model import Model
 from probcal.model.rows import Block, Linearised, Rows
 from probcal.model.sigma import Rule
 from probcal.noise import gate_limits
-from probcal.online.belief import Augmented, Slots, WhiteRow
+from probcal.stream.filters.belief import Augmented, Slots, WhiteRow
 
 FLOOR = 1e-10  # least variance along an axis of the sigma points
 

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.inference.mistakes import mistake
 from probcal.inference.widen import widened_by
 from probcal.motion import Target
 from probcal.priors import Prior
@@ -22,6 +21,7 @@ from probcal.smoothing.grid import track_mode
 from probcal.smoothing.linearised import LaplaceApproximation
 from probcal.smoothing.mode import Point
 from probcal.starts import automatic_start
+from probcal.stream.mistakes import mistake
 from probcal.table import Table
 from probcal.types import float64
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-    from probcal.inference.online import Online
+    from probcal.stream.online import Online
 
 
 class Watched:

@@ -9,8 +9,19 @@ import jax.numpy as jnp
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
 from probcal.model.sigma import cubature, unscented
-from probcal.online.belief import Augmented, KeptDatum, Slots, WhiteRow, moved_on, not_estimated, one, put, seen, walked
-from probcal.online.linearising import About, centre, linearised, regressed
+from probcal.stream.filters.belief import (
+    Augmented,
+    KeptDatum,
+    Slots,
+    WhiteRow,
+    moved_on,
+    not_estimated,
+    one,
+    put,
+    seen,
+    walked,
+)
+from probcal.stream.filters.linearising import About, centre, linearised, regressed
 
 RULES = {"extended": None, "unscented": unscented, "cubature": cubature}  # names of the linearisations
 

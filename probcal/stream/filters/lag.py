@@ -14,8 +14,8 @@ import jax.numpy as jnp
 
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
-from probcal.online.belief import ADMIT, DECIDE, HOLD, Augmented, KeptDatum
-from probcal.online.filtering import EpochStep, FilterForm, FilterGiven, RowPoints, epoch_step, window_evidence
+from probcal.stream.filters.belief import ADMIT, DECIDE, HOLD, Augmented, KeptDatum
+from probcal.stream.filters.filtering import EpochStep, FilterForm, FilterGiven, RowPoints, epoch_step, window_evidence
 
 HALVE = 6  # passes after which a point goes half of its way only
 FIRM = 4  # passes after which the data that are held back stay the same

@@ -16,13 +16,13 @@ import jax
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.arrivals import CarriedTarget
 from probcal.inference.manifest import check_same
-from probcal.inference.online import Jump, Online, ParticleFilter
-from probcal.inference.surveillance import BATCH, Event
 from probcal.lazy import Later
 from probcal.model.motions import Area
 from probcal.results.io import SEAL
+from probcal.stream.arrivals import CarriedTarget
+from probcal.stream.online import Jump, Online, ParticleFilter
+from probcal.stream.surveillance import BATCH, Event
 from probcal.table import Table, measure
 from probcal.types import float64
 
