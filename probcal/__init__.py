@@ -108,7 +108,6 @@ __all__ = lazy(
             "Unscented fit log_evidence numpyro_model particle_filter track"
         ),
         "probcal.inference.associations": "sample_associations",
-        "probcal.stream.online": "AugmentedFilter Jumps Online ParticleFilter",
         "probcal.motion": (
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"
         ),

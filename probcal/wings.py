@@ -10,9 +10,10 @@ from types import ModuleType
 
 from probcal.errors import InputError
 
-WINGS = ("adapters", "doa", "roads", "rss", "studies")
+WINGS = ("adapters", "doa", "roads", "rss", "stream", "studies")
 NAMES = {  # public names of `probcal` by module
     "probcal.roads": "LeavingRoad Road RoadNetwork match_track read_roads",
+    "probcal.stream.online": "AugmentedFilter Jumps Online ParticleFilter",
     "probcal.studies.coverage": "coverage_table",
     "probcal.studies.fits": "load_study",
     "probcal.studies.sbc": "sbc",
@@ -27,6 +28,7 @@ COMMANDS = {  # commands of the command line; the module of each defines NAME_co
     "levels": "probcal.rss.command",
     "sbc": "probcal.studies.commands",
     "study": "probcal.studies.commands",
+    "watch": "probcal.stream.command",
 }
 
 

@@ -40,6 +40,8 @@ NEEDS = {  # wings that all tests of a file need: it is not collected where one 
     "test_adapters_ros.py": "adapters",
     "test_adapters_stone_soup.py": "adapters",
     "test_doa.py": "doa",
+    "test_gate.py": "stream",
+    "test_online.py": "stream",
     "test_particle_methods.py": "roads",
     "test_roads.py": "roads",
     "test_rss.py": "rss",
@@ -47,6 +49,7 @@ NEEDS = {  # wings that all tests of a file need: it is not collected where one 
     "test_cluster.py": "studies",
     "test_fits.py": "studies",
     "test_studies.py": "studies",
+    "test_watch.py": "stream",
 }
 
 

@@ -27,7 +27,6 @@ from probcal import (
     LeastSquares,
     Network,
     Node,
-    Online,
     ParticleGibbs,
     Particles,
     Problem,
@@ -198,7 +197,7 @@ DRAWN = ("every bias surveyed", "distances alone")  # problems that samplers are
 
 
 def of_stream(problem, tree):
-    online = Online(problem.network, problem.motion, fix=problem.fixed)
+    online = probcal.Online(problem.network, problem.motion, fix=problem.fixed)
     online.update(problem.measurements.table.frame)
     online.finish()
     return online.tree()

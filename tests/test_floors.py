@@ -25,7 +25,7 @@ FLOORS = {
     6: ("identifiability", "results"),
     7: ("inference",),
     8: ("analysis",),
-    9: ("stream", "cli", "report", "plots", "diagnostics"),
+    9: ("cli", "report", "plots", "diagnostics"),
     10: WINGS,
 }  # fmt: skip
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}

@@ -465,7 +465,7 @@ def test_a_state_belongs_to_what_was_declared():
 DECLARED = """
 import numpy as np
 import probcal as pc
-from probcal.roads import Road, RoadNetwork
+from probcal import Road, RoadNetwork
 
 @pc.sensor(east=pc.Channel("m", pc.Unknown(1.0), noise=pc.Censored()))
 def gauge(target, pose, *, shift=pc.Bias("m", 2.0, drift=pc.Drift([0.0, 9.0], std=0.1))):

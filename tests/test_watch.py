@@ -35,7 +35,7 @@ def problem(data=None):
     return Problem(network, motion, data)
 """
 
-ON_ROAD = "from probcal.roads import Road, RoadNetwork\n" + MODEL.replace(
+ON_ROAD = "from probcal import Road, RoadNetwork\n" + MODEL.replace(
     'Target(ConstantVelocity(0.5), {"position": ((0.0, 0.0), 5.0), "velocity": ((1.0, 0.0), 1.0)})',
     'Road(RoadNetwork.from_lines({"west": [(-9.0, 0.0), (20.0, 0.0)], "east": [(20.0, 0.0), (90.0, 0.0)],'
     ' "north": [(20.0, 0.0), (20.0, 60.0)]}), 0.1, (1.0, 0.2), ((0.0, 0.0), 2.0), fastest=3.0)',
@@ -146,6 +146,7 @@ def test_particles_go_on_where_they_were(model, table, tmp_path):
     assert "--particles filters without --lag; give one of the two" in said
 
 
+@pytest.mark.needs("roads")
 def test_who_is_on_a_road_is_filtered_and_who_cannot_be_sure_is_told(model, table, tmp_path):
     model.write_text(ON_ROAD)
     out = tmp_path / "out"
@@ -257,6 +258,7 @@ def test_rows_are_filtered_at_common_epochs(model, table):
     assert "80 rows up to time 40 s" in printed
 
 
+@pytest.mark.needs("roads")
 def test_what_is_wrong_is_said(model, table, tmp_path):
     wrong = {
         ("--keep", "x", "--out", tmp_path): 'keep "x" is not known; give tracks, rows or both, separated by a comma',

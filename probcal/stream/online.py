@@ -37,7 +37,9 @@ from probcal.stream.filters.filtering import RULES, FilterForm, FilterGiven, Row
 from probcal.stream.filters.lag import Window, run_plain, run_window
 from probcal.stream.filters.particles import Cloud
 from probcal.stream.filters.starts import FIRST, place_new
+from probcal.stream.relearnt import relearnt
 from probcal.stream.surveillance import ChangePoint, StreamData, Surveillance, data_in_order
+from probcal.stream.watched import calibration_tree
 from probcal.table import read_table
 from probcal.types import float64
 
@@ -376,8 +378,6 @@ class Online:
         where biases walk, jumped or are only considered, or the stream began from an earlier calibration: there is no
         prior of them that could be replaced.
         """
-        from probcal.stream.relearnt import relearnt
-
         if self.method.walk or self.method.consider or self.jumps or self.calibration is not None:
             raise InputError(
                 "under(prior): biases that walk, jumped, are only considered or come from an earlier calibration have"
@@ -397,8 +397,6 @@ class Online:
 
         Raises `InputError` before the first rows.
         """
-        from probcal.stream.watched import calibration_tree
-
         return calibration_tree(self)
 
     # rows in

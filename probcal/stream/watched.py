@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import numpy as np
 
 from probcal.inference.widen import widened_by
 from probcal.motion import Target
-from probcal.priors import Prior
+from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import CHAINS, Answer, Draws, NormalPosterior, Tracks
 from probcal.results.build import build
@@ -21,7 +21,10 @@ from probcal.smoothing.grid import track_mode
 from probcal.smoothing.linearised import LaplaceApproximation
 from probcal.smoothing.mode import Point
 from probcal.starts import automatic_start
+from probcal.status import Status
+from probcal.stream.arrivals import Arrivals
 from probcal.stream.mistakes import mistake
+from probcal.stream.surveillance import Surveillance
 from probcal.table import Table
 from probcal.types import float64
 
@@ -29,7 +32,41 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-    from probcal.stream.online import Online
+
+class Filtered(Protocol):
+    """The filter of a stream, as its tree reads it."""
+
+    method: Any
+    prior: Gaussian
+    arrivals: Arrivals
+    check: Surveillance
+    end: Any  # the last `Augmented`
+    log_evidence: float
+    recent: pd.DataFrame | None  # the last rows that the model explains
+    last: pd.DataFrame | None  # the last rows of any kind
+    lately: pd.DataFrame | None  # tracks of the last rows, by particles
+
+    @property
+    def _problem(self) -> Problem: ...
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Numbers of rows by kind."""
+
+    @property
+    def status(self) -> Status:
+        """Validity of the answer."""
+
+    @property
+    def message(self) -> str:
+        """Reasons against the answer."""
+
+    @property
+    def inflation(self) -> np.ndarray:
+        """Factor (M,) of the part of each variance that comes from the data."""
+
+    def levels(self, problem: Problem) -> np.ndarray:
+        """Log levels (H,) of a problem."""
 
 
 class Watched:
@@ -81,7 +118,7 @@ class FilteredPosterior(StreamPosterior):
 
 
 @float64
-def calibration_tree(online: Online) -> xr.DataTree:
+def calibration_tree(online: Filtered) -> xr.DataTree:
     """The tree of what a filter knows."""
     sampled = any(motion is not None for motion in online._problem.model.sampled)
     if online.check.unexplained and online.last is not None and not sampled:
@@ -118,7 +155,7 @@ def calibration_tree(online: Online) -> xr.DataTree:
     return tree
 
 
-def _of_last(online: Online, frame: pd.DataFrame) -> Problem:
+def _of_last(online: Filtered, frame: pd.DataFrame) -> Problem:
     """The problem of the last rows of a stream."""
     template = online._problem
     own = frame.drop(columns=["cells", "line"])
@@ -129,7 +166,7 @@ def _of_last(online: Online, frame: pd.DataFrame) -> Problem:
     return Problem(template.network, motions, table, fix=template.fixed, epoch=template.epoch)
 
 
-def _filtered(online: Online, problem: Problem) -> list[Tracks]:
+def _filtered(online: Filtered, problem: Problem) -> list[Tracks]:
     """Mean and sd of the states at the last rows, as they were filtered."""
     assert online.lately is not None
     known = online.lately.drop_duplicates(["time", "target"], keep="last").set_index(["time", "target"])
