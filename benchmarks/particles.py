@@ -43,8 +43,8 @@ from probcal import (
     Target,
     simulate,
 )
-from probcal.particle.ensemble import ensemble
-from probcal.particle.targets import targets_of
+from probcal.particles.ensemble import ensemble
+from probcal.particles.targets import targets_of
 
 
 def best(problem, how, tries=5):

@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from probcal.network import Network, Node, Path
     from probcal.nodes import read_nodes, write_network, write_nodes
     from probcal.noise import Bernoulli, Censored, Mixture, StudentT, Truncated, Unknown
-    from probcal.particle.settings import Particles
+    from probcal.particles.settings import Particles
     from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
     from probcal.problem import Problem
     from probcal.results.drifts import drift_table
@@ -114,7 +114,7 @@ __all__ = lazy(
         "probcal.network": "Network Node Path",
         "probcal.nodes": "read_nodes write_network write_nodes",
         "probcal.noise": "Bernoulli Censored Mixture StudentT Truncated Unknown",
-        "probcal.particle.settings": "Particles",
+        "probcal.particles.settings": "Particles",
         "probcal.priors": "ARD BernoulliGaussian Flat Gaussian Horseshoe Laplace",
         "probcal.problem": "Problem",
         "probcal.sensor": "Bias Channel Drift Sensor SensorType sensor",

@@ -40,11 +40,11 @@ from probcal import (
     simulate,
     track,
 )
-from probcal.inference.particle_em import wandering
 from probcal.inference.run import given_of
-from probcal.inference.weighted import SD_ERROR, Ended, Paths, conclude_particles, louis, regressed_scores, score_slope
-from probcal.particle.ensemble import ensemble, nearest_states
-from probcal.particle.targets import targets_of
+from probcal.particles.em import wandering
+from probcal.particles.ensemble import ensemble, nearest_states
+from probcal.particles.targets import targets_of
+from probcal.particles.weighted import SD_ERROR, Ended, Paths, conclude_particles, louis, regressed_scores, score_slope
 from probcal.plots import plot_particles, plot_roads
 from probcal.plots.base import write_figure
 
@@ -142,8 +142,8 @@ def test_sds_of_em_by_particles_are_the_exact_ones_whatever_the_key(linear):
 
 def test_sds_that_filters_leave_open_are_said_to_be(linear, monkeypatch):
     problem, _ = linear
-    monkeypatch.setattr("probcal.inference.weighted.SD_ERROR", 1e-4)
-    monkeypatch.setattr("probcal.inference.weighted.FILTERED", 16)
+    monkeypatch.setattr("probcal.particles.weighted.SD_ERROR", 1e-4)
+    monkeypatch.setattr("probcal.particles.weighted.FILTERED", 16)
     answer = ended_at(problem, 0.0, Particles(400))[-1]
     assert str(answer.status) == "not converged"
     assert "after 16 filters: take more particles" in answer.message

@@ -32,9 +32,9 @@ from probcal import (
     simulate,
 )
 from probcal.noise import StudentT
-from probcal.particle import settings
-from probcal.particle.conditional import conditional_path, conditional_paths
-from probcal.particle.ensemble import (
+from probcal.particles import settings
+from probcal.particles.conditional import conditional_path, conditional_paths
+from probcal.particles.ensemble import (
     ensemble,
     log_likelihood_over,
     log_motion_over,
@@ -43,10 +43,10 @@ from probcal.particle.ensemble import (
     over_paths,
     state_moments,
 )
-from probcal.particle.filtering import run_filter
-from probcal.particle.proposals import check_proposal
-from probcal.particle.settings import SMOOTHERS, Particles
-from probcal.particle.targets import along_targets, place_by_epoch, targets_of, weigh_rows
+from probcal.particles.filtering import run_filter
+from probcal.particles.proposals import check_proposal
+from probcal.particles.settings import SMOOTHERS, Particles
+from probcal.particles.targets import along_targets, place_by_epoch, targets_of, weigh_rows
 from probcal.smoothing import resampling
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "papers"))

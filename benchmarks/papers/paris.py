@@ -18,10 +18,10 @@ import numpy as np
 import probcal as pc
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
-from probcal.particle.backward import sampler_of
-from probcal.particle.filtering import built
-from probcal.particle.settings import Particles
-from probcal.particle.targets import targets_of
+from probcal.particles.backward import sampler_of
+from probcal.particles.filtering import built
+from probcal.particles.settings import Particles
+from probcal.particles.targets import targets_of
 
 Functional = Callable[[State, State, Epoch], Any]  # the state before, that at an epoch, and the epoch: a pytree
 

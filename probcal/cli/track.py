@@ -11,7 +11,7 @@ from probcal.cli.progress import shown
 from probcal.files import Outputs
 from probcal.inference import track
 from probcal.inference.progress import Monitor
-from probcal.particle.settings import Particles
+from probcal.particles.settings import Particles
 from probcal.results.read import tracks
 from probcal.results.scores import scores
 from probcal.status import INVALID

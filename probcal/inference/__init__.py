@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from probcal.lazy import lazy
 
 if TYPE_CHECKING:
-    from probcal.inference.clouds import particle_filter
     from probcal.inference.evidence import Evidence, log_evidence
     from probcal.inference.fit import calibrate, fit, track
     from probcal.inference.methods import (
@@ -25,12 +24,13 @@ if TYPE_CHECKING:
     from probcal.inference.run import Method
     from probcal.inference.selfconfig import SelfConfiguration
     from probcal.inference.svi import SVI
+    from probcal.particles.clouds import particle_filter
     from probcal.smoothing.esteps import Cubature, EStep, Extended, Unscented
 
 __all__ = lazy(
     __name__,
     {
-        "probcal.inference.clouds": "particle_filter",
+        "probcal.particles.clouds": "particle_filter",
         "probcal.inference.evidence": "Evidence log_evidence",
         "probcal.inference.fit": "calibrate fit track",
         "probcal.inference.methods": "EA EM EMEA MAP METHODS NUTS Collapsed Gibbs LeastSquares ParticleGibbs table",

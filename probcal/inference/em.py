@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
-from probcal.inference.particle_em import climb_by_particles
 from probcal.inference.run import Context, Given, Maximiser, State, learn, reweighted, valued
 from probcal.model.model import Model
-from probcal.particle.settings import Particles
+from probcal.particles.em import climb_by_particles
+from probcal.particles.settings import Particles
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer

@@ -27,11 +27,11 @@ from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.solve import solve
 from probcal.inference.sparse import SparsePosterior
 from probcal.inference.storage import Storage
-from probcal.inference.weighted import track_by_particles
 from probcal.inference.widen import judge_fit, judge_tracks
 from probcal.labels import NODE, START, listed
 from probcal.lazy import Later
-from probcal.particle.settings import Particles
+from probcal.particles.settings import Particles
+from probcal.particles.weighted import track_by_particles
 from probcal.priors import Prior
 from probcal.problem import Problem, check_linear
 from probcal.results.answer import Answer, Tracks, tracks_of, uncalibrated

@@ -12,13 +12,13 @@ from probcal.inference.collapsed import Collapsed
 from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
 from probcal.inference.nuts import NUTS
-from probcal.inference.particle_gibbs import ParticleGibbs
 from probcal.inference.run import Method
 from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.sparse_gibbs import Gibbs
 from probcal.inference.svi import SVI
 from probcal.lazy import Later
-from probcal.particle.settings import Particles
+from probcal.particles.gibbs import ParticleGibbs
+from probcal.particles.settings import Particles
 from probcal.priors import PRIORS, BernoulliGaussian, Flat, Laplace, Prior
 from probcal.problem import Problem, check_linear
 

@@ -11,7 +11,7 @@ from probcal import linalg
 from probcal.errors import InputError
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
-from probcal.particle.settings import Particles
+from probcal.particles.settings import Particles
 
 LOST = -1e12  # log weight of a particle that cannot be: were all lost, they would count alike
 STEPS = {"bootstrap": 0, "extended": 1, "laplace": 5}  # of Gauss-Newton

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from probcal.model.model import At, Model, scaled
-from probcal.particle.backward import smooth_particles
-from probcal.particle.conditional import conditional_paths
-from probcal.particle.filtering import run_filter
-from probcal.particle.settings import Particles
-from probcal.particle.targets import Targets, along_targets, place_by_epoch
+from probcal.particles.backward import smooth_particles
+from probcal.particles.conditional import conditional_paths
+from probcal.particles.filtering import run_filter
+from probcal.particles.settings import Particles
+from probcal.particles.targets import Targets, along_targets, place_by_epoch
 
 DRAWS = 20  # paths that are read off one conditional filter
 AT_ONCE = 25  # paths whose rows are linearised together

@@ -17,10 +17,10 @@ from probcal.inference.ending import ABSURD, FAR, low_and_far
 from probcal.inference.run import Given, Maximiser
 from probcal.labels import listed
 from probcal.model.model import Model
-from probcal.particle.ensemble import Ensemble, ensemble, nearest_states, observed_over_paths, state_moments
-from probcal.particle.proposals import check_proposal
-from probcal.particle.settings import Particles, check_installed
-from probcal.particle.targets import Targets, targets_of
+from probcal.particles.ensemble import Ensemble, ensemble, nearest_states, observed_over_paths, state_moments
+from probcal.particles.proposals import check_proposal
+from probcal.particles.settings import Particles, check_installed
+from probcal.particles.targets import Targets, targets_of
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.results.answer import (

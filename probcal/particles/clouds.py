@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.weighted import FILTERS, Paths, judged_tracks, log_likelihood_at, prepared
 from probcal.lazy import Later
-from probcal.particle.ensemble import filter_ensemble
-from probcal.particle.settings import Particles
+from probcal.particles.ensemble import filter_ensemble
+from probcal.particles.settings import Particles
+from probcal.particles.weighted import FILTERS, Paths, judged_tracks, log_likelihood_at, prepared
 from probcal.problem import Problem
 from probcal.results.groups import by_target
 from probcal.results.read import apply

@@ -23,19 +23,19 @@ from probcal.errors import InputError
 from probcal.inference.chains import Draw, Sample
 from probcal.inference.draws import slice_step
 from probcal.inference.hierarchy import Phi, hierarchy_of
-from probcal.inference.particle_em import climb
 from probcal.inference.posed import Form, Natural, Posed, conditional, log_prior, prior_precision
 from probcal.inference.posterior import Chains, conclude_draws
 from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
-from probcal.inference.weighted import Paths, check_learnt, louis, misfit, positive, prepared, unexplained
 from probcal.model.model import At, Model
-from probcal.particle.conditional import conditional_path
-from probcal.particle.ensemble import ensemble, expected_over_paths, first_paths, log_motion_of, state_moments
-from probcal.particle.proposals import check_proposal
-from probcal.particle.settings import Particles
-from probcal.particle.targets import Targets, place_by_epoch
+from probcal.particles.conditional import conditional_path
+from probcal.particles.em import climb
+from probcal.particles.ensemble import ensemble, expected_over_paths, first_paths, log_motion_of, state_moments
+from probcal.particles.proposals import check_proposal
+from probcal.particles.settings import Particles
+from probcal.particles.targets import Targets, place_by_epoch
+from probcal.particles.weighted import Paths, check_learnt, louis, misfit, positive, prepared, unexplained
 from probcal.priors import Gaussian, Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer

@@ -12,9 +12,8 @@ import numpy as np
 
 from probcal import linalg
 from probcal.inference.run import Context, Given, Maximiser, bare, check_method, given_of, learn
-from probcal.inference.weighted import Ended, check_learnt, conclude_particles, prepared
 from probcal.model.model import At, Model
-from probcal.particle.ensemble import (
+from probcal.particles.ensemble import (
     Ensemble,
     Expectation,
     at_states,
@@ -26,8 +25,9 @@ from probcal.particle.ensemble import (
     nearest_states,
     over_paths,
 )
-from probcal.particle.settings import Particles
-from probcal.particle.targets import Targets, weigh_rows
+from probcal.particles.settings import Particles
+from probcal.particles.targets import Targets, weigh_rows
+from probcal.particles.weighted import Ended, check_learnt, conclude_particles, prepared
 from probcal.priors import Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
-from probcal.particle.proposals import gained, propagated
-from probcal.particle.settings import Particles
+from probcal.particles.proposals import gained, propagated
+from probcal.particles.settings import Particles
 from probcal.smoothing.resampling import multinomial
 
 

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
-from probcal.particle.filtering import FilteredParticles
-from probcal.particle.settings import Particles
+from probcal.particles.filtering import FilteredParticles
+from probcal.particles.settings import Particles
 from probcal.smoothing.resampling import multinomial, systematic
 
 Sampler = Callable[..., tuple[Any, jax.Array]]  # `cuthbertlib.smc.smoothing.protocols.BackwardSampling`
