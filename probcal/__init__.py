@@ -43,13 +43,11 @@ if TYPE_CHECKING:
         Extended,
         Gibbs,
         LeastSquares,
-        ParticleGibbs,
         SelfConfiguration,
         Unscented,
         fit,
         log_evidence,
         numpyro_model,
-        particle_filter,
         track,
     )
     from probcal.inference.associations import sample_associations
@@ -67,7 +65,9 @@ if TYPE_CHECKING:
     from probcal.network import Network, Node, Path
     from probcal.nodes import read_nodes, write_network, write_nodes
     from probcal.noise import Bernoulli, Censored, Mixture, StudentT, Truncated, Unknown
-    from probcal.particles.settings import Particles
+    from probcal.particles.clouds import particle_filter
+    from probcal.particles.gibbs import ParticleGibbs
+    from probcal.particles.particles import Particles
     from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace
     from probcal.problem import Problem
     from probcal.results.drifts import drift_table
@@ -104,8 +104,8 @@ __all__ = lazy(
         "probcal.errors": "FitError InputError",
         "probcal.geodesy": "LocalFrame",
         "probcal.inference": (
-            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended Gibbs LeastSquares ParticleGibbs SelfConfiguration "
-            "Unscented fit log_evidence numpyro_model particle_filter track"
+            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended Gibbs LeastSquares SelfConfiguration "
+            "Unscented fit log_evidence numpyro_model track"
         ),
         "probcal.inference.associations": "sample_associations",
         "probcal.motion": (
@@ -114,7 +114,6 @@ __all__ = lazy(
         "probcal.network": "Network Node Path",
         "probcal.nodes": "read_nodes write_network write_nodes",
         "probcal.noise": "Bernoulli Censored Mixture StudentT Truncated Unknown",
-        "probcal.particles.settings": "Particles",
         "probcal.priors": "ARD BernoulliGaussian Flat Gaussian Horseshoe Laplace",
         "probcal.problem": "Problem",
         "probcal.sensor": "Bias Channel Drift Sensor SensorType sensor",

@@ -4,14 +4,19 @@ Any wing may be deleted. The core then leaves out its names, methods, commands a
 one by name raises `WingMissing`.
 """
 
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from probcal.errors import InputError
 
-WINGS = ("adapters", "doa", "roads", "rss", "stream", "studies")
+WINGS = ("adapters", "doa", "particles", "roads", "rss", "stream", "studies")
 NAMES = {  # public names of `probcal` by module
+    "probcal.particles.clouds": "particle_filter",
+    "probcal.particles.gibbs": "ParticleGibbs",
+    "probcal.particles.particles": "Particles",
     "probcal.roads": "LeavingRoad Road RoadNetwork match_track read_roads",
     "probcal.stream.online": "AugmentedFilter Jumps Online ParticleFilter",
     "probcal.studies.coverage": "coverage_table",
@@ -23,6 +28,11 @@ PICTURES = {  # public names of `probcal.plots` by module
     "probcal.roads.plots": "plot_particles plot_roads",
     "probcal.studies.plot_sbc": "draw_sbc plot_coverage plot_ranks",
     "probcal.studies.plot_study": "draw_study plot_study",
+}
+METHODS = {  # methods by name on the command line; the module of each has it in its METHODS
+    "em-particles": "probcal.particles.methods",
+    "em-ea-particles": "probcal.particles.methods",
+    "particle-gibbs": "probcal.particles.methods",
 }
 COMMANDS = {  # commands of the command line; the module of each defines NAME_command
     "levels": "probcal.rss.command",
@@ -42,8 +52,47 @@ def installed(module: str) -> bool:
     return wing not in WINGS or (Path(__file__).parent / wing / "__init__.py").is_file()
 
 
-def loaded(module: str, name: str) -> ModuleType:
-    """The module, imported; raises `WingMissing` where its wing is not installed, for what `name` says."""
+def check_wing(module: str, name: str) -> None:
+    """Raise `WingMissing` for a name where the wing of its module is not installed."""
     if not installed(module):
         raise WingMissing(f"{name} needs the folder probcal/{module.split('.')[1]}, which is not installed")
+
+
+def check_method_installed(name: str) -> None:
+    """Raise `WingMissing` for a method of the command line whose wing is not installed."""
+    check_wing(METHODS.get(name, ""), name)
+
+
+def loaded(module: str, name: str) -> ModuleType:
+    """The module of a name, imported; raises `WingMissing` where its wing is not installed."""
+    check_wing(module, name)
     return import_module(module)
+
+
+def of_wing(name: str) -> Any:
+    """The value of a public name of `NAMES`."""
+    module = next(module for module, names in NAMES.items() if name in names.split())
+    return getattr(loaded(module, name), name)
+
+
+class WithWings[Value](Mapping[str, Value]):
+    """Values of the core by name, and those of installed wings, whose module is imported when one is asked for."""
+
+    def __init__(self, core: Mapping[str, Value], wings: Mapping[str, str], table: str):
+        self._core, self._wings, self._table = core, wings, table
+
+    def __getitem__(self, name: str) -> Value:
+        if name in self._core:
+            return self._core[name]
+        values: Mapping[str, Value] = getattr(loaded(self._wings[name], name), self._table)
+        return values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self._core
+        yield from (name for name, module in self._wings.items() if installed(module))
+
+    def __len__(self) -> int:
+        return len(list(self))
+
+    def __contains__(self, name: object) -> bool:
+        return name in list(self)

@@ -27,8 +27,6 @@ from probcal import (
     LeastSquares,
     Network,
     Node,
-    ParticleGibbs,
-    Particles,
     Problem,
     Static,
     add_scores,
@@ -42,6 +40,7 @@ from probcal import (
 from probcal.cli.check import print_known
 from probcal.errors import FitError, InputError
 from probcal.report import write_report
+from probcal.wings import installed
 
 SPAN_STD = 0.1  # m
 
@@ -183,15 +182,17 @@ METHODS = {
     "MAP, sparse": MAP(form="sparse"),
     "MAP, matrix-free": MAP(form="matrix-free"),
     "least squares": LeastSquares(),
-    "EM by particles": EM(Particles(20), iterations=3),
 }
+if installed("probcal.particles"):
+    METHODS["EM by particles"] = EM(probcal.Particles(20), iterations=3)
 SAMPLERS = {
     "Collapsed": Collapsed(chains=2, warmup=20, draws=50, patience=1),
     "NUTS": NUTS(chains=2, warmup=20, draws=20, depth=4),
     "Gibbs": Gibbs(chains=2, warmup=25, draws=25, patience=1),
-    "ParticleGibbs": ParticleGibbs(chains=2, warmup=25, draws=25, steps=2, patience=1),
     "SVI": SVI(chains=2, warmup=50, draws=50),
 }
+if installed("probcal.particles"):
+    SAMPLERS["ParticleGibbs"] = probcal.ParticleGibbs(chains=2, warmup=25, draws=25, steps=2, patience=1)
 
 DRAWN = ("every bias surveyed", "distances alone")  # problems that samplers are asked of too
 

@@ -23,15 +23,16 @@ FLOORS = {
     4: ("model", "problem", "scans", "simulate"),
     5: ("smoothing", "starts", "association"),
     6: ("identifiability", "results"),
-    7: ("inference", "particles"),
+    7: ("inference",),
     8: ("analysis",),
     9: ("cli", "report", "plots", "diagnostics"),
     10: WINGS,
 }  # fmt: skip
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
-METHODS = tuple(
-    f"inference.{name}" for name in ("ea", "em", "collapsed", "nuts", "selfconfig", "sparse_gibbs", "svi")
-) + ("particles.gibbs",)  # algorithms
+METHODS = (  # algorithms
+    "inference.ea", "inference.em", "inference.collapsed", "inference.nuts", "inference.selfconfig",
+    "inference.sparse_gibbs", "inference.svi", "particles.gibbs",
+)  # fmt: skip
 SHARED = tuple(
     f"inference.{name}"
     for name in (

@@ -123,15 +123,15 @@ def test_an_interrupted_climb_keeps_the_best_answer_so_far():
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("method", [pc.EA(form="sparse"), pc.EM(pc.Particles(50), iterations=60)])
-def test_climbs_in_sparse_form_and_by_particles_are_interrupted(method):
+@pytest.mark.parametrize("make", [lambda: pc.EA(form="sparse"), lambda: pc.EM(pc.Particles(50), iterations=60)])
+def test_climbs_in_sparse_form_and_by_particles_are_interrupted(make):
     problem = worlds.linear("plane")[0]
 
     def stop(at):
         if at.phase == "climb" and at.done:
             raise KeyboardInterrupt
 
-    found = pc.fit(problem, method, start=worlds.resting(problem), progress=stop)
+    found = pc.fit(problem, make(), start=worlds.resting(problem), progress=stop)
     assert (found.attrs["status"], found.attrs["interrupted"]) == ("not converged", 1)
     assert found.attrs["message"].startswith("Interrupted after ")
     assert found.attrs["message"].count("Interrupted") == 1

@@ -118,6 +118,7 @@ def fit_command(
 
     Several recordings of one network are fitted each into a folder below --out, with one table of all, fits.csv.
     """
+    wings.check_method_installed(method)
     if method not in METHODS:
         raise InputError(f'--method "{method}" is not known{nearest(method, METHODS)}')
     if prior is not None and prior not in PRIORS:

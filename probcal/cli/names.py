@@ -5,6 +5,9 @@
 
 from typing import NamedTuple
 
+from probcal.wings import METHODS as OF_WINGS
+from probcal.wings import installed
+
 
 class KnownMethod(NamedTuple):
     """What the command line knows of a method."""
@@ -38,14 +41,17 @@ METHODS = {
     "map-l1": KnownMethod("MAP", False, _FIXED),
     "ml": KnownMethod("MAP", False, _FIXED),
     "nls": KnownMethod("least squares", False, ("flat",)),
-    "em-particles": KnownMethod("EM", False, _FIXED),
-    "em-ea-particles": KnownMethod("EM-EA", False, _LEARNT),
     "collapsed": KnownMethod("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
     "collapsed-spike": KnownMethod("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
     "nuts": KnownMethod("NUTS", True, _SAMPLED),
     "gibbs": KnownMethod("Gibbs", True, _SAMPLED),
-    "particle-gibbs": KnownMethod("ParticleGibbs", True, _SAMPLED),
     "self-config": KnownMethod("self-configuration", False, _INTEGRATED),
     "self-config-beliefs": KnownMethod("self-configuration", False, _INTEGRATED),
     "svi": KnownMethod("SVI", True, _SAMPLED),
 }
+_OF_WINGS = {
+    "em-particles": KnownMethod("EM", False, _FIXED),
+    "em-ea-particles": KnownMethod("EM-EA", False, _LEARNT),
+    "particle-gibbs": KnownMethod("ParticleGibbs", True, _SAMPLED),
+}
+METHODS |= {name: known for name, known in _OF_WINGS.items() if installed(OF_WINGS[name])}

@@ -12,6 +12,7 @@ from probcal.cli.outputs import RECORDINGS
 from probcal.errors import InputError, nearest
 from probcal.inference.settings import check_setting
 from probcal.labels import check_name
+from probcal.wings import check_method_installed
 
 MOST_VALUES = 10_000  # of a setting of a study
 # largest count that an option takes: of more draws or particles no machine has the memory
@@ -144,6 +145,7 @@ def method_names(text: str) -> list[str]:
     """Names of the methods of a study, separated by commas."""
     names = [name.strip() for name in text.split(",")]
     for name in names:
+        check_method_installed(name)
         if name not in METHODS and name != ORACLE:
             raise InputError(f'method "{name}" is not known{nearest(name, [*METHODS, ORACLE])}')
     return names

@@ -11,10 +11,10 @@ from probcal.cli.progress import shown
 from probcal.files import Outputs
 from probcal.inference import track
 from probcal.inference.progress import Monitor
-from probcal.particles.settings import Particles
 from probcal.results.read import tracks
 from probcal.results.scores import scores
 from probcal.status import INVALID
+from probcal.wings import of_wing
 
 
 def run(model: Path, data: Path | None, given: Mapping[str, Any], network: Path | None, calibration: Path,
@@ -30,7 +30,7 @@ def run(model: Path, data: Path | None, given: Mapping[str, Any], network: Path 
         tree = track(
             problem,
             known,
-            smoother=Particles(particles) if smoother == "particles" else None,
+            smoother=of_wing("Particles")(particles) if smoother == "particles" else None,
             key=seed,
         )
     frame = tracks(tree)

@@ -17,23 +17,20 @@ if TYPE_CHECKING:
         Collapsed,
         Gibbs,
         LeastSquares,
-        ParticleGibbs,
         table,
     )
     from probcal.inference.model import numpyro_model
     from probcal.inference.run import Method
     from probcal.inference.selfconfig import SelfConfiguration
     from probcal.inference.svi import SVI
-    from probcal.particles.clouds import particle_filter
     from probcal.smoothing.esteps import Cubature, EStep, Extended, Unscented
 
 __all__ = lazy(
     __name__,
     {
-        "probcal.particles.clouds": "particle_filter",
         "probcal.inference.evidence": "Evidence log_evidence",
         "probcal.inference.fit": "calibrate fit track",
-        "probcal.inference.methods": "EA EM EMEA MAP METHODS NUTS Collapsed Gibbs LeastSquares ParticleGibbs table",
+        "probcal.inference.methods": "EA EM EMEA MAP METHODS NUTS Collapsed Gibbs LeastSquares table",
         "probcal.inference.model": "numpyro_model",
         "probcal.inference.run": "Method",
         "probcal.inference.selfconfig": "SelfConfiguration",

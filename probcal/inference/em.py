@@ -7,10 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
-from probcal.inference.run import Context, Given, Maximiser, State, learn, reweighted, valued
+from probcal.inference.run import Context, Given, Maximiser, ParticleSmoother, State, learn, reweighted, valued
 from probcal.model.model import Model
-from probcal.particles.em import climb_by_particles
-from probcal.particles.settings import Particles
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -79,7 +77,7 @@ class EM(Maximiser):
     it stays above 6 % the fit has not converged.
     """
 
-    e_step: EStep | Particles = EXTENDED
+    e_step: EStep | ParticleSmoother = EXTENDED
     iterations: int = 500
     tolerance: float = 1e-5
     inner: int = 1
@@ -89,7 +87,7 @@ class EM(Maximiser):
     intervals: ClassVar[str] = "Laplace: exact for a Gaussian or flat prior where the problem is linear and Gaussian"
 
     def __post_init__(self):
-        if not isinstance(self.e_step, EStep | Particles):
+        if not isinstance(self.e_step, EStep | ParticleSmoother):
             raise InputError(
                 f"{self.name}(e_step={self.e_step!r}): give an E-step such as Extended(), Cubature() or Particles(500)"
             )
@@ -99,7 +97,7 @@ class EM(Maximiser):
     @property
     def by_particles(self) -> bool:
         """Whether trajectories are particles."""
-        return isinstance(self.e_step, Particles)
+        return isinstance(self.e_step, ParticleSmoother)
 
     def note(self, prior: Prior) -> str:
         """What the intervals are worth."""
@@ -107,8 +105,8 @@ class EM(Maximiser):
 
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Climb from a start until it is done or its iterations are spent."""
-        if isinstance(self.e_step, Particles):
-            return climb_by_particles(problem, self, self.e_step, prior, start.z, context)
+        if isinstance(self.e_step, ParticleSmoother):
+            return self.e_step.climbed(problem, self, prior, start, context)
         return super().answer(problem, prior, start, context)
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:

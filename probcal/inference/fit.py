@@ -22,7 +22,7 @@ from probcal.inference.manifest import stored_run
 from probcal.inference.methods import EA, NUTS, check_problem, choose_prior
 from probcal.inference.progress import Monitor, OnProgress
 from probcal.inference.rates import of_calibration
-from probcal.inference.run import Context, Method
+from probcal.inference.run import Context, Method, ParticleSmoother
 from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.solve import solve
 from probcal.inference.sparse import SparsePosterior
@@ -30,8 +30,6 @@ from probcal.inference.storage import Storage
 from probcal.inference.widen import judge_fit, judge_tracks
 from probcal.labels import NODE, START, listed
 from probcal.lazy import Later
-from probcal.particles.settings import Particles
-from probcal.particles.weighted import track_by_particles
 from probcal.priors import Prior
 from probcal.problem import Problem, check_linear
 from probcal.results.answer import Answer, Tracks, tracks_of, uncalibrated
@@ -330,7 +328,7 @@ def _kept(save: Collection[str]) -> tuple[str, ...]:
 
 @float64
 def track(
-    problem: Problem, calibration: xr.DataTree, *, smoother: Particles | None = None, key: Key = 0
+    problem: Problem, calibration: xr.DataTree, *, smoother: ParticleSmoother | None = None, key: Key = 0
 ) -> xr.DataTree:
     """Tracks of other data with a calibration applied: a tree with group `track` (mean, sd, before).
 
@@ -363,7 +361,7 @@ def track(
     found = apply(problem, calibration)
     problem = found.problem
     if smoother is not None:
-        return track_by_particles(problem, smoother, found.z, found.covariance, found.levels, as_key(key))
+        return smoother.tracked(problem, found.z, found.covariance, found.levels, as_key(key))
     check_linear(problem)
     if too_large(problem.model):
         tracks, before, after = _many_tracks(problem, found)

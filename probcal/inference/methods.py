@@ -1,6 +1,7 @@
 """The methods as values, their names on the command line, and which priors each takes.
 
-To add one: a module beside this one with a frozen dataclass that inherits `inference.run.Method`, entered here.
+To add one: a module beside this one with a frozen dataclass that inherits `inference.run.Method`, entered here; of a
+wing, in its own METHODS and in `probcal/wings.py`.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.sparse_gibbs import Gibbs
 from probcal.inference.svi import SVI
 from probcal.lazy import Later
-from probcal.particles.gibbs import ParticleGibbs
-from probcal.particles.settings import Particles
 from probcal.priors import PRIORS, BernoulliGaussian, Flat, Laplace, Prior
 from probcal.problem import Problem, check_linear
+from probcal.wings import METHODS as OF_WINGS
+from probcal.wings import WithWings
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,29 +29,30 @@ else:
     pd = Later("pandas")
 
 # names on the command line: method, and the prior it means where that is not the method's first
-METHODS: dict[str, tuple[Method, Prior | None]] = {
-    "ea": (EA(), None),
-    "ea-maximised": (EA(precisions="maximised"), None),
-    "ea-printed": (EA.as_printed(), None),
-    "ea-em": (EA.as_printed(update="em", iterations=2000), None),
-    "em-ea": (EMEA(), None),
-    "em": (EM(), None),
-    "em-ml": (EM(), Flat()),
-    "map": (MAP(), None),
-    "map-l1": (MAP(), Laplace()),
-    "ml": (MAP(), Flat()),
-    "nls": (LeastSquares(), None),
-    "em-particles": (EM(Particles(200), iterations=200), None),
-    "em-ea-particles": (EMEA(Particles(200)), None),
-    "collapsed": (Collapsed(), None),
-    "collapsed-spike": (Collapsed(), BernoulliGaussian()),
-    "nuts": (NUTS(), None),
-    "gibbs": (Gibbs(), None),
-    "particle-gibbs": (ParticleGibbs(), None),
-    "self-config": (SelfConfiguration(EA()), None),
-    "self-config-beliefs": (SelfConfiguration(EA(), start="beliefs"), None),
-    "svi": (SVI(), None),
-}
+METHODS = WithWings[tuple[Method, Prior | None]](
+    {
+        "ea": (EA(), None),
+        "ea-maximised": (EA(precisions="maximised"), None),
+        "ea-printed": (EA.as_printed(), None),
+        "ea-em": (EA.as_printed(update="em", iterations=2000), None),
+        "em-ea": (EMEA(), None),
+        "em": (EM(), None),
+        "em-ml": (EM(), Flat()),
+        "map": (MAP(), None),
+        "map-l1": (MAP(), Laplace()),
+        "ml": (MAP(), Flat()),
+        "nls": (LeastSquares(), None),
+        "collapsed": (Collapsed(), None),
+        "collapsed-spike": (Collapsed(), BernoulliGaussian()),
+        "nuts": (NUTS(), None),
+        "gibbs": (Gibbs(), None),
+        "self-config": (SelfConfiguration(EA()), None),
+        "self-config-beliefs": (SelfConfiguration(EA(), start="beliefs"), None),
+        "svi": (SVI(), None),
+    },
+    OF_WINGS,
+    "METHODS",
+)
 
 
 def choose_prior(method: Method, prior: Prior | None) -> Prior:
@@ -80,7 +82,7 @@ def check_problem(problem: Problem, *, linear: bool = True) -> None:
 
 def table() -> pd.DataFrame:
     """Which method (rows, by class) takes which prior (columns, by name on the command line)."""
-    first = {type(method).__name__: method for method, _ in reversed(METHODS.values())}
+    first = {type(method).__name__: method for method, _ in reversed(list(METHODS.values()))}
     known = {name: first[name] for name in dict.fromkeys(type(method).__name__ for method, _ in METHODS.values())}
     rows = {name: ["yes" if one.takes(prior) else "" for prior in PRIORS.values()] for name, one in known.items()}
     return pd.DataFrame.from_dict(rows, orient="index", columns=list(PRIORS))

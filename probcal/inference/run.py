@@ -8,7 +8,7 @@ a study many at once.
 from abc import ABC, abstractmethod
 from dataclasses import replace
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,9 @@ from probcal.smoothing.linearised import LaplaceApproximation, compress_and_elim
 from probcal.smoothing.mode import Eliminated, Point, cost
 from probcal.smoothing.places import places_of, tilt_of
 from probcal.smoothing.tails import expected_mixing, rewhitened
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 CHUNK = 5  # outer iterations between two reports of progress
 STALLED = 8  # climbs on the host after which one that gains nothing is given up
@@ -114,6 +117,20 @@ class Method(ABC):
 
     def check_kept(self, problem: Problem, keep: tuple[str, ...]) -> None:  # noqa: B027
         """Raise `InputError` where an answer could not give the draws that are to be kept."""
+
+
+class ParticleSmoother(ABC):
+    """What the core asks of particles."""
+
+    @abstractmethod
+    def climbed(self, problem: Problem, method: "Maximiser", prior: Prior, start: Point, context: Context) -> Answer:
+        """The answer of EM whose E-step draws particles, from the biases of a start."""
+
+    @abstractmethod
+    def tracked(
+        self, problem: Problem, z: np.ndarray, covariance: np.ndarray, levels: np.ndarray, key: jax.Array
+    ) -> "xr.DataTree":
+        """Tracks by particles at biases z (M,) of a covariance (M, M)."""
 
 
 class Maximiser(Method, ABC):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
 from probcal.particles.filtering import FilteredParticles
-from probcal.particles.settings import Particles
+from probcal.particles.settings import ParticleSettings
 from probcal.smoothing.resampling import multinomial, systematic
 
 Sampler = Callable[..., tuple[Any, jax.Array]]  # `cuthbertlib.smc.smoothing.protocols.BackwardSampling`
@@ -55,7 +55,7 @@ def metropolis(
     return jax.tree.map(lambda leaf: leaf[chosen], x0_all), chosen
 
 
-def sampler_of(how: Particles) -> Sampler:
+def sampler_of(how: ParticleSettings) -> Sampler:
     """The backward sampler of a smoother."""
     if how.smoother == "exact":
         from cuthbertlib.smc.smoothing.exact_sampling import simulate
@@ -75,7 +75,7 @@ def draw_paths(
     there: jax.Array,
     levels: jax.Array,
     key: jax.Array,
-    how: Particles,
+    how: ParticleSettings,
 ) -> State:
     """As many paths as particles, (K, M) leading, drawn from a target's smoothing distribution."""
     sampler, keys = sampler_of(how), jax.random.split(key, 3)
@@ -134,7 +134,7 @@ def smooth_particles(
     there: jax.Array,
     levels: jax.Array,
     key: jax.Array,
-    how: Particles,
+    how: ParticleSettings,
 ) -> SmoothedParticles:
     """The smoother of `how` behind a filter."""
     if how.smoother == "marginal":

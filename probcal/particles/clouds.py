@@ -11,7 +11,7 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.lazy import Later
 from probcal.particles.ensemble import filter_ensemble
-from probcal.particles.settings import Particles
+from probcal.particles.particles import Particles
 from probcal.particles.weighted import FILTERS, Paths, judged_tracks, log_likelihood_at, prepared
 from probcal.problem import Problem
 from probcal.results.groups import by_target

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
 from probcal.particles.proposals import gained, propagated
-from probcal.particles.settings import Particles
+from probcal.particles.settings import ParticleSettings
 from probcal.smoothing.resampling import multinomial
 
 
 def conditional_path(
     model: Model, epochs: Epoch, there: jax.Array, path: State, z: jax.Array, levels: jax.Array, key: jax.Array,
-    how: Particles,
+    how: ParticleSettings,
 ) -> tuple[State, jax.Array]:  # fmt: skip
     """A path (K leading) drawn given another by a kernel that leaves its posterior invariant, and where it is new.
 
@@ -29,7 +29,7 @@ def conditional_path(
 
 def conditional_paths(
     model: Model, epochs: Epoch, there: jax.Array, path: State, z: jax.Array, levels: jax.Array, key: jax.Array,
-    how: Particles, draws: int,
+    how: ParticleSettings, draws: int,
 ) -> tuple[State, jax.Array]:  # fmt: skip
     """Several paths (K, draws leading) of one conditional filter, each by itself a draw of the kernel."""
     M, keys = how.count, jax.random.split(key)

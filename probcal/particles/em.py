@@ -25,7 +25,7 @@ from probcal.particles.ensemble import (
     nearest_states,
     over_paths,
 )
-from probcal.particles.settings import Particles
+from probcal.particles.settings import ParticleSettings
 from probcal.particles.targets import Targets, weigh_rows
 from probcal.particles.weighted import Ended, check_learnt, conclude_particles, prepared
 from probcal.priors import Precision, Prior
@@ -70,7 +70,7 @@ class Trace(NamedTuple):
 @partial(jax.jit, static_argnames=("prior", "how"))
 def em_chunk(
     model: Model, targets: tuple[Targets, ...], prior: Prior, given: Given, state: Climb, last: jax.Array,
-    how: Particles,
+    how: ParticleSettings,
 ) -> tuple[Climb, Trace]:  # fmt: skip
     """A few iterations, none after the `last`."""
 
@@ -86,7 +86,7 @@ def em_chunk(
 
 
 def iterate(
-    model: Model, targets: tuple[Targets, ...], prior: Prior, given: Given, state: Climb, how: Particles
+    model: Model, targets: tuple[Targets, ...], prior: Prior, given: Given, state: Climb, how: ParticleSettings
 ) -> tuple[Climb, Trace]:
     """One E-step and one M-step, with the prior of the biases (Paper A 20-21), then precisions and levels."""
     keys, now = jax.random.split(state.key), given.prior._replace(alpha=state.alpha)
@@ -120,7 +120,7 @@ def iterate(
     return after, Trace(z, variance, told)
 
 
-def _averaged(state: Climb, expected: Expectation, how: Particles) -> Climb:
+def _averaged(state: Climb, expected: Expectation, how: ParticleSettings) -> Climb:
     """The state with what this pass says of the biases, averaged with earlier ones if that is asked for."""
     share = jnp.ones(())
     if how.m_step == "averaged":
@@ -181,7 +181,7 @@ def _variance_of_mean(trace: np.ndarray) -> np.ndarray:
     return np.asarray(around.var(0) * (1 + r) / (1 - r) / len(trace))
 
 
-def climb(problem: Problem, how: Particles, prior: Prior, z: Any, iterations: int, key: jax.Array) -> Climb:
+def climb(problem: Problem, how: ParticleSettings, prior: Prior, z: Any, iterations: int, key: jax.Array) -> Climb:
     """Where the loop stands after some iterations from biases z (M,) under a prior: a start for a sampler."""
     given = Given(
         prior.precision(problem.labels, problem.surveyed), jnp.asarray(problem.surveyed),
@@ -195,7 +195,7 @@ def climb(problem: Problem, how: Particles, prior: Prior, z: Any, iterations: in
 
 
 def _begun(
-    problem: Problem, targets: tuple[Targets, ...], how: Particles, given: Given, z: Any, key: jax.Array
+    problem: Problem, targets: tuple[Targets, ...], how: ParticleSettings, given: Given, z: Any, key: jax.Array
 ) -> Climb:
     """The state before the first iteration."""
     if how.m_step == "averaged":
@@ -206,7 +206,7 @@ def _begun(
 
 @partial(jax.jit, static_argnames="how")
 def _beginning(
-    model: Model, targets: tuple[Targets, ...], alpha: jax.Array, z: Any, key: jax.Array, how: Particles
+    model: Model, targets: tuple[Targets, ...], alpha: jax.Array, z: Any, key: jax.Array, how: ParticleSettings
 ) -> Climb:
     M, keys, paths = model.biases, jax.random.split(key), tuple[Any, ...]()
     levels = jnp.zeros(model.level_spread.shape)
@@ -218,7 +218,7 @@ def _beginning(
 
 
 def climb_by_particles(
-    problem: Problem, method: Maximiser, how: Particles, prior: Prior, z: Any, context: Context
+    problem: Problem, method: Maximiser, how: ParticleSettings, prior: Prior, z: Any, context: Context
 ) -> Answer:
     """Run the loop from biases z (M,) and conclude: a Gaussian about them, its information by
     scores."""

@@ -12,7 +12,7 @@ from probcal.model.model import At, Model, scaled
 from probcal.particles.backward import smooth_particles
 from probcal.particles.conditional import conditional_paths
 from probcal.particles.filtering import run_filter
-from probcal.particles.settings import Particles
+from probcal.particles.settings import ParticleSettings
 from probcal.particles.targets import Targets, along_targets, place_by_epoch
 
 DRAWS = 20  # paths that are read off one conditional filter
@@ -45,7 +45,7 @@ class Expectation(NamedTuple):
 
 @partial(jax.jit, static_argnames="how")
 def ensemble(
-    model: Model, targets: tuple[Targets, ...], z: jax.Array, levels: jax.Array, key: jax.Array, how: Particles
+    model: Model, targets: tuple[Targets, ...], z: jax.Array, levels: jax.Array, key: jax.Array, how: ParticleSettings
 ) -> Ensemble:
     """Filter and smooth every target of a model."""
     found: list[Any] = []
@@ -67,7 +67,7 @@ def ensemble(
 
 @partial(jax.jit, static_argnames="how")
 def filter_ensemble(
-    model: Model, targets: tuple[Targets, ...], z: jax.Array, levels: jax.Array, key: jax.Array, how: Particles
+    model: Model, targets: tuple[Targets, ...], z: jax.Array, levels: jax.Array, key: jax.Array, how: ParticleSettings
 ) -> Ensemble:
     """Filter every target of a model: particles as they are weighed at each epoch, none smoothed."""
     found: list[Any] = []
@@ -88,7 +88,7 @@ def filter_ensemble(
 
 def conditional_ensemble(
     model: Model, targets: tuple[Targets, ...], paths: tuple[Any, ...], z: jax.Array, levels: jax.Array,
-    key: jax.Array, how: Particles,
+    key: jax.Array, how: ParticleSettings,
 ) -> tuple[Ensemble, tuple[Any, ...]]:  # fmt: skip
     """Paths of every target drawn given one (T, K, 1, ...) of each recursion, and the next one to be given."""
     found: list[Any] = []

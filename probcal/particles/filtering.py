@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
 from probcal.particles.proposals import lost, propagated
-from probcal.particles.settings import Particles
+from probcal.particles.settings import ParticleSettings
 from probcal.smoothing.resampling import systematic
 
 
@@ -24,7 +24,7 @@ class FilteredParticles(NamedTuple):
     lost: jax.Array  # (K,) whether no particle could have given the rows
 
 
-def built(model: Model, how: Particles, z: jax.Array, levels: jax.Array) -> Any:
+def built(model: Model, how: ParticleSettings, z: jax.Array, levels: jax.Array) -> Any:
     """The filter as cuthbert has it: a particle is a state and the log weight it gained last, an input is an epoch."""
     from cuthbert.smc.particle_filter import build_filter
     from cuthbertlib.resampling.adaptive import ess_decorator
@@ -45,7 +45,13 @@ def built(model: Model, how: Particles, z: jax.Array, levels: jax.Array) -> Any:
 
 
 def run_filter(
-    model: Model, epochs: Epoch, there: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array, how: Particles
+    model: Model,
+    epochs: Epoch,
+    there: jax.Array,
+    z: jax.Array,
+    levels: jax.Array,
+    key: jax.Array,
+    how: ParticleSettings,
 ) -> FilteredParticles:
     """Particles of one target over its epochs (K leading)."""
     import cuthbert

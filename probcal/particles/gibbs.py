@@ -32,8 +32,8 @@ from probcal.model.model import At, Model
 from probcal.particles.conditional import conditional_path
 from probcal.particles.em import climb
 from probcal.particles.ensemble import ensemble, expected_over_paths, first_paths, log_motion_of, state_moments
+from probcal.particles.particles import Particles
 from probcal.particles.proposals import check_proposal
-from probcal.particles.settings import Particles
 from probcal.particles.targets import Targets, place_by_epoch
 from probcal.particles.weighted import Paths, check_learnt, louis, misfit, positive, prepared, unexplained
 from probcal.priors import Gaussian, Horseshoe, Prior

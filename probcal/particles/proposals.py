@@ -11,7 +11,7 @@ from probcal import linalg
 from probcal.errors import InputError
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
-from probcal.particles.settings import Particles
+from probcal.particles.settings import ParticleSettings
 
 LOST = -1e12  # log weight of a particle that cannot be: were all lost, they would count alike
 STEPS = {"bootstrap": 0, "extended": 1, "laplace": 5}  # of Gauss-Newton
@@ -23,7 +23,7 @@ def log_rows(model: Model, epoch: Epoch, x: State, z: jax.Array, levels: jax.Arr
     return jnp.where(jnp.isnan(total), LOST, jnp.clip(total, LOST, -LOST))
 
 
-def steps_of(model: Model, how: Particles, conditional: bool) -> int:
+def steps_of(model: Model, how: ParticleSettings, conditional: bool) -> int:
     """Gauss-Newton steps of the proposal for the targets of one recursion, 0 where it is the motion itself.
 
     A heavy tail draws its precisions first, so that a given state has no weight: it is then proposed by the motion.
@@ -35,7 +35,7 @@ def steps_of(model: Model, how: Particles, conditional: bool) -> int:
 
 
 def propagated(
-    model: Model, how: Particles, key: jax.Array, x: State, epoch: Epoch, z: jax.Array, levels: jax.Array,
+    model: Model, how: ParticleSettings, key: jax.Array, x: State, epoch: Epoch, z: jax.Array, levels: jax.Array,
     conditional: bool = False,
 ) -> tuple[State, jax.Array]:  # fmt: skip
     """A state drawn for an epoch from that before it, and the log weight gained."""
@@ -47,7 +47,7 @@ def propagated(
 
 
 def gained(
-    model: Model, how: Particles, before: State, after: State, epoch: Epoch, z: jax.Array, levels: jax.Array
+    model: Model, how: ParticleSettings, before: State, after: State, epoch: Epoch, z: jax.Array, levels: jax.Array
 ) -> jax.Array:
     """The log weight that a given state gains."""
     steps = steps_of(model, how, True)
@@ -104,7 +104,7 @@ def guided(
     return after, jnp.maximum(log_rows(model, epoch, after, z, levels) + gain, LOST)
 
 
-def check_proposal(model: Model, how: Particles, *, conditional: bool = False) -> None:
+def check_proposal(model: Model, how: ParticleSettings, *, conditional: bool = False) -> None:
     """Raise `InputError` where a proposal asks for what a motion does not have."""
     if how.proposal in ("auto", "bootstrap"):
         return

@@ -19,7 +19,7 @@ from probcal.labels import listed
 from probcal.model.model import Model
 from probcal.particles.ensemble import Ensemble, ensemble, nearest_states, observed_over_paths, state_moments
 from probcal.particles.proposals import check_proposal
-from probcal.particles.settings import Particles, check_installed
+from probcal.particles.settings import ParticleSettings, check_installed
 from probcal.particles.targets import Targets, targets_of
 from probcal.priors import Prior
 from probcal.problem import Problem
@@ -57,7 +57,7 @@ LOST = 3.0  # nats below the typical likelihood from which a filter counts less
 SPREAD = 32  # draws of the biases behind the sd of a track, and behind values by datum
 
 
-def prepared(problem: Problem, how: Particles) -> tuple[Targets, ...]:
+def prepared(problem: Problem, how: ParticleSettings) -> tuple[Targets, ...]:
     """The targets of a problem; raises `InputError` for particles that it cannot have."""
     check_installed()
     check_proposal(problem.model, how)
@@ -100,7 +100,7 @@ class Paths:
     """Particles of the targets of a problem, run at any biases and levels."""
 
     problem: Problem  # with its own motions
-    how: Particles
+    how: ParticleSettings
     targets: tuple[Targets, ...]
 
     def at(self, z: Any, levels: Any, key: jax.Array) -> Ensemble:
@@ -349,8 +349,8 @@ def log_mean(logs: np.ndarray) -> tuple[float, float]:
 
 
 def conclude_particles(
-    problem: Problem, method: Maximiser, how: Particles, prior: Prior, given: Given, targets: tuple[Targets, ...],
-    ended: Ended, key: jax.Array,
+    problem: Problem, method: Maximiser, how: ParticleSettings, prior: Prior, given: Given,
+    targets: tuple[Targets, ...], ended: Ended, key: jax.Array,
 ) -> Answer:  # fmt: skip
     """The answer of a climb by particles."""
     paths, keys = Paths(problem, how, targets), jax.random.split(key)
@@ -417,7 +417,7 @@ def posterior_of(
 
 
 def track_by_particles(
-    problem: Problem, how: Particles, z: np.ndarray, covariance: np.ndarray, levels: np.ndarray, key: jax.Array
+    problem: Problem, how: ParticleSettings, z: np.ndarray, covariance: np.ndarray, levels: np.ndarray, key: jax.Array
 ) -> xr.DataTree:
     """Tracks by particles at biases z (M,) of a covariance (M, M), and what they are worth."""
     paths, keys = Paths(problem, how, prepared(problem, how)), jax.random.split(key, 4)

@@ -12,7 +12,7 @@ import numpy as np
 
 from probcal.inference.widen import widened_by
 from probcal.motion import Target
-from probcal.priors import Gaussian, Prior
+from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.results.answer import CHAINS, Answer, Draws, NormalPosterior, Tracks
 from probcal.results.build import build
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-class Filtered(Protocol):
+class FilteredStream(Protocol):
     """The filter of a stream, as its tree reads it."""
 
     method: Any
-    prior: Gaussian
+    prior: Prior
     arrivals: Arrivals
     check: Surveillance
     end: Any  # the last `Augmented`
@@ -118,7 +118,7 @@ class FilteredPosterior(StreamPosterior):
 
 
 @float64
-def calibration_tree(online: Filtered) -> xr.DataTree:
+def calibration_tree(online: FilteredStream) -> xr.DataTree:
     """The tree of what a filter knows."""
     sampled = any(motion is not None for motion in online._problem.model.sampled)
     if online.check.unexplained and online.last is not None and not sampled:
@@ -155,7 +155,7 @@ def calibration_tree(online: Filtered) -> xr.DataTree:
     return tree
 
 
-def _of_last(online: Filtered, frame: pd.DataFrame) -> Problem:
+def _of_last(online: FilteredStream, frame: pd.DataFrame) -> Problem:
     """The problem of the last rows of a stream."""
     template = online._problem
     own = frame.drop(columns=["cells", "line"])
@@ -166,7 +166,7 @@ def _of_last(online: Filtered, frame: pd.DataFrame) -> Problem:
     return Problem(template.network, motions, table, fix=template.fixed, epoch=template.epoch)
 
 
-def _filtered(online: Filtered, problem: Problem) -> list[Tracks]:
+def _filtered(online: FilteredStream, problem: Problem) -> list[Tracks]:
     """Mean and sd of the states at the last rows, as they were filtered."""
     assert online.lately is not None
     known = online.lately.drop_duplicates(["time", "target"], keep="last").set_index(["time", "target"])

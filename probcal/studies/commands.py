@@ -9,6 +9,7 @@ from probcal.cli import options, outputs
 from probcal.cli.arguments import LARGEST_SEED, Data, Fix, Given, Method, Model, Network, Overwrite, Scheduler, Seed
 from probcal.cli.names import METHODS, ORACLE, PRIORS
 from probcal.errors import InputError, nearest
+from probcal.wings import check_method_installed
 
 
 def study_command(
@@ -69,6 +70,7 @@ def sbc_command(
     scheduler: Scheduler = None,
 ) -> None:
     """Check a method on a model by simulation: do its intervals hold the truth as often as they say?"""
+    check_method_installed(method)
     if method not in METHODS:
         raise InputError(f'sbc: no method is called "{method}"{nearest(method, METHODS)}')
     for name in (prior, truths):

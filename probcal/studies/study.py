@@ -46,6 +46,7 @@ from probcal.smoothing.information import mean_square
 from probcal.smoothing.mode import Point
 from probcal.starts import automatic_start
 from probcal.studies.fits import Fits, open_fits
+from probcal.wings import check_method_installed
 
 CHECKED = 20  # stored problems that a resumed study makes anew, to see whether the model is still the same
 ORACLE = "oracle"  # MAP whose prior knows which biases are zero
@@ -258,6 +259,7 @@ def choose_methods(names: Sequence[str]) -> dict[str, tuple[Method, Prior]]:
     """Methods by their names on the command line; "oracle" is MAP that knows which biases are zero."""
     chosen = {}
     for name in names:
+        check_method_installed(name)
         if name not in METHODS and name != ORACLE:
             raise InputError(f'method "{name}" is not known{nearest(name, [*METHODS, ORACLE])}')
         method, prior = METHODS["map"] if name == ORACLE else METHODS[name]
