@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import probcal as pc
-from probcal.association.gospa import Gospa
+from probcal.tracking.gospa import Gospa
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import harbour

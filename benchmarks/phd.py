@@ -25,8 +25,8 @@ import numpy as np
 import pandas as pd
 
 import probcal as pc
-from probcal.association.entry import asked
-from probcal.association.phd import LEAST, filter_intensity
+from probcal.tracking.entry import asked
+from probcal.tracking.phd import LEAST, filter_intensity
 
 SCANS, OBJECTS, PROBABILITY, CLUTTER, STD = 60, 5, 0.9, 20.0, 5.0
 HALF, SPREAD, SPEED, DRIVE = 1000.0, 600.0, 12.0, 0.3

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import probcal as pc
-from probcal.inference.selfconfig import STARTS
+from probcal.tracking.selfconfig import STARTS
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import sapient

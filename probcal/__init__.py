@@ -23,11 +23,6 @@ if TYPE_CHECKING:
         observability,
         sensitivity,
     )
-    from probcal.association.gospa import gospa
-    from probcal.association.objects import Objects, track_objects
-    from probcal.association.phd import Intensities, phd_filter
-    from probcal.association.poses import Beliefs, propagate_beliefs, separable_likelihood
-    from probcal.association.registration import Registration, register_tracks
     from probcal.detection import Detection, Sector
     from probcal.errors import FitError, InputError
     from probcal.geodesy import LocalFrame
@@ -50,7 +45,6 @@ if TYPE_CHECKING:
         numpyro_model,
         track,
     )
-    from probcal.inference.associations import sample_associations
     from probcal.motion import (
         ConstantAcceleration,
         ConstantVelocity,
@@ -83,6 +77,12 @@ if TYPE_CHECKING:
     from probcal.studies.sbc import sbc
     from probcal.studies.study import study
     from probcal.table import read_table
+    from probcal.tracking.gospa import gospa
+    from probcal.tracking.objects import Objects, track_objects
+    from probcal.tracking.phd import Intensities, phd_filter
+    from probcal.tracking.poses.propagation import Beliefs, propagate_beliefs, separable_likelihood
+    from probcal.tracking.registration import Registration, register_tracks
+    from probcal.tracking.sampler.associations import sample_associations
 
 __version__: str  # of the installed package, read when it is asked for
 
@@ -93,11 +93,11 @@ __all__ = lazy(
             "assess bound_map bounds changes compare interchangeable next_anchors next_passes next_sensors "
             "observability sensitivity"
         ),
-        "probcal.association.gospa": "gospa",
-        "probcal.association.objects": "Objects track_objects",
-        "probcal.association.phd": "Intensities phd_filter",
-        "probcal.association.poses": "Beliefs propagate_beliefs separable_likelihood",
-        "probcal.association.registration": "Registration register_tracks",
+        "probcal.tracking.gospa": "gospa",
+        "probcal.tracking.objects": "Objects track_objects",
+        "probcal.tracking.phd": "Intensities phd_filter",
+        "probcal.tracking.poses.propagation": "Beliefs propagate_beliefs separable_likelihood",
+        "probcal.tracking.registration": "Registration register_tracks",
         "probcal.detection": "Detection Sector",
         "probcal.results.drifts": "drift_table",
         "probcal.results.scores": "add_scores scores",
@@ -107,7 +107,7 @@ __all__ = lazy(
             "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended Gibbs LeastSquares SelfConfiguration "
             "Unscented fit log_evidence numpyro_model track"
         ),
-        "probcal.inference.associations": "sample_associations",
+        "probcal.tracking.sampler.associations": "sample_associations",
         "probcal.motion": (
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"
         ),

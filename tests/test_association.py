@@ -10,11 +10,11 @@ import pandas as pd
 import pytest
 
 import probcal as pc
-from probcal.association.bernoulli import associate
-from probcal.association.gospa import gospa
 from probcal.errors import FitError, InputError
 from probcal.geometry import bearing, norm
-from probcal.inference.rates import by_beta, by_gamma, of_calibration
+from probcal.tracking.bernoulli import associate
+from probcal.tracking.gospa import gospa
+from probcal.tracking.rates import by_beta, by_gamma, of_calibration
 
 REPORT = pc.Detection(0.9, clutter=3.0, view=pc.Sector(range=3000.0))
 TIME = np.arange(40.0)

@@ -10,14 +10,14 @@ import pandas as pd
 import pytest
 
 import probcal as pc
-from probcal.association.moves import ALL_SCANS, ONE_SCAN, SWAP, TRACK, draw_scan, log_scan
-from probcal.association.sampled import Association, fitted
 from probcal.errors import InputError
 from probcal.geometry import bearing, norm
-from probcal.inference.associations import SWEEP, begun_at, matched, run_pass, run_passes, scene_of, split_r_hat
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.mixed import mixing
 from probcal.results.read import apply, summary
+from probcal.tracking.sampler.associations import SWEEP, begun_at, matched, run_pass, run_passes, scene_of, split_r_hat
+from probcal.tracking.sampler.moves import ALL_SCANS, ONE_SCAN, SWAP, TRACK, draw_scan, log_scan
+from probcal.tracking.sampler.sampled import Association, fitted
 
 CHANCE, CLUTTER, SIZE = 0.8, 0.6, 12.0  # of detection; false ones a scan; of the interval that they fill
 STD, SHIFT, START, SPEED, DRIVE = 0.4, 1.0, 3.0, 1.5, 0.3

@@ -8,14 +8,14 @@ import pandas as pd
 import pytest
 
 import probcal as pc
-from probcal.association.beliefs import Field, check_rivals
-from probcal.association.entry import asked, cloud_of
-from probcal.association.messages import Belief, Edge, Kernels, Normals
-from probcal.association.search import Peak, Potential, search
-from probcal.association.separable import first_slot, go_along, partners
-from probcal.association.vertices import Vertex, graph_of, vertices_of
 from probcal.errors import InputError
 from probcal.geometry import bearing, elevation, norm
+from probcal.tracking.entry import asked, cloud_of
+from probcal.tracking.poses.beliefs import Field, check_rivals
+from probcal.tracking.poses.messages import Belief, Edge, Kernels, Normals
+from probcal.tracking.poses.search import Peak, Potential, search
+from probcal.tracking.poses.separable import first_slot, go_along, partners
+from probcal.tracking.poses.vertices import Vertex, graph_of, vertices_of
 
 TIME = np.arange(12.0)
 START = {"position": ((0.0, 0.0), 100.0), "velocity": ((0.0, 0.0), 3.0)}
@@ -130,7 +130,7 @@ def test_likelihoods_are_those_of_a_loop(terms):
 
 def normalised(each, shift):
     """Log of the normaliser in a loop, by the shares of pairs that agree."""
-    from probcal.association.bernoulli import associate
+    from probcal.tracking.bernoulli import associate
 
     H, R = np.concatenate([np.eye(2, 4)] * 2), np.diag([1.0, 4.0, 1.0, 4.0])
     total = 0.0

@@ -21,16 +21,16 @@ FLOORS = {
     2: ("sensors",),
     3: ("geodesy", "misfit", "network", "table", "nodes", "plausible"),
     4: ("model", "problem", "scans", "simulate"),
-    5: ("smoothing", "starts", "association"),
+    5: ("smoothing", "starts"),
     6: ("identifiability", "results"),
-    7: ("inference",),
+    7: ("inference", "tracking"),
     8: ("analysis",),
     9: ("cli", "report", "plots", "diagnostics"),
     10: WINGS,
 }  # fmt: skip
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
 METHODS = (  # algorithms
-    "inference.ea", "inference.em", "inference.collapsed", "inference.nuts", "inference.selfconfig",
+    "inference.ea", "inference.em", "inference.collapsed", "inference.nuts", "tracking.selfconfig",
     "inference.sparse_gibbs", "inference.svi", "particles.gibbs",
 )  # fmt: skip
 SHARED = tuple(

@@ -22,7 +22,7 @@ from probcal import plots
 from probcal.geometry import bearing, norm
 from probcal.plots import interactive, scene
 from probcal.report import tables, write_report
-from probcal.results.objects import object_groups, view_variables
+from probcal.results.views import object_groups, view_variables
 from probcal.smoothing.mode import Point
 
 EXISTENCE = {"track_0": [0.3, 0.8, 1.0, 0.9], "track_1": [0.1, 0.95, 0.4]}

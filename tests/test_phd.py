@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 
 import probcal as pc
-from probcal.association.entry import cloud_of
-from probcal.association.phd import Intensity, filter_intensity, reduced
-from probcal.association.scan import watch_of
-from probcal.association.update import Biases, Chances, updated_by_points
 from probcal.errors import InputError
 from probcal.geometry import bearing, norm
+from probcal.tracking.entry import cloud_of
+from probcal.tracking.phd import Intensity, filter_intensity, reduced
+from probcal.tracking.scan import watch_of
+from probcal.tracking.update import Biases, Chances, updated_by_points
 
 LIMITS = {"x": (-300.0, 300.0), "y": (-300.0, 300.0)}
 PROBABILITY, CLUTTER, STD, SCALE = 0.8, 1.5, 5.0, 10.0

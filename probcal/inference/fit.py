@@ -11,19 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.association.objects import Objects, track_objects
 from probcal.errors import FitError, InputError
 from probcal.identifiability.directions import weak_directions
 from probcal.identifiability.remedies import Direction
 from probcal.identifiability.watch import runs, strained_starts
-from probcal.inference.configure import configure
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.manifest import stored_run
 from probcal.inference.methods import EA, NUTS, check_problem, choose_prior
 from probcal.inference.progress import Monitor, OnProgress
-from probcal.inference.rates import of_calibration
 from probcal.inference.run import Context, Method, ParticleSmoother
-from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.solve import solve
 from probcal.inference.sparse import SparsePosterior
 from probcal.inference.storage import Storage
@@ -34,8 +30,8 @@ from probcal.priors import Prior
 from probcal.problem import Problem, check_linear
 from probcal.results.answer import Answer, Tracks, tracks_of, uncalibrated
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
-from probcal.results.objects import belief_group, disagreeing, object_groups
 from probcal.results.read import Calibrated, apply
+from probcal.results.views import belief_group, disagreeing, object_groups
 from probcal.simulate import Key, as_key
 from probcal.smoothing.grid import grid_start, track_mode
 from probcal.smoothing.information import at_levels
@@ -47,6 +43,10 @@ from probcal.smoothing.sparse_mode import settle_each, settled_variances
 from probcal.smoothing.tails import settle
 from probcal.starts import automatic_start
 from probcal.status import Status
+from probcal.tracking.configure import configure
+from probcal.tracking.objects import Objects, track_objects
+from probcal.tracking.rates import of_calibration
+from probcal.tracking.selfconfig import SelfConfiguration
 from probcal.types import float64
 
 if TYPE_CHECKING:

@@ -14,12 +14,12 @@ from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
 from probcal.inference.nuts import NUTS
 from probcal.inference.run import Method
-from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.sparse_gibbs import Gibbs
 from probcal.inference.svi import SVI
 from probcal.lazy import Later
 from probcal.priors import PRIORS, BernoulliGaussian, Flat, Laplace, Prior
 from probcal.problem import Problem, check_linear
+from probcal.tracking.selfconfig import SelfConfiguration
 from probcal.wings import METHODS as OF_WINGS
 from probcal.wings import WithWings
 

@@ -10,7 +10,7 @@ import numpy as np
 from probcal.geodesy import GEODETIC
 from probcal.labels import AXES
 from probcal.lazy import Later
-from probcal.results.objects import view_variables
+from probcal.results.views import view_variables
 
 if TYPE_CHECKING:
     import xarray as xr

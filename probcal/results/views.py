@@ -9,21 +9,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.association.objects import Objects
-from probcal.association.scan import View, Watch, alone, detected, watch_of
 from probcal.detection import Sector
 from probcal.labels import AXES
 from probcal.lazy import Later
 from probcal.model.epochs import Seen
 from probcal.model.rows import look
+from probcal.tracking.objects import Objects
+from probcal.tracking.scan import View, Watch, alone, detected, watch_of
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-    from probcal.association.poses import Beliefs
     from probcal.problem import Problem
     from probcal.smoothing.mode import Point
+    from probcal.tracking.poses.propagation import Beliefs
 else:
     pd, xr = Later("pandas"), Later("xarray")
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.association.search import Potential
-from probcal.association.vertices import Vertex
+from probcal.tracking.poses.search import Potential
+from probcal.tracking.poses.vertices import Vertex
 
 MESSAGES = ("gaussian", "kernel")
 MOVED = 0.3  # sds of an edge by which its biases move before it is expanded anew

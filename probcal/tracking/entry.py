@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from probcal.association.scan import View, Watch, alone, heeded, watch_of
-from probcal.association.update import Biases, Chances
 from probcal.errors import InputError, nearest
 from probcal.problem import Problem, check_linear
+from probcal.tracking.scan import View, Watch, alone, heeded, watch_of
+from probcal.tracking.update import Biases, Chances
 
 CLOUD = 512  # states among which that behind a first detection is looked for
 

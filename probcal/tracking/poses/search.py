@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.association.quad import Paired, normaliser
-from probcal.association.scan import View
-from probcal.association.separable import Crossed, Explained, crossed
+from probcal.tracking.poses.quad import Paired, normaliser
+from probcal.tracking.poses.separable import Crossed, Explained, crossed
+from probcal.tracking.scan import View
 
 POPULATION = 512  # points of the search
 CLOSE, FOLLOWED = 0.1, 160  # width from which on so many of them go on

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.association.sampled import Association, Fit, Recording, chances, fitted, log_clutter
-from probcal.association.scan import View, detected, present
-from probcal.association.update import TINY, Biases, rows_from, updated
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import factors
+from probcal.tracking.sampler.sampled import Association, Fit, Recording, chances, fitted, log_clutter
+from probcal.tracking.scan import View, detected, present
+from probcal.tracking.update import TINY, Biases, rows_from, updated
 
 MOVES = ("all scans", "one scan", "swap", "track")
 ALL_SCANS, ONE_SCAN, SWAP, TRACK = range(4)

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg
-from probcal.association.scan import Scan, View, Watch, detected
 from probcal.model import rows as waist
 from probcal.model.epochs import Seen
 from probcal.model.model import Model
 from probcal.model.rows import Linearised, Rows
+from probcal.tracking.scan import Scan, View, Watch, detected
 
 STEPS = 10  # of the search for the state that explains one detection
 TINY = 1e-30

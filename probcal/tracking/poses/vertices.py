@@ -9,15 +9,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from probcal.association.bernoulli import filter_tracks
-from probcal.association.local import Alone, each_alone
-from probcal.association.phd import Intensity, filter_intensity
-from probcal.association.quad import paired
-from probcal.association.search import Potential, Term
-from probcal.association.separable import explained, matched_scans
-from probcal.association.update import Biases, Chances
 from probcal.network import ANGLES
 from probcal.problem import Problem
+from probcal.tracking.bernoulli import filter_tracks
+from probcal.tracking.phd import Intensity, filter_intensity
+from probcal.tracking.poses.local import Alone, each_alone
+from probcal.tracking.poses.quad import paired
+from probcal.tracking.poses.search import Potential, Term
+from probcal.tracking.poses.separable import explained, matched_scans
+from probcal.tracking.update import Biases, Chances
 
 POSE = ("position", *ANGLES)
 MOST = 8  # components of a mixture that explain another sensor

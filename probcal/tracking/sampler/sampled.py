@@ -14,14 +14,14 @@ import numpy as np
 from jax.scipy.special import gammaln
 
 from probcal import linalg
-from probcal.association.scan import View, Watch, detected, present
-from probcal.association.update import TINY, Biases, births, rows_from
 from probcal.model.epochs import Move
 from probcal.model.model import Model
 from probcal.priors import Precision
 from probcal.smoothing import recursion as rec
 from probcal.smoothing.mode import Eliminated, Kept, Point, eliminate, factors, follow, log_density
 from probcal.smoothing.solves import Dense
+from probcal.tracking.scan import View, Watch, detected, present
+from probcal.tracking.update import TINY, Biases, births, rows_from
 
 STEPS, HALVINGS = 40, 10  # of Gauss-Newton, and of one of its steps
 SETTLED = 1e-9  # nats at which they end

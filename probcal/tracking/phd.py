@@ -19,12 +19,12 @@ import numpy as np
 from jax.scipy.special import gammaln, logsumexp, xlogy
 
 from probcal import linalg
-from probcal.association.entry import asked
-from probcal.association.scan import Scan, View, Watch, detected, present
-from probcal.association.update import TINY, Biases, Chances, births, rows_from, updated, updated_by_points
 from probcal.errors import InputError
 from probcal.lazy import Later
 from probcal.problem import Problem
+from probcal.tracking.entry import asked
+from probcal.tracking.scan import Scan, View, Watch, detected, present
+from probcal.tracking.update import TINY, Biases, Chances, births, rows_from, updated, updated_by_points
 from probcal.types import float64
 
 if TYPE_CHECKING:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from probcal.association.bernoulli import Step, filter_tracks
-from probcal.association.entry import asked
 from probcal.errors import InputError
 from probcal.lazy import Later
 from probcal.problem import Problem
+from probcal.tracking.bernoulli import Step, filter_tracks
+from probcal.tracking.entry import asked
 from probcal.types import float64
 
 if TYPE_CHECKING:

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probcal.association.objects import Objects, track_objects
-from probcal.association.poses import Beliefs, propagate_beliefs
 from probcal.errors import FitError
-from probcal.inference.rates import rated
 from probcal.inference.run import Context
-from probcal.inference.selfconfig import SelfConfiguration
 from probcal.inference.solve import solve
 from probcal.lazy import Later
 from probcal.priors import Prior
 from probcal.problem import Problem
+from probcal.tracking.objects import Objects, track_objects
+from probcal.tracking.poses.propagation import Beliefs, propagate_beliefs
+from probcal.tracking.rates import rated
+from probcal.tracking.selfconfig import SelfConfiguration
 
 if TYPE_CHECKING:
     import pandas as pd

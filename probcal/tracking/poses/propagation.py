@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probcal.association.beliefs import Field, spread_beliefs
-from probcal.association.entry import asked, cloud_of
-from probcal.association.messages import MESSAGES
-from probcal.association.separable import TERMS
-from probcal.association.vertices import Graph, graph_of
 from probcal.errors import InputError, nearest
 from probcal.lazy import Later
 from probcal.problem import Problem
+from probcal.tracking.entry import asked, cloud_of
+from probcal.tracking.poses.beliefs import Field, spread_beliefs
+from probcal.tracking.poses.messages import MESSAGES
+from probcal.tracking.poses.separable import TERMS
+from probcal.tracking.poses.vertices import Graph, graph_of
 from probcal.types import float64
 
 if TYPE_CHECKING:

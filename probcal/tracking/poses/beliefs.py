@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probcal.association.messages import Belief, Edge, Kernels, Normals
-from probcal.association.search import Peak, Potential, search
-from probcal.association.vertices import Graph
 from probcal.lazy import Later
+from probcal.tracking.poses.messages import Belief, Edge, Kernels, Normals
+from probcal.tracking.poses.search import Peak, Potential, search
+from probcal.tracking.poses.vertices import Graph
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.association.local import Alone, carried
-from probcal.association.phd import Intensity
-from probcal.association.scan import Scan, View, detected, present
-from probcal.association.update import TINY
 from probcal.model.model import Model
 from probcal.problem import Problem
+from probcal.tracking.phd import Intensity
+from probcal.tracking.poses.local import Alone, carried
+from probcal.tracking.scan import Scan, View, detected, present
+from probcal.tracking.update import TINY
 
 TERMS = ("dual", "quad")
 

@@ -8,11 +8,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from probcal.association.scan import Scan, View, Watch, alone, watch_of
 from probcal.model.epochs import Move, Seen
 from probcal.model.motions import Levels, chain
 from probcal.problem import Problem
 from probcal.table import OBJECT
+from probcal.tracking.scan import Scan, View, Watch, alone, watch_of
 
 
 @dataclass(frozen=True, eq=False)

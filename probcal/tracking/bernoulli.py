@@ -11,8 +11,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from probcal.association.scan import Scan, View, Watch, detected, present
-from probcal.association.update import TINY, Biases, Chances, births, rows_from, updated
+from probcal.tracking.scan import Scan, View, Watch, detected, present
+from probcal.tracking.update import TINY, Biases, Chances, births, rows_from, updated
 
 ROUNDS = 40  # of belief propagation
 GONE = 1e-9  # existence below which a track takes no detection

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.association.bernoulli import associate
-from probcal.association.local import Alone
-from probcal.association.phd import Intensity
-from probcal.association.scan import Scan
-from probcal.association.separable import Crossed, carry, first_slot, go_along, matched_scans
 from probcal.model.model import Model
 from probcal.problem import Problem
+from probcal.tracking.bernoulli import associate
+from probcal.tracking.phd import Intensity
+from probcal.tracking.poses.local import Alone
+from probcal.tracking.poses.separable import Crossed, carry, first_slot, go_along, matched_scans
+from probcal.tracking.scan import Scan
 
 AGREE = 0.1  # coefficient from which two tracks are more likely than not one object
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probcal.association.objects import Objects
 from probcal.detection import Detection
 from probcal.lazy import Later
 from probcal.noise import Unknown
 from probcal.problem import Problem
-from probcal.results.objects import looks_of
+from probcal.results.views import looks_of
+from probcal.tracking.objects import Objects
 
 if TYPE_CHECKING:
     import pandas as pd

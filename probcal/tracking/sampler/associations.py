@@ -11,11 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.association.entry import asked
-from probcal.association.moves import ALL_SCANS, MOVES, ONE_SCAN, SWAP, TRACK, Standing, move
-from probcal.association.objects import Objects, track_objects
-from probcal.association.sampled import Association, Recording, first_of, places
-from probcal.association.scan import View
 from probcal.errors import InputError
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
 from probcal.inference.mixed import ESS, R_HAT, mixing
@@ -28,6 +23,11 @@ from probcal.results.read import apply
 from probcal.results.schema import INTERVAL
 from probcal.simulate import Key, as_key
 from probcal.status import Status
+from probcal.tracking.entry import asked
+from probcal.tracking.objects import Objects, track_objects
+from probcal.tracking.sampler.moves import ALL_SCANS, MOVES, ONE_SCAN, SWAP, TRACK, Standing, move
+from probcal.tracking.sampler.sampled import Association, Recording, first_of, places
+from probcal.tracking.scan import View
 from probcal.types import float64
 
 if TYPE_CHECKING:

@@ -1,0 +1,1 @@
+"""Associations drawn from their posterior by Markov chains."""
