@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import probcal as pc
-from probcal.results.views import belief_group
+from probcal.tracking.groups import belief_group
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import self_configuring_grid as grid

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
         Extended,
         Gibbs,
         LeastSquares,
-        SelfConfiguration,
         Unscented,
         fit,
         log_evidence,
@@ -83,6 +82,7 @@ if TYPE_CHECKING:
     from probcal.tracking.poses.propagation import Beliefs, propagate_beliefs, separable_likelihood
     from probcal.tracking.registration import Registration, register_tracks
     from probcal.tracking.sampler.associations import sample_associations
+    from probcal.tracking.selfconfig import SelfConfiguration
 
 __version__: str  # of the installed package, read when it is asked for
 
@@ -93,21 +93,15 @@ __all__ = lazy(
             "assess bound_map bounds changes compare interchangeable next_anchors next_passes next_sensors "
             "observability sensitivity"
         ),
-        "probcal.tracking.gospa": "gospa",
-        "probcal.tracking.objects": "Objects track_objects",
-        "probcal.tracking.phd": "Intensities phd_filter",
-        "probcal.tracking.poses.propagation": "Beliefs propagate_beliefs separable_likelihood",
-        "probcal.tracking.registration": "Registration register_tracks",
         "probcal.detection": "Detection Sector",
         "probcal.results.drifts": "drift_table",
         "probcal.results.scores": "add_scores scores",
         "probcal.errors": "FitError InputError",
         "probcal.geodesy": "LocalFrame",
         "probcal.inference": (
-            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended Gibbs LeastSquares SelfConfiguration "
+            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended Gibbs LeastSquares "
             "Unscented fit log_evidence numpyro_model track"
         ),
-        "probcal.tracking.sampler.associations": "sample_associations",
         "probcal.motion": (
             "ConstantAcceleration ConstantVelocity CoordinatedTurn Known Motion RandomWalk Static Target White"
         ),

@@ -12,7 +12,7 @@ from typing import Any
 
 from probcal.errors import InputError
 
-WINGS = ("adapters", "doa", "particles", "roads", "rss", "stream", "studies")
+WINGS = ("adapters", "doa", "particles", "roads", "rss", "stream", "studies", "tracking")
 NAMES = {  # public names of `probcal` by module
     "probcal.particles.clouds": "particle_filter",
     "probcal.particles.gibbs": "ParticleGibbs",
@@ -23,6 +23,16 @@ NAMES = {  # public names of `probcal` by module
     "probcal.studies.fits": "load_study",
     "probcal.studies.sbc": "sbc",
     "probcal.studies.study": "study",
+    "probcal.tracking.gospa": "gospa",
+    "probcal.tracking.objects": "Objects track_objects",
+    "probcal.tracking.phd": "Intensities phd_filter",
+    "probcal.tracking.poses.propagation": "Beliefs propagate_beliefs separable_likelihood",
+    "probcal.tracking.registration": "Registration register_tracks",
+    "probcal.tracking.sampler.associations": "sample_associations",
+    "probcal.tracking.selfconfig": "SelfConfiguration",
+}
+PARTS = {  # functions of wings that verbs of the core call, by module
+    "probcal.tracking.tracks": "track_detections",
 }
 PICTURES = {  # public names of `probcal.plots` by module
     "probcal.roads.plots": "plot_particles plot_roads",
@@ -33,6 +43,8 @@ METHODS = {  # methods by name on the command line; the module of each has it in
     "em-particles": "probcal.particles.methods",
     "em-ea-particles": "probcal.particles.methods",
     "particle-gibbs": "probcal.particles.methods",
+    "self-config": "probcal.tracking.methods",
+    "self-config-beliefs": "probcal.tracking.methods",
 }
 COMMANDS = {  # commands of the command line; the module of each defines NAME_command
     "levels": "probcal.rss.command",
@@ -70,8 +82,8 @@ def loaded(module: str, name: str) -> ModuleType:
 
 
 def of_wing(name: str) -> Any:
-    """The value of a public name of `NAMES`."""
-    module = next(module for module, names in NAMES.items() if name in names.split())
+    """The value of a name of `NAMES` or `PARTS`."""
+    module = next(module for module, names in {**NAMES, **PARTS}.items() if name in names.split())
     return getattr(loaded(module, name), name)
 
 
@@ -92,7 +104,7 @@ class WithWings[Value](Mapping[str, Value]):
         yield from (name for name, module in self._wings.items() if installed(module))
 
     def __len__(self) -> int:
-        return len(list(self))
+        return sum(1 for _ in self)
 
     def __contains__(self, name: object) -> bool:
-        return name in list(self)
+        return any(name == known for known in self)

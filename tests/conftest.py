@@ -33,29 +33,37 @@ TOGETHER = {  # files that share worlds run in one worker, one after the other; 
     "test_drift.py": "linear", "test_kernels.py": "linear", "test_metamorphic.py": "bent", "test_bounds.py": "bent",
     "test_degenerate.py": "linear", "test_sparse.py": "sparse", "test_halves.py": "sparse",
 }  # fmt: skip
-NEEDS = {  # wings that all tests of a file need: it is not collected where one is missing. Other
-    # tests say so by the marker `needs`, or skip themselves where they ask for a name of one
-    "../README.md": "roads",
+NEEDS = {  # the wings that all tests of a file need; it is not collected where one is missing
+    "../README.md": "adapters doa particles roads rss stream studies tracking",
     "test_adapters_files.py": "adapters",
     "test_adapters_ros.py": "adapters",
     "test_adapters_stone_soup.py": "adapters",
+    "test_association.py": "tracking",
+    "test_association_sampler.py": "tracking",
+    "test_beliefs.py": "tracking",
+    "test_cluster.py": "studies",
     "test_doa.py": "doa",
+    "test_fits.py": "studies",
     "test_gate.py": "stream",
     "test_online.py": "stream",
     "test_particle_methods.py": "particles roads",
     "test_particles.py": "particles",
+    "test_phd.py": "tracking",
+    "test_registration.py": "tracking",
     "test_roads.py": "roads",
     "test_rss.py": "rss",
     "test_sbc.py": "studies",
-    "test_cluster.py": "studies",
-    "test_fits.py": "studies",
+    "test_self_configuration.py": "tracking",
     "test_studies.py": "studies",
     "test_watch.py": "stream",
 }
 
 
 def missing(wings):
-    """Those of some wings that are not installed."""
+    """Those of some wings that are not installed.
+
+    A single test in a file of the core names its wings by the marker `needs`, or is skipped when it asks for a name.
+    """
     return [wing for wing in wings if not installed(f"probcal.{wing}")]
 
 

@@ -23,7 +23,7 @@ FLOORS = {
     4: ("model", "problem", "scans", "simulate"),
     5: ("smoothing", "starts"),
     6: ("identifiability", "results"),
-    7: ("inference", "tracking"),
+    7: ("inference",),
     8: ("analysis",),
     9: ("cli", "report", "plots", "diagnostics"),
     10: WINGS,

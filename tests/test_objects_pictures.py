@@ -22,7 +22,7 @@ from probcal import plots
 from probcal.geometry import bearing, norm
 from probcal.plots import interactive, scene
 from probcal.report import tables, write_report
-from probcal.results.views import object_groups, view_variables
+from probcal.results.views import view_variables
 from probcal.smoothing.mode import Point
 
 EXISTENCE = {"track_0": [0.3, 0.8, 1.0, 0.9], "track_1": [0.1, 0.95, 0.4]}
@@ -242,8 +242,11 @@ def recorded():
     return pc.Problem(network, pc.Target(pc.ConstantVelocity(0.5), start), table)
 
 
+@pytest.mark.needs("tracking")
 def test_what_each_sensor_detected_is_counted_and_views_are_saved():
     """The object is ahead of the turned radar at two times of four."""
+    from probcal.tracking.groups import object_groups
+
     problem = recorded()
     path = pd.DataFrame({"time": np.arange(4.0), "track": "track_0", "existence": [0.5, 1.0, 1.0, 1.0]})
     path = path.assign(position_x=50.0, position_y=[-9.0, -3.0, 3.0, 9.0], velocity_x=0.0, velocity_y=6.0)

@@ -44,8 +44,9 @@ from probcal.particles.ensemble import (
     state_moments,
 )
 from probcal.particles.filtering import run_filter
+from probcal.particles.particles import Particles
 from probcal.particles.proposals import check_proposal
-from probcal.particles.settings import SMOOTHERS, Particles
+from probcal.particles.settings import SMOOTHERS
 from probcal.particles.targets import along_targets, place_by_epoch, targets_of, weigh_rows
 from probcal.smoothing import resampling
 

@@ -20,7 +20,7 @@ from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
 from probcal.particles.backward import sampler_of
 from probcal.particles.filtering import built
-from probcal.particles.settings import Particles
+from probcal.particles.particles import Particles
 from probcal.particles.targets import targets_of
 
 Functional = Callable[[State, State, Epoch], Any]  # the state before, that at an epoch, and the epoch: a pytree

@@ -45,13 +45,13 @@ METHODS = {
     "collapsed-spike": KnownMethod("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
     "nuts": KnownMethod("NUTS", True, _SAMPLED),
     "gibbs": KnownMethod("Gibbs", True, _SAMPLED),
-    "self-config": KnownMethod("self-configuration", False, _INTEGRATED),
-    "self-config-beliefs": KnownMethod("self-configuration", False, _INTEGRATED),
     "svi": KnownMethod("SVI", True, _SAMPLED),
 }
 _OF_WINGS = {
     "em-particles": KnownMethod("EM", False, _FIXED),
     "em-ea-particles": KnownMethod("EM-EA", False, _LEARNT),
     "particle-gibbs": KnownMethod("ParticleGibbs", True, _SAMPLED),
+    "self-config": KnownMethod("self-configuration", False, _INTEGRATED),
+    "self-config-beliefs": KnownMethod("self-configuration", False, _INTEGRATED),
 }
 METHODS |= {name: known for name, known in _OF_WINGS.items() if installed(OF_WINGS[name])}

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from probcal.inference.run import Method
     from probcal.inference.svi import SVI
     from probcal.smoothing.esteps import Cubature, EStep, Extended, Unscented
-    from probcal.tracking.selfconfig import SelfConfiguration
 
 __all__ = lazy(
     __name__,
@@ -33,7 +32,6 @@ __all__ = lazy(
         "probcal.inference.methods": "EA EM EMEA MAP METHODS NUTS Collapsed Gibbs LeastSquares table",
         "probcal.inference.model": "numpyro_model",
         "probcal.inference.run": "Method",
-        "probcal.tracking.selfconfig": "SelfConfiguration",
         "probcal.inference.svi": "SVI",
         "probcal.smoothing.esteps": "Cubature EStep Extended Unscented",
     },

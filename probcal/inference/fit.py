@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +32,6 @@ from probcal.problem import Problem, check_linear
 from probcal.results.answer import Answer, Tracks, tracks_of, uncalibrated
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
 from probcal.results.read import Calibrated, apply
-from probcal.results.views import belief_group, disagreeing, object_groups
 from probcal.simulate import Key, as_key
 from probcal.smoothing.grid import grid_start, track_mode
 from probcal.smoothing.information import at_levels
@@ -43,11 +43,8 @@ from probcal.smoothing.sparse_mode import settle_each, settled_variances
 from probcal.smoothing.tails import settle
 from probcal.starts import automatic_start
 from probcal.status import Status
-from probcal.tracking.configure import configure
-from probcal.tracking.objects import Objects, track_objects
-from probcal.tracking.rates import of_calibration
-from probcal.tracking.selfconfig import SelfConfiguration
 from probcal.types import float64
+from probcal.wings import of_wing
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -118,10 +115,12 @@ def calibrate(
     prior = choose_prior(method, prior)
     check_problem(problem, linear=not method.by_particles)
     if problem.scans is not None:
-        return _configured(
-            problem, method, prior=prior, key=key, starts=starts, monitor=monitor, save=save, store=store,
-            resume=resume, overwrite=overwrite,
+        context = Context(jax.random.split(as_key(key))[0], monitor, None, fallback=NUTS())
+        fit_labelled = partial(
+            calibrate, prior=prior, key=key, starts=starts, monitor=monitor, save=save, store=store, resume=resume,
+            overwrite=overwrite,
         )  # fmt: skip
+        return method.configured(problem, prior, context, fit_labelled)
     keep = _kept(save)
     method.check_kept(problem, keep)
     if starts < 1:
@@ -166,69 +165,6 @@ def _interrupted(answer: Answer, monitor: Monitor) -> Answer:
     status = Status.NOT_CONVERGED if answer.status.settled else answer.status
     said = "" if monitor.stopped in answer.message else f"{monitor.stopped} while other answers were looked for."
     return replace(answer, interrupted=True, status=status, message=f"{said} {answer.message}".strip())
-
-
-def _configured(
-    problem: Problem, method: Method, *, prior: Prior, key: Key, monitor: Monitor, **settings: Any
-) -> tuple[xr.DataTree, Answer]:
-    """The fit of detections that name no target, with the objects that were found as groups of the tree."""
-    scans = problem.scans
-    assert scans is not None
-    if not isinstance(method, SelfConfiguration):
-        raise InputError(
-            f"{int(scans.count.sum())} detections in {problem.measurements.table.source} name no target: take"
-            f" SelfConfiguration({method.name.replace('-', '')}()), on the command line --method self-config, or name"
-            " them, as in problem.assigned(track_objects(problem).rows)"
-        )
-    context = Context(jax.random.split(as_key(key))[0], monitor, None, fallback=NUTS())
-    with monitor.interruptible():
-        found = configure(problem, method, prior, context)
-    if silent := found.labelled.silent:
-        raise FitError(
-            f"No detection of {', '.join(silent)} belongs to an object that is confirmed: all count as clutter, and its"
-            " biases are not found. Take it out of the network, or check its clock, its stated pose and Detection(...)."
-        )
-    tree, answer = calibrate(found.labelled, method.method, prior=prior, key=key, monitor=monitor, **settings)
-    wrong = []
-    if not found.rests:
-        wrong.append(f"{method.name} did not come to rest in {found.rounds} rounds: objects and biases still change.")
-    if found.beliefs is not None and found.beliefs.apart:
-        wrong.append(
-            f"The objects of {', '.join(found.beliefs.apart)} do not tell how they stand to the other sensors: their"
-            " biases are not found; give more common objects that turn, or state the pose."
-        )
-    if found.beliefs is not None and found.beliefs.rivals:
-        listed = ", ".join(f"{name} ({1 + count})" for name, count in found.beliefs.rivals.items())
-        wrong.append(
-            f"Several poses explain the detections as well (how many): {listed}. Survey one of these, or give objects"
-            " that turn."
-        )
-    status = Status.NOT_CONVERGED
-    for a, first, b, second in disagreeing(found.problem, found.objects, answer.posterior.summary.mean)[:1]:
-        status = Status.MISFIT
-        wrong.append(
-            f"{a} should see {first} and never does, {b} should see {second} and never does: the two differ by what no"
-            " bias allows for. Check their clocks and Detection(...), or give the sensor a bias for it."
-        )
-    if wrong and Status(tree.attrs["status"]).settled:
-        answer = replace(answer, status=status, message=f"{' '.join(wrong)} {answer.message}".strip())
-        tree.attrs |= {"status": str(answer.status), "message": answer.message}
-    said = f"{len(found.objects.names)} objects in {len(scans)} scans, found in {found.rounds} rounds of {method.name}."
-    tree.attrs |= {"rounds": found.rounds, "message": f"{said} {tree.attrs['message']}".strip()}
-    tree = _with_objects(tree, found.objects, found.problem, answer.posterior.summary.mean)
-    if found.beliefs is not None:
-        tree["belief"] = xr.DataTree(belief_group(found.beliefs))
-    if len(found.rates):
-        tree["rate"] = xr.DataTree(found.rates.rename_axis("line").to_xarray())
-    return tree, answer
-
-
-def _with_objects(tree: xr.DataTree, objects: Objects, problem: Problem, z: Any) -> xr.DataTree:
-    """The tree with the groups `association`, `object` and `detection`, at biases z (M,)."""
-    tree.attrs["objects"] = len(objects.names)
-    for name, group in object_groups(problem, objects, z).items():
-        tree[name] = xr.DataTree(group)
-    return tree
 
 
 def _directions(answer: Answer) -> tuple[Direction, ...]:
@@ -349,15 +285,9 @@ def track(
     if not problem.targets:
         source = problem.measurements.table.source
         raise InputError(f"track: no row of {source} has a target; fit(problem) tells of the biases")
-    if (scans := problem.scans) is not None:
-        check_linear(problem)
-        problem = of_calibration(problem, calibration)
-        known = apply(problem, calibration)
-        objects = track_objects(problem, known.z, known.covariance)
-        if not objects.names:
-            raise FitError(f"no object is confirmed in {len(scans)} scans: nothing stands out from clutter")
-        named = problem.assigned(objects.rows)
-        return _with_objects(track(named, calibration, smoother=smoother, key=key), objects, problem, known.z)
+    if problem.scans is not None:
+        found = of_wing("track_detections")(problem, calibration, partial(track, smoother=smoother, key=key))
+        return cast("xr.DataTree", found)
     found = apply(problem, calibration)
     problem = found.problem
     if smoother is not None:

@@ -19,7 +19,6 @@ from probcal.inference.svi import SVI
 from probcal.lazy import Later
 from probcal.priors import PRIORS, BernoulliGaussian, Flat, Laplace, Prior
 from probcal.problem import Problem, check_linear
-from probcal.tracking.selfconfig import SelfConfiguration
 from probcal.wings import METHODS as OF_WINGS
 from probcal.wings import WithWings
 
@@ -46,8 +45,6 @@ METHODS = WithWings[tuple[Method, Prior | None]](
         "collapsed-spike": (Collapsed(), BernoulliGaussian()),
         "nuts": (NUTS(), None),
         "gibbs": (Gibbs(), None),
-        "self-config": (SelfConfiguration(EA()), None),
-        "self-config-beliefs": (SelfConfiguration(EA(), start="beliefs"), None),
         "svi": (SVI(), None),
     },
     OF_WINGS,

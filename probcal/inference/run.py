@@ -6,6 +6,7 @@ a study many at once.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -115,8 +116,25 @@ class Method(ABC):
         """The problem that is solved in the place of the given one."""
         return problem
 
+    def configured(
+        self, problem: Problem, prior: Prior, context: Context, fit: "FitLabelled"
+    ) -> "tuple[xr.DataTree, Answer]":
+        """The tree and the answer of detections that name no target; `fit` fits rows that do.
+
+        Raises `InputError`: most methods take rows that name their targets.
+        """
+        assert problem.scans is not None
+        raise InputError(
+            f"{int(problem.scans.count.sum())} detections in {problem.measurements.table.source} name no target: take"
+            f" SelfConfiguration({self.name.replace('-', '')}()), on the command line --method self-config, or name"
+            " them, as in problem.assigned(track_objects(problem).rows)"
+        )
+
     def check_kept(self, problem: Problem, keep: tuple[str, ...]) -> None:  # noqa: B027
         """Raise `InputError` where an answer could not give the draws that are to be kept."""
+
+
+type FitLabelled = Callable[[Problem, Method], tuple[xr.DataTree, Answer]]  # of rows that name their targets
 
 
 class ParticleSmoother(ABC):

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from probcal.errors import FitError
-from probcal.inference.run import Context
+from probcal.inference.run import Context, Method
 from probcal.inference.solve import solve
 from probcal.lazy import Later
 from probcal.priors import Prior
@@ -16,7 +16,6 @@ from probcal.problem import Problem
 from probcal.tracking.objects import Objects, track_objects
 from probcal.tracking.poses.propagation import Beliefs, propagate_beliefs
 from probcal.tracking.rates import rated
-from probcal.tracking.selfconfig import SelfConfiguration
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,6 +26,19 @@ WIDER = 4.0  # times the variance of a belief that is granted at the start
 ALIKE = 0.02  # by which the weight of no pair may change from one round to the next
 LITTLE = 0.5  # sds that rounds which go in a circle may move
 SPARE = 0.05  # room for the rows and epochs of later rounds
+
+
+class Rounds(NamedTuple):
+    """The settings of `configure`."""
+
+    name: str  # of the method, for messages
+    method: Method  # fits labelled rows
+    iterations: int
+    tolerance: float
+    beliefs: bool  # whether beliefs say where to start
+    window: float | None
+    expected: dict[str, Any]  # of objects
+    chances: dict[str, Any]  # the settings of `track_objects`
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,20 +58,20 @@ class Configured:
         return self.problem.assigned(self.objects.rows)
 
 
-def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context: Context) -> Configured:
+def configure(problem: Problem, how: Rounds, prior: Prior, context: Context) -> Configured:
     """Track and fit in turn; raises `FitError` where no object is confirmed."""
     M = len(problem.labels)
     z, covariance, beliefs = np.zeros(M), np.eye(M), None
-    if method.start == "beliefs":
-        beliefs = propagate_beliefs(problem, window=method.window, **method.expected)
+    if how.beliefs:
+        beliefs = propagate_beliefs(problem, window=how.window, **how.expected)
         wider = np.sqrt(np.clip(1.0 / np.diagonal(beliefs.covariance), 1.0, WIDER))  # to the prior at most
         z, covariance = beliefs.z, wider[:, None] * beliefs.covariance * wider
     held: list[pd.DataFrame] = []
     moves: list[float] = []
     room, stated = Room(problem), problem
-    for k in range(method.iterations):
-        context.monitor.enter(f"objects, round {k + 1}", method.name)
-        objects = track_objects(problem, z, covariance, **method.chances)
+    for k in range(how.iterations):
+        context.monitor.enter(f"objects, round {k + 1}", how.name)
+        objects = track_objects(problem, z, covariance, **how.chances)
         if not objects.names:
             raise FitError(
                 f"no object is confirmed in {len(problem.scans or ())} scans (round {k + 1}): nothing is seen often"
@@ -71,11 +83,11 @@ def configure(problem: Problem, method: SelfConfiguration, prior: Prior, context
         if again and max(moves[len(moves) - again[0] :], default=0.0) < LITTLE:  # rounds that go in a circle
             return Configured(objects, problem, rates, k, True, beliefs)
         held.append(objects.rows)
-        summary = solve(problem.assigned(room.filled(objects.rows)), method.method, prior, context).posterior.summary
+        summary = solve(problem.assigned(room.filled(objects.rows)), how.method, prior, context).posterior.summary
         sd = np.sqrt(np.maximum(np.diagonal(summary.whole), 1e-300))
         moves.append(float(np.max(np.abs(summary.mean - z) / sd, initial=0.0)))
         z, covariance = summary.mean, summary.whole
-        if k and moves[-1] < method.tolerance:
+        if k and moves[-1] < how.tolerance:
             return Configured(objects, problem, rates, k + 1, True, beliefs)
         if context.monitor.stopped:
             break

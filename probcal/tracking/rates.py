@@ -11,7 +11,7 @@ from probcal.detection import Detection
 from probcal.lazy import Later
 from probcal.noise import Unknown
 from probcal.problem import Problem
-from probcal.results.views import looks_of
+from probcal.tracking.groups import looks_of
 from probcal.tracking.objects import Objects
 
 if TYPE_CHECKING:

@@ -1,14 +1,27 @@
 """Self-configuration: a method for detections that name no target, around one for rows that do."""
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from __future__ import annotations
 
-from probcal.errors import InputError
-from probcal.inference.run import Context, Method
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from probcal.errors import FitError, InputError
+from probcal.inference.run import Context, FitLabelled, Method
+from probcal.lazy import Later
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.mode import Point
+from probcal.status import Status
+from probcal.tracking.configure import Configured, Rounds, configure
+from probcal.tracking.groups import belief_group, disagreeing, with_objects
+
+if TYPE_CHECKING:
+    import xarray as xr
+else:
+    xr = Later("xarray")
 
 STARTS = ("stated", "beliefs")
 
@@ -76,6 +89,62 @@ class SelfConfiguration(Method):
         """What the intervals are worth: those of the method within, associations held."""
         return f"{self.method.note(prior)}; the associations are held at their weights"
 
+    def configured(
+        self, problem: Problem, prior: Prior, context: Context, fit: FitLabelled
+    ) -> tuple[xr.DataTree, Answer]:
+        """The fit of detections that name no target, with the objects that were found as groups of the tree."""
+        how = Rounds(
+            self.name, self.method, self.iterations, self.tolerance, self.start == "beliefs", self.window,
+            self.expected, self.chances,
+        )  # fmt: skip
+        with context.monitor.interruptible():
+            found = configure(problem, how, prior, context)
+        if silent := found.labelled.silent:
+            raise FitError(
+                f"No detection of {', '.join(silent)} belongs to an object that is confirmed: all count as clutter, and"
+                " its biases are not found. Take it out of the network, or check its clock, its stated pose and"
+                " Detection(...)."
+            )
+        tree, answer = fit(found.labelled, self.method)
+        status, wrong = _doubts(found, answer.posterior.summary.mean, self.name)
+        if wrong and Status(tree.attrs["status"]).settled:
+            answer = replace(answer, status=status, message=f"{' '.join(wrong)} {answer.message}".strip())
+            tree.attrs |= {"status": str(answer.status), "message": answer.message}
+        objects, scans = len(found.objects.names), len(problem.scans or ())
+        said = f"{objects} objects in {scans} scans, found in {found.rounds} rounds of {self.name}."
+        tree.attrs |= {"rounds": found.rounds, "message": f"{said} {tree.attrs['message']}".strip()}
+        tree = with_objects(tree, found.objects, found.problem, answer.posterior.summary.mean)
+        if found.beliefs is not None:
+            tree["belief"] = xr.DataTree(belief_group(found.beliefs))
+        if len(found.rates):
+            tree["rate"] = xr.DataTree(found.rates.rename_axis("line").to_xarray())
+        return tree, answer
+
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """That of the method within, where rows name their targets."""
         return self.method.answer(problem, prior, start, context)
+
+
+def _doubts(found: Configured, z: np.ndarray, name: str) -> tuple[Status, list[str]]:
+    """The status of objects and biases that do not agree, and sentences; no sentence where they do. Biases z (M,)."""
+    status, wrong = Status.NOT_CONVERGED, []
+    if not found.rests:
+        wrong.append(f"{name} did not come to rest in {found.rounds} rounds: objects and biases still change.")
+    if found.beliefs is not None and found.beliefs.apart:
+        wrong.append(
+            f"The objects of {', '.join(found.beliefs.apart)} do not tell how they stand to the other sensors: their"
+            " biases are not found; give more common objects that turn, or state the pose."
+        )
+    if found.beliefs is not None and found.beliefs.rivals:
+        listed = ", ".join(f"{name} ({1 + count})" for name, count in found.beliefs.rivals.items())
+        wrong.append(
+            f"Several poses explain the detections as well (how many): {listed}. Survey one of these, or give objects"
+            " that turn."
+        )
+    for a, first, b, second in disagreeing(found.problem, found.objects, z)[:1]:
+        status = Status.MISFIT
+        wrong.append(
+            f"{a} should see {first} and never does, {b} should see {second} and never does: the two differ by what no"
+            " bias allows for. Check their clocks and Detection(...), or give the sensor a bias for it."
+        )
+    return status, wrong
