@@ -75,7 +75,7 @@ def place_new(
             pull = slope.T @ (weight * off) - (place - resting[entries]) / spread**2
             damped = information + damping * jnp.diag(jnp.diagonal(information))
             after = place + linalg.solve_positive(damped, pull)
-            lower, _ = loss(after, some)
+            lower = loss(after, some)[0]
             good = lower < value
             state = (
                 jnp.where(good, after, place),
