@@ -66,7 +66,10 @@ class World:
 
 
 class Fit(NamedTuple):
-    """A method with its prior, the method's own where there is none, and the tolerance of its rows."""
+    """A method with its prior, the method's own where there is none, and the tolerance of its rows.
+
+    A method of a wing is a function that makes it.
+    """
 
     tolerance: str
     method: Any
@@ -249,8 +252,8 @@ FITS = {
     "em": Fit("climb", pc.EM()),
     "em-ml": Fit("climb", pc.EM(), pc.Flat()),
     "em-unscented": Fit("climb", pc.EM(pc.Unscented())),
-    "em-particles": Fit("draws", pc.EM(pc.Particles(100), iterations=8)),
-    "em-road": Fit("draws", pc.EM(pc.Particles(100), iterations=8)),
+    "em-particles": Fit("draws", lambda: pc.EM(pc.Particles(100), iterations=8)),
+    "em-road": Fit("draws", lambda: pc.EM(pc.Particles(100), iterations=8)),
     "em-ea": Fit("climb", pc.EMEA()),
     "ea": Fit("climb", pc.EA()),
     "ea-maximised": Fit("climb", pc.EA(precisions="maximised")),
@@ -264,9 +267,9 @@ FITS = {
     "collapsed-spike": Fit("draws", pc.Collapsed(**SHORT, warmup=50), pc.BernoulliGaussian()),
     "nuts": Fit("draws", pc.NUTS(**SHORT, warmup=100)),
     "gibbs": Fit("draws", pc.Gibbs(**SHORT, warmup=50)),
-    "particle-gibbs": Fit("draws", pc.ParticleGibbs(**SHORT, warmup=50), pc.Gaussian()),
+    "particle-gibbs": Fit("draws", lambda: pc.ParticleGibbs(**SHORT, warmup=50), pc.Gaussian()),
     "svi": Fit("draws", pc.SVI(**SHORT)),
-    "self-configuration": Fit("climb", pc.SelfConfiguration(pc.EA())),
+    "self-configuration": Fit("climb", lambda: pc.SelfConfiguration(pc.EA())),
 }
 
 
@@ -279,7 +282,8 @@ def made(name):
 def tree(name, method):
     """The fit of a problem by a method of `FITS`."""
     fit = FITS[method]
-    return pc.fit(made(name).problem, fit.method, prior=fit.prior, starts=fit.starts)
+    method = fit.method() if callable(fit.method) else fit.method
+    return pc.fit(made(name).problem, method, prior=fit.prior, starts=fit.starts)
 
 
 def column(values, labels=None):
