@@ -185,6 +185,7 @@ def test_what_moves_where_others_may_change_is_that_of_a_fit_where_they_do():
         assert here[k] * problem.scales[k] + moved[k] == pytest.approx(mean[label], abs=0.02)
 
 
+@pytest.mark.ci
 def test_a_bias_beside_one_that_jumps_is_weak_where_it_would_move():
     problem, _ = world(table=jumped(8.0))
     tree = assess(problem, probcal.fit(problem, MAP()))
@@ -196,6 +197,7 @@ def test_a_bias_beside_one_that_jumps_is_weak_where_it_would_move():
     assert tree["finding"]["kind"].values[0] == "drifting"  # the cause comes first
 
 
+@pytest.mark.ci
 def test_single_data_far_off_are_called_outliers_and_a_jump_is_not():
     _, table = world()
     rng, gross = np.random.default_rng(0), table.copy()

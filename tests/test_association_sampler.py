@@ -240,6 +240,7 @@ def test_draws_are_right_with_moves_left_out(schedule):
     assert np.abs(errors(*compared(e, e.p, kept))).max() < SIGMAS
 
 
+@pytest.mark.ci
 def test_one_kernel_serves_every_association_and_recording_of_a_form():
     for name in ("plain", "crossing"):
         sampled(name, SWEEP, 1)

@@ -71,6 +71,7 @@ def test_the_change_is_that_of_least_squares(pair):
     assert abs(found["t"].values[[0, 1, 3, 4]]).max() < 3.5
 
 
+@pytest.mark.ci
 def test_the_other_way_round_is_minus_that(pair):
     one, other = changes(*pair)["change"].to_dataset(), changes(*pair[::-1])["change"].to_dataset()
     np.testing.assert_allclose(one["change"].values, -other["change"].values, atol=1e-9)
@@ -199,6 +200,7 @@ def test_what_explains_it_as_well_is_named(pair):
     assert alone >= 25  # both are called moved at the rate of false alarms
 
 
+@pytest.mark.ci
 def test_fits_that_count_from_elsewhere_are_refused(pair):
     restated = pair[1].copy(deep=True)
     restated["constant_data"]["node_position"].values[2, 1] += 3.0

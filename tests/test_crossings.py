@@ -244,6 +244,7 @@ def test_a_bias_stays_from_the_square_that_its_prior_asks_for(shape, least):
     assert GroupEvidence(np.ones(1), np.array([1e3])).stays(ARD(shape=shape), 1.0)  # best at the lower bound
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("evidence", [np.nan, -np.inf])
 def test_a_trial_that_ends_nowhere_takes_no_ones_place(evidence):
     """The climb without a group of biases has no evidence: the state stands."""

@@ -402,6 +402,7 @@ def test_what_needs_the_whole_covariance_says_so():
         of_biases(tree, drawn()[1], 0.01)
 
 
+@pytest.mark.ci
 def test_a_sparse_fit_is_assessed_as_a_dense_one(dense):
     """The same innovations, contractions and verdicts; sums of squares over about the same degrees of freedom."""
     problem = drawn()[0]
@@ -705,6 +706,7 @@ def test_passes_of_a_large_network_tell_what_those_of_a_small_one_do(library, mo
     assert "weak" not in found
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 def test_a_pass_is_seen_by_the_sensors_that_it_comes_near_to(library, monkeypatch):
     """Where sensors reach so far as they did, those beyond see nothing: as if they had no row."""
