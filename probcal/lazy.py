@@ -26,7 +26,7 @@ class LazyPackage(ModuleType):
         module = f"{self.__name__}.{name}"
         if not name.startswith("_"):
             try:
-                return import_module(module)
+                return loaded(module, module)
             except ModuleNotFoundError as error:
                 if error.name != module:
                     raise

@@ -10,7 +10,7 @@ from without_wings import ROOT, package_without
 
 import probcal
 from probcal.status import Status
-from probcal.wings import COMMANDS, NAMES, PICTURES, WINGS, WingMissing, installed, loaded
+from probcal.wings import COMMANDS, METHODS, NAMES, PARTS, PICTURES, WINGS, WingMissing, installed, loaded
 
 ALONE = """
 import contextlib, importlib, io, pkgutil, sys
@@ -18,20 +18,25 @@ import numpy as np
 import pytest
 import probcal as pc
 from probcal import sensors
+from probcal.cli import main
+def said(*words):
+    sys.argv = ["probcal", *words]
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.suppress(SystemExit):
+        main()
+    return " ".join((out.getvalue() + err.getvalue()).split())
 for module in pkgutil.walk_packages(pc.__path__, "probcal."):
     if not module.name.endswith("__main__"):
         importlib.import_module(module.name)
-from probcal.cli import main
-sys.argv = ["probcal", "--help"]
-with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
-    main()
 nodes = [pc.Node(name, place, scale={"position": 1.0}) for name, place in (("a", (0, 0)), ("b", (9, 0)), ("c", (0, 9)))]
 network, motion = pc.Network([sensors.ranger.on(node) for node in nodes]), pc.ConstantVelocity(1.0)
 path = np.stack([np.linspace(1, 8, 8), np.linspace(2, 5, 8)], 1)
 run = pc.simulate(network, motion, np.arange(8.0), key=1, tracks={"t": path})
 print(pc.__file__, pc.fit(pc.Problem(network, motion, run.table), pc.EA()).attrs["status"])
-print(*pc.__all__, *pc.plots.__all__, *said.getvalue().split())
-sys.exit(pytest.main(sys.argv_of_tests))
+print(*pc.__all__, *pc.plots.__all__, said("--help"))
+for words in ORDERS:
+    print(said(*words))
+sys.exit(pytest.main(TESTS))
 """
 
 
@@ -42,20 +47,22 @@ def test_the_core_does_without_a_wing(wing, tmp_path):
     environment = os.environ | {"PYTHONPATH": str(package_without(tmp_path, wing))}
     quickly = ["--collect-only", "-qq", "-n", "0", "-p", "no:cacheprovider", "--assert=plain"]
     tests = [str(ROOT / "tests"), "-c", str(ROOT / "pyproject.toml"), *quickly]
-    code = ALONE.replace("sys.argv_of_tests", repr(tests))
+    commands = [name for name, home in COMMANDS.items() if of(home, wing)]
+    methods = [name for name, home in METHODS.items() if of(home, wing)]
+    orders = [*((name, "--what", "ever") for name in commands), *(("fit", "m.py", "--method", m) for m in methods)]
+    code = ALONE.replace("ORDERS", repr(orders)).replace("TESTS", repr(tests))
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment, check=False,
         timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    where, names = done.stdout.splitlines()[:2]
+    where, names, *sentences = done.stdout.splitlines()[: 2 + len(orders)]
     assert where.split()[0] == str(tmp_path / "probcal" / "__init__.py")
     assert where.removeprefix(where.split()[0] + " ") in set(Status)
-    gone = [
-        name for table in (NAMES, PICTURES) for home, own in table.items() if of(home, wing) for name in own.split()
-    ]
-    gone += [name for name, home in COMMANDS.items() if of(home, wing)]
-    assert not set(gone) & set(names.split())
+    gone = {name for home, own in {**NAMES, **PICTURES}.items() if of(home, wing) for name in own.split()}
+    assert not {*gone, *commands} & set(names.split())
+    for name, sentence in zip([*(f"probcal {name}" for name in commands), *methods], sentences, strict=True):
+        assert sentence == f"probcal: {name} needs the folder probcal/{wing}, which is not installed"
 
 
 def of(module, wing):
@@ -70,6 +77,8 @@ def test_what_is_of_a_wing_that_is_missing_says_so(monkeypatch):
         probcal.hoist  # noqa: B018
     with pytest.raises(ImportError, match="the folder probcal/sails, which is not installed"):
         from probcal import hoist  # noqa: F401
+    with pytest.raises(WingMissing, match=r"^probcal.sails needs the folder probcal/sails"):
+        probcal.sails  # noqa: B018
     assert loaded("probcal.labels", "labels").__name__ == "probcal.labels"
 
 
@@ -77,5 +86,5 @@ def test_every_wing_is_a_folder_of_the_package():
     """`WINGS` lists them all; one that is missing here was taken out on purpose."""
     folders = {path.parent.name for path in Path(probcal.__file__).parent.glob("*/__init__.py")}
     assert folders >= {wing for wing in WINGS if installed(f"probcal.{wing}")}
-    homes = {home.split(".")[1] for table in (NAMES, PICTURES) for home in table}
-    assert homes | {home.split(".")[1] for home in COMMANDS.values()} <= set(WINGS)
+    homes = [*NAMES, *PARTS, *PICTURES, *COMMANDS.values(), *METHODS.values()]
+    assert {home.split(".")[1] for home in homes} <= set(WINGS)
