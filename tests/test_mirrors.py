@@ -148,6 +148,7 @@ def test_a_scene_on_the_wrong_side_is_turned_in_sparse_form(seed, form):
     assert off(only(tree)["mean"].values, path) < 4
 
 
+@pytest.mark.ci
 def test_pieces_are_looked_at_again_where_the_scene_went_over():
     """The scene reflected fits better by 16 nats, and from there a piece of it by 17 more: 21 m off before."""
     problem, path = beside(53)
@@ -218,6 +219,7 @@ def test_a_mirror_is_reported_in_sparse_form(method, prior):
     assert "mirror" in found["finding"]["kind"].values.tolist()
 
 
+@pytest.mark.ci
 def test_an_answer_outlives_the_memory_that_its_other_side_takes():
     problem, _ = networks.setting(0, "line", share=1.0)
 

@@ -252,6 +252,7 @@ def test_the_frame_of_a_network_is_a_local_frame():
         Network([placed], frame=(48.0, 11.0))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["extras", "mixed"])
 def test_a_calibrated_network_states_what_the_fit_found_and_its_file_loads_back(name, tmp_path):
     """Nodes, one on a path, clocks, gains, and a bias shared by its type: `extras` and `mixed` have them."""

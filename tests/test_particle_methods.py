@@ -114,6 +114,7 @@ def ended_at(problem, away, how):
         return mean, covariance, z, told, conclude_particles(problem, method, how, prior, given, targets, ended, key)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("away", "status"), [(0.0, "converged"), (2.0, "not converged")])
 def test_where_a_climb_is_not_at_the_top_its_slope_says_so(linear, away, status):
     """Eight filters of 400 particles: score and information exact within a fifth, and the status with them."""
