@@ -11,6 +11,7 @@ GIVE = {  # class of an argument: the remedy where a value of another class is g
     "Network": "a Network, as in Network([sensor_type.on(node), ...])",
     "Method": "a method, such as EA() or MAP()",
     "Prior": "a prior, such as Gaussian() or Horseshoe()",
+    "Particles": "the number of particles, as in Particles(2000)",
     "ParticleSmoother": "the number of particles, as in Particles(2000)",
     "Point": "a Point, as probcal.starts.automatic_start(problem) returns it",
     "Truth": "a Truth, such as the truth of simulate(...)",

@@ -17,7 +17,10 @@ from probcal.priors import Precision
 from probcal.results.read import each_track
 from probcal.smoothing.mode import find_mode
 
-WORLDS = [pytest.param(name, marks=pytest.mark.ci if name in ("space", "extras", "mixed") else ()) for name in LINEAR]
+WORLDS = [
+    pytest.param(name, marks=pytest.mark.ci if name in ("space", "extras", "mixed", "drifting") else ())
+    for name in LINEAR
+]
 FALSE_ALARM = 1e-6  # of each statistical test below, all its comparisons together
 
 

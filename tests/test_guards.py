@@ -364,6 +364,7 @@ def test_a_scene_that_collapses_is_no_answer():
     assert "nats below its best on the way" in tree.attrs["message"]
 
 
+@pytest.mark.ci
 def test_biases_that_are_not_numbers_are_named():
     network, table = gauges()
     problem = Problem(network, ConstantVelocity(0.5), table)
@@ -514,6 +515,7 @@ def test_every_status_has_its_words_and_its_colour():
         assert COLOURS[status] == ("bad" if status in INVALID else "good" if status.settled else "warn")
 
 
+@pytest.mark.ci
 def test_a_hyper_prior_may_cost_evidence():
     """ARD(shape=4) prunes what the evidence would keep: what is maximised is their sum, which never falls."""
     problem, _ = linear("plane")

@@ -163,6 +163,7 @@ def test_the_size_of_a_chunk_changes_nothing(lag):
     np.testing.assert_allclose(whole["sd"], pieces["sd"], rtol=1e-7)
 
 
+@pytest.mark.ci
 def test_rows_within_the_lag_may_come_in_any_order():
     frame = rows()
     mixed = frame.copy()
@@ -336,6 +337,7 @@ def test_every_linear_world_ends_at_its_exact_posterior(name):
         np.testing.assert_allclose(online.biases["sd"] / scales, np.sqrt(np.diag(known.covariance)[:M]), rtol=1e-9)
 
 
+@pytest.mark.ci
 def test_a_target_without_a_start_is_placed_by_its_first_rows():
     places = ((0.0, 0.0), (400.0, 20.0), (100.0, 500.0), (450.0, 480.0))
     network_ = pc.Network([tape.on(pc.Node(f"n{k}", place, scale=0.5)) for k, place in enumerate(places)])
@@ -438,6 +440,7 @@ EDITS = {
 }  # fmt: skip
 
 
+@pytest.mark.ci
 def test_a_state_belongs_to_what_was_declared():
     def begun(network=None, motion=LINE, **settings):
         return pc.Online(network or stage(), motion, pc.AugmentedFilter(lag=0), **settings)
@@ -760,6 +763,7 @@ def test_a_table_that_breaks_off_midway_leaves_nothing_behind(lag, monkeypatch):
     assert online.since == other.since
 
 
+@pytest.mark.ci
 def test_a_tree_has_the_tracks_of_the_last_rows_wherever_they_began():
     found = pc.simulate(network(), {"a": MOTION["a"]}, np.arange(200.0), key=3).table.sort_values("time", kind="stable")
     online = pc.Online(network(), {"a": MOTION["a"]}, pc.AugmentedFilter(lag=0))
@@ -837,6 +841,7 @@ NONSENSE = {  # a change of 150 rows, the rows that are refused, the words of th
 }  # fmt: skip
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", NONSENSE)
 def test_rows_that_cannot_be_meant_are_refused_and_the_rest_is_filtered(kind):
     change, bad, says = NONSENSE[kind]

@@ -174,6 +174,7 @@ def test_a_trace_that_drifts_is_not_still():
         assert not wandering(np.hstack([0.3 * noise[:, :2], trace * np.ones(1)]), np.ones(3)).still
 
 
+@pytest.mark.ci
 def test_particles_that_collapsed_are_not_called_converged(linear):
     """A bootstrap filter of few particles under very sharp rows, by `track` and by `particle_filter`."""
     kind = replace(relative, channels={"place": replace(relative.channels["place"], std=0.1)})
@@ -329,6 +330,7 @@ def smoothed_along(measured, std, noise, place, pace):
     return (P @ b).reshape(K, 2), np.sqrt(np.diag(P)).reshape(K, 2)
 
 
+@pytest.mark.ci
 def test_a_road_of_one_long_edge_is_smoothed_as_a_line():
     """Mean and sd of place and speed against the Gaussian of all epochs; 4,000 particles, limits 0.15 sd and 12 %."""
     motion = Road(STREET, std=0.4, speed=(3.0, 0.5), position=((0.0, 0.0), 2.0))

@@ -164,6 +164,7 @@ def test_results_carry_more_digits_than_float32(processes):
         assert (values != values.astype(np.float32)).mean() > 0.9
 
 
+@pytest.mark.ci
 def test_other_data_of_the_same_shape_compile_nothing(kept_kernels):
     """A kernel takes data as arguments: new numbers, and a network of the same form, reuse every trace."""
     _, first = fitted(table())

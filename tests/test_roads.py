@@ -104,6 +104,7 @@ def midpoints(most, step):
     return (np.arange(-count, count) + 0.5) * step
 
 
+@pytest.mark.ci
 @given(seed=st.integers(0, 10**6), given_turns=st.booleans(), seconds=st.sampled_from([2.0, 7.0, 14.0]))
 @example(seed=3, given_turns=True, seconds=14.0)
 def test_steps_on_any_network_sum_to_one_and_agree_with_draws(seed, given_turns, seconds):

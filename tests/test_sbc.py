@@ -413,6 +413,7 @@ def test_around_a_sampler_keeps_hyper_parameters():
     assert "log joint" not in found["sbc"]["quantity"].values
 
 
+@pytest.mark.ci
 def test_around_what_is_no_fit(fitted):
     problem, tree = fitted
     with pytest.raises(InputError, match="around must be a fit of this problem that kept its draws"):

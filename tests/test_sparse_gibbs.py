@@ -182,6 +182,7 @@ def test_a_bias_that_bends_what_is_measured_has_its_posterior(away):
             assert np.std(draws) == pytest.approx(sd, abs=5 * error)
 
 
+@pytest.mark.ci
 def test_an_interrupted_run_goes_on_to_the_same_draws(tmp_path):
     """Stopped after a chunk, resumed: every draw is that of a run without a stop, bit for bit."""
     problem, method = worlds.linear("plane")[0], Gibbs(**SHORT)
@@ -201,6 +202,7 @@ def test_an_interrupted_run_goes_on_to_the_same_draws(tmp_path):
     np.testing.assert_array_equal(again["track/one"]["sd"].values, whole["track/one"]["sd"].values)
 
 
+@pytest.mark.ci
 def test_more_sweeps_a_draw_begin_the_sums_anew():
     """Of draws two sweeps apart what is summed are the sweeps since, of all chains."""
     problem = drawn()[0]
@@ -319,6 +321,7 @@ def test_what_it_does_not_take_is_said():
             pc.fit(pc.Problem(network, motion, run.table), Gibbs())
 
 
+@pytest.mark.ci
 def test_memory_that_does_not_hold_a_factor_is_said(monkeypatch):
     def refused(*_):
         raise MemoryError

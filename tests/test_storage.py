@@ -482,6 +482,7 @@ def test_a_method_without_draws_neither_resumes_nor_replaces(tmp_path):
     assert _check_store(MAP(), tmp_path, resume=False, overwrite=True) is None, "it lets the draws lie"
 
 
+@pytest.mark.ci
 def test_a_state_of_another_form_is_refused(tmp_path, monkeypatch):
     fitted(store=tmp_path)
     monkeypatch.setattr(Chunks, "count", property(lambda self: len(self.storage.numbers)))

@@ -137,6 +137,7 @@ def test_the_gain_of_a_mixture_is_its_divergence():
     np.testing.assert_allclose(np.asarray(family.mixing_gain(jnp.asarray(weight), size)), expected, atol=1e-6)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("family", "motion"),
     [
