@@ -59,7 +59,7 @@ def evidence(**stds):
     return float(probcal.fit(problem, MAP(trajectory="joint")).attrs["log_evidence"])
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_slope_and_curvature_are_those_of_the_evidence():
     problem, _ = world()
     fit = take_up(problem, probcal.fit(problem, MAP(trajectory="joint")))

@@ -60,7 +60,7 @@ def directly(first, second, moved):
     return mean[COUNT], np.sqrt(covariance[COUNT, COUNT])
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_the_change_is_that_of_least_squares(pair):
     found = changes(*pair)["change"].to_dataset()
     assert found["verdict"].values.tolist() == ["no change seen"] * 2 + ["moved"] + ["no change seen"] * 2

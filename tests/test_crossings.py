@@ -180,7 +180,7 @@ def test_chains_cross_with_a_node_alone(seed, method):
     assert bias(tree, "b0.position_y")[1] > 4.0
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("bend", [0.0, 2.0])
 def test_a_side_that_maximised_precisions_keep_in_is_left(bend):
     """It stood out by 70 sd, `converged`, though the stated place fits better or as well."""

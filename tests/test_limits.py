@@ -159,7 +159,7 @@ def likeliest(run, kind):
     return found
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [Censored(HEARS), Truncated(HEARS)], ids=repr)
 def test_what_is_not_heard_is_simulated_and_fitted(noise):
     """Rows below the floor are limits, or gone; the mode is that of scipy, and without the floor it is elsewhere."""

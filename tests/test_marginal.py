@@ -33,8 +33,10 @@ def at(model, point, prior, z, *, slope):
     return cost(model, point, prior) + 0.5 * solved.logdet
 
 
-@pytest.mark.ci
-@pytest.mark.parametrize("name", ["pair", *(pytest.param(n, marks=pytest.mark.ci) for n in bent.WORLDS if n != "pair")])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["pair", *(pytest.param(n, marks=pytest.mark.slow) for n in bent.WORLDS if n != "pair")]
+)
 def test_the_gradient_is_that_of_differences(name):
     """Radars, directions, ranges, times and events, in 2-D and 3-D, two targets: central differences of l itself."""
     world = bent.WORLDS[name]()

@@ -151,7 +151,7 @@ def test_prior_draws_have_the_moments_of_the_declaration():
     assert (np.abs(flat.std(0) / wide - 1) < width).all()
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_numpyros_own_sampler_finds_the_exact_posterior():
     network, motion, table = linear()
     problem = Problem(network, motion, table)

@@ -291,7 +291,7 @@ def test_a_calibrated_network_states_what_the_fit_found_and_its_file_loads_back(
     assert set(write_nodes(tmp_path / "map.csv", tree).read_text().splitlines()[0].split(",")) >= {"note"}
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_second_fit_from_a_calibrated_network_is_the_fit_of_both_recordings(tmp_path):
     """One bias, two targets of which each recording sees one: nothing is correlated, so that the two agree exactly."""
     declared = Network([worlds.ruler.on(Node("n", (0.0, 3.0)))])

@@ -180,6 +180,7 @@ def free_radars():
     return problem, point, observability(problem, point=point)
 
 
+@pytest.mark.slow
 @tiers(ALWAYS, SECOND)
 def test_gauge_directions_are_counted_and_named(name):
     kinds, dimension, scale, motion, expected = CASES[name]

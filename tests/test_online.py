@@ -202,7 +202,7 @@ def test_rows_of_one_time_may_come_one_by_one():
     np.testing.assert_allclose(together.biases["sd"], alone.biases["sd"], rtol=1e-9)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize(("lag", "chunk"), [(0, 1), (0, 7), (8, 3)])
 def test_rows_at_common_epochs_are_those_of_their_times(lag, chunk):
     frame = rows()
@@ -248,7 +248,7 @@ def test_a_target_that_is_silent_gives_up_its_slot():
         online.update(pd.concat([frame.assign(target=name, time=frame["time"] + 100.0) for name in "efg"]))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_jump_is_what_a_further_state_of_the_filter_says():
     one = rows("a", 0.0)
     online = filtered(pc.AugmentedFilter(lag=0, jumps=pc.Jumps(within=1e4, starts=1, false_alarms=1e-9)), one[:15], 15)
@@ -317,9 +317,9 @@ def test_a_window_of_everything_ends_at_the_batch_answer():
     np.testing.assert_allclose(online.biases["sd"], group["sd"].values, rtol=2e-3)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [name if name == "mixed" else pytest.param(name, marks=pytest.mark.ci) for name in worlds.LINEAR]
+    "name", [name if name == "mixed" else pytest.param(name, marks=pytest.mark.slow) for name in worlds.LINEAR]
 )
 def test_every_linear_world_ends_at_its_exact_posterior(name):
     """In 2-D and 3-D, with sensors of two nodes, moving nodes, drifts, targets of several motions, blank rows."""
@@ -576,7 +576,7 @@ def test_a_changed_state_is_one_sentence_or_as_good(method):
     assert refused[False] < 20  # of another version, or of something else
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_sparse_priors_are_laid_on_what_was_filtered():
     whole = pc.Problem(network(), MOTION, rows())
     online = filtered(pc.AugmentedFilter(lag=0))
@@ -928,7 +928,7 @@ def dated(frame, start="2026-01-01T00:00Z"):
     return frame.assign(time=pd.Timestamp(start) + pd.to_timedelta(frame["time"], unit="s"))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [lambda d: d, dated], ids=["seconds", "dates"])
 @pytest.mark.parametrize("epoch", [None, 2.0])
 def test_rows_that_a_fit_has_counted_are_refused(times, epoch):

@@ -228,7 +228,7 @@ def test_the_state_that_stands_for_particles_on_a_road_is_like_them_in_all_it_is
     assert (np.sum(off**2 / np.maximum(variance, 1e-12), 1) <= mean.shape[1] + 1e-6).all()
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_particle_gibbs_draws_the_exact_posterior(linear):
     problem, exact = linear
     found = fit(problem, ParticleGibbs(chains=2, warmup=100, draws=500, particles=Particles(60)), prior=Gaussian())
@@ -239,7 +239,7 @@ def test_particle_gibbs_draws_the_exact_posterior(linear):
     assert float(stats["acceptance_rate"].mean()) > 0.2
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_run_of_particle_gibbs_goes_on_where_it_was_stopped(linear, tmp_path):
     """The draws of a run in two pieces are those of one run."""
     problem, _ = linear

@@ -200,10 +200,10 @@ def near(drawn, exact, slack=0.0, errors=5.0):
 # evidence
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "proposal"),
-    [("linear", "bootstrap"), ("linear", "extended"), pytest.param("joint", "auto", marks=pytest.mark.ci)],
+    [("linear", "bootstrap"), ("linear", "extended"), pytest.param("joint", "auto", marks=pytest.mark.slow)],
 )
 def test_the_evidence_is_unbiased(name, proposal):
     """1,000 filters of 100 particles, targets of 5 and 4 epochs: sees a bias of some 10 % (bootstrap), 3 % (extended).
@@ -396,7 +396,7 @@ def test_a_sum_smoothed_on_the_way_is_exact(smoother, draws):
 # conditional filters
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "proposal"), [("linear", "extended"), ("linear", "bootstrap")])
 def test_a_kernel_leaves_exact_paths_exact(name, proposal):
     """20,000 paths of the exact posterior, four steps of 4 particles each: means, variances, products of neighbours.
@@ -475,10 +475,10 @@ def renewed(targets, key, how, runs):
     return jax.lax.map(one, jax.random.split(key, runs), batch_size=500)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("made", "proposal"),
-    [(restless, "auto"), (ranging, "laplace"), pytest.param(ranging, "auto", marks=pytest.mark.ci)],
+    [(restless, "auto"), (ranging, "laplace"), pytest.param(ranging, "auto", marks=pytest.mark.slow)],
 )
 def test_a_kernel_leaves_paths_from_the_prior_to_the_prior(made, proposal):
     """8,000 paths and data drawn together, then three steps of 5 particles given the data (Geweke 2004).

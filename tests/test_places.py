@@ -70,8 +70,9 @@ def offset(world):
     return float(drawn.mean()), float(drawn.std())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "seed", [pytest.param(0, marks=pytest.mark.ci), *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+    "seed", [pytest.param(0, marks=pytest.mark.slow), *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
 )
 def test_tags_that_one_or_two_hear_are_integrated(seed, monkeypatch):
     """Rings and pairs of places: MAP is the mode of a grid, from which Laplace's formula is far."""

@@ -44,7 +44,7 @@ def same(one, other):
     xr.testing.assert_identical(a[list(NUMBERS)], b[list(NUMBERS)])
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_each_recording_is_fitted_as_alone_and_only_what_is_missing_again(model, tmp_path):
     out = tmp_path / "out"
     code, said, complaint = call("fit", model, *days(model, 0, 1), *METHOD, "--out", out)

@@ -264,7 +264,7 @@ def test_draws_resolve_directions_that_data_leave_to_a_wide_prior(least, monkeyp
         np.testing.assert_allclose(form, true[: len(form)], atol=1e-4)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 def test_a_fit_without_factors_of_the_biases_ends_where_the_dense_one_does(library, dense, monkeypatch):
     """Means within 1e-4 sds, sds, gamma and evidence within 6 of their standard errors, which are small."""
@@ -706,7 +706,7 @@ def test_passes_of_a_large_network_tell_what_those_of_a_small_one_do(library, mo
     assert "weak" not in found
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 def test_a_pass_is_seen_by_the_sensors_that_it_comes_near_to(library, monkeypatch):
     """Where sensors reach so far as they did, those beyond see nothing: as if they had no row."""

@@ -30,8 +30,8 @@ def density_of(problem, point):
     return JointDensity.of(problem.model, joint, point, variables_of(joint, point))
 
 
-@pytest.mark.ci
-@pytest.mark.parametrize("made", [drawn, pytest.param(drawn_in_space, marks=pytest.mark.ci)])
+@pytest.mark.slow
+@pytest.mark.parametrize("made", [drawn, pytest.param(drawn_in_space, marks=pytest.mark.slow)])
 def test_the_joint_density_is_that_of_its_point_and_its_slope_that_of_differences(made):
     """Of moving targets, one at rest, bent sensors, in 2-D and 3-D: value to 1e-9, slope to 1e-5 of differences."""
     problem = made()[0]
@@ -66,7 +66,7 @@ def test_nothing_is_beside_the_gaussian_of_a_linear_world(name):
         assert np.abs(density.rest(at)[1]).max() < 1e-6 * np.abs(density.matrix).max()
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 @pytest.mark.parametrize("name", ["plane", "drifting"])
 def test_draws_of_a_linear_world_have_its_exact_moments(name, library):

@@ -220,7 +220,7 @@ def test_the_density_is_one_at_whatever_weights_and_that_of_numpyro():
         assert abs(likelihood + own + 0.5 * np.log(2 * np.pi) * point.noises[0].size - here) < 1e-9
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_steps_have_the_density_of_the_motion_and_its_tails():
     with jax.enable_x64(True):
         problem = turned()
@@ -280,7 +280,7 @@ def test_tails_drive_their_own_component_behind_noise_of_lower_rank(before):
     assert stats.kurtosis(np.diff(run.truth.tracks["power"])) > 3.0
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_tree_is_taken_up_without_its_answer():
     problem = turned()
     tree, answer = calibrate(problem)
