@@ -96,8 +96,7 @@ class WithWings[Value](Mapping[str, Value]):
     def __getitem__(self, name: str) -> Value:
         if name in self._core:
             return self._core[name]
-        values: Mapping[str, Value] = getattr(loaded(self._wings[name], name), self._table)
-        return values[name]
+        return getattr(loaded(self._wings[name], name), self._table)[name]
 
     def __iter__(self) -> Iterator[str]:
         yield from self._core

@@ -53,7 +53,7 @@ def test_the_core_does_without_a_wing(wing, tmp_path):
     code = ALONE.replace("ORDERS", repr(orders)).replace("TESTS", repr(tests))
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment, check=False,
-        timeout=300,
+        timeout=900,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     where, names, *sentences = done.stdout.splitlines()[: 2 + len(orders)]

@@ -7,12 +7,10 @@ from typing import Any
 
 import typer
 
-from probcal.cli.names import METHODS, ORACLE, PRIORS, SAVE
+from probcal.cli.names import METHODS, PRIORS, SAVE
 from probcal.cli.outputs import RECORDINGS
-from probcal.errors import InputError, nearest
-from probcal.inference.settings import check_setting
+from probcal.errors import InputError
 from probcal.labels import check_name
-from probcal.wings import check_method_installed
 
 MOST_VALUES = 10_000  # of a setting of a study
 # largest count that an option takes: of more draws or particles no machine has the memory
@@ -114,18 +112,6 @@ def chain_sizes(method: str, sizes: Mapping[str, int | None]) -> dict[str, int]:
     return given
 
 
-def walks(texts: Sequence[str]) -> dict[str, float]:
-    """`PATTERN=STD` of biases that walk; raises `InputError` for what is no such pair."""
-    found = {}
-    for text in texts:
-        pattern, equals, value = text.rpartition("=")
-        number = _number(value) if equals and pattern else None
-        if not isinstance(number, (int, float)) or not LEAST_SIZE <= number <= MOST_SIZE:
-            raise InputError(f'--walk "{text}": write PATTERN=STD, the positive standard deviation over one second')
-        found[pattern] = float(number)
-    return found
-
-
 def saved_names(text: str) -> list[str]:
     """Names of the draws that a fit shall save, separated by commas."""
     names = [name.strip() for name in text.split(",") if name.strip()]
@@ -141,26 +127,6 @@ def check_resumed(method: str, resume: bool) -> None:
         raise InputError(f'--resume: "{method}" keeps no draws to go on with; take collapsed, nuts, gibbs or svi')
 
 
-def method_names(text: str) -> list[str]:
-    """Names of the methods of a study, separated by commas."""
-    names = [name.strip() for name in text.split(",")]
-    for name in names:
-        check_method_installed(name)
-        if name not in METHODS and name != ORACLE:
-            raise InputError(f'method "{name}" is not known{nearest(name, [*METHODS, ORACLE])}')
-    return names
-
-
-def grid(settings: Sequence[str]) -> dict[str, list[Any]]:
-    """The values of each setting of a study, those given in several options one after the other."""
-    found: dict[str, list[Any]] = {}
-    for name, values in map(parse_values, settings):
-        found[name] = found.get(name, []) + values
-    for name, values in found.items():
-        check_setting(name, values)
-    return found
-
-
 def parse_values(text: str) -> tuple[str, list[Any]]:
     """`name=a,b,c` or `name=first:last:step` as a name and its values; numbers where they are numbers."""
     name, equals, values = text.partition("=")
@@ -169,7 +135,7 @@ def parse_values(text: str) -> tuple[str, list[Any]]:
         raise InputError(f'--set "{text}": write name=value,value,... or name=first:last:step')
     found: list[Any] = []
     for part in parts:
-        numbers = [_number(piece) for piece in part.split(":")]
+        numbers = [as_number(piece) for piece in part.split(":")]
         if len(numbers) == 3 and all(isinstance(number, (int, float)) for number in numbers):
             first, last, step = numbers
             if not all(map(math.isfinite, numbers)) or not step or (last - first) / step < 0:
@@ -179,7 +145,7 @@ def parse_values(text: str) -> tuple[str, list[Any]]:
                 raise InputError(f'--set "{text}": these are {count} values; give {MOST_VALUES} of them at most')
             found += [round(first + k * step, 12) for k in range(count)]
         else:
-            found.append(_number(part))
+            found.append(as_number(part))
     return name.strip(), found
 
 
@@ -193,7 +159,7 @@ def given(settings: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def _number(text: str) -> Any:
+def as_number(text: str) -> Any:
     """An integer or a float where the text is one, else the text."""
     for kind in (int, float):
         try:

@@ -1,5 +1,6 @@
 """The command `watch` and its options; nothing heavy is imported before these hold."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -64,7 +65,7 @@ def watch_command(
             raise InputError(f'--keep "{name}" is not known; give tracks, rows or both, separated by a comma')
     if kept and out is None:
         raise InputError("--keep needs --out, the folder of the tables")
-    arguments, walks = options.given(given or ()), options.walks(walk or ())
+    arguments, walks = options.given(given or ()), walks_of(walk or ())
     results = None if out is None else outputs.replaceable(out, outputs.WATCH)
     lock = None if out is None else Lock(out, 0.0)
     try:
@@ -89,3 +90,15 @@ def watch_command(
     finally:
         if lock is not None:
             lock.release()
+
+
+def walks_of(texts: Sequence[str]) -> dict[str, float]:
+    """`PATTERN=STD` of biases that walk; raises `InputError` for what is no such pair."""
+    found = {}
+    for text in texts:
+        pattern, equals, value = text.rpartition("=")
+        number = options.as_number(value) if equals and pattern else None
+        if not isinstance(number, (int, float)) or not options.LEAST_SIZE <= number <= options.MOST_SIZE:
+            raise InputError(f'--walk "{text}": write PATTERN=STD, the positive standard deviation over one second')
+        found[pattern] = float(number)
+    return found

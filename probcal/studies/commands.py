@@ -1,7 +1,8 @@
 """The commands `study` and `sbc` and their options; nothing heavy is imported before these hold."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -9,6 +10,7 @@ from probcal.cli import options, outputs
 from probcal.cli.arguments import LARGEST_SEED, Data, Fix, Given, Method, Model, Network, Overwrite, Scheduler, Seed
 from probcal.cli.names import METHODS, ORACLE, PRIORS
 from probcal.errors import InputError, nearest
+from probcal.studies.settings import check_setting
 from probcal.wings import check_method_installed
 
 
@@ -29,8 +31,8 @@ def study_command(
     scheduler: Scheduler = None,
 ) -> None:
     """Study: fit many simulated runs of a model's setting(run, ...) by several methods, and plot their errors."""
-    chosen = options.method_names(methods)
-    grid = options.grid(setting or ())
+    chosen = method_names(methods)
+    grid = values_of(setting or ())
     options.check_files(model)
     if resume and out is None:
         raise InputError("study: --resume needs --out DIR, the folder of the fits to go on with")
@@ -92,3 +94,23 @@ def sbc_command(
                 scheduler=scheduler,
             )
         )  # fmt: skip
+
+
+def method_names(text: str) -> list[str]:
+    """Names of the methods of a study, separated by commas."""
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        check_method_installed(name)
+        if name not in METHODS and name != ORACLE:
+            raise InputError(f'method "{name}" is not known{nearest(name, [*METHODS, ORACLE])}')
+    return names
+
+
+def values_of(settings: Sequence[str]) -> dict[str, list[Any]]:
+    """The values of each setting of a study, those given in several options one after the other."""
+    found: dict[str, list[Any]] = {}
+    for name, values in map(options.parse_values, settings):
+        found[name] = found.get(name, []) + values
+    for name, values in found.items():
+        check_setting(name, values)
+    return found

@@ -33,7 +33,6 @@ from probcal.inference.run import (
     kernel,
     stepped,
 )
-from probcal.inference.settings import check_setting
 from probcal.inference.solve import solve
 from probcal.inference.spread import check_scheduler, spread
 from probcal.inference.storage import Storage
@@ -46,6 +45,7 @@ from probcal.smoothing.information import mean_square
 from probcal.smoothing.mode import Point
 from probcal.starts import automatic_start
 from probcal.studies.fits import Fits, open_fits
+from probcal.studies.settings import check_setting
 from probcal.wings import check_method_installed
 
 CHECKED = 20  # stored problems that a resumed study makes anew, to see whether the model is still the same
