@@ -8,6 +8,8 @@ import nbclient
 import nbformat
 import pytest
 
+from probcal.wings import loaded
+
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 SAMPLE = ("01_quickstart", "02_declare_a_sensor")
 LARGEST = 300_000  # bytes of a notebook with its outputs
@@ -40,7 +42,7 @@ def test_a_notebook_imports_names_that_exist(path):
     for cell in code(nbformat.read(path, as_version=4)):
         for node in ast.walk(ast.parse(cell.source)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("probcal"):
-                module = importlib.import_module(node.module)
+                module = loaded(node.module, node.module)
                 for alias in node.names:
                     if not hasattr(module, alias.name):
                         importlib.import_module(f"{node.module}.{alias.name}")

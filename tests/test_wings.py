@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -40,33 +41,49 @@ sys.exit(pytest.main(TESTS))
 """
 
 
-@pytest.mark.ci
-@pytest.mark.parametrize("wing", WINGS)
-def test_the_core_does_without_a_wing(wing, tmp_path):
-    """All that is left is imported, says its help, fits, and collects its tests."""
-    environment = os.environ | {"PYTHONPATH": str(package_without(tmp_path, wing))}
-    quickly = ["--collect-only", "-qq", "-n", "0", "-p", "no:cacheprovider", "--assert=plain"]
-    tests = [str(ROOT / "tests"), "-c", str(ROOT / "pyproject.toml"), *quickly]
-    commands = [name for name, home in COMMANDS.items() if of(home, wing)]
-    methods = [name for name, home in METHODS.items() if of(home, wing)]
-    orders = [*((name, "--what", "ever") for name in commands), *(("fit", "m.py", "--method", m) for m in methods)]
-    code = ALONE.replace("ORDERS", repr(orders)).replace("TESTS", repr(tests))
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment, check=False,
-        timeout=900,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    where, names, *sentences = done.stdout.splitlines()[: 2 + len(orders)]
-    assert where.split()[0] == str(tmp_path / "probcal" / "__init__.py")
-    assert where.removeprefix(where.split()[0] + " ") in set(Status)
-    gone = {name for home, own in {**NAMES, **PICTURES}.items() if of(home, wing) for name in own.split()}
-    assert not {*gone, *commands} & set(names.split())
-    for name, sentence in zip([*(f"probcal {name}" for name in commands), *methods], sentences, strict=True):
-        assert sentence == f"probcal: {name} needs the folder probcal/{wing}, which is not installed"
-
-
 def of(module, wing):
     return module.split(".")[1] == wing
+
+
+def orders_of(wing):
+    """Commands that ask for what a wing gives, each with the name that is said to be missing."""
+    commands = {f"probcal {name}": (name, "--what", "ever") for name, home in COMMANDS.items() if of(home, wing)}
+    return commands | {name: ("fit", "m.py", "--method", name) for name, home in METHODS.items() if of(home, wing)}
+
+
+def alone(wing, folder):
+    """All that is left without a wing is imported, says its help, fits, and collects its tests."""
+    environment = os.environ | {"PYTHONPATH": str(package_without(folder, wing))}
+    quickly = ["--collect-only", "-qq", "-n", "0", "-p", "no:cacheprovider", "--assert=plain"]
+    tests = [str(ROOT / "tests"), "-c", str(ROOT / "pyproject.toml"), *quickly]
+    code = ALONE.replace("ORDERS", repr([*orders_of(wing).values()])).replace("TESTS", repr(tests))
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=folder, env=environment, check=False,
+        timeout=900,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """The package without each wing and its process, two at a time."""
+    pool, folders = ThreadPoolExecutor(2), {wing: tmp_path_factory.mktemp(wing) for wing in WINGS}
+    yield {wing: (folder, pool.submit(alone, wing, folder)) for wing, folder in folders.items()}
+    pool.shutdown(cancel_futures=True)
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("wing", WINGS)
+def test_the_core_does_without_a_wing(wing, runs):
+    folder, run = runs[wing]
+    done, missing = run.result(), orders_of(wing)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    where, names, *sentences = done.stdout.splitlines()[: 2 + len(missing)]
+    assert where.split()[0] == str(folder / "probcal" / "__init__.py")
+    assert where.removeprefix(where.split()[0] + " ") in set(Status)
+    gone = {name for home, own in {**NAMES, **PICTURES}.items() if of(home, wing) for name in own.split()}
+    assert not {*gone, *(name for name, home in COMMANDS.items() if of(home, wing))} & set(names.split())
+    for name, sentence in zip(missing, sentences, strict=True):
+        assert sentence == f"probcal: {name} needs the folder probcal/{wing}, which is not installed"
 
 
 def test_what_is_of_a_wing_that_is_missing_says_so(monkeypatch):
