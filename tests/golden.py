@@ -18,11 +18,13 @@ Statuses, verdicts and findings must be the same.
 import argparse
 import fnmatch
 import json
+import multiprocessing
 import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -960,6 +962,7 @@ QUICK = (  # of the linear problem
     "simulate observability bounds bounds-parametric map least-squares em ea assess evidence-gaussian track stream"
     " saved saved-track"
 )
+LIKE_RADARS = "radars later noisy outlying slipped exchanged"  # problems of one form, the form of `radars`
 SLOW_PROBLEMS = (
     "space motions turning asynchronous walking manoeuvre presence static known floor clocks robot bearings dipole"
     " globe scans grid town small"
@@ -1047,7 +1050,8 @@ def allowance(old, new, part, label, value):
         return DRAWS * float(np.hypot(old.get("evidence_error", 0.0), new.get("evidence_error", 0.0))) or CLIMB
     if kind == "climb":
         return CLIMB * (abs(value) if sd is None or part == "values" else sd) + POINT
-    ess = [min(row.get("ess", {}).get(label, np.inf), *row.get("ess", {None: 100.0}).values()) for row in (old, new)]
+    sizes = [row.get("ess", {}) for row in (old, new)]
+    ess = [own.get(label, min(own.values(), default=100.0)) for own in sizes]
     spread = abs(value) if sd is None else sd
     error = spread * float(np.sqrt(sum(1 / e for e in ess)))
     return DRAWS * (error / np.sqrt(2) if part == "sds" else error) + POINT
@@ -1061,32 +1065,53 @@ def write(rows):
     TABLE.write_text("{\n" + ",\n".join(lines) + "\n}\n")
 
 
-def main():
-    parser = argparse.ArgumentParser(description="Compare the golden table with what is answered today, or write it.")
-    parser.add_argument("--only", default="*", help='rows whose name holds this pattern, such as "radars ea"')
-    parser.add_argument("--write", action="store_true", help="write the rows into the table")
-    parser.add_argument("--seconds", action="store_true", help="print the seconds of every row")
-    given = parser.parse_args()
-    keys = [key for key in ROWS if fnmatch.fnmatch(key, given.only) or fnmatch.fnmatch(key, f"*{given.only}*")]
-    table, moved = stored(), 0
+def batches(keys):
+    """Rows by problem, for a process each: those of `radars` and of what shares its kernels together."""
+    found: dict[str, list[str]] = {}
+    for key in keys:
+        name = key.split()[0]
+        found.setdefault("radars" if name in LIKE_RADARS.split() else name, []).append(key)
+    return list(found.values())
+
+
+def made_of(keys):
+    """Rows by name with the seconds of the processor that each took; a text in the place of one that failed."""
+    found = {}
     for key in keys:
         begun = time.process_time()
         try:
             row = make(key)
         except Exception as error:
-            if not given.write:
-                raise
-            print(f"{key}: {type(error).__name__}: {error}", flush=True)
-            moved += 1
-            continue
-        if given.seconds:
-            print(f"{key}: {time.process_time() - begun:.1f} s", flush=True)
-        if given.write:
-            write({key: row})
-        elif said := differences(table[key], row) if key in table else ["not in the table"]:
-            moved += 1
-            print(key, *said, sep="\n    ", flush=True)
-    print(f"{moved} of {len(keys)} rows moved")
+            row = f"{type(error).__name__}: {error}"
+        found[key] = row, time.process_time() - begun
+    return found
+
+
+def main():
+    parser = argparse.ArgumentParser(description="Compare the golden table with what is answered today, or write it.")
+    parser.add_argument("--only", default="*", help='rows whose name holds this pattern, such as "radars ea"')
+    parser.add_argument("--write", action="store_true", help="write the rows into the table")
+    parser.add_argument("--seconds", action="store_true", help="print the seconds of every row")
+    parser.add_argument("--jobs", type=int, default=2, help="processes that make rows (default 2)")
+    given = parser.parse_args()
+    keys = [key for key in ROWS if fnmatch.fnmatch(key, given.only) or fnmatch.fnmatch(key, f"*{given.only}*")]
+    table, moved = stored(), 0
+    with ProcessPoolExecutor(given.jobs, multiprocessing.get_context("spawn")) as pool:
+        for done in as_completed([pool.submit(made_of, batch) for batch in batches(keys)]):
+            for key, (row, seconds) in done.result().items():
+                if given.seconds:
+                    print(f"{key}: {seconds:.1f} s", flush=True)
+                if isinstance(row, str):
+                    said = [row]
+                elif given.write:
+                    write({key: row})
+                    continue
+                else:
+                    said = differences(table[key], row) if key in table else ["not in the table"]
+                if said:
+                    moved += 1
+                    print(key, *said, sep="\n    ", flush=True)
+    print(f"{moved} of {len(keys)} rows {'failed' if given.write else 'moved'}")
     return int(moved > 0)
 
 
