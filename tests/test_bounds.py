@@ -129,7 +129,7 @@ def squarer(target, pose, *, offset=Bias("1", 2.0)):
     return {"level": 0.5 * offset**2 + target.position[0]}
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_the_trajectory_is_eliminated_from_the_averaged_system():
     """y = b^2/2 + x + e: van Trees gives E[b^2]/R for b, as E[b] = 0; eliminating x draw by draw E[b^2]/(R + P).
 

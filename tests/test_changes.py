@@ -228,7 +228,7 @@ def test_steps_of_a_drift_are_no_change(pair):
     assert changes(*trees)["change"]["bias_label"].values.tolist() == names[:4]
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_false_alarms_and_coverage():
     """60 pairs of recordings without a change: at most 3 with a false alarm (1 % each: 4 or more in 1 of 300 tests);
     the 89 % intervals of the change hold zero in 84 to 94 % of 300 (2.8 sd)."""

@@ -289,7 +289,7 @@ def problem(data=None):
 """
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_watch_ends_with_its_status(tmp_path):
     model = tmp_path / "model.py"
     model.write_text(MODEL.format(tests=str(next(p for p in sys.path if p.endswith("tests")))))

@@ -233,7 +233,7 @@ def test_an_answer_outlives_the_memory_that_its_other_side_takes():
     assert "mirror" not in tree.children
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_nodes_that_span_the_plane_have_no_mirror_in_sparse_form():
     problem, _ = networks.setting(1, "beacons")
     tree = probcal.fit(problem, probcal.MAP(form="sparse"), prior=probcal.Gaussian())

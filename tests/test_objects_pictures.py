@@ -273,7 +273,7 @@ def test_what_each_sensor_detected_is_counted_and_views_are_saved():
     assert float(seen.sel(x=50.0, y=-5.0, method="nearest")) == 0.0
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_equal_views_of_two_sensors_both_hide_what_is_outside():
     """Two `Sector` that are equal and not the same: what is 5 m from one sensor is not seen by the other."""
     near = [pc.Detection(1.0, clutter=0.0, view=pc.Sector(range=10.0)) for _ in range(2)]

@@ -681,7 +681,7 @@ def test_places_fall_on_particles_with_weight():
 # targets
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_targets_hold_every_row_once_and_find_back_to_their_epochs():
     """Two worlds, and one whose second target has a single epoch."""
     w = world("linear")

@@ -202,7 +202,7 @@ def test_a_tree_with_integrated_places_is_judged_alike_with_and_without_its_answ
         np.testing.assert_allclose(without["target_check"][name].values, near, atol=0.05)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_tag_that_many_rows_place_to_a_hair_is_integrated_around_its_mode():
     """Heavy-tailed noise far from the place hides it: a search by slopes alone ended on its way there."""
 

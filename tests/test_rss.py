@@ -81,7 +81,7 @@ def test_the_twin_has_the_pattern_of_the_printed_table(vehicle, channel, printed
     assert all(0.1 < a["exponent_sd"] < 0.35 for a in found[channel, "M2"])
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @float64
 def test_least_squares_is_the_fit_of_a_known_track():
     """Power, gains and exponent of `power_law` are those of shared and own biases under a flat prior."""
@@ -265,7 +265,7 @@ def test_the_posterior_of_a_place_integrates_what_is_not_known(criterion):
     np.testing.assert_allclose(found - found[0], np.array(expected) - expected[0], atol=0.02)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("criterion", ["snls", "gml"])
 def test_intervals_of_the_posterior_hold_at_strong_noise(criterion):
     """3 dB, sources all over the area, 500 runs of two coordinates: 90 % intervals hold 88 to 92 % (sd 0.95)."""

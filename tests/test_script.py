@@ -51,7 +51,7 @@ def record(folder):
     )
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_script_of_forty_lines_does_it_all(tmp_path, monkeypatch, capsys):
     assert len(SCRIPT.read_text().splitlines()) <= 40
     record(tmp_path)

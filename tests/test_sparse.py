@@ -764,7 +764,7 @@ def both_forms(problem, point, monkeypatch, reached=100.0, **asked):
     return gains
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_planning_takes_second_nodes_whose_spread_another_sensor_reads(monkeypatch):
     """And nodes that move, biases that are fixed, a network small beside its ranges, a name that is taken."""
     nodes = [pc.Node("new 0", (0.0, 0.0), scale={"position": 1.0}), pc.Node("b", (20.0, 0.0), scale={"heading": 0.05})]

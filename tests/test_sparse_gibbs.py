@@ -152,7 +152,7 @@ def bent(target, pose, *, gain=pc.Bias("1", 1.0)):
     return dict(level=norm(pose.local(target.position)) * jnp.exp(gain))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize("away", [0.0, 0.6])
 def test_a_bias_that_bends_what_is_measured_has_its_posterior(away):
     """One bias, known targets: mean and sd by quadrature within 5 standard errors, wherever the Gaussian is taken."""
@@ -234,7 +234,7 @@ def chains_of(problem, method, joint):
     return _SparseChains(method, form, first, problem.model, joint, mode.system, jax.random.key(0))
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_draws_of_states_that_take_much_room_are_not_kept(monkeypatch):
     """Their moments are, the same as with them; draws of states are refused in one sentence."""
     problem = drawn()[0]

@@ -243,7 +243,7 @@ def test_steps_have_the_density_of_the_motion_and_its_tails():
             assert stats.kstest(scaled, stats.t(3.0).cdf).pvalue > 1e-3
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_family_of_many_degrees_of_freedom_is_the_gaussian():
     gauss, heavy = (probcal.fit(turned(df=df) if df else turned(None), probcal.EA()) for df in (None, 1e7))
     for name in ("mean", "sd", "gamma"):
@@ -313,7 +313,7 @@ def test_what_it_refuses():
         probcal.log_evidence(turned(), prior=probcal.Gaussian())
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_targets_of_several_families_and_motions_stand_side_by_side():
     network = Network([finder.on(Node("a", (0.0, 0.0))), finder.on(Node("b", (5.0, 1.0)))])
     motion = {
@@ -361,7 +361,7 @@ def test_heavy_tails_are_found_and_gone_where_they_are_declared():
     assert kinds[1] == []
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_target_that_keeps_turning_has_noises_that_go_together():
     time = 0.5 * np.arange(120)
     path = np.stack([20 * np.cos(time / 6), 20 * np.sin(time / 6)], 1)

@@ -449,6 +449,7 @@ def wait_for(path, least=1):
     raise AssertionError(f"{path} did not come")
 
 
+@pytest.mark.slow
 def test_a_killed_watch_goes_on_and_counts_every_row_once(model, table, tmp_path):
     out, text = tmp_path / "out", lines()
     options = (model, table, "--out", out, "--lag", "8", "--every", "0")
