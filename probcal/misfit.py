@@ -6,11 +6,12 @@ time, a sensor, channel or target whose mean square stands out, and there the fa
 unit.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from probcal.labels import listed
 from probcal.table import UNITS
 
 MOST = 0.5  # share of all squares that a few data, or one repeated value, hold to be named
@@ -41,6 +42,16 @@ class MisfitData(NamedTuple):
     unit: np.ndarray  # of the channel
 
 
+class Rejected(NamedTuple):
+    """A channel of a sensor whose data a robust fit sets aside."""
+
+    sensor: str
+    channel: str
+    below: int  # data of less than half weight
+    data: int
+    expected: float  # fraction of such data under the noise family
+
+
 def misfit_text(mean: float, points: Iterable[MisfitData]) -> str:
     """The mean square of a misfit, the worst datum, and the likely cause with its remedy.
 
@@ -68,6 +79,18 @@ def misfit_text(mean: float, points: Iterable[MisfitData]) -> str:
     return (
         f"{said} where 1 is expected, worst {first.sensor[worst]}.{first.channel[worst]} at"
         f" {first.time[worst]:.6g} s. {cause or _group(first) or UNEXPLAINED}"
+    )
+
+
+def rejection_text(rejected: Sequence[Rejected]) -> str:
+    """The channels that robust noise rejects and what to check; empty where it rejects none."""
+    if not rejected:
+        return ""
+    named = [f"{one.sensor}.{one.channel} ({one.below} of {one.data})" for one in rejected]
+    return (
+        "The robust noise gives less than half weight to most data of"
+        f" {listed(named)}, where it expects {rejected[0].expected:.0%}. Check whether labels of"
+        " sensors are exchanged, then their positions, units and clocks."
     )
 
 

@@ -70,6 +70,7 @@ def check_level(level: Level, what: str, *, zero: bool = False) -> None:
 NEAR = 0.1  # std within which a residual has the weight of one at that distance: a density may have a kink at zero
 FAR = 6.0  # std of a floor above the predicted value, from which draws are those of the tail
 FARTHEST = 30.0  # asinh of the farthest point of a quadrature, in std
+HALF = 0.5  # reliance below which a datum counts as rejected
 
 
 class Family(Protocol):
@@ -82,6 +83,8 @@ class Family(Protocol):
     def information(self, predicted, std): ...
     def level_score(self, y, predicted, std, period: float | None): ...
     def reliance(self, y, predicted, std, period: float | None): ...
+    @property
+    def rejects(self) -> float: ...
     def sample(self, key, predicted, std): ...
     def emit(self, key, predicted, std): ...
     def reported(self, y): ...
@@ -172,6 +175,11 @@ class AdditiveNoise:
         there, none = self.weight(y, predicted, std, period), self.weight(predicted, predicted, std, period)
         return jnp.minimum(there / none, 1.0)
 
+    @property
+    def rejects(self) -> float:
+        """Probability of a datum with a reliance below one half, by quadrature."""
+        return _rejects(self)
+
     def sample(self, key, predicted, std):
         """Draw measured values around the predicted ones."""
         return predicted + std * self.draw(key, predicted.shape)
@@ -234,6 +242,19 @@ def normal_scores(family: Any) -> tuple[np.ndarray, np.ndarray]:
     return e, np.maximum.accumulate(np.where(lower, 1.0, -1.0) * special.ndtri(tail))
 
 
+@lru_cache
+def _rejects(family: Any) -> float:
+    """Probability of the residuals at which a family relies on a datum by less than half."""
+    from scipy import special
+
+    e, score = normal_scores(family)
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        points = jnp.asarray(e)
+        none = jnp.zeros_like(points)
+        low = np.asarray(family.reliance(points, none, none + 1.0, None)) < HALF
+    return float(np.diff(special.ndtr(score)) @ (0.5 * low[1:] + 0.5 * low[:-1]))
+
+
 def gate_limits(family: Any, odds: float) -> tuple[float, float]:
     """Residuals over the std beyond which a datum lies with probability `odds`; infinite for odds of 0."""
     from scipy import special
@@ -274,6 +295,11 @@ class Normal(AdditiveNoise):
         """One: every datum counts alike."""
         return jnp.ones_like(predicted)
 
+    @property
+    def rejects(self) -> float:
+        """Zero: no datum is rejected."""
+        return 0.0
+
     def sample(self, key, predicted, std):
         """Draw measured values around the predicted ones."""
         return predicted + std * jax.random.normal(key, predicted.shape, predicted.dtype)
@@ -282,6 +308,9 @@ class Normal(AdditiveNoise):
 @dataclass(frozen=True)
 class StudentT(AdditiveNoise):
     """Additive Student-t noise with scale `std` and `df` degrees of freedom, for channels with outliers.
+
+    A fit that gives less than half weight to most data of a sensor ends as a misfit: outliers are
+    single data, not a whole sensor (see `smoothing.information.rejected`).
 
     >>> bool(StudentT(4.0).log_likelihood(10.0, 0.0, 1.0, None) > -10.0)  # a Gaussian has -50.9
     True
@@ -319,6 +348,13 @@ class StudentT(AdditiveNoise):
     def reliance(self, y, predicted, std, period):
         """Weight of each datum over that of one without residual."""
         return 1.0 / (1.0 + (self.innovation(y, predicted, period) / std) ** 2 / self.df)
+
+    @property
+    def rejects(self) -> float:
+        """Probability beyond sqrt(df) to either side."""
+        from scipy import special
+
+        return 2.0 * float(special.stdtr(self.df, -np.sqrt(self.df)))
 
     def sample(self, key, predicted, std):
         """Draw measured values around the predicted ones, by the polar method (Bailey 1994): no loop to compile."""
@@ -537,6 +573,11 @@ class Heard(AdditiveNoise):
         """One: every datum counts alike."""
         return jnp.ones_like(predicted)
 
+    @property
+    def rejects(self) -> float:
+        """Zero: no datum is rejected."""
+        return 0.0
+
     def _log_normal(self, y, predicted, std):
         """Log density of a value, heard or not."""
         return -0.5 * (((y - predicted) / std) ** 2 + np.log(2 * np.pi)) - jnp.log(std)
@@ -690,6 +731,11 @@ class Bernoulli:
     def reliance(self, y, predicted, std, period):
         """One: every datum counts alike."""
         return jnp.ones_like(predicted)
+
+    @property
+    def rejects(self) -> float:
+        """Zero: no datum is rejected."""
+        return 0.0
 
     def sample(self, key, predicted, std):
         """Draw ones and zeros."""

@@ -375,11 +375,13 @@ def test_biases_that_are_not_numbers_are_named():
     assert "no finite answer: with the biases as stated the mean square a datum is 5.8" in said
     assert said.endswith("Use a prior, narrower scales, or fix some biases.")
     assert "nan" not in said
+    assert not misfit_sentence(problem, point, 99.0)
+    assert misfit_sentence(problem, point, 101.0).startswith("The fit explains nothing")
 
 
 def end(**changed):
     sound = {"still": True, "asked": False, "low": False, "far": False, "sound": True, "refused": False}
-    return End(**(sound | {"fallen": 0.0, "square": 1.0} | changed))
+    return End(**(sound | {"fallen": 0.0, "misfit": ""} | changed))
 
 
 def test_spent_iterations_are_not_convergence():
@@ -395,7 +397,7 @@ def test_status_follows_the_gravest():
         ({}, "converged"), ({"fallen": 0.9}, "converged"), ({"fallen": 1.1}, "not converged"),
         ({"still": False}, "not converged"), ({"low": True, "still": False}, "at bound"),
         ({"far": True, "low": True}, "diverged"), ({"sound": False}, "diverged"), ({"refused": True}, "diverged"),
-        ({"square": 101.0, "far": True}, "misfit"), ({"square": np.nan}, "misfit"), ({"square": 99.0}, "converged"),
+        ({"misfit": "nothing is explained", "far": True}, "misfit"),
     ]  # fmt: skip
     for changed, status in cases:
         assert status_of(end(**changed)) == status, changed

@@ -10,14 +10,14 @@ import numpy as np
 
 from probcal.inference.mixture import MixturePosterior
 from probcal.labels import listed
-from probcal.misfit import MisfitData, misfit_text
+from probcal.misfit import MisfitData, misfit_text, rejection_text
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, NormalPosterior, Posterior, Summary, uncalibrated
 from probcal.results.groups import datum_of, gather
 from probcal.smoothing.draws import residuals
 from probcal.smoothing.grid import track_mode
-from probcal.smoothing.information import squares_of
+from probcal.smoothing.information import rejected, squares_of
 from probcal.smoothing.mode import Point
 from probcal.starts import automatic_start
 from probcal.status import Status
@@ -86,9 +86,10 @@ def conclude_at(
     cut = bool(stopped) and not converged and iterations < method.iterations
     asked = method.tolerance == 0.0 and not cut  # to run so many iterations, whatever they reach
     sound = posterior.sound and bool(np.isfinite(evidence))
-    end = End(converged, asked, bool(low.any()), bool(far.any()), sound, refused, lost, square)
+    misfit = misfit_sentence(problem, point, square)
+    end = End(converged, asked, bool(low.any()), bool(far.any()), sound, refused, lost, misfit)
     status = verdict(end)
-    message = _message(problem, point, status, end, low, far, iterations, summary.precisions)
+    message = _message(problem, status, end, low, far, iterations, summary.precisions)
     if cut and status is Status.NOT_CONVERGED:
         steps = f"{iterations} iteration{'s' * (iterations > 1)}"
         message = f"{stopped} after {steps}, before it converged: this is the best estimate so far."
@@ -151,12 +152,12 @@ class End(NamedTuple):
     sound: bool  # everything is finite
     refused: bool  # the search never left its start, though a step promised to
     fallen: float  # nats that the evidence lost
-    square: float  # mean square a datum of what is left
+    misfit: str  # why the data are not explained; empty where they are
 
 
 def verdict(end: End) -> Status:
     """Status of a fit."""
-    if not end.square <= ABSURD:
+    if end.misfit:
         return Status.MISFIT
     if end.far or not end.sound or end.refused:
         return Status.DIVERGED
@@ -168,7 +169,12 @@ def verdict(end: End) -> Status:
 
 
 def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
-    """The misfit of a point that explains nothing, the likely cause and what to do."""
+    """The misfit of a point whose residuals have this mean square, its likely cause and what to do.
+
+    Empty where the point explains the data, and robust noise rejects no sensor.
+    """
+    if square <= ABSURD:
+        return rejection_text(rejected(problem, point))
     return misfit_text(square, (_remains(problem, at) for at in _points(problem, point, square)))
 
 
@@ -206,7 +212,6 @@ def _remains(problem: Problem, point: Point) -> MisfitData:
 
 def _message(
     problem: Problem,
-    point: Point,
     status: Status,
     end: End,
     low: np.ndarray,
@@ -225,7 +230,7 @@ def _message(
     if status is Status.AT_BOUND:
         return f"The precision of {named(low)} stands at its lower bound: the estimate is invalid."
     if status is Status.MISFIT:
-        return misfit_sentence(problem, point, end.square)
+        return end.misfit
     if status is Status.DIVERGED and end.sound and end.refused and not end.far:
         return (
             "The fit diverged: it never left its start, since no step fitted better; the estimate is invalid. Check"

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.inference.ending import ABSURD, FAR, misfit_sentence
+from probcal.inference.ending import FAR, misfit_sentence
 from probcal.inference.hierarchy import LEAST, MOST, SpikeAndSlab
 from probcal.inference.mixed import ESS, R_HAT, UNSURE, mixing, weights_of_sides, within_sides
 from probcal.inference.pose import pareto_khat
@@ -262,9 +262,8 @@ def judge_chains(
         said.append(f"Only {mixed['ess'][worst]:.0f} effective draws of {names[worst]}; take more draws.")
         good = False
     good = _say_sides(run, said) and good
-    square = float(mean_square(problem.model, mean))
-    if not square <= ABSURD:
-        return Status.MISFIT, " ".join([misfit_sentence(problem, mean, square), *said])
+    if misfit := misfit_sentence(problem, mean, float(mean_square(problem.model, mean))):
+        return Status.MISFIT, " ".join([misfit, *said])
     good = _say_steps(run, said) and good
     if not run.method.exact:
         good = _say_guide(run, said) and good

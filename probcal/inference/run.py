@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.ending import conclude
+from probcal.inference.ending import FAR, conclude
 from probcal.inference.hierarchy import learnt_groups
 from probcal.inference.integrate import Integration, integrate
 from probcal.inference.progress import Monitor
@@ -379,10 +379,16 @@ def maximise(
 
     The last state and the objectives.
 
-    It begins with precisions `alpha` (M,), those of the prior if None.
+    It begins with precisions `alpha` (M,), those of the prior if None. Where these are not given, a
+    bias that starts far from its stated value has that of its start: robust noise would rather
+    reject a sensor than hold an exchanged place against the declared scale.
     """
     check_method(method)
-    given, prior = given_of(method, problem, prior), bare(method.climbs_under(prior))
+    given = given_of(method, problem, prior)
+    far = (np.abs(start.z) > FAR) & ~problem.surveyed
+    if alpha is None and prior.hierarchical and far.any():
+        alpha = np.where(far, np.maximum(np.abs(start.z), FAR) ** -2.0, given.prior.alpha)
+    prior = bare(method.climbs_under(prior))
     state = first_state(given, problem.model, start, method.begin(problem.model, start), context.key)
     state = state if alpha is None else state._replace(alpha=jnp.asarray(alpha))
     trace = np.zeros(0)

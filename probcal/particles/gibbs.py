@@ -35,7 +35,7 @@ from probcal.particles.ensemble import ensemble, expected_over_paths, first_path
 from probcal.particles.particles import Particles
 from probcal.particles.proposals import check_proposal
 from probcal.particles.targets import Targets, place_by_epoch
-from probcal.particles.weighted import Paths, check_learnt, louis, misfit, positive, prepared, unexplained
+from probcal.particles.weighted import Paths, check_learnt, louis, positive, prepared, unexplained
 from probcal.priors import Gaussian, Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -145,8 +145,8 @@ class ParticleGibbs(Sampler):
         )  # fmt: skip
         linear = all(part is None for part in problem.model.sampled)
         answer = conclude_draws(problem if linear else problem.seen(), prior, run, ParticleChains)
-        if names := unexplained(answer.posterior.problem, answer.posterior.point):
-            return replace(answer, status=Status.MISFIT, message=misfit(names))
+        if misfit := unexplained(answer.posterior.problem, answer.posterior.point):
+            return replace(answer, status=Status.MISFIT, message=misfit)
         if (share := float(np.mean(drawn.stats["renewed"]))) < STUCK:
             more = f"A sweep renews {share:.0%} of the paths only: take more particles."
             status = Status.NOT_CONVERGED if answer.status is Status.CONVERGED else answer.status

@@ -16,6 +16,7 @@ from probcal.errors import InputError
 from probcal.inference.ending import ABSURD, FAR, low_and_far
 from probcal.inference.run import Given, Maximiser
 from probcal.labels import listed
+from probcal.misfit import rejection_text
 from probcal.model.model import Model
 from probcal.particles.ensemble import Ensemble, ensemble, nearest_states, observed_over_paths, state_moments
 from probcal.particles.proposals import check_proposal
@@ -38,6 +39,7 @@ from probcal.results.build import build_tracks
 from probcal.results.groups import Band
 from probcal.smoothing.draws import draw_biases, draws_a_chain, predictive
 from probcal.smoothing.grid import follow_states, track_mode
+from probcal.smoothing.information import rejected
 from probcal.smoothing.mode import Point
 from probcal.status import Status
 
@@ -435,8 +437,8 @@ def track_by_particles(
 
 def judged_tracks(problem: Problem, point: Point, found: Ensemble) -> tuple[Status, str]:
     """Status of tracks by particles at known biases, and a sentence: whether they explain the rows, and are enough."""
-    if names := unexplained(problem, point):
-        return Status.MISFIT, misfit(names)
+    if misfit := unexplained(problem, point):
+        return Status.MISFIT, misfit
     square, count = scatter(problem, point)
     if square > max(SCATTER, 1 + SURE * np.sqrt(2 / count)):
         return Status.NOT_CONVERGED, (
@@ -462,8 +464,8 @@ def fewest(found: Ensemble) -> int:
     return least
 
 
-def unexplained(problem: Problem, point: Point) -> list[str]:
-    """Targets whose rows no path explains, worst first."""
+def unexplained(problem: Problem, point: Point) -> str:
+    """A sentence on targets whose rows no path explains, or on rejected sensors; else empty."""
     squares, there = squares_by_epoch(problem.model, point)
     found = []
     for epochs, square, count in zip(problem.epochs, squares, there, strict=True):
@@ -472,7 +474,13 @@ def unexplained(problem: Problem, point: Point) -> list[str]:
             mean = float(np.asarray(square)[mine].sum() / max(np.asarray(count)[mine].sum(), 1))
             if not mean <= ABSURD:
                 found.append((mean, str(name)))
-    return [name for _, name in sorted(found, reverse=True)]
+    if not found:
+        return rejection_text(rejected(problem, point))
+    named = listed([f'"{name}"' for _, name in sorted(found, reverse=True)])
+    return (
+        f"No path of target {named} explains its rows: check its roads or let it leave them, its start, units and"
+        " the noise std; or take more particles."
+    )
 
 
 def scatter(problem: Problem, point: Point) -> tuple[float, float]:
@@ -483,21 +491,12 @@ def scatter(problem: Problem, point: Point) -> tuple[float, float]:
     return total / max(count, 1.0), max(count, 1.0)
 
 
-def misfit(names: Sequence[str]) -> str:
-    """What is said of targets that no path explains."""
-    named = listed([f'"{name}"' for name in names])
-    return (
-        f"No path of target {named} explains its rows: check its roads or let it leave them, its start, units and"
-        " the noise std; or take more particles."
-    )
-
-
 def _judged(
     posterior: EnsemblePosterior, method: Maximiser, ended: Ended, low: bool, far: bool, ahead: float, slope: ScoreSlope
 ) -> tuple[Status, str]:
     """Status of a climb by particles, and a sentence; `ahead` is how far a Newton step would go, in sd a bias."""
-    if names := unexplained(posterior.problem, posterior.point):
-        return Status.MISFIT, misfit(names)
+    if misfit := unexplained(posterior.problem, posterior.point):
+        return Status.MISFIT, misfit
     if far or not posterior.sound:
         where = f"some biases lie more than {FAR:g} scales away" if far else "the information is singular"
         return Status.DIVERGED, f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases."

@@ -1,12 +1,54 @@
-"""What follows from a point: noise levels, and the mean square of what is left."""
+"""Noise levels, mean square of the residuals, and rejected channels at a point."""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from probcal.misfit import Rejected
 from probcal.model.model import Data, Model
+from probcal.noise import HALF
+from probcal.problem import Problem
 from probcal.smoothing import recursion as rec
+from probcal.smoothing.draws import residuals
 from probcal.smoothing.linearised import linearise
 from probcal.smoothing.mode import Point, factors
+
+CHANCE = 1e-3  # probability that a sound fit rejects any channel of any sensor
+
+
+def rejected(problem: Problem, point: Point) -> list[Rejected]:
+    """Channels of sensors whose gross error robust noise hides at a point, the most data first.
+
+    Their fraction of data with less than half weight lies nearer to one than to the expected one,
+    and beyond chance: by the binomial distribution, Bonferroni over the channels, with one datum
+    less for each bias that the rows of the sensor read.
+    """
+    from scipy import special
+
+    model, sensors = problem.model, problem.network.sensors
+    if not any(noise.rejects for noises in model.noises for noise in noises):
+        return []
+    owners = [problem.measurements.sensor[index] for index in problem.row_index]
+    counts: dict[tuple[int, str, float], np.ndarray] = {}  # below half weight, and all
+    for b, reliance in enumerate(residuals(model, point).reliance):
+        there = np.asarray(model.measured[b])
+        low = np.asarray(reliance) < HALF * there
+        for c, (channel, noise) in enumerate(zip(problem.columns[b], model.noises[b], strict=True)):
+            each = (np.bincount(owners[b], own[:, c], len(sensors)) for own in (low, there > 0))
+            both = np.stack([*each], 1).astype(int)
+            for k in np.flatnonzero(both[:, 1] * noise.rejects).tolist():
+                key = (k, channel, noise.rejects)
+                counts[key] = counts.get(key, 0) + both[k]
+    found = []
+    for (k, channel, expected), both in counts.items():
+        below, data = both.tolist()
+        if below > 0.5 * (1.0 + expected) * data:
+            read = [own[owner == k] for own, owner in zip(model.read, owners, strict=True)]
+            used = len({m for own in read for m in np.unique(own).tolist()} - {model.biases})
+            chance = special.bdtrc(below - used - 1, data - used, expected) if below > used else 1.0
+            if chance < CHANCE / len(counts):
+                found.append(Rejected(sensors[k].name, channel, below, data, expected))
+    return sorted(found, key=lambda one: -one.below)
 
 
 @jax.jit

@@ -10,6 +10,7 @@ import numpy as np
 from probcal.priors import Precision
 from probcal.problem import Problem
 from probcal.smoothing.grid import grid_start, joint_cost, track_mode
+from probcal.smoothing.information import rejected
 from probcal.smoothing.mode import Point
 
 GROSS = 3.0  # scales from its stated place at which a node makes exchanges worth trying
@@ -30,16 +31,21 @@ def free_places(problem: Problem) -> dict[str, list[int]]:
     return {name: own for name, own in place.items() if len(own) == problem.network.dimension and name in resting}
 
 
-def swaps(problem: Problem) -> dict[tuple[str, str], np.ndarray]:
-    """Biases (M,) that exchange the places of two nodes, by their names, for every pair of free places."""
+def swaps(problem: Problem, z: np.ndarray | None = None) -> dict[tuple[str, str], np.ndarray]:
+    """Biases (M,) that exchange the places of two nodes, by their names, for each free pair.
+
+    The nodes stand at biases `z` (M,) before, as stated if None: several exchanges make a cycle.
+    """
     place = free_places(problem)
-    stand = {n.name: n.position for n in problem.network.nodes if n.name in place}
+    shift = np.zeros(len(problem.labels)) if z is None else z * problem.scales
+    stated = {n.name: n.position for n in problem.network.nodes if n.name in place}
     found = {}
-    for a, b in itertools.combinations(stand, 2):
-        z = np.zeros(len(problem.labels))
-        z[place[a]], z[place[b]] = stand[b] - stand[a], stand[a] - stand[b]
-        if z.any():
-            found[a, b] = z / problem.scales
+    for a, b in itertools.combinations(stated, 2):
+        moved, apart = shift.copy(), stated[b] + shift[place[b]] - stated[a] - shift[place[a]]
+        moved[place[a]] += apart
+        moved[place[b]] -= apart
+        if apart.any():
+            found[a, b] = moved / problem.scales
     return found
 
 
@@ -47,11 +53,14 @@ def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> 
     """Tracked starts with the places of nodes exchanged and all other biases zero, where these fit far better.
 
     `tracked` is the track at zero biases, `point` the mode that it led to: pairs are tried where that has a node far
-    from its stated place or has not `settled`. Each pair is screened by a few steps from the track at
-    zero biases, which robust losses keep near the truth; on top of the best a further pair, while that fits better.
+    from its stated place, rejects a sensor, or has not `settled`. Each pair is screened by a few steps from the track
+    at zero biases, which robust losses keep near the truth; on top of the best a further pair, while that fits better.
     """
     place, z = free_places(problem), np.asarray(point.z)
     far = {name: float(np.abs(z[own]).max()) for name, own in place.items()}
+    doubted = {one.sensor for one in rejected(problem, point)} if far else set()
+    doubtful = {node.name for s in problem.network.sensors if s.name in doubted for node in s.nodes}
+    far |= dict.fromkeys(doubtful & far.keys(), np.inf)
     if not far or (settled and max(far.values()) < GROSS):
         return
     pairs = swaps(problem)
@@ -64,19 +73,13 @@ def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> 
         return (value if np.isfinite(value) else np.inf), smoothed
 
     best, at = fitted(tracked, SCREENED)
-    base = np.zeros(len(problem.labels))
-    taken: set[str] = set()
     for _ in range(ROUNDS):
-        tried = [
-            (fitted(at._replace(z=jax.device_put(base + pairs[pair])), SCREENED)[0], pair)
-            for pair in order
-            if not taken & set(pair)
-        ]
-        tried = sorted(tried)[:KEPT]
+        placed = ((at._replace(z=jax.device_put(pairs[pair])), pair) for pair in order)
+        tried = sorted((fitted(start, SCREENED)[0], pair) for start, pair in placed)[:KEPT]
         better = [pair for value, pair in tried if value < best - GAIN]
         if not better:
             return
-        starts = [grid_start(problem, jax.device_put(base + pairs[pair]), 30) for pair in better]
+        starts = [grid_start(problem, jax.device_put(pairs[pair]), 30) for pair in better]
         yield from starts
-        pair, at = better[0], starts[0]
-        base, taken, best = base + pairs[pair], taken | set(pair), tried[0][0]
+        at, best = starts[0], tried[0][0]
+        pairs |= swaps(problem, pairs[better[0]])
