@@ -72,8 +72,9 @@ class Node:
     vectors (d,) where a sensor type declares them so (`vectors=("boresight",)`), with a bias an axis. `clock`
     is in m (time times speed), `time_offset` in s: the node's rows were measured so much after their stated time.
     `survey` and `scale` give standard deviations by component (a bare number means the position; a `Bias` may
-    carry the unit of a clock or an extra): `survey` is how well the stated value is known, `scale` is governed by
-    the prior chosen at the fit, neither means known. Raises `InputError` naming node and component.
+    carry the unit of a clock or an extra, a drift or `zeros`): `survey` is how well the stated value is known,
+    `scale` is governed by the prior chosen at the fit, neither means known. Raises `InputError` naming node and
+    component.
 
     >>> node = Node("mast", (0.0, 40.0), survey={"position": 0.1}, scale={"heading": 0.05})
     >>> node.name
@@ -155,6 +156,11 @@ class Node:
                 f'node "{self.name}": {kind} of {component} is {value.scale:g} rad, more than half a turn;'
                 f" give radians, as in np.deg2rad({value.scale:g})"
             )
+        if kind == "survey" and value.zeros != "expected":
+            raise InputError(
+                f'node "{self.name}": a survey of {component} takes no zeros, it is Gaussian under every prior;'
+                " give the Bias as scale"
+            )
         if value.nominal or value.shared:
             raise InputError(f'node "{self.name}": {component} takes no nominal or shared; state the value instead')
         self.spread[component] = (kind, value)
@@ -226,6 +232,7 @@ class BiasRecord:
     since: float | None = None  # time of a step
     vector: bool = False  # whether the component has one value an axis
     sensor_type: str = ""  # none where it is a bias of a node
+    zeros: str = "expected"  # how a sparse prior treats its kind: `Bias.zeros`
 
     def steps(self, drift: Drift | None) -> list["BiasRecord"]:
         """The steps of this bias in order of time."""
@@ -234,7 +241,7 @@ class BiasRecord:
                 self,
                 label=f"{self.label}@{np.format_float_positional(time, precision=3, trim='-')}",
                 scale=size, nominal=0.0, kind="drift" if drift.scale is None else "scale",
-                component=f"{self.component}_step", since=time,
+                component=f"{self.component}_step", since=time, zeros="expected",
             )
             for time, size in drift.steps
         ] if drift else []  # fmt: skip
@@ -388,7 +395,9 @@ class Network:
                 labels, vector = node.labels(component), component == "position"
                 vector = vector or np.ndim(node.components[component]) > 0
                 for axis, (label, scale) in enumerate(zip(labels, node.spreads(component), strict=True)):
-                    record = BiasRecord(label, bias.unit, scale, 0.0, kind, node.name, component, axis, vector=vector)
+                    record = BiasRecord(
+                        label, bias.unit, scale, 0.0, kind, node.name, component, axis, vector=vector, zeros=bias.zeros
+                    )
                     records += [record, *record.steps(bias.drift)]
         return records
 
@@ -400,7 +409,7 @@ class Network:
                 bias, kind = placed.known.get(name, declared), "survey" if name in placed.known else "scale"
                 record = BiasRecord(
                     f"{owner}.{name}", bias.unit, bias.scale, bias.nominal, kind, owner, name,
-                    sensor_type=placed.type.name,
+                    sensor_type=placed.type.name, zeros=bias.zeros,
                 )  # fmt: skip
                 records |= {r.label: r for r in (record, *record.steps(bias.drift))}
         return list(records.values())

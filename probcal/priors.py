@@ -2,11 +2,13 @@
 
 A bias with a `survey` keeps its Gaussian of known standard deviation under every prior. Every prior takes
 `correlation`: label patterns with the correlation of the Gaussian biases they match, for survey errors that
-nodes share. `inference.table()` says which method takes which prior.
+nodes share; and `kinds`: label patterns with the priors of the biases they match, each with hyper-parameters of its
+own, the last pattern that matches a bias being the one that counts. `by_kind` makes such a prior from the mapping that
+a fit takes. `inference.table()` says which method takes which prior.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any, ClassVar, NamedTuple
 
@@ -65,6 +67,7 @@ class Prior:
     """What every prior is and has: a method takes it by what it can do."""
 
     correlation: Any = ()
+    kinds: Any = ()
 
     learns: ClassVar[bool] = False  # precisions follow the data in a climb
     hierarchical: ClassVar[bool] = False  # hyper-parameters of its own, with a class in `inference.hierarchy`
@@ -79,12 +82,77 @@ class Prior:
         for pattern, value in pairs:
             if not -1 < value < 1:
                 raise InputError(f'correlation "{pattern}" is {value:g}: it must lie between -1 and 1')
+        kinds: Any = tuple(self.kinds.items() if isinstance(self.kinds, Mapping) else self.kinds)
+        for pattern, prior in kinds:
+            if not isinstance(prior, Prior) or isinstance(prior, Flat) or prior.kinds:
+                raise InputError(
+                    f'the prior of "{pattern}" is {prior!r}: give one such as Gaussian() or Horseshoe(); for biases'
+                    " without a prior declare a wide scale"
+                )
+            if prior.hierarchical and not self.hierarchical:
+                raise InputError(
+                    f'{type(self).__name__}(kinds=...) has a sparse prior of "{pattern}": give the fit'
+                    f' prior={{"*": {type(self).__name__}(), "{pattern}": {type(prior).__name__}()}}'
+                )
+            pairs += prior.correlation
+        kinds = tuple((str(pattern), replace(prior, correlation=())) for pattern, prior in kinds)
         object.__setattr__(self, "correlation", pairs)
+        object.__setattr__(self, "kinds", kinds)
+
+    def kind_of(self, label: str) -> int:
+        """Number of the kind that governs a bias, the last whose pattern matches; -1 where none does."""
+        return max((k for k, (pattern, _) in enumerate(self.kinds) if fnmatchcase(label, pattern)), default=-1)
+
+    def parts(self, biases: Sequence[Any]) -> tuple[list[tuple[str, "Prior"]], np.ndarray]:
+        """Priors by name, this one without its kinds first, and the number (M,) of the one that governs each bias.
+
+        A pattern is above what a bias declares as `zeros`, which only a hierarchical prior reads.
+        """
+        own = replace(self, kinds=())
+        found = {("", ""): own} | {("pattern", pattern): prior for pattern, prior in self.kinds}
+        names, numbers = list(found), []
+        for bias in biases:
+            kind, name = self.kind_of(bias.label), ("", "")
+            if kind >= 0:
+                name = ("pattern", self.kinds[kind][0])
+            elif self.hierarchical and bias.zeros == "none":
+                name = ("none", bias.component)
+                found[name] = Gaussian()
+            elif bias.zeros == "learnt" and (learnt := own.adaptive()) is not None:
+                name = ("learnt", bias.component)
+                found[name] = learnt
+            names += [name] if name not in names else []
+            numbers.append(names.index(name))
+        return [(name, found[kind, name]) for kind, name in names], np.array(numbers, int)
+
+    def title(self, biases: Sequence[Any]) -> str:
+        """Its name in results, with the names of the priors that govern kinds of these biases."""
+        parts, part = self.parts(biases)
+        governing = [pair for k, pair in enumerate(parts) if k in part] or parts[:1]
+        return "; ".join(
+            type(prior).__name__ + (f" of {name}" if name not in ("", "*") else "") for name, prior in governing
+        )
+
+    def adaptive(self) -> "Prior | None":
+        """This prior for a kind whose global scale and share of zeros are learnt; None where nothing is shared."""
+        return None
+
+    def check_kinds(self, labels: Sequence[str]) -> None:
+        """Raise `InputError` for a pattern that governs none of the biases of these labels."""
+        governing = {self.kind_of(label) for label in labels}
+        for k, (pattern, _) in enumerate(self.kinds):
+            if k in governing or pattern == "*":  # the rest, of which there may be none
+                continue
+            if not any(fnmatchcase(label, pattern) for label in labels):
+                raise InputError(f'prior "{pattern}" matches no bias{nearest(pattern, labels)}')
+            raise InputError(f'prior "{pattern}" governs no bias, as later patterns match all of them: put it last')
 
     def precision(self, labels: Sequence[str], surveyed: np.ndarray) -> Precision:
         """First precision of biases by label; those in `surveyed` (M,) have their own Gaussian."""
         M = len(labels)
-        alpha = jax.device_put(np.where(surveyed, 1.0, self.first))
+        priors = [self, *(prior for _, prior in self.kinds)]
+        own = [priors[self.kind_of(label) + 1] for label in labels]
+        alpha = jax.device_put(np.where(surveyed, 1.0, np.array([one.first for one in own])))
         if not self.correlation:
             return Precision.single(alpha)
         matrix, coupled = np.eye(M), np.zeros(M, bool)
@@ -93,7 +161,7 @@ class Prior:
             if len(members) < 2:
                 raise InputError(f'correlation "{pattern}" reaches {len(members)} bias(es){nearest(pattern, labels)}')
             for m in members:
-                if not (surveyed[m] or isinstance(self, Gaussian)):
+                if not (surveyed[m] or isinstance(own[m], Gaussian)):
                     raise InputError(
                         f'correlation "{pattern}" reaches {labels[m]}, which has no survey: give it one, '
                         f"or use the prior Gaussian"
@@ -156,6 +224,9 @@ class Laplace(Prior):
     def penalty(self, z: Any, alpha: Any) -> Any:
         """Negative log density of each z, up to a constant."""
         return self.rate * abs(z)
+
+
+AnyPrior = Prior | Mapping[str, Prior] | None  # as a fit takes it: one prior, or one by label pattern
 
 
 def check_by(name: str, by: str | None) -> None:
@@ -249,16 +320,21 @@ class Horseshoe(Prior):
         """Which local scale governs each bias, (M,)."""
         return grouped(members, self.by)
 
+    def adaptive(self) -> "Horseshoe":
+        """The one whose global scale, half-Cauchy of scale 1, says whether few of the kind are zero or most."""
+        return replace(self, expected=0.5)
+
 
 @dataclass(frozen=True, kw_only=True)
 class BernoulliGaussian(Prior):
     """Spike and slab, the generating model of Papers B and C: each bias is zero or Gaussian of `slab` declared scales.
 
-    `share` of the biases is non-zero; None learns it under a Beta(a, b) prior, uniform by default.
+    `share` of the biases is non-zero; None learns it under a Beta(a, b) prior, uniform by default. `slab` None learns
+    its variance too, under an inverse-Gamma(2, 2): the non-zero biases are then Student t of 4 degrees of freedom.
     """
 
     share: float | None = None
-    slab: float = 1.0
+    slab: float | None = 1.0
     a: float = 1.0
     b: float = 1.0
 
@@ -270,8 +346,47 @@ class BernoulliGaussian(Prior):
         if self.share is not None and not 0 < self.share < 1:
             raise InputError(f"BernoulliGaussian(share={self.share}): it must lie between 0 and 1, or be None")
         for name in ("slab", "a", "b"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(f"BernoulliGaussian({name}={getattr(self, name)}): give a positive number")
+            value = getattr(self, name)
+            if not (name == "slab" and value is None) and not (np.isfinite(value) and value > 0):
+                raise InputError(f"BernoulliGaussian({name}={value}): give a positive number")
+
+    def adaptive(self) -> "BernoulliGaussian":
+        """The one whose share and slab are learnt."""
+        return replace(self, share=None, slab=None)
+
+
+def by_kind(first: Prior, priors: Mapping[str, Prior]) -> Prior:
+    """The prior of a mapping from label pattern to prior; biases that none matches have that of "*", else `first`.
+
+    Of several other patterns that match a bias the last one counts. The type of the result is that of a sparse prior
+    where one is among them, since that decides which method takes it.
+
+    >>> by_kind(Horseshoe(), {"*.delay": Gaussian()}).kinds
+    (('*.delay', Gaussian(correlation=(), kinds=())),)
+    """
+    given = dict(priors)
+    rest = given.pop("*", first)
+    every = {"*": rest} | given
+    sparse = [prior for prior in every.values() if isinstance(prior, Prior) and prior.hierarchical]
+    core = sparse[0] if sparse else rest if isinstance(rest, Prior) else first
+    plain = core is first or isinstance(core, Flat)
+    return replace(core, correlation=first.correlation if core is first else (), kinds=given if plain else every)
+
+
+def as_prior(prior: Any, first: Prior, labels: Sequence[str] = ()) -> Prior:
+    """The prior that is given, by a mapping from label pattern too, or `first` where none is.
+
+    Raises `InputError` for what is no prior, and for a pattern that governs none of the biases of these labels.
+    """
+    found = first if prior is None else by_kind(first, prior) if isinstance(prior, Mapping) else prior
+    if not isinstance(found, Prior):
+        raise InputError(
+            f"the prior is {prior!r}; give a prior itself, such as Horseshoe() or Gaussian(), or a mapping from label"
+            ' pattern to prior, such as {"*.delay": Gaussian()}'
+        )
+    if labels:
+        found.check_kinds(labels)
+    return found
 
 
 # names on the command line

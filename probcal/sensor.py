@@ -93,6 +93,9 @@ class Drift:
         return tuple(zip(self.times[1:], sizes.tolist(), strict=True))
 
 
+ZEROS = ("expected", "none", "learnt")
+
+
 @dataclass(frozen=True)
 class Bias:
     """An unknown parameter of a sensor: its unit, prior scale (standard deviation) and nominal value.
@@ -101,8 +104,16 @@ class Bias:
     sensors of the type. With a `drift` it changes in time: `<label>@<time>` is its step at that time, to the
     millisecond.
 
+    `zeros` says how a sparse prior treats this kind of bias. "expected": many are zero, and the prior
+    finds those that are not. "none": none is zero, as antenna delays; the kind is Gaussian of its
+    scale. "learnt": the kind has hyper-parameters of its own, by which the data say whether few are
+    zero or most (`Prior.adaptive`). `Gaussian` and `Flat` take all kinds alike. A pattern in the
+    prior of a fit (`prior={"*.delay": Gaussian()}`) is above the declaration.
+
     >>> Bias("m", 5.0).scale
     5.0
+    >>> Bias("m", 0.3, zeros="none").zeros
+    'none'
     """
 
     unit: str
@@ -110,9 +121,12 @@ class Bias:
     nominal: float = 0.0
     shared: str | None = None
     drift: Drift | None = None
+    zeros: str = "expected"
 
     def __post_init__(self):
         _check_unit("Bias", self.unit)
+        if self.zeros not in ZEROS:
+            raise InputError(f"Bias({self.unit!r}, zeros={self.zeros!r}): zeros is one of {', '.join(ZEROS)}")
         if not (np.isfinite(self.scale) and self.scale > 0):
             raise InputError(
                 f"Bias({self.unit!r}, scale={self.scale}): the scale must be positive; to fix a bias use fix="

@@ -338,7 +338,7 @@ def _biases(problem: Problem, share: float, given: Mapping[str, float] | None, k
     shape = (len(problem.labels),)
     z = np.array(jax.random.normal(draw, shape))
     zero = np.asarray(jax.random.uniform(chosen, shape)) >= share
-    z[zero & ~problem.surveyed] = 0.0
+    z[zero & np.array([bias.kind == "scale" and bias.zeros != "none" for bias in problem.biases], bool)] = 0.0
     if given is not None:
         z[:] = 0.0
         for label, value in given.items():

@@ -248,12 +248,18 @@ def test_a_model_may_bring_its_prior(model):
     model.write_text(model.read_text() + '\nfrom probcal import ARD\nPRIOR = ARD(by="node")\n')
     module = load_model(model)
     for method, name, wanted in (
-        ("ea", None, probcal.ARD(by="node")),
-        ("ea", "ard", probcal.ARD()),
-        ("map", None, None),
+        ("ea", (), probcal.ARD(by="node")),
+        ("ea", ("ard",), probcal.ARD()),
+        ("map", (), None),
+        ("ea", ("*.delay=gaussian",), probcal.ARD(by="node", kinds={"*.delay": probcal.Gaussian()})),
+        ("ea", ("ard", "*.delay=gaussian"), probcal.ARD(kinds={"*.delay": probcal.Gaussian()})),
+        ("map", ("*.delay=laplace",), probcal.Laplace(kinds={"*": probcal.Gaussian(), "*.delay": probcal.Laplace()})),
     ):
         assert prior_named(module, *METHODS[method], name) == wanted
-    assert prior_named(load_model(MODEL), *METHODS["ea"], None) is None
+    assert prior_named(load_model(MODEL), *METHODS["ea"]) is None
+    kinds = {"*.delay": probcal.Gaussian()}
+    module.PRIOR = kinds
+    assert prior_named(module, *METHODS["ea"]) == probcal.Horseshoe(kinds=kinds)
 
 
 def edit(rows, change):

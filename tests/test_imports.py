@@ -33,6 +33,12 @@ ERRORS = [  # of options and arguments, with the end of what is said
     ("fit {plaza} none.csv", "none.csv: no such file"),
     ("fit {plaza} --method eaa", '--method "eaa" is not known; did you mean "ea"?'),
     ("fit {plaza} --prior gausian", '--prior "gausian" is not known; did you mean "gaussian"?'),
+    ("fit {plaza} --prior *.x=gausian", '--prior "gausian" is not known; did you mean "gaussian"?'),
+    ("fit {plaza} --prior *.x=flat", "EA does not take the prior Flat; it takes: laplace, ard"),
+    (
+        "fit {plaza} --prior ard --prior laplace",
+        '--prior: give one NAME for all biases, and "PATTERN=NAME" for those of a',
+    ),
     (
         "fit {plaza} --prior gaussian",
         "EA does not take the prior Gaussian; it takes: laplace, ard, ard-node, ard-owner",

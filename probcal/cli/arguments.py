@@ -6,11 +6,19 @@ from typing import Annotated
 import typer
 
 from probcal.cli import options
-from probcal.cli.names import METHODS
+from probcal.cli.names import METHODS, PRIORS
 
 Model = Annotated[Path, typer.Argument(help="model file that defines problem(data=None)", show_default=False)]
 Data = Annotated[Path | None, typer.Argument(help="table of rows (CSV); the model's own data if left out")]
 Method = Annotated[str, typer.Option(help=" | ".join(METHODS))]
+Prior = Annotated[
+    list[str] | None,
+    typer.Option(
+        help=" | ".join(PRIORS) + "; PATTERN=NAME for biases of a kind (repeat); the model's or the method's own if"
+        " left out",
+        show_default=False,
+    ),
+]
 Fix = Annotated[list[str] | None, typer.Option(help="hold biases at 0, by label or pattern (repeat)")]
 Given = Annotated[
     list[str] | None, typer.Option("--set", help="an argument of problem(): swap=3,4 (repeat)", show_default=False)

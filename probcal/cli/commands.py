@@ -11,8 +11,8 @@ import typer
 from probcal import wings
 from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.cli import files, options, outputs
-from probcal.cli.arguments import Data, Fix, Given, Method, Model, Network, Overwrite, Scheduler, Seed
-from probcal.cli.names import METHODS, PRIORS
+from probcal.cli.arguments import Data, Fix, Given, Method, Model, Network, Overwrite, Prior, Scheduler, Seed
+from probcal.cli.names import METHODS
 from probcal.errors import FitError, InputError, nearest
 from probcal.inference.progress import Terminated, check_limit
 
@@ -71,10 +71,7 @@ def fit_command(
         typer.Argument(help="table of rows (CSV), or several recordings; the model's own data if left out"),
     ] = None,
     method: Method = "ea",
-    prior: Annotated[
-        str | None,
-        typer.Option(help=" | ".join(PRIORS) + "; the model's or the method's own if left out"),
-    ] = None,
+    prior: Prior = None,
     fix: Fix = None,
     given: Given = None,
     network: Network = None,
@@ -121,9 +118,7 @@ def fit_command(
     wings.check_method_installed(method)
     if method not in METHODS:
         raise InputError(f'--method "{method}" is not known{nearest(method, METHODS)}')
-    if prior is not None and prior not in PRIORS:
-        raise InputError(f'--prior "{prior}" is not known{nearest(prior, PRIORS)}')
-    options.check_taken(method, prior)
+    options.check_priors(method, prior or ())
     sizes = options.chain_sizes(method, {"chains": chains, "draws": draws, "warmup": warmup})
     if resume and out is None:
         raise InputError("--resume needs --out, the folder of the run to go on with")
@@ -135,8 +130,8 @@ def fit_command(
     options.check_alignment(align)
     check_limit(limit)
     chosen: dict[str, Any] = dict(
-        method=method, prior=prior, fix=fix or (), given=arguments, starts=starts, seed=seed, sizes=sizes, kept=kept,
-        assessed=assessed, epoch=epoch, align=align, limit=limit, network=network,
+        method=method, prior=prior or (), fix=fix or (), given=arguments, starts=starts, seed=seed, sizes=sizes,
+        kept=kept, assessed=assessed, epoch=epoch, align=align, limit=limit, network=network,
     )  # fmt: skip
     if recordings:
         options.check_files(model)

@@ -75,7 +75,7 @@ def _load_ahead(names: Sequence[str]) -> None:
 
 
 def calibrated(
-    model: Path, data: Path | None, *, method: str, prior: str | None, fix: Sequence[str], given: Mapping[str, Any],
+    model: Path, data: Path | None, *, method: str, prior: Sequence[str], fix: Sequence[str], given: Mapping[str, Any],
     starts: int, seed: int, outputs: Outputs | None, sizes: Mapping[str, int], resume: bool, overwrite: bool,
     kept: Sequence[str], assessed: bool, epoch: float | None = None, align: str | None = None,
     monitor: Monitor | None = None, limit: float | None = None, module: ModuleType | None = None,

@@ -238,12 +238,19 @@ def load_truth(
     return truth
 
 
-def prior_named(module: ModuleType, method: "Method", implied: "Prior | None", name: str | None) -> "Prior | None":
-    """The prior that is named, else that of the method's name, else the model's own `PRIOR` if the method takes it."""
-    from probcal.priors import PRIORS, Prior
+def prior_named(
+    module: ModuleType, method: "Method", implied: "Prior | None", names: Sequence[str] = ()
+) -> "Prior | None":
+    """The prior that is named, else that of the method's name, else the model's own `PRIOR` if the method takes it.
 
-    chosen = PRIORS[name] if name is not None else implied
-    own = getattr(module, "PRIOR", None)
-    if not isinstance(own, Prior | None):
+    Of the names, `NAME` is for all biases, and `PATTERN=NAME` for those of a kind.
+    """
+    from probcal.priors import PRIORS, Prior, as_prior, by_kind
+
+    named = {pattern: PRIORS[name] for pattern, _, name in (text.rpartition("=") for text in names)}
+    chosen, own = named.pop("", implied), getattr(module, "PRIOR", None)
+    if not isinstance(own, Prior | Mapping | None):
         raise InputError(f"{module.__name__}.py: PRIOR is {own!r}; give a prior of probcal, such as Horseshoe()")
-    return own if chosen is None and own is not None and method.takes(own) else chosen
+    if chosen is None and own is not None and method.takes(as_prior(own, method.first_prior())):
+        chosen = as_prior(own, method.first_prior())
+    return by_kind(chosen or method.first_prior(), named) if named else chosen

@@ -9,7 +9,7 @@ import typer
 
 from probcal.cli.names import METHODS, PRIORS, SAVE
 from probcal.cli.outputs import RECORDINGS
-from probcal.errors import InputError
+from probcal.errors import InputError, nearest
 from probcal.labels import check_name
 
 MOST_VALUES = 10_000  # of a setting of a study
@@ -97,11 +97,18 @@ def exists(path: Path) -> bool:
         return False
 
 
-def check_taken(method: str, prior: str | None) -> None:
-    """Raise `InputError` for a known prior that a known method does not take."""
-    known = METHODS[method]
-    if prior is not None and prior not in known.priors:
-        raise InputError(f"{known.title} does not take the prior {PRIORS[prior]}; it takes: {', '.join(known.priors)}")
+def check_priors(method: str, priors: Sequence[str]) -> None:
+    """Raise `InputError` for priors, `NAME` or `PATTERN=NAME`, that are not known or that a method does not take."""
+    known, split = METHODS[method], [text.rpartition("=") for text in priors]
+    for pattern, _, name in split:
+        if name not in PRIORS:
+            raise InputError(f'--prior "{name}" is not known{nearest(name, PRIORS)}')
+        if name not in known.priors and not (pattern and name == "gaussian"):
+            raise InputError(
+                f"{known.title} does not take the prior {PRIORS[name]}; it takes: {', '.join(known.priors)}"
+            )
+    if sum(not pattern for pattern, *_ in split) > 1:
+        raise InputError('--prior: give one NAME for all biases, and "PATTERN=NAME" for those of a kind')
 
 
 def chain_sizes(method: str, sizes: Mapping[str, int | None]) -> dict[str, int]:

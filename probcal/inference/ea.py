@@ -10,7 +10,7 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.inference.ending import astray
-from probcal.inference.hierarchy import hierarchy_of
+from probcal.inference.hierarchy import held, hierarchy_of
 from probcal.inference.integrate import Integration, likelihood
 from probcal.inference.posed import Form
 from probcal.inference.pruned import without_far_modes
@@ -224,7 +224,7 @@ class EA(Maximiser):
         known, sound = likelihood(how, model, first_precision(problem, prior), state.point)
         if not bool(sound):
             return np.asarray(state.alpha), 0.0
-        learnt, members = np.flatnonzero(~problem.surveyed).tolist(), problem.members
+        learnt, members = np.flatnonzero(~held(prior, problem)).tolist(), problem.members
         names = dict.fromkeys((kind, members[m][kind]) for kind in ("component", "owner") for m in learnt)
         sets = [[m for m in learnt if members[m][kind] == name] for kind, name in names]
         information = np.asarray(known.information + known.first.coupled())
@@ -243,9 +243,11 @@ class EA(Maximiser):
 
         None where it governs no bias.
         """
-        if not self.integrates(prior) or problem.surveyed.all():
+        if not self.integrates(prior):
             return None
         form = Form(problem.model.biases, hierarchy_of(prior, problem))
+        if not form.hierarchy.learnt:
+            return None
         return Integration(form, self.trajectory == "marginal", len(form.hierarchy.learnt) <= MANY)
 
     def note(self, prior: Prior) -> str:

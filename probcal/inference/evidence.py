@@ -16,7 +16,7 @@ from probcal.inference.methods import check_problem
 from probcal.inference.pose import pareto_khat, pose, weights
 from probcal.inference.posed import Form, Posed, conditional, draw_given, prior_precision
 from probcal.inference.psis import smoothed
-from probcal.priors import Flat, Horseshoe, Prior
+from probcal.priors import AnyPrior, Flat, Horseshoe, as_prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
 from probcal.smoothing.mode import Point
@@ -39,7 +39,7 @@ class Evidence(NamedTuple):
 
 
 @float64
-def log_evidence(problem: Problem, *, prior: Prior | None = None, key: Key = 0, start: Point | None = None) -> Evidence:
+def log_evidence(problem: Problem, *, prior: AnyPrior = None, key: Key = 0, start: Point | None = None) -> Evidence:
     """Log of the density of the data under a prior (`Horseshoe()` by default), everything unknown integrated.
 
     The frame marginalises trajectories (Laplace), and biases and noise levels given the hyper-parameters, in closed
@@ -48,8 +48,8 @@ def log_evidence(problem: Problem, *, prior: Prior | None = None, key: Key = 0, 
     are not to be trusted. Under a `Gaussian` prior a linear-Gaussian problem has its evidence to rounding.
     Raises `InputError` for a flat prior, which has no evidence, and for process noise that is not Gaussian.
     """
-    prior = Horseshoe() if prior is None else prior
-    if isinstance(prior, Flat):
+    chosen = as_prior(prior, Horseshoe(), problem.network.labels)
+    if isinstance(chosen, Flat):
         raise InputError("log_evidence: a flat prior has no evidence; give a proper one")
     check_problem(problem)
     if problem.model.tailed:
@@ -59,7 +59,7 @@ def log_evidence(problem: Problem, *, prior: Prior | None = None, key: Key = 0, 
         )
     keys = jax.random.split(as_key(key), 3)
     point = automatic_start(problem) if start is None else start
-    form, posed, _, _ = pose(problem, prior, point, keys[0], whole=True)
+    form, posed, _, _ = pose(problem, chosen, point, keys[0], whole=True)
     runs = tempered_runs(form, posed, keys[1])
     corrections = np.asarray(weights(form, posed, runs.theta, keys[2]))
     khat = pareto_khat(corrections)

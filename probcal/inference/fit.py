@@ -27,7 +27,7 @@ from probcal.inference.storage import Storage
 from probcal.inference.widen import judge_fit, judge_tracks
 from probcal.labels import NODE, START, listed
 from probcal.lazy import Later
-from probcal.priors import Prior
+from probcal.priors import AnyPrior
 from probcal.problem import Problem, check_linear
 from probcal.results.answer import Answer, Tracks, tracks_of, uncalibrated
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
@@ -61,7 +61,7 @@ def fit(
     problem: Problem,
     method: Method | None = None,
     *,
-    prior: Prior | None = None,
+    prior: AnyPrior = None,
     key: Key = 0,
     start: Point | None = None,
     starts: int = 1,
@@ -74,12 +74,15 @@ def fit(
 ) -> xr.DataTree:
     """Calibrate: estimate the biases of a problem and the tracks of its targets.
 
-    `method` is a value (`EA()` by default); `prior` defaults to the method's own; `key` is a seed
-    or jax key of the draws and of further starts; `start` replaces the automatic start. `starts`
-    runs the method from so many starts, the further ones with two nodes swapped or a share of the
-    biases drawn: the best optimum is reported, all of them with their evidence in the group
-    `optimum`. `save` names draws that the tree keeps beside those of the biases and of the
-    log-likelihood: "states" of every epoch (large), "predictive" replicas of the data. A sampler
+    `method` is a value (`EA()` by default); `prior` defaults to the method's own, and may be a
+    mapping from label pattern to prior (`{"*.range_offset": Gaussian()}`), in which a bias that no
+    pattern matches has the method's own or that of "*", and of several others the last one counts:
+    each kind has hyper-parameters of its own. `key` is a seed or jax key of the draws and of
+    further starts; `start` replaces the automatic start. `starts` runs the method from so many
+    starts, the further ones with two nodes swapped or a share of the biases drawn: the best optimum
+    is reported, all of them with their evidence in the group `optimum`. `save` names draws that the
+    tree keeps beside those of the biases and of the log-likelihood: "states" of every epoch
+    (large), "predictive" replicas of the data. A sampler
     (`Collapsed()`, `NUTS()`, `SVI()`) writes its draws to the folder `store` while it runs;
     `resume` goes on where a killed run of the same model, data and settings stopped, with the draws
     of an uninterrupted one. A folder that holds a run is refused without `resume` or `overwrite`.
@@ -106,21 +109,21 @@ def fit(
 
 @float64
 def calibrate(
-    problem: Problem, method: Method | None = None, *, prior: Prior | None = None, key: Key = 0,
+    problem: Problem, method: Method | None = None, *, prior: AnyPrior = None, key: Key = 0,
     start: Point | None = None, starts: int = 1, monitor: Monitor | None = None, save: Collection[str] = (),
     store: str | PathLike[str] | None = None, resume: bool = False, overwrite: bool = False,
 ) -> tuple[xr.DataTree, Answer]:  # fmt: skip
     """The tree of `fit`, and the answer behind it, which `assess` takes so that it need not be found again."""
     method, monitor = EA() if method is None else method, monitor or Monitor()
-    prior = choose_prior(method, prior)
+    chosen = choose_prior(method, prior, problem.network.labels)
     check_problem(problem, linear=not method.by_particles)
     if problem.scans is not None:
         context = Context(jax.random.split(as_key(key))[0], monitor, None, fallback=NUTS())
         fit_labelled = partial(
-            calibrate, prior=prior, key=key, starts=starts, monitor=monitor, save=save, store=store, resume=resume,
+            calibrate, prior=chosen, key=key, starts=starts, monitor=monitor, save=save, store=store, resume=resume,
             overwrite=overwrite,
         )  # fmt: skip
-        return method.configured(problem, prior, context, fit_labelled)
+        return method.configured(problem, chosen, context, fit_labelled)
     keep = _kept(save)
     method.check_kept(problem, keep)
     if starts < 1:
@@ -130,7 +133,7 @@ def calibrate(
     identity: dict[str, str] = {}
     if store is not None:
         identity = identity_of(
-            problem, method=method, prior=prior, seed=seed_text(as_key(key)), number_of_starts=starts,
+            problem, method=method, prior=chosen, seed=seed_text(as_key(key)), number_of_starts=starts,
             start="" if start is None else points_digest(start),
         )  # fmt: skip
     folder = None if method.climbs else store
@@ -140,7 +143,7 @@ def calibrate(
     ):
         keys = jax.random.split(as_key(key))
         context = Context(keys[0], monitor, storage, fallback=NUTS())
-        answer = _interrupted(solve(problem, method, prior, context, start=start, starts=starts), monitor)
+        answer = _interrupted(solve(problem, method, chosen, context, start=start, starts=starts), monitor)
         directions = _directions(answer)
         answer = _watched(replace(answer, message=_advised(answer, directions)))
         if not answer.posterior.sound:  # a flat prior on a singular problem: no interval exists

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from probcal.inference.hierarchy import Phi, SpikeAndSlab
+from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Quadratic, draw_given, update_inclusions
 
 
@@ -21,7 +21,7 @@ def gibbs_sweep(
 
     def biases(theta: jax.Array, phi: Phi, key: jax.Array) -> tuple[jax.Array, Phi]:
         keys = jax.random.split(key)
-        if isinstance(kind, SpikeAndSlab):
+        if kind.spiked:
             phi = update_inclusions(form, posed, phi, keys[0], backwards=backwards)
         return draw_given(form, posed, phi, keys[1]), phi
 

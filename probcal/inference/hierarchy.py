@@ -2,14 +2,17 @@
 
 A `Hierarchy` is the static part (which biases it governs, in which groups); its variables `phi` are a dict of arrays.
 Given them the biases are Gaussian of precision `alpha(phi)`, so that every prior but the spike is a scale mixture. To
-add one: a class here with its `hyper` distributions and its `updates`, and a line in `hierarchy_of`.
+add one: a class here with its `hyper` distributions and its `updates`, and a line in `KINDS`. Kinds of biases with
+priors of their own are a `Product` of such parts.
 """
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
@@ -19,7 +22,7 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.inference.draws import inverse_gaussian, slice_step
 from probcal.lazy import Later
-from probcal.priors import ARD, BernoulliGaussian, Horseshoe, Laplace, Prior
+from probcal.priors import ARD, BernoulliGaussian, Gaussian, Horseshoe, Laplace, Prior
 from probcal.problem import Problem
 
 if TYPE_CHECKING:
@@ -49,6 +52,15 @@ class Hierarchy(ABC):
     def count(self) -> int:
         """Number of precisions."""
         return max(self.group, default=-1) + 1
+
+    @property
+    def spiked(self) -> tuple[int, ...]:
+        """Biases that may be exactly zero, of which `phi["included"]` says which are not."""
+        return ()
+
+    def share(self, phi: Phi) -> jax.Array:
+        """The prior probability that a spiked bias is not zero, one number or one per spiked bias."""
+        raise AssertionError("no bias of this prior can be exactly zero")
 
     def belongs(self, name: str) -> str:
         """Whose a hyper-parameter is: of each "bias" that is governed, of each "group" of them, or of "all"."""
@@ -340,21 +352,32 @@ class SpikeAndSlab(Hierarchy):
     by_bias = ("included",)
 
     sweeps = 2
+    shape: ClassVar[float] = 2.0  # and rate of the Gamma of a learnt slab precision: 4 degrees of freedom
+
+    @property
+    def spiked(self):
+        """All that it governs."""
+        return self.learnt
 
     def hyper(self):
-        """The share of the biases that are not zero, where it is not given."""
-        return {} if self.prior.share is not None else {"share": dist.Beta(self.prior.a, self.prior.b)}
+        """The share of the biases that are not zero, and the precision of these, where they are not given."""
+        share = {} if self.prior.share is not None else {"share": dist.Beta(self.prior.a, self.prior.b)}
+        return share if self.prior.slab is not None else share | {"slab_precision": dist.Gamma(self.shape, self.shape)}
 
     def drawn(self):
-        """Beta, where it is not given."""
-        if self.prior.share is not None:
-            return {}
-        both = jnp.array([self.prior.a, self.prior.b])
-        return {"share": lambda key: jax.random.dirichlet(key, both)[0]}
+        """Beta and Gamma, where they are not given."""
+        found = {}
+        if self.prior.share is None:
+            both = jnp.array([self.prior.a, self.prior.b])
+            found["share"] = lambda key: jax.random.dirichlet(key, both)[0]
+        if self.prior.slab is None:
+            found["slab_precision"] = lambda key: jax.random.gamma(key, self.shape) / self.shape
+        return found
 
     def governed(self, phi):
         """The slab."""
-        return jnp.full(len(self.learnt), 1.0 / self.prior.slab**2)
+        precision = phi["slab_precision"] if self.prior.slab is None else 1.0 / self.prior.slab**2
+        return jnp.full(len(self.learnt), precision)
 
     def active(self, phi, biases):
         """Those that are in, and all that the prior does not govern."""
@@ -371,20 +394,162 @@ class SpikeAndSlab(Hierarchy):
         return phi | {"included": jax.random.uniform(keys[1], (len(self.learnt),)) < self.share(phi)}
 
     def updates(self):
-        """The conjugate Beta of the share."""
+        """The conjugate Beta of the share, and the conjugate Gamma of the precision of the biases that are in."""
 
         def share(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
             number = jnp.sum(phi["included"])
             out = len(self.learnt) - number
             return phi | {"share": jax.random.beta(key, self.prior.a + number, self.prior.b + out)}
 
-        return [share] if self.prior.share is None else []
+        def slab(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
+            number, square = jnp.sum(phi["included"]), jnp.sum(jnp.where(phi["included"], z**2, 0.0))
+            drawn = jax.random.gamma(key, self.shape + 0.5 * number)
+            return phi | {"slab_precision": drawn / (self.shape + 0.5 * square)}
+
+        return [share] * (self.prior.share is None) + [slab] * (self.prior.slab is None)
+
+
+@dataclass(frozen=True)
+class Product(Hierarchy):
+    """Hierarchies of disjoint biases, each with hyper-parameters of its own, called `<name>_<part>`."""
+
+    pieces: tuple[tuple[str, Hierarchy], ...] = ()
+
+    @classmethod
+    def of(cls, prior: Prior, parts: Sequence[tuple[str, Hierarchy]]) -> Product:
+        """The product of named parts; a part without a name keeps the names of its hyper-parameters."""
+        before = np.cumsum([0, *(one.count for _, one in parts)]).tolist()
+        learnt = tuple(m for _, one in parts for m in one.learnt)
+        group = tuple(first + g for first, (_, one) in zip(before, parts, strict=False) for g in one.group)
+        return cls(prior, learnt, group, tuple(parts))
+
+    @property
+    def spiked(self):
+        """Those of all parts."""
+        return tuple(m for _, one in self.pieces for m in one.spiked)
+
+    def _slices(self, counts: Sequence[int]) -> list[slice]:
+        """Places of each part in an array that holds as many entries of each."""
+        ends = np.cumsum([0, *counts]).tolist()
+        return [slice(*pair) for pair in pairwise(ends)]
+
+    def _parts(self, phi: Mapping[str, Any]) -> list[tuple[str, Hierarchy, Any, slice]]:
+        """Each part: name, hierarchy, its hyper-parameters by their own names, and its places in `learnt`."""
+        spiked = self._slices([len(one.spiked) for _, one in self.pieces])
+        found = []
+        for (name, one), mine, inside in zip(
+            self.pieces, self._slices([len(one.learnt) for _, one in self.pieces]), spiked, strict=True
+        ):
+            own = {known: phi[_named(known, name)] for known in one.drawn() if _named(known, name) in phi}
+            if one.spiked and "included" in phi:
+                own["included"] = phi["included"][..., inside]
+            found.append((name, one, own, mine))
+        return found
+
+    def _joined(self, found: Sequence[Phi]) -> Phi:
+        """Hyper-parameters of all parts as one."""
+        inside = [own["included"] for own in found if "included" in own]
+        joined = {
+            _named(known, name): value
+            for (name, _), own in zip(self.pieces, found, strict=True)
+            for known, value in own.items()
+            if known != "included"
+        }
+        return joined | ({"included": jnp.concatenate(inside, -1)} if inside else {})
+
+    def variables(self, labels, phi):
+        """Those of every part, with dimensions of its own."""
+        found = dict[str, Any]()
+        for name, one, own, _ in self._parts(phi):
+            for known, (dims, values, *coords) in one.variables(labels, own).items():
+                renamed = [{_named(dim, name): c for dim, c in each.items()} for each in coords]
+                found[_named(known, name)] = (tuple(_named(dim, name) for dim in dims), values, *renamed)
+        return found
+
+    def hyper(self):
+        """Those of every part."""
+        return {_named(known, name): d for name, one in self.pieces for known, d in one.hyper().items()}
+
+    def drawn(self):
+        """Those of every part."""
+        return {_named(known, name): d for name, one in self.pieces for known, d in one.drawn().items()}
+
+    def governed(self, phi):
+        """Part by part."""
+        return jnp.concatenate([one.governed(own) for _, one, own, _ in self._parts(phi)])
+
+    def active(self, phi, biases):
+        """Those that no part takes out."""
+        active = jnp.ones(biases, bool)
+        for _, one, own, _ in self._parts(phi):
+            active = active & one.active(own, biases)
+        return active
+
+    def share(self, phi):
+        """That of its part for every spiked bias."""
+        each = [
+            jnp.broadcast_to(one.share(own), (len(one.spiked),))
+            for _, one, own, _ in self._parts(phi) if one.spiked
+        ]  # fmt: skip
+        return jnp.concatenate(each)
+
+    def draw(self, key):
+        """From the prior of every part."""
+        keys = jax.random.split(key, len(self.pieces))
+        return self._joined([one.draw(own) for (_, one), own in zip(self.pieces, keys, strict=True)])
+
+    def begin(self, key):
+        """Where every part begins."""
+        keys = jax.random.split(key, len(self.pieces))
+        return self._joined([one.begin(own) for (_, one), own in zip(self.pieces, keys, strict=True)])
+
+    def updates(self):
+        """Those of every part, given its own biases."""
+
+        def lifted(k: int, update: Update) -> Update:
+            def moved(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
+                name, one, own, mine = self._parts(phi)[k]
+                new = update(own, z[mine], key)
+                return phi | {_named(known, name): new[known] for known in one.drawn()}
+
+            return moved
+
+        return [lifted(k, update) for k, (_, one) in enumerate(self.pieces) for update in one.updates()]
+
+    def renewed(self, phi, here, there, key):
+        """Own values of every part, whose ratios add up."""
+        found, total = list[Phi](), jnp.zeros(())
+        for (_, one, own, mine), k in zip(self._parts(phi), jax.random.split(key, len(self.pieces)), strict=True):
+            new, ratio = one.renewed(own, here[mine], there[mine], k)
+            found.append(new)
+            total = total + ratio
+        return self._joined(found), total
+
+
+def _named(name: str, part: str) -> str:
+    """The name of a hyper-parameter, or dimension, of a part."""
+    return f"{name}_{part}" if part else name
+
+
+KINDS: dict[type, type[Hierarchy]] = {
+    ARD: GammaPrecision, Laplace: LaplaceMixture, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab,
+}  # fmt: skip
+
+
+def held(prior: Prior, problem: Problem) -> np.ndarray:
+    """Biases (M,) whose Gaussian is known under a prior: those with a survey, and kinds that are Gaussian."""
+    parts, part = prior.parts(problem.biases)
+    known = np.array([k > 0 and isinstance(one, Gaussian) for k, (_, one) in enumerate(parts)])
+    return problem.surveyed | known[part]
 
 
 def learnt_groups(prior: Prior, problem: Problem) -> np.ndarray:
-    """Which learnt precision governs each bias, (M,), numbered from 0; those with a survey share none."""
-    group = prior.groups(problem.members)
-    group = np.where(problem.surveyed, len(group) + np.arange(len(group)), group)
+    """Which learnt precision governs each bias, (M,), numbered from 0; those that are held share none."""
+    group, count = np.arange(len(problem.biases)), len(problem.biases)
+    parts, part = prior.parts(problem.biases)
+    for k, (_, one) in enumerate(parts):
+        group = np.where(part == k, (k + 1) * count + one.groups(problem.members), group)
+    group = np.where(held(prior, problem), np.arange(count), group)
     return np.unique(group, return_inverse=True)[1]
 
 
@@ -394,20 +559,29 @@ def hierarchy_of(prior: Prior, problem: Problem) -> Hierarchy:
     Raises `InputError` for an ARD prior whose hyper-prior is not proper: no posterior of the biases exists then; and
     for a prior with hyper-parameters that has no class here.
     """
-    learnt = np.flatnonzero(~problem.surveyed)
-    groups = np.unique(prior.groups(problem.members)[learnt], return_inverse=True)[1] if len(learnt) else learnt
-    kinds: dict[type, type[Hierarchy]] = {
-        ARD: GammaPrecision, Laplace: LaplaceMixture, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab,
-    }  # fmt: skip
-    kind = kinds.get(type(prior))
-    if kind is None and (prior.hierarchical or prior.learns):
-        name = type(prior).__name__
-        raise InputError(f"{name} has hyper-parameters but no class that draws them; add one to inference/hierarchy.py")
-    if kind is None or not len(learnt):
-        return NoHyperprior(prior, (), ())
-    if isinstance(prior, ARD) and prior.rate == 0.0:
-        raise InputError(
-            "a sampler needs a proper hyper-prior: ARD(shape=1, rate=0) is flat and its posterior does not exist;"
-            ' give ARD(rate=0.5) ("ard-gamma") or Horseshoe()'
-        )
-    return kind(prior, tuple(learnt.tolist()), tuple(int(g) for g in groups))
+    named, part = prior.parts(problem.biases)
+    found = list[tuple[str, Hierarchy]]()
+    for k, (name, one) in enumerate(named):
+        learnt = np.flatnonzero(~problem.surveyed & (part == k))
+        kind = KINDS.get(type(one))
+        if kind is None and (one.hierarchical or one.learns):
+            title = type(one).__name__
+            raise InputError(
+                f"{title} has hyper-parameters but no class that draws them; add one to inference/hierarchy.py"
+            )
+        if kind is None or not len(learnt):
+            continue
+        if isinstance(one, ARD) and one.rate == 0.0:
+            raise InputError(
+                "a sampler needs a proper hyper-prior: ARD(shape=1, rate=0) is flat and its posterior does not exist;"
+                ' give ARD(rate=0.5) ("ard-gamma") or Horseshoe()'
+            )
+        groups = np.unique(one.groups(problem.members)[learnt], return_inverse=True)[1]
+        own: Any = replace(one, correlation=prior.correlation)
+        word = re.sub(r"\W+", "_", name).strip("_")
+        found.append((word, kind(own, tuple(learnt.tolist()), tuple(int(g) for g in groups))))
+    if len(found) == 1:
+        return found[0][1]
+    words = [word for word, _ in found]
+    apart = [(f"{word}_{k}" if words.count(word) > 1 else word, one) for k, (word, one) in enumerate(found)]
+    return Product.of(prior, apart) if found else NoHyperprior(prior, (), ())

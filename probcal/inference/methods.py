@@ -6,6 +6,8 @@ wing, in its own METHODS and in `probcal/wings.py`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from probcal.errors import InputError
@@ -13,11 +15,11 @@ from probcal.inference.collapsed import Collapsed
 from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
 from probcal.inference.nuts import NUTS
-from probcal.inference.run import Method
+from probcal.inference.run import Maximiser, Method
 from probcal.inference.sparse_gibbs import Gibbs
 from probcal.inference.svi import SVI
 from probcal.lazy import Later
-from probcal.priors import PRIORS, BernoulliGaussian, Flat, Laplace, Prior
+from probcal.priors import PRIORS, AnyPrior, BernoulliGaussian, Flat, Gaussian, Laplace, Prior, as_prior
 from probcal.problem import Problem, check_linear
 from probcal.wings import METHODS as OF_WINGS
 from probcal.wings import WithWings
@@ -52,16 +54,26 @@ METHODS = WithWings[tuple[Method, Prior | None]](
 )
 
 
-def choose_prior(method: Method, prior: Prior | None) -> Prior:
-    """The prior of a fit: the given one if the method takes it, else the method's first."""
-    if prior is None:
-        return method.first_prior()
-    if not isinstance(prior, Prior):
-        raise InputError(f"the prior is {prior!r}; give a prior itself, such as Horseshoe() or Gaussian()")
-    if not method.takes(prior):
-        allowed = ", ".join(name for name, known in PRIORS.items() if method.takes(known))
-        raise InputError(f"{method.name} does not take the prior {type(prior).__name__}; it takes: {allowed}")
-    return prior
+def choose_prior(method: Method, prior: AnyPrior, labels: Sequence[str] = ()) -> Prior:
+    """The prior of a fit of biases of these labels: the given one if the method takes it, else the method's first.
+
+    A kind may be Gaussian under every prior, as a survey is. Precisions that are maximised in a climb are those of one
+    sparse prior.
+    """
+    found = as_prior(prior, method.first_prior(), labels)
+    kinds = [one for _, one in found.kinds if not isinstance(one, Gaussian)]
+    for one in (found, *kinds):
+        if not method.takes(one):
+            allowed = ", ".join(name for name, known in PRIORS.items() if method.takes(known))
+            raise InputError(f"{method.name} does not take the prior {type(one).__name__}; it takes: {allowed}")
+    alone = replace(found, correlation=(), kinds=())
+    climbs = [one for one in (alone, *kinds) if isinstance(method, Maximiser) and method.climbs_under(one).learns]
+    if climbs and any(one != alone for one in kinds):
+        raise InputError(
+            f"{method.name} maximises the precisions of one sparse prior: give the other kinds Gaussian(), or take"
+            " priors whose precisions EA() integrates, such as Horseshoe() and ARD(rate=0.5)"
+        )
+    return found
 
 
 def check_problem(problem: Problem, *, linear: bool = True) -> None:

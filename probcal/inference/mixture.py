@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.inference.hierarchy import LEAST, MOST, Hierarchy, Phi, SpikeAndSlab
+from probcal.inference.hierarchy import LEAST, MOST, Hierarchy, Phi, held
 from probcal.inference.integrate import Integrated
 from probcal.inference.posed import Form
 from probcal.priors import PRECISION_BOUNDS, Prior
@@ -46,10 +46,10 @@ class MixturePosterior(Posterior):
         columns = {"inclusion": (np.abs(z) > ROPE).mean((0, 1))}
         if "included" in found.phi:
             columns["included"] = np.ones(len(mean))
-            columns["included"][list(form.hierarchy.learnt)] = np.asarray(found.phi["included"]).mean((0, 1))
+            columns["included"][list(form.hierarchy.spiked)] = np.asarray(found.phi["included"]).mean((0, 1))
         with np.errstate(invalid="ignore", divide="ignore"):
             own = np.clip((1 - gamma) / np.maximum(np.diag(covariance), 1e-300), *PRECISION_BOUNDS)
-        precision = np.where(problem.surveyed, first, own)
+        precision = np.where(held(prior, problem), first, own)
         summary = Summary(
             "mixture", "integrated", mean, covariance, lower, upper, gamma, precision, np.asarray(found.information),
             np.asarray(found.point.levels), evidence, columns,
@@ -89,7 +89,7 @@ class MixturePosterior(Posterior):
 
     def log_prior(self, draws: Draws) -> np.ndarray | None:
         """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
-        if self.prior.correlation or isinstance(self.hierarchy, SpikeAndSlab) or not self.found.phi:
+        if self.prior.correlation or self.hierarchy.spiked or not self.found.phi:
             return None
         alpha = np.asarray(_precisions(self.hierarchy, dict(self.hyper), self.first))
         return log_prior_normal(draws.z, np.clip(alpha, LEAST, MOST))

@@ -25,7 +25,7 @@ from probcal.inference.posed import Form, Posed
 from probcal.model import rows
 from probcal.model.model import Model
 from probcal.model.rows import Block, Rows
-from probcal.priors import PRIORS, Flat, Horseshoe, Precision, Prior
+from probcal.priors import PRIORS, AnyPrior, Flat, Horseshoe, Precision, as_prior
 from probcal.problem import Problem, check_linear
 from probcal.results.read import apply
 from probcal.smoothing.frame import frame_at
@@ -105,7 +105,7 @@ class Mixed(dist.Distribution):
 
 
 @float64
-def numpyro_model(problem: Problem, *, prior: Prior | None = None) -> NumpyroModel:
+def numpyro_model(problem: Problem, *, prior: AnyPrior = None) -> NumpyroModel:
     """The joint posterior of a problem as a numpyro model `model(data=None, *, observed=True)`.
 
     `model()` conditions on the problem's own rows. `data` maps sites `y_TYPE` to other values (N, C), NaN where
@@ -140,15 +140,16 @@ def numpyro_model(problem: Problem, *, prior: Prior | None = None) -> NumpyroMod
     Raises `InputError` for a prior without density (`BernoulliGaussian`), and the model for single precision, for
     unknown sites and for values of another shape.
     """
-    prior = Horseshoe() if prior is None else prior
-    if not prior.dense:
+    chosen = as_prior(prior, Horseshoe(), problem.network.labels)
+    hierarchy = hierarchy_of(chosen, problem)
+    if hierarchy.spiked:
         known = dict.fromkeys(type(one).__name__ for one in PRIORS.values() if one.dense)
         raise InputError(
-            f"numpyro_model: {type(prior).__name__} has no density that numpyro could take; give one of"
+            f"numpyro_model: {chosen.title(problem.biases)} has no density that numpyro could take; give one of"
             f" {', '.join(known)}, or fit it by Collapsed()"
         )
     check_linear(problem)
-    return NumpyroModel(problem, hierarchy_of(prior, problem), prior.precision(problem.labels, problem.surveyed))
+    return NumpyroModel(problem, hierarchy, chosen.precision(problem.labels, problem.surveyed))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg
-from probcal.inference.hierarchy import Hierarchy, Phi, SpikeAndSlab
+from probcal.inference.hierarchy import Hierarchy, Phi
 from probcal.model.model import Model
 from probcal.priors import Precision
 from probcal.smoothing.frame import Frame
@@ -150,16 +150,15 @@ def update_inclusions(form: Form, posed: Quadratic, phi: Phi, key: jax.Array, *,
     The covariance of what is in follows each flip by a rank-one update (George, McCulloch 1997, collapsed).
     """
     kind = form.hierarchy
-    assert isinstance(kind, SpikeAndSlab)
-    L = len(kind.learnt)
-    learnt = jnp.asarray(kind.learnt)
+    L = len(kind.spiked)
+    learnt = jnp.asarray(kind.spiked)
     alpha, coupling = prior_precision(form, posed, phi)
     matrix, pull = posed.information + coupling + jnp.diag(alpha), posed.pull
     start = conditional(form, posed, phi)
     both = start.active[:, None] & start.active[None, :]
     covariance = jnp.where(both, start.inverse.T @ start.inverse, 0.0)
     share = kind.share(phi)
-    odds = jnp.log(share) - jnp.log1p(-share)
+    odds = jnp.broadcast_to(jnp.log(share) - jnp.log1p(-share), (L,))
 
     def without(V: jax.Array, m: jax.Array) -> jax.Array:
         column = V[:, m]
@@ -181,17 +180,18 @@ def update_inclusions(form: Form, posed: Quadratic, phi: Phi, key: jax.Array, *,
         m = learnt[k]
         bare = jnp.where(V[m, m] > 0, without(V, m), V)
         gain, towards, pivot = entering(bare, m)
-        takes = jnp.log(draw) - jnp.log1p(-draw) < odds + gain
+        takes = jnp.log(draw) - jnp.log1p(-draw) < odds[k] + gain
         return jnp.where(takes, entered(bare, towards, pivot), bare), None
 
     def exchange(V: jax.Array, pick: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         pair, draw = pick
         a, b = learnt[pair[0]], learnt[pair[1]]
         leaves, comes = jnp.where(V[a, a] > 0, a, b), jnp.where(V[a, a] > 0, b, a)
+        prefers = jnp.where(V[a, a] > 0, 1.0, -1.0) * (odds[pair[1]] - odds[pair[0]])
         possible = (V[a, a] > 0) != (V[b, b] > 0)
         bare = without(V, leaves)
         (old, _, _), (new, towards, pivot) = entering(bare, leaves), entering(bare, comes)
-        takes = possible & (jnp.log(draw) < new - old)
+        takes = possible & (jnp.log(draw) < new - old + prefers)
         return jnp.where(takes, entered(bare, towards, pivot), V), None
 
     keys = jax.random.split(key, 3)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.inference.ending import FAR, misfit_sentence
-from probcal.inference.hierarchy import LEAST, MOST, SpikeAndSlab
+from probcal.inference.hierarchy import LEAST, MOST, held
 from probcal.inference.mixed import ESS, R_HAT, UNSURE, mixing, weights_of_sides, within_sides
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Posed
@@ -52,7 +52,9 @@ class Chains(Posterior):
         half = 50 * (1 - INTERVAL)
         lower, upper = np.percentile(z, [half, 100 - half], axis=(0, 1))
         precision = np.clip((1 - gamma) / np.maximum(np.diag(covariance), 1e-300), *PRECISION_BOUNDS)
-        precision = np.where(problem.surveyed | isinstance(prior, Flat), np.asarray(run.posed.first.alpha), precision)
+        precision = np.where(
+            held(prior, problem) | isinstance(prior, Flat), np.asarray(run.posed.first.alpha), precision
+        )
         summary = Summary(
             "exact" if run.method.exact else "variational", "sampled", z.mean((0, 1)), covariance, lower, upper, gamma,
             precision, np.asarray(run.posed.information)[:M, :M], run.levels.mean((0, 1)), None,
@@ -89,7 +91,7 @@ class Chains(Posterior):
     def log_prior(self, draws: Draws) -> np.ndarray | None:
         """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
         run = self.run
-        if isinstance(self.prior, Flat) or self.prior.correlation or isinstance(run.form.hierarchy, SpikeAndSlab):
+        if isinstance(self.prior, Flat) or self.prior.correlation or run.form.hierarchy.spiked:
             return None
         return log_prior_normal(run.z, np.clip(_alpha(run), LEAST, MOST))
 
@@ -205,7 +207,7 @@ def _columns(run: SamplerRun, mixed: Mapping[str, np.ndarray], M: int) -> dict[s
     found["inclusion"] = (np.abs(run.z) > ROPE).mean((0, 1))
     if "included" in run.draws.phi:
         found["included"] = np.ones(M)
-        found["included"][list(run.form.hierarchy.learnt)] = np.asarray(run.draws.phi["included"]).mean((0, 1))
+        found["included"][list(run.form.hierarchy.spiked)] = np.asarray(run.draws.phi["included"]).mean((0, 1))
     return found
 
 

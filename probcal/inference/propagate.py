@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.inference.hierarchy import Phi, SpikeAndSlab
+from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form
 from probcal.priors import Precision
 
@@ -88,7 +88,8 @@ def sweep_blocks(
     kind, M = form.hierarchy, form.biases
     learnt, (B, p) = jnp.asarray(kind.learnt, int), members.shape
     updates, eye = kind.updates(), jnp.eye(p)[None]
-    governed = jnp.zeros(M + 1, bool).at[learnt].set(True)[members]
+    spiked = jnp.asarray(kind.spiked, int)
+    governed = jnp.zeros(M + 1, bool).at[spiked].set(True)[members]
     toggles = np.array([np.isin(np.arange(p), pair) for k in (1, 2) for pair in combinations(range(p), k)])
 
     def of_members(values: jax.Array, filling: Any) -> jax.Array:
@@ -107,9 +108,8 @@ def sweep_blocks(
 
     def include(phi: Phi, key: jax.Array) -> Phi:
         """Inclusions after moves of one or two members of each block, its biases integrated out."""
-        assert isinstance(kind, SpikeAndSlab)
         share = kind.share(phi)
-        odds = jnp.log(share) - jnp.log1p(-share)
+        odds = of_members(jnp.zeros(M).at[spiked].set(jnp.log(share) - jnp.log1p(-share)), 0.0)
         alpha = of_members(kind.alpha(phi, first.alpha), 0.0)
 
         def weight(active: jax.Array) -> jax.Array:
@@ -128,14 +128,14 @@ def sweep_blocks(
         active = of_members(kind.active(phi, M), True)
         draws = jax.random.uniform(key, (len(toggles), B))
         (active, _), _ = jax.lax.scan(move, (active, weight(active)), (jnp.asarray(toggles), draws))
-        return phi | {"included": of_biases(active)[learnt]}
+        return phi | {"included": of_biases(active)[spiked]}
 
     def one(carry: tuple[BlockChain, Any], k: jax.Array) -> tuple[tuple[BlockChain, Any], None]:
         (z, phi), (count, mean, second, gamma, means, sds) = carry
         keys = jax.random.split(jax.random.fold_in(key, k), len(updates) + 2)
         for update, own in zip(updates, keys, strict=False):
             phi = update(phi, z[learnt], own)
-        if isinstance(kind, SpikeAndSlab):
+        if kind.spiked:
             phi = include(phi, keys[-2])
         alpha, active = kind.alpha(phi, first.alpha), of_members(kind.active(phi, M), True)
         root, half = given(of_members(alpha, 0.0), active)

@@ -17,7 +17,7 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.inference.ending import FAR, conclude
-from probcal.inference.hierarchy import learnt_groups
+from probcal.inference.hierarchy import held, learnt_groups
 from probcal.inference.integrate import Integration, integrate
 from probcal.inference.progress import Monitor
 from probcal.inference.sparse import sparse_answer, takes_sparse
@@ -290,8 +290,9 @@ def kernel(method: Any) -> Any:
 
 
 def bare(prior: Prior) -> Prior:
-    """The prior without what reaches kernels as arrays (correlations, groups), so that these are compiled once."""
-    return replace(prior, correlation=(), by=None) if isinstance(prior, ARD) else replace(prior, correlation=())
+    """The prior without what reaches kernels as arrays (correlations, kinds, groups): these are compiled once."""
+    alone: dict[str, Any] = {"correlation": (), "kinds": ()} | ({"by": None} if isinstance(prior, ARD) else {})
+    return replace(prior, **alone)
 
 
 def check_method(method: Maximiser) -> None:
@@ -310,7 +311,7 @@ def first_precision(problem: Problem, prior: Prior) -> Precision:
 def given_of(method: Maximiser, problem: Problem, prior: Prior) -> Given:
     """Arrays of a prior and of the stopping rule for a problem."""
     prior = method.climbs_under(prior)
-    numbers: Any = problem.surveyed, learnt_groups(prior, problem), np.array(float(method.tolerance))
+    numbers: Any = held(prior, problem), learnt_groups(prior, problem), np.array(float(method.tolerance))
     return Given(first_precision(problem, prior), *numbers)
 
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from probcal.errors import FitError, InputError
 from probcal.inference.chains import Draw, run_chunk, run_sided, run_together
-from probcal.inference.hierarchy import SpikeAndSlab
 from probcal.inference.mixed import settled
 from probcal.inference.orbits import orbits_of
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
@@ -176,7 +175,7 @@ def sample(
     if len(poses) > 1:
         away = distances(problem, [start, *(other.point for other in sides)])
         poses = [(one._replace(away=own), drawn) for (one, drawn), own in zip(poses, away, strict=True)]
-    if worth.acceptance < ROAMING and method.roams and not isinstance(form.hierarchy, SpikeAndSlab):
+    if worth.acceptance < ROAMING and method.roams and not form.hierarchy.spiked:
         covariance = np.cov(np.asarray(found.theta)[:, : form.biases].T).reshape(form.biases, form.biases)
         orbits = orbits_of(problem, posed, covariance)
         poses = [(one._replace(orbits=orbits), drawn) for one, drawn in poses]

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from probcal.inference.hierarchy import SpikeAndSlab
 from probcal.inference.leaps import Place
 from probcal.inference.posed import Form, Posed, log_prior
 from probcal.problem import Problem
@@ -62,7 +61,7 @@ def shifted(form: Form, here: Posed, there: Posed, at: Place) -> tuple[Place, ja
     moved = jax.tree.map(jnp.add, point, way)._replace(levels=point.levels)
     theta, eps = jnp.concatenate([moved.z, moved.levels]), unit_normals(model, there.frame, moved)
     gain = mixed_density(model, moved) - mixed_density(model, point)
-    if isinstance(form.hierarchy, SpikeAndSlab):  # what is out must stay at zero
+    if form.hierarchy.spiked:  # what is out must stay at zero
         gain = jnp.where(jnp.any(way.z != 0), -jnp.inf, gain)
     else:
         gain = gain + log_prior(form, here, theta, at.phi) - log_prior(form, here, at.theta, at.phi)

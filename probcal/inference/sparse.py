@@ -20,7 +20,7 @@ from probcal.errors import FitError, InputError
 from probcal.identifiability.directions import open_alone, open_together
 from probcal.identifiability.remedies import Direction
 from probcal.inference.ending import conclude_at
-from probcal.inference.hierarchy import hierarchy_of
+from probcal.inference.hierarchy import held, hierarchy_of
 from probcal.inference.integrate import quantile
 from probcal.inference.posed import Form
 from probcal.inference.propagate import BlockMarginals, Blocks, Propagation
@@ -385,8 +385,9 @@ def _mixture(
     tail, first = 0.5 * (1.0 - INTERVAL), np.asarray(work.first.alpha)
     lower, upper = (np.asarray(quantile(swept.means, swept.sds, share)) for share in (tail, 1.0 - tail))
     alpha = np.clip((1 - swept.gamma) / np.maximum(own, 1e-300), *PRECISION_BOUNDS)
+    alpha = np.where(held(prior, problem), first, alpha)
     summary = Summary(
-        "mixture", "integrated", mean, None, lower, upper, swept.gamma, np.where(problem.surveyed, first, alpha), None,
+        "mixture", "integrated", mean, None, lower, upper, swept.gamma, alpha, None,
         np.zeros(0), evidence, told_columns(declared), SensorBlocks(len(mean), work.members, swept.covariance),
     )  # fmt: skip
     point = system.moved(problem.model, mean - np.asarray(system.point.z))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.inference.hierarchy import held
 from probcal.inference.run import Context, Given, Maximiser, bare, check_method, given_of, learn
 from probcal.model.model import At, Model
 from probcal.particles.ensemble import (
@@ -184,7 +185,7 @@ def _variance_of_mean(trace: np.ndarray) -> np.ndarray:
 def climb(problem: Problem, how: ParticleSettings, prior: Prior, z: Any, iterations: int, key: jax.Array) -> Climb:
     """Where the loop stands after some iterations from biases z (M,) under a prior: a start for a sampler."""
     given = Given(
-        prior.precision(problem.labels, problem.surveyed), jnp.asarray(problem.surveyed),
+        prior.precision(problem.labels, problem.surveyed), jnp.asarray(held(prior, problem)),
         jnp.arange(problem.model.biases), jnp.zeros(()),
     )  # fmt: skip
     targets = prepared(problem, how)

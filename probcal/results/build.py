@@ -172,7 +172,8 @@ def _attrs(answer: Answer) -> dict[str, Any]:
     if found.kind == "Laplace" and answer.problem.model.tailed:
         intervals += "; each epoch's precision of the heavy-tailed process noise is held at its mean"
     attrs = {
-        "method": answer.method.name, "requested": answer.requested.name, "prior": type(answer.prior).__name__,
+        "method": answer.method.name, "requested": answer.requested.name,
+        "prior": answer.prior.title(answer.problem.biases),
         "approximate": found.kind, "precisions": found.precisions, "correlated": int(bool(answer.prior.correlation)),
         "intervals": intervals,
         "settings": f"{answer.method!r}, {answer.prior!r}", "interval_probability": INTERVAL,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.inference.hierarchy import held as held_biases
 from probcal.inference.hierarchy import hierarchy_of, learnt_groups
 from probcal.inference.integrate import KEPT, Moments, begin, moments, run_sweeps
 from probcal.inference.posed import Form, Natural
@@ -40,7 +41,7 @@ def relearnt(problem: Problem, prior: Prior, held: Precision, mean: np.ndarray, 
 
 def _maximised(problem: Problem, prior: ARD, first: Precision, information: np.ndarray, pull: np.ndarray) -> Moments:
     """Precisions of largest evidence (Paper B 24-25), by the fixed points of MacKay."""
-    group, surveyed = learnt_groups(prior, problem), problem.surveyed
+    group, surveyed = learnt_groups(prior, problem), held_biases(prior, problem)
     alpha, coupling = np.asarray(first.alpha), np.asarray(first.coupled())
     for _ in range(SWEEPS):
         covariance = np.linalg.inv(information + coupling + np.diag(alpha))

@@ -7,7 +7,19 @@ from typing import Annotated, Any
 import typer
 
 from probcal.cli import options, outputs
-from probcal.cli.arguments import LARGEST_SEED, Data, Fix, Given, Method, Model, Network, Overwrite, Scheduler, Seed
+from probcal.cli.arguments import (
+    LARGEST_SEED,
+    Data,
+    Fix,
+    Given,
+    Method,
+    Model,
+    Network,
+    Overwrite,
+    Prior,
+    Scheduler,
+    Seed,
+)
 from probcal.cli.names import METHODS, ORACLE, PRIORS
 from probcal.errors import InputError, nearest
 from probcal.studies.settings import check_setting
@@ -51,7 +63,7 @@ def sbc_command(
     model: Model,
     data: Data = None,
     method: Method = "ea",
-    prior: Annotated[str | None, typer.Option(help=" | ".join(PRIORS) + "; the method's own if left out")] = None,
+    prior: Prior = None,
     truths: Annotated[
         str | None, typer.Option("--from", help="prior that the truths are drawn from; that of the fit if left out")
     ] = None,
@@ -75,10 +87,9 @@ def sbc_command(
     check_method_installed(method)
     if method not in METHODS:
         raise InputError(f'sbc: no method is called "{method}"{nearest(method, METHODS)}')
-    for name in (prior, truths):
-        if name is not None and name not in PRIORS:
-            raise InputError(f'sbc: no prior is called "{name}"{nearest(name, PRIORS)}')
-    options.check_taken(method, prior)
+    if truths is not None and truths not in PRIORS:
+        raise InputError(f'sbc: no prior is called "{truths}"{nearest(truths, PRIORS)}')
+    options.check_priors(method, prior or ())
     if resume and out is None:
         raise InputError("sbc: --resume needs --out DIR, the folder of the runs to go on with")
     options.check_files(model, data)
@@ -88,10 +99,9 @@ def sbc_command(
 
         raise typer.Exit(
             run_sbc.run(
-                model, data, method=method, prior=prior, truths=truths, fix=fix or (), given=arguments, network=network,
-                runs=runs,
-                seed=seed, posterior=posterior, full=full, outputs=results, resume=resume, overwrite=overwrite,
-                scheduler=scheduler,
+                model, data, method=method, prior=prior or (), truths=truths, fix=fix or (), given=arguments,
+                network=network, runs=runs, seed=seed, posterior=posterior, full=full, outputs=results, resume=resume,
+                overwrite=overwrite, scheduler=scheduler,
             )
         )  # fmt: skip
 

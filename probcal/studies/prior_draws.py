@@ -28,9 +28,11 @@ class SimulatedTruth(NamedTuple):
 
 def check_drawable(prior: Prior, problem: Problem) -> None:
     """Raise `InputError` for a prior that is no distribution, of which no truth can be drawn."""
-    if isinstance(prior, Flat) or (isinstance(prior, ARD) and prior.rate == 0.0):
-        if problem.surveyed.all():
-            return
+    if problem.surveyed.all():
+        return
+    parts, part = prior.parts(problem.biases)
+    governing = [parts[k][1] for k in set(part[~problem.surveyed].tolist())]
+    if any(isinstance(one, Flat) or (isinstance(one, ARD) and one.rate == 0.0) for one in governing):
         raise InputError(
             f"no truth can be drawn from {prior!r}, whose density has no integral: simulate from a proper prior such as"
             " Gaussian(), ARD(rate=0.5), Horseshoe() or BernoulliGaussian()"

@@ -20,7 +20,7 @@ from probcal.studies.sbc import sbc, short
 
 
 def run(
-    model: Path, data: Path | None, *, method: str, prior: str | None, truths: str | None, fix: Sequence[str],
+    model: Path, data: Path | None, *, method: str, prior: Sequence[str], truths: str | None, fix: Sequence[str],
     given: Mapping[str, Any], network: Path | None,
     runs: int, seed: int, posterior: bool, full: bool, outputs: Outputs | None,
     resume: bool, overwrite: bool, scheduler: str | None = None,

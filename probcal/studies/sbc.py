@@ -32,7 +32,7 @@ from probcal.inference.solve import solve
 from probcal.inference.spread import check_scheduler, spread
 from probcal.inference.storage import Records, Storage
 from probcal.model import variants
-from probcal.priors import Precision, Prior
+from probcal.priors import AnyPrior, Precision, Prior, as_prior
 from probcal.problem import Problem
 from probcal.results.read import each_track, saved_states
 from probcal.simulate import Key, as_key
@@ -56,9 +56,9 @@ def sbc(
     problem: Problem,
     method: Method,
     *,
-    prior: Prior | None = None,
+    prior: AnyPrior = None,
     runs: int = 200,
-    simulate_from: Prior | None = None,
+    simulate_from: AnyPrior = None,
     around: str | xr.DataTree | None = None,
     start: str = "automatic",
     key: Key = 0,
@@ -93,11 +93,12 @@ def sbc(
     if start not in STARTS:
         raise InputError(f'sbc: start "{start}" is not known; give "automatic" or "truth"')
     check_scheduler(scheduler)
-    prior = choose_prior(method, prior)
+    chosen = choose_prior(method, prior, problem.network.labels)
+    source = as_prior(simulate_from, chosen, problem.network.labels)
     check_problem(problem)
     method.check_kept(problem, ("states",))
     key = as_key(key)
-    engine = _Engine(problem, method, prior, simulate_from or prior, around, start, draws, fallback, key)
+    engine = _Engine(problem, method, chosen, source, around, start, draws, fallback, key)
     identity = {} if store is None else engine.identity()
     with Storage(store, "sbc", identity, resume=resume, overwrite=overwrite) as storage:
         kept = Records(storage)
@@ -281,6 +282,7 @@ def _tree(engine: _Engine, records: dict[int, dict[str, np.ndarray]], interrupte
     table: dict[str, Any] = {
         name: (("run", "quantity", "nominal")[: stacked[name].ndim], stacked[name]) for name in columns
     }
+    biases = engine.problem.biases
     quantity = {"quantity": names, "kind": ("quantity", kinds)}
     groups = {
         "sbc": xr.Dataset(table, coords={"run": runs, **quantity, "nominal": list(NOMINAL)}),
@@ -290,7 +292,7 @@ def _tree(engine: _Engine, records: dict[int, dict[str, np.ndarray]], interrupte
     judge_coverage(tree)
     tree.attrs |= {
         "method": engine.method.name, "settings": f"{engine.method!r}, {engine.prior!r}", "runs": len(good),
-        "prior": type(engine.prior).__name__, "source": engine.around or type(engine.source).__name__,
+        "prior": engine.prior.title(biases), "source": engine.around or engine.source.title(biases),
         "start": engine.start, "failed": len(failed), "interrupted": int(interrupted),
         "data": engine.problem.measurements.table.source, "message": _message(engine, tree, failed, interrupted),
     }  # fmt: skip
@@ -314,8 +316,8 @@ def _message(engine: _Engine, tree: xr.DataTree, failed: dict[int, str], interru
         parts.append(f"Interrupted after {tree['run'].sizes['run']} runs; resume to go on.")
     if not engine.around and engine.prior != engine.source:
         parts.append(
-            f"Truths come from {type(engine.source).__name__}, not from the prior of the fit: read the coverage, ranks"
-            " need not be uniform."
+            f"Truths come from {engine.source.title(engine.problem.biases)}, not from the prior of the fit: read the"
+            " coverage, ranks need not be uniform."
         )
     if not engine.around and (wide := far_start(engine.problem)) > FAR:
         parts.append(

@@ -153,6 +153,8 @@ def _batch(
         found: list[dict[str, Any]] = []
         for name in _turned(list(methods), turn):
             method, prior = methods[name]
+            for run in whole:
+                prior.check_kinds(run.problem.network.labels)
             once = [_climbs_once(method, prior, run, name == ORACLE) for run in whole]
             alone = [run for run, own in zip(whole, once, strict=True) if not own]
             records = [_record(run, _alone_by(run, method, prior)) for run in alone]

@@ -16,7 +16,7 @@ from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
 from probcal.inference.mixed import ESS, R_HAT, mixing
 from probcal.lazy import Later
 from probcal.noise import Unknown
-from probcal.priors import PRECISION_BOUNDS, Gaussian, Prior
+from probcal.priors import PRECISION_BOUNDS, AnyPrior, Gaussian, Prior, as_prior
 from probcal.problem import Problem
 from probcal.results.groups import bias_coords, constant_group
 from probcal.results.read import apply
@@ -108,7 +108,7 @@ def run_pass(
 def sample_associations(
     problem: Problem,
     *,
-    prior: Prior | None = None,
+    prior: AnyPrior = None,
     objects: float = 3.0,
     most: int = 4,
     draws: int = 1000,
@@ -136,23 +136,24 @@ def sample_associations(
     Traceback (most recent call last):
     probcal.errors.InputError: sample_associations: no row leaves its target open, nothing is to be associated; use fit
     """
-    prior = Gaussian() if prior is None else prior
-    _check(problem, prior, objects, most, draws, warmup, chains)
+    chosen = as_prior(prior, Gaussian(), problem.network.labels)
+    _check(problem, chosen, objects, most, draws, warmup, chains)
     clock = time.perf_counter()
     known = None if start is None else apply(problem, start)
     problem = problem if known is None else known.problem
     z = np.zeros(len(problem.labels)) if known is None else known.z
     covariance = np.eye(len(z)) if known is None else known.covariance
-    scene, views, rows = scene_of(problem, prior, objects, z)
+    scene, views, rows = scene_of(problem, chosen, objects, z)
     found = track_objects(problem, z, covariance, objects=objects, confirmed=SURE)
-    hierarchy = hierarchy_of(prior, problem)
+    hierarchy = hierarchy_of(chosen, problem)
     state = begun_at(_starts(found, rows, most, chains), len(z), hierarchy, as_key(key))
     sampled = run_passes(scene, views, hierarchy, state, SWEEP, warmup + draws, as_key(key))
     kept = jax.tree.map(lambda leaf: leaf[:, warmup:], sampled)
     tree = _tree(problem, kept, rows, SWEEP)
     tree.attrs |= {
-        "method": "association sampler", "prior": type(prior).__name__, "data": problem.measurements.table.source,
-        "settings": f"objects={objects}, most={most}, draws={draws}, warmup={warmup}, chains={chains}, {prior!r}",
+        "method": "association sampler", "prior": chosen.title(problem.biases),
+        "data": problem.measurements.table.source,
+        "settings": f"objects={objects}, most={most}, draws={draws}, warmup={warmup}, chains={chains}, {chosen!r}",
         "seed": int(key) if isinstance(key, (int, np.integer)) else -1, "seconds": time.perf_counter() - clock,
         "interval_probability": INTERVAL,
     }  # fmt: skip
@@ -209,7 +210,8 @@ def _check(problem: Problem, prior: Prior, objects: float, most: int, draws: int
     if min(draws, chains) < 1 or warmup < 0:
         given = f"draws={draws}, warmup={warmup}, chains={chains}"
         raise InputError(f"sample_associations({given}): take 1 or more draws and chains, warmup 0 or more")
-    if not (isinstance(prior, Gaussian) or (prior.hierarchical and prior.dense)):
+    every = (prior, *(one for _, one in prior.kinds))
+    if not all(isinstance(one, Gaussian) or (one.hierarchical and one.dense) for one in every):
         raise InputError(
             f"sample_associations(prior={type(prior).__name__}()): associations are weighed by evidence, which needs a"
             " density of the biases that integrates: Gaussian(), ARD(rate=0.5), Laplace() or Horseshoe()"
