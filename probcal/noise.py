@@ -7,9 +7,10 @@ drive a motion too, write the methods of `ScaleMixture`: a vector of noise is th
 at every epoch.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -24,14 +25,23 @@ from probcal.geometry import wrap
 class Unknown:
     """A noise level that is estimated along: a guess, known to within a factor (one standard deviation).
 
+    A parameter of a noise family may be unknown too, `StudentT(Unknown(4.0))` or `Mixture(Unknown(0.1))`; the factor
+    of a share is that of its odds. All sensors of a type have one value; with `by="sensor"` each has its own.
+
     >>> Unknown(0.5, factor=3.0).guess
     0.5
     """
 
     guess: float
     factor: float = 3.0
+    by: str | None = None
+
+    def __repr__(self):
+        return f"Unknown(guess={self.guess!r}, factor={self.factor!r}{', by=' + repr(self.by) if self.by else ''})"
 
     def __post_init__(self):
+        if self.by not in (None, "sensor"):
+            raise InputError(f'Unknown(by={self.by!r}): by is None or "sensor"')
         if not (np.isfinite(self.guess) and self.guess > 0):
             raise InputError(f"Unknown(guess={self.guess}): the guess must be positive")
         if not (np.isfinite(self.factor) and self.factor > 1):
@@ -47,17 +57,75 @@ def guess_of(level: Level) -> float:
 
 
 def check_driving(noise: Any, what: str) -> None:
-    """Raise `InputError` unless a family can drive a motion: Gaussian, or a scale mixture around zero."""
-    if isinstance(noise, Normal) or (isinstance(noise, ScaleMixture) and not getattr(noise, "delay", 0.0)):
+    """Raise `InputError` unless a family can drive a motion: Gaussian, or a known scale mixture around zero."""
+    centred = not getattr(noise, "delay", 0.0) and getattr(noise, "late", NORMAL) == NORMAL
+    if isinstance(noise, Normal) or (isinstance(noise, ScaleMixture) and centred and not unknowns(noise)):
         return
     raise InputError(
         f"{what} is {noise!r}, which cannot drive a motion: give noise.Normal(), StudentT(df) or Mixture(share, scale)"
     )
 
 
-def check_level(level: Level, what: str, *, zero: bool = False) -> None:
-    """Raise `InputError` unless the level is a positive (or, where allowed, zero) finite number."""
+def unknowns(family: Any) -> dict[str, Unknown]:
+    """The parameters of a family that are unknown, by name; those of a family within it as `noise.share`."""
+    found: dict[str, Unknown] = {}
+    for one in fields(family) if is_dataclass(family) else ():
+        value = getattr(family, one.name)
+        if isinstance(value, Unknown):
+            found[one.name] = value
+        else:
+            found |= {f"{one.name}.{name}": own for name, own in unknowns(value).items()}
+    return found
+
+
+def with_values(family: Any, values: Mapping[str, Any]) -> Any:
+    """A family with numbers or arrays for its unknown parameters, by the names of `unknowns`; they are not checked."""
+    parts = {one.name: getattr(family, one.name) for one in fields(family)}
+    for name, value in values.items():
+        first, _, rest = name.partition(".")
+        parts[first] = with_values(parts[first], {rest: value}) if rest else value
+    found = object.__new__(type(family))
+    found.__dict__.update(parts)
+    return found
+
+
+def at_guess(family: Any) -> Any:
+    """A family with the guesses of its unknown parameters."""
+    values = {name: level.guess for name, level in unknowns(family).items()}
+    return with_values(family, values) if values else family
+
+
+def is_odds(family: Any, name: str) -> bool:
+    """Whether a parameter lies between 0 and 1, so that what is unknown of it are its odds."""
+    first, _, rest = name.partition(".")
+    return is_odds(getattr(family, first), rest) if rest else name in getattr(family, "fractions", ())
+
+
+def level_at(guess: float, odds: bool, log: Any) -> Any:
+    """Value of a level whose log (or log odds) lies `log` above that of its guess."""
+    factor = (np if isinstance(log, (float, np.ndarray)) else jnp).exp(log)
+    return guess * factor / (1.0 - guess + guess * factor) if odds else guess * factor
+
+
+def log_level(guess: float, odds: bool, value: Any) -> Any:
+    """By how much the log (or log odds) of a level lies above that of its guess."""
+    value = np.asarray(value, float)
+    return np.log(value / guess * ((1.0 - guess) / (1.0 - value) if odds else 1.0))
+
+
+def _functions(*values: Any) -> Any:
+    """NumPy for numbers, which compile to constants; jax for parameters that are estimated."""
+    return jnp if any(isinstance(value, jax.Array) for value in values) else np
+
+
+def check_level(level: Level, what: str, *, zero: bool = False, by: bool = False) -> None:
+    """Raise `InputError` unless the level is a positive (or, where allowed, zero) finite number.
+
+    One for each sensor is allowed with `by`.
+    """
     if isinstance(level, Unknown):
+        if level.by and not by:
+            raise InputError(f'{what} is {level!r}: by="sensor" is for the noise of channels')
         return
     try:
         value = float(level)
@@ -67,8 +135,11 @@ def check_level(level: Level, what: str, *, zero: bool = False) -> None:
         raise InputError(f"{what} is {value:g}: it must be positive")
 
 
+NORMAL, EXPONENTIAL, HALF_NORMAL = "normal", "exponential", "half-normal"  # late parts of a `Mixture`
 NEAR = 0.1  # std within which a residual has the weight of one at that distance: a density may have a kink at zero
 FAR = 6.0  # std of a floor above the predicted value, from which draws are those of the tail
+FAR_OUT = 1e4  # std of the farthest point of a quadrature with estimated parameters: 10 of the widest late part
+POINTS = 401  # of that quadrature: the information of a mixture is 4e-4 off
 FARTHEST = 30.0  # asinh of the farthest point of a quadrature, in std
 HALF = 0.5  # reliance below which a datum counts as rejected
 
@@ -178,7 +249,7 @@ class AdditiveNoise:
     @property
     def rejects(self) -> float:
         """Probability of a datum with a reliance below one half, by quadrature."""
-        return _rejects(self)
+        return _rejects(at_guess(self))
 
     def sample(self, key, predicted, std):
         """Draw measured values around the predicted ones."""
@@ -196,9 +267,21 @@ class AdditiveNoise:
         """Which values are legal: all."""
         return np.ones(y.shape, bool)
 
-    def unit_information(self) -> float:
-        """Expected information at std 1, by quadrature of the squared score."""
-        return _information_of(self)
+    def unit_information(self) -> Any:
+        """Expected information at std 1, by quadrature of the squared score; of parameters (S,) by each."""
+        if _functions(*self.__dict__.values()) is np:
+            return _information_of(self)
+        # the same in fewer points, which are an axis more of parameters that are estimated, () or (S,)
+        values = {name: value for name, value in self.__dict__.items() if isinstance(value, jax.Array)}
+        own = with_values(self, {name: value.reshape(-1, 1) for name, value in values.items()})
+        e = own._points(jnp.sinh(np.linspace(-np.arcsinh(FAR_OUT), np.arcsinh(FAR_OUT), POINTS))[None])
+        square = own._slope(e) ** 2 * jnp.exp(own.log_density(e))
+        found = jnp.sum(0.5 * (square[:, 1:] + square[:, :-1]) * jnp.diff(e), -1)
+        return found.reshape(jnp.broadcast_shapes(*(value.shape for value in values.values())))
+
+    def _points(self, e):
+        """Residuals over the std (increasing) at which a quadrature looks, from those that suit a wide density."""
+        return e
 
     def _slope(self, e):
         """Derivative of the log density by e."""
@@ -224,7 +307,7 @@ def normal_scores(family: Any) -> tuple[np.ndarray, np.ndarray]:
     """
     from scipy import special
 
-    t = np.linspace(-FARTHEST, FARTHEST, 20_001)
+    t, family = np.linspace(-FARTHEST, FARTHEST, 20_001), at_guess(family)
     e = np.sinh(t)
     if not isinstance(family, AdditiveNoise):
         return e, np.zeros_like(e)
@@ -309,6 +392,7 @@ class Normal(AdditiveNoise):
 class StudentT(AdditiveNoise):
     """Additive Student-t noise with scale `std` and `df` degrees of freedom, for channels with outliers.
 
+    `StudentT(Unknown(4.0))` learns how heavy the tails are.
     A fit that gives less than half weight to most data of a sensor ends as a misfit: outliers are
     single data, not a whole sensor (see `smoothing.information.rejected`).
 
@@ -316,16 +400,16 @@ class StudentT(AdditiveNoise):
     True
     """
 
-    df: float = 4.0
+    df: Any = 4.0  # or `Unknown`
 
     def __post_init__(self):
-        if not (np.isfinite(self.df) and self.df > 0):
+        if not (isinstance(self.df, Unknown) or (np.isfinite(self.df) and self.df > 0)):
             raise InputError(f"StudentT(df={self.df}): the degrees of freedom must be positive")
 
     def log_likelihood(self, y, predicted, std, period):
         """Log density of each datum."""
         r2 = (self.innovation(y, predicted, period) / std) ** 2
-        constant = gammaln((self.df + 1) / 2) - gammaln(self.df / 2) - 0.5 * np.log(self.df * np.pi)
+        constant = gammaln((self.df + 1) / 2) - gammaln(self.df / 2) - 0.5 * _functions(self.df).log(self.df * np.pi)
         return constant - jnp.log(std) - 0.5 * (self.df + 1) * jnp.log1p(r2 / self.df)
 
     def score(self, y, predicted, std, period):
@@ -354,7 +438,8 @@ class StudentT(AdditiveNoise):
         """Probability beyond sqrt(df) to either side."""
         from scipy import special
 
-        return 2.0 * float(special.stdtr(self.df, -np.sqrt(self.df)))
+        df = guess_of(self.df)
+        return 2.0 * float(special.stdtr(df, -np.sqrt(df)))
 
     def sample(self, key, predicted, std):
         """Draw measured values around the predicted ones, by the polar method (Bailey 1994): no loop to compile."""
@@ -390,73 +475,118 @@ class StudentT(AdditiveNoise):
         return jax.random.gamma(key, 0.5 * self.df, shape) / (0.5 * self.df)
 
 
+def _late_normal(x, scale):
+    """Log density of a late part N(0, scale^2) of a mixture, minus its slope by x, and its curvature."""
+    return -0.5 * (x / scale) ** 2 - _functions(scale).log(scale) - HALF_LOG, x / scale**2, 1.0 / scale**2
+
+
+def _late_exponential(x, scale):
+    """The same of a unit normal plus an exponential of mean `scale` (exponentially modified Gaussian, Grushka 1972).
+
+    log f = 1 / (2 scale^2) - x / scale - log scale + log Phi(x - 1 / scale).
+    """
+    a, rate = x - 1.0 / scale, 1.0 / scale
+    ratio = _mills(a)
+    density = 0.5 * rate**2 - rate * x + _functions(rate).log(rate) + log_ndtr(a)
+    return density, rate - ratio, jnp.clip(ratio * (ratio + a), 0.0, 1.0)
+
+
+def _late_half_normal(x, scale):
+    """The same of a unit normal plus scale times the size of another (skew normal, Azzalini 1985).
+
+    f = 2 / v phi(x / v) Phi(scale x / v), v^2 = 1 + scale^2.
+    """
+    square = 1.0 + scale**2
+    steep = scale / square**0.5
+    ratio = _mills(steep * x)
+    density = np.log(2.0) - 0.5 * x**2 / square - 0.5 * _functions(square).log(square) - HALF_LOG + log_ndtr(steep * x)
+    curved = jnp.clip(ratio * (ratio + steep * x), 0.0, 1.0)
+    return density, x / square - steep * ratio, 1.0 / square + steep**2 * curved
+
+
+HALF_LOG = 0.5 * np.log(2 * np.pi)
+LATE = {NORMAL: _late_normal, EXPONENTIAL: _late_exponential, HALF_NORMAL: _late_half_normal}
+
+
 @dataclass(frozen=True)
 class Mixture(AdditiveNoise):
     """Inliers of standard deviation `std`, and a `share` of echoes: `scale` times wider, `delay` stds later.
 
-    An echo of sound or radio comes late: with a positive `delay` the second component is centred there.
+    `late` is the distribution of an echo after its delay, in stds. "normal": a normal of sd `scale` replaces the noise
+    of the inlier, so that an echo may be early. "exponential" adds an exponential of mean `scale` to that noise,
+    "half-normal" adds `scale` times the size of a normal: these echoes are never early. Each of the three numbers may
+    be `Unknown(guess, factor)`; the factor of the share is that of its odds.
+
+    >>> reflected = Mixture(Unknown(0.2), Unknown(20.0), late="exponential")  # of ranges: the direct path is blocked
     """
 
-    share: float = 0.1
-    scale: float = 10.0
-    delay: float = 0.0
+    fractions: ClassVar[tuple[str, ...]] = ("share",)
+
+    share: Any = 0.1  # or `Unknown`, as the next two
+    scale: Any = 10.0
+    delay: Any = 0.0
+    late: str = NORMAL
 
     def __post_init__(self):
-        if not 0 < self.share < 1:
+        if self.late not in LATE:
+            raise InputError(f'Mixture(late="{self.late}"): give one of {", ".join(LATE)}')
+        share, scale, delay = guess_of(self.share), guess_of(self.scale), guess_of(self.delay)
+        if not 0 < share < 1:
             raise InputError(f"Mixture(share={self.share}): the share of echoes must lie between 0 and 1")
-        if not 1e-3 <= self.scale <= 1e3:
+        if not 1e-3 <= scale <= 1e3:
             raise InputError(f"Mixture(scale={self.scale}): the scale of echoes must lie between 0.001 and 1000 stds")
-        if not abs(self.delay) <= 1e3 or (self.delay == 0 and self.scale == 1):
+        if not abs(delay) <= 1e3 or (delay == 0 and scale == 1 and self.late == NORMAL):
             raise InputError(
                 f"Mixture(scale={self.scale}, delay={self.delay}): an echo must differ from an inlier, by at most "
                 f"1000 stds of delay"
             )
 
     def _parts(self, r):
-        """Whitened residuals and log densities (without std) of the two components."""
-        late = (r - self.delay) / self.scale
-        inlier = np.log1p(-self.share) - 0.5 * r**2 - 0.5 * np.log(2 * np.pi)
-        echo = np.log(self.share / self.scale) - 0.5 * late**2 - 0.5 * np.log(2 * np.pi)
-        return late, inlier, echo
+        """Log densities (without std) of the two components, and slope and step weight of the late one."""
+        xp = _functions(self.share)
+        late = r - self.delay
+        density, slope, curved = LATE[self.late](late, self.scale)
+        # slope over distance bounds the density by a parabola where the curvature dies away
+        curved = jnp.where(late > 1.0, jnp.maximum(curved, slope / jnp.maximum(late, 1.0)), curved)
+        inlier = xp.log1p(-self.share) - 0.5 * r**2 - HALF_LOG
+        return inlier, xp.log(self.share) + density, slope, curved
 
     def _slopes(self, r):
-        """Probability of an inlier, and the derivative of the negative log density by the whitened residual."""
-        late, inlier, echo = self._parts(r)
+        """Probability of an inlier, the derivative of the negative log density by r, and the step weight."""
+        inlier, echo, slope, curved = self._parts(r)
         kept = jax.nn.sigmoid(inlier - echo)
-        return kept, kept * r + (1 - kept) * late / self.scale
+        return kept, kept * r + (1 - kept) * slope, kept + (1 - kept) * curved
+
+    def log_density(self, e):
+        """Log density of the noise at std 1."""
+        inlier, echo, _, _ = self._parts(e)
+        return jnp.logaddexp(inlier, echo)
+
+    def _slope(self, e):
+        return -self._slopes(e)[1]
+
+    def _points(self, e):
+        narrow = jnp.minimum(self.scale, 1.0) if self.late == NORMAL else 1.0
+        return jnp.sort(jnp.concatenate(jnp.broadcast_arrays(e, self.delay + narrow * e), -1))
 
     @cached_property
     def _unit_information(self) -> float:
         """Expected information at std 1, by the trapezoidal rule."""
         inner = np.linspace(-12.0, 12.0, 20_001)
-        r = np.union1d(inner, self.delay + self.scale * inner)
-        late, inlier, echo = self._parts(r)
-        kept = 1.0 / (1.0 + np.exp(np.clip(echo - inlier, -700.0, 700.0)))
-        slope = kept * r + (1 - kept) * late / self.scale
-        return float(np.trapezoid(slope**2 * (np.exp(inlier) + np.exp(echo)), r))
+        wide = self.scale * (inner if self.late == NORMAL else np.linspace(0.0, 40.0, 20_001))
+        r = np.union1d(np.append(inner, self.delay + inner), self.delay + wide)
+        with jax.enable_x64(True), jax.ensure_compile_time_eval():
+            density, slope = (np.asarray(part) for part in (self.log_density(r), self._slope(r)))
+        return float(np.trapezoid(slope**2 * np.exp(density), r))
 
-    def log_likelihood(self, y, predicted, std, period):
-        """Log density of each datum."""
-        _, inlier, echo = self._parts(self.innovation(y, predicted, period) / std)
-        return jnp.logaddexp(inlier, echo) - jnp.log(std)
-
-    def score(self, y, predicted, std, period):
-        """Derivative of the log density by the predicted value."""
-        return self._slopes(self.innovation(y, predicted, period) / std)[1] / std
+    def unit_information(self) -> Any:
+        """Expected information at std 1."""
+        known = _functions(self.share, self.scale, self.delay) is np
+        return self._unit_information if known else super().unit_information()
 
     def weight(self, y, predicted, std, period):
         """Positive curvature used by a step: that of the two components, each by its probability."""
-        kept = self.reliance(y, predicted, std, period)
-        return (kept + (1 - kept) / self.scale**2) / std**2
-
-    def information(self, predicted, std):
-        """Expected information about the predicted value."""
-        return self._unit_information * jnp.ones_like(predicted) / std**2
-
-    def level_score(self, y, predicted, std, period):
-        """One plus the derivative of the log density by log std."""
-        r = self.innovation(y, predicted, period) / std
-        return r * self._slopes(r)[1]
+        return self._slopes(self.innovation(y, predicted, period) / std)[2] / std**2
 
     def reliance(self, y, predicted, std, period):
         """Probability that a datum is no echo."""
@@ -467,7 +597,11 @@ class Mixture(AdditiveNoise):
         pick, size = jax.random.split(key)
         late = jax.random.uniform(pick, predicted.shape) < self.share
         normal = jax.random.normal(size, predicted.shape, predicted.dtype)
-        return predicted + std * jnp.where(late, self.delay + self.scale * normal, normal)
+        if self.late == NORMAL:
+            return predicted + std * jnp.where(late, self.delay + self.scale * normal, normal)
+        draw = jax.random.exponential if self.late == EXPONENTIAL else jax.random.normal
+        extra = jnp.abs(draw(jax.random.fold_in(key, 2), predicted.shape, predicted.dtype))
+        return predicted + std * (normal + jnp.where(late, self.delay + self.scale * extra, 0.0))
 
     def _often(self, square, size):
         """Log densities of u, times its share, of the two components, less the constant."""

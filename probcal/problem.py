@@ -29,6 +29,7 @@ from probcal.model.motions import (
     channel_levels,
     form_of,
     linear_of,
+    parameters,
     start_of,
     tails_of,
 )
@@ -506,25 +507,31 @@ class Problem:
         """Rows by sensor type and recursion."""
         found = []
         for kind in self.network.types:
-            level_of = channel_levels(kind, self.network.dimension, levels)
+            sensors = [placed.name for placed in self.network.sensors if placed.type == kind]
+            level_of = channel_levels(kind, self.network.dimension, levels, sensors)
             columns = tuple(name for name, _ in kind.expand(self.network.dimension))
             for r, own in enumerate(chained):
                 chosen = self._rows_of(kind, own.epoch_of >= 0)
                 if len(chosen):
                     block = make_block(self.network, kind, own.epochs.layout)
-                    rows = Rows(**self._rows(block, chosen, own.epoch_of[chosen], level_of))
-                    found.append(_Gathered(block, rows, r, chosen, columns))
+                    numbers, pieces = self._rows(block, chosen, own.epoch_of[chosen], level_of)
+                    unknown = parameters(kind, self.network.dimension, levels, sensors, pieces)
+                    block = replace(block, unknown=unknown) if unknown else block
+                    found.append(_Gathered(block, Rows(**numbers), r, chosen, columns))
         return found
 
     def _rows_of(self, kind: Any, inside: np.ndarray) -> np.ndarray:
         ours = [k for k, placed in enumerate(self.network.sensors) if placed.type == kind]
         return np.flatnonzero(inside & np.isin(self.measurements.sensor, ours))
 
-    def _rows(self, block: Block, chosen: np.ndarray, epoch: np.ndarray, level_of: list[int]) -> dict[str, Any]:
-        """Numbers of a block of rows, by the names of `Rows`."""
+    def _rows(
+        self, block: Block, chosen: np.ndarray, epoch: np.ndarray, level_of: np.ndarray
+    ) -> tuple[dict[str, Any], list[int]]:
+        """Numbers of a block of rows, by the names of `Rows`, and the number of pieces of each sensor."""
         data, network = self.measurements, self.network
         ours = [k for k, placed in enumerate(network.sensors) if placed.type == block.type]
         sensor = np.searchsorted(ours, data.sensor[chosen])
+        level = level_of[sensor]
         nodes = [network.sensors[k].nodes for k in ours]
         entries = pose_entries(block.type, network.dimension)
         pose = np.zeros((len(chosen), block.type.arity, len(entries)))
@@ -557,8 +564,8 @@ class Problem:
             y=np.where(data.measured[pick], data.value[pick], 0.0),
             mask=data.measured[pick] * data.weight[chosen, None],
             std=std,
-            level=np.where(own, -1, np.asarray(level_of)),
-        )  # fmt: skip
+            level=np.where(own, -1, level),
+        ), [len(start) for start in starts]  # fmt: skip
 
     def _check_path(self, node: Node, rows: np.ndarray) -> None:
         """Raise `InputError` for a row at a time outside the path of a moving node."""

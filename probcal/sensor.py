@@ -166,7 +166,7 @@ class Channel:
                 f"Bernoulli() or probcal.noise.Normal(); probcal.Gaussian is a prior"
             )
         if not isinstance(self.noise, Bernoulli):
-            check_level(self.std, f"Channel({self.unit!r}): std")
+            check_level(self.std, f"Channel({self.unit!r}): std", by=True)
         if self.wrap and self.unit not in PERIODS:
             raise InputError(f"Channel({self.unit!r}, wrap=True): only angles in rad or deg wrap")
         if self.wrap and isinstance(self.noise, Heard):

@@ -144,7 +144,9 @@ MUTATIONS = [
     Mutation("return -0.5 * r**2 - jnp.log(std) - 0.5 * np.log(2 * np.pi)", "return -0.5 * r**2 - jnp.log(std)", "test_exact.py"),
     Mutation("(self.df + 1) / (self.df + 3)", "(self.df + 1) / (self.df + 2)", "test_methods.py"),
     Mutation("(self.df + 1) / (self.df * std**2", "(self.df + 3) / (self.df * std**2", "test_methods.py"),
-    Mutation("np.log(self.share / self.scale)", "np.log(self.share)", "test_methods.py"),
+    Mutation("xp.log(self.share) + density", "density", "test_methods.py"),
+    Mutation("told - 0.5 * spread", "told - 0.0 * spread", "test_late.py"),
+    Mutation("rate - ratio, jnp.clip", "rate - ratio + 0.1, jnp.clip", "test_late.py"),
     # motion/components.py
     Mutation("[root * np.sqrt(3) / 2, root / 2]", "[root * np.sqrt(3) / 2, root / 3]", "test_exact.py"),
     Mutation("[[dt**2 / 2], [dt]], dimension", "[[dt**2], [dt]], dimension", "test_exact.py"),

@@ -16,6 +16,7 @@ import xarray as xr
 from probcal.inference.fitted import Fitted, Judged
 from probcal.inference.residuals import all_gaussian, exact_kurtosis
 from probcal.model.model import At, Model
+from probcal.model.motions import level_logs
 from probcal.model.rows import standardised
 from probcal.results.read import each_track, saved_states
 from probcal.smoothing.draws import draw
@@ -110,8 +111,7 @@ def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> FitDraws:
     z = jnp.asarray(thin(posterior["bias"].values) / problem.scales)
     levels = jnp.broadcast_to(fit.point.levels, (most, len(problem.levels)))
     if "level" in posterior:
-        guess = np.array([level.guess for level in problem.levels])
-        levels = jnp.asarray(np.log(thin(posterior["level"].values) / guess))
+        levels = jnp.asarray(level_logs(problem.levels, thin(posterior["level"].values)))
     if any("state" not in track for track in tracked.values()):
         drawn = draw(fit.at, z, levels, key)
         return FitDraws(z, levels, drawn.states, None)

@@ -13,6 +13,7 @@ from probcal import linalg
 from probcal.errors import InputError
 from probcal.inference.sparse import SparsePosterior
 from probcal.lazy import Later
+from probcal.model.motions import level_logs
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
 from probcal.problem import Epochs, Problem
@@ -155,7 +156,7 @@ def point_of(problem: Problem, fit: xr.DataTree) -> Point:
     point = follow_states(problem, saved)
     if problem.levels:
         level = fit["level"].to_dataset()
-        point = at_levels(problem.model, point, jnp.asarray(np.log(level["std"].values / level["guess"].values)))
+        point = at_levels(problem.model, point, jnp.asarray(level_logs(problem.levels, level["std"].values)))
     z = jnp.asarray(fit["calibration"].to_dataset()["mean"].values / problem.scales)
     return track_mode(problem, point._replace(z=z))
 

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.fingerprint import ADDRESS, computes
-from probcal.model.rows import Block, Rows, information, log_likelihood, noise_std, weigh
+from probcal.model.rows import Block, Rows, information, log_likelihood, weigh
 from probcal.model.sampled import SampledMotion
 from probcal.motion import Component, Motion
 from probcal.network import Network, Node
-from probcal.noise import Heard, guess_of
+from probcal.noise import Heard, at_guess, guess_of
 from probcal.problem import Problem
 from probcal.results.schema import RESULTS_VERSION
 from probcal.sensor import Channel, Sensor, SensorType
@@ -157,7 +157,7 @@ def _computed(value: Any, dimension: int) -> dict[str, Any]:
     """What the functions of a channel's noise or of a motion compute, which its fields need not say."""
     if isinstance(value, Channel):
         noise, number = value.noise, jax.ShapeDtypeStruct((), float)
-        known: Any = noise.at(0.0) if isinstance(noise, Heard) and noise.floor is None else noise
+        known: Any = noise.at(0.0) if isinstance(noise, Heard) and noise.floor is None else at_guess(noise)
 
         def density(y: Any, predicted: Any, std: Any) -> Any:
             weight = known.weight(y, predicted, std, value.period)
@@ -183,7 +183,7 @@ def _code(block: Block, rows: Rows, levels: int) -> str:
     """What a block computes: its sensors, and the densities and weights of its noise."""
 
     def noise(rows: Rows, predicted: jax.Array, levels: jax.Array) -> Any:
-        weights = weigh(block, rows, predicted, noise_std(rows, levels), expected=False)
+        weights = weigh(block, rows, predicted, levels, expected=False)
         return (
             log_likelihood(block, rows, predicted, levels), weights, information(block, rows, predicted, levels)
         )  # fmt: skip

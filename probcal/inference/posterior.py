@@ -16,6 +16,7 @@ from probcal.inference.mixed import ESS, R_HAT, UNSURE, mixing, weights_of_sides
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Posed
 from probcal.inference.sampling import SamplerRun
+from probcal.model.motions import level_values
 from probcal.priors import PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
@@ -219,9 +220,8 @@ def _variables(problem: Problem, run: SamplerRun) -> dict[str, Any]:
     }
     found |= run.form.hierarchy.variables(problem.labels, run.draws.phi)
     if problem.levels:
-        guess = np.array([level.guess for level in problem.levels])
         names = [level.label for level in problem.levels]
-        found["level"] = (("level_label",), guess * np.exp(run.levels), {"level_label": names})
+        found["level"] = (("level_label",), level_values(problem.levels, run.levels), {"level_label": names})
     return found
 
 

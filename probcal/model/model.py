@@ -190,6 +190,15 @@ class Model(Stepwise):
         """One plus the derivative of each log density by log std, zero where missing."""
         return self._each(waist.level_score, self.predict(at), levels=at.levels)
 
+    def parameter_score(
+        self, predicted: Data, levels: jax.Array, spread: Data
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Sums over the blocks of `waist.parameter_score`."""
+        parts = zip(self.blocks, self.rows, predicted, spread, strict=True)
+        each = [waist.parameter_score(*own[:3], levels, own[3]) for own in parts if own[0].unknown]
+        slope, information, chosen = (sum(column[1:], column[0]) for column in zip(*each, strict=True))
+        return slope, information, chosen
+
     def slopes(self, at: Where) -> tuple[tuple[jax.Array, jax.Array], ...]:
         """Score of every datum by its predicted value and its observed information, a pair for each block."""
         return self._each(waist.slopes, self.predict(at), levels=at.levels)
@@ -197,7 +206,7 @@ class Model(Stepwise):
     def score(self, at: Where) -> tuple[tuple[jax.Array, jax.Array], ...]:
         """Score of every datum by its predicted value and the expected information, a pair for each block."""
         return tuple(
-            waist.weigh(block, data, predicted, waist.noise_std(data, at.levels), expected=True)
+            waist.weigh(block, data, predicted, at.levels, expected=True)
             for block, data, predicted in zip(self.blocks, self.rows, self.predict(at), strict=True)
         )
 
@@ -368,6 +377,10 @@ class Model(Stepwise):
     def noises(self) -> tuple[tuple[Any, ...], ...]:
         """Noise family of each channel of each block."""
         return tuple(tuple(channel.noise for channel in block.channels) for block in self.blocks)
+
+    def noises_at(self, levels: Any) -> tuple[tuple[Any, ...], ...]:
+        """The same with the values of unknown parameters; of parameters by sensor, the middle ones."""
+        return tuple(tuple(waist.families_at(block, np.asarray(levels))) for block in self.blocks)
 
     @property
     def weighs_as_expected(self) -> bool:

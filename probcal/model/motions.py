@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.model.rows import Parameter
 from probcal.model.sampled import SampledMotion, sampled_of
 from probcal.motion import Layout, Motion, Target, as_motion
 from probcal.motion.base import GAUSSIAN, level_name
 from probcal.motion.layout import layout_of, stacked
-from probcal.noise import Bernoulli, Level, Normal, Unknown, guess_of
+from probcal.noise import Bernoulli, Level, Normal, Unknown, guess_of, is_odds, level_at, log_level, unknowns
 
 DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
 FAR = 10.0  # times as wide where no sensor measures a range: bearings of a small array reach far beyond it
@@ -33,12 +34,36 @@ class Area(NamedTuple):
 
 @dataclass(frozen=True)
 class LevelRecord:
-    """One unknown noise level: label, unit, guess and the factor within which it is known."""
+    """One unknown noise level: label, unit, guess and the factor within which it is known.
+
+    Of a share between 0 and 1 the factor is that of the odds (`odds`).
+    """
 
     label: str
     unit: str
     guess: float
     factor: float
+    odds: bool = field(default=False, repr=False)
+
+    def at(self, log: Any) -> Any:
+        """Value at a log level."""
+        return level_at(self.guess, self.odds, np.asarray(log, float))
+
+    def log(self, value: Any) -> Any:
+        """Log level of a value."""
+        return log_level(self.guess, self.odds, value)
+
+
+def level_values(records: Sequence[LevelRecord], logs: Any) -> np.ndarray:
+    """Values (..., H) of levels at log levels (..., H)."""
+    logs = np.asarray(logs, float)
+    return np.stack([level.at(logs[..., h]) for h, level in enumerate(records)], -1) if records else logs
+
+
+def level_logs(records: Sequence[LevelRecord], values: Any) -> np.ndarray:
+    """Log levels (..., H) of values (..., H)."""
+    values = np.asarray(values, float)
+    return np.stack([level.log(values[..., h]) for h, level in enumerate(records)], -1) if records else values
 
 
 class Levels:
@@ -47,7 +72,7 @@ class Levels:
     def __init__(self, records: Iterable[LevelRecord] = ()) -> None:
         self.records: list[LevelRecord] = list(records)
 
-    def of(self, level: Level, label: str, unit: str) -> int:
+    def of(self, level: Level, label: str, unit: str, odds: bool = False) -> int:
         """Number of the level, -1 where it is known."""
         if not isinstance(level, Unknown):
             return -1
@@ -56,21 +81,43 @@ class Levels:
             if (other.guess, other.factor) == (level.guess, level.factor):
                 return self.records.index(twins[k])
         name = f"{label}#{len(twins) + 1}" if twins else label
-        self.records.append(LevelRecord(name, unit, level.guess, level.factor))
+        self.records.append(LevelRecord(name, unit, level.guess, level.factor, odds))
         return len(self.records) - 1
 
 
-def channel_levels(kind: Any, dimension: int, levels: Levels) -> list[int]:
-    """Level number of each scalar channel of a type; a channel declared per axis has one level."""
-    numbers = []
+def channel_levels(kind: Any, dimension: int, levels: Levels, sensors: Sequence[str]) -> np.ndarray:
+    """Level number (S, C) of each scalar channel of the sensors of a type; a channel per axis has one level."""
+    numbers: list[np.ndarray] = []
     for name, channel in kind.channels.items():
-        level = (
-            -1
-            if isinstance(channel.noise, Bernoulli)
-            else levels.of(channel.std, f"{kind.name}.{name}_std", channel.unit)
-        )
+        level = np.full(len(sensors), -1)
+        if not isinstance(channel.noise, Bernoulli):
+            level[:] = _numbers(channel.std, kind, f"{name}_std", channel.unit, levels, sensors)
         numbers += [level] * (dimension if channel.per_axis else 1)
-    return numbers
+    return np.stack(numbers, 1)
+
+
+def parameters(
+    kind: Any, dimension: int, levels: Levels, sensors: Sequence[str], pieces: Sequence[int]
+) -> tuple[Parameter, ...]:
+    """Unknown parameters of the noise of each scalar channel of a type, whose sensors count once for each piece."""
+    found, column = list[Parameter](), 0
+    for channel_name, channel in kind.channels.items():
+        width = dimension if channel.per_axis else 1
+        for name, level in unknowns(channel.noise).items():
+            odds, label = is_odds(channel.noise, name), f"{channel_name}_{name.split('.')[-1]}"
+            own = _numbers(level, kind, label, "", levels, sensors, odds)
+            number = tuple(np.repeat(own, pieces).tolist()) if level.by else (own[0],)
+            found += [Parameter(column + c, name, level.guess, odds, number) for c in range(width)]
+        column += width
+    return tuple(found)
+
+
+def _numbers(
+    level: Level, kind: Any, label: str, unit: str, levels: Levels, sensors: Sequence[str], odds: bool = False
+) -> list[int]:
+    """Number (S,) of the level that each sensor of a type has: one for all, or each its own."""
+    own = isinstance(level, Unknown) and level.by
+    return [levels.of(level, f"{name if own else kind.name}.{label}", unit, odds) for name in sensors]
 
 
 def linear_of(motion: Motion) -> tuple[Any, ...]:

@@ -17,9 +17,23 @@ from probcal.errors import InputError, nearest
 from probcal.geometry import wrap
 from probcal.motion import Layout, view
 from probcal.network import ANGLES, Network, Node
-from probcal.noise import Bernoulli
+from probcal.noise import AdditiveNoise, Bernoulli, level_at, with_values
 from probcal.sensor import Channel, Sensor, SensorType
 from probcal.types import PoseView
+
+
+class Parameter(NamedTuple):
+    """An unknown parameter of the noise family of a channel: which level it is, of all sensors or of each."""
+
+    channel: int
+    name: str  # as `noise.unknowns` has it
+    guess: float
+    odds: bool  # whether it lies between 0 and 1
+    number: tuple[int, ...]  # one, or one of each sensor (of each of its pieces)
+
+    def of(self, rows: "Rows") -> jax.Array:
+        """Level number of each row, (N,)."""
+        return jnp.asarray(self.number)[rows.sensor % len(self.number)]
 
 
 @dataclass(frozen=True)
@@ -33,6 +47,7 @@ class Block:
     extras: tuple[str, ...]  # pose components beyond the position, in the order of a pose vector
     free: tuple[tuple[int, int], ...]  # (node, entry of its pose vector) of the biased pose entries
     steps: tuple[int, ...]  # which bias each further column steps: the biased pose entries, then those of the sensor
+    unknown: tuple[Parameter, ...] = ()  # of the noise families of its channels
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -252,19 +267,49 @@ def noise_std(rows: Rows, levels: jax.Array) -> jax.Array:
     return rows.std * factors[rows.level]
 
 
-def _by_channel(block: Block, method: str, *columns: jax.Array, period: bool = True) -> jax.Array:
+def _families(
+    block: Block, rows: Rows, levels: jax.Array, offset: jax.Array | None = None, *, each: bool = False
+) -> list[Any]:
+    """Noise family of each channel at log levels (H,), for each row `offset` (N, unknown) away.
+
+    Parameters by sensor are those of each row; with `each`, of each sensor.
+    """
+    values: dict[int, dict[str, jax.Array]] = {}
+    for k, own in enumerate(block.unknown):
+        one = len(own.number) == 1 and offset is None
+        places = own.number[0] if one else jnp.asarray(own.number) if each else own.of(rows)
+        log = jnp.asarray(levels)[places]
+        log = log if offset is None else log + offset[:, k]
+        values.setdefault(own.channel, {})[own.name] = level_at(own.guess, own.odds, log)
+    families = enumerate(channel.noise for channel in block.channels)
+    return [with_values(family, values[c]) if c in values else family for c, family in families]
+
+
+def families_at(block: Block, levels: np.ndarray) -> list[Any]:
+    """Noise family of each channel with numbers for its unknown parameters, in the middle of those of its sensors."""
+    families = [channel.noise for channel in block.channels]
+    for own in block.unknown:
+        value = level_at(own.guess, own.odds, float(levels[list(own.number)].mean()))
+        families[own.channel] = with_values(families[own.channel], {own.name: float(value)})
+    return families
+
+
+def _by_channel(
+    block: Block, families: Sequence[Any], method: str, *columns: jax.Array, period: bool = True
+) -> jax.Array:
     """Apply a method of each channel's noise family to the columns of (N, C) arrays."""
     parts = []
-    for c, channel in enumerate(block.channels):
+    for c, (channel, family) in enumerate(zip(block.channels, families, strict=True)):
         arguments = [column[:, c] for column in columns]
-        call = getattr(channel.noise, method)
+        call = getattr(family, method)
         parts.append(call(*arguments, channel.period) if period else call(*arguments))
     return jnp.stack(parts, 1)
 
 
 def innovation(block: Block, rows: Rows, predicted: jax.Array) -> jax.Array:
     """Measured minus predicted, wrapped, zero where missing, shape (N, C)."""
-    return rows.mask * _by_channel(block, "innovation", rows.y, predicted)
+    families = [channel.noise for channel in block.channels]
+    return rows.mask * _by_channel(block, families, "innovation", rows.y, predicted)
 
 
 @partial(jax.jit, static_argnames="block")
@@ -272,19 +317,68 @@ def log_likelihood(block: Block, rows: Rows, predicted: jax.Array, levels: jax.A
     """Log density of every datum, zero where missing, shape (N, C)."""
 
     def look(own: Rows, values: jax.Array) -> jax.Array:
-        return own.mask * _by_channel(block, "log_likelihood", own.y, values, noise_std(own, levels))
+        families = _families(block, own, levels)
+        return own.mask * _by_channel(block, families, "log_likelihood", own.y, values, noise_std(own, levels))
 
     return by_parts(look, rows, predicted)
 
 
 def level_score(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
     """One plus the derivative of each log density by log std, zero where missing, shape (N, C)."""
-    return rows.mask * _by_channel(block, "level_score", rows.y, predicted, noise_std(rows, levels))
+    families = _families(block, rows, levels)
+    return rows.mask * _by_channel(block, families, "level_score", rows.y, predicted, noise_std(rows, levels))
 
 
 def information(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
     """Expected information of every datum about its predicted value, zero where missing, shape (N, C)."""
-    return rows.mask * _by_channel(block, "information", predicted, noise_std(rows, levels), period=False)
+    return rows.mask * _information(block, rows, predicted, noise_std(rows, levels), levels)
+
+
+def _information(block: Block, rows: Rows, predicted: jax.Array, std: jax.Array, levels: jax.Array) -> jax.Array:
+    """Expected information of every datum about its predicted value, (N, C).
+
+    With parameters by sensor it is a quadrature, made once for each sensor and not for each row.
+    """
+    parts, families, each = [], _families(block, rows, levels), _families(block, rows, levels, each=True)
+    for c, family in enumerate(families):
+        S = max((len(own.number) for own in block.unknown if own.channel == c), default=1)
+        if S > 1 and isinstance(family, AdditiveNoise):
+            unit = each[c].information(jnp.zeros(S), jnp.ones(S))
+            parts.append(unit[rows.sensor % S] / std[:, c] ** 2)
+        else:
+            parts.append(family.information(predicted[:, c], std[:, c]))
+    return jnp.stack(parts, 1)
+
+
+def parameter_score(
+    block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array, spread: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Of the levels of unknown parameters: slope (H,), information (H + 1, H + 1), and which they are (H + 1,).
+
+    Slope of the sum of log p(y | predicted) - spread I / 2, I the expected information and `spread` (N, C) the variance
+    of the predicted values: the slope of the log evidence, trajectories and biases integrated. The information is the
+    sum of the squared scores of single data (Berndt, Hall, Hall, Hausman 1974).
+    """
+    N, H, K = rows.y.shape[0], levels.shape[0], len(block.unknown)
+    number = jnp.stack([own.of(rows) for own in block.unknown], 1)
+
+    def density(offset: jax.Array) -> jax.Array:
+        families = _families(block, rows, levels, offset)
+        return _by_channel(block, families, "log_likelihood", rows.y, predicted, noise_std(rows, levels))
+
+    def whole(levels: jax.Array) -> jax.Array:
+        std = noise_std(rows, levels)
+        told = _by_channel(block, _families(block, rows, levels), "log_likelihood", rows.y, predicted, std)
+        return jnp.sum(rows.mask * (told - 0.5 * spread * _information(block, rows, predicted, std, levels)))
+
+    scores = []
+    for k, own in enumerate(block.unknown):
+        along = jnp.zeros((N, K)).at[:, k].set(1.0)
+        slope = jax.jvp(density, (jnp.zeros((N, K)),), (along,))[1]
+        scores.append(jnp.sqrt(rows.mask[:, own.channel]) * slope[:, own.channel])
+    score = jnp.stack(scores, 1)
+    outer = jnp.zeros((H + 1, H + 1)).at[number[:, :, None], number[:, None, :]].add(score[:, :, None] * score[:, None])
+    return jax.grad(whole)(levels), outer, jnp.zeros(H + 1).at[number].set(1.0)
 
 
 def sample(
@@ -295,8 +389,8 @@ def sample(
     `how` is the method of the noise families: "sample", or "emit" for what sensors need not hear.
     """
     std, drawn = noise_std(rows, levels), []
-    for c, channel in enumerate(block.channels):
-        value = getattr(channel.noise, how)(jax.random.fold_in(key, c), predicted[:, c], std[:, c])
+    for c, (channel, family) in enumerate(zip(block.channels, _families(block, rows, levels), strict=True)):
+        value = getattr(family, how)(jax.random.fold_in(key, c), predicted[:, c], std[:, c])
         if channel.period is not None:
             value = jnp.mod(value + channel.period / 2, channel.period) - channel.period / 2
         drawn.append(value)
@@ -328,7 +422,7 @@ def _linearised(
     entries = jnp.stack([reached[:, i] for i in block.used], 1) if block.used else reached[:, :0]
     both = jax.jacfwd(one, argnums=(0, 3), has_aux=True)  # forward: half the time of backward in 3-D, and to compile
     (by_state, by_bias), predicted = jax.vmap(both)(entries, reached, rows.pose, local)
-    score, weight = weigh(block, rows, predicted, noise_std(rows, levels), expected=expected)
+    score, weight = weigh(block, rows, predicted, levels, expected=expected)
     return Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])
 
 
@@ -344,21 +438,21 @@ def linearise_biases(
         return found, found
 
     by_bias, predicted = jax.vmap(jax.jacfwd(one, argnums=2, has_aux=True))(reached, rows.pose, local)
-    score, weight = weigh(block, rows, predicted, noise_std(rows, levels), expected=expected)
+    score, weight = weigh(block, rows, predicted, levels, expected=expected)
     none = jnp.zeros((*score.shape, 0))
     return Linearised(score, weight, none, by_bias * rows.scale[rows.sensor][:, None, :])
 
 
 def curvature(block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array) -> jax.Array:
     """Minus the second derivative (N, p, p) of each row's log density by the biases z that it reads."""
-    std, local, scale = noise_std(rows, levels), read_biases(block, rows, z), rows.scale[rows.sensor]
+    local, scale = read_biases(block, rows, z), rows.scale[rows.sensor]
 
-    def density(b: jax.Array, state: jax.Array, pose: jax.Array, y: jax.Array, mask: jax.Array, s: jax.Array) -> Any:
-        predicted = _one(block, state, pose, b)
-        columns = _by_channel(block, "log_likelihood", y[None], predicted[None], s[None])
-        return jnp.sum(mask * columns[0])
+    def density(b: jax.Array, state: jax.Array, row: Rows) -> Any:
+        one = jax.tree.map(lambda leaf: leaf[None], row)
+        return jnp.sum(log_likelihood(block, one, _one(block, state, row.pose, b)[None], levels))
 
-    second = jax.vmap(jax.jacfwd(jax.grad(density)))(local, states[rows.epoch], rows.pose, rows.y, rows.mask, std)
+    whole: Any = Rows(*(0 if name in BY_ROW else None for name in Rows._fields))  # type: ignore[arg-type]
+    second = jax.vmap(jax.jacfwd(jax.grad(density)), (0, 0, whole))(local, states[rows.epoch], rows)
     return -second * scale[:, :, None] * scale[:, None, :]
 
 
@@ -373,7 +467,7 @@ def square(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) ->
 
     A yes-or-no channel has twice the negative log probability where that is smaller: nothing to do with a scale.
     """
-    score, information = weigh(block, rows, predicted, noise_std(rows, levels), expected=True)
+    score, information = weigh(block, rows, predicted, levels, expected=True)
     found = standardised(score, information) ** 2
     events = np.array([isinstance(channel.noise, Bernoulli) for channel in block.channels])
     if not events.any():
@@ -382,27 +476,34 @@ def square(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) ->
 
 
 def weigh(
-    block: Block, rows: Rows, predicted: jax.Array, std: jax.Array, *, expected: bool
+    block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array, *, expected: bool, extra: Any = None
 ) -> tuple[jax.Array, jax.Array]:
-    """Score and step weight (or expected information) of every datum, zero where missing, both (N, C)."""
-    score = rows.mask * _by_channel(block, "score", rows.y, predicted, std)
+    """Score and step weight (or expected information) of every datum, zero where missing, both (N, C).
+
+    A variance `extra` (N, C) adds to that of the noise.
+    """
+    std, families = noise_std(rows, levels), _families(block, rows, levels)
+    if extra is not None:
+        std = jnp.sqrt(std**2 + extra)
+    score = rows.mask * _by_channel(block, families, "score", rows.y, predicted, std)
     if expected:
-        return score, rows.mask * _by_channel(block, "information", predicted, std, period=False)
-    return score, rows.mask * _by_channel(block, "weight", rows.y, predicted, std)
+        return score, rows.mask * _information(block, rows, predicted, std, levels)
+    return score, rows.mask * _by_channel(block, families, "weight", rows.y, predicted, std)
 
 
 def slopes(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Score of every datum by its predicted value and the observed information, zero where missing, both (N, C)."""
-    std = noise_std(rows, levels)
+    std, families = noise_std(rows, levels), _families(block, rows, levels)
     score, slope = jax.jvp(
-        lambda p: _by_channel(block, "score", rows.y, p, std), (predicted,), (jnp.ones_like(predicted),)
+        lambda p: _by_channel(block, families, "score", rows.y, p, std), (predicted,), (jnp.ones_like(predicted),)
     )
     return rows.mask * score, -rows.mask * slope
 
 
 def reliance(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
     """How much each datum counts against one that fits: 1 inlying, towards 0 outlying, (N, C)."""
-    return rows.mask * _by_channel(block, "reliance", rows.y, predicted, noise_std(rows, levels))
+    families = _families(block, rows, levels)
+    return rows.mask * _by_channel(block, families, "reliance", rows.y, predicted, noise_std(rows, levels))
 
 
 def difference(block: Block, value: jax.Array, other: jax.Array) -> jax.Array:

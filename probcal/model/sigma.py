@@ -64,8 +64,8 @@ def _block(block: Block, data: Rows, point: Where, states: jax.Array, covariance
     mean = jnp.einsum("s,snc->nc", points.weight, moved)
     slope = jnp.einsum("s,snc,su->ncu", points.weight, moved - mean[None], points.unit)
     left = jnp.einsum("s,snc->nc", points.weight, (moved - mean[None]) ** 2) - jnp.sum(slope**2, -1)
-    std = jnp.sqrt(rows.noise_std(data, point.levels) ** 2 + jnp.maximum(left, 0.0))
-    score, weight = rows.weigh(block, data, centre + mean, std, expected=False)
+    extra = jnp.maximum(left, 0.0)
+    score, weight = rows.weigh(block, data, centre + mean, point.levels, expected=False, extra=extra)
     by_bias = jax.lax.map(
         lambda x: rows.linearise(block, data, x, point.z, point.levels, expected=False).bias, points.states
     )

@@ -12,6 +12,7 @@ import numpy as np
 
 from probcal.labels import AXES
 from probcal.lazy import Later
+from probcal.model.motions import level_values
 from probcal.results.accessor import register
 from probcal.results.answer import Answer, Draws, Summary, Tracks
 from probcal.results.groups import (
@@ -76,9 +77,11 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
         coords = {**_sample(draws), "bias_label": list(problem.labels)}
         groups["log_prior"] = xr.Dataset({"bias": ((*SAMPLE, "bias_label"), log_prior)}, coords=coords)
     if problem.levels:
-        guess = np.array([level.guess for level in problem.levels])
         groups["level"] = xr.Dataset(
-            {"std": ("level", guess * np.exp(posterior.summary.levels)), "guess": ("level", guess)},
+            {
+                "std": ("level", level_values(problem.levels, posterior.summary.levels)),
+                "guess": ("level", [level.guess for level in problem.levels]),
+            },
             coords={"level": [level.label for level in problem.levels]},
         )
     if directions:

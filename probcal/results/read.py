@@ -240,7 +240,7 @@ def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
     levels = np.zeros(len(problem.levels))
     if problem.levels and "level" in calibration.children:
         found = calibration["level"].to_dataset()["std"].to_series()
-        levels = np.array([np.log(found.get(r.label, r.guess) / r.guess) for r in problem.levels])
+        levels = np.array([level.log(found.get(level.label, level.guess)) for level in problem.levels])
     if "block" in group:
         return Calibrated(problem, mean / problem.scales, levels, SensorBlocks.read(group, labels, problem.scales))
     spread = covariance_of(group, labels, "a calibration") / np.outer(problem.scales, problem.scales)

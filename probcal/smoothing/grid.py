@@ -147,16 +147,15 @@ def _seen(
     for data, (first, _) in zip(mine.rows, alike, strict=True):
         chosen: dict[str, Any] = {name: getattr(data, name)[first] for name in waist.BY_ROW}
         some.append(data._replace(**chosen | {"epoch": jnp.zeros_like(first)}))
-    stds = [waist.noise_std(data, levels) for data in mine.rows]
 
     def loss(place: jax.Array) -> list[jax.Array]:
         state, misfits = jnp.zeros((1, n)).at[0, span[0] : span[1]].set(place), []
-        for block, data, few, (_, own), std in zip(mine.blocks, mine.rows, some, alike, stds, strict=True):
+        for block, data, few, (_, own) in zip(mine.blocks, mine.rows, some, alike, strict=True):
             lin = waist.linearise_biases(block, few, state, z, levels, expected=False)
             spread = jnp.sqrt(jnp.sum(lin.bias**2, -1, keepdims=True))
             looked = apart((waist.predict(block, few, state, z), spread))
             predicted, spread = apart(jax.tree.map(lambda part, own=own: part[own], looked))
-            score, weight = waist.weigh(block, data, predicted, std, expected=False)
+            score, weight = waist.weigh(block, data, predicted, levels, expected=False)
             misfits.append(_misfit(Linearised(score, weight, jnp.zeros((*score.shape, 0)), spread)))
         return misfits
 

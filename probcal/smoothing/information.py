@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal import linalg
 from probcal.misfit import Rejected
 from probcal.model.model import Data, Model
 from probcal.noise import HALF
@@ -13,6 +14,8 @@ from probcal.smoothing.draws import residuals
 from probcal.smoothing.linearised import linearise
 from probcal.smoothing.mode import Point, factors
 
+STEPS = 3  # of the parameters of noise families between two modes: more change less than the next mode does
+FARTHEST = 1.0  # of one step of a log level, as for noise levels: a guess may be a factor of several off
 CHANCE = 1e-3  # probability that a sound fit rejects any channel of any sensor
 
 
@@ -30,10 +33,11 @@ def rejected(problem: Problem, point: Point) -> list[Rejected]:
         return []
     owners = [problem.measurements.sensor[index] for index in problem.row_index]
     counts: dict[tuple[int, str, float], np.ndarray] = {}  # below half weight, and all
+    families = model.noises_at(point.levels)
     for b, reliance in enumerate(residuals(model, point).reliance):
         there = np.asarray(model.measured[b])
         low = np.asarray(reliance) < HALF * there
-        for c, (channel, noise) in enumerate(zip(problem.columns[b], model.noises[b], strict=True)):
+        for c, (channel, noise) in enumerate(zip(problem.columns[b], families[b], strict=True)):
             each = (np.bincount(owners[b], own[:, c], len(sensors)) for own in (low, there > 0))
             both = np.stack([*each], 1).astype(int)
             for k in np.flatnonzero(both[:, 1] * noise.rejects).tolist():
@@ -97,7 +101,29 @@ def update_levels(model: Model, point: Point, covariance: jax.Array) -> Point:
         pull = square[:H] * jnp.exp(-2 * step)
         gradient = -free + pull - (point.levels + step) / model.level_spread**2
         step = step + gradient / (2 * pull + 1 / model.level_spread**2)
-    return at_levels(model, point, point.levels + jnp.clip(step, -1.0, 1.0))
+    levels = point.levels + jnp.clip(step, -1.0, 1.0)
+    if any(block.unknown for block in model.blocks):
+        levels = _parameters(model, point._replace(levels=levels), spread, point.levels)
+    return at_levels(model, point, levels)
+
+
+def _parameters(model: Model, point: Point, spread: Data, before: jax.Array) -> jax.Array:
+    """Log levels (H,) after steps of those that are parameters of noise families, from `before`, by scoring.
+
+    `spread` is the variance of the predicted values (see `waist.parameter_score`).
+    """
+    H, predicted = before.shape[0], model.predict(point)
+
+    def step(_: int, levels: jax.Array) -> jax.Array:
+        slope, information, chosen = model.parameter_score(predicted, levels, spread)
+        there = chosen[:H] > 0
+        matrix = jnp.where(there[:, None] & there[None], information[:H, :H], 0.0) + jnp.diag(model.level_spread**-2.0)
+        move = linalg.solve_positive(matrix, jnp.where(there, slope - levels / model.level_spread**2, 0.0)[:, None])
+        return levels + jnp.clip(move[:, 0], -FARTHEST, FARTHEST)
+
+    numbers = np.array(sorted({n for own in model.blocks for p in own.unknown for n in p.number}))
+    start = point.levels.at[numbers].set(before[numbers])
+    return jax.lax.fori_loop(0, STEPS, step, start)
 
 
 def at_levels(model: Model, point: Point, levels: jax.Array) -> Point:

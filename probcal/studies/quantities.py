@@ -154,8 +154,8 @@ def _quantities(trial: Trial, found: Pool) -> dict[str, _Quantity]:
         all_[label] = _Quantity("bias", float(point.z[m]) * scale, points.z[:, m] * scale)
     if not found.held:
         for h, level in enumerate(problem.levels):
-            draws = level.guess * np.exp(points.levels[:, h])
-            all_[level.label] = _Quantity("level", level.guess * float(np.exp(point.levels[h])), draws)
+            draws = level.at(points.levels[:, h])
+            all_[level.label] = _Quantity("level", float(level.at(point.levels[h])), draws)
     sampled = found.run
     if found.hierarchy is not None:
         all_ |= _hyper(found.hyper, trial.phi, found.hierarchy)

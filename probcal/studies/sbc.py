@@ -260,7 +260,7 @@ def _of_tree(problem: Problem, tree: xr.DataTree) -> Pool:
     for h, level in enumerate(problem.levels):
         drawn, held = group.get("level"), tree["level"].to_dataset()["std"]
         std = held.sel(level=level.label) if drawn is None else drawn.sel(level_label=level.label)
-        levels[:, h] = np.log(np.ravel(std.values) / level.guess)
+        levels[:, h] = level.log(np.ravel(std.values))
     points = Points(z, levels, tuple(flat(states) for states in saved_states(problem, tracked)))
     return Pool(points, {}, group.sizes["chain"], True, False, "read")
 

@@ -121,7 +121,7 @@ def updated_by_points(
         wide = off - middle[None]
         left = jnp.einsum("sdc,sde->dce", wide, wide) / (2 * n) - jnp.einsum("ndc,nde->dce", slope, slope)
         told = waist.log_likelihood(block, here, centre + middle, at.levels)
-        score, weight = waist.weigh(block, here, centre + middle, waist.noise_std(here, at.levels), expected=True)
+        score, weight = waist.weigh(block, here, centre + middle, at.levels, expected=True)
         known = there & (weight > 0)
         variance = jnp.where(known, 1.0 / jnp.where(known, weight, 1.0), 1.0)
         residual = jnp.where(known, score * variance, 0.0)

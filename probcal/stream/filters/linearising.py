@@ -51,7 +51,7 @@ def linearised(model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array,
     for _, block, data in here(model, epoch, r):
         lin = waist.linearise(block, data, at.x[None], at.z, levels, expected=True)
         predicted = waist.predict(block, data, at.x[None], at.z)
-        _, step = waist.weigh(block, data, predicted, waist.noise_std(data, levels), expected=False)
+        _, step = waist.weigh(block, data, predicted, levels, expected=False)
         lin = lin._replace(weight=jnp.minimum(lin.weight, step))
         found.append(_rows(block, data, lin, at, predicted, waist.noise_std(data, levels), odds))
     return found
@@ -111,9 +111,11 @@ def _regress(
     mean = jnp.einsum("s,spc->pc", weight, moved)
     slope = jnp.einsum("s,spc,su->pcu", weight, moved - mean[None], jnp.asarray(unit))
     left = jnp.einsum("s,spc->pc", weight, (moved - mean[None]) ** 2) - jnp.sum(slope**2, -1)
-    std = jnp.sqrt(waist.noise_std(data, levels) ** 2 + jnp.maximum(left, 0.0))
-    score, information = waist.weigh(block, data, reference + mean, std, expected=True)
-    information = jnp.minimum(information, waist.weigh(block, data, reference + mean, std, expected=False)[1])
+    extra = jnp.maximum(left, 0.0)
+    std = jnp.sqrt(waist.noise_std(data, levels) ** 2 + extra)
+    score, information = waist.weigh(block, data, reference + mean, levels, expected=True, extra=extra)
+    step = waist.weigh(block, data, reference + mean, levels, expected=False, extra=extra)[1]
+    information = jnp.minimum(information, step)
     by = jnp.einsum("pcu,puv->pcv", slope, vectors.mT / root[:, :, None])
     lin = Linearised(score, information, by[:, :, : len(used)], by[:, :, len(used) :])
     return lin, at, reference + mean, std
@@ -175,7 +177,7 @@ def residuals_widened(
         derive = waist.linearise if slopes else waist.linearise_biases
         lin = derive(block, data, at.x[None], at.z, levels, expected=True)
         predicted, std = waist.predict(block, data, at.x[None], at.z), waist.noise_std(data, levels)
-        _, step = waist.weigh(block, data, predicted, std, expected=False)
+        _, step = waist.weigh(block, data, predicted, levels, expected=False)
         there = (data.mask > 0) & (lin.weight > 0) & (step > 0)
         read = data.bias[data.sensor]
         spread = covariance[read[:, :, None], read[:, None, :]]
