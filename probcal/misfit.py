@@ -49,7 +49,7 @@ class Rejected(NamedTuple):
     channel: str
     below: int  # data of less than half weight
     data: int
-    expected: float  # fraction of such data under the noise family
+    expected: float  # fraction of such data under the noise family, or of most sensors
 
 
 def misfit_text(mean: float, points: Iterable[MisfitData]) -> str:
@@ -89,8 +89,8 @@ def rejection_text(rejected: Sequence[Rejected]) -> str:
     named = [f"{one.sensor}.{one.channel} ({one.below} of {one.data})" for one in rejected]
     return (
         "The robust noise gives less than half weight to most data of"
-        f" {listed(named)}, where it expects {rejected[0].expected:.0%}. Check whether labels of"
-        " sensors are exchanged, then their positions, units and clocks."
+        f" {listed(named)}, where {rejected[0].expected:.0%} is expected. Check whether labels of"
+        " sensors are exchanged, then their positions, units, clocks and std."
     )
 
 

@@ -372,11 +372,11 @@ def test_biases_that_are_not_numbers_are_named():
         point = automatic_start(problem)
         lost = point._replace(z=jnp.asarray(point.z).at[0].set(jnp.nan))
         said = misfit_sentence(problem, lost, float(mean_square(problem.model, lost)))
+        assert not misfit_sentence(problem, point, 99.0)
+        assert misfit_sentence(problem, point, 101.0).startswith("The fit explains nothing")
     assert "no finite answer: with the biases as stated the mean square a datum is 5.8" in said
     assert said.endswith("Use a prior, narrower scales, or fix some biases.")
     assert "nan" not in said
-    assert not misfit_sentence(problem, point, 99.0)
-    assert misfit_sentence(problem, point, 101.0).startswith("The fit explains nothing")
 
 
 def end(**changed):

@@ -386,7 +386,7 @@ def maximise(
     """
     check_method(method)
     given = given_of(method, problem, prior)
-    far = (np.abs(start.z) > FAR) & ~problem.surveyed
+    far = (np.abs(start.z) > FAR) & ~held(prior, problem)
     if alpha is None and prior.hierarchical and far.any():
         alpha = np.where(far, np.maximum(np.abs(start.z), FAR) ** -2.0, given.prior.alpha)
     prior = bare(method.climbs_under(prior))

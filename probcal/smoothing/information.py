@@ -17,6 +17,8 @@ from probcal.smoothing.mode import Point, factors
 STEPS = 3  # of the parameters of noise families between two modes: more change less than the next mode does
 FARTHEST = 1.0  # of one step of a log level, as for noise levels: a guess may be a factor of several off
 CHANCE = 1e-3  # probability that a sound fit rejects any channel of any sensor
+# std beyond which a datum is not explained by a std that was declared too small
+GROSS = 10.0
 
 
 def rejected(problem: Problem, point: Point) -> list[Rejected]:
@@ -24,7 +26,8 @@ def rejected(problem: Problem, point: Point) -> list[Rejected]:
 
     Their fraction of data with less than half weight lies nearer to one than to the expected one,
     and beyond chance: by the binomial distribution, Bonferroni over the channels, with one datum
-    less for each bias that the rows of the sensor read.
+    less for each bias that the rows of the sensor read. The noise family says what is expected, or
+    most sensors of the channel do where these data are not `GROSS`: its std is then too small.
     """
     from scipy import special
 
@@ -32,26 +35,29 @@ def rejected(problem: Problem, point: Point) -> list[Rejected]:
     if not any(noise.rejects for noises in model.noises for noise in noises):
         return []
     owners = [problem.measurements.sensor[index] for index in problem.row_index]
-    counts: dict[tuple[int, str, float], np.ndarray] = {}  # below half weight, and all
-    families = model.noises_at(point.levels)
-    for b, reliance in enumerate(residuals(model, point).reliance):
-        there = np.asarray(model.measured[b])
-        low = np.asarray(reliance) < HALF * there
-        for c, (channel, noise) in enumerate(zip(problem.columns[b], families[b], strict=True)):
-            each = (np.bincount(owners[b], own[:, c], len(sensors)) for own in (low, there > 0))
-            both = np.stack([*each], 1).astype(int)
-            for k in np.flatnonzero(both[:, 1] * noise.rejects).tolist():
-                key = (k, channel, noise.rejects)
-                counts[key] = counts.get(key, 0) + both[k]
-    found = []
-    for (k, channel, expected), both in counts.items():
-        below, data = both.tolist()
-        if below > 0.5 * (1.0 + expected) * data:
+    left, found = residuals(model, point), list[Rejected]()
+    counts: dict[tuple[str, float], np.ndarray] = {}  # below half weight, of these not gross, all
+    for b, noises in enumerate(model.noises_at(point.levels)):
+        mask = np.asarray(model.measured[b])
+        low = np.asarray(left.reliance[b]) < HALF * mask
+        near = np.abs(left.innovation[b]) < GROSS * np.asarray(left.std[b])
+        for c, (channel, noise) in enumerate(zip(problem.columns[b], noises, strict=True)):
+            kinds = (low[:, c], low[:, c] & near[:, c], mask[:, c] > 0)
+            each = np.stack([np.bincount(owners[b], kind, len(sensors)) for kind in kinds])
+            counts[channel, noise.rejects] = each + counts.get((channel, noise.rejects), 0)
+    counts = {key: each for key, each in counts.items() if key[1]}
+    tests = sum(np.count_nonzero(each[2]) for each in counts.values())
+    for (channel, expected), (below, mild, data) in counts.items():
+        usual = np.quantile((mild / np.maximum(data, 1))[data > 0], 0.5, method="lower")
+        expected = max(expected, float(usual))
+        for k in np.flatnonzero(below > 0.5 * (1.0 + expected) * data):
             read = [own[owner == k] for own, owner in zip(model.read, owners, strict=True)]
             used = len({m for own in read for m in np.unique(own).tolist()} - {model.biases})
-            chance = special.bdtrc(below - used - 1, data - used, expected) if below > used else 1.0
-            if chance < CHANCE / len(counts):
-                found.append(Rejected(sensors[k].name, channel, below, data, expected))
+            n = max(int(data[k]) - used, 0)
+            chance = special.bdtrc(int(below[k]) - used - 1, n, expected)
+            if n and chance < CHANCE / tests:
+                name = sensors[k].name
+                found.append(Rejected(name, channel, int(below[k]), int(data[k]), expected))
     return sorted(found, key=lambda one: -one.below)
 
 

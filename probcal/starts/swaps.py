@@ -54,7 +54,7 @@ def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> 
 
     `tracked` is the track at zero biases, `point` the mode that it led to: pairs are tried where that has a node far
     from its stated place, rejects a sensor, or has not `settled`. Each pair is screened by a few steps from the track
-    at zero biases, which robust losses keep near the truth; on top of the best a further pair, while that fits better.
+    at zero biases, which robust losses keep near the truth; on top of those kept a further pair, while one fits better.
     """
     place, z = free_places(problem), np.asarray(point.z)
     far = {name: float(np.abs(z[own]).max()) for name, own in place.items()}
@@ -63,23 +63,24 @@ def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> 
     far |= dict.fromkeys(doubtful & far.keys(), np.inf)
     if not far or (settled and max(far.values()) < GROSS):
         return
-    pairs = swaps(problem)
-    order = sorted(pairs, key=lambda pair: -max(far[pair[0]], far[pair[1]]))[:TRIED]
+    order = sorted(swaps(problem), key=lambda pair: -max(far[pair[0]], far[pair[1]]))[:TRIED]
     flat = Precision.single(jnp.zeros(len(problem.labels)))
 
-    def fitted(start: Point, iterations: int) -> tuple[float, Point]:
-        smoothed = track_mode(problem, start, iterations)
-        value = float(joint_cost(problem.model, smoothed, flat))
-        return (value if np.isfinite(value) else np.inf), smoothed
+    def fitted(start: Point) -> float:
+        value = float(joint_cost(problem.model, track_mode(problem, start, SCREENED), flat))
+        return value if np.isfinite(value) else np.inf
 
-    best, at = fitted(tracked, SCREENED)
+    best, starts = fitted(tracked), [tracked]
     for _ in range(ROUNDS):
-        placed = ((at._replace(z=jax.device_put(pairs[pair])), pair) for pair in order)
-        tried = sorted((fitted(start, SCREENED)[0], pair) for start, pair in placed)[:KEPT]
-        better = [pair for value, pair in tried if value < best - GAIN]
+        tried: dict[bytes, tuple[float, np.ndarray]] = {}
+        for start in starts:
+            for pair, exchange in swaps(problem, np.asarray(start.z)).items():
+                if pair in order and (name := exchange.round(6).tobytes()) not in tried:
+                    tried[name] = fitted(start._replace(z=jax.device_put(exchange))), exchange
+        kept = sorted(tried.values(), key=lambda one: one[0])[:KEPT]
+        better = [exchange for value, exchange in kept if value < best - GAIN]
         if not better:
             return
-        starts = [grid_start(problem, jax.device_put(pairs[pair]), 30) for pair in better]
+        best = kept[0][0]
+        starts = [grid_start(problem, jax.device_put(exchange), 30) for exchange in better]
         yield from starts
-        at, best = starts[0], tried[0][0]
-        pairs |= swaps(problem, pairs[better[0]])
