@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from probcal.clocks import CLOCK, by_clock
 from probcal.detection import Detection
 from probcal.errors import InputError, nearest
 from probcal.geodesy import LocalFrame
@@ -16,9 +17,12 @@ from probcal.labels import AXES, check_name
 from probcal.noise import Heard
 from probcal.sensor import Bias, Drift, Sensor, SensorType
 
-POSE_UNITS = {"position": "m", "heading": "rad", "pitch": "rad", "roll": "rad", "clock": "m", "time_offset": "s"}
+POSE_UNITS = {
+    "position": "m", "heading": "rad", "pitch": "rad", "roll": "rad", "clock": "m", "time_offset": "s",
+    "time_rate": "1",
+}  # fmt: skip
 ANGLES = ("heading", "pitch", "roll")
-MOVING = ("velocity", "acceleration")  # what the path of a node says
+MOVING = ("velocity", "acceleration", "heading_rate", "pitch_rate", "roll_rate", "time")  # of a path and its rows
 TURN = 2 * np.pi  # rad of a heading, pitch or roll above which degrees were meant
 Spread = float | Bias
 
@@ -56,13 +60,16 @@ class Path:
             object.__setattr__(self, name, value)
 
     def at(self, time: np.ndarray) -> dict[str, np.ndarray]:
-        """Position and velocity (N, d), heading, pitch and roll (N,) at times (N,)."""
+        """Position and velocity (N, d), heading, pitch and roll and their rates (N,) at times (N,)."""
 
         def between(values: np.ndarray) -> np.ndarray:
             return np.stack([np.interp(time, self.time, column) for column in values.T], -1)
 
         moving = {"position": between(self.position), "velocity": between(slopes(self.time, self.position))}
-        return moving | {name: np.interp(time, self.time, getattr(self, name)) for name in ANGLES}
+        for name in ANGLES:
+            angle = getattr(self, name)[:, None]
+            moving |= {name: between(angle)[:, 0], f"{name}_rate": between(slopes(self.time, angle))[:, 0]}
+        return moving
 
 
 class Node:
@@ -70,7 +77,9 @@ class Node:
 
     position (d,) in m, heading (pitch, roll) in rad, or a known `path`; extras such as `gain=0.0` are numbers, or
     vectors (d,) where a sensor type declares them so (`vectors=("boresight",)`), with a bias an axis. `clock`
-    is in m (time times speed), `time_offset` in s: the node's rows were measured so much after their stated time.
+    is in m (time times speed). A row was measured at its stated time plus `time_offset` (s) plus `time_rate` (s per s)
+    times the seconds since the first row of the table: targets and moving nodes are taken there, whatever the sensor's
+    function reads (of a sensor with several nodes, by the clock of the first).
     `survey` and `scale` give standard deviations by component (a bare number means the position; a `Bias` may
     carry the unit of a clock or an extra, a drift or `zeros`): `survey` is how well the stated value is known,
     `scale` is governed by the prior chosen at the fit, neither means known. Raises `InputError` naming node and
@@ -101,12 +110,12 @@ class Node:
         if stated.shape not in ((2,), (3,)) or not np.isfinite(stated).all():
             raise InputError(f'node "{name}": position must be 2 or 3 finite numbers, got {position!r}')
         self.position = stated
-        own = dict.fromkeys(("heading", "pitch", "roll", "clock", "time_offset"), 0.0)
+        own = dict.fromkeys(("heading", "pitch", "roll", "clock", *CLOCK), 0.0)
         self.components: dict[str, Any] = own | components
         self.components["heading"] = heading
         for vector in set(MOVING) & set(components):
             raise InputError(
-                f'node "{name}": {vector} cannot be stated; a moving node takes its velocity from path=Path(...)'
+                f'node "{name}": {vector} cannot be stated; it follows from path=Path(...) and the times of the rows'
             )
         for component, value in self.components.items():
             check_name(f'node "{name}": a component', component)
@@ -169,6 +178,11 @@ class Node:
     def dimension(self) -> int:
         """Number of coordinates."""
         return len(self.position)
+
+    @property
+    def clocked(self) -> bool:
+        """True where its rows may have been measured at another time than the stated one."""
+        return any(name in self.spread or self.components[name] for name in CLOCK)
 
     def labels(self, component: str) -> list[str]:
         """Labels of the biases of a component, one per axis where it has axes."""
@@ -269,6 +283,11 @@ class Network:
             if not isinstance(placed, Sensor):
                 raise InputError(f"the network holds {placed!r}; place a sensor with sensor_type.on(node)")
         self.nodes = self._collect_nodes()
+        late = {placed.type for placed in self.sensors if placed.nodes[0].clocked}
+        if late:
+            moving = any(node.path is not None for node in self.nodes)
+            kinds = {kind: by_clock(kind, moving=moving) for kind in late}
+            self.sensors = tuple(replace(s, type=kinds.get(s.type, s.type)) for s in self.sensors)
         self.types: tuple[SensorType, ...] = tuple(dict.fromkeys(s.type for s in self.sensors))
         self._check_names()
         self.dimension = self.nodes[0].dimension
@@ -385,8 +404,9 @@ class Network:
         records: list[BiasRecord] = []
         users: dict[str, set[str]] = {}
         for placed in self.sensors:
-            for node in placed.nodes:
-                users.setdefault(node.name, set()).update(placed.type.pose_components)
+            for k, node in enumerate(placed.nodes):
+                other = {*CLOCK} if placed.type.clocked and k else set[str]()
+                users.setdefault(node.name, set()).update(placed.type.pose_components - other)
         for node in self.nodes:
             read = users[node.name]
             for component, (kind, bias) in node.spread.items():

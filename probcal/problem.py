@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
+from probcal.clocks import CLOCK
 from probcal.errors import InputError, nearest
 from probcal.labels import NOBODY
 from probcal.model.epochs import Epoch, merged
@@ -33,10 +34,10 @@ from probcal.model.motions import (
     start_of,
     tails_of,
 )
-from probcal.model.rows import Block, Rows, addresses, make_block, pose_entries, pose_vector
+from probcal.model.rows import Block, Rows, addresses, late_by, make_block, pose_entries, pose_vector
 from probcal.model.sampled import SampledMotion
 from probcal.model.variants import aligned
-from probcal.motion import Known, Layout, LinearMotion, Static, Target, White, as_motion, labels_of
+from probcal.motion import Known, Layout, LinearMotion, Static, Target, White, as_motion, flow_of, labels_of
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, guess_of
 from probcal.plausible import check_plausible, check_scales
@@ -66,6 +67,8 @@ class Epochs:
     target: np.ndarray
     layout: Layout
     components: tuple[str, ...]
+    order: np.ndarray  # (E,) number of each epoch where all rows are taken at their stated times
+    flow: tuple[Any, ...] = ()  # parts of the motion that `motion.flow_of` names
 
     @property
     def position(self) -> tuple[int, int]:
@@ -149,6 +152,9 @@ class Problem:
         self.epoch_shift = float(np.abs(self.measurements.time - whole.time).max())  # s, of the rows to their epochs
         self.silent = _check_rows(self.measurements, network)
         self.levels: tuple[LevelRecord, ...]
+        self.begin = float(self.measurements.time.min())  # s, from which clocks that run count
+        self.moved = np.zeros(len(self.measurements.time))  # s, of each row from its stated time
+        self.timed: dict[str, float] = {}  # values of the biases of clocks that moved the rows, by label
         self._compile()
 
     def _at_epochs(self, data: Measurements) -> Measurements:
@@ -189,7 +195,7 @@ class Problem:
         check_linear(self)
         names = self.measurements.target_names
         motion = {name: self._unlinked(name, self.target(name)) for name in names}
-        return Problem(self.network, motion, self.measurements.table, fix=self.fixed, epoch=self.epoch)
+        return self.rebuild(motion=motion)
 
     def _unlinked(self, name: str, target: Target) -> Target:
         """Each component that links epochs replaced by one drawn anew, as wide as an undeclared start."""
@@ -254,8 +260,69 @@ class Problem:
 
     def rebuild(self, data: Any = None, **changes: Any) -> Problem:
         """The same problem with other data, another network or other fixed biases."""
-        settings: dict[str, Any] = {"network": self.network, "fix": self.fixed, "epoch": self.epoch} | changes
-        return Problem(motion=self.motion, data=self.measurements.table if data is None else data, **settings)
+        settings: dict[str, Any] = {
+            "network": self.network, "motion": self.motion, "fix": self.fixed, "epoch": self.epoch,
+        }  # fmt: skip
+        settings |= changes
+        found = Problem(data=self.measurements.table if data is None else data, **settings)
+        if data is not None:
+            return found
+        found.begin = self.begin
+        return found.at_times(self.moved, self.timed)
+
+    @property
+    def clocks(self) -> np.ndarray:
+        """Number of the clock that gives the rows of each sensor their times, 0 where the table does, (S,)."""
+        number = {node.name: k + 1 for k, node in enumerate(self.network.nodes) if node.clocked}
+        own = [number.get(s.nodes[0].name, 0) if s.type.clocked else 0 for s in self.network.sensors]
+        return np.array(own)
+
+    @property
+    def by_clock(self) -> list[np.ndarray]:
+        """Mask (E,) of the epochs of each recursion whose rows have a free clock."""
+        found = [np.zeros(len(epochs.time), bool) for epochs in self.epochs]
+        for data, r, index in zip(self.model.rows, self.model.recursion, self.row_index, strict=True):
+            found[r][np.asarray(data.epoch)[self.clocks[self.measurements.sensor[index]] > 0]] = True
+        return found
+
+    @property
+    def first_z(self) -> np.ndarray:
+        """Biases z (M,) at which a search begins: zero but for those of the clocks by which the rows are taken."""
+        return np.array([self.timed.get(b.label, 0.0) / b.scale for b in self.biases])
+
+    @float64
+    def at_times(self, moved: np.ndarray, timed: dict[str, float]) -> Problem:
+        """The same problem with its rows taken so many seconds (N,) after their stated times; shapes stay.
+
+        `timed` are the values of the biases by which they are.
+        """
+        if np.array_equal(moved, self.moved):
+            return self
+        other = copy(self)
+        other.moved, other.timed = moved, timed
+        other._compile()
+        return other
+
+    def lateness(self, z: Any) -> np.ndarray:
+        """Seconds (N,) from where each row is taken to where its clock puts it at biases z (M,)."""
+        late = np.zeros(len(self.moved))
+        for block, data, index in zip(self.model.blocks, self.model.rows, self.row_index, strict=True):
+            if block.type.clocked:
+                late[index] = late_by(block, data, z)
+        return late
+
+    def retimed(self, z: Any) -> Problem:
+        """The same problem with the rows of free clocks taken where biases z (M,) put them."""
+        if not self.clocks.any():
+            return self
+        values = zip(self.biases, np.asarray(z) * self.scales, strict=True)
+        timed = {b.label: float(value) for b, value in values if b.component.removesuffix("_step") in CLOCK}
+        return self.at_times(self.moved + self.lateness(z), timed)
+
+    def reordered(self, other: Problem, states: Sequence[Any]) -> list[np.ndarray]:
+        """States (E, n) of the epochs of this problem in the order that they have at the times of another."""
+        pairs = zip(self.epochs, other.epochs, states, strict=True)
+        return [np.asarray(x)[np.argsort(own.order)][new.order] for own, new, x in pairs]
 
     @property
     def scans(self) -> Scans | None:
@@ -282,7 +349,7 @@ class Problem:
         """The same problem with some rows of its table only: a mask or numbers (N,)."""
         table = self.measurements.table
         frame = table.frame.iloc[rows].reset_index(drop=True)
-        return self.rebuild(replace(table, frame=frame, lines=table.lines[rows]))
+        return self.rebuild(replace(table, frame=frame, lines=table.lines[rows])).at_times(self.moved[rows], self.timed)
 
     def redrawn(self, y: Sequence[Any]) -> Problem:
         """The same rows with other measured values: y (N, C) of each block, read where a value is measured.
@@ -347,7 +414,7 @@ class Problem:
             if found is None:
                 return None
             motions[name] = Target(found[0], {**found[1], **target.start}) if found else target
-        return Problem(self.network, motions, self.measurements.table, fix=self.fixed, epoch=self.epoch)
+        return self.rebuild(motion=motions)
 
     def seen(self) -> Problem:
         """The same problem where states are what rows see of them, (E, n) whatever the motion."""
@@ -365,6 +432,7 @@ class Problem:
         """
         other = copy(self)
         other.measurements = self._at_epochs(measure(read_table(data), self.network))
+        other.moved = np.zeros(len(other.measurements.time))
         other.silent = _check_rows(other.measurements, self.network)
         last = {str(name): float(e.time[e.target == name][-1]) for e in self.epochs for name in dict.fromkeys(e.target)}
         measured = other.measurements
@@ -395,6 +463,7 @@ class Problem:
         """
         other = copy(self)
         other.measurements = self._at_epochs(data)
+        other.moved = np.zeros(len(data.time))
         other.silent = ()
         other._compile(begun, further=True)
         model, pairs = self._aligned(other, slots)
@@ -407,7 +476,10 @@ class Problem:
 
     def _aligned(self, other: Problem, slots: Mapping[str, int]) -> tuple[Model, list[int | None]]:
         """The model of rows that came later in the form of this one, and which recursion of it each here is."""
-        forms = [list(zip((e.layout for e in p.epochs), p.model.sampled, strict=True)) for p in (self, other)]
+        forms = [
+            [(e.layout, e.flow, sampled) for e, sampled in zip(p.epochs, p.model.sampled, strict=True)]
+            for p in (self, other)
+        ]
         own = {form: r for r, form in enumerate(forms[1])}
         pairs = [own.get(form) for form in forms[0]]
         targets = [[] if r is None else [slots[n] for n in dict.fromkeys(other.epochs[r].target)] for r in pairs]
@@ -418,7 +490,7 @@ class Problem:
         levels = Levels(self.levels if further else ())
         self.longest = self._longest(begun, further)
         forms = self._forms(levels)
-        chained = [self._chained(layout, names, levels, begun) for (layout, _), names in forms.items()]
+        chained = [self._chained(layout, flow, names, levels, begun) for (layout, flow, _), names in forms.items()]
         self.epochs = [own.epochs for own in chained]
         gathered = self._gathered(levels, chained)
         self.row_index = [own.mine for own in gathered]  # rows of the table behind each block
@@ -427,7 +499,7 @@ class Problem:
         free = len(self.levels)
         recursions = tuple(_numbered(own.recursion, free) for own in chained)
         rows = tuple(_numbered(own.rows, free) for own in gathered)
-        sampled_of_each = tuple(sampled for _, sampled in forms)
+        sampled_of_each = tuple(sampled for *_, sampled in forms)
         driven = any((own.recursion.level >= 0).any() for own in chained) or any(
             number >= 0 for sampled in sampled_of_each if sampled is not None for *_, number in sampled.levels
         )
@@ -440,7 +512,8 @@ class Problem:
             len(self.biases),
             driven,
             counts,
-            all(bool((np.linalg.slogdet(part.L)[0] != 0).all()) for part in recursions),
+            # rows of clocks may fall on one time, here or where they are taken next
+            not self.clocks.any() and all(bool((np.linalg.slogdet(part.L)[0] != 0).all()) for part in recursions),
             sampled_of_each,
             recursions,
             rows,
@@ -454,7 +527,7 @@ class Problem:
         """The longest time in s between two epochs of a target; of rows that come later, what it was before them."""
         data, longest = self.measurements, 0.0
         for n, name in enumerate(data.target_names):
-            times = np.unique(data.time[data.target == n])
+            times = np.unique((data.time + self.moved)[data.target == n])
             longest = max(longest, float(np.diff(times, prepend=begun.get(name, times[0])).max()))
         if not further:
             return longest or 1.0
@@ -466,30 +539,35 @@ class Problem:
             )
         return self.longest
 
-    def _forms(self, levels: Levels) -> dict[tuple[Layout, SampledMotion | None], list[str]]:
-        """The targets whose states are alike, by layout and motion without linear form: one recursion each."""
-        forms: dict[tuple[Layout, SampledMotion | None], list[str]] = {}
+    def _forms(self, levels: Levels) -> dict[tuple[Layout, tuple[Any, ...], SampledMotion | None], list[str]]:
+        """The targets whose states are alike, by layout, flow and motion without linear form: one recursion each."""
+        forms: dict[tuple[Layout, tuple[Any, ...], SampledMotion | None], list[str]] = {}
+        goes_on = any("at" in kind.target_components for kind in self.network.types)
         for name in self.measurements.target_names:
             motion = as_motion(self.target(name).motion).within(self.longest)
             layout, sampled = form_of(name, motion, levels, self.network.dimension)
             if "position" not in {component for component, *_ in layout}:
                 raise InputError(f'target "{name}": the motion has no position; add ConstantVelocity(std) or Static()')
-            forms.setdefault((layout, sampled), []).append(name)
+            flow = flow_of(linear_of(motion), self.network.dimension) if goes_on else ()
+            forms.setdefault((layout, flow, sampled), []).append(name)
         return forms
 
-    def _chained(self, layout: Layout, names: list[str], levels: Levels, begun: Mapping[str, float]) -> _Chained:
+    def _chained(
+        self, layout: Layout, flow: tuple[Any, ...], names: list[str], levels: Levels, begun: Mapping[str, float]
+    ) -> _Chained:
         """The epochs of some targets, one target after the other, and the epoch of each of their rows."""
         data, area, dimension = self.measurements, self.area, self.network.dimension
         epoch_of = np.full(len(data.time), -1)
         parts, drives, times = list[Any](), list[tuple[Any, int]](), list[np.ndarray]()
-        offset = 0
+        orders, clocks, offset = list[np.ndarray](), self.clocks[data.sensor], 0
         for name in names:
             target = self.target(name)
             rows = data.target == data.target_names.index(name)
-            time = np.unique(data.time[rows])
-            if getattr(as_motion(target.motion), "static", False) and name not in begun:
-                time = time[:1]
-            epoch_of[rows] = offset + np.minimum(np.searchsorted(time, data.time[rows]), len(time) - 1)
+            self._check_memory(name, np.unique(data.sensor[rows]))
+            still = getattr(as_motion(target.motion), "static", False) and name not in begun
+            time, order, own = _epochs(data.time[rows], self.moved[rows], clocks[rows], once=still)
+            epoch_of[rows] = offset + own
+            orders.append(offset + order)
             arrays = chain(name, target, time, levels, begun.get(name), area, self._counting(name))
             first = np.arange(len(time)) == (0 if name not in begun else -1)
             dt = np.diff(time, prepend=begun.get(name, time[0]))
@@ -500,8 +578,26 @@ class Problem:
         columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
         recursion = Recursion(*columns)._replace(tails=_tails(drives, offset))
         owners = np.repeat(names, [len(time) for time in times])
-        epochs = Epochs(np.concatenate(times), owners, layout, labels_of(layout, dimension))
+        order = np.concatenate(orders)
+        epochs = Epochs(np.concatenate(times), owners, layout, labels_of(layout, dimension), order, flow)
         return _Chained(recursion, epochs, epoch_of)
+
+    def _check_memory(self, name: str, sensors: np.ndarray) -> None:
+        """Raise `InputError` for a sensor with a clock that reads what a target has at one epoch only."""
+        anew = {
+            part
+            for c in linear_of(as_motion(self.target(name).motion))
+            if c.memoryless and not c.timed
+            for part, _ in c.names()
+        }
+        for k in sensors[self.clocks[sensors] > 0]:
+            placed = self.network.sensors[k]
+            if both := sorted(anew & placed.type.target_components):
+                raise InputError(
+                    f'sensor "{placed.name}" reads target.{both[0]}, of which every epoch has its own, so that its'
+                    f' rows cannot have times of their own; leave time_offset of node "{placed.nodes[0].name}" out'
+                    " and free what the sensor has of a clock"
+                )
 
     def _gathered(self, levels: Levels, chained: list[_Chained]) -> list[_Gathered]:
         """Rows by sensor type and recursion."""
@@ -513,7 +609,7 @@ class Problem:
             for r, own in enumerate(chained):
                 chosen = self._rows_of(kind, own.epoch_of >= 0)
                 if len(chosen):
-                    block = make_block(self.network, kind, own.epochs.layout)
+                    block = make_block(self.network, kind, own.epochs.layout, own.epochs.flow)
                     numbers, pieces = self._rows(block, chosen, own.epoch_of[chosen], level_of)
                     unknown = parameters(kind, self.network.dimension, levels, sensors, pieces)
                     block = replace(block, unknown=unknown) if unknown else block
@@ -541,7 +637,8 @@ class Problem:
         for pair, own in zip(nodes, pieces, strict=True):
             for a, node in enumerate(pair):
                 self._check_path(node, chosen[own])
-                pose[own, a] = pose_vector(node, block.extras, data.time[chosen[own]])
+                moved = self.moved[chosen[own]]
+                pose[own, a] = pose_vector(node, block.extras, data.time[chosen[own]] + moved, moved, self.begin)
         first = np.cumsum([0, *map(len, starts)])
         for s, own in enumerate(pieces):
             sensor[own] = first[s] + np.searchsorted(starts[s], data.time[chosen[own]], side="right") - 1
@@ -608,6 +705,24 @@ def _numbered[P: (Recursion, Rows)](part: P, free: int) -> P:
     """Arrays whose known levels have the number after those of the `free` ones."""
     level: Any = np.where(part.level < 0, free, part.level)
     return part._replace(level=level)
+
+
+def _epochs(
+    time: np.ndarray, moved: np.ndarray, clock: np.ndarray, *, once: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times (E,) of the epochs of one target, their order at stated times (E,), and the epoch of each row (N,).
+
+    Rows of one stated time share an epoch, but for those of a free clock, which have theirs. With `once` there is one.
+    """
+    if once:
+        return time.min()[None], np.zeros(1, int), np.zeros(len(time), int)
+    if not clock.any():
+        found, own = np.unique(time, return_inverse=True)
+        return found, np.arange(len(found)), own
+    _, first, own = np.unique(np.stack([time, clock]), axis=1, return_index=True, return_inverse=True)
+    found = (time + moved)[first]
+    order = np.argsort(found, kind="stable")
+    return found[order], order, np.argsort(order)[own.ravel()]
 
 
 def _tails(drives: list[tuple[Any, int]], epochs: int) -> tuple[Tail, ...]:

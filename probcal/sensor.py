@@ -197,6 +197,7 @@ class SensorType:
     pose_components: frozenset[str]
     dimensions: tuple[int, ...]  # those in which the function works
     vectors: frozenset[str] = frozenset(VECTORS)  # components of targets and poses with one value an axis
+    clocked: bool = False  # whether rows are taken at the time of their node's clock (`clocks.by_clock`)
 
     @cached_property
     def fingerprint(self) -> str:

@@ -121,10 +121,9 @@ def radar_3d(target, pose, *, range_offset=Bias("m", 10.0), range_scale=Bias("1"
     """Radar in 3-D with the biases of a real one (thesis 2.3.4): slant range, azimuth and elevation in its own axes.
 
     Range offset and gain (`range_scale`) are here; the rest are its node's: position (z with the sign turned is the
-    altitude bias), heading (north alignment), pitch and roll (axis tilt, antenna pitch and roll), and `time_offset`.
+    altitude bias), heading (north alignment), pitch and roll (axis tilt, antenna pitch and roll), and its clock.
     """
-    seen = target.at(pose.time_offset).position - pose.time_offset * pose.velocity
-    line = pose.local(seen)
+    line = pose.local(target.position)
     distance = (1 + range_scale) * norm(line) + range_offset
     return dict(range=distance, azimuth=bearing(line), elevation=elevation(line))
 

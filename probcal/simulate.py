@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from os import PathLike
@@ -212,7 +212,8 @@ def simulate(
 
     Biases are drawn from their scales, a `share` of them non-zero, unless given by label. `tracks` maps
     target names to positions (T, d) or to frames with state columns; what they leave out is drawn from the
-    motion. `missing` data are left blank, `outliers` get `outlier_scale` times the noise on top.
+    motion, and rows by a free clock see their spline. `missing` data are left blank, `outliers` get `outlier_scale`
+    times the noise on top.
 
     >>> again = simulate(network, motion, np.arange(60.0), key=0, share=0.2, missing=0.1)
     >>> again.table.columns.tolist()
@@ -230,13 +231,13 @@ def simulate(
     plan = _plan(network, time, targets) if schedule is None else schedule.reset_index(drop=True)
     problem = Problem(network, motion, blank(network, plan))
     z = _biases(problem, share, biases, keys[0])
+    problem, tracks = _by_clock(problem, z, time, tracks)
     states = [_states(problem, r, tracks, keys[1]) for r in range(len(problem.epochs))]
     columns = {name: np.full(len(plan), np.nan) for name in network.channel_names}
-    levels = np.zeros(len(problem.levels))
     pieces = zip(problem.model.blocks, problem.model.rows, problem.model.recursion, problem.row_index, strict=True)
     for b, (block, data, r, index) in enumerate(pieces):
         seed = jax.random.split(jax.random.fold_in(keys[2], b), 3)
-        drawn = np.array(_drawn(block, data, states[r], z, levels, seed[0]))
+        drawn = np.array(_drawn(block, data, states[r], z, np.zeros(len(problem.levels)), seed[0]))
         drawn = _spoil(block, data, drawn, outliers, outlier_scale, seed[1])
         gone = np.asarray(jax.random.uniform(seed[2], drawn.shape)) < missing
         for c, (name, channel) in enumerate(block.type.expand(network.dimension)):
@@ -252,8 +253,7 @@ def simulate(
     track = pd.concat(parts, ignore_index=True)
     track = track[["time", "target", *(c for c in track.columns if c not in ("time", "target"))]]
     track = track[track["target"] != NOBODY].reset_index(drop=True)
-    values = dict(zip(problem.labels, (z * problem.scales).tolist(), strict=True))
-    return Simulation(table, Truth(track, values))
+    return Simulation(table, Truth(track, dict(zip(problem.labels, (z * problem.scales).tolist(), strict=True))))
 
 
 def _detections(
@@ -366,10 +366,13 @@ def _states(problem: Problem, r: int, tracks: Mapping[str, Any], key: jax.Array)
         states = np.asarray(problem.model.vectors(r, sampled.whole(states, others)))
     count = {name: int((epochs.target == name).sum()) for name in tracks}
     frames = {
-        name: _frame(track, problem.network.dimension, count[name], name)
+        name: _frame(
+            track(epochs.time[epochs.target == name]) if callable(track) else track,
+            problem.network.dimension, count[name], name,
+        )
         for name, track in tracks.items()
         if count[name]
-    }
+    }  # fmt: skip
     return on_tracks(epochs, states, frames)
 
 
@@ -387,6 +390,26 @@ def on_tracks(epochs: Epochs, states: np.ndarray, tracks: Mapping[str, pd.DataFr
             elif (position := component.replace("velocity", "position")) in frame and len(mine) > 1:
                 states[mine, j] = np.gradient(frame[position].to_numpy(float), epochs.time[mine])
     return states
+
+
+def _by_clock(
+    problem: Problem, z: np.ndarray, time: np.ndarray, tracks: Mapping[str, Any]
+) -> tuple[Problem, Mapping[str, Any]]:
+    """The problem with its rows where their clocks put them, and then the tracks as functions of time."""
+    if not problem.clocks.any():
+        return problem, tracks
+    splines = {name: _spline(time, own, name) if len(own) > 1 else own for name, own in tracks.items()}
+    return problem.retimed(z), splines
+
+
+def _spline(time: np.ndarray, track: Any, name: str) -> Callable[[np.ndarray], pd.DataFrame]:
+    """A track given at times (T,), as a function of other times: its spline, and the velocity of this."""
+    from scipy.interpolate import CubicSpline  # loaded where a track is read between its times
+
+    frame = _frame(track, np.shape(track)[-1], len(time), name)
+    curves = {str(column): CubicSpline(time, frame[column].to_numpy(float)) for column in frame}
+    slopes = {c.replace("position", "velocity"): curve.derivative() for c, curve in curves.items() if "position" in c}
+    return lambda at: pd.DataFrame({name: curve(at) for name, curve in (slopes | curves).items()})
 
 
 def _frame(track: Any, dimension: int, epochs: int, name: str) -> pd.DataFrame:

@@ -20,6 +20,7 @@ REMEDIES: dict[type[Exception], str] = {  # what jax raises where Python asks fo
     jax.errors.TracerIntegerConversionError: "write jnp.asarray(values)[index] for an index into a list",
     jax.errors.ConcretizationTypeError: "leave out float() and int(), and write jnp. for math.",
 }
+RATES = {"position": "velocity", "heading": "heading_rate", "pitch": "pitch_rate", "roll": "roll_rate"}  # of a path
 LIBRARIES = ("probcal", "jax", "jaxlib", "numpy")  # packages whose lines are not the user's
 
 
@@ -81,8 +82,15 @@ class View:
 class TargetView(View):
     """One target at one instant: its state components by name, in metres, seconds and radians."""
 
+    def __init__(self, owner: str, components: Mapping[str, Any], flow: Callable[..., Mapping[str, Any]] | None = None):
+        super().__init__(owner, components)
+        self._flow = flow
+
     def at(self, dt: Any) -> "TargetView":
-        """Extrapolate by `dt` seconds along velocity and acceleration; other components stay."""
+        """The target `dt` seconds later, as its motion goes on without noise.
+
+        A component that does not move by itself stays.
+        """
         moved = dict(self._components)
         acceleration = moved.get("acceleration")
         if "velocity" in moved:
@@ -90,11 +98,21 @@ class TargetView(View):
         if acceleration is not None:
             moved["position"] = moved["position"] + 0.5 * dt**2 * acceleration
             moved["velocity"] = moved["velocity"] + dt * acceleration
+        if self._flow is not None:
+            moved |= self._flow(dt)
         return TargetView(self._owner, moved)
 
 
 class PoseView(View):
     """One node at one instant, already corrected for its biases: position, velocity, heading and what it owns."""
+
+    def at(self, dt: Any, **changes: Any) -> "PoseView":
+        """The node `dt` seconds later along its path, with other values of some components."""
+        moved = self._components | changes
+        for name, rate in RATES.items():
+            if rate in moved:
+                moved[name] = moved[name] + dt * moved[rate]
+        return PoseView(self._owner, moved)
 
     def local(self, point: Any) -> jax.Array:
         """A point of the common frame in the node's own axes (x ahead, y left, z up), from the node."""

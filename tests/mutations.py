@@ -160,7 +160,10 @@ MUTATIONS = [
     Mutation("jnp.where(epoch.recursion == r, jnp.where", "jnp.where(epoch.recursion >= 0, jnp.where", "test_motion_protocol.py"),
     Mutation("total = total + jax.lax.cond(", "total = jax.lax.cond(", "test_motion_protocol.py"),
     # problem.py
-    Mutation("epoch_of[rows] = offset + np.minimum(", "epoch_of[rows] = np.minimum(", "test_exact.py"),
+    Mutation("epoch_of[rows] = offset + own", "epoch_of[rows] = own", "test_exact.py"),
+    Mutation("return offset + rate * time", "return offset", "test_clocks.py"),
+    Mutation("return function(target.at(late), pose.at(late", "return function(target, pose.at(late", "test_clocks.py"),
+    Mutation("found[order], order, np.argsort(order)", "found[order], order, (order)", "test_clocks.py"),
     Mutation("data.time[chosen[own]], side=\"right\") - 1", "data.time[chosen[own]], side=\"left\") - 1", "test_exact.py test_drift.py"),
     Mutation("level=np.where(own, -1,", "level=np.where(own, 0,", "test_formulas.py"),
     Mutation("pace, wander = area.wide * extent / duration", "pace, wander = area.wide * extent", "test_formulas.py test_model.py"),

@@ -308,7 +308,7 @@ def tracked(motion):
 @pytest.mark.parametrize(
     ("declare", "text"),
     [
-        (lambda: Node("a", (0, 0), velocity=1.0), 'node "a": velocity cannot be stated; a moving node'),
+        (lambda: Node("a", (0, 0), velocity=1.0), 'node "a": velocity cannot be stated; it follows from path'),
         (
             lambda: Path([0, 1], [(0, 0), (1, 1)], pitch=[0.0]),
             r"Path: time has shape \(T,\), position .* pitch and roll",
@@ -548,6 +548,7 @@ def test_a_moving_node_carries_its_velocity_and_its_angles():
     np.testing.assert_allclose(predicted(sensors.doa_3d, [robot], state, {}), angles(axes.apply(line)))
     late = Node("a", heading=0.1, path=ROBOT, scale={"time_offset": 1.0})  # both have moved on half a second later
     line = line + 0.5 * (np.array(V[3]) - (2, 1, 0.4))
+    axes = Rotation.from_euler("ZYX", [0.32, -0.165, 0.1]).inv()
     found = predicted(sensors.radar_3d, [late], state, {"a.time_offset": 0.5})
     np.testing.assert_allclose(found, [np.linalg.norm(line), *angles(axes.apply(line))])
     assert (Path([5.0], [(10, 5, 2)]).at(np.array([5.0]))["velocity"] == 0).all()

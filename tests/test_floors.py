@@ -17,7 +17,7 @@ FLOORS = {
         "linalg", "devices", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files",
         "status", "wings",
     ),
-    1: ("sensor", "motion", "priors", "noise", "detection"),
+    1: ("sensor", "motion", "priors", "noise", "detection", "clocks"),
     2: ("sensors",),
     3: ("geodesy", "misfit", "network", "table", "nodes", "plausible"),
     4: ("model", "problem", "scans", "simulate"),

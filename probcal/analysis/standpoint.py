@@ -31,7 +31,7 @@ def standpoint(problem: Problem, point: Point | None, truth: Truth | None) -> Po
     """The point where a problem is looked at: a given one, that of a truth, else the automatic start."""
     if point is not None or truth is None:
         if point is None and too_large(problem.model):
-            return grid_start(problem, jnp.zeros(problem.model.biases), START_STEPS)
+            return grid_start(problem, jnp.asarray(problem.first_z), START_STEPS)
         return automatic_start(problem) if point is None else point
     z, states = true_point(problem, truth)
     one = tuple(x[0] for x in states)

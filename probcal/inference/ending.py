@@ -185,7 +185,7 @@ def _points(problem: Problem, point: Point, square: float) -> Iterator[Point]:
     if np.isfinite(square) or drawn:
         yield point
     if not drawn:
-        yield track_mode(problem, uncalibrated(automatic_start(problem)))
+        yield track_mode(problem, uncalibrated(problem, automatic_start(problem)))
 
 
 def _remains(problem: Problem, point: Point) -> MisfitData:

@@ -301,7 +301,7 @@ def track(
         return judge_tracks(build_tracks(problem, bands(tracks, before)), problem, found, after)
     covariance = jnp.asarray(found.covariance)
     start = at_levels(problem.model, automatic_start(problem), jnp.asarray(found.levels))
-    before = track_mode(problem, uncalibrated(start))
+    before = track_mode(problem, uncalibrated(problem, start))
     after = track_mode(problem, start._replace(z=jnp.asarray(found.z)))
     if problem.model.tailed:
         _, before = settle(problem, before, jnp.zeros_like(covariance))
@@ -315,7 +315,7 @@ def _many_tracks(problem: Problem, found: Calibrated) -> tuple[list[Tracks], Poi
     """Tracks at a calibration, and points without and with it, where the response of states to
     biases does not fit."""
     z = jnp.asarray(found.z)
-    before = settle_each(problem.model, grid_start(problem, jnp.zeros_like(z), 30))
+    before = settle_each(problem.model, grid_start(problem, jnp.asarray(problem.first_z), 30))
     after = settle_each(problem.model, grid_start(problem, z, 30))
     variances = settled_variances(problem.model, after, found.root)
     return [Tracks(np.asarray(x), np.sqrt(own)) for x, own in zip(after.states, variances, strict=True)], before, after

@@ -115,12 +115,15 @@ def identified(problem: Problem, fit: xr.DataTree, answer: Answer | None) -> tup
     """The problem as it was fitted, and its data; raises `InputError` where the tree is no fit of this problem."""
     if "calibration" not in fit.children or "track" not in fit.children:
         raise InputError("assess: the tree is no fit; give the problem and the DataTree that fit() returned for it")
-    if fit.attrs.get("motion") == "left out":
-        problem = problem.unlinked() if answer is None else answer.problem
-    problem = _weighted(problem, dict(each_track(fit))) if answer is None else answer.problem
     group = fit["calibration"].to_dataset()
     if group["bias_label"].values.tolist() != list(problem.labels):
         raise InputError("assess: the tree was fitted with other free biases; give the problem as it was fitted")
+    if answer is not None:
+        problem = answer.problem
+    else:
+        problem = problem.unlinked() if fit.attrs.get("motion") == "left out" else problem
+        problem = problem.retimed(group["mean"].values / problem.scales)
+        problem = _weighted(problem, dict(each_track(fit)))
     datum, picks = datum_of(problem)
     if not np.array_equal(datum["y"], fit["observed_data"].to_dataset()["y"].values):
         raise InputError("assess: the tree was fitted to other data; give the problem as it was fitted")

@@ -14,20 +14,24 @@ from probcal.inference.progress import Monitor, Stopped
 from probcal.inference.run import Context, Maximiser, Method
 from probcal.inference.sparse import PRODUCTS, check_sparse, gains_by_sparse, sparse_climb, takes_sparse
 from probcal.inference.sparse_gibbs import check_gibbs
-from probcal.labels import SCENE, START
+from probcal.labels import SCENE, START, listed
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.smoothing.grid import follow_states, grid_start
+from probcal.smoothing.joint import too_large
 from probcal.smoothing.mirrors import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, other_sides
 from probcal.smoothing.mode import Point
 from probcal.smoothing.reflections import new, reach
 from probcal.smoothing.room import check_room
 from probcal.starts import further_starts
 from probcal.starts import optima as optima_of
+from probcal.starts.clocks import first_times, settled_times, taken_there
 from probcal.status import Status
 
 ELSEWHERE = "found from another start"
+ROUNDS = 8  # answers in turn, each with the rows where the one before puts them
+STILL = 0.1  # sd by which no clock moves at the end of them
 TRIES = 3  # climbs by particles from one start
 DIFFERENT = 2.0  # sd by which an answer from another start must differ in some bias to be one of its own
 APART = 0.01  # scales that count as an sd where that is smaller
@@ -37,6 +41,42 @@ def solve(
     problem: Problem, method: Method, prior: Prior, context: Context, *, start: Point | None = None, starts: int = 1
 ) -> Answer:
     """The answer of a method, the best of several starts; its `optima` are all of them where there are several.
+
+    Rows of free clocks are taken where the answer puts them: its problem is then the given one `retimed`, solved again
+    until no clock moves by `STILL` sd. A sampler takes them where the joint mode does.
+    """
+    if not problem.clocks.any():
+        return _solve(problem, method, prior, context, start, starts)
+    monitor = context.monitor
+    monitor.enter("clocks", method.name)
+    if start is not None:
+        problem, start = taken_there(problem, start)
+    else:
+        problem = first_times(problem, lambda: bool(monitor.stopped))
+        if all(form is None for form in problem.model.sampled) and not too_large(problem.model):
+            found = optima_of(problem, stopped=lambda: bool(monitor.stopped))
+            problem, point = settled_times(problem, found[0].point)
+            start = point if len(found) == 1 and starts == 1 else None
+    for _ in range(ROUNDS):
+        answer = _solve(problem, method, prior, context, start, starts)
+        if not (method.climbs and answer.posterior.sound and answer.motion == "used"):
+            return answer
+        summary = answer.posterior.summary
+        later = problem.retimed(summary.mean)
+        away = np.abs(later.first_z - problem.first_z)
+        if np.all(away <= STILL * summary.sd) or monitor.stopped:
+            return answer
+        problem, start = taken_there(problem, answer.posterior.point)
+    moving = [problem.labels[m] for m in np.flatnonzero(away > STILL * summary.sd)]
+    said = f"The rows could not be given times: {listed(moving, 3)} still moves."
+    status = Status.NOT_CONVERGED if answer.status.settled else answer.status
+    return replace(answer, status=status, message=f"{answer.message} {said}".strip())
+
+
+def _solve(
+    problem: Problem, method: Method, prior: Prior, context: Context, start: Point | None, starts: int
+) -> Answer:
+    """The answer of a method with every row at its time.
 
     A sampler starts at the best joint mode under the declared scales where there are several
     starts, or noise levels that are unknown. The context's key seeds draws and further starts; its
@@ -48,7 +88,7 @@ def solve(
         return _by_particles(problem, method, prior, context, start, starts)
     given, problem = problem, method.prepare(problem)
     if (sparse := _sparsely(problem, method, prior, starts)) is not None:
-        first = grid_start(problem, jnp.zeros(problem.model.biases), 30) if start is None else start
+        first = grid_start(problem, jnp.asarray(problem.first_z), 30) if start is None else start
         return _in_sparse_form(problem, sparse, prior, first, context)
     if start is None:
         points = [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))]
@@ -155,16 +195,12 @@ def _by_particles(
     near = problem if linear else problem.loosened()
     mirrors: tuple[Mirrored, ...] = ()
     if start is None and near is not None:
-        first = solve(
-            near,
-            MAP(trajectory="joint"),
-            Gaussian(),
-            context._replace(monitor=context.monitor.silent()),
-        )
+        silent = context._replace(monitor=context.monitor.silent())
+        first = _solve(near, MAP(trajectory="joint"), Gaussian(), silent, None, 1)
         start = first.posterior.point if first.status.valid and first.posterior.sound else None
         mirrors = first.mirrors if linear and start is not None and method.climbs else ()
     drawn = np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(context.key, 1))))
-    begin = np.zeros(problem.model.biases) if start is None else np.asarray(start.z)
+    begin = problem.first_z if start is None else np.asarray(start.z)
     places = [begin, *drawn.standard_normal((starts - 1, len(begin)))]
     answers = []
     for k, z in _starts(places, method, context.monitor):

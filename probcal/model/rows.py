@@ -16,7 +16,7 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.geometry import wrap
 from probcal.motion import Layout, view
-from probcal.network import ANGLES, Network, Node
+from probcal.network import ANGLES, MOVING, Network, Node
 from probcal.noise import AdditiveNoise, Bernoulli, level_at, with_values
 from probcal.sensor import Channel, Sensor, SensorType
 from probcal.types import PoseView
@@ -47,6 +47,7 @@ class Block:
     extras: tuple[str, ...]  # pose components beyond the position, in the order of a pose vector
     free: tuple[tuple[int, int], ...]  # (node, entry of its pose vector) of the biased pose entries
     steps: tuple[int, ...]  # which bias each further column steps: the biased pose entries, then those of the sensor
+    flow: tuple[Any, ...] = ()  # components of the motion that `target.at` does not know, as in `motion.flow_of`
     unknown: tuple[Parameter, ...] = ()  # of the noise families of its channels
 
     @property
@@ -86,12 +87,13 @@ class Linearised(NamedTuple):
     bias: jax.Array  # (N, C, p) Jacobian by z
 
 
-def make_block(network: Network, kind: SensorType, layout: Layout) -> Block:
+def make_block(network: Network, kind: SensorType, layout: Layout, flow: tuple[Any, ...] = ()) -> Block:
     """Static part for the sensors of one type; raises `InputError` for a component nobody states."""
     known = {name: (start, stop) for name, start, stop, _ in layout}
     asked = set(kind.target_components) & set(known)
     if "at" in kind.target_components:  # extrapolates along what there is
         asked |= {"velocity", "acceleration"} & set(known)
+        asked |= {name for part in flow for name, _ in part.names()}
     missing = sorted(kind.target_components - set(known) - {"at"})
     if missing:
         name, vector = missing[0], ", per_axis=True" if missing[0] in kind.vectors else ""
@@ -114,13 +116,13 @@ def make_block(network: Network, kind: SensorType, layout: Layout) -> Block:
     for sensor in placed:
         for node in sensor.nodes:
             for name in extras:
-                if name != "velocity" and name not in node.components:
+                if name not in MOVING and name not in node.components:
                     value = (0.0,) * network.dimension if name in kind.vectors else 0.0
                     raise InputError(
                         f'sensor {kind.name} reads pose.{name}, which node "{node.name}" does not have'
                         f"{nearest(name, node.components)}; state it, as in Node(..., {name}={value})"
                     )
-                if name == "velocity" or (np.ndim(node.components[name]) > 0) == (name in kind.vectors):
+                if name in MOVING or (np.ndim(node.components[name]) > 0) == (name in kind.vectors):
                     continue
                 if name in kind.vectors:
                     raise InputError(
@@ -140,7 +142,8 @@ def make_block(network: Network, kind: SensorType, layout: Layout) -> Block:
     )
     columns = zip(*(addresses(kind, sensor, free, entries) for sensor in placed), strict=True)
     steps = [(k, max(len(network.steps(*address)) for address in column)) for k, column in enumerate(columns)]
-    return Block(kind, layout, network.dimension, used, extras, free, tuple(k for k, n in steps for _ in range(n)))
+    columns_of = tuple(k for k, n in steps for _ in range(n))
+    return Block(kind, layout, network.dimension, used, extras, free, columns_of, flow)
 
 
 def addresses(
@@ -157,10 +160,17 @@ def pose_entries(kind: SensorType, dimension: int) -> list[tuple[str, int]]:
     return [(name, axis) for name in parts for axis in range(dimension if name in kind.vectors else 1)]
 
 
-def pose_vector(node: Node, extras: tuple[str, ...], time: np.ndarray) -> np.ndarray:
-    """Stated pose of a node at times (N,), shape (N, P); angles of a path add to those of the node."""
-    still = {"position": node.position, "velocity": np.zeros(node.dimension)} | node.components
+def pose_vector(
+    node: Node, extras: tuple[str, ...], time: np.ndarray, moved: np.ndarray | float = 0.0, begin: float = 0.0
+) -> np.ndarray:
+    """Stated pose of a node at times (N,), shape (N, P); angles of a path add to those of the node.
+
+    Rows were `moved` (N,) by what is known of their clock, and count `pose.time` from `begin` on.
+    """
+    zero: dict[str, Any] = {"velocity": np.zeros(node.dimension), **dict.fromkeys(MOVING[1:], 0.0)}
+    still = {"position": node.position, **zero} | node.components
     stated = {name: np.broadcast_to(value, (len(time), *np.shape(value))) for name, value in still.items()}
+    stated |= {"time": time - begin, "time_offset": stated["time_offset"] - moved}
     if node.path is not None:
         moving = node.path.at(time)
         stated |= {name: value + stated[name] if name in ANGLES else value for name, value in moving.items()}
@@ -224,7 +234,7 @@ def _added(vector: jax.Array, places: Sequence[int], values: jax.Array) -> jax.A
 def _one(block: Block, state: jax.Array, pose: jax.Array, local: jax.Array) -> jax.Array:
     """Predicted channels (C,) of one row from its state (n,), poses (nodes, P) and biases (p,)."""
     poses, biases = _scene(block, pose, local)
-    return block.type.evaluate(view(block.layout, state), poses, biases)
+    return block.type.evaluate(view(block.layout, state, block.flow), poses, biases)
 
 
 def _scene(block: Block, pose: jax.Array, local: jax.Array) -> tuple[list[PoseView], dict[str, jax.Array]]:
@@ -239,13 +249,29 @@ def _scene(block: Block, pose: jax.Array, local: jax.Array) -> tuple[list[PoseVi
     return poses, dict(zip(block.type.biases, local[len(block.free) :], strict=True))
 
 
+def late_by(block: Block, rows: Rows, z: np.ndarray) -> np.ndarray:
+    """Seconds (N,) from the epoch of each row to where its clock puts it at biases z (M,)."""
+    entries = [name for name, _ in pose_entries(block.type, block.dimension)]
+    padded = np.append(np.asarray(z, float), 0.0)
+    local = np.asarray(rows.base) + np.asarray(rows.scale) * padded[np.asarray(rows.bias)]
+    constant = local.shape[1] - len(block.steps)
+    for k, column in enumerate(block.steps):
+        local[:, column] += local[:, constant + k]
+    pose = np.asarray(rows.pose)[:, 0].copy()
+    for k, (a, e) in enumerate(block.free):
+        if a == 0:
+            pose[:, e] += local[np.asarray(rows.sensor), k]
+    offset, rate, time = (pose[:, entries.index(name)] for name in ("time_offset", "time_rate", "time"))
+    return offset + rate * time
+
+
 def look(block: Block, rows: Rows, states: jax.Array, z: jax.Array, seen: Callable[..., Any]) -> jax.Array:
     """A function of target and pose(s), such as a field of view, at every row: (N, ...)."""
     local = read_biases(block, rows, z)
 
     def one(state: jax.Array, pose: jax.Array, b: jax.Array) -> jax.Array:
         poses, _ = _scene(block, pose, b)
-        return jnp.asarray(seen(view(block.layout, state), *poses))
+        return jnp.asarray(seen(view(block.layout, state, block.flow), *poses))
 
     return jax.vmap(one)(states[rows.epoch], rows.pose, local)
 

@@ -10,5 +10,5 @@ from probcal.motion.components import (
     White,
 )
 from probcal.motion.known import Known
-from probcal.motion.layout import Layout, labels_of, view
+from probcal.motion.layout import Layout, flow_of, labels_of, view
 from probcal.motion.target import Target

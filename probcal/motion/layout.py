@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import is_dataclass, replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
@@ -40,9 +42,42 @@ def pieces(layout: Layout, state: Any) -> dict[str, Any]:
     return {name: state[start:stop] if per_axis else state[start] for name, start, stop, per_axis in layout}
 
 
-def view(layout: Layout, state: Any) -> TargetView:
-    """Read a state vector (n,) by component name, as a sensor function does."""
-    return TargetView("the target", pieces(layout, state))
+def view(layout: Layout, state: Any, flow: Sequence[Any] = ()) -> TargetView:
+    """Read a state vector (n,) by component name, as a sensor function does; `flow` is that of `flow_of`."""
+    if not flow:
+        return TargetView("the target", pieces(layout, state))
+    spans = {name: (start, stop) for name, start, stop, _ in layout}
+    dimension = next(stop - start for name, start, stop, _ in layout if name == "position")
+
+    def moved(dt: Any) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for part in flow:
+            own = layout_of([part], dimension)
+            start = spans[own[0][0]][0]
+            F = part.transition(jnp.reshape(dt, (1,)), dimension)[0]
+            found |= pieces(own, F @ state[start : start + own[-1][2]])
+        return found
+
+    return TargetView("the target", pieces(layout, state), moved)
+
+
+def flow_of(components: Iterable[Any], dimension: int) -> tuple[Any, ...]:
+    """The components whose state goes on otherwise than `TargetView.at` knows, each of unit std.
+
+    They are those that turn, or decay: what has a memory and no constant velocity or acceleration.
+    """
+    found = []
+    for part in components:
+        layout, dt = layout_of([part], dimension), 0.7  # s, any that shows the form
+        if part.memoryless:
+            continue
+        eye = np.eye(layout[-1][2])
+        known = TargetView("the target", {name: eye[start:stop] for name, start, stop, _ in layout}).at(dt)
+        same = np.concatenate([getattr(known, name) for name, *_ in layout])
+        if not np.allclose(part.transition(np.full(1, dt), dimension)[0], same, atol=1e-12):
+            declared: Any = part
+            found.append(replace(declared, std=1.0) if is_dataclass(part) and hasattr(part, "std") else part)
+    return tuple(found)
 
 
 def stacked(component: Any, start: Start, dimension: int) -> tuple[np.ndarray, np.ndarray]:

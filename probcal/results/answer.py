@@ -143,7 +143,7 @@ class Posterior(ABC):
     @cached_property
     def before(self) -> Point:
         """The point with all biases zero, each trajectory at its mode."""
-        return track_mode(self.problem, uncalibrated(self.point))
+        return track_mode(self.problem, uncalibrated(self.problem, self.point))
 
     @property
     def pull(self) -> np.ndarray:
@@ -279,6 +279,6 @@ class Answer:
         return -np.inf if value is None or not np.isfinite(value) else value
 
 
-def uncalibrated(point: Point) -> Point:
-    """The point with all biases zero."""
-    return point._replace(z=jnp.zeros_like(point.z))
+def uncalibrated(problem: Problem, point: Point) -> Point:
+    """The point with all biases zero, but for the clocks by which the rows of the problem are taken."""
+    return point._replace(z=jnp.asarray(problem.first_z))

@@ -237,6 +237,7 @@ def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
         if label not in known:
             raise InputError(f'the calibration has no bias "{label}"; fit the same network, or fix that bias')
     mean = group["mean"].sel(bias_label=labels).values
+    problem = problem.retimed(mean / problem.scales)
     levels = np.zeros(len(problem.levels))
     if problem.levels and "level" in calibration.children:
         found = calibration["level"].to_dataset()["std"].to_series()

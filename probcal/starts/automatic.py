@@ -48,7 +48,7 @@ def optima(problem: Problem, iterations: int = 30, stopped: Callable[[], bool] =
     Once `stopped` no other start than the first is tried.
     """
     check_linear(problem)
-    first = grid_start(problem, jax.device_put(np.zeros(problem.model.biases)), iterations)
+    first = grid_start(problem, jax.device_put(problem.first_z), iterations)
     found = [_polished(problem, first, iterations)]
     if (z := turned(problem, first)) is not None:
         found.append(_polished(problem, first._replace(z=jax.device_put(z)), iterations))
@@ -56,12 +56,13 @@ def optima(problem: Problem, iterations: int = 30, stopped: Callable[[], bool] =
         for z in family(problem):
             if stopped():
                 break
-            found.append(_polished(problem, grid_start(problem, jax.device_put(z), iterations), iterations))
+            placed = grid_start(problem, jax.device_put(problem.first_z + z), iterations)
+            found.append(_polished(problem, placed, iterations))
     best = min(found, key=_order)
     for tracked in exchanged(problem, first, best.point, best.settled):
         if stopped():
             break
-        value = min(float(_sparse_cost(problem.model, tracked)), _polished(problem, tracked, iterations).value)
+        value = min(float(sparse_cost(problem.model, tracked)), _polished(problem, tracked, iterations).value)
         found.append(Optimum(value, tracked))
     if len(found) == 1:
         return found
@@ -80,11 +81,11 @@ def _polished(problem: Problem, tracked: Point, iterations: int) -> Optimum:
     """The joint mode at the declared scales next to a point."""
     scales = Precision.single(jnp.ones(problem.model.biases))
     mode = find_mode(problem.model, tracked, scales, iterations, 1e-3)
-    return Optimum(float(_sparse_cost(problem.model, mode.point)), mode.point, bool(mode.converged))
+    return Optimum(float(sparse_cost(problem.model, mode.point)), mode.point, bool(mode.converged))
 
 
 @jax.jit
-def _sparse_cost(model: Model, point: Point) -> jax.Array:
+def sparse_cost(model: Model, point: Point) -> jax.Array:
     """Joint cost of a point with a Cauchy prior of scale one for each bias."""
     flat = Precision.single(jnp.zeros(model.biases))
     return cost(model, point, flat) + jnp.sum(jnp.log1p(point.z**2))

@@ -14,7 +14,7 @@ import numpy as np
 
 from probcal.geometry import bearing, elevation, norm
 from probcal.labels import AXES
-from probcal.network import ANGLES
+from probcal.network import ANGLES, CLOCK, MOVING
 from probcal.noise import guess_of
 from probcal.problem import Problem
 from probcal.sensor import SensorType
@@ -51,7 +51,7 @@ def _tried(kind: SensorType, d: int) -> dict[str, Kind]:
     """Kinds of the channels of one sensor type, by name."""
     rng = np.random.default_rng(0)
     others = sorted(kind.target_components - {"position", "at"})
-    extras = sorted(kind.pose_components - {"position", *ANGLES, "time_offset", "velocity"})
+    extras = sorted(kind.pose_components - {"position", *ANGLES, *CLOCK, *MOVING})
     names = list(kind.biases)
     place = rng.normal(size=(TRIALS, d)) * 50.0
     nodes = rng.normal(size=(TRIALS, kind.arity, d)) * 50.0
@@ -67,7 +67,8 @@ def _tried(kind: SensorType, d: int) -> dict[str, Kind]:
         target = TargetView("the target", {"position": p, "velocity": jnp.zeros(d), "acceleration": jnp.zeros(d)} | own)
         poses = []
         for a in range(kind.arity):
-            parts = {"position": s[a], "velocity": jnp.zeros(d), "time_offset": jnp.zeros(()), "clock": jnp.zeros(())}
+            parts = {"position": s[a], "velocity": jnp.zeros(d), "clock": jnp.zeros(())}
+            parts |= dict.fromkeys((*CLOCK, *MOVING[2:]), jnp.zeros(()))
             parts |= {name: jnp.zeros(width(name)) for name in extras}
             poses.append(PoseView("the node", parts | dict(zip(ANGLES, angles[a], strict=True))))
         value = kind.evaluate(

@@ -39,7 +39,7 @@ def mistake(problem: Problem, suspects: Sequence[str]) -> str:
 
 def _left(problem: Problem) -> float:
     """Mean of the squares, none larger than `LARGE`, that the best tracks leave with the biases as stated."""
-    point = track_mode(problem, uncalibrated(automatic_start(problem)))
+    point = track_mode(problem, uncalibrated(problem, automatic_start(problem)))
     squares = [
         np.asarray(part)[np.asarray(there) > 0]
         for part, there in zip(squares_of(problem.model, point), problem.model.measured, strict=True)

@@ -66,8 +66,8 @@ class Pool:
         return len(self.points.z)
 
 
-def pool_of(answer: Answer, key: jax.Array) -> Pool:
-    """Draws of an answer, its chains one after the other.
+def pool_of(answer: Answer, key: jax.Array, problem: Problem) -> Pool:
+    """Draws of an answer, its chains one after the other, the states in the order of the epochs of a problem.
 
     There are no trajectories where the method solved another problem in the place of the given one. Raises `FitError`
     where there is no covariance.
@@ -81,6 +81,10 @@ def pool_of(answer: Answer, key: jax.Array) -> Pool:
         return a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
 
     states = tuple(flat(x) for x in drawn.states) if answer.motion == "used" else ()
+    if states and answer.problem.clocks.any():
+        states = tuple(
+            np.moveaxis(x, 0, 1) for x in answer.problem.reordered(problem, [np.moveaxis(x, 1, 0) for x in states])
+        )
     points = Points(flat(drawn.z), flat(drawn.levels), states)
     hyper = {name: flat(a) for name, a in posterior.hyper.items()}
     taken = answer.method != answer.requested
@@ -161,6 +165,7 @@ def _quantities(trial: Trial, found: Pool) -> dict[str, _Quantity]:
         all_ |= _hyper(found.hyper, trial.phi, found.hierarchy)
     if points.states:
         all_ |= _middle(problem, point, points)
+    if points.states and not problem.clocks.any():
         args = jax.tree.map(jnp.asarray, tuple(points))
         true = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (point.z, point.levels, point.states))
         draws = np.asarray(_likelihoods(problem.model, *args))
@@ -173,10 +178,12 @@ def _quantities(trial: Trial, found: Pool) -> dict[str, _Quantity]:
 
 
 def _middle(problem: Problem, point: Point, points: Points) -> dict[str, _Quantity]:
-    """The position of the first target of each recursion at the middle of its track."""
+    """The position of the first target of each recursion at the middle of its track, at a time that the table tells."""
     found = {}
     for r, epochs in enumerate(problem.epochs):
-        mine = np.flatnonzero(epochs.target == epochs.target[0])
+        mine = np.flatnonzero((epochs.target == epochs.target[0]) & ~problem.by_clock[r])
+        if not len(mine):
+            continue
         e = mine[len(mine) // 2]
         for j in range(*epochs.position):
             name = f"{epochs.target[e]} {epochs.components[j]} at {epochs.time[e]:g}"

@@ -164,6 +164,11 @@ class _Engine:
         self.first = source.precision(problem.labels, problem.surveyed)
         self.around = "data" if isinstance(around, str) else "fit" if around is not None else ""
         self.pool: Pool | None = None
+        if around is not None and problem.clocks.any():
+            raise InputError(
+                "sbc: rows of free clocks have other times in every truth; leave around (--posterior) out, so that"
+                " truths come from the prior"
+            )
         if around is None:
             check_drawable(source, problem)
             self.form = Form(problem.model.biases, hierarchy_of(source, problem))
@@ -188,9 +193,15 @@ class _Engine:
     def trial(self, key: jax.Array) -> Trial:
         """A truth, and the problem with its data."""
         if self.pool is None:
-            drawn = draw_prior(self.form, self.problem.model, self.first, key)
-            same = self.prior == self.source
-            return Trial(self.problem.redrawn(drawn.y), drawn.point, drawn.phi if same else {}, same)
+            drawn, same = draw_prior(self.form, self.problem.model, self.first, key), self.prior == self.source
+            point, timed = drawn.point, self.problem.retimed(drawn.point.z)
+            if timed is not self.problem:  # the same truth, its rows where its clocks put them
+                drawn = draw_prior(self.form, timed.model, self.first, key)
+                states = timed.reordered(self.problem, drawn.point.states)
+                point = drawn.point._replace(states=tuple(jnp.asarray(x) for x in states))
+            return Trial(
+                self.problem.redrawn(drawn.y), point, drawn.phi if same else {}, same and timed is self.problem
+            )
         pick, seed = jax.random.split(key)
         k = int(jax.random.randint(pick, (), 0, self.pool.count))
         z, levels, states = jax.tree.map(lambda leaf: leaf[k], self.pool.points)
@@ -206,14 +217,18 @@ class _Engine:
         if self.start == "automatic":
             return None
         wide = Precision.single(jnp.ones(trial.problem.model.biases))
-        return find_mode(trial.problem.model, trial.point, wide, 30, 1e-3).point
+        point = trial.point
+        if trial.problem.clocks.any():  # whose states are those of other times
+            followed = follow_states(trial.problem, [np.asarray(x) for x in point.states])
+            point = followed._replace(z=point.z, levels=point.levels)
+        return find_mode(trial.problem.model, point, wide, 30, 1e-3).point
 
     def _fit(self, problem: Problem, start: Point | None, key: jax.Array) -> Pool:
         """The method's answer, started as `fit` starts it where no start is given."""
         keys = jax.random.split(key)
         context = Context(keys[0], threads=1, fallback=self.other)
         answer = solve(problem, self.method, self.prior, context, start=start)
-        return pool_of(answer, keys[1])
+        return pool_of(answer, keys[1], problem)
 
     def several(self, numbers: list[int]) -> list[dict[str, np.ndarray]]:
         """The records of some runs."""

@@ -200,10 +200,13 @@ def _number(problem: Problem, truth: Truth) -> int:
 def _simulated(setting: Setting, point: dict[str, Any], number: int, linear: bool) -> _Run:
     """One problem with its start; raises `InputError` where a setting does not return what a study needs."""
     problem, truth = _made(setting, point, number, linear)
-    d = problem.network.dimension
     truth.check_targets(problem.measurements.target_names)
-    places = [truth.positions(epochs.time, epochs.target, d) for epochs in problem.epochs]
-    return _Run(problem, truth, automatic_start(problem) if linear else None, number, places)
+    return _Run(problem, truth, automatic_start(problem) if linear else None, number, _places(problem, truth))
+
+
+def _places(problem: Problem, truth: Truth) -> list[np.ndarray]:
+    """True positions (E, d) at the epochs of each recursion."""
+    return [truth.positions(epochs.time, epochs.target, problem.network.dimension) for epochs in problem.epochs]
 
 
 def _needs_linear(methods: Mapping[str, tuple[Method, Prior]]) -> bool:
@@ -234,6 +237,8 @@ def _record(run: _Run, answer: Answer) -> dict[str, Any]:
     problem, found = answer.problem, answer.posterior.summary
     true = np.array([run.truth.biases[label] for label in problem.labels]) / problem.scales
     error, lower, upper = found.mean - true, found.lower - true, found.upper - true
+    if problem.clocks.any():  # whose rows stand at other times
+        run = run._replace(problem=problem, places=_places(problem, run.truth))
     return {
         "bias_rmse": float(np.sqrt(np.mean(error**2))),
         "coverage": float(((lower <= 0) & (upper >= 0)).mean()),
@@ -248,13 +253,14 @@ def _climbs_once(method: Method, prior: Prior, run: _Run, oracle: bool) -> bool:
     """Whether runs are solved together: not by samplers and particles, nor where a fit is more than one climb."""
     if not isinstance(method, Maximiser) or method.by_particles:
         return False
-    return oracle or method.climbs_once(run.problem, prior)
+    return oracle or (method.climbs_once(run.problem, prior) and not run.problem.clocks.any())
 
 
 def _alone_by(run: _Run, method: Method, prior: Prior) -> Answer:
     """The answer to a run that is solved by itself, as `fit` does it."""
     context = Context(jax.random.key(run.number), threads=1, fallback=NUTS())
-    return solve(run.problem, method, prior, context, start=None if method.by_particles else run.start)
+    anew = method.by_particles or run.problem.clocks.any()
+    return solve(run.problem, method, prior, context, start=None if anew else run.start)
 
 
 def choose_methods(names: Sequence[str]) -> dict[str, tuple[Method, Prior]]:
