@@ -29,6 +29,13 @@ class Mutation(NamedTuple):
 
 
 MUTATIONS = [
+    # smoothing/information.py, starts/swaps.py, inference/run.py: rejected sensors, exchanged labels
+    Mutation("np.flatnonzero(below > 0.5 * (1.0 + expected) * data)", "np.flatnonzero(below > data)", "test_labels.py"),
+    Mutation("int(below[k]) - used - 1, n, expected", "int(below[k]) - 1, n, expected", "test_labels.py"),
+    Mutation("low[:, c] & near[:, c], mask[:, c] > 0", "low[:, c], mask[:, c] > 0", "test_labels.py"),
+    Mutation("expected = max(expected, float(usual))", "pass", "test_labels.py"),
+    Mutation("moved[place[b]] -= apart", "moved[place[b]] += apart", "test_labels.py"),
+    Mutation("2.0 * float(special.stdtr(df, -np.sqrt(df)))", "float(special.stdtr(df, -np.sqrt(df)))", "test_labels.py"),
     # smoothing/recursion.py
     Mutation("moved @ (below.mT @ first.A)", "0 * moved @ (below.mT @ first.A)", "test_scans.py"),
     Mutation("[first.A.mT @ rest, first.Z]", "[rest, first.Z]", "test_scans.py"),

@@ -144,3 +144,10 @@ def test_a_prior_that_forbids_the_exchange_ends_in_a_misfit():
     assert tree.attrs["status"] == "misfit"
     assert "n3.range (15 of 15)" in tree.attrs["message"]
     assert pc.fit(world(SOUND)[0], pc.MAP()).attrs["status"] == "converged"
+
+
+@pytest.mark.ci
+def test_tracks_at_a_calibration_name_sensors_that_were_exchanged_since():
+    calibrated = pc.fit(world(SOUND)[0], pc.MAP())
+    assert "robust noise" not in pc.track(world(SOUND)[0], calibrated).attrs["message"]
+    assert "n3.range (15 of 15)" in pc.track(world(PAIR)[0], calibrated).attrs["message"]

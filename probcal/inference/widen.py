@@ -15,6 +15,7 @@ from probcal.inference import residuals
 from probcal.inference.fitted import Fitted, Judged, JudgedLarge, take_up, take_up_large
 from probcal.inference.residuals import LAGGED, NOTABLE, PRACTICAL, Channels, Innovations
 from probcal.lazy import Later
+from probcal.misfit import rejection_text
 from probcal.model.model import Data, Model
 from probcal.model.motions import by_component, linear_of
 from probcal.model.rows import Linearised
@@ -27,6 +28,7 @@ from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import by_target, datum_of
 from probcal.results.read import Calibrated
 from probcal.smoothing import recursion as rec
+from probcal.smoothing.information import rejected
 from probcal.smoothing.joint import JointPrecision
 from probcal.smoothing.linearised import Linearisation
 from probcal.smoothing.mode import Eliminated, Point, factors
@@ -389,10 +391,11 @@ def judge_tracks(
         fit = Fitted(problem, at.point, at.rows, at.solved, picks, data, at, open_, root @ root.T)
         dz = fit.covariance @ np.asarray(at.solved.score)
         found = residuals.innovations(fit, residuals.measured_kurtosis(fit), dz).innovations
-        return _judged(fit, found, tree, known.root)
+        return _judged(fit, found, tree, known.root, rejection_text(rejected(problem, at.point)))
     system = system_at(problem.model, JointPrecision.of(problem.model), at)
     large = JudgedLarge(problem, system.point, system.rows, system.solved, picks, data, system, known.blocks)
-    return _judged(large, residuals.innovations_given(large), tree, known.root)
+    hidden = rejection_text(rejected(problem, at))
+    return _judged(large, residuals.innovations_given(large), tree, known.root, hidden)
 
 
 def _judged(
