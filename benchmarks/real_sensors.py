@@ -255,5 +255,82 @@ def warehouse_2hz(seed, declared, noise):
     return kinds(seed, declared, noise, 2.0)
 
 
+# Clocks: three scopes that read range and azimuth, or five cameras; the clocks of all but the first are off.
+
+OFFSETS = (1e-3, 5.0)  # s, between which the sizes of offsets lie, their logarithms even
+TIMED = ("free", "free, rate too", "not declared")
+SCENES = ("scopes", "cameras")
+
+
+def by_clocks(seed, scene, declared):
+    """A problem whose rows carry the times of clocks that are off, and its truth."""
+    import probcal as pc
+    from probcal.geometry import bearing, elevation, norm
+
+    @pc.sensor(range=pc.Channel("m", std=0.5), azimuth=pc.Channel("rad", std=0.003, wrap=True))
+    def scope(target, pose):
+        line = pose.local(target.position)
+        return dict(range=norm(line), azimuth=bearing(line))
+
+    @pc.sensor(azimuth=pc.Channel("rad", std=1e-3, wrap=True), elevation=pc.Channel("rad", std=1e-3, wrap=True))
+    def camera(target, pose):
+        line = pose.local(target.position)
+        return dict(azimuth=bearing(line), elevation=elevation(line))
+
+    rng = np.random.default_rng(seed)
+    cameras = scene == "cameras"
+    places = (
+        [(0, 0, 6), (40, 0, 5), (40, 40, 7), (0, 40, 6), (20, -10, 3)] if cameras else [(0, 0), (400, 0), (200, 300)]
+    )
+    kind, unit = (camera, 1.0) if cameras else (scope, 10.0)
+    free = {"time_offset": 2.0, "heading": 0.02} | ({"time_rate": 2e-3} if "rate" in declared else {})
+
+    def network(free):
+        nodes = [pc.Node(f"n{k}", place, scale=free if k else None) for k, place in enumerate(places)]
+        return pc.Network([kind.on(node) for node in nodes])
+
+    low, high = np.log(OFFSETS)
+    size = np.exp(rng.uniform(low, high, len(places))) * rng.choice([-1.0, 1.0], len(places))
+    biases = {f"n{k}.time_offset": float(size[k]) for k in range(1, len(places))}
+    biases |= {f"n{k}.heading": float(0.01 * rng.standard_normal()) for k in range(1, len(places))}
+    if "rate" in declared:
+        biases |= {f"n{k}.time_rate": float(1e-3 * rng.standard_normal()) for k in range(1, len(places))}
+    centre = np.mean(places, 0)
+    start = {"position": (centre, 6.0 * unit), "velocity": (0.0, 1.0 * unit), "acceleration": (0.0, 0.2 * unit)}
+    motion = pc.Target(pc.ConstantAcceleration(0.1 * unit), start=start)
+    run = pc.simulate(network(free), motion, np.arange(0.0, 80.0, 2.0), key=seed, biases=biases, missing=0.1)
+    if declared == "not declared":
+        free = {"heading": 0.02}
+    return pc.Problem(network(free), motion, run.table), run.truth
+
+
+@situation(*itertools.product(SCENES, TIMED))
+def clocks(seed, scene, declared):
+    """Offsets from a millisecond to five seconds: coverage, and any that is determined beyond 4 sd of the truth."""
+    import probcal as pc
+
+    problem, truth = by_clocks(seed, scene, declared)
+    tree = pc.assess(problem, pc.fit(problem))
+    table = pc.summary(tree).set_index("bias")
+    at = np.array([truth.biases[label] for label in table.index])
+    away = (np.abs(table["mean"] - at) / table["sd"]).to_numpy()
+    inside = ((table["lower"] <= at) & (at <= table["upper"])).to_numpy()
+    timed = np.array(["time_" in label for label in table.index])
+    sure = (table["verdict"] == "determined").to_numpy() & (tree.attrs["status"] == "converged")
+    found = {"all": share_of(inside, np.ones(len(at), bool)), "clocks": share_of(inside, timed)}
+    track, d = tree["track/target"].to_dataset(), problem.network.dimension
+    names = [f"position_{x}" for x in "xyz"[:d]]
+    true = truth.positions(track["time"].values, np.full(track.sizes["time"], "target"), d)
+    part = track.sel(component=names)
+    z = np.abs(part["mean"].values - true) / part["sd"].values
+    known = np.isfinite(true)
+    return found | {
+        "tracks": (int((z[known] < 1.598).sum()), int(known.sum())),
+        "determined and beyond 4 sd": share_of(away > 4, sure), "status": tree.attrs["status"],
+        "sd of an offset in s": float(np.nanmedian(np.where(timed, table["sd"], np.nan))) if timed.any() else np.nan,
+        "worst in sd": float(away.max()),
+    }  # fmt: skip
+
+
 if __name__ == "__main__":
     main()
