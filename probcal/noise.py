@@ -51,6 +51,28 @@ class Unknown:
 Level = float | Unknown
 
 
+@dataclass(frozen=True)
+class Memory:
+    """The part of the noise of a channel that is remembered, `Channel("m", std=0.02, memory=Memory(0.05, 2.0))`.
+
+    It adds to the white noise of the channel. For each sensor and target it is a stationary Ornstein-Uhlenbeck process
+    e, an AR(1) at equal steps: e' = exp(-dt / time) e + sqrt(1 - exp(-2 dt / time)) std u, u ~ N(0, 1) (Uhlenbeck,
+    Ornstein 1930). `std` is in the unit of the channel and may be `Unknown`, `time` is in s and known. It is one more
+    state of every target for each sensor, so that the answer is exact, and costs what these states cost.
+
+    >>> Memory(0.05, 2.0).time
+    2.0
+    """
+
+    std: Level
+    time: float
+
+    def __post_init__(self):
+        check_level(self.std, "Memory: std", by=True)
+        if not (np.isfinite(self.time) and self.time > 0):
+            raise InputError(f"Memory(time={self.time}): the correlation time must be positive, in s")
+
+
 def guess_of(level: Level) -> float:
     """Number to start from: the level itself, or the guess of an `Unknown`."""
     return float(level.guess if isinstance(level, Unknown) else level)

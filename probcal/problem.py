@@ -38,6 +38,7 @@ from probcal.model.rows import Block, Rows, addresses, late_by, make_block, pose
 from probcal.model.sampled import SampledMotion
 from probcal.model.variants import aligned
 from probcal.motion import Known, Layout, LinearMotion, Static, Target, White, as_motion, flow_of, labels_of
+from probcal.motion.components import Remembered
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, guess_of
 from probcal.plausible import check_plausible, check_scales
@@ -202,7 +203,7 @@ class Problem:
         time = self._counting(name)
         free: list[Any] = []
         for component in linear_of(as_motion(target.motion)):
-            if component.memoryless or isinstance(component, Static):
+            if component.memoryless or isinstance(component, Static | Remembered):
                 free.append(component)
                 continue
             mean, std = start_of(name, component, Target(target.motion), time, self.area)
@@ -612,7 +613,8 @@ class Problem:
                     block = make_block(self.network, kind, own.epochs.layout, own.epochs.flow)
                     numbers, pieces = self._rows(block, chosen, own.epoch_of[chosen], level_of)
                     unknown = parameters(kind, self.network.dimension, levels, sensors, pieces)
-                    block = replace(block, unknown=unknown) if unknown else block
+                    memory = tuple((c, tuple(np.repeat(own, pieces).tolist())) for c, own in block.memory)
+                    block = replace(block, unknown=unknown, memory=memory) if unknown or memory else block
                     found.append(_Gathered(block, Rows(**numbers), r, chosen, columns))
         return found
 
@@ -741,6 +743,27 @@ def positions_of(network: Network) -> np.ndarray:
 
 
 def declared_target(motion: Any, name: str, network: Network) -> Target:
+    """Motion and start of a target with the remembered noise of all sensors; raises `InputError`."""
+    target = _stated_target(motion, name, network)
+    known = {part for component in linear_of(as_motion(target.motion)) for part, _ in component.names()}
+    found = [own for own in remembered(network, name != NOBODY) if own.name not in known]
+    return replace(target, motion=sum(found, as_motion(target.motion))) if found else target
+
+
+def remembered(network: Network, reads_target: bool) -> list[Remembered]:
+    """The remembered noise of each channel of each sensor, of those that read a target or of the others."""
+    return [
+        Remembered(
+            f"{placed.name}.{name}_memory", channel.memory.std, channel.memory.time,
+            f"{placed.name if getattr(channel.memory.std, 'by', None) else placed.type.name}.{name}_memory_std",
+        )
+        for placed in network.sensors
+        for name, channel in placed.type.expand(network.dimension)
+        if channel.memory is not None and placed.type.reads_target == reads_target
+    ]  # fmt: skip
+
+
+def _stated_target(motion: Any, name: str, network: Network) -> Target:
     """Motion and start of a target, of one motion for all or of a mapping by name; raises `InputError`."""
     if name == NOBODY:
         centre = positions_of(network).mean(0)

@@ -15,7 +15,7 @@ from probcal.detection import Detection
 from probcal.errors import InputError, nearest
 from probcal.fingerprint import computes
 from probcal.labels import AXES, check_name
-from probcal.noise import Bernoulli, Family, Heard, Level, Normal, check_level
+from probcal.noise import AdditiveNoise, Bernoulli, Family, Heard, Level, Memory, Normal, check_level
 from probcal.types import PoseView, TargetView, untraceable
 
 VECTORS = ("position", "velocity", "acceleration", "moment")  # have one value an axis without being declared so
@@ -145,7 +145,8 @@ class Channel:
 
     `wrap=True` compares angles around the circle; `per_axis=True` makes one channel a coordinate
     (`position_x`, `position_y`, ...). `compass=True`: tables hold bearings clockwise from north, which are turned into
-    mathematical angles (from east, counter-clockwise) when they are read, and back when they are written.
+    mathematical angles (from east, counter-clockwise) when they are read, and back when they are written. With a
+    `memory` part of the noise is correlated in time.
 
     >>> Channel("rad", std=0.01, wrap=True).period  # doctest: +ELLIPSIS
     6.28...
@@ -157,6 +158,7 @@ class Channel:
     wrap: bool = False
     per_axis: bool = False
     compass: bool = False
+    memory: Memory | None = None
 
     def __post_init__(self):
         _check_unit("Channel", self.unit)
@@ -171,6 +173,12 @@ class Channel:
             raise InputError(f"Channel({self.unit!r}, wrap=True): only angles in rad or deg wrap")
         if self.wrap and isinstance(self.noise, Heard):
             raise InputError(f"Channel({self.unit!r}, wrap=True): an angle has no least value; give another noise")
+        if self.memory is not None and not (isinstance(self.memory, Memory) and isinstance(self.noise, AdditiveNoise)):
+            raise InputError(
+                f"Channel({self.unit!r}, memory={self.memory!r}): give Memory(std, time), with noise that is additive"
+            )
+        if self.memory is not None and isinstance(self.noise, Heard):
+            raise InputError(f"Channel({self.unit!r}, memory=...): a floor has no memory; give another noise")
         if self.compass and not self.wrap:
             raise InputError(f"Channel({self.unit!r}, compass=True): a compass bearing wraps; give wrap=True too")
 

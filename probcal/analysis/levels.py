@@ -23,7 +23,7 @@ from probcal.labels import listed
 from probcal.model.model import Data, Model
 from probcal.model.motions import by_component, linear_of
 from probcal.motion import as_motion
-from probcal.motion.base import level_name
+from probcal.motion.base import level_label
 from probcal.noise import Bernoulli, Unknown, guess_of
 from probcal.problem import Problem
 from probcal.results.groups import bias_coords
@@ -121,7 +121,7 @@ def _of_noises(problem: Problem, r: int, found: dict[Level, int]) -> np.ndarray:
         components = linear_of(as_motion(problem.target(target).motion))
         for component, _, own in by_component(components, problem.network.dimension):
             if mine.any() and not isinstance(component.std, Unknown):
-                level = Level(f"motion.{level_name(component)}", float(component.std))
+                level = Level(level_label(component), float(component.std))
                 index[mine, own] = found.setdefault(level, len(found))
     index = _with_unknown(problem, np.asarray(part.level), index, found)
     return np.where(np.asarray(part.L).any(1) & ~first[:, None], index, -1)

@@ -87,7 +87,8 @@ def _reason(found: Innovations, channels: Channels) -> str:
     red = (channels.white < REJECTED / len(lagged)) & (lagged > notable)
     if red.any():
         worst = int(np.argmax(np.where(red, lagged, -1.0)))
-        return f"those of {channels.names[worst]} follow each other ({lagged[worst]:.2f})"
+        cure = "if its noise has a memory, declare Channel(..., memory=Memory(std, time))"
+        return f"those of {channels.names[worst]} follow each other ({lagged[worst]:.2f}; {cure})"
     return ""
 
 

@@ -12,7 +12,7 @@ from probcal.errors import InputError
 from probcal.model.rows import Parameter
 from probcal.model.sampled import SampledMotion, sampled_of
 from probcal.motion import Layout, Motion, Target, as_motion
-from probcal.motion.base import GAUSSIAN, level_name
+from probcal.motion.base import GAUSSIAN, level_label
 from probcal.motion.layout import layout_of, stacked
 from probcal.noise import Bernoulli, Level, Normal, Unknown, guess_of, is_odds, level_at, log_level, unknowns
 
@@ -174,17 +174,18 @@ def chain(
     for component, here, noise in by_component(components, d):
         F[:, here, here] = component.transition(dt, d)
         L[:, here, noise] = component.noise_factor(dt, d) * guess_of(component.std)
-        level[:, noise] = levels.of(component.std, f"motion.{level_name(component)}", "")
+        level[:, noise] = levels.of(component.std, level_label(component), "")
         try:
             drift[:, here] = component.means(time, d)
         except InputError as error:
             raise InputError(f'target "{name}": {error}') from None
         if not component.memoryless and before is None:
             F[0, here, here], drift[0, here] = 0.0, 0.0
-            L[0, here, :], level[0, noise] = 0.0, -1
             mean, std = start_of(name, component, target, time if seen is None else seen, area)
-            drift[0, here] = mean
+            L[0, here, :], drift[0, here] = 0.0, mean
             L[0, here, here] = np.diag(std)
+            if not getattr(component, "stationary", False):
+                level[0, noise] = -1
     if before is None:
         F[0] = 0.0
     return F, L, level, drift

@@ -49,6 +49,14 @@ class Block:
     steps: tuple[int, ...]  # which bias each further column steps: the biased pose entries, then those of the sensor
     flow: tuple[Any, ...] = ()  # components of the motion that `target.at` does not know, as in `motion.flow_of`
     unknown: tuple[Parameter, ...] = ()  # of the noise families of its channels
+    # channels whose noise is remembered, and the state entry of each sensor (of each of its pieces)
+    memory: tuple[tuple[int, tuple[int, ...]], ...] = ()
+
+    @property
+    def seen(self) -> tuple[int, ...]:
+        """State entries that the function reads, without the noise that is remembered."""
+        held = {entry for _, entries in self.memory for entry in entries}
+        return tuple(i for i in self.used if i not in held)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -110,8 +118,14 @@ def make_block(network: Network, kind: SensorType, layout: Layout, flow: tuple[A
                 f"sensor {kind.name} reads target.{name} as a number, but the motion has one value an axis;"
                 f' declare it, as in @sensor(..., vectors=("{name}",))'
             )
-    used = tuple(sorted(i for name in asked for i in range(*known[name])))
     placed = [s for s in network.sensors if s.type == kind]
+    memory = tuple(
+        (c, tuple(known[f"{own.name}.{name}_memory"][0] for own in placed))
+        for c, (name, channel) in enumerate(kind.expand(network.dimension))
+        if channel.memory is not None
+    )
+    held = [entry for _, entries in memory for entry in entries]
+    used = tuple(sorted([*(i for name in asked for i in range(*known[name])), *held]))
     extras = tuple(sorted(kind.pose_components - {"position"}))
     for sensor in placed:
         for node in sensor.nodes:
@@ -142,8 +156,8 @@ def make_block(network: Network, kind: SensorType, layout: Layout, flow: tuple[A
     )
     columns = zip(*(addresses(kind, sensor, free, entries) for sensor in placed), strict=True)
     steps = [(k, max(len(network.steps(*address)) for address in column)) for k, column in enumerate(columns)]
-    columns_of = tuple(k for k, n in steps for _ in range(n))
-    return Block(kind, layout, network.dimension, used, extras, free, columns_of, flow)
+    stepped = tuple(k for k, n in steps for _ in range(n))
+    return Block(kind, layout, network.dimension, used, extras, free, stepped, flow, memory=memory)
 
 
 def addresses(
@@ -284,7 +298,16 @@ def predict(block: Block, rows: Rows, states: jax.Array, z: jax.Array) -> jax.Ar
 
 def predict_local(block: Block, rows: Rows, states: jax.Array, biases: jax.Array) -> jax.Array:
     """Predicted values (N, C) from the state (N, n) and the biases (N, p), in their units, of every row."""
-    return jax.vmap(lambda x, pose, b: _one(block, x, pose, b))(states, rows.pose, biases)
+    predicted = jax.vmap(lambda x, pose, b: _one(block, x, pose, b))(states, rows.pose, biases)
+    return _with_memory(block, rows, states, predicted)
+
+
+def _with_memory(block: Block, rows: Rows, states: jax.Array, predicted: jax.Array) -> jax.Array:
+    """Predicted values (N, C) with the noise that each sensor remembers, at the states (N, n) of the rows."""
+    for c, entries in block.memory:
+        entry = jnp.asarray(entries)[rows.sensor % len(entries)]
+        predicted = predicted.at[:, c].add(jnp.take_along_axis(states, entry[:, None], 1)[:, 0])
+    return predicted
 
 
 def noise_std(rows: Rows, levels: jax.Array) -> jax.Array:
@@ -440,16 +463,30 @@ def _linearised(
 
     def one(entries: jax.Array, state: jax.Array, pose: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
         whole = [state[i] for i in range(len(state))]
-        for k, i in enumerate(block.used):
+        for k, i in enumerate(block.seen):
             whole[i] = entries[k]
         found = _one(block, jnp.stack(whole), pose, b)
         return found, found
 
-    entries = jnp.stack([reached[:, i] for i in block.used], 1) if block.used else reached[:, :0]
+    entries = jnp.stack([reached[:, i] for i in block.seen], 1) if block.seen else reached[:, :0]
     both = jax.jacfwd(one, argnums=(0, 3), has_aux=True)  # forward: half the time of backward in 3-D, and to compile
     (by_state, by_bias), predicted = jax.vmap(both)(entries, reached, rows.pose, local)
+    if block.memory:
+        predicted = _with_memory(block, rows, reached, predicted)
+        by_state = _by_memory(block, rows, by_state)
     score, weight = weigh(block, rows, predicted, levels, expected=expected)
     return Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])
+
+
+def _by_memory(block: Block, rows: Rows, by_state: jax.Array) -> jax.Array:
+    """Jacobian (N, C, used) by the state entries in `used` from that by the entries in `seen`."""
+    N, C, _ = by_state.shape
+    places = np.searchsorted(block.used, block.seen)
+    found = jnp.zeros((N, C, len(block.used))).at[:, :, places].set(by_state)
+    for c, entries in block.memory:
+        place = jnp.asarray(np.searchsorted(block.used, entries))[rows.sensor % len(entries)]
+        found = found.at[jnp.arange(N), c, place].set(1.0)
+    return found
 
 
 @partial(jax.jit, static_argnames=("block", "expected"))
@@ -464,7 +501,7 @@ def linearise_biases(
         return found, found
 
     by_bias, predicted = jax.vmap(jax.jacfwd(one, argnums=2, has_aux=True))(reached, rows.pose, local)
-    score, weight = weigh(block, rows, predicted, levels, expected=expected)
+    score, weight = weigh(block, rows, _with_memory(block, rows, reached, predicted), levels, expected=expected)
     none = jnp.zeros((*score.shape, 0))
     return Linearised(score, weight, none, by_bias * rows.scale[rows.sensor][:, None, :])
 
@@ -475,7 +512,8 @@ def curvature(block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels:
 
     def density(b: jax.Array, state: jax.Array, row: Rows) -> Any:
         one = jax.tree.map(lambda leaf: leaf[None], row)
-        return jnp.sum(log_likelihood(block, one, _one(block, state, row.pose, b)[None], levels))
+        predicted = _with_memory(block, one, state[None], _one(block, state, row.pose, b)[None])
+        return jnp.sum(log_likelihood(block, one, predicted, levels))
 
     whole: Any = Rows(*(0 if name in BY_ROW else None for name in Rows._fields))  # type: ignore[arg-type]
     second = jax.vmap(jax.jacfwd(jax.grad(density)), (0, 0, whole))(local, states[rows.epoch], rows)

@@ -107,6 +107,7 @@ class Component(ABC):
     noise: Any = GAUSSIAN
     memoryless: ClassVar[bool] = False  # drawn anew at every epoch around `means`; the others start from `start()`
     timed: ClassVar[bool] = False  # whether the means are those of a time, known at the rows of a table only
+    stationary: ClassVar[bool] = False  # the start is as wide as every other epoch, whatever the level
     static: ClassVar[bool] = False  # whether it never moves, so that all rows of a target form one epoch
     # declared where its noise has a memory
     next_order: ClassVar[str] = "a component of your own with one state more"
@@ -380,7 +381,13 @@ def _joined(*motions: Motion) -> Motion:
 
 def level_name(component: Any) -> str:
     """What the noise level of a component is called."""
-    return f"{component.driven}_std"
+    return component.level if getattr(component, "stationary", False) else f"{component.driven}_std"
+
+
+def level_label(component: Any) -> str:
+    """Label of the noise level of a component in a problem."""
+    own = level_name(component)
+    return own if getattr(component, "stationary", False) else f"motion.{own}"
 
 
 def _check_density(root: Any, still: bool) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.motion.base import GAUSSIAN, Component
 from probcal.motion.target import check_pair
-from probcal.noise import Level, check_driving, check_level
+from probcal.noise import Level, check_driving, check_level, guess_of
 
 PLANE, QUARTER, UP = np.diag([1.0, 1.0, 0.0]), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]), np.diag([0.0, 0, 1])
 
@@ -216,6 +216,39 @@ class RandomWalk(Component):
     def start(self) -> dict[str, tuple[Any, float]]:
         """Mean and standard deviation at the first epoch."""
         return {self.name: self.initial}
+
+
+@dataclass(frozen=True)
+class Remembered(Component):
+    """The remembered noise of one channel of one sensor (`noise.Memory`), a state that the rows of this sensor read.
+
+    `level` is the label of its std.
+    """
+
+    stationary: ClassVar[bool] = True
+    next_order: ClassVar[str] = "another time of its Memory(std, time)"
+
+    name: str
+    std: Level
+    time: float
+    level: str
+
+    def names(self) -> tuple[tuple[str, bool], ...]:
+        """State component, a number."""
+        return ((self.name, False),)
+
+    def transition(self, dt: Any, dimension: int) -> Any:
+        """The fraction that is remembered, shape (E, 1, 1)."""
+        return blocks([[dt.__array_namespace__().exp(-dt / self.time)]], 1, dt)
+
+    def noise_factor(self, dt: Any, dimension: int) -> Any:
+        """Noise factors for unit std, shape (E, 1, 1)."""
+        xp = dt.__array_namespace__()
+        return blocks([[xp.sqrt(-xp.expm1(-2.0 * dt / self.time))]], 1, dt)
+
+    def start(self) -> dict[str, tuple[Any, float]]:
+        """Mean and standard deviation at the first epoch, which are those of every epoch."""
+        return {self.name: (0.0, guess_of(self.std))}
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def flow_of(components: Iterable[Any], dimension: int) -> tuple[Any, ...]:
     found = []
     for part in components:
         layout, dt = layout_of([part], dimension), 0.7  # s, any that shows the form
-        if part.memoryless:
+        if part.memoryless or getattr(part, "stationary", False):  # noise of sensors is read as it is
             continue
         eye = np.eye(layout[-1][2])
         known = TargetView("the target", {name: eye[start:stop] for name, start, stop, _ in layout}).at(dt)
