@@ -52,6 +52,24 @@ Level = float | Unknown
 
 
 @dataclass(frozen=True)
+class Grows:
+    """A std that grows with the predicted value p, `Channel("m", std=Grows(0.05, 0.01))`: sqrt(std^2 + (slope p)^2).
+
+    Either may be `Unknown`. A row with a std of its own has it in the place of `std`.
+
+    >>> Grows(0.05, 0.01).slope
+    0.01
+    """
+
+    std: Level
+    slope: Level
+
+    def __post_init__(self):
+        check_level(self.std, "Grows: std", by=True)
+        check_level(self.slope, "Grows: slope", by=True)
+
+
+@dataclass(frozen=True)
 class Memory:
     """The part of the noise of a channel that is remembered, `Channel("m", std=0.02, memory=Memory(0.05, 2.0))`.
 
@@ -408,6 +426,118 @@ class Normal(AdditiveNoise):
     def sample(self, key, predicted, std):
         """Draw measured values around the predicted ones."""
         return predicted + std * jax.random.normal(key, predicted.shape, predicted.dtype)
+
+
+@lru_cache
+def _level_moments(family: AdditiveNoise) -> tuple[float, float]:
+    """Expected square of the derivative l of a log density by log std, and of its product with the score, at std 1."""
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        found = _moments(family, jnp.sinh(np.linspace(-FARTHEST, FARTHEST, 20_001)))
+    return float(found[0]), float(found[1])
+
+
+def _moments(family: AdditiveNoise, e: Any) -> tuple[Any, Any]:
+    """The same by the trapezoidal rule over residuals e."""
+    none, one = jnp.zeros_like(e), jnp.ones_like(e)
+    p = jnp.exp(family.log_likelihood(e, none, one, None))
+    score, level = family.score(e, none, one, None), family.level_score(e, none, one, None) - 1.0
+    there = p > 0
+    parts = (jnp.where(there, p * level**2, 0.0), jnp.where(there, p * score * level, 0.0))
+    square, cross = (jnp.sum(0.5 * (x[..., 1:] + x[..., :-1]) * jnp.diff(e), -1) for x in parts)
+    return square, cross
+
+
+@dataclass(frozen=True)
+class Growing:
+    """Additive `noise` whose std grows with the predicted value p (see `Grows`): s^2 = std^2 + (slope p)^2.
+
+    With g = d log s / d p = slope^2 p / s^2 the score is that of the noise at s plus l g, l the derivative of its log
+    density by log s; the information I / s^2 + E[l^2] g^2 + 2 E[l score] g / s (Seber, Wild 1989, 2.8).
+    """
+
+    noise: Any
+    slope: Any
+
+    def spread(self, predicted, std):
+        """Std at the predicted value."""
+        return jnp.sqrt(std**2 + (self.slope * predicted) ** 2)
+
+    def _steep(self, predicted, std):
+        """Std, and the derivative of its log by the predicted value."""
+        s = self.spread(predicted, std)
+        return s, self.slope**2 * predicted / s**2
+
+    def _moments(self):
+        """Moments of the derivative by log std: numbers, or arrays of parameters that are estimated."""
+        return _level_moments(at_guess(self.noise)) if not _estimated(self.noise) else _moments_estimated(self.noise)
+
+    def innovation(self, y, predicted, period):
+        """Measured value minus the predicted one."""
+        return self.noise.innovation(y, predicted, period)
+
+    def log_likelihood(self, y, predicted, std, period):
+        """Log density of each datum."""
+        return self.noise.log_likelihood(y, predicted, self.spread(predicted, std), period)
+
+    def score(self, y, predicted, std, period):
+        """Derivative of the log density by the predicted value, which the std has too."""
+        s, g = self._steep(predicted, std)
+        level = self.noise.level_score(y, predicted, s, period) - 1.0
+        return self.noise.score(y, predicted, s, period) + level * g
+
+    def weight(self, y, predicted, std, period):
+        """Positive curvature used by a step."""
+        s, g = self._steep(predicted, std)
+        return self.noise.weight(y, predicted, s, period) + self._moments()[0] * g**2
+
+    def information(self, predicted, std):
+        """Expected information about the predicted value."""
+        s, g = self._steep(predicted, std)
+        square, cross = self._moments()
+        return self.noise.information(predicted, s) + square * g**2 + 2.0 * cross * g / s
+
+    def level_score(self, y, predicted, std, period):
+        """One plus the derivative of the log density by log std."""
+        s = self.spread(predicted, std)
+        return 1.0 + (self.noise.level_score(y, predicted, s, period) - 1.0) * (std / s) ** 2
+
+    def reliance(self, y, predicted, std, period):
+        """Weight of each datum over that of one without residual."""
+        return self.noise.reliance(y, predicted, self.spread(predicted, std), period)
+
+    @property
+    def rejects(self):
+        """Probability of a datum with a reliance below one half."""
+        return self.noise.rejects
+
+    def sample(self, key, predicted, std):
+        """Draw measured values around the predicted ones."""
+        return self.noise.sample(key, predicted, self.spread(predicted, std))
+
+    emit = sample
+
+    def reported(self, y):
+        """All of it."""
+        return self.noise.reported(y)
+
+    def check(self, y):
+        """Which values are legal: all."""
+        return self.noise.check(y)
+
+
+def _estimated(family: Any) -> bool:
+    """Whether parameters of a family are estimated: arrays in the place of numbers."""
+    return _functions(*family.__dict__.values()) is jnp
+
+
+def _moments_estimated(family: Any) -> tuple[Any, Any]:
+    """The moments of a family whose parameters are arrays () or (N,)."""
+    values = {name: value for name, value in family.__dict__.items() if isinstance(value, jax.Array)}
+    own = with_values(family, {name: value.reshape(-1, 1) for name, value in values.items()})
+    shape = jnp.broadcast_shapes(*(value.shape for value in values.values()))
+    e = jnp.sinh(np.linspace(-np.arcsinh(FAR_OUT), np.arcsinh(FAR_OUT), POINTS))[None]
+    square, cross = _moments(own, e)
+    return square.reshape(shape), cross.reshape(shape)
 
 
 @dataclass(frozen=True)

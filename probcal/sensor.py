@@ -15,7 +15,7 @@ from probcal.detection import Detection
 from probcal.errors import InputError, nearest
 from probcal.fingerprint import computes
 from probcal.labels import AXES, check_name
-from probcal.noise import AdditiveNoise, Bernoulli, Family, Heard, Level, Memory, Normal, check_level
+from probcal.noise import AdditiveNoise, Bernoulli, Family, Growing, Grows, Heard, Memory, Normal, check_level
 from probcal.types import PoseView, TargetView, untraceable
 
 VECTORS = ("position", "velocity", "acceleration", "moment")  # have one value an axis without being declared so
@@ -145,15 +145,16 @@ class Channel:
 
     `wrap=True` compares angles around the circle; `per_axis=True` makes one channel a coordinate
     (`position_x`, `position_y`, ...). `compass=True`: tables hold bearings clockwise from north, which are turned into
-    mathematical angles (from east, counter-clockwise) when they are read, and back when they are written. With a
-    `memory` part of the noise is correlated in time.
+    mathematical angles (from east, counter-clockwise) when they are read, and back when they are written. With
+    `std=Grows(std, slope)` the noise grows with the predicted value; with a `memory` a part of it is correlated in
+    time.
 
     >>> Channel("rad", std=0.01, wrap=True).period  # doctest: +ELLIPSIS
     6.28...
     """
 
     unit: str
-    std: Level = 1.0
+    std: Any = 1.0  # a level, or `Grows`
     noise: Family = field(default_factory=Normal)
     wrap: bool = False
     per_axis: bool = False
@@ -167,13 +168,20 @@ class Channel:
                 f"Channel({self.unit!r}, noise={self.noise!r}): give a noise family such as StudentT(4), Mixture(), "
                 f"Bernoulli() or probcal.noise.Normal(); probcal.Gaussian is a prior"
             )
+        if isinstance(self.std, Grows):
+            if isinstance(self.noise, Heard) or not isinstance(self.noise, AdditiveNoise) or self.wrap:
+                raise InputError(f"Channel({self.unit!r}, std=Grows(...)): the noise must be additive, and not wrap")
+            object.__setattr__(self, "noise", Growing(self.noise, self.std.slope))
+            object.__setattr__(self, "std", self.std.std)
         if not isinstance(self.noise, Bernoulli):
             check_level(self.std, f"Channel({self.unit!r}): std", by=True)
         if self.wrap and self.unit not in PERIODS:
             raise InputError(f"Channel({self.unit!r}, wrap=True): only angles in rad or deg wrap")
         if self.wrap and isinstance(self.noise, Heard):
             raise InputError(f"Channel({self.unit!r}, wrap=True): an angle has no least value; give another noise")
-        if self.memory is not None and not (isinstance(self.memory, Memory) and isinstance(self.noise, AdditiveNoise)):
+        if self.memory is not None and not (
+            isinstance(self.memory, Memory) and isinstance(self.noise, AdditiveNoise | Growing)
+        ):
             raise InputError(
                 f"Channel({self.unit!r}, memory={self.memory!r}): give Memory(std, time), with noise that is additive"
             )

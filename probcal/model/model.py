@@ -210,6 +210,10 @@ class Model(Stepwise):
             for block, data, predicted in zip(self.blocks, self.rows, self.predict(at), strict=True)
         )
 
+    def spread_of_noise(self, at: Where) -> Data:
+        """Noise std of every datum at a point."""
+        return self._each(waist.std_at, self.predict(at), levels=at.levels)
+
     def noise_std(self, levels: jax.Array) -> Data:
         """Noise std of every datum at log levels (H,)."""
         return tuple(waist.noise_std(data, levels) for data in self.rows)

@@ -14,7 +14,7 @@ from probcal.model.sampled import SampledMotion, sampled_of
 from probcal.motion import Layout, Motion, Target, as_motion
 from probcal.motion.base import GAUSSIAN, level_label
 from probcal.motion.layout import layout_of, stacked
-from probcal.noise import Bernoulli, Level, Normal, Unknown, guess_of, is_odds, level_at, log_level, unknowns
+from probcal.noise import Bernoulli, Growing, Level, Normal, Unknown, guess_of, is_odds, level_at, log_level, unknowns
 
 DIFFUSE = 10.0  # start spread of an undeclared position, in extents of network and measured ranges
 FAR = 10.0  # times as wide where no sensor measures a range: bearings of a small array reach far beyond it
@@ -108,6 +108,9 @@ def parameters(
             own = _numbers(level, kind, label, "", levels, sensors, odds)
             number = tuple(np.repeat(own, pieces).tolist()) if level.by else (own[0],)
             found += [Parameter(column + c, name, level.guess, odds, number) for c in range(width)]
+        if isinstance(channel.noise, Growing) and isinstance(channel.std, Unknown):
+            own = _numbers(channel.std, kind, f"{channel_name}_std", channel.unit, levels, sensors)
+            found += [Parameter(column + c, "", channel.std.guess, False, tuple(own)) for c in range(width)]
         column += width
     return tuple(found)
 

@@ -17,13 +17,16 @@ from probcal.errors import InputError, nearest
 from probcal.geometry import wrap
 from probcal.motion import Layout, view
 from probcal.network import ANGLES, MOVING, Network, Node
-from probcal.noise import AdditiveNoise, Bernoulli, level_at, with_values
+from probcal.noise import AdditiveNoise, Bernoulli, Growing, level_at, with_values
 from probcal.sensor import Channel, Sensor, SensorType
 from probcal.types import PoseView
 
 
 class Parameter(NamedTuple):
-    """An unknown parameter of the noise family of a channel: which level it is, of all sensors or of each."""
+    """An unknown parameter of the noise family of a channel: which level it is, of all sensors or of each.
+
+    The name "" is the std of a channel, where its family does not grow in proportion to it.
+    """
 
     channel: int
     name: str  # as `noise.unknowns` has it
@@ -33,6 +36,8 @@ class Parameter(NamedTuple):
 
     def of(self, rows: "Rows") -> jax.Array:
         """Level number of each row, (N,)."""
+        if not self.name:
+            return rows.level[:, self.channel]
         return jnp.asarray(self.number)[rows.sensor % len(self.number)]
 
 
@@ -316,6 +321,18 @@ def noise_std(rows: Rows, levels: jax.Array) -> jax.Array:
     return rows.std * factors[rows.level]
 
 
+def std_at(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
+    """Std of the noise (N, C) at the predicted values, with which it may grow."""
+    std, families = noise_std(rows, levels), _families(block, rows, levels)
+    if not any(isinstance(family, Growing) for family in families):
+        return std
+    parts = [
+        family.spread(predicted[:, c], std[:, c]) if isinstance(family, Growing) else std[:, c]
+        for c, family in enumerate(families)
+    ]
+    return jnp.stack(parts, 1)
+
+
 def _families(
     block: Block, rows: Rows, levels: jax.Array, offset: jax.Array | None = None, *, each: bool = False
 ) -> list[Any]:
@@ -325,6 +342,8 @@ def _families(
     """
     values: dict[int, dict[str, jax.Array]] = {}
     for k, own in enumerate(block.unknown):
+        if not own.name:
+            continue
         one = len(own.number) == 1 and offset is None
         places = own.number[0] if one else jnp.asarray(own.number) if each else own.of(rows)
         log = jnp.asarray(levels)[places]
@@ -337,7 +356,7 @@ def _families(
 def families_at(block: Block, levels: np.ndarray) -> list[Any]:
     """Noise family of each channel with numbers for its unknown parameters, in the middle of those of its sensors."""
     families = [channel.noise for channel in block.channels]
-    for own in block.unknown:
+    for own in (own for own in block.unknown if own.name):
         value = level_at(own.guess, own.odds, float(levels[list(own.number)].mean()))
         families[own.channel] = with_values(families[own.channel], {own.name: float(value)})
     return families
@@ -412,8 +431,11 @@ def parameter_score(
     number = jnp.stack([own.of(rows) for own in block.unknown], 1)
 
     def density(offset: jax.Array) -> jax.Array:
-        families = _families(block, rows, levels, offset)
-        return _by_channel(block, families, "log_likelihood", rows.y, predicted, noise_std(rows, levels))
+        families, std = _families(block, rows, levels, offset), noise_std(rows, levels)
+        for k, own in enumerate(block.unknown):
+            if not own.name:
+                std = std.at[:, own.channel].multiply(jnp.exp(offset[:, k]))
+        return _by_channel(block, families, "log_likelihood", rows.y, predicted, std)
 
     def whole(levels: jax.Array) -> jax.Array:
         std = noise_std(rows, levels)

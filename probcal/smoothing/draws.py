@@ -97,4 +97,4 @@ class Remainder(NamedTuple):
 @jax.jit
 def residuals(model: Model, point: Point) -> Remainder:
     """Innovation, noise level and reliance of every datum at a point."""
-    return Remainder(model.innovation(point), model.noise_std(point.levels), model.reliance(point))
+    return Remainder(model.innovation(point), model.spread_of_noise(point), model.reliance(point))
