@@ -258,7 +258,7 @@ def warehouse_2hz(seed, declared, noise):
 # Clocks: three scopes that read range and azimuth, or five cameras; the clocks of all but the first are off.
 
 OFFSETS = (1e-3, 5.0)  # s, between which the sizes of offsets lie, their logarithms even
-TIMED = ("free", "free, rate too", "not declared")
+TIMED = ("offset", "rate too", "not declared")
 SCENES = ("scopes", "cameras")
 
 
