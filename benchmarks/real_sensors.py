@@ -332,5 +332,80 @@ def clocks(seed, scene, declared):
     }  # fmt: skip
 
 
+# Noise of ranges as it is: late by reflection, with a memory, growing with distance.
+
+BEACONS = ((0, 0), (10, 0), (10, 8), (0, 8), (5, 9))  # m
+WALK, PACE = 150, 0.2  # epochs, s apart
+TRUE_NOISE = {
+    "late": 'pc.Channel("m", std=0.05, noise=families.Mixture(0.2, 15.0, late="exponential"))',
+    "memory": 'pc.Channel("m", std=0.02, memory=families.Memory(0.05, 2.0))',
+    "growing": 'pc.Channel("m", std=families.Grows(0.03, 0.02))',
+}
+MIXED = 'pc.Channel("m", std=pc.Unknown(0.1), noise=families.Mixture({}, pc.Unknown(8.0), late="exponential"))'
+CONSTANT = 'pc.Channel("m", std=pc.Unknown(0.1))'
+DECLARED_NOISE = {  # of each: as it may be declared now, and the former declarations
+    "late": {
+        "learnt": MIXED.format("pc.Unknown(0.1)"),
+        "by-sensor": MIXED.format('pc.Unknown(0.1, by="sensor")'),
+        "student": 'pc.Channel("m", std=pc.Unknown(0.1), noise=families.StudentT(4.0))',
+        "normal": CONSTANT,
+    },
+    "memory": {
+        "memory": 'pc.Channel("m", std=pc.Unknown(0.05), memory=families.Memory(pc.Unknown(0.1), 2.0))',
+        "white": CONSTANT,
+    },
+    "growing": {
+        "grows": 'pc.Channel("m", std=families.Grows(pc.Unknown(0.1), pc.Unknown(0.05)))',
+        "constant": CONSTANT,
+    },
+}
+
+
+def beacons(channel, dimension):
+    """A network of five beacons whose ranges have offsets, with the channel of a declaration."""
+    import probcal as pc
+    from probcal import noise as families
+
+    @pc.sensor(range=eval(channel, {"pc": pc, "families": families}))
+    def uwb(target, pose, *, range_offset=pc.Bias("m", 0.3, zeros="none")):
+        return dict(range=pc.geometry.norm(target.position - pose.position) + range_offset)
+
+    places = [(*place, 3.0 * (k % 2)) for k, place in enumerate(BEACONS)]
+    return pc.Network(
+        [uwb.on(pc.Node(f"a{k}", p[:dimension], survey={"position": 0.01})) for k, p in enumerate(places)]
+    )
+
+
+@situation(*((true, name, d) for true, own in DECLARED_NOISE.items() for name in own for d in (2, 3)))
+def ranges(seed, true, declared, dimension):
+    """Offsets and track where the noise is declared as it is, and as it was declared before; all of it is drawn."""
+    import probcal as pc
+
+    middle = (5.0, 4.0, 1.0)[:dimension]
+    motion = pc.Target(pc.ConstantVelocity(0.2), {"position": (middle, 2.0), "velocity": ((0.0,) * dimension, 0.5)})
+    time = PACE * np.arange(WALK)
+    run = pc.simulate(beacons(TRUE_NOISE[true], dimension), motion, time, key=seed, share=1.0, missing=0.1)
+    network = beacons(DECLARED_NOISE[true][declared], dimension)
+    problem = pc.Problem(network, motion, run.table)
+    tree = pc.assess(problem, pc.fit(problem, pc.MAP(), prior=pc.Gaussian()))
+    group, truth = tree["calibration"].to_dataset(), np.array([run.truth.biases[label] for label in problem.labels])
+    inside = (group["lower"].values <= truth) & (truth <= group["upper"].values)
+    names = [f"position_{x}" for x in "xyz"[:dimension]]
+    track, path = tree["track/target"].to_dataset(), run.truth.tracks[names].to_numpy()
+    mean, sd = (track[part].sel(component=names).values for part in ("mean", "sd"))
+    held = np.abs(mean - path) < 1.598 * sd  # 89 % of a Gaussian
+    best = pc.fit(pc.Problem(beacons(TRUE_NOISE[true], dimension), motion, run.table), pc.MAP(), prior=pc.Gaussian())
+    known = best["track/target"].to_dataset()["mean"].sel(component=names).values
+    return {
+        "offsets": share_of(inside, np.ones(len(truth), bool)),
+        "track": share_of(held, np.ones_like(held)),
+        "offset rmse in m": float(np.sqrt(np.mean((group["mean"].values - truth) ** 2))),
+        "bound": float(np.sqrt(np.mean(best["calibration"].to_dataset()["sd"].values ** 2))),
+        "track rmse in m": float(np.sqrt(np.mean((mean - path) ** 2))),
+        "noise known": float(np.sqrt(np.mean((known - path) ** 2))),
+        "status": tree.attrs["status"],
+    }  # fmt: skip
+
+
 if __name__ == "__main__":
     main()
