@@ -194,6 +194,11 @@ class Problem:
     def unlinked(self) -> Problem:
         """The same problem without motion: the state of every epoch is free, but for known and static targets."""
         check_linear(self)
+        if self.clocks.any():
+            raise InputError(
+                'without a motion nothing tells the time of a row: hold the clocks, fix=("*.time_*",), or take a method'
+                " that uses the motion"
+            )
         names = self.measurements.target_names
         motion = {name: self._unlinked(name, self.target(name)) for name in names}
         return self.rebuild(motion=motion)

@@ -168,6 +168,13 @@ def test_only_the_first_node_of_a_sensor_gives_its_rows_their_time():
         pc.Network([apart.on(first, second)])
 
 
+def test_a_method_without_motion_is_refused(problem):
+    with pytest.raises(pc.InputError, match="without a motion nothing tells the time of a row: hold the clocks"):
+        pc.fit(problem, pc.LeastSquares())
+    held = pc.Problem(problem.network, DRIVE, problem.measurements.table, fix=("*.time_*",))
+    assert "n1.time_offset" not in held.labels
+
+
 def test_posterior_calibration_with_clocks_is_refused(problem):
     with pytest.raises(pc.InputError, match="sbc: rows of free clocks have other times in every truth"):
         pc.sbc(problem, pc.EA(), runs=2, around="data")

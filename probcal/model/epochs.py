@@ -158,8 +158,9 @@ class Stepwise:
         check_densities(self.sampled)
         if not self.full_rank:
             raise InputError(
-                "the motion has no density: its noise does not reach every component of the state (singular=True, or"
-                " Static()); take a motion with noise in all of them"
+                "the motion has no density: its noise does not reach every component of the state (singular=True,"
+                " Static(), or rows of free clocks at one time); take a motion with noise in all of them, and hold the"
+                " clocks (fix=)"
             )
 
     def predict_at(self, epoch: Epoch, x: State, z: jax.Array) -> tuple[jax.Array, ...]:
