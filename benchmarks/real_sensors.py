@@ -11,6 +11,7 @@ import argparse
 import itertools
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
+from functools import cache
 from multiprocessing import get_context
 
 import numpy as np
@@ -158,12 +159,15 @@ ANCHORS = ((0, 0, 4.5), (20, 0, 6), (40, 0, 4.5), (40, 25, 6), (20, 25, 3), (0, 
 DELAY = 0.15  # sd of the delays in m, declared with a scale of 0.3
 LATE = 0.1  # fraction of ranges that come by reflection, 0.3 m and an exponential of 0.8 m late
 DECLARED = {  # variants: zeros of the delays, and the prior of the fit
-    "former": ("expected", "None"),  # zeros expected of the delays too
-    "none": ("none", "None"),
-    "learnt": ("learnt", "None"),
+    "former": ("expected", "pc.Horseshoe(by=None)"),  # zeros expected of delays too, every axis by itself
+    "expected": ("expected", "pc.Horseshoe()"),
+    "none-by-axis": ("none", "pc.Horseshoe(by=None)"),
+    "none": ("none", "pc.Horseshoe()"),
+    "learnt": ("learnt", "pc.Horseshoe()"),
+    "level": ("expected", '{"*.range_offset": pc.ARD(shape=2, rate=2, by="component")}'),
+    "spike": ("expected", "pc.BernoulliGaussian()"),
     "learnt-spike": ("learnt", "pc.BernoulliGaussian()"),
-    "by-axis": ("none", "pc.Horseshoe(by=None)"),
-    "all-gaussian": ("none", '{"*": pc.Gaussian()}'),
+    "gaussian": ("none", "pc.Gaussian()"),
 }
 
 
@@ -180,6 +184,20 @@ def ride(rng, rate, seconds=180.0):
     return t, np.stack([*smooth, 2.2 + 1.2 * np.sin(t / 17) + 0.3 * np.sin(t / 5)], 1)
 
 
+def displaced(rng):
+    """Displacements (8, 3) of the anchors, two of them by 0.4 m, and their delays (8,), in m."""
+    shift, moved = np.zeros((len(ANCHORS), 3)), rng.choice(len(ANCHORS), 2, replace=False)
+    towards = rng.normal(size=(2, 3)) * [1.0, 1.0, 0.5]
+    shift[moved] = 0.4 * towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    return shift, rng.normal(0.0, DELAY, len(ANCHORS))
+
+
+def labelled_biases(shift, delay):
+    """True biases by label."""
+    true = {f"A{k:02d}.range_offset": delay[k] for k in range(len(delay))}
+    return true | {f"A{k:02d}.position_{x}": shift[k, i] for k in range(len(delay)) for i, x in enumerate("xyz")}
+
+
 def warehouse_of(seed, zeros, noise, rate=10.0):
     """A problem, its true biases by label and the true track: delays, displaced anchors and the ride are drawn."""
     import pandas as pd
@@ -192,11 +210,7 @@ def warehouse_of(seed, zeros, noise, rate=10.0):
         return dict(range=pc.geometry.norm(target.position - pose.position) + range_offset)
 
     rng, stated = np.random.default_rng(seed), np.array(ANCHORS, float)
-    shift = np.zeros_like(stated)
-    moved = rng.choice(len(stated), 2, replace=False)
-    towards = rng.normal(size=(2, 3)) * [1.0, 1.0, 0.5]
-    shift[moved] = 0.4 * towards / np.linalg.norm(towards, axis=1, keepdims=True)
-    delay = rng.normal(0.0, DELAY, len(stated))
+    shift, delay = displaced(rng)
     t, place = ride(rng, rate)
     rows = []
     for k, own in enumerate(stated + shift):
@@ -205,10 +219,8 @@ def warehouse_of(seed, zeros, noise, rate=10.0):
         there = rng.random(len(t)) > 0.15
         rows.append(pd.DataFrame({"time": t, "sensor": f"A{k:02d}", "range": measured})[there])
     network = pc.Network([uwb.on(pc.Node(f"A{k:02d}", at, scale={"position": 0.5})) for k, at in enumerate(stated)])
-    true = {f"A{k:02d}.range_offset": delay[k] for k in range(len(stated))}
-    true |= {f"A{k:02d}.position_{x}": shift[k, i] for k in range(len(stated)) for i, x in enumerate("xyz")}
     table = pd.concat(rows).sort_values(["time", "sensor"])
-    return pc.Problem(network, pc.ConstantVelocity(pc.Unknown(1.0)), table), true, place
+    return pc.Problem(network, pc.ConstantVelocity(pc.Unknown(1.0)), table), labelled_biases(shift, delay), place
 
 
 def share_of(inside, chosen):
@@ -222,24 +234,28 @@ def kinds(seed, declared, noise, rate=10.0):
 
     zeros, prior = DECLARED[declared]
     problem, true, place = warehouse_of(seed, zeros, noise, rate)
-    gaussian = declared == "all-gaussian"
-    tree = pc.fit(problem, pc.MAP() if gaussian else pc.EA(), prior=eval(prior, {"pc": pc}))
+    tree = pc.fit(problem, pc.MAP() if declared == "gaussian" else pc.EA(), prior=eval(prior, {"pc": pc}))
     tree = pc.assess(problem, tree)
     table = pc.summary(tree).set_index("bias")
-    at = np.array([true[label] for label in table.index])
-    inside = ((table["lower"] <= at) & (at <= table["upper"])).to_numpy()
-    delays = table.index.str.endswith("range_offset")
     sure = (table["verdict"] == "determined").to_numpy()
     track = pc.tracks(tree)
     found = track[[f"position_{x}" for x in "xyz"]].to_numpy()
     off = np.sqrt(np.mean(np.sum((found - place) ** 2, 1)))
+    held = coverage(table["mean"], table["sd"], table["lower"], table["upper"], true, sure)
+    return held | {"track rmse in m": float(off), "status": tree.attrs["status"]}
+
+
+def coverage(mean, sd, lower, upper, true, sure):
+    """Biases (M,) whose intervals hold the truth by label: of all, of a kind, and of those called determined."""
+    at = np.array([true[label] for label in mean.index])
+    inside = ((lower <= at) & (at <= upper)).to_numpy()
+    delays = mean.index.str.endswith("range_offset")
     return {
         "all": share_of(inside, np.ones(len(at), bool)), "not zero": share_of(inside, at != 0),
-        "delays": share_of(inside, delays), "determined": share_of(inside, sure),
-        "determined, not zero": share_of(inside, sure & (at != 0)),
-        "determined and beyond 4 sd": share_of((np.abs(table["mean"] - at) > 4 * table["sd"]).to_numpy(), sure),
-        "bias rmse in m": float(np.sqrt(np.mean((table["mean"] - at) ** 2))), "track rmse in m": float(off),
-        "status": tree.attrs["status"],
+        "delays": share_of(inside, delays), "displaced": share_of(inside, ~delays & (at != 0)),
+        "determined": share_of(inside, sure), "determined, not zero": share_of(inside, sure & (at != 0)),
+        "determined and beyond 4 sd": share_of((np.abs(mean - at) > 4 * sd).to_numpy(), sure),
+        "bias rmse in m": float(np.sqrt(np.mean((mean - at) ** 2))), "width in m": float((upper - lower).median()),
     }  # fmt: skip
 
 
@@ -247,6 +263,48 @@ def kinds(seed, declared, noise, rate=10.0):
 def warehouse(seed, declared, noise):
     """Delays that are never zero, declared so and not, at ten ranges a second of each anchor."""
     return kinds(seed, declared, noise)
+
+
+@cache
+def information():
+    """Information of the data about the biases of the warehouse in declared scales, at two ranges a second."""
+    import probcal as pc
+
+    return pc.fit(warehouse_of(0, "none", "StudentT(4)", 2.0)[0], pc.MAP())["calibration"]["information"].to_numpy()
+
+
+@situation(*[(name,) for name in DECLARED], name="warehouse-linear")
+def warehouse_linear(seed, declared):
+    """The prior alone: a Gaussian likelihood of the biases around their truth, integrated as `EA` does."""
+    import jax
+    import jax.numpy as jnp
+    import pandas as pd
+
+    import probcal as pc
+    from probcal.inference.hierarchy import hierarchy_of
+    from probcal.inference.integrate import KEPT, begin, moments, run_sweeps
+    from probcal.inference.methods import choose_prior
+    from probcal.inference.posed import Form, Natural
+
+    zeros, given = DECLARED[declared]
+    problem, matrix = warehouse_of(0, zeros, "StudentT(4)", 2.0)[0], information()
+    method = pc.MAP() if declared == "gaussian" else pc.EA()
+    prior, rng = choose_prior(method, eval(given, {"pc": pc}), problem.labels), np.random.default_rng(seed)
+    true = labelled_biases(*displaced(rng))
+    z = np.array([true[label] for label in problem.labels]) / problem.scales
+    values, axes = np.linalg.eigh(matrix)
+    pull = matrix @ z + axes @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(z)))
+    with jax.enable_x64(True):
+        form = Form(len(z), hierarchy_of(prior, problem))
+        first = prior.precision(problem.labels, problem.surveyed)
+        known = Natural(jnp.asarray(matrix), jnp.asarray(pull), jnp.zeros(0), first)
+        keys = jax.random.split(jax.random.key(seed))
+        _, swept = run_sweeps(form, known, begin(form, known, keys[0]), keys[1], KEPT)
+        phi = swept.phi or {"none": jnp.zeros((4, KEPT))}
+        found = jax.device_get(moments(form, known, phi))
+    sure = 1.0 - np.diagonal(np.linalg.inv(matrix + np.eye(len(z)))) > 0.5
+    columns = (found.mean, np.sqrt(np.diagonal(found.covariance)), found.lower, found.upper)
+    return coverage(*(pd.Series(c * problem.scales, problem.labels) for c in columns), true, sure)
 
 
 @situation(*itertools.product(DECLARED, ("StudentT(4)", "Mixture(0.1, 10, 12)")), name="warehouse-2hz")

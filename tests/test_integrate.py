@@ -11,7 +11,14 @@ import probcal
 from probcal import ARD, EA, MAP, BernoulliGaussian, Gaussian, Horseshoe, Laplace, fit
 from probcal.errors import InputError
 from probcal.inference.ending import uncertain
-from probcal.inference.hierarchy import GammaPrecision, LaplaceMixture, RegularisedHorseshoe, SpikeAndSlab, hierarchy_of
+from probcal.inference.hierarchy import (
+    GammaPrecision,
+    LaplaceMixture,
+    Product,
+    RegularisedHorseshoe,
+    SpikeAndSlab,
+    hierarchy_of,
+)
 from probcal.inference.integrate import (
     CHAINS,
     KEPT,
@@ -28,21 +35,35 @@ from probcal.inference.integrate import (
 )
 from probcal.inference.posed import Form, Natural
 from probcal.inference.propagate import CLOSE, ROUNDS, Propagation
-from probcal.priors import Precision
+from probcal.priors import Precision, by_kind
 from probcal.smoothing.grid import track_mode
 from probcal.smoothing.mode import Point
 
 PRIORS = [ARD(shape=1.5, rate=0.5), Laplace(), Horseshoe(), BernoulliGaussian(share=0.4)]
 KINDS = {ARD: GammaPrecision, Laplace: LaplaceMixture, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab}
-SOME = [pytest.param(p, marks=pytest.mark.ci) if isinstance(p, ARD | Laplace) else p for p in PRIORS]
+KINDS_OF_BIASES = by_kind(Horseshoe(), {"spiked": BernoulliGaussian(slab=None)})  # of the second and third bias
+PRIORS.append(KINDS_OF_BIASES)
+SOME = [pytest.param(p, marks=pytest.mark.ci) if isinstance(p, ARD | Laplace) or p.kinds else p for p in PRIORS]
 G = np.array([[4.0, 2.5, 0.0], [2.5, 3.0, 0.5], [0.0, 0.5, 9.0]])  # two that trade against each other, one seen well
 PULL = np.array([5.0, 2.0, -1.0])
 DRAWS = 200_000
 
 
+def kind_of(prior, group=(0, 1, 2)):
+    """The hierarchy of three biases, of which the last two are spiked where the prior has kinds."""
+    if not prior.kinds:
+        return KINDS[type(prior)](prior, (0, 1, 2), group)
+    spiked = SpikeAndSlab(prior.kinds[0][1], (1, 2), (0, 1))
+    return Product.of(prior, [("", RegularisedHorseshoe(prior, (0,), (0,))), ("spiked", spiked)])
+
+
+def name_of(prior):
+    return "Product" if prior.kinds else type(prior).__name__
+
+
 def mixture(prior, matrix=G, pull=PULL, group=(0, 1, 2), key=0):
     """The mixture by Gibbs sweeps: moments and draws."""
-    form = Form(3, KINDS[type(prior)](prior, (0, 1, 2), group))
+    form = Form(3, kind_of(prior, group))
     with jax.enable_x64(True):
         known = Natural(jnp.asarray(matrix), jnp.asarray(pull), jnp.zeros(0), Precision.single(jnp.ones(3)))
         keys = jax.random.split(jax.random.key(key))
@@ -53,7 +74,7 @@ def mixture(prior, matrix=G, pull=PULL, group=(0, 1, 2), key=0):
 
 def weighed(prior):
     """The same by importance sampling: hyper-parameters from their prior, each weighed by its evidence."""
-    kind = KINDS[type(prior)](prior, (0, 1, 2), (0, 1, 2))
+    kind = kind_of(prior)
     with jax.enable_x64(True):
         phi = jax.vmap(kind.draw)(jax.random.split(jax.random.key(1), DRAWS))
         alpha = np.asarray(jax.vmap(lambda one: kind.alpha(one, jnp.ones(3)))(phi))
@@ -70,7 +91,7 @@ def weighed(prior):
     return middle, spread, gamma
 
 
-@pytest.mark.parametrize("prior", SOME, ids=lambda prior: type(prior).__name__)
+@pytest.mark.parametrize("prior", SOME, ids=name_of)
 def test_a_mixture_has_the_moments_of_the_posterior(prior):
     """Three biases, two of them traded: within five Monte Carlo errors of some 400 effective draws, a quarter sd."""
     found, z, mean = mixture(prior)
@@ -111,11 +132,11 @@ class Fixed(DenseLikelihood):
         pytest.param([[0, 3], [1, 3], [2, 3]], id="one", marks=pytest.mark.ci),
     ],
 )
-@pytest.mark.parametrize("prior", SOME, ids=lambda prior: type(prior).__name__)
+@pytest.mark.parametrize("prior", SOME, ids=name_of)
 def test_expectation_propagation_agrees_too(prior, members):
     """Without sweeps over all: means within a fifth of an sd, sds within 15 %; less where a block parts the traded."""
     members = np.array(members)
-    form = Form(3, KINDS[type(prior)](prior, (0, 1, 2), (0, 1, 2)))
+    form = Form(3, kind_of(prior))
     with jax.enable_x64(True):
         known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision.single(jnp.ones(3)))
         point = Point((), (), jnp.zeros(3), jnp.zeros(0))

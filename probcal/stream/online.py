@@ -22,7 +22,7 @@ from probcal.inference.widen import widening_factors
 from probcal.labels import NOBODY, label_parts
 from probcal.lazy import Later
 from probcal.network import Network
-from probcal.priors import Gaussian, Prior
+from probcal.priors import AnyPrior, Gaussian, Horseshoe, Prior, as_prior
 from probcal.problem import Problem, fixed_biases
 from probcal.results.answer import HALF
 from probcal.results.read import apply, held_by
@@ -370,7 +370,7 @@ class Online:
         return np.flatnonzero([label_parts(label)[0] in owners for label in self.labels])
 
     @float64
-    def under(self, prior: Prior, *, key: int = 0) -> pd.DataFrame:
+    def under(self, prior: AnyPrior, *, key: int = 0) -> pd.DataFrame:
         """`biases` under a sparse prior in the place of the declared scales: online evidence approximation.
 
         What the rows say of the biases is a Gaussian likelihood, whatever the prior: a hierarchical one is integrated
@@ -385,7 +385,8 @@ class Online:
             )
         problem = self._problem
         precision = self.prior.precision(problem.labels, problem.surveyed)
-        moments = relearnt(problem, prior, precision, np.asarray(self.end.mean), np.asarray(self.end.root), key)
+        chosen = as_prior(prior, Horseshoe(), problem.network.labels)
+        moments = relearnt(problem, chosen, precision, np.asarray(self.end.mean), np.asarray(self.end.root), key)
         scales, sd = problem.scales, np.sqrt(np.diag(moments.covariance))
         return self.biases.assign(
             mean=moments.mean * scales, sd=sd * scales, lower=moments.lower * scales, upper=moments.upper * scales,
