@@ -296,14 +296,14 @@ class Horseshoe(Prior):
     """Regularised horseshoe: half-Cauchy global and local scales, a slab of inverse-Gamma variance.
 
     `expected` is the share of biases expected to be non-zero, `slab_scale` (in declared scales) and `slab_df` bound
-    the large ones (Piironen, Vehtari 2017). `by` shares a local scale, as in `ARD`: by "vector" the axes of one
-    position.
+    the large ones (Piironen, Vehtari 2017). `by` shares a local scale, as in `ARD`: by "vector", the default, the axes
+    of one position, so that the answer turns with the world; None gives every bias one of its own.
     """
 
     expected: float = 0.2
     slab_scale: float = 2.0
     slab_df: float = 4.0
-    by: str | None = None
+    by: str | None = "vector"
 
     hierarchical: ClassVar[bool] = True
 
@@ -321,7 +321,12 @@ class Horseshoe(Prior):
         return grouped(members, self.by)
 
     def adaptive(self) -> "Horseshoe":
-        """The one whose global scale, half-Cauchy of scale 1, says whether few of the kind are zero or most."""
+        """The one whose global scale, half-Cauchy of scale 1, says whether few of the kind are zero or most.
+
+        A handful of biases says little of their kind, and every kind that learns that few of it are zero
+        makes the others sparser: the kinds trade, and those gain what these lose. Where it is known that
+        none is zero, say so by `zeros="none"` (measured in `benchmarks/README.md`, kinds of biases).
+        """
         return replace(self, expected=0.5)
 
 
@@ -402,6 +407,6 @@ PRIORS: dict[str, Prior] = {
     "ard-vector": ARD(by="vector"),
     "ard-gamma": ARD(shape=1.0, rate=0.5),
     "horseshoe": Horseshoe(),
-    "horseshoe-vector": Horseshoe(by="vector"),
+    "horseshoe-axis": Horseshoe(by=None),
     "bernoulli-gaussian": BernoulliGaussian(),
 }

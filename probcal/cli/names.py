@@ -22,11 +22,11 @@ SAVE = ("states", "predictive")  # draws that a fit writes where asked for
 PRIORS = {  # the class of each
     "flat": "Flat", "gaussian": "Gaussian", "laplace": "Laplace", "ard": "ARD", "ard-node": "ARD", "ard-owner": "ARD",
     "ard-type": "ARD", "ard-component": "ARD", "ard-vector": "ARD", "ard-gamma": "ARD", "horseshoe": "Horseshoe",
-    "horseshoe-vector": "Horseshoe", "bernoulli-gaussian": "BernoulliGaussian",
+    "horseshoe-axis": "Horseshoe", "bernoulli-gaussian": "BernoulliGaussian",
 }  # fmt: skip
 _LEARNT = ("ard", "ard-node", "ard-owner", "ard-type", "ard-component", "ard-vector", "ard-gamma")
 _FIXED = ("flat", "gaussian", "laplace")
-_HORSESHOE = ("horseshoe", "horseshoe-vector")
+_HORSESHOE = ("horseshoe", "horseshoe-axis")
 _SAMPLED = (*_FIXED, "ard-gamma", *_HORSESHOE)
 _INTEGRATED = ("laplace", *_LEARNT, *_HORSESHOE, "bernoulli-gaussian")
 METHODS = {

@@ -21,6 +21,7 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.inference.draws import inverse_gaussian, slice_step
+from probcal.labels import AXES
 from probcal.lazy import Later
 from probcal.priors import ARD, BernoulliGaussian, Gaussian, Horseshoe, Laplace, Prior
 from probcal.problem import Problem
@@ -69,12 +70,13 @@ class Hierarchy(ABC):
     def variables(self, labels: Sequence[str], phi: Mapping[str, Any]) -> dict[str, Any]:
         """Hyper-parameters by draw for biases of these labels: name -> (dims beyond chain and draw, values, coords)."""
         governed, found = {"governed_label": [labels[m] for m in self.learnt]}, dict[str, Any]()
+        first = {"precision_group": [labels[self.learnt[self.group.index(g)]] for g in range(self.count)]}
         for name, values in phi.items():
             whose = self.belongs(name)
             if whose == "bias":
                 found[name] = (("governed_label",), values, governed)
             else:
-                found[name] = ((), values) if whose == "all" else (("precision_group",), values)
+                found[name] = ((), values) if whose == "all" else (("precision_group",), values, first)
         return found
 
     @abstractmethod
@@ -310,10 +312,17 @@ class RegularisedHorseshoe(Hierarchy):
             return jnp.zeros(self.count).at[group].add(z**2)
 
         def standard_gamma(key: jax.Array) -> jax.Array:
-            """Gamma draws of shape (members + 1) / 2, of one member an exponential."""
+            """Gamma draws of shape (members + 1) / 2, of one member an exponential.
+
+            Those of the axes of a vector are halves of chi-squares: the sampler of jax would take a
+            second to compile.
+            """
             if (members == 1).all():
                 return jax.random.exponential(key, (self.count,))
-            return jax.random.gamma(key, 0.5 * (jnp.asarray(members) + 1.0))
+            if members.max(initial=0) > len(AXES):
+                return jax.random.gamma(key, 0.5 * (jnp.asarray(members) + 1.0))
+            squares = jax.random.normal(key, (self.count, len(AXES) + 1)) ** 2
+            return 0.5 * jnp.sum(jnp.where(np.arange(len(AXES) + 1) <= members[:, None], squares, 0.0), 1)
 
         def local(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
             keys = jax.random.split(key, 3)
