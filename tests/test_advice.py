@@ -29,7 +29,10 @@ HOOKS = ["problem", "scenario", "setting", "truth", "initial", "log_initial", "l
 HOOKS += ["update", "under", "float", "int"]
 VALUES = {"problem": "Problem", "online": "Online", "motion": "Motion", "sensor_type": "SensorType"}  # their class
 NOISY = ["ConstantVelocity", "ConstantAcceleration", "CoordinatedTurn", "RandomWalk", "White", "Known"]
-CALLED = {"own.family": NOISY, "method.name": ["EA", "MAP"], "name": HOOKS}  # what a filled-in name may be
+CALLED = {  # values that a filled-in name may have
+    "own.family": NOISY, "method.name": ["EA", "MAP"], "name": HOOKS, "type(self).__name__": ["Gaussian", "ARD"],
+    "type(prior).__name__": ["Horseshoe", "BernoulliGaussian"],
+}  # fmt: skip
 
 
 @cache

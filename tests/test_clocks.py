@@ -127,6 +127,7 @@ def test_a_motion_that_turns_goes_on_by_its_own_transition():
     assert np.allclose(np.concatenate([seen.position, seen.velocity]), expected, atol=1e-6)
 
 
+@pytest.mark.ci
 def test_offsets_are_found_from_anywhere_within_their_scale():
     problem = pc.Problem(network(), DRIVE, late_rows((0.0, 0.4, -1.3), headings=(0.0, 0.03, 0.0)))
     tree = pc.fit(problem)

@@ -35,6 +35,7 @@ from probcal.noise import Growing, Grows, Normal, level_at
 FAMILIES = [Normal(), StudentT(4.0), Mixture(0.2, 6.0, late="exponential")]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("inner", FAMILIES, ids=repr)
 @pytest.mark.parametrize("predicted", [3.0, -8.0])
 def test_growing_noise_agrees_with_its_density(inner, predicted):

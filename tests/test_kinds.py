@@ -173,6 +173,7 @@ PHI = {
 }
 
 
+@pytest.mark.ci
 def test_a_product_has_hyper_parameters_of_its_own():
     """Names, sizes and dimensions; what each part does is what it does alone."""
     problem = ranges()

@@ -57,6 +57,7 @@ def recording(noise, dimension=2, key=1):
     return run.table, biases
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("family", FAMILIES, ids=repr)
 def test_a_late_part_agrees_with_its_density(family):
     """It integrates to one; score, level score and information follow from it, and the draws have it."""
@@ -107,6 +108,7 @@ def each(noise, std=0.05):
     return problem, At((jnp.asarray(states),), jnp.zeros(problem.model.biases), jnp.zeros(len(problem.levels)))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("by", [None, "sensor"])
 @pytest.mark.parametrize("name", ["share", "df"])
 def test_the_slope_by_a_parameter_is_that_of_the_evidence(name, by):
