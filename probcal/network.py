@@ -78,8 +78,8 @@ class Node:
     position (d,) in m, heading (pitch, roll) in rad, or a known `path`; extras such as `gain=0.0` are numbers, or
     vectors (d,) where a sensor type declares them so (`vectors=("boresight",)`), with a bias an axis. `clock`
     is in m (time times speed). A row was measured at its stated time plus `time_offset` (s) plus `time_rate` (s per s)
-    times the seconds since the first row of the table: targets and moving nodes are taken there, whatever the sensor's
-    function reads (of a sensor with several nodes, by the clock of the first).
+    times the seconds since the first row of the table, or of the calibration that is applied to it. Targets and moving
+    nodes are taken there, whatever the sensor's function reads; a sensor of several nodes has the clock of the first.
     `survey` and `scale` give standard deviations by component (a bare number means the position; a `Bias` may
     carry the unit of a clock or an extra, a drift or `zeros`): `survey` is how well the stated value is known,
     `scale` is governed by the prior chosen at the fit, neither means known. Raises `InputError` naming node and

@@ -297,6 +297,16 @@ class Problem:
         return np.array([self.timed.get(b.label, 0.0) / b.scale for b in self.biases])
 
     @float64
+    def counted_from(self, begin: float) -> Problem:
+        """The same problem, whose clocks that run count from a time in s on, by default that of the first row."""
+        if begin == self.begin or not self.clocks.any():
+            return self
+        other = copy(self)
+        other.begin = begin
+        other._compile()
+        return other
+
+    @float64
     def at_times(self, moved: np.ndarray, timed: dict[str, float]) -> Problem:
         """The same problem with its rows taken so many seconds (N,) after their stated times; shapes stay.
 

@@ -10,6 +10,7 @@ import probcal as pc
 from probcal.geometry import bearing, norm
 from probcal.motion import CoordinatedTurn
 from probcal.motion.layout import flow_of, layout_of, view
+from probcal.results.read import apply
 from probcal.smoothing.mode import Point
 
 TIME = np.arange(0.0, 40.0, 2.0)
@@ -200,3 +201,26 @@ def test_a_moving_node_goes_on_along_its_path_too():
     assert np.abs(rows["range"] - np.hypot(100.0 - (rows["time"] + 0.8), 100.0)).max() < 4 * 0.5
     assert np.abs(rows["azimuth"] - np.arctan2(100.0, 100.0 - (rows["time"] + 0.8)) + 0.01 * (rows["time"] + 0.8)
                   ).max() < 4 * 0.003  # fmt: skip
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("dated", [False, True])
+def test_a_clock_that_runs_counts_from_the_rows_of_its_calibration(dated):
+    loose = network(0.5, more={"time_rate": 1e-2})
+    running = {"n1.time_offset": 0.3, "n1.time_rate": 8e-3, "n2.time_rate": -4e-3}
+
+    def written(table, begin):
+        time = table["time"] + begin
+        return table.assign(time=pd.Timestamp("2026-03-01") + pd.to_timedelta(time, unit="s") if dated else time)
+
+    first = pc.simulate(loose, DRIVE, TIME, key=1, biases=running, tracks={"target": WAY}).table
+    tree = pc.fit(pc.Problem(loose, DRIVE, written(first, 0.0)))
+    found = pc.summary(tree).set_index("bias")
+    assert abs(found.loc["n1.time_rate", "mean"] - 8e-3) < 4 * found.loc["n1.time_rate", "sd"]
+    later = pc.Problem(loose, DRIVE, written(first, 100.0))
+    applied = apply(later, tree).problem
+    assert applied.begin == pytest.approx(-100.0 if dated else 0.0)
+    mine = later.measurements.sensor == 1
+    since = later.measurements.time[mine] - applied.begin
+    ahead = found.loc["n1.time_offset", "mean"] + found.loc["n1.time_rate", "mean"] * since
+    assert np.allclose(applied.moved[mine], ahead, rtol=0.03)

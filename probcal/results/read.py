@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -222,6 +223,21 @@ def check_valid(calibration: xr.DataTree, name: str) -> None:
         raise InputError(f"{name}: the fit ended {status}, its estimate is invalid; fit again first")
 
 
+def _began(problem: Problem, calibration: xr.DataTree, group: xr.Dataset) -> float:
+    """Time in s of a problem from which the clocks of a calibration count: that of its own first row."""
+    running = [b.label for b in problem.biases if b.component == "time_rate"]
+    if not running or "since" not in group.coords:
+        return problem.begin
+    from probcal.table import first_date
+
+    began = float(group["since"].sel(bias_label=running[0]))
+    dates = str(calibration.attrs.get("time_origin", "")), first_date(problem.measurements.table)
+    if all(dates):
+        then, now = map(datetime.fromisoformat, dates)
+        began += (then - now).total_seconds()
+    return began
+
+
 def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
     """What a fit found, for another problem of its network; biases and levels are matched by label.
 
@@ -237,7 +253,7 @@ def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
         if label not in known:
             raise InputError(f'the calibration has no bias "{label}"; fit the same network, or fix that bias')
     mean = group["mean"].sel(bias_label=labels).values
-    problem = problem.retimed(mean / problem.scales)
+    problem = problem.counted_from(_began(problem, calibration, group)).retimed(mean / problem.scales)
     levels = np.zeros(len(problem.levels))
     if problem.levels and "level" in calibration.children:
         found = calibration["level"].to_dataset()["std"].to_series()
