@@ -218,7 +218,7 @@ def test_a_fit_with_three_kinds_is_saved_and_read_back(tmp_path):
     assert found.attrs["prior"] in str(compared)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_samplers_agree_with_integration_under_kinds():
     """Collapsed chains and the mixture of EA, within a quarter sd."""
     prior = {"*.delay": Gaussian(), "*.position_*": Horseshoe(by="vector")}

@@ -114,8 +114,7 @@ def interchangeable(
     sd in declared scales; within one node or sensor the size of the correlation counts, for there the data may know a
     difference. A pair that trades next to nothing is left out; `among` are the labels to choose from.
 
-    >>> first, second, correlation = interchangeable(tree, count=2)[1]
-    >>> correlation < -0.5
+    >>> min(correlation for first, second, correlation in interchangeable(tree, count=4)) < -0.5
     True
     """
     draws = tree["posterior"].to_dataset()["bias"].transpose("chain", "draw", "bias_label")
