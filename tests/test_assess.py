@@ -306,6 +306,7 @@ def alarms(out):
     return frame[frame["verdict"].isin(["drifting", "conflicting"])][["verdict", "reason"]].T.to_dict("list")
 
 
+@pytest.mark.ci
 def test_the_true_model_raises_no_alarm(judged):
     """Every check has a false-alarm rate of 1 %, and this seed none; NIS lies within its limits."""
     _, out, problem = judged("true")

@@ -385,6 +385,7 @@ def test_associations_objects_and_biases_are_sampled_together():
     assert abs(summary(other)["mean"][0] - e.p @ e.mean) < 0.05, "where a search begins changes nothing"
 
 
+@pytest.mark.ci
 def test_few_draws_are_said_not_to_have_converged():
     e = enumerated("crossing")
     tree = pc.sample_associations(problem_of(e.scans), objects=OBJECTS, most=SLOTS, draws=10, warmup=0, key=1)

@@ -146,6 +146,7 @@ def test_nodes_that_drift_are_left_out_of_the_file(moved, tmp_path):
         assert [line.split(",")[0] for line in text.splitlines()] == ["node", "a", "c"]
 
 
+@pytest.mark.ci
 def test_values_hold_fixed_steps_and_steps_before_the_data():
     """The linear world `drifting`: every piece is the sum of what has begun by then, its sd that of the exact sum."""
     problem, naive = linear("drifting")

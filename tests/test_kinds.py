@@ -150,6 +150,7 @@ def test_the_answer_turns_with_the_world():
         assert (away < 0.1 * float(one["sd"].sel(bias_label=pair).min())).all()
 
 
+@pytest.mark.ci
 def test_every_bias_without_zeros_is_the_gaussian_fit():
     """Nothing is left for the hierarchy."""
     found, wanted = fit(ranges(), EA(tolerance=1e-6), prior={"*.*": Gaussian()}), fit(ranges(), MAP())
@@ -157,6 +158,7 @@ def test_every_bias_without_zeros_is_the_gaussian_fit():
     assert found.attrs["precisions"] == "given"
 
 
+@pytest.mark.ci
 def test_maximised_precisions_hold_a_gaussian_kind():
     """ARD leaves the delays at their declared scale; two sparse priors are refused."""
     found = fit(ranges("none"), EA(precisions="maximised"))

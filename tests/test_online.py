@@ -302,6 +302,7 @@ def test_a_jump_is_found_soon_and_none_where_there_is_none(lag):
     assert moved == pytest.approx(6.0, abs=3 * online.biases["sd"]["n1.shift"])
 
 
+@pytest.mark.ci
 def test_a_window_of_everything_ends_at_the_batch_answer():
     network_ = pc.Network(
         [tape.on(pc.Node(f"n{k}", place, scale=3.0)) for k, place in enumerate(((0, 0), (60, 5), (20, 70)))]
