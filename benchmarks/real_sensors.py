@@ -386,9 +386,8 @@ def clocks(seed, scene, declared):
     return found | {
         "tracks": (int((z[known] < 1.598).sum()), int(known.sum())),
         "determined and beyond 4 sd": share_of(away > 4, sure), "status": tree.attrs["status"],
-        "sd of an offset in s": float(np.nanmedian(np.where(timed, table["sd"], np.nan))) if timed.any() else np.nan,
         "worst in sd": float(away.max()),
-    }  # fmt: skip
+    } | ({"sd of an offset in s": float(np.median(table["sd"][timed]))} if timed.any() else {})  # fmt: skip
 
 
 # Noise of ranges as it is: late by reflection, with a memory, growing with distance.
