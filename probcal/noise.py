@@ -136,7 +136,7 @@ def at_guess(family: Any) -> Any:
 
 
 def is_odds(family: Any, name: str) -> bool:
-    """Whether a parameter lies between 0 and 1, so that what is unknown of it are its odds."""
+    """True for a parameter between 0 and 1, whose log odds are estimated."""
     first, _, rest = name.partition(".")
     return is_odds(getattr(family, first), rest) if rest else name in getattr(family, "fractions", ())
 
@@ -526,7 +526,7 @@ class Growing:
 
 
 def _estimated(family: Any) -> bool:
-    """Whether parameters of a family are estimated: arrays in the place of numbers."""
+    """True where parameters of a family are estimated: arrays replace the numbers."""
     return _functions(*family.__dict__.values()) is jnp
 
 

@@ -279,9 +279,11 @@ class Problem:
     @property
     def clocks(self) -> np.ndarray:
         """Number of the clock that gives the rows of each sensor their times, 0 where the table does, (S,)."""
-        number = {node.name: k + 1 for k, node in enumerate(self.network.nodes) if node.clocked}
-        own = [number.get(s.nodes[0].name, 0) if s.type.clocked else 0 for s in self.network.sensors]
-        return np.array(own)
+        own = [b for b in self.network.biases if b.component.removesuffix("_step") in CLOCK]
+        off = {b.owner for b in own if self.fixed.get(b.label, 1.0)}  # free, or held at another time
+        off |= {node.name for node in self.network.nodes if any(node.components[name] for name in CLOCK)}
+        number = {node.name: k + 1 for k, node in enumerate(self.network.nodes) if node.name in off}
+        return np.array([number.get(s.nodes[0].name, 0) if s.type.clocked else 0 for s in self.network.sensors])
 
     @property
     def by_clock(self) -> list[np.ndarray]:
@@ -612,7 +614,7 @@ class Problem:
                 raise InputError(
                     f'sensor "{placed.name}" reads target.{both[0]}, of which every epoch has its own, so that its'
                     f' rows cannot have times of their own; leave time_offset of node "{placed.nodes[0].name}" out'
-                    " and free what the sensor has of a clock"
+                    " and free the clock bias of the sensor instead"
                 )
 
     def _gathered(self, levels: Levels, chained: list[_Chained]) -> list[_Gathered]:

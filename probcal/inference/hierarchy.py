@@ -508,7 +508,7 @@ class Product(Hierarchy):
         return self._joined([one.draw(own) for (_, one), own in zip(self.pieces, keys, strict=True)])
 
     def begin(self, key):
-        """Where every part begins."""
+        """Starting values of every part."""
         keys = jax.random.split(key, len(self.pieces))
         return self._joined([one.begin(own) for (_, one), own in zip(self.pieces, keys, strict=True)])
 

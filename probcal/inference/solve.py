@@ -68,7 +68,7 @@ def solve(
             return answer
         problem, start = taken_there(problem, answer.posterior.point)
     moving = [problem.labels[m] for m in np.flatnonzero(away > STILL * summary.sd)]
-    said = f"The rows could not be given times: {listed(moving, 3)} still moves."
+    said = f"The times of the rows have not converged: {listed(moving, 3)} still moves from round to round."
     status = Status.NOT_CONVERGED if answer.status.settled else answer.status
     return replace(answer, status=status, message=f"{answer.message} {said}".strip())
 
