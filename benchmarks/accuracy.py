@@ -25,8 +25,8 @@ from by_gtsam import RefusedError, solve
 from scipy.stats import norm
 
 import probcal as pc
-from probcal.smoothing.grid import grid_start
-from probcal.starts import automatic_start
+from probcal.modes import automatic_start
+from probcal.modes.grid import grid_start
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 

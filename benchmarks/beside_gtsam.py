@@ -18,12 +18,12 @@ import numpy as np
 import pandas as pd
 
 import probcal as pc
+from probcal.gaussian.linearised import laplace
+from probcal.gaussian.mode import cost, find_mode
 from probcal.geometry import bearing, norm
+from probcal.modes.grid import follow_states
 from probcal.motion import Component
 from probcal.motion.components import blocks
-from probcal.smoothing.grid import follow_states
-from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import cost, find_mode
 
 RANGE, AZIMUTH, PLACE = 10.0, np.deg2rad(10.0), 10.0
 MOVED, BENT = 0.3, 1.0  # sds of the noise of position and velocity, a step

@@ -13,8 +13,8 @@ import jax
 import numpy as np
 
 import probcal as pc
+from probcal.gaussian.mode import Point, factors
 from probcal.model.model import At, Model
-from probcal.smoothing.mode import Point, factors
 
 HUBER = 1.345  # sds up to which a datum counts in full
 ITERATIONS, TOLERANCE, DAMPING = 200, 1e-6, 1e8  # of Levenberg-Marquardt

@@ -3,7 +3,7 @@
     uv run python benchmarks/epochs.py 1000 10000 --columns 1 300
 
 One target in the plane at constant velocity, position measured; a line a size. What is taken by itself is parallel on
-an accelerator and one after the other on a CPU (`probcal/smoothing/scans.py`).
+an accelerator and one after the other on a CPU (`probcal/gaussian/scans.py`).
 """
 
 import argparse
@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian import recursion as rec
+from probcal.gaussian import scans
 from probcal.motion import ConstantVelocity
-from probcal.smoothing import recursion as rec
-from probcal.smoothing import scans
 
 
 def main():

@@ -19,9 +19,9 @@ from beside_gtsam import best, built, drawn
 from jax.extend import core
 
 import probcal as pc
-from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import eliminate
-from probcal.smoothing.solves import Dense
+from probcal.gaussian.linearised import laplace
+from probcal.gaussian.mode import eliminate
+from probcal.gaussian.solves import Dense
 
 FREE = {
     "broadcast_in_dim", "reshape", "transpose", "concatenate", "slice", "dynamic_slice", "dynamic_update_slice",

@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 
 from probcal import ConstantVelocity, Network, Node, Problem, sensors
+from probcal.gaussian.mode import Point
 from probcal.model import rows as waist
-from probcal.smoothing.mode import Point
 
 SENSORS = 8
 TYPES = {"ranger": 2, "tdoa": 2, "radar": 2, "doa": 2, "radar_3d": 3, "camera_3d": 3}

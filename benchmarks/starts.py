@@ -36,10 +36,10 @@ SHIPPED = {  # model, and what of `shared/data` it needs
 
 def one_model(name, data):
     """Costs at the declared scales that the automatic start and random ones reach: seconds, and share at the best."""
+    from probcal.gaussian.mode import find_mode
+    from probcal.modes import optima
+    from probcal.modes.grid import grid_start
     from probcal.priors import Precision
-    from probcal.smoothing.grid import grid_start
-    from probcal.smoothing.mode import find_mode
-    from probcal.starts import optima
 
     with jax.enable_x64(True):
         problem = importlib.import_module(name).problem(data)
@@ -80,7 +80,7 @@ def one_array(run, space):
 
     import probcal
     from probcal import EA
-    from probcal.starts import optima
+    from probcal.modes import optima
 
     problem, truth = doa_array.problem(run=run, space=space), doa_array.truth(run=run, space=space)
     true = np.array([truth.biases[label] for label in problem.labels])

@@ -16,7 +16,7 @@ from probcal import Truth
 from probcal.analysis.bounds import bounds
 from probcal.analysis.maps import bound_map, snapshot, spectra
 from probcal.analysis.sensitivity import sensitivity
-from probcal.smoothing.mode import Point
+from probcal.gaussian.mode import Point
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import radars

@@ -18,7 +18,7 @@ import pytest
 from probcal import NUTS, SVI, BernoulliGaussian, Collapsed, Horseshoe
 from probcal.inference.mixed import mixing
 from probcal.inference.sampling import sample
-from probcal.starts import automatic_start
+from probcal.modes import automatic_start
 from probcal.types import float64
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "models"))

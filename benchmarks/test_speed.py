@@ -18,13 +18,13 @@ import pytest
 
 from probcal import ARD, EMEA, Bias, ConstantVelocity, Drift, Network, Node, Problem, fit, study
 from probcal.analysis import next_passes, observability
+from probcal.gaussian.linearised import laplace
+from probcal.gaussian.mode import Point, find_mode
 from probcal.inference.run import Context, maximise
+from probcal.modes import automatic_start
+from probcal.modes.grid import project, track_mode
 from probcal.priors import Precision
 from probcal.sensors import radar
-from probcal.smoothing.grid import project, track_mode
-from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import Point, find_mode
-from probcal.starts import automatic_start
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import radars

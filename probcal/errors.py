@@ -13,7 +13,7 @@ GIVE = {  # class of an argument: the remedy where a value of another class is g
     "Prior": "a prior, such as Gaussian() or Horseshoe()",
     "Particles": "the number of particles, as in Particles(2000)",
     "ParticleSmoother": "the number of particles, as in Particles(2000)",
-    "Point": "a Point, as probcal.starts.automatic_start(problem) returns it",
+    "Point": "a Point, as probcal.modes.automatic_start(problem) returns it",
     "Truth": "a Truth, such as the truth of simulate(...)",
     "DataTree": "the tree that fit(problem) or load(folder) returns",
 }

@@ -546,7 +546,7 @@ class StudentT(AdditiveNoise):
 
     `StudentT(Unknown(4.0))` learns how heavy the tails are.
     A fit that gives less than half weight to most data of a sensor ends as a misfit: outliers are
-    single data, not a whole sensor (see `smoothing.information.rejected`).
+    single data, not a whole sensor (see `gaussian.information.rejected`).
 
     >>> bool(StudentT(4.0).log_likelihood(10.0, 0.0, 1.0, None) > -10.0)  # a Gaussian has -50.9
     True

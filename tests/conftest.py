@@ -20,8 +20,8 @@ from hypothesis import settings
 from xdist.scheduler import LoadFileScheduling
 
 from probcal import kernels
-from probcal.smoothing import cholesky
-from probcal.smoothing.cholesky import Cholmod
+from probcal.gaussian import cholesky
+from probcal.gaussian.cholesky import Cholmod
 from probcal.wings import WingMissing, installed
 
 BUDGET = 5000  # kernels of a whole default run, all workers together (some 4000, by which takes which file)

@@ -29,14 +29,14 @@ class Mutation(NamedTuple):
 
 
 MUTATIONS = [
-    # smoothing/information.py, starts/swaps.py, inference/run.py: rejected sensors, exchanged labels
+    # gaussian/information.py, modes/swaps.py, inference/run.py: rejected sensors, exchanged labels
     Mutation("np.flatnonzero(below > 0.5 * (1.0 + expected) * data)", "np.flatnonzero(below > data)", "test_labels.py"),
     Mutation("int(below[k]) - used - 1, n, expected", "int(below[k]) - 1, n, expected", "test_labels.py"),
     Mutation("low[:, c] & near[:, c], mask[:, c] > 0", "low[:, c], mask[:, c] > 0", "test_labels.py"),
     Mutation("expected = max(expected, float(usual))", "pass", "test_labels.py"),
     Mutation("moved[place[b]] -= apart", "moved[place[b]] += apart", "test_labels.py"),
     Mutation("2.0 * float(special.stdtr(df, -np.sqrt(df)))", "float(special.stdtr(df, -np.sqrt(df)))", "test_labels.py"),
-    # smoothing/recursion.py
+    # gaussian/recursion.py
     Mutation("moved @ (below.mT @ first.A)", "0 * moved @ (below.mT @ first.A)", "test_scans.py"),
     Mutation("[first.A.mT @ rest, first.Z]", "[rest, first.Z]", "test_scans.py"),
     Mutation("alone - gain.data.mT @ states", "alone + gain.data.mT @ states", "test_exact.py"),
@@ -79,12 +79,12 @@ MUTATIONS = [
     # linalg.py
     Mutation("(seen / (1.0 + std))", "(seen / std)", "test_exact.py"),
     Mutation("least = LOST * jnp", "least = 1e7 * LOST * jnp", "test_diffuse.py"),
-    # smoothing/mode.py
+    # gaussian/mode.py
     Mutation("information + linalg.gram_less(new, alone)", "information + linalg.gram(new)", "test_exact.py"),
     Mutation("0.5 * known + widening(model, point.levels)", "0.5 * known", "test_formulas.py"),
     Mutation("return proposal, 0.5 * slope", "return proposal, slope", "test_guards.py"),
     Mutation("~last.moved & ~converged", "last.moved & ~converged", "test_guards.py"),
-    # smoothing/marginal.py
+    # gaussian/marginal.py
     Mutation("slope = own + jax.grad(along)(point.z)", "slope = own", "test_marginal.py"),
     Mutation("tuple(-own - jnp.einsum(", "tuple(0 * own - 0 * jnp.einsum(", "test_marginal.py"),
     Mutation("score = solved.score - prior.pull(point.z) - 0.5 * volume", "score = solved.score - prior.pull(point.z) + 0.5 * volume", "test_marginal.py"),
@@ -99,9 +99,9 @@ MUTATIONS = [
     # inference/orbits.py
     Mutation("gain = gain - there + here", "gain = gain + 0.0 * (there + here)", "test_orbits.py"),
     Mutation("density(at) + orbit.volume * r", "density(at)", "test_orbits.py"),
-    # smoothing/mirrors.py, and crossing
+    # modes/mirrors.py, and crossing
     Mutation("return place - 2.0 * self.distance(place)", "return place - 1.0 * self.distance(place)", "test_mirrors.py"),
-    # smoothing/crossings.py, inference/pruned.py, analysis/halves.py
+    # modes/crossings.py, inference/pruned.py, analysis/halves.py
     Mutation("[-now, reach, -reach]", "[now, now]", "test_crossings.py"),
     Mutation("if max(climbs, back) >= TRIED:", "if climbs >= TRIED:", "test_crossings.py"),
     Mutation("0.0) * self.q2).gain", "1.0) * self.q2).gain", "test_crossings.py"),
@@ -118,7 +118,7 @@ MUTATIONS = [
     # inference/widen.py
     Mutation("1.0 + share * (inflation - 1.0)", "inflation", "test_assess.py"),
     Mutation("more = [own + sign * ", "more = [own + ", "test_assess.py"),
-    # smoothing/information.py
+    # gaussian/information.py
     Mutation("0.5 * (solved.logdet + biases.log_determinant())", "0.5 * solved.logdet", "test_exact.py"),
     Mutation("half, -response.states,", "half, response.states,", "test_exact.py test_observability.py"),
     Mutation("pull - (point.levels + step) / model.level_spread**2", "pull", "test_formulas.py"),
@@ -126,13 +126,13 @@ MUTATIONS = [
     Mutation("@ moved[epoch] + by_bias", "@ moved[epoch] - by_bias", "test_formulas.py test_observability.py"),
     Mutation("jnp.exp(point.levels - levels)", "jnp.exp(levels - point.levels)", "test_formulas.py"),
     Mutation("(squares + sum(jnp.sum(u**2) for u in point.noises))", "squares", "test_guards.py"),
-    # smoothing/draws.py
+    # gaussian/draws.py
     Mutation("free = prior - smooth.states", "free = prior + smooth.states", "test_exact.py"),
     Mutation("jax.random.normal(key, (count, M)) @ root.T", "jax.random.normal(key, (count, M)) @ root", "test_exact.py"),
     Mutation("kept.J @ prior + own.half @ noise[1]", "kept.J @ prior", "test_exact.py"),
-    # smoothing/gauge.py
+    # identifiability/gauge.py
     Mutation("information = information - linalg.gram(flat)", "information = information", "test_observability.py"),
-    # smoothing/frame.py
+    # gaussian/frame.py
     Mutation("own - jnp.einsum(\"eij,ej->ei\", at.feedback, before))", "own + jnp.einsum(\"eij,ej->ei\", at.feedback, before))", "test_samplers.py test_model.py"),
     Mutation("self.score @ step - 0.5 * step", "self.score @ step + 0.5 * step", "test_samplers.py"),
     Mutation("loops.append(Loop(-smooth.states,", "loops.append(Loop(smooth.states,", "test_samplers.py"),

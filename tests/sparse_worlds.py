@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import probcal as pc
+from probcal.gaussian.cholesky import Cholmod, SuperLU
 from probcal.geometry import bearing, norm
-from probcal.smoothing.cholesky import Cholmod, SuperLU
 
 TIME = np.arange(30.0)
 MOTION = {"car": pc.ConstantVelocity(1.0), "van": pc.ConstantVelocity(1.0), "mast": pc.Static()}

@@ -39,12 +39,12 @@ from probcal import (
 from probcal.analysis.bounds import bounds
 from probcal.analysis.maps import bound_map
 from probcal.analysis.sensitivity import sensitivity
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.mode import Point, cost, factors, find_mode
+from probcal.modes.grid import project
 from probcal.plots import plot_bound_map, plot_sensitivity
 from probcal.priors import Precision
 from probcal.results.read import each_track
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.grid import project
-from probcal.smoothing.mode import Point, cost, factors, find_mode
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import radars

@@ -7,11 +7,11 @@ import pandas as pd
 import pytest
 
 import probcal as pc
+from probcal.gaussian.mode import Point
 from probcal.geometry import bearing, norm
 from probcal.motion import CoordinatedTurn
 from probcal.motion.layout import flow_of, layout_of, view
 from probcal.results.read import apply
-from probcal.smoothing.mode import Point
 
 TIME = np.arange(0.0, 40.0, 2.0)
 PLACES = ((0.0, 0.0), (400.0, 0.0), (200.0, 300.0))

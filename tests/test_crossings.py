@@ -11,15 +11,14 @@ from scipy import stats
 import probcal
 from probcal import ARD, EA, MAP, ConstantVelocity, Gaussian, Network, Node, Problem, simulate
 from probcal.inference.pruned import GroupEvidence, without_far_modes
+from probcal.modes import automatic_start, mirrors
+from probcal.modes.crossings import _parted, node_sides
+from probcal.modes.grid import track_mode
+from probcal.modes.reflections import Plane, across
 from probcal.plots.interactive import interactive_map, layers
 from probcal.plots.map import plot_map
 from probcal.plots.scene import scene
 from probcal.sensors import ranger, tdoa
-from probcal.smoothing import mirrors
-from probcal.smoothing.crossings import _parted, node_sides
-from probcal.smoothing.grid import track_mode
-from probcal.smoothing.reflections import Plane, across
-from probcal.starts import automatic_start
 
 PLACES = [(0, 10), (40, -14), (80, 12), (120, -9), (60, 40), (20, -40), (100, -38)]
 FLIGHT = [(0, 0, 60), (120, 0, 6), (0, 120, 4), (120, 120, 64), (60, -20, 2), (60, 140, 62)]
@@ -204,7 +203,7 @@ def test_what_must_move_is_free_and_within_reach():
 def test_a_node_surveyed_on_its_side_costs_no_look():
     """Its scale is 1 m, the other side 20 m away."""
     problem = beside(0, 0.0, scale=1.0)
-    with jax.enable_x64(True), patch("probcal.smoothing.crossings._linearised") as looked:
+    with jax.enable_x64(True), patch("probcal.modes.crossings._linearised") as looked:
         assert not list(node_sides(problem, automatic_start(problem), 0.4))
     assert not looked.called
 

@@ -18,7 +18,7 @@ from contracts import only
 import probcal
 from probcal import Bias, Channel, ConstantVelocity, Network, Node, Problem, geometry, sensor
 from probcal.errors import InputError
-from probcal.smoothing import recursion as rec
+from probcal.gaussian import recursion as rec
 
 LOSS = 1e-15
 EPOCHS, STD, SCALE = 12, 0.01, 0.1  # of data and of biases, in metres

@@ -278,7 +278,7 @@ CASES = [
     (lambda _: compare(calibrated("a"), calibrated("a")), "compare: fits is a single tree; give several in a list"),
     (lambda _: fit(problem(), key=2**63), "key=9223372036854775808: a seed is a whole number below 2**63"),
     (lambda _: fit(problem(), EA), "fit: method is the class EA itself; give a method, such as EA() or MAP()"),
-    (lambda _: fit(problem(), start=np.zeros(3)), "fit: start is of type ndarray; give a Point, as probcal.starts."),
+    (lambda _: fit(problem(), start=np.zeros(3)), "fit: start is of type ndarray; give a Point, as probcal.modes."),
     (lambda _: track(problem()), "track: the argument calibration is missing; give the tree that fit(problem) or load("),
     (lambda _: track(problem(), "out"), 'track: calibration is the text "out"; give the tree that fit(problem) or load('),
     (lambda _: fit(problem(), save=("tracks",)), 'which is no group of draws; give "states", "predictive" or both'),

@@ -13,9 +13,9 @@ from scipy import stats
 from worlds import DRAWN, LINEAR, exact, fitted, linear, resting
 
 import probcal
+from probcal.gaussian.mode import find_mode
 from probcal.priors import Precision
 from probcal.results.read import each_track
-from probcal.smoothing.mode import find_mode
 
 WORLDS = [
     pytest.param(name, marks=pytest.mark.ci if name in ("space", "extras", "mixed", "drifting") else ())

@@ -15,13 +15,13 @@ ROOT = Path(probcal.__file__).parent
 FLOORS = {
     0: (
         "linalg", "devices", "geometry", "types", "errors", "labels", "lazy", "kernels", "fingerprint", "files",
-        "status", "wings",
+        "resampling", "status", "wings",
     ),
     1: ("sensor", "motion", "priors", "noise", "detection", "clocks"),
     2: ("sensors",),
     3: ("geodesy", "misfit", "network", "table", "nodes", "plausible"),
     4: ("model", "problem", "scans", "simulate"),
-    5: ("smoothing", "starts"),
+    5: ("gaussian", "modes"),
     6: ("identifiability", "results"),
     7: ("inference",),
     8: ("analysis",),
@@ -49,7 +49,7 @@ FILES = sorted(path for path in ROOT.rglob("*.py") if "__pycache__" not in path.
 
 
 def dotted(path):
-    """Module name inside the package: `smoothing.mode`, `inference`, or empty for the package itself."""
+    """Module name inside the package: `gaussian.mode`, `inference`, or empty for the package itself."""
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -88,15 +88,15 @@ def floor(module):
 
 
 def test_the_walk_finds_the_package():
-    assert {"linalg", "model.rows", "smoothing.mode", "inference.fit", "inference"} <= set(MODULES)
-    found = {name for name, _ in own("smoothing.mode", MODULES["smoothing.mode"])}
-    assert {"linalg", "model.model", "smoothing.recursion"} <= found
+    assert {"linalg", "model.rows", "gaussian.mode", "inference.fit", "inference"} <= set(MODULES)
+    found = {name for name, _ in own("gaussian.mode", MODULES["gaussian.mode"])}
+    assert {"linalg", "model.model", "gaussian.recursion"} <= found
 
 
 def test_imports_inside_functions_and_relative_ones_are_seen():
     text = "def f():\n    from ..problem import Epochs\n    import probcal.cli\n    from . import mode\n"
-    found = [name for name, _ in imports(ast.parse(text), "smoothing.start", False)]
-    assert found == ["probcal.problem.Epochs", "probcal.cli", "probcal.smoothing.mode"]
+    found = [name for name, _ in imports(ast.parse(text), "gaussian.start", False)]
+    assert found == ["probcal.problem.Epochs", "probcal.cli", "probcal.gaussian.mode"]
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if m], ids=str)

@@ -10,15 +10,15 @@ import pytest
 from worlds import exact, linear, resting, ruler
 
 from probcal import ARD, Channel, ConstantVelocity, Network, Node, Problem, Unknown, simulate
+from probcal.gaussian.frame import _moves, _with_levels
+from probcal.gaussian.information import at_levels, update_levels
+from probcal.gaussian.linearised import linearise
+from probcal.gaussian.mode import Point, cost, factors, find_mode
+from probcal.gaussian.recursion import trajectory
 from probcal.inference.posterior import bias_status
 from probcal.model.rows import noise_std
 from probcal.priors import Precision
 from probcal.sensors import doa
-from probcal.smoothing.frame import _moves, _with_levels
-from probcal.smoothing.information import at_levels, update_levels
-from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mode import Point, cost, factors, find_mode
-from probcal.smoothing.recursion import trajectory
 
 
 def test_an_undeclared_start_is_as_wide_as_network_and_recording():

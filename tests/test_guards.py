@@ -33,21 +33,21 @@ from probcal import (
 from probcal.analysis import findings, verdict
 from probcal.diagnostics import study_table
 from probcal.errors import FitError
+from probcal.gaussian.information import mean_square, squares_of
+from probcal.gaussian.linearised import laplace
+from probcal.gaussian.mode import _proposal, eliminate, find_mode
 from probcal.geometry import bearing, norm
 from probcal.inference.ending import End, conclude, misfit_sentence
 from probcal.inference.ending import verdict as status_of
 from probcal.inference.fit import calibrate
 from probcal.inference.run import Context, first_state, given_of
 from probcal.misfit import MisfitData, misfit_text
+from probcal.modes import automatic_start
 from probcal.noise import Bernoulli
 from probcal.priors import Precision
 from probcal.report.page import COLOURS
 from probcal.report.words import said_once
 from probcal.sensors import doa
-from probcal.smoothing.information import mean_square, squares_of
-from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import _proposal, eliminate, find_mode
-from probcal.starts import automatic_start
 from probcal.status import INVALID, Status
 
 

@@ -10,6 +10,7 @@ from contracts import check_tree, close
 import probcal
 from probcal import ARD, EA, MAP, BernoulliGaussian, Gaussian, Horseshoe, Laplace, fit
 from probcal.errors import InputError
+from probcal.gaussian.mode import Point
 from probcal.inference.ending import uncertain
 from probcal.inference.hierarchy import (
     GammaPrecision,
@@ -35,9 +36,8 @@ from probcal.inference.integrate import (
 )
 from probcal.inference.posed import Form, Natural
 from probcal.inference.propagate import CLOSE, ROUNDS, Propagation
+from probcal.modes.grid import track_mode
 from probcal.priors import Precision, by_kind
-from probcal.smoothing.grid import track_mode
-from probcal.smoothing.mode import Point
 
 PRIORS = [ARD(shape=1.5, rate=0.5), Laplace(), Horseshoe(), BernoulliGaussian(share=0.4)]
 KINDS = {ARD: GammaPrecision, Laplace: LaplaceMixture, Horseshoe: RegularisedHorseshoe, BernoulliGaussian: SpikeAndSlab}

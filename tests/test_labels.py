@@ -10,14 +10,14 @@ import pytest
 from scipy import stats
 
 import probcal as pc
+from probcal.gaussian.information import rejected
+from probcal.gaussian.mode import Point
 from probcal.geometry import norm
 from probcal.inference.ending import misfit_sentence
 from probcal.misfit import rejection_text
+from probcal.modes import optima
+from probcal.modes.swaps import swaps
 from probcal.noise import AdditiveNoise, Bernoulli, Censored, Mixture, Normal, StudentT
-from probcal.smoothing.information import rejected
-from probcal.smoothing.mode import Point
-from probcal.starts import optima
-from probcal.starts.swaps import swaps
 from probcal.types import float64
 
 PLACES = np.array([(0, 0), (95, 10), (120, 80), (60, 130), (-20, 110), (-40, 40), (45, 60)], float)

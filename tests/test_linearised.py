@@ -7,13 +7,13 @@ import pytest
 from worlds import exact, linear, resting
 
 from probcal import EA, MAP, Gaussian, assess, fit
+from probcal.gaussian.linearised import laplace, linearise
+from probcal.gaussian.mode import find_mode
+from probcal.gaussian.solves import Dense
 from probcal.inference import calibrate
 from probcal.inference.fitted import take_up
 from probcal.priors import Precision
 from probcal.results.schema import DECLARED
-from probcal.smoothing.linearised import laplace, linearise
-from probcal.smoothing.mode import find_mode
-from probcal.smoothing.solves import Dense
 from probcal.types import float64
 
 ALARM = 5.0  # sds of a mean beyond which a draw is wrong: one false alarm in 10^6

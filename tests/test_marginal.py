@@ -12,12 +12,12 @@ from worlds import linear, resting
 import probcal
 from probcal import EA, MAP, Channel, ConstantVelocity, Gaussian, Network, Node, Problem, sensor, simulate
 from probcal.errors import InputError
+from probcal.gaussian.linearised import laplace
+from probcal.gaussian.marginal import _damped, find_marginal_mode, volume_slope
+from probcal.gaussian.mode import DAMPING, cost, eliminate, find_mode
 from probcal.geometry import bearing
+from probcal.modes import automatic_start
 from probcal.priors import Precision
-from probcal.smoothing.linearised import laplace
-from probcal.smoothing.marginal import _damped, find_marginal_mode, volume_slope
-from probcal.smoothing.mode import DAMPING, cost, eliminate, find_mode
-from probcal.starts import automatic_start
 
 STEP = 3e-4  # of z in the differences
 

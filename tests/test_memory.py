@@ -30,10 +30,10 @@ from probcal import (
     simulate,
 )
 from probcal.errors import InputError
+from probcal.gaussian.linearised import linearise
+from probcal.gaussian.mode import find_mode
 from probcal.noise import Bernoulli, Memory
 from probcal.priors import Precision
-from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mode import find_mode
 
 MEMORY, WHITE, EAST, SCALE = Memory(0.3, 2.0), 0.1, 0.2, 0.5
 

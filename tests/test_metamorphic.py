@@ -19,11 +19,11 @@ from worlds import resting
 
 import probcal
 from probcal import Bias, Channel, sensor
+from probcal.gaussian.linearised import linearise
+from probcal.gaussian.mode import find_mode
 from probcal.geometry import norm
+from probcal.modes.recognise import seen_directions
 from probcal.priors import Precision
-from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mode import find_mode
-from probcal.starts.recognise import seen_directions
 
 TOLERANCE = 1e-6  # in z, and in metres for tracks of sd near one metre
 AXES = "xyz"

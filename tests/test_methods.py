@@ -16,6 +16,9 @@ from worlds import linear, resting
 import probcal
 from probcal import ARD, EA, EM, EMEA, MAP, Cubature, Extended, Flat, Gaussian, Laplace, Mixture, StudentT, Unscented
 from probcal.errors import InputError
+from probcal.gaussian.esteps import EStep, Expected
+from probcal.gaussian.linearised import linearise
+from probcal.gaussian.mode import cost, find_mode
 from probcal.inference import METHODS, table
 from probcal.inference.methods import choose_prior
 from probcal.inference.run import Context, maximise
@@ -24,9 +27,6 @@ from probcal.model.model import At
 from probcal.noise import AdditiveNoise, Normal
 from probcal.priors import PRIORS, Precision, Prior
 from probcal.results.schema import TYPE_II
-from probcal.smoothing.esteps import EStep, Expected
-from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mode import cost, find_mode
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "papers"))
 from paper_b import PaperB, paper_b
@@ -242,8 +242,8 @@ def test_an_e_step_draws_by_its_key_and_keeps_its_carry():
 @pytest.mark.ci
 def test_paper_b_marginalises_each_epoch_alone():
     """R-bar = R + H P H' built row by row (Paper B 10-17) gives the covariance, mean step and evidence reported."""
+    from probcal.gaussian.mode import smooth_tracks
     from probcal.priors import Precision
-    from probcal.smoothing.mode import smooth_tracks
 
     problem, naive = linear("shifted")
     alpha, M = np.full(len(naive.labels), 0.7), len(naive.labels)

@@ -13,17 +13,17 @@ import pytest
 
 import probcal
 from probcal import ConstantVelocity, Network, Node, Problem, simulate
+from probcal.gaussian import recursion
+from probcal.gaussian.information import at_levels
+from probcal.gaussian.mode import factors
 from probcal.inference import calibrate, solve
 from probcal.inference.progress import Monitor
+from probcal.modes import automatic_start
+from probcal.modes.grid import track_mode
+from probcal.modes.mirrors import Mirrored, Sides, other_sides
+from probcal.modes.reflections import planes, reflect, reflect_nodes
 from probcal.plots.map import plot_map
 from probcal.sensors import radar, ranger
-from probcal.smoothing import recursion
-from probcal.smoothing.grid import track_mode
-from probcal.smoothing.information import at_levels
-from probcal.smoothing.mirrors import Mirrored, Sides, other_sides
-from probcal.smoothing.mode import factors
-from probcal.smoothing.reflections import planes, reflect, reflect_nodes
-from probcal.starts import automatic_start
 from probcal.status import Status
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))

@@ -9,6 +9,7 @@ import pytest
 
 import probcal
 from probcal import Collapsed, Gaussian, Problem
+from probcal.gaussian.frame import frame_at, log_joint, log_weight, unit_normals, volume
 from probcal.inference import sampling
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.leaps import Place, leap
@@ -16,10 +17,9 @@ from probcal.inference.mixed import settled, weights_of_sides
 from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.sampling import Plan
 from probcal.inference.sides import distances, shifted
-from probcal.smoothing.frame import frame_at, log_joint, log_weight, unit_normals, volume
-from probcal.smoothing.grid import track_mode
-from probcal.smoothing.mirrors import other_sides
-from probcal.starts import automatic_start
+from probcal.modes import automatic_start
+from probcal.modes.grid import track_mode
+from probcal.modes.mirrors import other_sides
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import networks

@@ -38,10 +38,10 @@ from probcal import (
     numpyro_model,
     sensor,
 )
+from probcal.gaussian.frame import place
+from probcal.gaussian.mode import factors
 from probcal.inference.coordinates import Free, parts
 from probcal.priors import BernoulliGaussian
-from probcal.smoothing.frame import place
-from probcal.smoothing.mode import factors
 
 FALSE_ALARM = 1e-6  # of each statistical test
 radar, fix = probcal.sensors.radar, probcal.sensors.position

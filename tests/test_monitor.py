@@ -13,7 +13,7 @@ import probcal as pc
 from probcal.errors import InputError
 from probcal.inference import calibrate
 from probcal.inference.progress import Monitor, Stopped, duration
-from probcal.smoothing.mirrors import Sides
+from probcal.modes.mirrors import Sides
 
 
 class Clock:

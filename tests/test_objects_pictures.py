@@ -19,11 +19,11 @@ from matplotlib.patches import Polygon
 
 import probcal as pc
 from probcal import plots
+from probcal.gaussian.mode import Point
 from probcal.geometry import bearing, norm
 from probcal.plots import interactive, scene
 from probcal.report import tables, write_report
 from probcal.results.views import view_variables
-from probcal.smoothing.mode import Point
 
 EXISTENCE = {"track_0": [0.3, 0.8, 1.0, 0.9], "track_1": [0.1, 0.95, 0.4]}
 WIDTH, TOWARDS = np.pi / 2, 0.25

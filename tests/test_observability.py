@@ -30,13 +30,13 @@ from probcal import (
     simulate,
 )
 from probcal.analysis import next_anchors, next_passes, next_sensors, observability
+from probcal.gaussian.linearised import marginal_information
+from probcal.gaussian.mode import Point
 from probcal.geometry import bearing, norm
 from probcal.identifiability.directions import weak_directions
 from probcal.identifiability.gauge import gauge
 from probcal.model import rows as waist
-from probcal.smoothing.linearised import marginal_information
-from probcal.smoothing.mode import Point
-from probcal.starts import automatic_start
+from probcal.modes import automatic_start
 from probcal.types import float64
 
 TIME = np.arange(30.0)
@@ -471,7 +471,7 @@ def test_planning_works_for_every_kind(kinds, dimension, scale, motion, monkeypa
     with monkeypatch.context() as patch:
         patch.setattr("probcal.analysis.additions.REACHED", 100.0)
         for name in ("joint", "room"):
-            patch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+            patch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
         for plan, gain in zip((next_passes, next_sensors), wanted, strict=True):
             np.testing.assert_allclose(plan(problem, point=point)["gain"].values, gain, rtol=1e-5, atol=1e-6)
     for plan in (next_passes, next_anchors, next_sensors):

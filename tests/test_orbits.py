@@ -10,14 +10,14 @@ from scipy import stats
 
 import probcal
 from probcal import ARD, ConstantVelocity, Horseshoe, Laplace, Network, Node, Problem, Target, Unknown, simulate
+from probcal.gaussian.frame import frame_at, log_weight, place, unit_normals, volume
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.leaps import Place
 from probcal.inference.orbits import orbits_of, roam
 from probcal.inference.posed import Form, Posed, prior_precision
+from probcal.modes import automatic_start
 from probcal.motion import RandomWalk
 from probcal.sensors import doa, ranger
-from probcal.smoothing.frame import frame_at, log_weight, place, unit_normals, volume
-from probcal.starts import automatic_start
 
 
 @cache

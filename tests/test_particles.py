@@ -28,6 +28,7 @@ from probcal import (
     Static,
     Target,
     Unknown,
+    resampling,
     sensor,
     simulate,
 )
@@ -48,7 +49,6 @@ from probcal.particles.particles import Particles
 from probcal.particles.proposals import check_proposal
 from probcal.particles.settings import SMOOTHERS
 from probcal.particles.targets import along_targets, place_by_epoch, targets_of, weigh_rows
-from probcal.smoothing import resampling
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "papers"))
 from paris import smoothed_sum

@@ -8,11 +8,11 @@ import pytest
 from scipy.special import logsumexp
 
 import probcal as pc
+from probcal.gaussian.mode import find_mode
+from probcal.gaussian.places import places_of, tilt_of
 from probcal.inference.fit import calibrate
+from probcal.modes import automatic_start
 from probcal.priors import Precision
-from probcal.smoothing.mode import find_mode
-from probcal.smoothing.places import places_of, tilt_of
-from probcal.starts import automatic_start
 
 ANCHORS = np.array([(0.0, 0.0), (40.0, 0.0), (0.0, 40.0)])
 STD, OFFSET, CENTRE, SPREAD = 1.0, 6.0, np.array([15.0, 12.0]), 10.0
@@ -115,7 +115,7 @@ def test_the_slope_is_that_of_the_height():
 def test_an_integral_that_is_lost_adds_nothing(monkeypatch):
     """A number that is not finite leaves Laplace's formula, and no message of LAPACK."""
     problem = pc.Problem(*tags(3, hears=[1, 2, 3]))
-    monkeypatch.setattr("probcal.smoothing.places._gain", lambda *_: (0.0, np.zeros(1), np.full((1, 1), np.nan)))
+    monkeypatch.setattr("probcal.gaussian.places._gain", lambda *_: (0.0, np.zeros(1), np.full((1, 1), np.nan)))
     with jax.enable_x64(True):
         here = consistent(problem)
         assert tilt_of(problem.model, here, places_of(problem.model, here)) is None

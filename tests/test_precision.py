@@ -14,7 +14,7 @@ from contracts import only
 
 import probcal
 from probcal import ConstantVelocity, Network, Node, Target
-from probcal.smoothing.linearised import compress_and_eliminate
+from probcal.gaussian.linearised import compress_and_eliminate
 
 SCRIPT = """
 import json

@@ -17,19 +17,19 @@ from worlds import LINEAR, linear, resting
 import probcal
 from probcal import ARD, NUTS, SVI, BernoulliGaussian, Collapsed, Flat, Gaussian, Horseshoe, InputError, Laplace
 from probcal.analysis.assess import assess
+from probcal.gaussian.frame import frame_at, log_weight, place, unit_normals, volume
+from probcal.gaussian.information import at_levels
+from probcal.gaussian.linearised import laplace
+from probcal.gaussian.mode import factors, find_mode, smooth_tracks
 from probcal.inference.collapsed import CollapsedState, hmc_step
 from probcal.inference.draws import inverse_gaussian, slice_step
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.mixed import mixing
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Form, Posed, conditional, update_inclusions, whiten
+from probcal.modes import automatic_start
 from probcal.priors import Precision
 from probcal.results.read import each_track
-from probcal.smoothing.frame import frame_at, log_weight, place, unit_normals, volume
-from probcal.smoothing.information import at_levels
-from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import factors, find_mode, smooth_tracks
-from probcal.starts import automatic_start
 
 PRIORS = [ARD(shape=2.0, rate=0.7), ARD(by="node", rate=0.5), Laplace(), Horseshoe()]
 ALARM = 1e-4  # rate at which a right sampler fails one of these tests, for each comparison

@@ -7,8 +7,8 @@ import pytest
 import worlds
 
 import probcal as pc
-from probcal.smoothing import recursion as rec
-from probcal.smoothing import scans
+from probcal.gaussian import recursion as rec
+from probcal.gaussian import scans
 
 
 def drawn(seed, n, u, wide):

@@ -20,17 +20,17 @@ from probcal.analysis.nees import of_biases
 from probcal.cli import check
 from probcal.errors import FitError, InputError
 from probcal.files import Outputs
+from probcal.gaussian.cholesky import Cholmod, Entries, factorise, mirrored
+from probcal.gaussian.joint import JointPrecision, blocks_of, missing
+from probcal.gaussian.linearised import linearise_rows
+from probcal.gaussian.mode import compress
+from probcal.gaussian.products import Products
+from probcal.gaussian.room import check_room
 from probcal.geometry import bearing, norm
 from probcal.inference import calibrate
 from probcal.inference.sparse import gains_by_sparse, takes_sparse
+from probcal.modes import automatic_start
 from probcal.results.blocks import covariance_of
-from probcal.smoothing.cholesky import Cholmod, Entries, factorise, mirrored
-from probcal.smoothing.joint import JointPrecision, blocks_of, missing
-from probcal.smoothing.linearised import linearise_rows
-from probcal.smoothing.mode import compress
-from probcal.smoothing.products import Products
-from probcal.smoothing.room import check_room
-from probcal.starts import automatic_start
 
 
 def fitted(method, prior=None):
@@ -213,7 +213,7 @@ def test_products_of_some_columns_are_those_of_each(monkeypatch):
     """Where there is room for the bases of a few draws only, as many are made and as well."""
     A, members = thing(20, 10, np.random.default_rng(0))
     found = by_products(A, 20, members)
-    monkeypatch.setattr("probcal.smoothing.products.NUMBERS", 30 * 30 * 7)  # seven columns
+    monkeypatch.setattr("probcal.gaussian.products.NUMBERS", 30 * 30 * 7)  # seven columns
     draws = found.draw(np.random.default_rng(1), 3_000)
     np.testing.assert_allclose(draws.T @ draws / 3_000, np.linalg.inv(A), atol=0.15)
     value, error = found.log_determinant()
@@ -232,7 +232,7 @@ def test_products_that_are_not_positive_or_do_not_end_are_no_answer(monkeypatch)
     for ask in (lambda: found.solve(np.eye(50)[25]), lambda: found.draw(np.random.default_rng(0), 1)):
         with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
             ask()
-    monkeypatch.setattr("probcal.smoothing.products.STEPS", 2)
+    monkeypatch.setattr("probcal.gaussian.products.STEPS", 2)
     with pytest.raises(FitError, match="conjugate gradients did not end within 2 steps"):
         by_products(A, 20, members).solve(np.ones(50))
     with pytest.raises(FitError, match="draws of the biases did not end within 2 steps"):
@@ -254,7 +254,7 @@ def test_draws_resolve_directions_that_data_leave_to_a_wide_prior(least, monkeyp
     start[:, 0] = np.eye(600)[3]  # ends after one step
     wanted = spectrum[:, None] ** -0.5 * start
     for numbers, columns in ((10**9, 6), (600 * 100 * 6, 1)):  # where there is room for all, and for 600 steps of one
-        monkeypatch.setattr("probcal.smoothing.products.NUMBERS", numbers)
+        monkeypatch.setattr("probcal.gaussian.products.NUMBERS", numbers)
         drawn, form = found._lanczos(start, lambda values: values**-0.5)
         assert columns <= drawn.shape[1] == len(form) <= 6
         off = np.linalg.norm(drawn - wanted[:, : len(form)], axis=0) / np.linalg.norm(wanted[:, : len(form)], axis=0)
@@ -287,7 +287,7 @@ def test_a_fit_without_factors_of_the_biases_ends_where_the_dense_one_does(libra
     np.testing.assert_allclose(draws.std(0) / b["sd"].values, 1.0, atol=0.2)
     assert "No factor of the biases was made: sds and evidence are estimated" in free.attrs["message"]
     refused = "an assessment makes no factor either"
-    monkeypatch.setattr("probcal.smoothing.joint.JointPrecision.factor", lambda *_: pytest.fail(refused))
+    monkeypatch.setattr("probcal.gaussian.joint.JointPrecision.factor", lambda *_: pytest.fail(refused))
     judged = pc.assess(drawn()[0], free)["verdict"]["verdict"].values
     monkeypatch.undo()
     assert (judged == pc.assess(drawn()[0], dense)["verdict"]["verdict"].values).mean() > 0.7
@@ -310,7 +310,7 @@ def test_a_singular_matrix_is_no_fit(monkeypatch):
     def singular(places, values):
         raise np.linalg.LinAlgError("not positive definite")
 
-    monkeypatch.setattr("probcal.smoothing.joint.factorise", singular)
+    monkeypatch.setattr("probcal.gaussian.joint.factorise", singular)
     with pytest.raises(FitError, match="the information matrix is singular"):
         fitted(pc.MAP(form="sparse"), pc.Flat())
 
@@ -321,10 +321,10 @@ def test_a_factor_that_memory_does_not_hold_is_replaced_by_products_or_said(monk
 
     kept = factorise
     monkeypatch.setattr(
-        "probcal.smoothing.joint.factorise",
+        "probcal.gaussian.joint.factorise",
         lambda places, values: full(places, values) if places.size > states else kept(places, values),
     )
-    monkeypatch.setattr("probcal.smoothing.joint.ROOM", 100)
+    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 100)
     states = JointPrecision.of(drawn()[0].model).states
     tree = fitted(pc.MAP(), pc.Gaussian())
     assert tree.attrs["status"] == "converged"
@@ -332,7 +332,7 @@ def test_a_factor_that_memory_does_not_hold_is_replaced_by_products_or_said(monk
     for method in (pc.MAP(form="sparse"), pc.EA()):
         with pytest.raises(FitError, match=r'does not fit in memory: MAP\(form="matrix-free"\) makes none'):
             fitted(method)
-    monkeypatch.setattr("probcal.smoothing.joint.factorise", full)
+    monkeypatch.setattr("probcal.gaussian.joint.factorise", full)
     with pytest.raises(FitError, match="not even without a factor: take fewer sensors or a shorter time"):
         fitted(pc.MAP(), pc.Gaussian())
 
@@ -477,7 +477,7 @@ def test_the_covariance_of_each_sensor_is_that_of_the_dense_form(dense):
 
 
 def test_a_dense_form_that_fits_no_machine_is_refused(monkeypatch):
-    monkeypatch.setattr("probcal.smoothing.room.ROOM", 100)
+    monkeypatch.setattr("probcal.gaussian.room.ROOM", 100)
     with pytest.raises(InputError, match=r"the dense form of 15 biases and .* states takes .* GB"):
         check_room(drawn()[0].model)
     with jax.enable_x64(True), pytest.raises(InputError, match="in sparse form"):
@@ -574,13 +574,13 @@ def test_few_of_many_biases_at_an_epoch_take_the_sparse_form(monkeypatch):
     problem = drawn()[0]
     settings = (pc.MAP(), problem, pc.Gaussian(), 1)
     assert not gains_by_sparse(*settings)
-    monkeypatch.setattr("probcal.smoothing.joint.MANY", 5)
-    monkeypatch.setattr("probcal.smoothing.joint.THIN", 100.0)
+    monkeypatch.setattr("probcal.gaussian.joint.MANY", 5)
+    monkeypatch.setattr("probcal.gaussian.joint.THIN", 100.0)
     assert gains_by_sparse(*settings)
     assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(), 2)
     assert not gains_by_sparse(pc.MAP(form="dense"), problem, pc.Gaussian(), 1)
     assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(correlation={"*": 0.1}), 1)
-    monkeypatch.setattr("probcal.smoothing.joint.THIN", 1e-6)
+    monkeypatch.setattr("probcal.gaussian.joint.THIN", 1e-6)
     assert not gains_by_sparse(*settings)
 
 
@@ -589,7 +589,7 @@ def test_a_fit_of_many_data_keeps_what_a_mail_holds(monkeypatch, tmp_path):
     """Above `LARGE` data: the log-likelihood in sum, residuals and tracks to a small part of noise and sd."""
     problem = worlds.small()
     small = pc.fit(problem, pc.MAP(), prior=pc.Gaussian())
-    monkeypatch.setattr("probcal.smoothing.draws.LARGE", 3)
+    monkeypatch.setattr("probcal.gaussian.draws.LARGE", 3)
     large = pc.fit(problem, pc.MAP(), prior=pc.Gaussian())
     assert "log_likelihood" not in large.children
     sums = small["log_likelihood"]["y"].sum("datum").values
@@ -618,7 +618,7 @@ def test_a_fit_of_many_data_keeps_what_a_mail_holds(monkeypatch, tmp_path):
 def test_bounds_by_sparse_factors_are_those_of_the_dense_form(kind, library, monkeypatch):
     problem, truth = drawn()
     wanted = pc.bounds(problem, kind=kind, truth=truth, draws=3)
-    monkeypatch.setattr("probcal.smoothing.joint.ROOM", 0)
+    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 0)
     found = pc.bounds(problem, kind=kind, truth=truth, draws=3)
     close = 1e-6 if library is Cholmod else 0.15  # 512 draws tell a variance to 6 %
     a, b = (tree["bias"].to_dataset() for tree in (wanted, found))
@@ -643,7 +643,7 @@ def test_what_has_no_bound_has_none_by_sparse_factors(library, monkeypatch):
     placed = [(turned_ear if s.type is ear else s.type).on(s.nodes[0]) for s in problem.network.sensors]
     problem = pc.Problem(pc.Network(placed), MOTION, problem.measurements.table)
     wanted = pc.bounds(problem, kind="parametric", truth=pc.Truth(truth.tracks))
-    monkeypatch.setattr("probcal.smoothing.joint.ROOM", 0)
+    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 0)
     found = pc.bounds(problem, kind="parametric", truth=pc.Truth(truth.tracks))
     open_ = found["unbounded"]["bias_label"].values.tolist()
     assert set(open_) == {"d.heading", "e.heading", *(f"{s.name}.offset" for s in problem.network.sensors[3:])}
@@ -656,7 +656,7 @@ def test_surveys_of_many_biases_tell_what_those_of_few_do(monkeypatch):
     pytest.importorskip("sparsax", reason="sparsax is an extra")
     problem, _ = drawn()
     wanted = pc.next_anchors(problem)
-    monkeypatch.setattr("probcal.smoothing.joint.ROOM", 0)
+    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 0)
     point = automatic_start(problem)
     found, same = pc.next_anchors(problem, point=point), wanted.drop_vars("weak")
     xr.testing.assert_allclose(found.sortby("anchor"), same.sortby("anchor"), rtol=1e-6)
@@ -694,7 +694,7 @@ def test_passes_of_a_large_network_tell_what_those_of_a_small_one_do(library, mo
     lines = [[(0.0, 0.0), (300.0, 300.0)], [(100.0, 100.0), (250.0, 200.0)], [(9e5, 0.0), (9e5, 100.0)]]
     wanted = pc.next_passes(problem, point=point, passes=lines[:2])
     for name in ("joint", "room"):
-        monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+        monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
     monkeypatch.setattr("probcal.analysis.additions.REACHED", 2.0)
     found = pc.next_passes(problem, point=point, passes=lines)
     assert found["gain"].values[-1] == 0.0
@@ -712,7 +712,7 @@ def test_a_pass_is_seen_by_the_sensors_that_it_comes_near_to(library, monkeypatc
     """Where sensors reach so far as they did, those beyond see nothing: as if they had no row."""
     problem, point = all_seen()
     for name in ("joint", "room"):
-        monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+        monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
     line = [[(0.0, 0.0), (300.0, 300.0)]]
     gains = []
     for reached in (0.3, 1.0, 2.0):
@@ -729,7 +729,7 @@ def test_sensors_of_a_large_network_tell_what_those_of_a_small_one_do(library, m
     places = [(100.0, 50.0), (200.0, 200.0), (0.0, 300.0)]
     wanted = pc.next_sensors(problem, point=point, places=places)
     for name in ("joint", "room"):
-        monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+        monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
     monkeypatch.setattr("probcal.analysis.additions.REACHED", 2.0)
     found = pc.next_sensors(problem, point=point, places=[*places, (9e5, 0.0)])
     assert found["gain"].values[-2:].tolist() == [0.0, 0.0]
@@ -758,7 +758,7 @@ def both_forms(problem, point, monkeypatch, reached=100.0, **asked):
     with monkeypatch.context() as patch:
         patch.setattr("probcal.analysis.additions.REACHED", reached)
         for name in ("joint", "room"):
-            patch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+            patch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
         gains.append([call(problem, point=point, **{name: given})["gain"].values for (call, given), name in
                       zip(calls, ("passes", "places"), strict=True)])  # fmt: skip
     return gains
@@ -790,7 +790,7 @@ def test_what_planning_of_a_large_network_cannot_say_it_says(monkeypatch):
     with jax.enable_x64(True):
         point = automatic_start(problem)
     for name in ("joint", "room"):
-        monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+        monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
     with pytest.raises(InputError, match="pass 0 runs over the place of a sensor that has no derivative there"):
         pc.next_passes(problem, point=point, passes=[[(0.0, 0.0), (0.0, 0.0)]])
     at = np.asarray(point.states[0])[3, slice(*problem.epochs[0].position)]
@@ -819,7 +819,7 @@ def test_what_planning_of_a_large_network_cannot_say_it_says(monkeypatch):
 )
 def test_what_needs_the_dense_form_says_so_where_there_is_no_room(asked, monkeypatch):
     for name in ("joint", "room"):
-        monkeypatch.setattr(f"probcal.smoothing.{name}.ROOM", 0)
+        monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
     with pytest.raises(InputError, match=r"the dense form of 15 biases .* for all else take fewer sensors"):
         asked(drawn()[0])
 
@@ -829,7 +829,7 @@ def test_bounds_that_rounding_hides_are_none(monkeypatch):
     def singular(*_):
         raise np.linalg.LinAlgError("not positive definite")
 
-    monkeypatch.setattr("probcal.smoothing.joint.ROOM", 0)
-    monkeypatch.setattr("probcal.smoothing.joint.JointPrecision.factor", singular)
+    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 0)
+    monkeypatch.setattr("probcal.gaussian.joint.JointPrecision.factor", singular)
     with pytest.raises(InputError, match=r'rounding hides which biases of so many have none; .* take kind="posterior"'):
         pc.bounds(drawn()[0], kind="hybrid", truth=drawn()[1], draws=1)

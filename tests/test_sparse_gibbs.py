@@ -12,15 +12,15 @@ from sparse_worlds import LIBRARIES, drawn, drawn_in_space, ear, loud_ear
 
 import probcal as pc
 from probcal.errors import InputError
+from probcal.gaussian.joint import JointPrecision
+from probcal.gaussian.joint_density import JointDensity, point_of_variables, variables_of
+from probcal.gaussian.mode import log_density
 from probcal.geometry import norm
 from probcal.inference import calibrate
 from probcal.inference.run import Context
 from probcal.inference.solve import solve
 from probcal.inference.sparse_gibbs import Gibbs, _Given, _SparseChains
-from probcal.smoothing.joint import JointPrecision
-from probcal.smoothing.joint_density import JointDensity, point_of_variables, variables_of
-from probcal.smoothing.mode import log_density
-from probcal.starts import automatic_start
+from probcal.modes import automatic_start
 
 SHORT = {"chains": 2, "warmup": 25, "draws": 50, "patience": 1}
 
@@ -223,9 +223,9 @@ def test_more_sweeps_a_draw_begin_the_sums_anew():
 
 
 def chains_of(problem, method, joint):
+    from probcal.gaussian.sparse_mode import find_sparse_mode
     from probcal.inference.hierarchy import hierarchy_of
     from probcal.inference.posed import Form
-    from probcal.smoothing.sparse_mode import find_sparse_mode
 
     prior = pc.Horseshoe()
     mode = find_sparse_mode(problem.model, joint, automatic_start(problem), np.ones(problem.model.biases), 60, 1e-3)
@@ -326,7 +326,7 @@ def test_memory_that_does_not_hold_a_factor_is_said(monkeypatch):
     def refused(*_):
         raise MemoryError
 
-    monkeypatch.setattr("probcal.smoothing.joint.JointPrecision.factor", refused)
+    monkeypatch.setattr("probcal.gaussian.joint.JointPrecision.factor", refused)
     with pytest.raises(pc.FitError, match="does not fit in memory: take fewer sensors or a shorter time"):
         pc.fit(drawn()[0], Gibbs(**SHORT))
 

@@ -15,10 +15,9 @@ from worlds import small
 import probcal
 from probcal import Bias, Channel, ConstantVelocity, InputError, Network, Node, Problem, sensor, simulate
 from probcal.geometry import bearing, norm
+from probcal.modes import automatic, grid, optima
+from probcal.modes.recognise import kinds, seen_directions
 from probcal.sensors import doa, radar, ranger, rss, tdoa, toa
-from probcal.smoothing import grid
-from probcal.starts import automatic, optima
-from probcal.starts.recognise import kinds, seen_directions
 from probcal.types import float64
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
@@ -108,7 +107,7 @@ def test_a_network_that_is_known_well_has_one_start_and_no_trials(monkeypatch):
     network = placed(radar, scale={"position": 3.0, "heading": 0.05})
     motion = ConstantVelocity(1.0)
     problem = Problem(network, motion, rows_of(network, motion, biases={"n1.heading": 0.05}).table)
-    monkeypatch.setattr("probcal.starts.bearings.seen_directions", lambda problem: pytest.fail("not needed"))
+    monkeypatch.setattr("probcal.modes.bearings.seen_directions", lambda problem: pytest.fail("not needed"))
     assert len(optima(problem)) == 1
 
 

@@ -8,14 +8,14 @@ import reference
 from worlds import linear, resting, small
 
 from probcal import NUTS, SVI, Gaussian, Horseshoe, InputError
+from probcal.gaussian.mode import smooth_tracks
 from probcal.inference.guides import GuideParameters, Structured
 from probcal.inference.mixed import mixing
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posterior import judge_chains
 from probcal.inference.progress import Monitor
 from probcal.inference.sampling import sample
-from probcal.smoothing.mode import smooth_tracks
-from probcal.starts import automatic_start
+from probcal.modes import automatic_start
 
 ALARM = 5.0  # standard errors: a right sampler fails one comparison in a million
 

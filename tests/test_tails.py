@@ -13,15 +13,15 @@ from scipy import integrate, stats
 import probcal
 from probcal import Bias, Channel, ConstantVelocity, Known, Network, Node, Problem, Target, simulate
 from probcal.errors import InputError
+from probcal.gaussian.mode import mixed_density
+from probcal.gaussian.recursion import trajectory
+from probcal.gaussian.tails import rewhitened
 from probcal.inference.fit import calibrate
 from probcal.inference.model import Mixed
+from probcal.modes import automatic_start
 from probcal.motion import ConstantAcceleration, CoordinatedTurn, RandomWalk, White
 from probcal.noise import Bernoulli, Mixture, StudentT
 from probcal.results.read import each_track
-from probcal.smoothing.mode import mixed_density
-from probcal.smoothing.recursion import trajectory
-from probcal.smoothing.tails import rewhitened
-from probcal.starts import automatic_start
 
 FAMILIES = [StudentT(3.0), Mixture(0.2, 6.0)]
 START = {"position": ((0.0, 0.0), 2.0), "velocity": ((1.0, 0.0), 1.0)}

@@ -25,11 +25,11 @@ from probcal import (
     White,
     sensor,
 )
+from probcal.gaussian.frame import frame_at
+from probcal.gaussian.mode import Point
 from probcal.inference import calibrate
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.posed import Form, Posed
-from probcal.smoothing.frame import frame_at
-from probcal.smoothing.mode import Point
 
 fix = probcal.sensors.position
 

@@ -14,13 +14,13 @@ import numpy as np
 
 import probcal as pc
 from probcal import linalg
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.linearised import LaplaceApproximation
+from probcal.gaussian.mode import Point, compress, factors, log_likelihood, smooth_tracks
 from probcal.inference.ea import learnt
 from probcal.inference.run import Given, State, valued
 from probcal.model.model import Model
 from probcal.priors import Precision, Prior
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.linearised import LaplaceApproximation
-from probcal.smoothing.mode import Point, compress, factors, log_likelihood, smooth_tracks
 
 
 def paper_b(model: Model, point: Point, prior: Precision) -> tuple[LaplaceApproximation, jax.Array]:

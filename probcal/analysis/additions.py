@@ -17,15 +17,15 @@ import numpy as np
 import pandas as pd
 
 from probcal.errors import InputError
+from probcal.gaussian.cholesky import Factor, SuperLU
+from probcal.gaussian.joint import JointPrecision
+from probcal.gaussian.linearised import linearise_rows
+from probcal.gaussian.mode import Point
 from probcal.model.model import Model
 from probcal.model.rows import Linearised, pose_vector
 from probcal.network import Network, Node
 from probcal.problem import Problem
 from probcal.sensor import Sensor, SensorType
-from probcal.smoothing.cholesky import Factor, SuperLU
-from probcal.smoothing.joint import JointPrecision
-from probcal.smoothing.linearised import linearise_rows
-from probcal.smoothing.mode import Point
 
 NUMBERS = 40_000_000  # of the right-hand sides of some columns of the inverse
 TOUCHED = 8_000  # variables of which a matrix is made

@@ -8,8 +8,8 @@ import xarray as xr
 from probcal.analysis.findings import Finding
 from probcal.inference.fitted import Judged, saved_by_epoch
 from probcal.labels import PIECE, SCENE
+from probcal.modes.reflections import touched
 from probcal.results.read import each_track
-from probcal.smoothing.reflections import touched
 
 BEYOND = 2.0  # sd that an answer as good may be away
 

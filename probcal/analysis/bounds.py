@@ -16,15 +16,15 @@ import xarray as xr
 
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
 from probcal.errors import InputError, nearest
+from probcal.gaussian import cholesky
+from probcal.gaussian.joint import JointPrecision, too_large
+from probcal.gaussian.linearised import Trajectory, linearise_rows, state_variances, trajectories_of
+from probcal.gaussian.mode import Compressed, compress, eliminate_compressed
 from probcal.labels import NOBODY, listed
 from probcal.model.model import At, Model
 from probcal.problem import Problem
 from probcal.results.groups import bias_coords, by_target, node_of
 from probcal.simulate import Key, Truth, as_key
-from probcal.smoothing import cholesky
-from probcal.smoothing.joint import JointPrecision, too_large
-from probcal.smoothing.linearised import Trajectory, linearise_rows, state_variances, trajectories_of
-from probcal.smoothing.mode import Compressed, compress, eliminate_compressed
 from probcal.types import float64
 
 KINDS = ("parametric", "posterior", "hybrid")

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.analysis.pieces import LEAST
+from probcal.gaussian.joint import JointPrecision
+from probcal.gaussian.sparse_mode import SparseSystem
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
-from probcal.smoothing.joint import JointPrecision
-from probcal.smoothing.sparse_mode import SparseSystem
 
 SAMPLED, TOGETHER = 128, 16  # of the joint Gaussian, and of them at once
 SUSPECT, MOST = 0.4, 100  # share of the limit from which a bias is suspected, and how many are solved for at most

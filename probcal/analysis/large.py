@@ -17,6 +17,7 @@ from probcal.analysis import checks, pieces, verdict
 from probcal.analysis.beside import mirror_doubts, mirror_findings
 from probcal.analysis.findings import Finding, completed, of_invalid
 from probcal.analysis.halves import SAMPLED, Divided, Halves, drifts_of
+from probcal.gaussian import cholesky
 from probcal.identifiability.directions import shared_in_blocks
 from probcal.inference import residuals
 from probcal.inference.fitted import JudgedLarge, take_up_large
@@ -26,7 +27,6 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import bias_coords
-from probcal.smoothing import cholesky
 from probcal.status import INVALID, Status
 
 SHARED = 1.8  # sd that an open combination of one scale may put a bias off

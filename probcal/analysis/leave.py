@@ -18,6 +18,9 @@ import xarray as xr
 from scipy import special
 
 from probcal import linalg
+from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
+from probcal.gaussian.mode import Eliminated, Point, cost, find_mode, follow, smooth_tracks
+from probcal.gaussian.places import tilt_at
 from probcal.inference.fitted import Fitted
 from probcal.inference.pose import TAILED
 from probcal.inference.psis import smoothed
@@ -26,9 +29,6 @@ from probcal.model.model import Model, scaled
 from probcal.model.rows import Linearised, standardised
 from probcal.priors import Precision
 from probcal.results.read import summed_log_likelihood
-from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
-from probcal.smoothing.mode import Eliminated, Point, cost, find_mode, follow, smooth_tracks
-from probcal.smoothing.places import tilt_at
 
 STEPS = 20  # Gauss-Newton steps of a refit
 TOLERANCE = 1e-5  # nats

@@ -17,6 +17,9 @@ import xarray as xr
 
 from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import limit_of
+from probcal.gaussian.linearised import Linearisation, linearise
+from probcal.gaussian.marginal import SETTLED, TRACK_STEPS, volume_slope
+from probcal.gaussian.mode import Point, find_tracks
 from probcal.inference.fitted import Fitted
 from probcal.inference.residuals import PRACTICAL
 from probcal.labels import listed
@@ -27,9 +30,6 @@ from probcal.motion.base import level_label
 from probcal.noise import Bernoulli, Unknown, guess_of
 from probcal.problem import Problem
 from probcal.results.groups import bias_coords
-from probcal.smoothing.linearised import Linearisation, linearise
-from probcal.smoothing.marginal import SETTLED, TRACK_STEPS, volume_slope
-from probcal.smoothing.mode import Point, find_tracks
 
 STEP = 0.1  # of a log level to either side
 FEWEST = 30  # noises below which nothing is said of their level

@@ -12,12 +12,12 @@ import xarray as xr
 
 from probcal import linalg
 from probcal.errors import InputError, nearest
+from probcal.gaussian.mode import compress, factors
 from probcal.labels import AXES, NOBODY
 from probcal.model.model import At, Model
 from probcal.problem import Problem, check_linear
 from probcal.results.read import apply
 from probcal.simulate import blank
-from probcal.smoothing.mode import compress, factors
 from probcal.types import float64
 
 BATCH = (256, 200_000)  # cells worked on at once, and entries of their matrices

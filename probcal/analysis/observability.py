@@ -11,6 +11,10 @@ import xarray as xr
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.analysis.verdict import narrowed
 from probcal.errors import InputError
+from probcal.gaussian.cholesky import exact
+from probcal.gaussian.joint import JointPrecision, blocks_of, too_large
+from probcal.gaussian.linearised import Linearisation, linearise, linearise_rows
+from probcal.gaussian.mode import Point
 from probcal.identifiability.directions import marginal, open_alone, open_together, weak_directions
 from probcal.identifiability.gauge import NULL, gauge, unfixed
 from probcal.identifiability.remedies import WEAK
@@ -20,10 +24,6 @@ from probcal.results.blocks import SensorBlocks
 from probcal.results.build import bands
 from probcal.results.groups import bias_coords, constant_group, datum_of, direction_group, gather, track_groups
 from probcal.simulate import Truth
-from probcal.smoothing.cholesky import exact
-from probcal.smoothing.joint import JointPrecision, blocks_of, too_large
-from probcal.smoothing.linearised import Linearisation, linearise, linearise_rows
-from probcal.smoothing.mode import Point
 from probcal.types import float64
 
 RULE = (

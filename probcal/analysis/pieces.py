@@ -11,11 +11,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.linearised import compress_and_eliminate
 from probcal.inference.fitted import Fitted
 from probcal.model import variants
 from probcal.model.model import Model
 from probcal.problem import Problem
-from probcal.smoothing.linearised import compress_and_eliminate
 
 Limit = Callable[[int], float]  # chi-square by degrees of freedom
 Patterns = dict[str, np.ndarray]

@@ -15,6 +15,11 @@ import xarray as xr
 from probcal.analysis.additions import Informed, gains_of_passes, gains_of_sensors, typical_values
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
+from probcal.gaussian.cholesky import exact
+from probcal.gaussian.joint import JointPrecision, too_large
+from probcal.gaussian.linearised import linearise_rows, marginal_information
+from probcal.gaussian.mode import Point
+from probcal.gaussian.room import check_room
 from probcal.identifiability.remedies import WEAK
 from probcal.labels import AXES, NOBODY
 from probcal.model import variants
@@ -23,11 +28,6 @@ from probcal.network import Network, Node
 from probcal.problem import Epochs, Problem
 from probcal.sensor import SensorType
 from probcal.simulate import Truth
-from probcal.smoothing.cholesky import exact
-from probcal.smoothing.joint import JointPrecision, too_large
-from probcal.smoothing.linearised import linearise_rows, marginal_information
-from probcal.smoothing.mode import Point
-from probcal.smoothing.room import check_room
 from probcal.table import Table, header, unit_factor
 from probcal.types import float64
 

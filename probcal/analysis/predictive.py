@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from probcal.gaussian.draws import draw
 from probcal.inference.fitted import Fitted, Judged
 from probcal.inference.residuals import all_gaussian, exact_kurtosis
 from probcal.model.model import At, Model
 from probcal.model.motions import level_logs
 from probcal.model.rows import standardised
 from probcal.results.read import each_track, saved_states
-from probcal.smoothing.draws import draw
 
 DRAWS = 400
 VALUES = 20_000_000  # of all states drawn

@@ -11,12 +11,12 @@ import xarray as xr
 
 from probcal.analysis.standpoint import draw_states, on_tracks_of
 from probcal.errors import InputError, nearest
+from probcal.gaussian.linearised import linearise
+from probcal.gaussian.mode import Point, smooth_tracks
 from probcal.model.model import At, Model
+from probcal.modes.grid import follow_states
 from probcal.problem import Problem
 from probcal.simulate import Key, Truth, as_key
-from probcal.smoothing.grid import follow_states
-from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mode import Point, smooth_tracks
 from probcal.types import float64
 
 ITERATIONS = 30  # of a track

@@ -9,9 +9,9 @@ import jax
 import xarray as xr
 
 from probcal.analysis.findings import Finding
+from probcal.gaussian.mode import log_likelihood
 from probcal.inference.fitted import Fitted
 from probcal.results.read import summed_log_likelihood
-from probcal.smoothing.mode import log_likelihood
 
 LINEAR, MOST = 0.5, 0.75  # nats a datum: at most of a linear model, and from which it is a finding
 GAUSSIAN = ("Laplace", "mixture")  # kinds of answers that draw from Gaussians around a mode

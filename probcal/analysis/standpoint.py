@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError, nearest
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.joint import too_large
+from probcal.gaussian.mode import Point, factors
+from probcal.modes import automatic_start
+from probcal.modes.grid import grid_start, track_mode
 from probcal.problem import Problem, check_linear
 from probcal.simulate import Truth, on_tracks
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.grid import grid_start, track_mode
-from probcal.smoothing.joint import too_large
-from probcal.smoothing.mode import Point, factors
-from probcal.starts import automatic_start
 from probcal.types import float64
 
 START_STEPS = 30  # of a track of a network that is large

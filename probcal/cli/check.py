@@ -15,13 +15,13 @@ from probcal.cli.models import load_problem, on_network
 from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs
+from probcal.gaussian.joint import too_large
+from probcal.gaussian.mode import Point
 from probcal.inference.progress import Monitor
 from probcal.labels import NOBODY
+from probcal.modes import automatic_start
 from probcal.problem import Problem
 from probcal.results.io import save
-from probcal.smoothing.joint import too_large
-from probcal.smoothing.mode import Point
-from probcal.starts import automatic_start
 
 MANY, SHOWN, LISTED = 400, 40, 12  # biases up to which all are printed, of more so many; directions of many
 MAP_CELLS = 60  # of a bound map an axis

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probcal.starts.modified import (
+from probcal.modes.modified import (
     GAMMA,
     Bearings,
     SensorTrack,

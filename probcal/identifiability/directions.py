@@ -8,13 +8,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from probcal.gaussian.mode import Point
 from probcal.identifiability.gauge import Gauge
 from probcal.identifiability.patterns import DILATION, Pattern, cause, common_shifts, rigid_motions
 from probcal.identifiability.remedies import WEAK, Direction, with_remedies
 from probcal.identifiability.spaces import complete, inside, orthonormal, readable
 from probcal.identifiability.wording import amount, in_words, involved, name_without_owner, owner_of
 from probcal.problem import Problem
-from probcal.smoothing.mode import Point
 
 ALONG = 0.1  # share of the largest entry above which a component moves along with a rigid motion
 APART = 0.5  # part of a unit direction outside those already named that makes it a new one

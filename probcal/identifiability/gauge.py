@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian.mode import Point, compress
 from probcal.model import variants
 from probcal.model.model import Model
 from probcal.motion import Known, as_motion
 from probcal.problem import Problem
-from probcal.smoothing.mode import Point, compress
 
 NULL = 1e-10  # share of information left below which a direction is a gauge
 CLOSE = 1e-6  # share below which a direction is looked at again, without cancellation

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from probcal.gaussian.mode import Point
 from probcal.labels import AXES, NOBODY, label_parts
 from probcal.problem import Problem
-from probcal.smoothing.mode import Point
 
 STRAIGHT = 0.03  # width of a path over its length below which it is one line
 DILATION = "dilation: all positions grow or shrink together"

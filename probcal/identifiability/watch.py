@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from probcal.gaussian.mode import Point
 from probcal.identifiability.gauge import gauge, unfixed
 from probcal.identifiability.patterns import common_shifts, rigid_motions
 from probcal.motion import as_motion
 from probcal.problem import Problem
-from probcal.smoothing.mode import Point
 
 ALONG = 4.0  # prior sd along a combination of biases beyond which an estimate ran along it
 INSIDE = 0.7  # size of a unit direction within the gauge from which it belongs to it

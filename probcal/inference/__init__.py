@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from probcal.lazy import lazy
 
 if TYPE_CHECKING:
+    from probcal.gaussian.esteps import Cubature, EStep, Extended, Unscented
     from probcal.inference.evidence import Evidence, log_evidence
     from probcal.inference.fit import calibrate, fit, track
     from probcal.inference.methods import (
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from probcal.inference.model import numpyro_model
     from probcal.inference.run import Method
     from probcal.inference.svi import SVI
-    from probcal.smoothing.esteps import Cubature, EStep, Extended, Unscented
 
 __all__ = lazy(
     __name__,
@@ -33,6 +33,6 @@ __all__ = lazy(
         "probcal.inference.model": "numpyro_model",
         "probcal.inference.run": "Method",
         "probcal.inference.svi": "SVI",
-        "probcal.smoothing.esteps": "Cubature EStep Extended Unscented",
+        "probcal.gaussian.esteps": "Cubature EStep Extended Unscented",
     },
 )

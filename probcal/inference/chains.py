@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from probcal.devices import over_devices
+from probcal.gaussian.frame import place
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.sides import Sided, shifted, side_of
-from probcal.smoothing.frame import place
 
 
 class Sample(NamedTuple):

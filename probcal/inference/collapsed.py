@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.frame import log_weight
 from probcal.inference.hierarchy import Phi
 from probcal.inference.leaps import Place, leap
 from probcal.inference.orbits import roam
 from probcal.inference.posed import Conditional, Form, Posed, conditional, prior_precision
 from probcal.inference.sampler import Sample, Sampler
 from probcal.priors import Horseshoe, Prior
-from probcal.smoothing.frame import log_weight
 
 LEAPS = 4  # tries before a swing, which costs more than all of them
 STEP = 1.3  # of a swing, over the fourth root of the dimension (Beskos and others 2013)

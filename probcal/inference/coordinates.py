@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import jax
 
+from probcal.gaussian.frame import log_joint
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, log_prior, prior_precision, whiten
-from probcal.smoothing.frame import log_joint
 
 
 class Free(NamedTuple):

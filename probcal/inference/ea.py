@@ -9,6 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.information import update_levels
+from probcal.gaussian.linearised import laplace_of
+from probcal.gaussian.marginal import find_marginal_mode
+from probcal.gaussian.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, mixing_gain
 from probcal.inference.ending import astray
 from probcal.inference.hierarchy import held, hierarchy_of
 from probcal.inference.integrate import Integration, likelihood
@@ -31,10 +35,6 @@ from probcal.inference.sparse import FORMS, PRODUCTS
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
-from probcal.smoothing.information import update_levels
-from probcal.smoothing.linearised import laplace_of
-from probcal.smoothing.marginal import find_marginal_mode
-from probcal.smoothing.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, mixing_gain
 
 RULES = ("mackay", "em")
 MODES = ("joint", "marginal")
@@ -134,8 +134,8 @@ class EA(Maximiser):
     posterior and is always maximised. Noise levels that are unknown maximise the evidence and are held.
 
     `trajectory` says what the reported point is: "marginal" the mode of the biases with the trajectory integrated
-    (Laplace, see `smoothing.marginal`; the places of targets at rest by quadrature where Laplace is wrong, on a ring or
-    on either side of a line, see `smoothing.places`), "joint" that of biases and trajectory together, which shrinks a
+    (Laplace, see `gaussian.marginal`; the places of targets at rest by quadrature where Laplace is wrong, on a ring or
+    on either side of a line, see `gaussian.places`), "joint" that of biases and trajectory together, which shrinks a
     scene whose size only the motion tells. `EA.as_printed()` is the joint mode with precisions maximised; Paper B as
     printed is in `benchmarks/papers/paper_b.py`. `update` of maximised precisions is "mackay" (Paper B 25) or "em"
     (Paper C 40; the same fixed points, slower). `tolerance` is the change of log evidence, in nats, at which it stops;
@@ -293,7 +293,7 @@ class MAP(Maximiser):
     `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood; `trajectory` "marginal" or "joint", as
     in `EA`, places on rings included. `form` as in `EA`; "matrix-free" makes no factor of the biases: steps by
     conjugate gradients, sds (with their relative errors, `sd_error`) and the evidence by draws (see
-    `smoothing.products`). It is for what has no room for a sparse factor; "auto" goes on with it where making one is
+    `gaussian.products`). It is for what has no room for a sparse factor; "auto" goes on with it where making one is
     refused for want of memory. Under `Flat` a climb of which a bias still lies more than ten scales from its stated
     value after fifteen steps, or thirty, has diverged and ends there. Raises `InputError` for another trajectory or
     form.

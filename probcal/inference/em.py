@@ -7,16 +7,16 @@ import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
+from probcal.gaussian.esteps import EStep, Extended, shorten
+from probcal.gaussian.information import update_levels
+from probcal.gaussian.linearised import laplace
+from probcal.gaussian.mode import Point, cost, mixing_gain
+from probcal.gaussian.solves import Dense
 from probcal.inference.run import Context, Given, Maximiser, ParticleSmoother, State, learn, reweighted, valued
 from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.smoothing.esteps import EStep, Extended, shorten
-from probcal.smoothing.information import update_levels
-from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import Point, cost, mixing_gain
-from probcal.smoothing.solves import Dense
 
 EXTENDED = Extended()
 BY_PATHS = "Gaussian of the curvature of the marginal likelihood, by the slope of its score over filters"

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from probcal.gaussian.draws import residuals
+from probcal.gaussian.information import rejected, squares_of
+from probcal.gaussian.mode import Point
 from probcal.inference.mixture import MixturePosterior
 from probcal.labels import listed
 from probcal.misfit import MisfitData, misfit_text, rejection_text
+from probcal.modes import automatic_start
+from probcal.modes.grid import track_mode
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, NormalPosterior, Posterior, Summary, uncalibrated
 from probcal.results.groups import datum_of, gather
-from probcal.smoothing.draws import residuals
-from probcal.smoothing.grid import track_mode
-from probcal.smoothing.information import rejected, squares_of
-from probcal.smoothing.mode import Point
-from probcal.starts import automatic_start
 from probcal.status import Status
 
 if TYPE_CHECKING:

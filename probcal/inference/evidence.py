@@ -10,17 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.mode import Point
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.methods import check_problem
 from probcal.inference.pose import pareto_khat, pose, weights
 from probcal.inference.posed import Form, Posed, conditional, draw_given, prior_precision
 from probcal.inference.psis import smoothed
+from probcal.modes import automatic_start
 from probcal.priors import AnyPrior, Flat, Horseshoe, as_prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
-from probcal.smoothing.mode import Point
-from probcal.starts import automatic_start
 from probcal.types import float64
 
 RUNS, PARTICLES = 8, 50  # independent runs, and the hyper-parameters that each of them carries

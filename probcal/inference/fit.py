@@ -13,6 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
+from probcal.gaussian.information import at_levels
+from probcal.gaussian.joint import too_large
+from probcal.gaussian.linearised import linearise
+from probcal.gaussian.mode import Point
+from probcal.gaussian.sparse_mode import settle_each, settled_variances
+from probcal.gaussian.tails import settle
 from probcal.identifiability.directions import weak_directions
 from probcal.identifiability.remedies import Direction
 from probcal.identifiability.watch import runs, strained_starts
@@ -27,21 +33,15 @@ from probcal.inference.storage import Storage
 from probcal.inference.widen import judge_fit, judge_tracks
 from probcal.labels import NODE, START, listed
 from probcal.lazy import Later
+from probcal.modes import automatic_start
+from probcal.modes.grid import grid_start, track_mode
+from probcal.modes.mirrors import SAME, Mirrored
 from probcal.priors import AnyPrior
 from probcal.problem import Problem, check_linear
 from probcal.results.answer import Answer, Tracks, tracks_of, uncalibrated
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
 from probcal.results.read import Calibrated, apply
 from probcal.simulate import Key, as_key
-from probcal.smoothing.grid import grid_start, track_mode
-from probcal.smoothing.information import at_levels
-from probcal.smoothing.joint import too_large
-from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mirrors import SAME, Mirrored
-from probcal.smoothing.mode import Point
-from probcal.smoothing.sparse_mode import settle_each, settled_variances
-from probcal.smoothing.tails import settle
-from probcal.starts import automatic_start
 from probcal.status import Status
 from probcal.types import float64
 from probcal.wings import of_wing
@@ -255,7 +255,7 @@ def _check_store(method: Method, store: str | PathLike[str] | None, resume: bool
 
 
 def _kept(save: Collection[str]) -> tuple[str, ...]:
-    """What is kept of every draw, in the words of `smoothing.draws`; raises `InputError` for what cannot be saved."""
+    """What is kept of every draw, in the words of `gaussian.draws`; raises `InputError` for what cannot be saved."""
     names = (save,) if isinstance(save, str) else tuple(save)
     for name in names:
         if name not in SAVE:

@@ -11,10 +11,17 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
+from probcal.gaussian.information import at_levels
+from probcal.gaussian.joint import JointPrecision
+from probcal.gaussian.linearised import Linearisation, linearise
+from probcal.gaussian.mode import Eliminated, Point
+from probcal.gaussian.places import tilt_at
+from probcal.gaussian.sparse_mode import SparseSystem, system_at
 from probcal.inference.sparse import SparsePosterior
 from probcal.lazy import Later
 from probcal.model.motions import level_logs
 from probcal.model.rows import Linearised
+from probcal.modes.grid import follow_states, track_mode
 from probcal.priors import Precision
 from probcal.problem import Epochs, Problem
 from probcal.results.answer import Answer
@@ -22,13 +29,6 @@ from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import datum_of, gather, weight_name
 from probcal.results.read import each_track
 from probcal.results.schema import matrix_of
-from probcal.smoothing.grid import follow_states, track_mode
-from probcal.smoothing.information import at_levels
-from probcal.smoothing.joint import JointPrecision
-from probcal.smoothing.linearised import Linearisation, linearise
-from probcal.smoothing.mode import Eliminated, Point
-from probcal.smoothing.places import tilt_at
-from probcal.smoothing.sparse_mode import SparseSystem, system_at
 
 if TYPE_CHECKING:
     import pandas as pd

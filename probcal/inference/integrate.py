@@ -16,6 +16,10 @@ import numpy as np
 from jax.scipy.special import ndtr
 
 from probcal import linalg
+from probcal.gaussian.joint import blocks_of
+from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
+from probcal.gaussian.marginal import volume_slope
+from probcal.gaussian.mode import Eliminated, Point, smooth_tracks
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Natural, activity, draw_given, prior_precision
@@ -23,10 +27,6 @@ from probcal.inference.propagate import BlockMarginals, Blocks, Propagation
 from probcal.model.model import Model
 from probcal.priors import Precision
 from probcal.results.schema import INTERVAL
-from probcal.smoothing.joint import blocks_of
-from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
-from probcal.smoothing.marginal import volume_slope
-from probcal.smoothing.mode import Eliminated, Point, smooth_tracks
 
 CHAINS, BURN, FIRST, KEPT = (
     4,

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from probcal.gaussian.frame import log_weight
 from probcal.inference.gibbs import reversible_sweeps
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed
-from probcal.smoothing.frame import log_weight
 
 
 class Place(NamedTuple):

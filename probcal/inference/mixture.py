@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.draws import draw, draws_a_chain
+from probcal.gaussian.linearised import laplace
 from probcal.inference.hierarchy import LEAST, MOST, Hierarchy, Phi, held
 from probcal.inference.integrate import Integrated
 from probcal.inference.posed import Form
@@ -18,8 +20,6 @@ from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Draws, Posterior, Summary, Tracks, log_prior_normal, tracks_of
 from probcal.results.schema import ROPE
-from probcal.smoothing.draws import draw, draws_a_chain
-from probcal.smoothing.linearised import laplace
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,21 +19,21 @@ import numpyro
 from numpyro import distributions as dist
 
 from probcal.errors import InputError, nearest
+from probcal.gaussian.frame import frame_at
+from probcal.gaussian.information import at_levels
+from probcal.gaussian.mode import Point, factors
+from probcal.gaussian.recursion import trajectory
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
 from probcal.inference.pose import pilot
 from probcal.inference.posed import Form, Posed
 from probcal.model import rows
 from probcal.model.model import Model
 from probcal.model.rows import Block, Rows
+from probcal.modes import automatic_start
+from probcal.modes.grid import track_mode
 from probcal.priors import PRIORS, AnyPrior, Flat, Horseshoe, Precision, as_prior
 from probcal.problem import Problem, check_linear
 from probcal.results.read import apply
-from probcal.smoothing.frame import frame_at
-from probcal.smoothing.grid import track_mode
-from probcal.smoothing.information import at_levels
-from probcal.smoothing.mode import Point, factors
-from probcal.smoothing.recursion import trajectory
-from probcal.starts import automatic_start
 from probcal.types import float64
 
 if TYPE_CHECKING:

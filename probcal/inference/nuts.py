@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
+from probcal.gaussian.frame import log_weight
 from probcal.inference.coordinates import Free, Parts, parts
 from probcal.inference.hierarchy import Phi
 from probcal.inference.leaps import Place, leap
@@ -17,7 +18,6 @@ from probcal.inference.posed import Form, Posed, conditional
 from probcal.inference.sampler import Sample, Sampler
 from probcal.lazy import Later
 from probcal.priors import Horseshoe, Prior
-from probcal.smoothing.frame import log_weight
 
 if TYPE_CHECKING:
     from numpyro.infer import hmc

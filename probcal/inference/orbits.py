@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian.frame import log_weight, place, unit_normals, volume
+from probcal.gaussian.mode import Point, factors
+from probcal.gaussian.recursion import trajectory
 from probcal.inference.leaps import Place
 from probcal.inference.posed import Form, Posed, log_prior
 from probcal.problem import Problem
-from probcal.smoothing.frame import log_weight, place, unit_normals, volume
-from probcal.smoothing.mode import Point, factors
-from probcal.smoothing.recursion import trajectory
 
 SIZES = (2.0, 0.5, 0.1)  # of a proposal, in sd along the direction by the frame: one of them by lot
 CLOSE = 1e-6  # share by which a moved track may miss the motion

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.frame import Frame, frame_at, log_weight, place, refined
+from probcal.gaussian.mode import Point, smooth_tracks
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.posed import Form, Posed, activity, conditional
@@ -16,8 +18,6 @@ from probcal.inference.psis import smoothed
 from probcal.model.model import Model
 from probcal.priors import Prior
 from probcal.problem import Problem
-from probcal.smoothing.frame import Frame, frame_at, log_weight, place, refined
-from probcal.smoothing.mode import Point, smooth_tracks
 
 PILOTS = 4  # chains of the pilot
 BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, sweeps between two

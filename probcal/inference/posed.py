@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg
+from probcal.gaussian.frame import Frame
 from probcal.inference.hierarchy import Hierarchy, Phi
 from probcal.model.model import Model
 from probcal.priors import Precision
-from probcal.smoothing.frame import Frame
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.draws import draws_a_chain, predictive
+from probcal.gaussian.information import at_levels, mean_square
+from probcal.gaussian.mode import Point
 from probcal.inference.ending import FAR, misfit_sentence
 from probcal.inference.hierarchy import LEAST, MOST, held
 from probcal.inference.mixed import ESS, R_HAT, UNSURE, mixing, weights_of_sides, within_sides
@@ -17,15 +20,12 @@ from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Posed
 from probcal.inference.sampling import SamplerRun
 from probcal.model.motions import level_values
+from probcal.modes.grid import track_mode
+from probcal.modes.mirrors import Mirrored
 from probcal.priors import PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
 from probcal.results.schema import INTERVAL, ROPE
-from probcal.smoothing.draws import draws_a_chain, predictive
-from probcal.smoothing.grid import track_mode
-from probcal.smoothing.information import at_levels, mean_square
-from probcal.smoothing.mirrors import Mirrored
-from probcal.smoothing.mode import Point
 from probcal.status import Status
 
 RARE = 0.05  # share of leaps, or of swings, taken below which it is said

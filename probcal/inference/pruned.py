@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.linearised import laplace
+from probcal.gaussian.mode import Point, find_mode, smooth_tracks
 from probcal.inference.run import Given, State
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, PRECISION_BOUNDS
-from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import Point, find_mode, smooth_tracks
 
 TRIED = 8  # groups of biases that are taken out for a trial, those farthest from their stated values first
 SHARE = 0.5  # of the fall that the curvature foretells, from which a group is believed

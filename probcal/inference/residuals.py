@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.mode import Eliminated, Point, factors
 from probcal.inference.fitted import Fitted, Judged, JudgedLarge
 from probcal.lazy import Later
 from probcal.model.model import Data, Model
 from probcal.model.rows import Linearised, standardised
 from probcal.noise import Bernoulli, Normal
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Eliminated, Point, factors
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,6 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.information import mean_square
+from probcal.gaussian.linearised import LaplaceApproximation, compress_and_eliminate, laplace, linearise_rows
+from probcal.gaussian.mode import Eliminated, Point, cost
+from probcal.gaussian.places import places_of, tilt_of
+from probcal.gaussian.tails import expected_mixing, rewhitened
 from probcal.inference.ending import FAR, conclude
 from probcal.inference.hierarchy import held, learnt_groups
 from probcal.inference.integrate import Integration, integrate
@@ -27,11 +32,6 @@ from probcal.priors import ARD, PRECISION_BOUNDS, Precision, Prior
 from probcal.priors import Laplace as LaplacePrior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.smoothing.information import mean_square
-from probcal.smoothing.linearised import LaplaceApproximation, compress_and_eliminate, laplace, linearise_rows
-from probcal.smoothing.mode import Eliminated, Point, cost
-from probcal.smoothing.places import places_of, tilt_of
-from probcal.smoothing.tails import expected_mixing, rewhitened
 
 if TYPE_CHECKING:
     import xarray as xr

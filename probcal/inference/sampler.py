@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
+from probcal.gaussian.mode import Point
 from probcal.inference.chains import Sample
 from probcal.inference.hierarchy import Phi
 from probcal.inference.leaps import Place
@@ -19,7 +20,6 @@ from probcal.inference.sampling import sample
 from probcal.priors import ARD, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.smoothing.mode import Point
 
 CHAINS, DRAWS = 4_096, 10_000_000  # the most; draws with warm-up, of all chains
 

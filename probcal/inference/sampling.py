@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
+from probcal.gaussian.mode import Point
 from probcal.inference.chains import Draw, run_chunk, run_sided, run_together
 from probcal.inference.mixed import settled
 from probcal.inference.orbits import orbits_of
@@ -22,11 +23,10 @@ from probcal.inference.posed import Form, Natural, Posed
 from probcal.inference.progress import Monitor
 from probcal.inference.sides import Sided, distances, side_by_side
 from probcal.inference.storage import Chunks, Storage
+from probcal.modes.mirrors import Mirrored, other_sides
+from probcal.modes.reflections import new, reach
 from probcal.priors import Prior
 from probcal.problem import Problem
-from probcal.smoothing.mirrors import Mirrored, other_sides
-from probcal.smoothing.mode import Point
-from probcal.smoothing.reflections import new, reach
 
 if TYPE_CHECKING:
     from probcal.inference.sampler import Sampler

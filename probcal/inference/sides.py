@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from probcal.gaussian.frame import log_weight, place, unit_normals
+from probcal.gaussian.information import at_levels
+from probcal.gaussian.mode import Point, mixed_density
 from probcal.inference.leaps import Place
 from probcal.inference.posed import Form, Posed, log_prior
+from probcal.modes.grid import track_mode
+from probcal.modes.reflections import new, reach
 from probcal.problem import Problem
-from probcal.smoothing.frame import log_weight, place, unit_normals
-from probcal.smoothing.grid import track_mode
-from probcal.smoothing.information import at_levels
-from probcal.smoothing.mode import Point, mixed_density
-from probcal.smoothing.reflections import new, reach
 
 
 class Sided(NamedTuple):

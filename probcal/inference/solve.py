@@ -9,24 +9,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
+from probcal.gaussian.joint import too_large
+from probcal.gaussian.mode import Point
+from probcal.gaussian.room import check_room
 from probcal.inference.methods import MAP
 from probcal.inference.progress import Monitor, Stopped
 from probcal.inference.run import Context, Maximiser, Method
 from probcal.inference.sparse import PRODUCTS, check_sparse, gains_by_sparse, sparse_climb, takes_sparse
 from probcal.inference.sparse_gibbs import check_gibbs
 from probcal.labels import SCENE, START, listed
+from probcal.modes import further_starts
+from probcal.modes import optima as optima_of
+from probcal.modes.clocks import first_times, settled_times, taken_there
+from probcal.modes.grid import follow_states, grid_start
+from probcal.modes.mirrors import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, other_sides
+from probcal.modes.reflections import new, reach
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.smoothing.grid import follow_states, grid_start
-from probcal.smoothing.joint import too_large
-from probcal.smoothing.mirrors import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, other_sides
-from probcal.smoothing.mode import Point
-from probcal.smoothing.reflections import new, reach
-from probcal.smoothing.room import check_room
-from probcal.starts import further_starts
-from probcal.starts import optima as optima_of
-from probcal.starts.clocks import first_times, settled_times, taken_there
 from probcal.status import Status
 
 ELSEWHERE = "found from another start"

@@ -17,6 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
+from probcal.gaussian.cholesky import Factor, exact
+from probcal.gaussian.information import mean_square
+from probcal.gaussian.joint import JointPrecision, blocks_of, is_thin, missing, prefers_sparse
+from probcal.gaussian.linearised import linearise_rows
+from probcal.gaussian.mode import Point
+from probcal.gaussian.sparse_mode import SparseMode, SparseSystem, find_sparse_mode, system_at
 from probcal.identifiability.directions import open_alone, open_together
 from probcal.identifiability.remedies import Direction
 from probcal.inference.ending import conclude_at
@@ -25,18 +31,12 @@ from probcal.inference.integrate import quantile
 from probcal.inference.posed import Form
 from probcal.inference.propagate import BlockMarginals, Blocks, Propagation
 from probcal.model.model import Model
+from probcal.modes.mirrors import SideClimb
 from probcal.priors import PRECISION_BOUNDS, Flat, Gaussian, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import HALF, Answer, Draws, Posterior, Summary, Tracks
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
-from probcal.smoothing.cholesky import Factor, exact
-from probcal.smoothing.information import mean_square
-from probcal.smoothing.joint import JointPrecision, blocks_of, is_thin, missing, prefers_sparse
-from probcal.smoothing.linearised import linearise_rows
-from probcal.smoothing.mirrors import SideClimb
-from probcal.smoothing.mode import Point
-from probcal.smoothing.sparse_mode import SparseMode, SparseSystem, find_sparse_mode, system_at
 
 if TYPE_CHECKING:
     from probcal.inference.run import Context, Maximiser

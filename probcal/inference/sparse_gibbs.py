@@ -19,6 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
+from probcal.gaussian.cholesky import Factor
+from probcal.gaussian.joint import JointPrecision, blocks_of, missing
+from probcal.gaussian.joint_density import JointDensity, point_of_variables, variables_of
+from probcal.gaussian.mode import Point, log_density
+from probcal.gaussian.sparse_mode import SparseSystem, find_sparse_mode, system_at
 from probcal.inference.chains import Draw, Sample
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.mixed import mixing
@@ -41,11 +46,6 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Summary
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
-from probcal.smoothing.cholesky import Factor
-from probcal.smoothing.joint import JointPrecision, blocks_of, missing
-from probcal.smoothing.joint_density import JointDensity, point_of_variables, variables_of
-from probcal.smoothing.mode import Point, log_density
-from probcal.smoothing.sparse_mode import SparseSystem, find_sparse_mode, system_at
 from probcal.status import Status
 
 STEPS = 60  # of the climb to the mode

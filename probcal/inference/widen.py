@@ -11,6 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.information import rejected
+from probcal.gaussian.joint import JointPrecision
+from probcal.gaussian.linearised import Linearisation
+from probcal.gaussian.mode import Eliminated, Point, factors
+from probcal.gaussian.scans import recur_squared
+from probcal.gaussian.sparse_mode import system_at
 from probcal.inference import residuals
 from probcal.inference.fitted import Fitted, Judged, JudgedLarge, take_up, take_up_large
 from probcal.inference.residuals import LAGGED, NOTABLE, PRACTICAL, Channels, Innovations
@@ -27,13 +34,6 @@ from probcal.results.answer import Answer
 from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import by_target, datum_of
 from probcal.results.read import Calibrated
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.information import rejected
-from probcal.smoothing.joint import JointPrecision
-from probcal.smoothing.linearised import Linearisation
-from probcal.smoothing.mode import Eliminated, Point, factors
-from probcal.smoothing.scans import recur_squared
-from probcal.smoothing.sparse_mode import system_at
 from probcal.status import INVALID
 from probcal.types import float64
 

@@ -79,7 +79,7 @@ TILTED = 200  # biases up to which the curvature of a tilt is worked out, and ro
 class Tilt(NamedTuple):
     """A term of the log-likelihood of the biases beside that of the rows, quadratic about a point.
 
-    Places that are integrated add it (see `smoothing.places`).
+    Places that are integrated add it (see `gaussian.places`).
     """
 
     at: Any  # (M,) point z

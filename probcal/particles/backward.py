@@ -13,7 +13,7 @@ from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
 from probcal.particles.filtering import FilteredParticles
 from probcal.particles.settings import ParticleSettings
-from probcal.smoothing.resampling import multinomial, systematic
+from probcal.resampling import multinomial, systematic
 
 Sampler = Callable[..., tuple[Any, jax.Array]]  # `cuthbertlib.smc.smoothing.protocols.BackwardSampling`
 

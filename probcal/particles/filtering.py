@@ -11,7 +11,7 @@ from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
 from probcal.particles.proposals import lost, propagated
 from probcal.particles.settings import ParticleSettings
-from probcal.smoothing.resampling import systematic
+from probcal.resampling import systematic
 
 
 class FilteredParticles(NamedTuple):

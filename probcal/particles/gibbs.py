@@ -20,6 +20,7 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
+from probcal.gaussian.mode import Point
 from probcal.inference.chains import Draw, Sample
 from probcal.inference.draws import slice_step
 from probcal.inference.hierarchy import Phi, hierarchy_of
@@ -29,6 +30,7 @@ from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
 from probcal.model.model import At, Model
+from probcal.modes.grid import follow_states, track_mode
 from probcal.particles.conditional import conditional_path
 from probcal.particles.em import climb
 from probcal.particles.ensemble import ensemble, expected_over_paths, first_paths, log_motion_of, state_moments
@@ -39,8 +41,6 @@ from probcal.particles.weighted import Paths, check_learnt, louis, positive, pre
 from probcal.priors import Gaussian, Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.smoothing.grid import follow_states, track_mode
-from probcal.smoothing.mode import Point
 from probcal.status import Status
 
 SPREAD = 1.5  # by how much chains start further out than the data leave the biases

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
+from probcal.gaussian.mode import Point
 from probcal.inference.run import Context, Maximiser, ParticleSmoother
 from probcal.particles.em import climb_by_particles
 from probcal.particles.settings import ParticleSettings
@@ -15,7 +16,6 @@ from probcal.particles.weighted import track_by_particles
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.smoothing.mode import Point
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -13,11 +13,15 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
+from probcal.gaussian.draws import draw_biases, draws_a_chain, predictive
+from probcal.gaussian.information import rejected
+from probcal.gaussian.mode import Point
 from probcal.inference.ending import ABSURD, FAR, low_and_far
 from probcal.inference.run import Given, Maximiser
 from probcal.labels import listed
 from probcal.misfit import rejection_text
 from probcal.model.model import Model
+from probcal.modes.grid import follow_states, track_mode
 from probcal.particles.ensemble import Ensemble, ensemble, nearest_states, observed_over_paths, state_moments
 from probcal.particles.proposals import check_proposal
 from probcal.particles.settings import ParticleSettings, check_installed
@@ -37,10 +41,6 @@ from probcal.results.answer import (
 )
 from probcal.results.build import build_tracks
 from probcal.results.groups import Band
-from probcal.smoothing.draws import draw_biases, draws_a_chain, predictive
-from probcal.smoothing.grid import follow_states, track_mode
-from probcal.smoothing.information import rejected
-from probcal.smoothing.mode import Point
 from probcal.status import Status
 
 if TYPE_CHECKING:

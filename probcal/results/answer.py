@@ -17,15 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.draws import draw, draw_biases, draws_a_chain
+from probcal.gaussian.linearised import LaplaceApproximation, Linearisation, linearise
+from probcal.gaussian.marginal import volume_slope
+from probcal.gaussian.mode import Point
+from probcal.modes.grid import track_mode
+from probcal.modes.mirrors import Mirrored
 from probcal.priors import Prior
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL
-from probcal.smoothing.draws import draw, draw_biases, draws_a_chain
-from probcal.smoothing.grid import track_mode
-from probcal.smoothing.linearised import LaplaceApproximation, Linearisation, linearise
-from probcal.smoothing.marginal import volume_slope
-from probcal.smoothing.mirrors import Mirrored
-from probcal.smoothing.mode import Point
 from probcal.status import Status
 
 if TYPE_CHECKING:

@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from probcal.gaussian.draws import many_data, residuals
+from probcal.gaussian.mode import Point
 from probcal.labels import AXES
 from probcal.lazy import Later
 from probcal.model.motions import level_values
+from probcal.modes.mirrors import SAME
 from probcal.results.accessor import register
 from probcal.results.answer import Answer, Draws, Summary, Tracks
 from probcal.results.groups import (
@@ -26,9 +29,6 @@ from probcal.results.groups import (
     track_groups,
 )
 from probcal.results.schema import BOUND, EVIDENCE, INTERVAL, RESULTS_VERSION
-from probcal.smoothing.draws import many_data, residuals
-from probcal.smoothing.mirrors import SAME
-from probcal.smoothing.mode import Point
 from probcal.table import first_date
 
 if TYPE_CHECKING:

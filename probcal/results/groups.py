@@ -15,8 +15,8 @@ from probcal.results.views import view_variables
 if TYPE_CHECKING:
     import xarray as xr
 
+    from probcal.gaussian.mode import Point
     from probcal.problem import Problem
-    from probcal.smoothing.mode import Point
 else:
     xr = Later("xarray")
 

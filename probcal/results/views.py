@@ -14,8 +14,8 @@ from probcal.model.epochs import Seen
 from probcal.model.rows import look
 
 if TYPE_CHECKING:
+    from probcal.gaussian.mode import Point
     from probcal.problem import Problem
-    from probcal.smoothing.mode import Point
 
 CELLS = 121  # along each side of the grid on which a view that is no sector is evaluated
 BESIDE = 0.5  # of the extent of nodes and tracks that this grid reaches beyond them

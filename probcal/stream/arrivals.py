@@ -15,12 +15,12 @@ from probcal.labels import AXES, NOBODY
 from probcal.lazy import Later
 from probcal.model.epochs import Epoch, merged, slots
 from probcal.model.motions import Area, linear_of, start_of
+from probcal.modes.grid import candidates
 from probcal.motion import Target, as_motion
 from probcal.network import Network
 from probcal.noise import Heard, Normal
 from probcal.plausible import implausible
 from probcal.problem import Problem, check_linear, declared_target
-from probcal.smoothing.grid import candidates
 from probcal.stream.counted import COUNTED, STREAMS, Counted, Stream, first_key
 from probcal.table import Table, header, measure, name_as_text, names_as_text
 

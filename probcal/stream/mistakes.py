@@ -9,11 +9,11 @@ from itertools import combinations
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.information import squares_of
+from probcal.modes import automatic_start
+from probcal.modes.grid import track_mode
 from probcal.problem import Problem
 from probcal.results.answer import uncalibrated
-from probcal.smoothing.grid import track_mode
-from probcal.smoothing.information import squares_of
-from probcal.starts import automatic_start
 from probcal.table import UNITS
 
 LARGE = 100.0  # largest square of a standardised residual that counts: a few outliers hide no mistake

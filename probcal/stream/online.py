@@ -21,12 +21,12 @@ from probcal.inference.identity import declared_identity
 from probcal.inference.widen import widening_factors
 from probcal.labels import NOBODY, label_parts
 from probcal.lazy import Later
+from probcal.modes.grid import NEAR
 from probcal.network import Network
 from probcal.priors import AnyPrior, Gaussian, Horseshoe, Prior, as_prior
 from probcal.problem import Problem, fixed_biases
 from probcal.results.answer import HALF
 from probcal.results.read import apply, held_by
-from probcal.smoothing.grid import NEAR
 from probcal.status import Status
 from probcal.stream.arrivals import Arrivals, Batch, padded, refused_rows
 from probcal.stream.counted import Counted

@@ -10,17 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.draws import draw_biases, draws_a_chain
+from probcal.gaussian.linearised import LaplaceApproximation
+from probcal.gaussian.mode import Point
 from probcal.inference.widen import widened_by
+from probcal.modes import automatic_start
+from probcal.modes.grid import track_mode
 from probcal.motion import Target
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.results.answer import CHAINS, Answer, Draws, NormalPosterior, Tracks
 from probcal.results.build import build
-from probcal.smoothing.draws import draw_biases, draws_a_chain
-from probcal.smoothing.grid import track_mode
-from probcal.smoothing.linearised import LaplaceApproximation
-from probcal.smoothing.mode import Point
-from probcal.starts import automatic_start
 from probcal.status import Status
 from probcal.stream.arrivals import Arrivals
 from probcal.stream.mistakes import mistake

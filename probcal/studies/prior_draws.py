@@ -9,13 +9,13 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
+from probcal.gaussian.mode import Point, factors
+from probcal.gaussian.recursion import trajectory
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form
 from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Precision, Prior
 from probcal.problem import Problem
-from probcal.smoothing.mode import Point, factors
-from probcal.smoothing.recursion import trajectory
 
 
 class SimulatedTruth(NamedTuple):

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError
+from probcal.gaussian.frame import volume
+from probcal.gaussian.mode import Point, log_likelihood, mixed_density
 from probcal.inference.hierarchy import Hierarchy, Phi
 from probcal.inference.mixture import MixturePosterior
 from probcal.inference.posed import Form, Posed, log_prior
@@ -26,8 +28,6 @@ from probcal.lazy import Later
 from probcal.model.model import At, Model
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.smoothing.frame import volume
-from probcal.smoothing.mode import Point, log_likelihood, mixed_density
 from probcal.studies.uniformity import NOMINAL, randomised_rank
 
 if TYPE_CHECKING:

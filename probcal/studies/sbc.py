@@ -21,6 +21,8 @@ import numpy as np
 import xarray as xr
 
 from probcal.errors import FitError, InputError
+from probcal.gaussian.information import at_levels
+from probcal.gaussian.mode import Point, find_mode
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.methods import NUTS, check_problem, choose_prior
@@ -32,13 +34,11 @@ from probcal.inference.solve import solve
 from probcal.inference.spread import check_scheduler, spread
 from probcal.inference.storage import Records, Storage
 from probcal.model import variants
+from probcal.modes.grid import follow_states
 from probcal.priors import AnyPrior, Precision, Prior, as_prior
 from probcal.problem import Problem
 from probcal.results.read import each_track, saved_states
 from probcal.simulate import Key, as_key
-from probcal.smoothing.grid import follow_states
-from probcal.smoothing.information import at_levels
-from probcal.smoothing.mode import Point, find_mode
 from probcal.studies.coverage import judge_coverage
 from probcal.studies.prior_draws import check_drawable, draw_data, draw_prior, far_start
 from probcal.studies.quantities import TAKEN, Points, Pool, Trial, pool_of, ranked

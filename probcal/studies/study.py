@@ -15,6 +15,8 @@ import xarray as xr
 
 from probcal.devices import over_devices
 from probcal.errors import InputError, nearest
+from probcal.gaussian.information import mean_square
+from probcal.gaussian.mode import Point
 from probcal.inference.ending import conclude
 from probcal.inference.identity import identity, problem_digest
 from probcal.inference.integrate import Integrated, Integration, integrate
@@ -37,13 +39,11 @@ from probcal.inference.solve import solve
 from probcal.inference.spread import check_scheduler, spread
 from probcal.inference.storage import Storage
 from probcal.model.model import Model
+from probcal.modes import automatic_start
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.simulate import Truth
-from probcal.smoothing.information import mean_square
-from probcal.smoothing.mode import Point
-from probcal.starts import automatic_start
 from probcal.studies.fits import Fits, open_fits
 from probcal.studies.settings import check_setting
 from probcal.wings import check_method_installed

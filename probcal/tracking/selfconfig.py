@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from probcal.errors import FitError, InputError
+from probcal.gaussian.mode import Point
 from probcal.inference.run import Context, FitLabelled, Method
 from probcal.lazy import Later
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.smoothing.mode import Point
 from probcal.status import Status
 from probcal.tracking.configure import Configured, Rounds, configure
 from probcal.tracking.groups import belief_group, disagreeing, with_objects

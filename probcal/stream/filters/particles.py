@@ -17,7 +17,7 @@ from probcal import linalg
 from probcal.model import rows as waist
 from probcal.model.epochs import Epoch, State
 from probcal.model.model import Model
-from probcal.smoothing.resampling import chosen_at
+from probcal.resampling import chosen_at
 from probcal.stream.filters.belief import WhiteRow
 from probcal.stream.filters.filtering import FilterGiven
 from probcal.stream.filters.linearising import About, here, linearised

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from probcal import linalg
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
-from probcal.smoothing.grid import ROBUST
+from probcal.modes.grid import ROBUST
 from probcal.stream.filters.belief import Augmented
 from probcal.stream.filters.filtering import FilterGiven
 from probcal.stream.filters.linearising import About, limits, residuals_widened

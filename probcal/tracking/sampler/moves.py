@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import factors
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.mode import factors
 from probcal.tracking.sampler.sampled import Association, Fit, Recording, chances, fitted, log_clutter
 from probcal.tracking.scan import View, detected, present
 from probcal.tracking.update import TINY, Biases, rows_from, updated

@@ -14,12 +14,12 @@ import numpy as np
 from jax.scipy.special import gammaln
 
 from probcal import linalg
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.mode import Eliminated, Kept, Point, eliminate, factors, follow, log_density
+from probcal.gaussian.solves import Dense
 from probcal.model.epochs import Move
 from probcal.model.model import Model
 from probcal.priors import Precision
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Eliminated, Kept, Point, eliminate, factors, follow, log_density
-from probcal.smoothing.solves import Dense
 from probcal.tracking.scan import View, Watch, detected, present
 from probcal.tracking.update import TINY, Biases, births, rows_from
 

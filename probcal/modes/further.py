@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.mode import Point
+from probcal.modes.grid import grid_start, joint_cost
+from probcal.modes.swaps import TRIED
+from probcal.modes.swaps import swaps as all_swaps
 from probcal.priors import Precision
 from probcal.problem import Problem
-from probcal.smoothing.grid import grid_start, joint_cost
-from probcal.smoothing.mode import Point
-from probcal.starts.swaps import TRIED
-from probcal.starts.swaps import swaps as all_swaps
 
 DRAWN = 3  # draws of the biases that are tried for one further start
 SPARSE = 0.3  # share of the biases that a draw moves

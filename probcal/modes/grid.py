@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.mode import Point, apart, cost, factors, smooth_tracks
 from probcal.model import rows as waist
 from probcal.model import variants
 from probcal.model.model import At, Model, Recursion
 from probcal.model.rows import Linearised, Rows
 from probcal.problem import Problem
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import Point, apart, cost, factors, smooth_tracks
 
 WINDOWS = 60  # at most so many windows a target
 INNER = {2: 24, 3: 10}  # grid points an axis inside the network

@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian import cholesky
+from probcal.gaussian.cholesky import Entries, Factor, factorise, mirrored
+from probcal.gaussian.mode import factors
+from probcal.gaussian.products import Products
+from probcal.gaussian.room import ROOM, dense_numbers
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
-from probcal.smoothing import cholesky
-from probcal.smoothing.cholesky import Entries, Factor, factorise, mirrored
-from probcal.smoothing.mode import factors
-from probcal.smoothing.products import Products
-from probcal.smoothing.room import ROOM, dense_numbers
 
 MANY, THIN = 500, 0.25  # biases, and the share of them that an epoch sees, from which the sparse form is the faster
 

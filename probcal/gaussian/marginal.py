@@ -10,11 +10,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from probcal.model.model import At, Model
-from probcal.priors import Precision
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
-from probcal.smoothing.mode import (
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
+from probcal.gaussian.mode import (
     DAMPING,
     HALVINGS,
     ROUNDING,
@@ -28,7 +26,9 @@ from probcal.smoothing.mode import (
     follow,
     log_likelihood,
 )
-from probcal.smoothing.solves import Dense
+from probcal.gaussian.solves import Dense
+from probcal.model.model import At, Model
+from probcal.priors import Precision
 
 States = tuple[jax.Array, ...]  # (E, n) of each recursion
 ROUNDS, EXACT = 30, 1e-14  # of an adjoint solve at most, and the share of its first square that ends it

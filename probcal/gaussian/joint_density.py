@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian.cholesky import mirrored
+from probcal.gaussian.joint import JointPrecision
+from probcal.gaussian.linearised import linearise_rows
+from probcal.gaussian.mode import Point, factors, log_density
 from probcal.model.model import Model
-from probcal.smoothing.cholesky import mirrored
-from probcal.smoothing.joint import JointPrecision
-from probcal.smoothing.linearised import linearise_rows
-from probcal.smoothing.mode import Point, factors, log_density
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.draws import residuals
+from probcal.gaussian.linearised import linearise
+from probcal.gaussian.mode import Point, factors
 from probcal.misfit import Rejected
 from probcal.model.model import Data, Model
 from probcal.noise import HALF
 from probcal.problem import Problem
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.draws import residuals
-from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mode import Point, factors
 
 STEPS = 3  # of the parameters of noise families between two modes: more change less than the next mode does
 FARTHEST = 1.0  # of one step of a log level, as for noise levels: a guess may be a factor of several off

@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.room import check_room
+from probcal.gaussian.solves import Dense
 from probcal.model.model import Model, Recursion, Where
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.room import check_room
-from probcal.smoothing.solves import Dense
 
 CHORD = 0.1  # share of the last gain up to which what was eliminated serves on
 HALVINGS = 12  # step lengths tried before the damping grows

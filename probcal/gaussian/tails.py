@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.linearised import linearise
+from probcal.gaussian.mode import Point, smooth_tracks
 from probcal.model.model import Mixing, Model
 from probcal.problem import Problem
-from probcal.smoothing.linearised import linearise
-from probcal.smoothing.mode import Point, smooth_tracks
 
 ROUNDS, STILL = 50, 1e-3  # of precisions and trajectories in turn, and change of log precision at which they end
 

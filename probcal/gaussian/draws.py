@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian.linearised import Linearisation
+from probcal.gaussian.mode import Point
 from probcal.model.model import At, Data, Model
-from probcal.smoothing.linearised import Linearisation
-from probcal.smoothing.mode import Point
 
 PASS = 200  # draws that are made at once
 VALUES = 4_000_000  # of all states that are drawn at once, at most

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from probcal.gaussian.scans import filter_roots, in_parallel, inverse_root, recur, recur_squared
 from probcal.linalg import forward, multiply_rows, regress_rows, semi_cholesky
-from probcal.smoothing.scans import filter_roots, in_parallel, inverse_root, recur, recur_squared
 
 
 class Gains(NamedTuple):

@@ -14,15 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.cholesky import Factor
+from probcal.gaussian.joint import JointPrecision
+from probcal.gaussian.linearised import linearise_rows
+from probcal.gaussian.marginal import ENOUGH, HALVINGS, LEAST_CURVED, SETTLED, TRACK_STEPS, volume_slope
+from probcal.gaussian.mode import Eliminated, Point, cost, eliminate, eliminate_rows, factors, follow
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.cholesky import Factor
-from probcal.smoothing.joint import JointPrecision
-from probcal.smoothing.linearised import linearise_rows
-from probcal.smoothing.marginal import ENOUGH, HALVINGS, LEAST_CURVED, SETTLED, TRACK_STEPS, volume_slope
-from probcal.smoothing.mode import Eliminated, Point, cost, eliminate, eliminate_rows, factors, follow
 
 KEPT = 8  # secants
 COLUMNS = 256  # of a root of the covariance at once

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.information import rejected
+from probcal.gaussian.mode import Point
+from probcal.modes.grid import grid_start, joint_cost, track_mode
 from probcal.priors import Precision
 from probcal.problem import Problem
-from probcal.smoothing.grid import grid_start, joint_cost, track_mode
-from probcal.smoothing.information import rejected
-from probcal.smoothing.mode import Point
 
 GROSS = 3.0  # scales from its stated place at which a node makes exchanges worth trying
 TRIED = 60  # exchanges that are tried

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
+from probcal.gaussian.marginal import volume_slope
+from probcal.gaussian.mode import Point, factors
 from probcal.model.model import TILTED, At, Model, Tilt, at_rest
-from probcal.smoothing.linearised import compress_and_eliminate, linearise_rows
-from probcal.smoothing.marginal import volume_slope
-from probcal.smoothing.mode import Point, factors
 
 MOST = 3  # entries of a state that is integrated
 FEW = 2  # poses above the dimension up to which a place may be a ring or one of two

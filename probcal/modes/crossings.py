@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.mode import Point
 from probcal.model.model import At, Model
 from probcal.model.rows import Linearised
+from probcal.modes.reflections import FAR, SHIFTED, Plane, node_places, place_biases
 from probcal.problem import Problem
-from probcal.smoothing.mode import Point
-from probcal.smoothing.reflections import FAR, SHIFTED, Plane, node_places, place_biases
 
 FEW = 3  # rows without which a node hears no path
 STILL = 1e-3  # extent of a path, over how far off a node stands, below which it is none

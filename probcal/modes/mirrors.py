@@ -14,15 +14,15 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.information import at_levels
+from probcal.gaussian.linearised import laplace
+from probcal.gaussian.mode import Point, find_mode
 from probcal.labels import NODE, PIECE, SCENE
+from probcal.modes.crossings import node_sides
+from probcal.modes.grid import grid_start, profile, track_mode
+from probcal.modes.reflections import Gap, Plane, distance, movable, new, planes, reach, reflect, reflect_nodes
 from probcal.priors import Precision
 from probcal.problem import Problem
-from probcal.smoothing.crossings import node_sides
-from probcal.smoothing.grid import grid_start, profile, track_mode
-from probcal.smoothing.information import at_levels
-from probcal.smoothing.linearised import laplace
-from probcal.smoothing.mode import Point, find_mode
-from probcal.smoothing.reflections import Gap, Plane, distance, movable, new, planes, reach, reflect, reflect_nodes
 from probcal.types import float64
 
 WORSE = 0.4  # nats a datum by which a reflected place may fit worse and is still polished: 0 to 0.2 beside a mirror,

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.mode import Point, cost, find_mode
 from probcal.model.model import Model
+from probcal.modes.bearings import by_directions, turned
+from probcal.modes.grid import grid_start
+from probcal.modes.swaps import exchanged
 from probcal.priors import Precision
 from probcal.problem import Problem, check_linear
-from probcal.smoothing.grid import grid_start
-from probcal.smoothing.mode import Point, cost, find_mode
-from probcal.starts.bearings import by_directions, turned
-from probcal.starts.swaps import exchanged
 from probcal.types import float64
 
 FAMILIES: tuple[Callable[[Problem], Iterator[np.ndarray]], ...] = (by_directions,)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from probcal.errors import FitError
-from probcal.smoothing.cholesky import BLOCK, Factor, drawn_diagonal
+from probcal.gaussian.cholesky import BLOCK, Factor, drawn_diagonal
 
 TOLERANCE = 1e-9  # share of the first residual that ends a solve
 DRAWN = 1e-2  # share of a draw that its error may have: a bound, which errors stay far below

@@ -5,13 +5,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.mode import Point
 from probcal.geometry import attitude
 from probcal.labels import AXES
+from probcal.modes.array import Array, match
+from probcal.modes.modified import SensorTrack, straight_track
+from probcal.modes.recognise import Directions, kinds, members, seen_directions
 from probcal.problem import Problem
-from probcal.smoothing.mode import Point
-from probcal.starts.array import Array, match
-from probcal.starts.modified import SensorTrack, straight_track
-from probcal.starts.recognise import Directions, kinds, members, seen_directions
 
 WIDE = 0.3  # rad, spread of a heading from which the grid alone is not trusted
 LOOSE = 0.2  # spread of a place, in extents of the network, from which triangulation is not

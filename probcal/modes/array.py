@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.starts.modified import SensorTrack, step
-from probcal.starts.triangles import similarity, turn_of
+from probcal.modes.modified import SensorTrack, step
+from probcal.modes.triangles import similarity, turn_of
 
 POINTS = 20  # times at which two tracks are compared
 

@@ -17,12 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.linalg import inverse_cholesky, multiply
-from probcal.model.model import Model, Recursion, scaled
-from probcal.model.rows import Linearised
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.information import at_levels
-from probcal.smoothing.mode import (
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.information import at_levels
+from probcal.gaussian.mode import (
     Point,
     compress,
     eliminate_compressed,
@@ -33,6 +30,9 @@ from probcal.smoothing.mode import (
     smooth_tracks,
     widening,
 )
+from probcal.linalg import inverse_cholesky, multiply
+from probcal.model.model import Model, Recursion, scaled
+from probcal.model.rows import Linearised
 
 STEP = 0.05  # of a log level, for differences
 

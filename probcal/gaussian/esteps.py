@@ -12,11 +12,11 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from probcal.gaussian.information import state_covariances
+from probcal.gaussian.mode import Point, between, cost, eliminate_rows, find_mode, follow
 from probcal.model import sigma
 from probcal.model.model import Model
 from probcal.priors import Precision
-from probcal.smoothing.information import state_covariances
-from probcal.smoothing.mode import Point, between, cost, eliminate_rows, find_mode, follow
 
 HALVINGS = 8
 

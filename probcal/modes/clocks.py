@@ -6,13 +6,13 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.information import squares_of
+from probcal.gaussian.joint import too_large
+from probcal.gaussian.mode import Point, find_mode
+from probcal.modes.automatic import sparse_cost
+from probcal.modes.grid import follow_states, grid_start
 from probcal.priors import Precision
 from probcal.problem import Problem
-from probcal.smoothing.grid import follow_states, grid_start
-from probcal.smoothing.information import squares_of
-from probcal.smoothing.joint import too_large
-from probcal.smoothing.mode import Point, find_mode
-from probcal.starts.automatic import sparse_cost
 
 SPAN = 4.0  # scales to either side within which the offset of a clock is looked for
 MOST = 24  # lags to either side

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian.information import at_levels
+from probcal.gaussian.mode import Point
 from probcal.labels import AXES
+from probcal.modes.grid import follow_states, known_places
 from probcal.problem import Problem
-from probcal.smoothing.grid import follow_states, known_places
-from probcal.smoothing.information import at_levels
-from probcal.smoothing.mode import Point
 
 FAR = 6.0  # scales beyond which a node is not reflected
 FAINT = 0.03  # share of the extent of the tracks, of which a part (`new`) is no other place

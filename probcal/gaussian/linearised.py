@@ -11,11 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from probcal import linalg
-from probcal.model.model import Data, Model, Where
-from probcal.model.rows import Linearised
-from probcal.priors import Precision
-from probcal.smoothing import recursion as rec
-from probcal.smoothing.mode import (
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.mode import (
     Compressed,
     Eliminated,
     Point,
@@ -27,7 +24,10 @@ from probcal.smoothing.mode import (
     mixing_gain,
     tilted,
 )
-from probcal.smoothing.solves import Dense
+from probcal.gaussian.solves import Dense
+from probcal.model.model import Data, Model, Where
+from probcal.model.rows import Linearised
+from probcal.priors import Precision
 
 
 class LaplaceApproximation(NamedTuple):

@@ -1,1 +1,0 @@
-"""Smoothing: the epoch recursion, the damped joint mode, the automatic start and the information of the biases."""
