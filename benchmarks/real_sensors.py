@@ -123,7 +123,7 @@ def labelled(kind, noise, exchanged, seed, epochs=40):
     a, b = rng.uniform(0, 2 * np.pi, 2)
     path = np.stack([40 + 70 * np.sin(0.13 * t + a), 60 + 60 * np.sin(0.19 * t + b)], 1)
     biases = {f"n{k}.position_{x}": true[k, i] - surveyed[k, i] for k in range(len(PLACES)) for i, x in enumerate("xy")}
-    run = pc.simulate(network, motion, t, key=seed, biases=biases, tracks={"target": path}, missing=0.1)
+    run = pc.simulate(network, motion, t, key=seed, biases=biases, tracks={"target": path})
     return pc.Problem(network, motion, run.table), run.truth
 
 
@@ -216,7 +216,7 @@ def warehouse_of(seed, zeros, noise, rate=10.0):
     for k, own in enumerate(stated + shift):
         late = (rng.random(len(t)) < LATE) * (0.3 + rng.exponential(0.8, len(t)))
         measured = np.linalg.norm(place - own, axis=1) + delay[k] + rng.normal(0, 0.06, len(t)) + late
-        there = rng.random(len(t)) > 0.15
+        there = rng.permutation(len(t)) >= 0.15 * len(t)  # as many in all runs, so that they share their kernels
         rows.append(pd.DataFrame({"time": t, "sensor": f"A{k:02d}", "range": measured})[there])
     network = pc.Network([uwb.on(pc.Node(f"A{k:02d}", at, scale={"position": 0.5})) for k, at in enumerate(stated)])
     table = pd.concat(rows).sort_values(["time", "sensor"])
@@ -442,7 +442,7 @@ def ranges(seed, true, declared, dimension):
     middle = (5.0, 4.0, 1.0)[:dimension]
     motion = pc.Target(pc.ConstantVelocity(0.2), {"position": (middle, 2.0), "velocity": ((0.0,) * dimension, 0.5)})
     time = PACE * np.arange(WALK)
-    run = pc.simulate(beacons(TRUE_NOISE[true], dimension), motion, time, key=seed, share=1.0, missing=0.1)
+    run = pc.simulate(beacons(TRUE_NOISE[true], dimension), motion, time, key=seed, share=1.0)
     network = beacons(DECLARED_NOISE[true][declared], dimension)
     problem = pc.Problem(network, motion, run.table)
     tree = pc.assess(problem, pc.fit(problem, pc.MAP(), prior=pc.Gaussian()))
