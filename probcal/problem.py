@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -75,6 +75,11 @@ class Epochs:
     def position(self) -> tuple[int, int]:
         """First and last (excluded) state entry of the position."""
         return next((start, stop) for name, start, stop, _ in self.layout if name == "position")
+
+    @property
+    def members(self) -> dict[str, np.ndarray]:
+        """Mask (E,) of the epochs of each target."""
+        return {str(name): self.target == name for name in dict.fromkeys(self.target)}
 
 
 class _Chained(NamedTuple):
@@ -285,11 +290,24 @@ class Problem:
         number = {node.name: k + 1 for k, node in enumerate(self.network.nodes) if node.name in off}
         return np.array([number.get(s.nodes[0].name, 0) if s.type.clocked else 0 for s in self.network.sensors])
 
+    def positions(self, states: Iterable[Any]) -> tuple[np.ndarray, ...]:
+        """Positions (E, d) in states (E, n) of each state layout."""
+        return self.model.each(lambda _, own, x: np.asarray(x)[:, slice(*own.position)], self.epochs, states)
+
+    def tracks(self, *of_each: Iterable[Any]) -> Iterator[tuple[Any, ...]]:
+        """Name and times (K,) of each target, and its part of each sequence in `of_each`.
+
+        A sequence has one array (E, ...) per state layout, or one pytree of them.
+        """
+        for _, epochs, *own in self.model.each_layout(self.epochs, *of_each):
+            for name, mine in epochs.members.items():
+                yield name, epochs.time[mine], *jax.tree.map(lambda leaf, mine=mine: np.asarray(leaf)[mine], own)
+
     @property
     def by_clock(self) -> list[np.ndarray]:
         """Mask (E,) of the epochs of each recursion whose rows have a free clock."""
         found = [np.zeros(len(epochs.time), bool) for epochs in self.epochs]
-        for data, r, index in zip(self.model.rows, self.model.recursion, self.row_index, strict=True):
+        for _, data, r, index in self.model.each_block(self.row_index):
             found[r][np.asarray(data.epoch)[self.clocks[self.measurements.sensor[index]] > 0]] = True
         return found
 
@@ -324,7 +342,7 @@ class Problem:
     def lateness(self, z: Any) -> np.ndarray:
         """Seconds (N,) from where each row is taken to where its clock puts it at biases z (M,)."""
         late = np.zeros(len(self.moved))
-        for block, data, index in zip(self.model.blocks, self.model.rows, self.row_index, strict=True):
+        for block, data, _, index in self.model.each_block(self.row_index):
             if block.type.clocked:
                 late[index] = late_by(block, data, z)
         return late
@@ -339,8 +357,8 @@ class Problem:
 
     def reordered(self, other: Problem, states: Sequence[Any]) -> list[np.ndarray]:
         """States (E, n) of the epochs of this problem in the order that they have at the times of another."""
-        pairs = zip(self.epochs, other.epochs, states, strict=True)
-        return [np.asarray(x)[np.argsort(own.order)][new.order] for own, new, x in pairs]
+        layouts = self.model.each_layout(self.epochs, other.epochs, states)
+        return [np.asarray(x)[np.argsort(own.order)][new.order] for _, own, new, x in layouts]
 
     @property
     def scans(self) -> Scans | None:
@@ -452,7 +470,7 @@ class Problem:
         other.measurements = self._at_epochs(measure(read_table(data), self.network))
         other.moved = np.zeros(len(other.measurements.time))
         other.silent = _check_rows(other.measurements, self.network)
-        last = {str(name): float(e.time[e.target == name][-1]) for e in self.epochs for name in dict.fromkeys(e.target)}
+        last = {name: float(time[-1]) for name, time in self.tracks()}
         measured = other.measurements
         for name in measured.target_names:
             if name not in last:
@@ -468,7 +486,7 @@ class Problem:
                 f" {before[n]:g}"
             )
         other._compile(last, further=True)
-        slots = {n: k for e in self.epochs for k, n in enumerate(dict.fromkeys(e.target))}
+        slots = {n: k for e in self.epochs for k, n in enumerate(e.members)}
         sizes = self.model.sizes if sizes is None else sizes
         return jax.device_put(merged(self._aligned(other, slots)[0], self.model.rows, sizes))
 
@@ -485,22 +503,21 @@ class Problem:
         other.silent = ()
         other._compile(begun, further=True)
         model, pairs = self._aligned(other, slots)
-        own = zip(other.model.blocks, other.model.recursion, other.row_index, strict=True)
-        found = {(block, r): rows for block, r, rows in own}
+        found = {(block, r): rows for block, _, r, rows in other.model.each_block(other.row_index)}
         none = np.zeros(0, int)
-        rows = [found.get((block, pairs[r]), none) for block, r in zip(model.blocks, model.recursion, strict=True)]
+        rows = [found.get((block, pairs[r]), none) for block, _, r in model.each_block()]
         names = [np.zeros(0, str) if r is None else other.epochs[r].target for r in pairs]
         return Arrived(model, rows, names)
 
     def _aligned(self, other: Problem, slots: Mapping[str, int]) -> tuple[Model, list[int | None]]:
         """The model of rows that came later in the form of this one, and which recursion of it each here is."""
-        forms = [
-            [(e.layout, e.flow, sampled) for e, sampled in zip(p.epochs, p.model.sampled, strict=True)]
+        forms, others = (
+            p.model.each(lambda _, own, sampled: (own.layout, own.flow, sampled), p.epochs, p.model.sampled)
             for p in (self, other)
-        ]
-        own = {form: r for r, form in enumerate(forms[1])}
-        pairs = [own.get(form) for form in forms[0]]
-        targets = [[] if r is None else [slots[n] for n in dict.fromkeys(other.epochs[r].target)] for r in pairs]
+        )
+        own = {form: r for r, form in enumerate(others)}
+        pairs = [own.get(form) for form in forms]
+        targets = [[] if r is None else [slots[n] for n in other.epochs[r].members] for r in pairs]
         return aligned(self.model, other.model, pairs, targets), pairs
 
     def _compile(self, begun: Mapping[str, float] = MappingProxyType({}), *, further: bool = False) -> None:
@@ -522,7 +539,7 @@ class Problem:
             number >= 0 for sampled in sampled_of_each if sampled is not None for *_, number in sampled.levels
         )
         spread: Any = np.array([np.log(level.factor) for level in self.levels])
-        counts = tuple(len(dict.fromkeys(epochs.target)) for epochs in self.epochs)
+        counts = tuple(len(epochs.members) for epochs in self.epochs)
         rest = any(at_rest(part, T).any() for part, T in zip(recursions, counts, strict=True))
         model = Model(
             tuple(own.block for own in gathered),
@@ -799,7 +816,7 @@ def _stated_target(motion: Any, name: str, network: Network) -> Target:
 
 def check_linear(problem: Problem) -> None:
     """Raise `InputError` naming target and motion where one has no linear form, which Gaussian methods need."""
-    for epochs, sampled in zip(problem.epochs, problem.model.sampled, strict=True):
+    for _, epochs, sampled in problem.model.each_layout(problem.epochs, problem.model.sampled):
         if sampled is not None:
             raise InputError(
                 f'target "{epochs.target[0]}" moves by {type(sampled.others[0]).__name__}, which has no linear form, as'

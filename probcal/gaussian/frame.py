@@ -76,6 +76,10 @@ class Frame(NamedTuple):
         """Linear term of the marginal log-likelihood about zero, (Q,)."""
         return self.information @ self.theta + self.score
 
+    def normals(self, keys: Any) -> tuple[jax.Array, ...]:
+        """Unit normals eps (E, n) of each state layout, each drawn from its own key."""
+        return tuple(map(jax.random.normal, keys, [x.shape for x in self.point.states]))
+
     def log_likelihood(self, theta: jax.Array) -> jax.Array:
         """Gaussian marginal log-likelihood of theta (Q,)."""
         step = theta - self.theta
@@ -171,7 +175,7 @@ def _frame(model: Model, point: Point, lins: Sequence[Linearised]) -> Frame:
         information, score = _with_levels(information, score, values, slopes, H)
     by_level = [_share(model, point, lins, h) for h in range(H if model.driven else 0)]
     loops = []
-    for r, (part, kept) in enumerate(zip(model.recursions, solved.parts, strict=True)):
+    for r, (part, kept) in enumerate(model.each_layout(solved.parts)):
         L, J, pull = factors(part, point.levels), kept.J, kept.pull
         smooth = rec.smooth(part.F, kept.gain, kept.cross)
         closed = closed_loop(part, L, J, pull, point.noises[r])
@@ -226,9 +230,9 @@ def _closed(model: Model, frame: Frame, theta: jax.Array) -> list[Closed]:
     step = theta[frame.point.z.shape[0] :] - frame.point.levels
     if frame.loops[0].shares[0].shape[0] == 0:
         return [loop.closed for loop in frame.loops]
-    found = []
     change = jnp.concatenate([step, jnp.zeros(1)])
-    for part, loop, u in zip(model.recursions, frame.loops, frame.point.noises, strict=True):
+
+    def closed(part: Recursion, loop: Loop, u: jax.Array) -> Closed:
         J, pull = (
             whole + jnp.tensordot(jnp.expm1(-2 * step), own, 1)
             for whole, own in zip(loop.data, loop.shares, strict=True)
@@ -237,8 +241,9 @@ def _closed(model: Model, frame: Frame, theta: jax.Array) -> list[Closed]:
         ratio = jnp.exp(wider)
         at = closed_loop(part, factors(part, frame.point.levels + step), J, pull, u / ratio)
         column = ratio[:, :, None]
-        found.append(Closed(column * at.feedback, at.factor * column / column.mT, at.size + wider, ratio * at.shift))
-    return found
+        return Closed(column * at.feedback, at.factor * column / column.mT, at.size + wider, ratio * at.shift)
+
+    return list(model.each(closed, frame.loops, frame.point.noises))
 
 
 def place(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> Point:
@@ -249,9 +254,10 @@ def place(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ..
 def _placed(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...], loops: list[Closed]) -> Point:
     M = frame.point.z.shape[0]
     step = theta[:M] - frame.point.z
-    states, noises = [], []
-    parts = zip(model.recursions, frame.loops, loops, frame.point.states, frame.point.noises, eps, strict=True)
-    for part, loop, at, x, u, e in parts:
+
+    def placed(
+        x: jax.Array, u: jax.Array, part: Recursion, loop: Loop, at: Closed, e: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         L = factors(part, frame.point.levels)
         own = at.shift + jnp.einsum("eij,ej->ei", at.factor, jnp.exp(at.size) * e)
         closed, driven = part.F - L @ at.feedback, jnp.einsum("eij,ej->ei", L, own)
@@ -263,26 +269,29 @@ def _placed(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, 
 
         last, before = jax.lax.scan(forward, jnp.zeros_like(x[0]), (closed, driven))
         deviations = jnp.concatenate([before[1:], last[None]])
-        states.append(x + loop.states @ step + deviations)
-        noises.append(u + loop.noises @ step + own - jnp.einsum("eij,ej->ei", at.feedback, before))
-    point = Point(tuple(states), tuple(noises), theta[:M], frame.point.levels)
+        noises = u + loop.noises @ step + own - jnp.einsum("eij,ej->ei", at.feedback, before)
+        return x + loop.states @ step + deviations, noises
+
+    tracks = frame.point.trajectories.map(placed, model.recursions, frame.loops, loops, eps)
+    point = Point(tracks, theta[:M], frame.point.levels)
     return at_levels(model, point, theta[M:]) if theta.shape[0] > M else point
 
 
 def unit_normals(model: Model, frame: Frame, point: Point) -> tuple[jax.Array, ...]:
     """The unit normals eps (E, n) of each recursion that `place` makes a consistent point of."""
     step = point.z - frame.point.z
-    noises = at_levels(model, point, frame.point.levels).noises
-    found = []
-    loops = _closed(model, frame, jnp.concatenate([point.z, point.levels]))
-    parts = zip(frame.loops, loops, frame.point.states, frame.point.noises, point.states, noises, strict=True)
-    for loop, at, x0, u0, x, u in parts:
-        deviations = x - x0 - loop.states @ step
-        before = jnp.concatenate([jnp.zeros_like(x[:1]), deviations[:-1]])
-        own = u - u0 - loop.noises @ step - at.shift + jnp.einsum("eij,ej->ei", at.feedback, before)
+    away = jax.tree.map(
+        jnp.subtract, at_levels(model, point, frame.point.levels).trajectories, frame.point.trajectories
+    )
+
+    def normals(_: Recursion, loop: Loop, at: Closed, dx: jax.Array, du: jax.Array) -> jax.Array:
+        deviations = dx - loop.states @ step
+        before = jnp.concatenate([jnp.zeros_like(dx[:1]), deviations[:-1]])
+        own = du - loop.noises @ step - at.shift + jnp.einsum("eij,ej->ei", at.feedback, before)
         solved = linalg.solve_batched(at.factor @ at.factor.mT, own)
-        found.append(jnp.exp(-at.size) * jnp.einsum("eji,ej->ei", at.factor, solved))
-    return tuple(found)
+        return jnp.exp(-at.size) * jnp.einsum("eji,ej->ei", at.factor, solved)
+
+    return model.each(normals, frame.loops, _closed(model, frame, jnp.concatenate([point.z, point.levels])), *away)
 
 
 def volume(model: Model, frame: Frame, theta: jax.Array) -> jax.Array:

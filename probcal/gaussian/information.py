@@ -10,7 +10,7 @@ from probcal.gaussian.draws import residuals
 from probcal.gaussian.linearised import linearise
 from probcal.gaussian.mode import Point, factors
 from probcal.misfit import Rejected
-from probcal.model.model import Data, Model
+from probcal.model.model import Data, Model, Recursion
 from probcal.noise import HALF
 from probcal.problem import Problem
 
@@ -72,17 +72,18 @@ def mean_square(model: Model, point: Point) -> jax.Array:
     """Squares of all data and whitened noises a datum: about 1 at most where the model is right."""
     count = sum(jnp.sum(there) for there in model.measured)
     squares = sum(jnp.sum(part) for part in squares_of(model, point))
-    return (squares + sum(jnp.sum(u**2) for u in point.noises)) / jnp.maximum(count, 1)
+    return (squares + point.trajectories.square) / jnp.maximum(count, 1)
 
 
-def state_covariances(model: Model, point: Point) -> list[jax.Array]:
+def state_covariances(model: Model, point: Point) -> tuple[jax.Array, ...]:
     """Covariances (E, n, n) of every smoothed state at held biases, linearised at a point."""
     compressed = model.of_states(model.linearise(point, expected=True))
-    found = []
-    for r, (part, (J, _)) in enumerate(zip(model.recursions, compressed, strict=True)):
+
+    def of(part: Recursion, own: tuple[jax.Array, jax.Array], used: tuple[int, ...]) -> jax.Array:
         L = factors(part, point.levels)
-        found.append(rec.covariances(part.F, L, rec.gains(part.F, L, J, model.entries(r)))[0])
-    return found
+        return rec.covariances(part.F, L, rec.gains(part.F, L, own[0], used))[0]
+
+    return model.each(of, compressed, map(model.entries, range(len(compressed))))
 
 
 def update_levels(model: Model, point: Point, covariance: jax.Array) -> Point:
@@ -96,7 +97,7 @@ def update_levels(model: Model, point: Point, covariance: jax.Array) -> Point:
     spread = at.predicted_variances(covariance)
     count, square = model.by_level(model.measured), model.by_level(model.level_score(point))
     variance = model.by_level(jax.tree.map(jnp.multiply, model.information(point), spread))
-    for part, u, own in zip(model.recursions, point.noises, at.noise_variances(covariance), strict=True):
+    for part, u, own in model.each_layout(point.noises, at.noise_variances(covariance)):
         active = jnp.any(part.L != 0, 1)
         count = count.at[part.level].add(active)
         square = square.at[part.level].add(active * u**2)
@@ -135,5 +136,5 @@ def _parameters(model: Model, point: Point, spread: Data, before: jax.Array) -> 
 def at_levels(model: Model, point: Point, levels: jax.Array) -> Point:
     """The same trajectories and biases at other noise levels: the whitened noises are rescaled."""
     ratio = jnp.concatenate([jnp.exp(point.levels - levels), jnp.ones(1)])
-    noises = tuple(u * ratio[part.level] for part, u in zip(model.recursions, point.noises, strict=True))
+    noises = model.each(lambda part, u: u * ratio[part.level], point.noises)
     return point._replace(levels=levels, noises=noises)

@@ -6,7 +6,7 @@ trajectories: Paper B (17) with the covariance of whole trajectories in the plac
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,9 @@ from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.room import check_room
 from probcal.gaussian.solves import Dense
-from probcal.model.model import Model, Recursion, Where
+from probcal.model.model import At, Model, Recursion, Where
 from probcal.model.rows import Linearised
+from probcal.model.trajectories import Trajectories
 from probcal.priors import Precision
 
 CHORD = 0.1  # share of the last gain up to which what was eliminated serves on
@@ -26,13 +27,37 @@ ROUNDING = 1e-12  # of the cost: what a step that promises less cannot show
 apart = jax.lax.optimization_barrier  # keeps XLA from weaving two computations together, or doing one of them twice
 
 
-class Point(NamedTuple):
-    """Where the joint density is evaluated: states and whitened noises of each recursion, biases, log levels."""
+class _Point(NamedTuple):
+    trajectories: Trajectories
+    z: jax.Array  # (M,) biases in units of their scales
+    levels: jax.Array  # (H,) log factors of the unknown noise levels
 
-    states: tuple[jax.Array, ...]  # (E, n) each
-    noises: tuple[jax.Array, ...]  # (E, n) each
-    z: jax.Array  # (M,)
-    levels: jax.Array  # (H,)
+
+class Point(_Point):
+    """The trajectories, biases and log levels where the joint density is evaluated; a pytree.
+
+    It is also made of states, noises, biases and levels.
+    """
+
+    def __new__(cls, *fields: Any) -> "Point":
+        """The point of three fields, or of four: states and noises apart."""
+        return super().__new__(cls, *(fields if len(fields) == 3 else (Trajectories(*fields[:2]), *fields[2:])))
+
+    @property
+    def states(self) -> tuple[Any, ...]:
+        """States (E, n) of each state layout."""
+        return self.trajectories.states
+
+    @property
+    def noises(self) -> tuple[Any, ...]:
+        """Whitened noises (E, n) of each state layout."""
+        return self.trajectories.noises
+
+    def _replace(self, **fields: Any) -> "Point":
+        """The point with other fields; states and noises may be named too."""
+        own = {name: fields.pop(name) for name in Trajectories._fields if name in fields}
+        whole = {"trajectories": self.trajectories._replace(**own), "z": self.z, "levels": self.levels}
+        return Point(*(whole | fields).values())
 
 
 class Compressed(NamedTuple):
@@ -81,13 +106,13 @@ def log_density(model: Model, point: Point) -> jax.Array:
 
     Noise that is not Gaussian has the precisions of the model here; `mixed_density` integrates them.
     """
-    return log_likelihood(model, point) - 0.5 * sum(jnp.sum(u**2) for u in point.noises)
+    return log_likelihood(model, point) - 0.5 * point.trajectories.square
 
 
 def mixed_density(model: Model, point: Point) -> jax.Array:
     """`log_density` with the precisions of noise that is not Gaussian integrated, of noises whitened by those."""
     value = log_density(model, point)
-    for part, u in zip(model.recursions, point.noises, strict=True):
+    for part, u in model.each_layout(point.noises):
         for tail in part.tails:
             square = tail.squares(u)
             own = tail.family.mixing_density(square, tail.size) - 0.5 * square - 0.5 * tail.size * jnp.log(tail.weight)
@@ -170,7 +195,7 @@ def eliminate_compressed(
     """
     information, score = compressed.information, compressed.score
     kept, logdet = [], jnp.zeros(())
-    parts = zip(model.recursions, compressed.states, compressed.crosses, noises, strict=True)
+    parts = model.each_layout(compressed.states, compressed.crosses, noises)
     for r, (part, (J, pull), cross, u) in enumerate(parts):
         L = factors(part, levels)
         used = model.entries(r)
@@ -202,10 +227,9 @@ def _proposal(
     proposal = follow(model, point, solved, dz)
     slope = -prior.pull(point.z) @ dz
     slope = slope + (solved.pull @ dz if joint and model.biases else 0.0)
-    for kept, x, new, u, moved in zip(
-        solved.parts, point.states, proposal.states, point.noises, proposal.noises, strict=True
-    ):
-        slope = slope + jnp.sum(kept.pull * (new - x)) - jnp.sum(u * (moved - u))
+    steps = jax.tree.map(jnp.subtract, proposal.trajectories, point.trajectories)
+    for _, kept, dx, u, du in model.each_layout(solved.parts, steps.states, point.noises, steps.noises):
+        slope = slope + jnp.sum(kept.pull * dx) - jnp.sum(u * du)
     return proposal, 0.5 * slope
 
 
@@ -214,14 +238,15 @@ def follow(model: Model, point: Point, solved: Eliminated, dz: jax.Array, *, fre
 
     Where scores are `free`, some data may have one without an information.
     """
-    states, noises = [], []
-    for part, kept, x, u in zip(model.recursions, solved.parts, point.states, point.noises, strict=True):
-        L = factors(part, point.levels)
+
+    def smoothed(x: jax.Array, u: jax.Array, part: Recursion, kept: Kept) -> tuple[jax.Array, jax.Array]:
         column = kept.pull - kept.cross @ dz[: kept.cross.shape[2]]
-        smooth = rec.smooth(part.F, kept.gain, column[:, :, None], -(L @ u[:, :, None]), free=free)
-        states.append(x + smooth.states[:, :, 0])
-        noises.append(smooth.noises[:, :, 0])
-    return point._replace(states=tuple(states), noises=tuple(noises), z=point.z + dz)
+        drift = -(factors(part, point.levels) @ u[:, :, None])
+        smooth = rec.smooth(part.F, kept.gain, column[:, :, None], drift, free=free)
+        return x + smooth.states[:, :, 0], smooth.noises[:, :, 0]
+
+    tracks = point.trajectories.map(smoothed, model.recursions, solved.parts)
+    return Point(tracks, point.z + dz, point.levels)
 
 
 def between(a: Point, b: Point, t: jax.Array) -> Point:
@@ -337,7 +362,7 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
     """
     flat = Precision.single(jnp.zeros_like(start.z))
     still = jnp.zeros_like(start.z)
-    score = jax.grad(lambda states, at: log_likelihood(model, at._replace(states=states)))
+    score = jax.grad(lambda states, at: log_likelihood(model, At(states, at.z, at.levels)))
 
     def at(point: Point) -> Eliminated:
         return eliminate(model, point, expected=False, joint=False)
@@ -345,8 +370,8 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
     def body(s: _Tracking) -> _Tracking:
         solved = jax.lax.cond(s.renew, at, lambda _: s.solved, s.point)
         pulls = score(s.point.states, s.point)
-        here = solved._replace(parts=tuple(k._replace(pull=p) for k, p in zip(solved.parts, pulls, strict=True)))
-        proposal = follow(model, s.point, here, still, free=True)
+        parts = model.each(lambda _, kept, pull: kept._replace(pull=pull), solved.parts, pulls)
+        proposal = follow(model, s.point, solved._replace(parts=parts), still, free=True)
         t, value, _ = _shortened(model, s.point, proposal, flat, s.cost)
         better = value <= s.cost
         point = jax.tree.map(lambda new, old: jnp.where(better, new, old), between(s.point, proposal, t), s.point)

@@ -17,7 +17,7 @@ from probcal import linalg
 from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
 from probcal.gaussian.marginal import volume_slope
 from probcal.gaussian.mode import Point, factors
-from probcal.model.model import TILTED, At, Model, Tilt, at_rest
+from probcal.model.model import TILTED, At, Model, Recursion, Tilt
 
 MOST = 3  # entries of a state that is integrated
 FEW = 2  # poses above the dimension up to which a place may be a ring or one of two
@@ -59,7 +59,7 @@ def tilt_of(model: Model, point: Point, still: tuple[Still, ...]) -> Tilt | None
         return Tilt.none(M)
     height, slope, information = _gain(model, point, still, *_cells(model, point, still))
     _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
-    epochs = tuple(s.on[part.target] for s, part in zip(still, model.recursions, strict=True))
+    epochs = model.each(lambda part, s: s.on[part.target], still)
     volume, sound = volume_slope(model, point, solved, epochs)
     slope = slope + 0.5 * np.asarray(volume)
     curvature = np.zeros((M, M))
@@ -93,40 +93,36 @@ def _bounded(information: np.ndarray, curvature: np.ndarray) -> np.ndarray:
 
 def _still(model: Model, point: Point) -> tuple[Still, ...] | None:
     """The targets that stand still at a place that is not known; None without any."""
-    resting = [at_rest(part, T) for part, T in zip(model.recursions, model.targets, strict=True)]
+    resting = model.resting
     if not any(on.any() for on in resting):
         return None
-    found = []
-    for part, T, on in zip(model.recursions, model.targets, resting, strict=True):
+
+    def of(part: Recursion, T: int, on: np.ndarray) -> Still:
         n = part.drift.shape[1]
         first, target, L = np.asarray(part.first), np.asarray(part.target), np.asarray(factors(part, point.levels))
         mean, root = np.zeros((T, n)), np.zeros((T, n, n))
         mean[target[first]], root[target[first]] = np.asarray(part.drift)[first], L[first]
-        found.append(Still(*jax.device_put((on & (n <= MOST), mean, root))))
-    return tuple(found)
+        return Still(*jax.device_put((on & (n <= MOST), mean, root)))
 
-
-def _by_target(model: Model, values: list[jax.Array]) -> list[jax.Array]:
-    """Sums over the epochs of each target."""
-    parts = zip(model.recursions, model.targets, values, strict=True)
-    return [jax.ops.segment_sum(v, part.target, T) for part, T, v in parts]
+    return model.each(of, model.targets, resting)
 
 
 def _placed(model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
     """States with the chosen targets at whitened places (T, n) of each recursion."""
-    states = []
-    for part, s, own, x in zip(model.recursions, still, u, point.states, strict=True):
+
+    def placed(part: Recursion, s: Still, own: jax.Array, x: jax.Array) -> jax.Array:
         place = s.mean + jnp.einsum("tij,tj->ti", s.root, own)
-        states.append(jnp.where(s.on[part.target][:, None], place[part.target], x))
-    return tuple(states)
+        return jnp.where(s.on[part.target][:, None], place[part.target], x)
+
+    return model.each(placed, still, u, point.states)
 
 
 def _densities(
     model: Model, point: Point, still: tuple[Still, ...], z: jax.Array, u: tuple[jax.Array, ...]
-) -> list[jax.Array]:
+) -> tuple[jax.Array, ...]:
     """Log-likelihood (T,) of the rows of each target with the chosen ones at whitened places."""
     at = At(_placed(model, point, still, u), z, point.levels)
-    return _by_target(model, model.by_epoch(model.log_likelihood(at)))
+    return model.by_target(model.by_epoch(model.log_likelihood(at)))
 
 
 States = tuple[jax.Array, ...]
@@ -147,7 +143,7 @@ def _look(model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.Arr
         told = _densities(model, point, still, point.z, u)
         at = At(_placed(model, point, still, u), point.z, point.levels)
         own = model.of_states(model.linearise(at, expected=True))
-        J, score = (_by_target(model, [pair[k] for pair in own]) for k in (0, 1))
+        J, score = (model.by_target([pair[k] for pair in own]) for k in (0, 1))
         found = []
         for s, f, j, g, v in zip(still, told, J, score, u, strict=True):
             W = jnp.eye(v.shape[1])[None] + jnp.einsum("tji,tjk,tkl->til", s.root, j, s.root)
@@ -176,7 +172,7 @@ def _moments(
         lins = model.linearise(At(_placed(model, point, still, u), point.z, point.levels), expected=True)
         first = [jnp.zeros((T, M + 1)) for T in model.targets]
         weighed, second, information = [], jnp.zeros((M, M)), jnp.zeros((M, M))
-        for data, r, lin in zip(model.rows, model.recursion, lins, strict=True):
+        for _, data, r, lin in model.each_block(lins):
             target = model.recursions[r].target[data.epoch]
             w = p[r][target][:, None]
             bias, score = jnp.where((w > 0)[:, :, None], lin.bias, 0.0), jnp.where(w > 0, lin.score, 0.0)
@@ -202,8 +198,8 @@ def _moments(
 def _schur(model: Model, point: Point, still: tuple[Still, ...]) -> jax.Array:
     """What Laplace's formula takes the chosen places to leave unknown: J_zx W^-1 J_xz (M, M) summed over targets."""
     lins = model.linearise(point, expected=True)
-    J = _by_target(model, [own for own, _ in model.of_states(lins)])
-    cross = _by_target(model, model.of_both(lins))
+    J = model.by_target([own for own, _ in model.of_states(lins)])
+    cross = model.by_target(model.of_both(lins))
     lost = jnp.zeros((model.biases, model.biases))
     for s, j, c in zip(still, J, cross, strict=True):
         W = jnp.eye(j.shape[1])[None] + jnp.einsum("tji,tjk,tkl->til", s.root, j, s.root)
@@ -231,21 +227,22 @@ def _batches(arrays: list[np.ndarray]) -> Iterator[tuple[jax.Array, ...]]:
         yield tuple(jnp.asarray(np.concatenate([a, np.zeros((BATCH - len(a), *a.shape[1:]))])) for a in own)
 
 
-def _first(model: Model, point: Point) -> list[np.ndarray]:
+def _first(model: Model, point: Point) -> tuple[np.ndarray, ...]:
     """Whitened places (T, n) at a point: the noises of first epochs."""
-    found = []
-    for part, T, u in zip(model.recursions, model.targets, point.noises, strict=True):
+
+    def of(part: Recursion, T: int, u: jax.Array) -> np.ndarray:
         own = np.zeros((T, u.shape[1]))
         first = np.asarray(part.first)
         own[np.asarray(part.target)[first]] = np.asarray(u)[first]
-        found.append(own)
-    return found
+        return own
+
+    return model.each(of, model.targets, point.noises)
 
 
 def _poses(model: Model) -> list[np.ndarray]:
     """Number (T,) of different stated poses from which each target is seen."""
     seen: list[list[set[bytes]]] = [[set() for _ in range(T)] for T in model.targets]
-    for b, (data, r) in enumerate(zip(model.rows, model.recursion, strict=True)):
+    for b, (_, data, r) in enumerate(model.each_block()):
         target = np.asarray(model.recursions[r].target)[np.asarray(data.epoch)]
         pose, there = np.asarray(data.pose), np.asarray(data.mask).any(1)
         for t, own in zip(target[there], pose[there], strict=True):
@@ -356,7 +353,7 @@ def _cells(model: Model, point: Point, still: tuple[Still, ...]) -> tuple[list[n
 def _padded(model: Model, cells: dict[tuple[int, int], np.ndarray]) -> list[np.ndarray]:
     """Cells of all targets as arrays (K, T, n) of each recursion, zeros where a target has fewer."""
     most = max(len(own) for own in cells.values())
-    u = [np.zeros((most, T, part.drift.shape[1])) for part, T in zip(model.recursions, model.targets, strict=True)]
+    u = list(model.each(lambda part, T: np.zeros((most, T, part.drift.shape[1])), model.targets))
     for (r, t), own in cells.items():
         u[r][: len(own), t] = own
     return u

@@ -12,7 +12,7 @@ import numpy as np
 
 from probcal.gaussian.linearised import linearise
 from probcal.gaussian.mode import Point, smooth_tracks
-from probcal.model.model import Mixing, Model
+from probcal.model.model import Mixing, Model, Recursion
 from probcal.problem import Problem
 
 ROUNDS, STILL = 50, 1e-3  # of precisions and trajectories in turn, and change of log precision at which they end
@@ -20,23 +20,22 @@ ROUNDS, STILL = 50, 1e-3  # of precisions and trajectories in turn, and change o
 
 def expected_mixing(model: Model, point: Point, covariance: jax.Array) -> Mixing:
     """Mean precisions (E,) of every tail at a point, for a covariance (M, M) of z."""
-    at = linearise(model, point)
-    found = []
-    pairs = zip(model.recursions, point.noises, at.noise_variances(covariance), strict=True)
-    for part, u, variance in pairs:
+
+    def means(part: Recursion, u: jax.Array, variance: jax.Array) -> tuple[jax.Array, ...]:
         squares = [jnp.sum((u**2 + variance)[:, slice(*tail.columns)], 1) / tail.weight for tail in part.tails]
         means = [tail.family.mixing_mean(s, tail.size) for tail, s in zip(part.tails, squares, strict=True)]
-        found.append(tuple(jnp.where(tail.on, w, 1.0) for tail, w in zip(part.tails, means, strict=True)))
-    return tuple(found)
+        return tuple(jnp.where(tail.on, w, 1.0) for tail, w in zip(part.tails, means, strict=True))
+
+    return model.each(means, point.noises, linearise(model, point).noise_variances(covariance))
 
 
 def rewhitened(model: Model, point: Point, weights: Mixing) -> Point:
     """The same states at other precisions of the process noise than those of the model: its noises are rescaled."""
     if not model.tailed:
         return point
-    after = model.with_mixing(weights)
-    pairs = zip(point.noises, model.recursions, after.recursions, strict=True)
-    return point._replace(noises=tuple(u * jnp.sqrt(new.weight / old.weight) for u, old, new in pairs))
+    after = model.with_mixing(weights).recursions
+    noises = model.each(lambda old, new, u: u * jnp.sqrt(new.weight / old.weight), after, point.noises)
+    return point._replace(noises=noises)
 
 
 def settle(problem: Problem, point: Point, covariance: jax.Array) -> tuple[Problem, Point]:

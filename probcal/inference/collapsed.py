@@ -127,8 +127,7 @@ class Collapsed(Sampler):
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> CollapsedState:
         """A chain at a draw of the frame's posterior."""
         keys = jax.random.split(key, len(posed.frame.loops) + 1)
-        pairs = zip(keys, posed.frame.point.states, strict=False)
-        eps = tuple(jax.random.normal(k, x.shape) for k, x in pairs)
+        eps = posed.frame.normals(keys)
         weight = log_weight(posed.model, posed.frame, theta, eps)
         return CollapsedState(theta, eps, phi, weight, keys[-1])
 

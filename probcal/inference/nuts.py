@@ -69,8 +69,7 @@ class NUTS(Sampler):
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
         """A chain at theta and phi, its trajectories drawn from the frame."""
         keys = jax.random.split(key, len(posed.frame.loops) + 1)
-        pairs = zip(keys, posed.frame.point.states, strict=False)
-        eps = tuple(jax.random.normal(k, x.shape) for k, x in pairs)
+        eps = posed.frame.normals(keys)
         given = conditional(form, posed, phi)
         eta = given.factor.T @ (theta - given.mean)
         return self._started(self._kernels(form, posed), Free(form.hierarchy.relax(phi), eta, eps), keys[-1])

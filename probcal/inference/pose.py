@@ -86,9 +86,7 @@ def weights(form: Form, posed: Posed, theta: jax.Array, key: jax.Array) -> jax.A
     """Log weights (D,) of draws theta (D, Q) with trajectories drawn from the frame."""
 
     def one(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
-        keys = jax.random.split(pair[1], len(posed.frame.loops))
-        pairs = zip(keys, posed.frame.point.states, strict=True)
-        eps = tuple(jax.random.normal(k, x.shape) for k, x in pairs)
+        eps = posed.frame.normals(jax.random.split(pair[1], len(posed.frame.loops)))
         return log_weight(posed.model, posed.frame, pair[0], eps)
 
     return jax.lax.map(one, (theta, jax.random.split(key, theta.shape[0])))
@@ -99,8 +97,7 @@ def weights_along(posed: Posed, theta: jax.Array, key: jax.Array) -> jax.Array:
     """Log weights (ROUNDS, D) of draws theta (D, Q), all of a round with the same trajectories from the frame."""
 
     def one(key: jax.Array) -> jax.Array:
-        keys = jax.random.split(key, len(posed.frame.loops))
-        eps = tuple(jax.random.normal(k, x.shape) for k, x in zip(keys, posed.frame.point.states, strict=True))
+        eps = posed.frame.normals(jax.random.split(key, len(posed.frame.loops)))
         return jax.lax.map(lambda own: log_weight(posed.model, posed.frame, own, eps), theta)
 
     return jax.lax.map(one, jax.random.split(key, ROUNDS))

@@ -18,6 +18,7 @@ from probcal.errors import InputError
 from probcal.model import rows as waist
 from probcal.model.rows import Block, Linearised, Rows
 from probcal.model.sampled import SampledMotion, check_densities
+from probcal.model.trajectories import Loops
 
 State = tuple[Any, ...]  # (T, n) of each recursion, or a pytree with T leading
 
@@ -55,7 +56,7 @@ class Epoch(NamedTuple):
     rows: tuple[Seen, ...]  # of each block
 
 
-class Stepwise:
+class Stepwise(Loops):
     """What a `Model` computes at one epoch."""
 
     blocks: tuple[Block, ...]
@@ -70,7 +71,7 @@ class Stepwise:
     def initial(self) -> State:
         """State before any epoch, all 0: each target is drawn at its first epoch, where `step` ignores what was."""
         found: list[Any] = []
-        for part, count, form in zip(self.recursions, self.targets, self.sampled, strict=True):
+        for part, count, form in self.each_layout(self.targets, self.sampled):
             vector = jnp.zeros((count, part.drift.shape[1]))
             found.append(vector if form is None else form.whole(vector, form.resting(count)))
         return tuple(found)
@@ -200,8 +201,8 @@ class Stepwise:
         That is the expected information of a datum about its predicted value, 0 where nothing was measured.
         """
         found = []
-        for block, data, seen, value in zip(self.blocks, self.rows, epoch.rows, predicted, strict=True):
-            here = data._replace(epoch=jnp.zeros_like(seen.sensor), **seen._asdict())
+        for block, data, _, seen, value in self.each_block(epoch.rows, predicted):
+            here = _rows_at(data, seen)
             whole = jnp.broadcast_to(value, here.y.shape)
             there = here.mask > 0
             off = jnp.where(there, waist.difference(block, here.y, whole), 0.0)
@@ -215,8 +216,8 @@ class Stepwise:
     def _seen(self, epoch: Epoch, x: State) -> list[tuple[Block, Rows, jax.Array]]:
         """Blocks, their rows at an epoch, and the state (1, n) of the target that they see."""
         found = []
-        for block, data, r, seen in zip(self.blocks, self.rows, self.recursion, epoch.rows, strict=True):
-            here = data._replace(epoch=jnp.zeros_like(seen.sensor), **seen._asdict())
+        for block, data, r, seen in self.each_block(epoch.rows):
+            here = _rows_at(data, seen)
             mine = jax.tree.map(lambda leaf, k=epoch.target[r]: leaf[k][None], x[r])
             found.append((block, here, self.vectors(r, mine)))
         return found
@@ -234,6 +235,11 @@ class Stepwise:
                     f"{type(form.others[0]).__name__} has no linear form, so that nothing is linearised by its state;"
                     " use predict and log_likelihood, which jax differentiates by biases and levels"
                 )
+
+
+def _rows_at(data: Rows, seen: Seen) -> Rows:
+    """The rows of a block at one epoch, of which there is only this one."""
+    return data._replace(epoch=jnp.zeros_like(seen.sensor), **seen._asdict())
 
 
 def _mean(states: jax.Array, move: Move, target: jax.Array) -> jax.Array:
@@ -266,7 +272,7 @@ def merged(model: Any, fill: tuple[Rows, ...], sizes: tuple[int, ...]) -> Epoch:
     }  # fmt: skip
     targets: list[Any] = []
     moves, rows = [], []
-    for r, (part, mine) in enumerate(zip(model.recursions, of, strict=True)):
+    for r, (part, mine) in enumerate(model.each_layout(of)):
         n = part.drift.shape[1]
         for name, value in (("time", part.time), ("dt", part.dt), ("first", part.first), ("recursion", r)):
             shared[name][mine] = np.asarray(value)
@@ -281,8 +287,8 @@ def merged(model: Any, fill: tuple[Rows, ...], sizes: tuple[int, ...]) -> Epoch:
             whole[mine] = np.asarray(tail.on)
         driving: Any = tuple(mixed)
         moves.append(Move(*nothing)._replace(mixed=driving))
-    for b, (data, r) in enumerate(zip(model.rows, model.recursion, strict=True)):
-        rows.append(padded_rows(data, of[r][np.asarray(data.epoch)], K, sizes[b], fill[b], model.blocks[b]))
+    for block, data, r, size, own in model.each_block(sizes, fill):
+        rows.append(padded_rows(data, of[r][np.asarray(data.epoch)], K, size, own, block))
     return Epoch(**shared, target=tuple(targets), move=tuple(moves), rows=tuple(rows))
 
 

@@ -1,10 +1,11 @@
 """The waist: a problem as one pytree of arrays, with its static form inside, equal by content.
 
 What belongs to every datum is a tuple of arrays, (N, C) of N rows by C channels for each block (rows of one sensor
-type that see targets of one state layout). Loops over blocks stand here and nowhere above.
+type that see targets of one state layout). Loops over blocks and state layouts are those of
+`trajectories.Loops`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -163,7 +164,7 @@ class Model(Stepwise):
     def predict(self, at: Where) -> Data:
         """Predicted value of every datum."""
         return tuple(
-            waist.predict(block, data, self.vectors(r, at.states[r]), at.z) for block, data, r in self._blocks()
+            waist.predict(block, data, self.vectors(r, at.states[r]), at.z) for block, data, r in self.each_block()
         )
 
     def innovation(self, at: Where) -> Data:
@@ -194,8 +195,11 @@ class Model(Stepwise):
         self, predicted: Data, levels: jax.Array, spread: Data
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Sums over the blocks of `waist.parameter_score`."""
-        parts = zip(self.blocks, self.rows, predicted, spread, strict=True)
-        each = [waist.parameter_score(*own[:3], levels, own[3]) for own in parts if own[0].unknown]
+        each = [
+            waist.parameter_score(block, data, own, levels, wide)
+            for block, data, _, own, wide in self.each_block(predicted, spread)
+            if block.unknown
+        ]
         slope, information, chosen = (sum(column[1:], column[0]) for column in zip(*each, strict=True))
         return slope, information, chosen
 
@@ -207,7 +211,7 @@ class Model(Stepwise):
         """Score of every datum by its predicted value and the expected information, a pair for each block."""
         return tuple(
             waist.weigh(block, data, predicted, at.levels, expected=True)
-            for block, data, predicted in zip(self.blocks, self.rows, self.predict(at), strict=True)
+            for block, data, _, predicted in self.each_block(self.predict(at))
         )
 
     def spread_of_noise(self, at: Where) -> Data:
@@ -222,7 +226,7 @@ class Model(Stepwise):
         """Measured values drawn at a point, for missing ones too; angles are wrapped."""
         return tuple(
             waist.sample(block, data, predicted, at.levels, jax.random.fold_in(key, b))
-            for b, (block, data, predicted) in enumerate(zip(self.blocks, self.rows, self.predict(at), strict=True))
+            for b, (block, data, _, predicted) in enumerate(self.each_block(self.predict(at)))
         )
 
     def linearise(self, at: Where, *, expected: bool) -> tuple[Linearised, ...]:
@@ -233,14 +237,14 @@ class Model(Stepwise):
         self.check_linear()
         return tuple(
             waist.linearise(block, data, at.states[r], at.z, at.levels, expected=expected)
-            for block, data, r in self._blocks()
+            for block, data, r in self.each_block()
         )
 
     def linearise_biases(self, at: Where, *, expected: bool) -> tuple[Linearised, ...]:
         """Every block linearised by the biases alone, whatever the motion: `of_biases` reads it."""
         return tuple(
             waist.linearise_biases(block, data, self.vectors(r, at.states[r]), at.z, at.levels, expected=expected)
-            for block, data, r in self._blocks()
+            for block, data, r in self.each_block()
         )
 
     # rows linearised at a point
@@ -249,7 +253,7 @@ class Model(Stepwise):
         """Rows compressed onto the states: information J (E, n, n) and score (E, n) of each recursion."""
         shapes = [part.drift.shape for part in self.recursions]
         parts = [(jnp.zeros((E, n, n)), jnp.zeros((E, n))) for E, n in shapes]
-        for (block, data, r), lin in zip(self._blocks(), lins, strict=True):
+        for block, data, r, lin in self.each_block(lins):
             used, E = jnp.asarray(block.used, int), shapes[r][0]
             J = jax.ops.segment_sum(jnp.einsum("ncu,nc,ncv->nuv", lin.state, lin.weight, lin.state), data.epoch, E)
             score = jax.ops.segment_sum(jnp.einsum("ncu,nc->nu", lin.state, lin.score), data.epoch, E)
@@ -261,7 +265,7 @@ class Model(Stepwise):
         """Rows compressed onto the biases at fixed trajectories: information (M, M), score (M,) (Paper C 35-36)."""
         M = self.biases
         G, g = jnp.zeros((M + 1, M + 1)), jnp.zeros(M + 1)
-        for data, lin in zip(self.rows, lins, strict=True):
+        for _, data, _, lin in self.each_block(lins):
             S = data.bias.shape[0]
             own = jax.ops.segment_sum(jnp.einsum("ncp,nc,ncq->npq", lin.bias, lin.weight, lin.bias), data.sensor, S)
             pull = jax.ops.segment_sum(jnp.einsum("ncp,nc->np", lin.bias, lin.score), data.sensor, S)
@@ -273,7 +277,7 @@ class Model(Stepwise):
         """Minus the second derivative (M, M) of the log-likelihood by the biases at given states, rows weighed (N,)."""
         M = self.biases
         G = jnp.zeros((M + 1, M + 1))
-        for (block, data, r), w in zip(self._blocks(), weights, strict=True):
+        for block, data, r, w in self.each_block(weights):
             rows = waist.curvature(block, data, self.vectors(r, at.states[r]), at.z, at.levels)
             own = jax.ops.segment_sum(rows * w[:, None, None], data.sensor, data.bias.shape[0])
             G = G.at[data.bias[:, :, None], data.bias[:, None, :]].add(own)
@@ -283,7 +287,7 @@ class Model(Stepwise):
         """Cross information of states and biases, (E, n, M) of each recursion."""
         M = self.biases
         parts = [jnp.zeros((*part.drift.shape, M)) for part in self.recursions]
-        for (block, data, r), lin in zip(self._blocks(), lins, strict=True):
+        for block, data, r, lin in self.each_block(lins):
             weighted = jnp.einsum("ncp,nc,ncu->npu", lin.bias, lin.weight, lin.state)
             summed = jnp.zeros((parts[r].shape[0], M + 1, len(block.used)))
             summed = summed.at[data.epoch[:, None], data.bias[data.sensor]].add(weighted)
@@ -294,13 +298,13 @@ class Model(Stepwise):
         """Change (N, C, K) of every predicted value along K directions of the states (E, n, K)."""
         return tuple(
             jnp.einsum("ncu,nuk->nck", lin.state, states[r][:, jnp.asarray(block.used, int)][data.epoch])
-            for (block, data, r), lin in zip(self._blocks(), lins, strict=True)
+            for block, data, r, lin in self.each_block(lins)
         )
 
     def by_bias(self, lins: Sequence[Linearised], biases: jax.Array) -> Data:
         """Change (N, C, K) of every predicted value along K directions of the biases (M, K)."""
-        parts = zip(self.rows, lins, self.by_sensor(biases), strict=True)
-        return tuple(jnp.einsum("ncp,npk->nck", lin.bias, own[data.sensor]) for data, lin, own in parts)
+        parts = self.each_block(lins, self.by_sensor(biases))
+        return tuple(jnp.einsum("ncp,npk->nck", lin.bias, own[data.sensor]) for _, data, _, lin, own in parts)
 
     def responses(self, lins: Sequence[Linearised], states: Sequence[jax.Array], biases: jax.Array) -> Data:
         """Change (N, C, K) of every predicted value along K directions of states (E, n, K) and biases (M, K)."""
@@ -309,7 +313,7 @@ class Model(Stepwise):
     def spread(self, lins: Sequence[Linearised], states: Sequence[jax.Array], biases: jax.Array) -> Data:
         """Sum of squares (N, C) over the K directions of `responses`, some rows at a time."""
         found = []
-        for (block, data, r), lin, own in zip(self._blocks(), lins, self.by_sensor(biases), strict=True):
+        for block, data, r, lin, own in self.each_block(lins, self.by_sensor(biases)):
             moved = states[r][:, jnp.asarray(block.used, int)]
 
             def one(row: tuple[jax.Array, ...], moved: jax.Array = moved, own: jax.Array = own) -> jax.Array:
@@ -322,7 +326,7 @@ class Model(Stepwise):
     def state_variance(self, lins: Sequence[Linearised], covariances: Sequence[jax.Array]) -> Data:
         """Variance (N, C) of every predicted value by the covariances (E, n, n) of the states of each recursion."""
         found = []
-        for (block, data, r), lin in zip(self._blocks(), lins, strict=True):
+        for block, data, r, lin in self.each_block(lins):
             used = jnp.asarray(block.used, int)
             P = covariances[r][:, used[:, None], used[None, :]][data.epoch]
             found.append(jnp.einsum("ncu,nuv,ncv->nc", lin.state, P, lin.state))
@@ -331,7 +335,7 @@ class Model(Stepwise):
     def onto_states(self, lins: Sequence[Linearised], columns: Sequence[jax.Array]) -> list[jax.Array]:
         """Columns (N, C, K) of data taken back to the states by their Jacobians, (E, n, K) of each recursion."""
         parts = [jnp.zeros((*part.drift.shape, columns[0].shape[2])) for part in self.recursions]
-        for (block, data, r), lin, column in zip(self._blocks(), lins, columns, strict=True):
+        for block, data, r, lin, column in self.each_block(lins, columns):
             summed = jax.ops.segment_sum(jnp.einsum("ncu,nck->nuk", lin.state, column), data.epoch, parts[r].shape[0])
             parts[r] = parts[r].at[:, jnp.asarray(block.used, int)].add(summed)
         return parts
@@ -341,14 +345,14 @@ class Model(Stepwise):
     def by_epoch(self, values: Sequence[jax.Array]) -> list[jax.Array]:
         """Sums (E,) of values (N, C) over the data of each epoch, for each recursion."""
         parts = [jnp.zeros(part.drift.shape[0]) for part in self.recursions]
-        for data, r, value in zip(self.rows, self.recursion, values, strict=True):
+        for _, data, r, value in self.each_block(values):
             parts[r] = parts[r].at[data.epoch].add(jnp.sum(value, 1))
         return parts
 
     def by_level(self, values: Sequence[jax.Array]) -> jax.Array:
         """Sums (H + 1,) of values (N, C) over the data of each unknown level, those of known ones last."""
         total = jnp.zeros(self.level_spread.shape[0] + 1)
-        for data, value in zip(self.rows, values, strict=True):
+        for _, data, _, value in self.each_block(values):
             total = total.at[data.level].add(value)
         return total
 
@@ -394,8 +398,7 @@ class Model(Stepwise):
     @property
     def linear(self) -> tuple[Recursion | None, ...]:
         """Linear form of the motion of each recursion, None where it has none."""
-        pairs = zip(self.recursions, self.sampled, strict=True)
-        return tuple(part if form is None else None for part, form in pairs)
+        return self.each(lambda part, form: part if form is None else None, self.sampled)
 
     @property
     def tailed(self) -> bool:
@@ -408,9 +411,14 @@ class Model(Stepwise):
         return tuple(tuple(tail.weight for tail in part.tails) for part in self.recursions)
 
     @property
+    def resting(self) -> tuple[np.ndarray, ...]:
+        """Mask (T,) of the targets of each recursion that rest at a place that is not known."""
+        return self.each(at_rest, self.targets)
+
+    @property
     def rests(self) -> bool:
         """Whether some target stands still at a place that is not known."""
-        return any(at_rest(part, T).any() for part, T in zip(self.recursions, self.targets, strict=True))
+        return any(own.any() for own in self.resting)
 
     def with_tilt(self, tilt: Tilt) -> "Model":
         """The model with a term of the log-likelihood of the biases beside that of the rows."""
@@ -420,11 +428,11 @@ class Model(Stepwise):
         """The model with other precisions of its process noise, where this is not Gaussian."""
         if not self.tailed:
             return self
-        parts = [
-            part._replace(tails=tuple(replace(t, weight=w) for t, w in zip(part.tails, own, strict=True)))
-            for part, own in zip(self.recursions, weights, strict=True)
-        ]
-        return replace(self, recursions=tuple(parts))
+
+        def weighted(part: Recursion, own: tuple[jax.Array, ...]) -> Recursion:
+            return part._replace(tails=tuple(replace(t, weight=w) for t, w in zip(part.tails, own, strict=True)))
+
+        return replace(self, recursions=self.each(weighted, weights))
 
     def by_information(self) -> "Model":
         """The model with Gaussian process noises of the same Fisher information, which bounds see of their family."""
@@ -457,7 +465,7 @@ class Model(Stepwise):
 
     def entries(self, r: int) -> tuple[int, ...]:
         """State entries of recursion r that any row reads."""
-        return tuple(sorted({i for block, _, own in self._blocks() if own == r for i in block.used}))
+        return tuple(sorted({i for block, _, own in self.each_block() if own == r for i in block.used}))
 
     def epochs(self, sizes: tuple[int, ...] | None = None) -> Epoch:
         """The epochs of all targets in time order, stacked (K leading), for filters that scan over them.
@@ -481,22 +489,23 @@ class Model(Stepwise):
 
     def with_values(self, y: Sequence[Any]) -> "Model":
         """The same rows with other measured values y (N, C), read where a value is measured."""
-        pairs = zip(self.rows, y, strict=True)
-        rows = [data._replace(y=jnp.where(data.mask > 0, jnp.asarray(new, data.y.dtype), 0.0)) for data, new in pairs]
-        return replace(self, rows=tuple(rows))
+        return self.with_rows(lambda data, new: {"y": jnp.where(data.mask > 0, jnp.asarray(new, data.y.dtype), 0.0)}, y)
 
     def weighted(self, weights: Sequence[Any]) -> "Model":
         """Every datum counted by a weight (N, C) or (N, 1): 0 leaves it out, a share is soft association."""
-        pairs = zip(self.rows, weights, strict=True)
-        return replace(self, rows=tuple(data._replace(mask=data.mask * jnp.asarray(w)) for data, w in pairs))
+        return self.with_rows(lambda data, w: {"mask": data.mask * jnp.asarray(w)}, weights)
 
-    def _blocks(self) -> Iterator[tuple[Block, Rows, int]]:
-        return zip(self.blocks, self.rows, self.recursion, strict=True)
+    def with_rows(self, changes: Callable[..., dict[str, Any]], *of_each: Iterable[Any]) -> "Model":
+        """The model whose rows of each block have the fields `changes(rows, *own)`.
+
+        `own` is the entry of each sequence in `of_each` for the block.
+        """
+        changed = (data._replace(**changes(data, *own)) for _, data, _, *own in self.each_block(*of_each))
+        return replace(self, rows=tuple(changed))
 
     def _each(self, function: Any, predicted: Data, **given: Any) -> tuple[Any, ...]:
         """A function of a block, its rows and its predicted values, for every block."""
-        parts = zip(self.blocks, self.rows, predicted, strict=True)
-        return tuple(function(block, data, values, **given) for block, data, values in parts)
+        return tuple(function(block, data, own, **given) for block, data, _, own in self.each_block(predicted))
 
 
 def scaled(lins: Sequence[Linearised], weights: Sequence[Any]) -> tuple[Linearised, ...]:

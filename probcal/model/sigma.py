@@ -75,10 +75,7 @@ def _block(block: Block, data: Rows, point: Where, states: jax.Array, covariance
 
 def regress_blocks(model: Model, point: Where, covariances: Sequence[jax.Array], rule: Rule) -> list[Linearised]:
     """Every block regressed on the states over their smoothed densities; what is left over widens the noise."""
-    return [
-        _block(block, data, point, point.states[r], covariances[r], rule)
-        for block, data, r in zip(model.blocks, model.rows, model.recursion, strict=True)
-    ]
+    return [_block(block, data, point, point.states[r], covariances[r], rule) for block, data, r in model.each_block()]
 
 
 def expect_biases(
@@ -87,7 +84,7 @@ def expect_biases(
     """Information (M, M) and score (M,) of the biases, expected over the smoothed states (Paper A 15-21)."""
     M = model.biases
     information, score = jnp.zeros((M, M)), jnp.zeros(M)
-    for block, data, r in zip(model.blocks, model.rows, model.recursion, strict=True):
+    for block, data, r in model.each_block():
         alone = replace(model, rows=(data,))  # the biases of one block
 
         def at(x: jax.Array, block: Block = block, data: Rows = data, alone: Model = alone) -> tuple:

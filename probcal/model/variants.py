@@ -14,8 +14,7 @@ from probcal.model.rows import BY_ROW, Rows
 
 def part(model: Model, r: int) -> Model:
     """The model of recursion r and its rows alone."""
-    triples = zip(model.blocks, model.rows, model.recursion, strict=True)
-    pairs = [(block, data) for block, data, own in triples if own == r]
+    pairs = [(block, data) for block, data, own in model.each_block() if own == r]
     return replace(
         model,
         blocks=tuple(block for block, _ in pairs),
@@ -31,7 +30,7 @@ def part(model: Model, r: int) -> Model:
 def counts(model: Model, of: Callable[[np.ndarray], np.ndarray]) -> list[np.ndarray]:
     """Counts (E,) at each epoch of each recursion: sums of what `of` makes of the mask (N, C), a number (N,) a row."""
     found = [np.zeros(recursion.drift.shape[0]) for recursion in model.recursions]
-    for data, r in zip(model.rows, model.recursion, strict=True):
+    for _, data, r in model.each_block():
         np.add.at(found[r], np.asarray(data.epoch), of(np.asarray(data.mask)))
     return found
 
@@ -42,14 +41,14 @@ def aligned(like: Model, later: Model, recursions: Sequence[int | None], targets
     `recursions` names the later recursion behind each earlier one, `targets` which earlier target each later one is.
     """
     found, rows = [], []
-    for part, r, names in zip(like.recursions, recursions, targets, strict=True):
+    for part, r, names in like.each_layout(recursions, targets):
         if r is None:
             found.append(jax.tree.map(lambda leaf: leaf[:0], part))
         else:
             mine = later.recursions[r]
             found.append(mine._replace(target=np.asarray(names, int)[np.asarray(mine.target)]))
-    own: dict[Any, Rows] = {(b, r): data for b, data, r in zip(later.blocks, later.rows, later.recursion, strict=True)}
-    for block, data, r in zip(like.blocks, like.rows, like.recursion, strict=True):
+    own: dict[Any, Rows] = {(block, r): data for block, data, r in later.each_block()}
+    for block, data, r in like.each_block():
         nothing = {name: getattr(data, name)[:0] for name in BY_ROW}
         rows.append(own.get((block, recursions[r]), data._replace(**nothing)))
     return replace(like, recursions=tuple(found), rows=tuple(rows))
@@ -63,47 +62,45 @@ def of_epochs(model: Model, r: int, kept: np.ndarray) -> Model:
         chosen: dict[str, Any] = {name: np.asarray(getattr(data, name))[mine] for name in BY_ROW}
         return data._replace(**chosen)
 
-    pairs = zip(model.rows, model.recursion, strict=True)
-    return replace(model, rows=tuple(some(data) if own == r else data for data, own in pairs))
+    return replace(model, rows=tuple(some(data) if own == r else data for _, data, own in model.each_block()))
 
 
 def measured_twice(model: Model, y: Sequence[Any]) -> Model:
     """Every row twice, the second time with measured values y (N, C)."""
-    again = model.with_values(y)
-    pairs = zip(model.rows, again.rows, strict=True)
-    both = [
-        old._replace(**{name: jnp.concatenate([getattr(old, name), getattr(new, name)]) for name in BY_ROW})
-        for old, new in pairs
-    ]
-    return replace(model, rows=tuple(both))
+
+    def both(old: Rows, new: Rows) -> dict[str, Any]:
+        return {name: jnp.concatenate([getattr(old, name), getattr(new, name)]) for name in BY_ROW}
+
+    return model.with_rows(both, model.with_values(y).rows)
 
 
 def split(model: Model, piece: Sequence[np.ndarray], count: int) -> Model:
     """Biases of its own for each of `count` pieces; `piece` (N,) is that of every row."""
-    M, rows = model.biases, []
-    for data, own in zip(model.rows, piece, strict=True):
+    M = model.biases
+
+    def copied(data: Rows, own: np.ndarray) -> dict[str, Any]:
         S, bias = data.bias.shape[0], np.asarray(data.bias)
-        copied: dict[str, Any] = {
+        return {
             "sensor": np.asarray(data.sensor) + S * own,
             "bias": np.concatenate([np.where(bias < M, bias + p * M, count * M) for p in range(count)]),
             "scale": np.tile(data.scale, (count, 1)),
             "base": np.tile(data.base, (count, 1)),
         }
-        rows.append(data._replace(**copied))
-    return replace(model, biases=count * M, rows=tuple(rows), tilt=None)
+
+    return replace(model.with_rows(copied, piece), biases=count * M, tilt=None)
 
 
 def placed(model: Model, mine: Sequence[jax.Array], place: jax.Array) -> Model:
     """The first node of the rows `mine` (N,) of each block moved to a place (d,)."""
-    rows = []
-    for data, own in zip(model.rows, mine, strict=True):
+
+    def moved(data: Rows, own: jax.Array) -> dict[str, Any]:
         first = jnp.where(own[:, None], place[None], data.pose[:, 0, : len(place)])
-        rows.append(data._replace(pose=data.pose.at[:, 0, : len(place)].set(first)))
-    return replace(model, rows=tuple(rows))
+        return {"pose": data.pose.at[:, 0, : len(place)].set(first)}
+
+    return model.with_rows(moved, mine)
 
 
 def without(model: Model, held: np.ndarray) -> Model:
     """The model that does not feel the biases in `held` (M,), which stay columns."""
     felt = np.append(~held, True)
-    rows = (data._replace(scale=np.asarray(data.scale) * felt[np.asarray(data.bias)]) for data in model.rows)
-    return replace(model, rows=tuple(rows))
+    return model.with_rows(lambda data: {"scale": np.asarray(data.scale) * felt[np.asarray(data.bias)]})

@@ -87,16 +87,11 @@ def turned(problem: Problem, point: Point) -> np.ndarray | None:
     place, turn = _stated(problem)
     z = np.array(point.z)
     total: dict[str, complex] = {}
+    tracks = {name: (time, track) for name, time, track in problem.tracks(problem.positions(point.states))}
     for s in seen_directions(problem):
-        if s.node not in turning:
-            continue
-        for epochs, states in zip(problem.epochs, point.states, strict=True):
-            mine = epochs.target == s.target
-            if not mine.any():
-                continue
-            track = np.asarray(states)[mine][:, slice(*epochs.position)]
-            at = np.searchsorted(epochs.time[mine], s.time).clip(0, mine.sum() - 1)
-            line = track[at] - place[s.node]
+        if s.node in turning:
+            time, track = tracks[s.target]
+            line = track[np.searchsorted(time, s.time).clip(0, len(time) - 1)] - place[s.node]
             off = np.arctan2(line[:, 1], line[:, 0]) - s.angles[:, 0]
             total[s.node] = total.get(s.node, 0.0) + complex(np.exp(1j * off).sum())
     for name, sum_ in total.items():

@@ -106,16 +106,14 @@ def _moved(best: _Tried, m: int, value: float) -> _Tried:
 def _worst(best: _Tried, columns: list[int], tried: set[int]) -> int | None:
     """The bias of the clock, of those not tried, whose rows are explained worst; None where all are explained."""
     problem, model, total = best.problem, best.problem.model, dict[str, list[float]]()
-    for block, square, mask, index in zip(
-        model.blocks, squares_of(model, best.point), model.measured, problem.row_index, strict=True
-    ):
+    for block, data, _, square, index in model.each_block(squares_of(model, best.point), problem.row_index):
         owners = np.array([problem.network.sensors[k].nodes[0].name for k in problem.measurements.sensor[index]])
         if block.type.clocked:
             for name in dict.fromkeys(owners):
                 mine = owners == name
                 own = total.setdefault(name, [0.0, 0.0])
                 own[0] += float(np.asarray(square)[mine].sum())
-                own[1] += float((np.asarray(mask)[mine] > 0).sum())
+                own[1] += float((np.asarray(data.mask)[mine] > 0).sum())
     means = {name: square / max(count, 1.0) for name, (square, count) in total.items()}
     left = [m for m in columns if m not in tried and means.get(problem.biases[m].owner, 0.0) > EXPLAINED]
     return max(left, key=lambda m: means[problem.biases[m].owner], default=None)
@@ -138,17 +136,14 @@ def turning_time(problem: Problem, point: Point) -> float:
     Targets that go straight on stay alike for as long as they are seen.
     """
     squares, times = [], []
-    for epochs, states in zip(problem.epochs, point.states, strict=True):
-        for name in dict.fromkeys(epochs.target):
-            mine = epochs.target == name
-            time, first = np.unique(epochs.time[mine], return_index=True)
-            place = np.asarray(states)[mine][first][:, slice(*epochs.position)]
-            if len(time) < 3:
-                continue
-            velocity = np.gradient(place, time, axis=0)
-            for lag in np.unique(np.geomspace(1, len(time) - 1, 20).astype(int)):
-                change = velocity[lag:] - velocity[:-lag]
-                squares.append(np.mean(np.sum(change**2, 1)) / max(np.mean(np.sum(velocity**2, 1)), 1e-300))
-                times.append(float(np.median(time[lag:] - time[:-lag])))
+    for _, time, track in problem.tracks(problem.positions(point.states)):
+        time, first = np.unique(time, return_index=True)
+        if len(time) < 3:
+            continue
+        velocity = np.gradient(track[first], time, axis=0)
+        for lag in np.unique(np.geomspace(1, len(time) - 1, 20).astype(int)):
+            change = velocity[lag:] - velocity[:-lag]
+            squares.append(np.mean(np.sum(change**2, 1)) / max(np.mean(np.sum(velocity**2, 1)), 1e-300))
+            times.append(float(np.median(time[lag:] - time[:-lag])))
     turned = [t for t, s in zip(times, squares, strict=True) if s > 1.0]
     return 0.5 * (min(turned) if turned else max(times, default=np.inf))

@@ -195,8 +195,9 @@ def _paths(problem: Problem, point: Point, heard: list[np.ndarray], place: np.nd
     """Line (in 3-D plane) of least squares of the places of targets that each node hears, `place` (nodes, d) theirs."""
     d, n, model = problem.network.dimension, len(place), problem.model
     count, total, square = np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d))
-    for own, data, r in zip(heard, model.rows, model.recursion, strict=True):
-        there = np.asarray(point.states[r])[:, slice(*problem.epochs[r].position)][np.asarray(data.epoch)]
+    places = problem.positions(point.states)
+    for _, data, r, own in model.each_block(heard):
+        there = places[r][np.asarray(data.epoch)]
         used = np.asarray(data.mask).any(1)
         for slot in range(own.shape[1]):
             node = own[:, slot][np.asarray(data.sensor)]

@@ -20,6 +20,7 @@ from probcal.model import rows as waist
 from probcal.model import variants
 from probcal.model.model import At, Model, Recursion
 from probcal.model.rows import Linearised, Rows
+from probcal.model.trajectories import Trajectories
 from probcal.problem import Problem
 
 WINDOWS = 60  # at most so many windows a target
@@ -125,7 +126,7 @@ def _alike(problem: Problem, model: Model, r: int) -> tuple[tuple[np.ndarray, np
     span, found = set(range(*problem.epochs[r].position)), []
     if not {name for name, *_ in problem.epochs[r].layout} <= {"position", "velocity", "acceleration"}:
         return None
-    for block, data, own in zip(model.blocks, model.rows, model.recursion, strict=True):
+    for block, data, own in model.each_block():
         if own == r:
             pose = np.asarray(data.pose)
             _, first, alike = np.unique(np.asarray(data.sensor), return_index=True, return_inverse=True)
@@ -143,14 +144,16 @@ def _seen(
     """Loss (candidates, E) where rows alike see the same at a place."""
     mine, n = variants.part(model, r), model.recursions[r].drift.shape[1]
     levels = jnp.zeros(model.level_spread.shape)
-    some: list[Rows] = []
-    for data, (first, _) in zip(mine.rows, alike, strict=True):
-        chosen: dict[str, Any] = {name: getattr(data, name)[first] for name in waist.BY_ROW}
-        some.append(data._replace(**chosen | {"epoch": jnp.zeros_like(first)}))
+
+    def one_per_sensor(data: Rows, own: tuple[jax.Array, jax.Array]) -> dict[str, Any]:
+        chosen: dict[str, Any] = {name: getattr(data, name)[own[0]] for name in waist.BY_ROW}
+        return chosen | {"epoch": jnp.zeros_like(own[0])}
+
+    some = mine.with_rows(one_per_sensor, alike)
 
     def loss(place: jax.Array) -> list[jax.Array]:
         state, misfits = jnp.zeros((1, n)).at[0, span[0] : span[1]].set(place), []
-        for block, data, few, (_, own) in zip(mine.blocks, mine.rows, some, alike, strict=True):
+        for block, data, _, few, (_, own) in mine.each_block(some.rows, alike):
             lin = waist.linearise_biases(block, few, state, z, levels, expected=False)
             spread = jnp.sqrt(jnp.sum(lin.bias**2, -1, keepdims=True))
             looked = apart((waist.predict(block, few, state, z), spread))
@@ -160,7 +163,7 @@ def _seen(
         return misfits
 
     found = jnp.zeros((mine.recursions[0].drift.shape[0], len(places)))
-    for data, misfit in zip(mine.rows, jax.lax.map(loss, places), strict=True):
+    for _, data, _, misfit in mine.each_block(jax.lax.map(loss, places)):
         found = found.at[data.epoch].add(misfit.T)  # of all candidates at once
     return found.T
 
@@ -198,8 +201,8 @@ def _thinned(problem: Problem, r: int) -> Model:
     epochs = problem.epochs[r]
     counts = variants.counts(problem.model, lambda mask: mask.any(1))[r]
     kept = np.zeros(len(counts), bool)
-    for name in dict.fromkeys(epochs.target):
-        for window in _windows(np.flatnonzero(epochs.target == name)):
+    for mine in epochs.members.values():
+        for window in _windows(np.flatnonzero(mine)):
             stride = max(1, int(min(counts[window].sum() / WINDOW_ROWS, len(window) / 2)))
             kept[window[::stride]] = True
     return variants.of_epochs(problem.model, r, kept)
@@ -246,12 +249,8 @@ def _consistent(
 def project(problem: Problem, tracks: list[np.ndarray], precision: list[np.ndarray]) -> Point:
     """Point at zero biases whose trajectories follow given states (E, n) with given precisions (E, n)."""
     levels: Any = np.zeros(len(problem.levels))
-    pairs = [
-        _consistent(part, states, weight, levels)
-        for part, states, weight in zip(problem.model.recursions, tracks, precision, strict=True)
-    ]
-    z, levels = jax.device_put((np.zeros(problem.model.biases), levels))
-    return Point(tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), z, levels)
+    pairs = problem.model.each(lambda *own: _consistent(*own, levels), tracks, precision)
+    return Point(Trajectories.of(pairs), *jax.device_put((np.zeros(problem.model.biases), levels)))
 
 
 def follow_states(problem: Problem, states: list[np.ndarray]) -> Point:
@@ -266,11 +265,10 @@ def grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
     for r, epochs in enumerate(problem.epochs):
         span = epochs.position
         path, known = known_places(problem, r, span)
-        unknown = [name for name in dict.fromkeys(epochs.target) if not known[epochs.target == name].all()]
+        unknown = [mine for mine in epochs.members.values() if not known[mine].all()]
         if unknown:
             loss = _losses(problem, r, z, places)
-        for name in unknown:
-            mine = epochs.target == name
+        for mine in unknown:
             path[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)
         _, states = profile(problem.model, r, span, z, path)
         states = np.array(states)

@@ -18,6 +18,7 @@ from probcal.gaussian.information import at_levels
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point, find_mode
 from probcal.labels import NODE, PIECE, SCENE
+from probcal.model import variants
 from probcal.modes.crossings import node_sides
 from probcal.modes.grid import grid_start, profile, track_mode
 from probcal.modes.reflections import Gap, Plane, distance, movable, new, planes, reach, reflect, reflect_nodes
@@ -191,27 +192,22 @@ def _crossed(problem: Problem, point: Point, climb: SideClimb) -> tuple[Point, s
 def _losses(problem: Problem, z: np.ndarray, point: Point, plane: Plane | None) -> list[np.ndarray]:
     """Robust misfit (E,) of the data of each epoch at the places of a point, or at those on the other side."""
     found = []
-    for r, (epochs, states) in enumerate(zip(problem.epochs, point.states, strict=True)):
-        place = np.asarray(states)[:, slice(*epochs.position)]
+    for r, place in enumerate(problem.positions(point.states)):
         place = place if plane is None else plane.across(place)
-        loss, _ = profile(problem.model, r, epochs.position, jnp.asarray(z), jnp.asarray(place))
+        loss, _ = profile(problem.model, r, problem.epochs[r].position, jnp.asarray(z), jnp.asarray(place))
         found.append(np.nan_to_num(np.asarray(loss), nan=1e9, posinf=1e9))
     return found
 
 
 def _counts(problem: Problem) -> list[np.ndarray]:
     """Number of data (E,) at each epoch of each recursion."""
-    found = [np.zeros(len(epochs.time)) for epochs in problem.epochs]
-    model = problem.model
-    for there, epoch, r in zip(model.measured, model.epoch, model.recursion, strict=True):
-        np.add.at(found[r], np.asarray(epoch), np.asarray(there).sum(1))
-    return found
+    return variants.counts(problem.model, lambda mask: mask.sum(1))
 
 
 def _candidates(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
     """Reflections of the whole scene, and of the track of one target alone, that fit nearly as well unpolished."""
     z, free, counts = np.asarray(point.z), movable(problem), _counts(problem)
-    targets = [n for epochs in problem.epochs for n in dict.fromkeys(epochs.target) if n in problem.targets]
+    targets = [n for epochs in problem.epochs for n in epochs.members if n in problem.targets]
     every = sum(float(count.sum()) for count in counts)
     found = planes(problem, z)
     here = _losses(problem, z, point, None) if found else []
@@ -228,7 +224,7 @@ def _candidates(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
             if len(targets) < 2 or word:
                 continue
             for name in targets[:MOST]:
-                own = [m & (e.target == name) for m, e in zip(free, problem.epochs, strict=True)]
+                own = problem.model.each(lambda _, mine, own, n=name: mine & (own.target == n), free, problem.epochs)
                 much = sum(float(c[mine].sum()) for c, mine in zip(counts, own, strict=True))
                 loss = sum(float(w[mine].sum()) for w, mine in zip(worse, own, strict=True))
                 if any(mine.any() for mine in own) and loss < WORSE * much:
@@ -307,8 +303,8 @@ def _cut(problem: Problem, point: Point) -> Iterator[tuple[str, Point]]:
         there = _losses(problem, z, point, plane)
         for r, epochs in enumerate(problem.epochs):
             worse = there[r] - here[r]
-            for target in dict.fromkeys(epochs.target):
-                mine = np.flatnonzero((epochs.target == target) & free[r])
+            for target, members in epochs.members.items():
+                mine = np.flatnonzero(members & free[r])
                 for own in _pieces(problem, point, plane, r, mine):
                     count = float(counts[r][own].sum())
                     if len(own) >= SHORTEST and count > 0 and worse[own].sum() < WORSE * count:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -67,17 +68,15 @@ def touched(problem: Problem, point: Point, variances: Sequence[np.ndarray]) -> 
     """
     least, words = np.inf, ""
     for plane in planes(problem, np.asarray(point.z)):
-        for epochs, states, variance, mine in zip(
-            problem.epochs, point.states, variances, movable(problem), strict=True
+        for name, time, place, variance, mine in problem.tracks(
+            problem.positions(point.states), problem.positions(variances), movable(problem)
         ):
-            place = slice(*epochs.position)
-            away = np.abs(plane.distance(np.asarray(states)[:, place]))
-            sd = np.sqrt(np.asarray(variance)[:, place] @ plane.normal**2)
-            ratio = np.where(mine, away / np.maximum(sd, 1e-300), np.inf)
+            sd = np.sqrt(variance @ plane.normal**2)
+            ratio = np.where(mine, np.abs(plane.distance(place)) / np.maximum(sd, 1e-300), np.inf)
             k = int(ratio.argmin())
             if ratio[k] < least:
                 least = float(ratio[k])
-                words = f'target "{epochs.target[k]}" touches {plane.name} at {epochs.time[k]:.6g} s'
+                words = f'target "{name}" touches {plane.name} at {time[k]:.6g} s'
     return least, words
 
 
@@ -149,10 +148,10 @@ def reflect_nodes(problem: Problem, z: np.ndarray, plane: Plane) -> np.ndarray:
     return moved
 
 
-def reflect(problem: Problem, point: Point, plane: Plane, chosen: list[np.ndarray], z: np.ndarray) -> Point:
+def reflect(problem: Problem, point: Point, plane: Plane, chosen: Sequence[np.ndarray], z: np.ndarray) -> Point:
     """The point at biases z (M,) with the chosen epochs (E,) of each recursion on the other side of a plane."""
     tracks = []
-    for epochs, states, mine in zip(problem.epochs, point.states, chosen, strict=True):
+    for _, epochs, states, mine in problem.model.each_layout(problem.epochs, point.states, chosen):
         moved = np.array(states)
         for name, start, stop, _ in epochs.layout:
             if name == "position":
@@ -182,13 +181,10 @@ class Gap(NamedTuple):
 
 def distance(problem: Problem, a: Point, b: Point) -> Gap:
     """What lies between the places of two points."""
-    places = [
-        np.sum((np.asarray(x) - np.asarray(y))[:, slice(*epochs.position)] ** 2)
-        for x, y, epochs in zip(a.states, b.states, problem.epochs, strict=True)
-    ]
+    away = problem.positions(jax.tree.map(np.subtract, a.states, b.states))
     own = [m for members in place_biases(problem).values() for m in members]
     moved = (np.asarray(a.z) - np.asarray(b.z))[own]
-    return Gap(float(np.sqrt(sum(places))), float(np.sqrt(np.sum(moved**2))))
+    return Gap(float(np.sqrt(sum(np.sum(own**2) for own in away))), float(np.sqrt(np.sum(moved**2))))
 
 
 def reach(problem: Problem, a: Point, b: Point) -> Gap:
@@ -199,8 +195,7 @@ def reach(problem: Problem, a: Point, b: Point) -> Gap:
 
 def extent(problem: Problem, point: Point) -> float:
     """Root of the sum of squares of the places of a point about their mean, as `distance` counts."""
-    places = [np.asarray(x)[:, slice(*e.position)] for x, e in zip(point.states, problem.epochs, strict=True)]
-    return float(np.sqrt(sum(np.sum((own - own.mean(0)) ** 2) for own in places)))
+    return float(np.sqrt(sum(np.sum((own - own.mean(0)) ** 2) for own in problem.positions(point.states))))
 
 
 def new(problem: Problem, point: Point, known: Sequence[Point], size: Gap) -> bool:

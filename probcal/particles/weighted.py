@@ -89,7 +89,7 @@ class Ended(NamedTuple):
     stopped: str = ""  # why it was ended early
 
 
-class Trajectories(NamedTuple):
+class DrawnTracks(NamedTuple):
     """What particles say of all states over draws of the biases."""
 
     z: np.ndarray  # (D, M)
@@ -119,7 +119,7 @@ class Paths:
         """What rows see of the states, (E, N, n) of each recursion."""
         return list(vectors_of(self.problem.model, found.states))
 
-    def over(self, z: np.ndarray, levels: np.ndarray, key: jax.Array) -> Trajectories:
+    def over(self, z: np.ndarray, levels: np.ndarray, key: jax.Array) -> DrawnTracks:
         """Mean and sd of all states over draws of the biases z (D, M), and a path for each of the draws."""
         moments, single, model, walked = [], [], self.problem.model, self.along_paths()
         for k, own in enumerate(z):
@@ -131,7 +131,7 @@ class Paths:
         for column in zip(*moments, strict=True):
             mean, variance = (np.stack(part) for part in zip(*column, strict=True))
             tracks.append(Tracks(mean.mean(0), np.sqrt(variance.mean(0) + mean.var(0))))
-        return Trajectories(np.asarray(z), tracks, [np.stack(column) for column in zip(*single, strict=True)])
+        return DrawnTracks(np.asarray(z), tracks, [np.stack(column) for column in zip(*single, strict=True)])
 
     def point(self, found: Ensemble, z: Any, levels: Any) -> Point:
         """The states that stand for the particles: on the road where there is one (Paper A 43)."""
@@ -148,7 +148,7 @@ class EnsemblePosterior(Posterior):
     paths: Paths
     term: np.ndarray  # (M,)
     without: Point
-    over: Trajectories
+    over: DrawnTracks
     numbers: Mapping[str, float]
 
     chained: ClassVar[bool] = False
