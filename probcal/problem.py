@@ -26,6 +26,7 @@ from probcal.model.motions import (
     Area,
     LevelRecord,
     Levels,
+    by_component,
     chain,
     channel_levels,
     form_of,
@@ -416,6 +417,11 @@ class Problem:
     def target(self, name: str) -> Target:
         """Motion and start of a target by name."""
         return declared_target(self.motion, name, self.network)
+
+    def noise_columns(self, name: str) -> list[tuple[Any, slice]]:
+        """Each component of a target's linear motion, and the columns of the noise factor that drive it."""
+        components = linear_of(as_motion(self.target(name).motion))
+        return [(component, own) for component, _, own in by_component(components, self.network.dimension)]
 
     def with_tilt(self, tilt: Tilt) -> Problem:
         """The same problem with a term of the log-likelihood of its biases beside that of the rows."""

@@ -234,8 +234,7 @@ def simulate(
     problem, tracks = _by_clock(problem, z, time, tracks)
     states = [_states(problem, r, tracks, keys[1]) for r in range(len(problem.epochs))]
     columns = {name: np.full(len(plan), np.nan) for name in network.channel_names}
-    pieces = zip(problem.model.blocks, problem.model.rows, problem.model.recursion, problem.row_index, strict=True)
-    for b, (block, data, r, index) in enumerate(pieces):
+    for b, (block, data, r, index) in enumerate(problem.model.each_block(problem.row_index)):
         seed = jax.random.split(jax.random.fold_in(keys[2], b), 3)
         drawn = np.array(_drawn(block, data, states[r], z, np.zeros(len(problem.levels)), seed[0]))
         drawn = _spoil(block, data, drawn, outliers, outlier_scale, seed[1])
@@ -248,7 +247,7 @@ def simulate(
         table = _detections(problem, table, plan, columns, states, z, keys[3])
     parts = [
         pd.DataFrame(np.asarray(x), columns=list(e.components)).assign(time=e.time, target=e.target)
-        for x, e in zip(states, problem.epochs, strict=True)
+        for _, x, e in problem.model.each_layout(states, problem.epochs)
     ]
     track = pd.concat(parts, ignore_index=True)
     track = track[["time", "target", *(c for c in track.columns if c not in ("time", "target"))]]
@@ -264,8 +263,7 @@ def _detections(
     network, rng = problem.network, np.random.default_rng(np.asarray(jax.random.bits(key, (4,))))
     placed = {s.name: s for s in network.sensors}
     kept = np.ones(len(plan), bool)
-    pieces = zip(problem.model.blocks, problem.model.rows, problem.model.recursion, problem.row_index, strict=True)
-    for block, data, r, index in pieces:
+    for block, data, r, index in problem.model.each_block(problem.row_index):
         told = [placed[str(name)].detection for name in plan["sensor"].to_numpy()[index]]
         chance = np.array([1.0 if own is None else own.chance for own in told])
         for view in {own.view for own in told if own is not None and own.view is not None}:

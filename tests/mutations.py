@@ -125,7 +125,7 @@ MUTATIONS = [
     Mutation("jax.tree.map(jnp.add, alone,", "jax.tree.map(lambda a, b: b, alone,", "test_formulas.py"),
     Mutation("@ moved[epoch] + by_bias", "@ moved[epoch] - by_bias", "test_formulas.py test_observability.py"),
     Mutation("jnp.exp(point.levels - levels)", "jnp.exp(levels - point.levels)", "test_formulas.py"),
-    Mutation("(squares + sum(jnp.sum(u**2) for u in point.noises))", "squares", "test_guards.py"),
+    Mutation("(squares + point.trajectories.square)", "squares", "test_guards.py"),
     # gaussian/draws.py
     Mutation("free = prior - smooth.states", "free = prior + smooth.states", "test_exact.py"),
     Mutation("jax.random.normal(key, (count, M)) @ root.T", "jax.random.normal(key, (count, M)) @ root", "test_exact.py"),
@@ -133,7 +133,7 @@ MUTATIONS = [
     # identifiability/gauge.py
     Mutation("information = information - linalg.gram(flat)", "information = information", "test_observability.py"),
     # gaussian/frame.py
-    Mutation("own - jnp.einsum(\"eij,ej->ei\", at.feedback, before))", "own + jnp.einsum(\"eij,ej->ei\", at.feedback, before))", "test_samplers.py test_model.py"),
+    Mutation("step + own - jnp.einsum(\"eij,ej->ei\", at.feedback, before)", "step + own + jnp.einsum(\"eij,ej->ei\", at.feedback, before)", "test_samplers.py test_model.py"),
     Mutation("self.score @ step - 0.5 * step", "self.score @ step + 0.5 * step", "test_samplers.py"),
     Mutation("loops.append(Loop(-smooth.states,", "loops.append(Loop(smooth.states,", "test_samplers.py"),
     Mutation("cross = -(slopes", "cross = (slopes", "test_formulas.py"),

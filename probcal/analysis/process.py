@@ -13,8 +13,6 @@ import numpy as np
 
 from probcal.analysis.findings import Finding
 from probcal.inference.fitted import Fitted
-from probcal.model.motions import by_component, linear_of
-from probcal.motion import as_motion
 from probcal.motion.base import GAUSSIAN, Component, level_name
 from probcal.noise import Normal, guess_of
 
@@ -68,26 +66,21 @@ def _driven(fit: Fitted, key: jax.Array, count: int) -> Iterator[Driven]:
     """The noises that the data say something of, those of a start left out."""
     problem = fit.problem
     drawn = fit.at.smoothed_noises(key, count)
-    parts = zip(problem.epochs, problem.model.recursions, fit.point.noises, drawn, strict=True)
-    for epochs, part, u, replicas in parts:
-        smoothed, columns, first = np.asarray(u), np.asarray(replicas), np.asarray(part.first)
-        active = np.asarray(part.L).any(1)
-        for name in dict.fromkeys(epochs.target):
-            mine = (epochs.target == name) & ~first
-            components = linear_of(as_motion(problem.target(name).motion))
-            for component, _, own in by_component(components, problem.network.dimension):
-                gaussian = isinstance(getattr(component, "noise", GAUSSIAN), Normal)
-                if not gaussian or guess_of(component.std) == 0 or mine.sum() < FEWEST:
-                    continue
-                sd = columns[mine, own].std(2)
-                told = active[mine, own] & (sd > HELD)
-                if told.any(1).sum() < FEWEST:
-                    continue
-                scale = np.where(told, 1.0 / np.where(told, sd, 1.0), 0.0)
-                drives = level_name(component).removesuffix("_std")
-                own_noises = smoothed[mine, own] * scale, columns[mine, own] * scale[:, :, None]
-                order = getattr(component, "next_order", Component.next_order)
-                yield Driven(name, drives, type(component).__name__, order, *own_noises)
+    for name, _, part, smoothed, columns in problem.tracks(problem.model.recursions, fit.point.noises, drawn):
+        mine, active = ~part.first, part.L.any(1)
+        for component, own in problem.noise_columns(name):
+            gaussian = isinstance(getattr(component, "noise", GAUSSIAN), Normal)
+            if not gaussian or guess_of(component.std) == 0 or mine.sum() < FEWEST:
+                continue
+            sd = columns[mine, own].std(2)
+            told = active[mine, own] & (sd > HELD)
+            if told.any(1).sum() < FEWEST:
+                continue
+            scale = np.where(told, 1.0 / np.where(told, sd, 1.0), 0.0)
+            drives = level_name(component).removesuffix("_std")
+            own_noises = smoothed[mine, own] * scale, columns[mine, own] * scale[:, :, None]
+            order = getattr(component, "next_order", Component.next_order)
+            yield Driven(name, drives, type(component).__name__, order, *own_noises)
 
 
 def _kurtosis(noises: np.ndarray) -> np.ndarray:

@@ -114,8 +114,8 @@ def _errors(
         states, z = tuple(x[run] for x in true), spread[cell] * unit[run]
         measured = model.with_values(model.sample(At(states, z, start.levels[run]), keys[run]))
         found = smooth_tracks(measured, jax.tree.map(lambda leaf: leaf[run], start), ITERATIONS)
-        pairs = zip(found.states, states, spans, strict=True)
-        squares = [jnp.sum((x - x_true)[:, a:b] ** 2) for x, x_true, (a, b) in pairs]
+        parts = model.each_layout(found.states, states, spans)
+        squares = [jnp.sum((x - true)[:, slice(*span)] ** 2) for _, x, true, span in parts]
         return jnp.sum(jnp.stack(squares)) / sum(x.shape[0] for x in states)
 
     pairs = jnp.stack(jnp.meshgrid(jnp.arange(cells), jnp.arange(runs), indexing="ij"), -1).reshape(-1, 2)

@@ -95,6 +95,12 @@ def factors(part: Recursion, levels: jax.Array) -> jax.Array:
     return part.L * scale[:, None, :]
 
 
+def driven_states(part: Recursion, levels: jax.Array, noises: jax.Array) -> jax.Array:
+    """States (E, n) of one recursion that whitened noises (E, n) drive at log levels (H,)."""
+    path = rec.trajectory(part.F, factors(part, levels), part.drift[:, :, None], noises[:, :, None])
+    return path[:, :, 0]
+
+
 def log_likelihood(model: Model, point: Where) -> jax.Array:
     """Log-likelihood of all data at a point, with the tilt of the model."""
     beside = jnp.zeros(()) if model.tilt is None else model.tilt.value(point.z)

@@ -182,9 +182,8 @@ def _directions(answer: Answer) -> tuple[Direction, ...]:
 
 def linear_form(answer: Answer) -> bool:
     """Whether the states of an answer are those of linear motions, as what follows gauges needs them."""
-    return all(
-        x.shape == u.shape for x, u in zip(answer.posterior.point.states, answer.posterior.point.noises, strict=True)
-    )
+    states, noises = jax.tree.map(np.shape, answer.posterior.point.trajectories)
+    return states == noises
 
 
 def _advised(answer: Answer, directions: Sequence[Direction]) -> str:
@@ -318,4 +317,5 @@ def _many_tracks(problem: Problem, found: Calibrated) -> tuple[list[Tracks], Poi
     before = settle_each(problem.model, grid_start(problem, jnp.asarray(problem.first_z), 30))
     after = settle_each(problem.model, grid_start(problem, z, 30))
     variances = settled_variances(problem.model, after, found.root)
-    return [Tracks(np.asarray(x), np.sqrt(own)) for x, own in zip(after.states, variances, strict=True)], before, after
+    tracks = problem.model.each(lambda _, x, own: Tracks(np.asarray(x), np.sqrt(own)), after.states, variances)
+    return list(tracks), before, after

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -19,6 +20,7 @@ from probcal.gaussian.places import tilt_at
 from probcal.gaussian.sparse_mode import SparseSystem, system_at
 from probcal.inference.sparse import SparsePosterior
 from probcal.lazy import Later
+from probcal.model.model import Recursion
 from probcal.model.motions import level_logs
 from probcal.model.rows import Linearised
 from probcal.modes.grid import follow_states, track_mode
@@ -26,7 +28,7 @@ from probcal.priors import Precision
 from probcal.problem import Epochs, Problem
 from probcal.results.answer import Answer
 from probcal.results.blocks import SensorBlocks
-from probcal.results.groups import datum_of, gather, weight_name
+from probcal.results.groups import datum_of, gather, weights_of_tails
 from probcal.results.read import each_track
 from probcal.results.schema import matrix_of
 
@@ -132,21 +134,20 @@ def identified(problem: Problem, fit: xr.DataTree, answer: Answer | None) -> tup
 
 def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
     """The problem with the precisions of its process noise that the tracks of a tree hold."""
-    names = [[weight_name(problem, r, k) for k in range(len(p.tails))] for r, p in enumerate(problem.model.recursions)]
-    return problem.with_mixing(
-        tuple(
-            tuple(jnp.asarray(saved_by_epoch(epochs, tracked, name, "process noise")) for name in own)
-            for epochs, own in zip(problem.epochs, names, strict=True)
-        )
-    )
+
+    def saved(part: Recursion, epochs: Epochs) -> tuple[jax.Array, ...]:
+        names = weights_of_tails(part)
+        return tuple(jnp.asarray(saved_by_epoch(epochs, tracked, name, "process noise")) for name in names)
+
+    return problem.with_mixing(problem.model.each(saved, problem.epochs))
 
 
 def saved_by_epoch(epochs: Epochs, tracked: dict[str, xr.Dataset], name: str, what: str) -> np.ndarray:
     """A variable of the tracks of a tree at the epochs of a recursion, (E, ...)."""
     parts = []
-    for target in dict.fromkeys(np.asarray(epochs.target, str).tolist()):
+    for target, mine in epochs.members.items():
         own = tracked.get(target)
-        if own is None or name not in own or own.sizes["time"] != int((epochs.target == target).sum()):
+        if own is None or name not in own or own.sizes["time"] != mine.sum():
             raise InputError(f"assess: the tree was fitted with other {what}; give the problem as it was fitted")
         parts.append(own[name].values)
     return np.concatenate(parts)

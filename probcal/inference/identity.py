@@ -81,7 +81,7 @@ def data_digest(problem: Problem) -> str:
 def model_digest(problem: Problem) -> str:
     """Digest of sensors (functions and their constants), noise, motion, network, biases and what is fixed."""
     found = hashlib.sha256()
-    for block, rows in zip(problem.model.blocks, problem.model.rows, strict=True):
+    for block, rows, _ in problem.model.each_block():
         found.update(_code(block, rows, len(problem.levels)).encode())
         for name, leaf in rows._asdict().items():
             if name not in ("y", "mask"):

@@ -21,8 +21,7 @@ from numpyro import distributions as dist
 from probcal.errors import InputError, nearest
 from probcal.gaussian.frame import frame_at
 from probcal.gaussian.information import at_levels
-from probcal.gaussian.mode import Point, factors
-from probcal.gaussian.recursion import trajectory
+from probcal.gaussian.mode import Point, driven_states
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
 from probcal.inference.pose import pilot
 from probcal.inference.posed import Form, Posed
@@ -190,9 +189,8 @@ class NumpyroModel:
             s = suffix(self.problem, r)
             unit = Mixed(of, r) if part.tails else dist.Normal(jnp.zeros_like(part.drift), 1.0).to_event()
             u = numpyro.sample(f"noise{s}", unit)
-            x = trajectory(part.F, factors(part, levels), part.drift[:, :, None], u[:, :, None])[:, :, 0]
-            states.append(numpyro.deterministic(f"state{s}", x))
-        for site, block, own, r in zip(self.sites, of.blocks, of.rows, of.recursion, strict=True):
+            states.append(numpyro.deterministic(f"state{s}", driven_states(part, levels, u)))
+        for block, own, r, site in of.each_block(self.sites):
             predicted = rows.predict(block, own, states[r], z)
             numpyro.sample(site, Measured(block, own, predicted, levels), obs=given[site] if observed else None)
 

@@ -16,10 +16,11 @@ import numpy as np
 
 from probcal import linalg
 from probcal.gaussian.frame import log_weight, place, unit_normals, volume
-from probcal.gaussian.mode import Point, factors
-from probcal.gaussian.recursion import trajectory
+from probcal.gaussian.mode import Point, driven_states
 from probcal.inference.leaps import Place
 from probcal.inference.posed import Form, Posed, log_prior
+from probcal.model.model import Recursion
+from probcal.model.trajectories import Trajectories
 from probcal.problem import Problem
 
 SIZES = (2.0, 0.5, 0.1)  # of a proposal, in sd along the direction by the frame: one of them by lot
@@ -85,9 +86,8 @@ class Orbit:
     def moved(self, posed: Posed, r: jax.Array, point: Point) -> Point:
         """The point moved by r, its noises those of the moved trajectories at the moved levels."""
         levels = point.levels.at[jnp.asarray(self.levels, int)].add(r) if self.levels else point.levels
-        states, noises = self.states(r, point.states), []
-        parts = zip(posed.model.recursions, states, point.noises, self.pinned, strict=True)
-        for part, x, u, inverse in parts:
+
+        def moved(x: jax.Array, u: jax.Array, part: Recursion, inverse: jax.Array) -> tuple[jax.Array, jax.Array]:
             old, new = (
                 jnp.concatenate([jnp.exp(own), jnp.ones(1)])[part.level] / jnp.sqrt(part.weight)
                 for own in (point.levels, levels)
@@ -95,8 +95,10 @@ class Orbit:
             before = jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
             source = x - part.drift - jnp.einsum("eij,ej->ei", part.F, before)
             idle = jnp.einsum("eij,ej->ei", part.L, old * u)  # columns that reach no state stay as they are
-            noises.append((old * u + jnp.einsum("eij,ej->ei", inverse, source - idle)) / new)
-        return Point(states, tuple(noises), self.biases(r, point.z), levels)
+            return x, (old * u + jnp.einsum("eij,ej->ei", inverse, source - idle)) / new
+
+        tracks = Trajectories(self.states(r, point.states), point.noises)
+        return Point(tracks.map(moved, posed.model.recursions, self.pinned), self.biases(r, point.z), levels)
 
 
 def roam(form: Form, posed: Posed, at: Place, key: jax.Array) -> tuple[Place, jax.Array]:
@@ -176,15 +178,24 @@ def orbits_of(problem: Problem, posed: Posed, covariance: np.ndarray) -> tuple[O
 VECTORS = ("position", "velocity", "acceleration")
 
 
+def _entries_of(problem: Problem, spans: tuple[Any, ...]) -> tuple[np.ndarray, ...]:
+    """Mask (n,) of the state entries of vectors, for each recursion."""
+
+    def of(part: Recursion, own: Any) -> np.ndarray:
+        mine = np.zeros(part.drift.shape[1], bool)
+        for start, stop, _ in own:
+            mine[start:stop] = True
+        return mine
+
+    return problem.model.each(of, spans)
+
+
 def _levels(problem: Problem, spans: tuple[Any, ...]) -> tuple[int, ...]:
     """Unknown levels of the process noise of places, which belong to nothing else."""
     found: set[int] = set()
     other: set[int] = set()
     H = len(problem.levels)
-    for part, own in zip(problem.model.recursions, spans, strict=True):
-        mine = np.zeros(part.drift.shape[1], bool)
-        for start, stop, _ in own:
-            mine[start:stop] = True
+    for part, mine in problem.model.each_layout(_entries_of(problem, spans)):
         L, level = np.asarray(part.L) != 0, np.asarray(part.level)
         inside, outside = L[:, mine].any(1), L[:, ~mine].any(1)
         found |= set(level[inside & ~np.asarray(part.first)[:, None]].tolist())
@@ -197,10 +208,7 @@ def _levels(problem: Problem, spans: tuple[Any, ...]) -> tuple[int, ...]:
 def _entries(problem: Problem, spans: tuple[Any, ...], levels: tuple[int, ...]) -> int:
     """Whitened noises that grow with the scene: those of vectors, without those whose level grows along."""
     count = 0
-    for part, own in zip(problem.model.recursions, spans, strict=True):
-        mine = np.zeros(part.drift.shape[1], bool)
-        for start, stop, _ in own:
-            mine[start:stop] = True
+    for part, mine in problem.model.each_layout(_entries_of(problem, spans)):
         active = (np.asarray(part.L)[:, mine] != 0).any(1)
         count += int((active & ~np.isin(np.asarray(part.level), levels)).sum())
     return count
@@ -212,9 +220,9 @@ def _tried(orbits: tuple[Orbit, ...], posed: Posed, point: Point) -> list[tuple[
     found = []
     for orbit in orbits:
         moved, miss = orbit.moved(posed, jnp.asarray(0.1), point), jnp.zeros(())
-        for part, x, u in zip(posed.model.recursions, moved.states, moved.noises, strict=True):
-            again = trajectory(part.F, factors(part, moved.levels), part.drift[:, :, None], u[:, :, None])[:, :, 0]
-            own = jnp.max(jnp.abs(again - x)) / (1.0 + jnp.max(jnp.abs(x)))
+        for part, x, u in posed.model.each_layout(*moved.trajectories):
+            off = driven_states(part, moved.levels, u) - x
+            own = jnp.max(jnp.abs(off)) / (1.0 + jnp.max(jnp.abs(x)))
             miss = jnp.maximum(miss, jnp.where(jnp.isfinite(own), own, jnp.inf))
         turn = jax.jvp(lambda r, o=orbit: o.biases(r, point.z), (jnp.zeros(()),), (jnp.ones(()),))[1]
         found.append((miss, turn))

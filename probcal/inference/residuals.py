@@ -20,7 +20,7 @@ from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import Eliminated, Point, factors
 from probcal.inference.fitted import Fitted, Judged, JudgedLarge
 from probcal.lazy import Later
-from probcal.model.model import Data, Model
+from probcal.model.model import Data, Model, Recursion
 from probcal.model.rows import Linearised, standardised
 from probcal.noise import Bernoulli, Normal
 
@@ -104,13 +104,13 @@ def _whiten(
     """Innovations (N, C, K) of columns of unit-noise data (N, C, K) with drifts (E, n, K) of the states."""
     unit = [lin._replace(state=jnp.sqrt(lin.weight)[:, :, None] * lin.state) for lin in lins]
     pulls = model.onto_states(unit, columns)
-    predicted, corrected = [], []
-    for part, known, pull, drift in zip(model.recursions, filters, pulls, drifts, strict=True):
+
+    def corrected(part: Recursion, known: Filter, pull: jax.Array, drift: jax.Array) -> jax.Array:
         found = rec.predict(part.F, known.gain, pull, drift)
-        predicted.append(found.states)
         # what S^-1/2 takes off each datum
-        corrected.append(found.states - known.mix @ (known.gain.data @ found.innovation))
-    return jax.tree.map(jnp.subtract, columns, model.by_state(unit, corrected))
+        return found.states - known.mix @ (known.gain.data @ found.innovation)
+
+    return jax.tree.map(jnp.subtract, columns, model.by_state(unit, model.each(corrected, filters, pulls, drifts)))
 
 
 @jax.jit
@@ -135,7 +135,7 @@ def _innovations(
     kept = [1.0 + lin.weight * own for lin, own in zip(lins, mixed, strict=True)]
     drifts = [
         jnp.pad(-(factors(part, point.levels) @ u[:, :, None]), ((0, 0), (0, 0), (0, root.shape[1])))
-        for part, u in zip(model.recursions, point.noises, strict=True)
+        for part, u in model.each_layout(point.noises)
     ]
     white = _whiten(model, lins, filters, tuple(columns), drifts)
     return [(c[:, :, 0], jnp.sum(c[:, :, 1:] ** 2, 2), k) for c, k in zip(white, kept, strict=True)]
@@ -167,8 +167,8 @@ def exact_kurtosis(fit: Judged, kurtosis: np.ndarray) -> np.ndarray:
     """Excess kurtosis (D,), that of yes-or-no data in closed form, 1 / (p q) - 6: replicas may lack
     a rare event."""
     answers = [
-        np.broadcast_to([isinstance(noise, Bernoulli) for noise in noises], lin.weight.shape)
-        for noises, lin in zip(fit.problem.model.noises, fit.lins, strict=True)
+        np.broadcast_to([isinstance(channel.noise, Bernoulli) for channel in block.channels], lin.weight.shape)
+        for block, _, _, lin in fit.problem.model.each_block(fit.lins)
     ]
     variance = fit.flat([lin.weight for lin in fit.lins])
     return np.maximum(np.where(fit.flat(answers), 1 / np.maximum(variance, 1e-12) - 6, kurtosis), -2.0)

@@ -24,9 +24,7 @@ from probcal.inference.residuals import LAGGED, NOTABLE, PRACTICAL, Channels, In
 from probcal.lazy import Later
 from probcal.misfit import rejection_text
 from probcal.model.model import Data, Model
-from probcal.model.motions import by_component, linear_of
 from probcal.model.rows import Linearised
-from probcal.motion import as_motion
 from probcal.motion.base import level_name
 from probcal.priors import Precision
 from probcal.problem import Problem
@@ -120,18 +118,15 @@ def unmoved(fit: Fitted) -> str:
     variance.
     """
     problem, found = fit.problem, dict[str, float]()
-    parts = zip(problem.epochs, problem.model.recursions, fit.point.noises, fit.at.trajectories, strict=True)
-    for epochs, part, noises, own in parts:
-        expected = np.where(np.asarray(part.L).any(1), 1.0 - np.asarray(own.spread), 0.0)
-        for name in dict.fromkeys(epochs.target):
-            mine = (epochs.target == name) & ~np.asarray(part.first)
-            components = linear_of(as_motion(problem.target(name).motion))
-            for component, _, columns in by_component(components, problem.network.dimension):
-                told = float(expected[mine, columns].sum())
-                if told >= residuals.FEWEST:
-                    square = float(np.sum(np.asarray(noises)[mine, columns] ** 2)) / told
-                    drives = level_name(component).removesuffix("_std")
-                    found[f'the {drives} noise of target "{name}"'] = square
+    spreads = [own.spread for own in fit.at.trajectories]
+    for name, _, part, noises, spread in problem.tracks(problem.model.recursions, fit.point.noises, spreads):
+        expected = np.where(part.L.any(1), 1.0 - spread, 0.0)
+        for component, columns in problem.noise_columns(name):
+            told = float(expected[~part.first, columns].sum())
+            if told >= residuals.FEWEST:
+                square = float(np.sum(noises[~part.first, columns] ** 2)) / told
+                drives = level_name(component).removesuffix("_std")
+                found[f'the {drives} noise of target "{name}"'] = square
     name, square = min(found.items(), key=lambda pair: pair[1], default=("", 1.0))
     if square > UNMOVED:
         return ""
@@ -156,7 +151,7 @@ def _errors(
         for own, along, lin in zip(noise, model.by_bias(lins, biases), lins, strict=True)
     ]
     pulls = model.onto_states(unit, columns)
-    parts = zip(model.recursions, solved.parts, pulls, strict=True)
+    parts = model.each_layout(solved.parts, pulls)
     return [jnp.mean(rec.smooth(part.F, kept.gain, pull).states ** 2, 2) for part, kept, pull in parts]
 
 

@@ -43,6 +43,10 @@ class Seen(NamedTuple):
     std: jax.Array  # (P, C)
     level: jax.Array  # (P, C)
 
+    def rows_of(self, data: Rows) -> Rows:
+        """The rows of a block at this epoch alone, from all its rows."""
+        return data._replace(epoch=jnp.zeros_like(self.sensor), **self._asdict())
+
 
 class Epoch(NamedTuple):
     """One epoch of one target, or a stack of K of them along the leading axis of every array."""
@@ -202,7 +206,7 @@ class Stepwise(Loops):
         """
         found = []
         for block, data, _, seen, value in self.each_block(epoch.rows, predicted):
-            here = _rows_at(data, seen)
+            here = seen.rows_of(data)
             whole = jnp.broadcast_to(value, here.y.shape)
             there = here.mask > 0
             off = jnp.where(there, waist.difference(block, here.y, whole), 0.0)
@@ -217,7 +221,7 @@ class Stepwise(Loops):
         """Blocks, their rows at an epoch, and the state (1, n) of the target that they see."""
         found = []
         for block, data, r, seen in self.each_block(epoch.rows):
-            here = _rows_at(data, seen)
+            here = seen.rows_of(data)
             mine = jax.tree.map(lambda leaf, k=epoch.target[r]: leaf[k][None], x[r])
             found.append((block, here, self.vectors(r, mine)))
         return found
@@ -227,6 +231,10 @@ class Stepwise(Loops):
         form = self.sampled[r]
         return states if form is None else jax.vmap(form.vector)(states)
 
+    def vectors_of(self, states: tuple[Any, ...]) -> tuple[jax.Array, ...]:
+        """What rows read of the states of each recursion, (E, n)."""
+        return tuple(map(self.vectors, range(len(states)), states))
+
     def check_linear(self) -> None:
         """Raise `InputError` where a motion has no linear form, so that there are no Jacobians by its state."""
         for form in self.sampled:
@@ -235,11 +243,6 @@ class Stepwise(Loops):
                     f"{type(form.others[0]).__name__} has no linear form, so that nothing is linearised by its state;"
                     " use predict and log_likelihood, which jax differentiates by biases and levels"
                 )
-
-
-def _rows_at(data: Rows, seen: Seen) -> Rows:
-    """The rows of a block at one epoch, of which there is only this one."""
-    return data._replace(epoch=jnp.zeros_like(seen.sensor), **seen._asdict())
 
 
 def _mean(states: jax.Array, move: Move, target: jax.Array) -> jax.Array:

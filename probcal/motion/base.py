@@ -298,10 +298,10 @@ class Joint(Motion):
     others: tuple[Motion, ...]
 
     def __post_init__(self):
-        check_once((name for part in self.parts for name in part.levels), "level")
+        check_once((name for part in self.motions for name in part.levels), "level")
 
     @property
-    def parts(self) -> tuple[Motion, ...]:
+    def motions(self) -> tuple[Motion, ...]:
         """The motions in the order of the state."""
         return self.others if self.vector is None else (self.vector, *self.others)
 
@@ -313,7 +313,7 @@ class Joint(Motion):
     @property
     def levels(self) -> dict[str, Level]:
         """Noise levels of all parts."""
-        return {name: level for part in self.parts for name, level in part.levels.items()}
+        return {name: level for part in self.motions for name, level in part.levels.items()}
 
     def loose(self) -> tuple[Any, Start] | None:
         """The loose motions of all parts, side by side."""
@@ -331,7 +331,7 @@ class Joint(Motion):
 
     def view(self, state: Any) -> dict[str, Any]:
         """Components of all parts by name."""
-        found = [part.view(own) for part, own in zip(self.parts, state, strict=True)]
+        found = [part.view(own) for part, own in zip(self.motions, state, strict=True)]
         check_once(name for own in found for name in own)
         return {name: value for own in found for name, value in own.items()}
 
@@ -343,12 +343,12 @@ class Joint(Motion):
 
     def sample(self, key: jax.Array, state: Any, dt: Any, levels: Mapping[str, Any]) -> tuple[Any, ...]:
         """State of each part after `dt` seconds."""
-        keys = jax.random.split(key, len(self.parts))
-        return tuple(part.sample(k, own, dt, levels) for part, k, own in zip(self.parts, keys, state, strict=True))
+        keys = jax.random.split(key, len(self.motions))
+        return tuple(part.sample(k, own, dt, levels) for part, k, own in zip(self.motions, keys, state, strict=True))
 
     def log_density(self, before: Any, state: Any, dt: Any, levels: Mapping[str, Any]) -> jax.Array:
         """Sum of the log densities of the parts."""
-        triples = zip(self.parts, before, state, strict=True)
+        triples = zip(self.motions, before, state, strict=True)
         return sum((part.log_density(old, new, dt, levels) for part, old, new in triples), jnp.zeros(()))
 
     def log_initial(self, state: Any, start: Start = NO_START) -> jax.Array:

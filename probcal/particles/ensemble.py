@@ -27,6 +27,18 @@ class Ensemble(NamedTuple):
     log_evidence: jax.Array  # () of all targets
     lost: tuple[jax.Array, ...]  # (E,) whether no particle could have given the rows of an epoch
 
+    def path(self, n: Any) -> tuple[Any, ...]:
+        """States (E leading) of each recursion along path n."""
+        return jax.tree.map(lambda leaf: leaf[:, n], self.states)
+
+    def row_weights(self, model: Model, n: Any) -> list[jax.Array]:
+        """Weight (N,) of path n at the epoch of each row, for each block; 0 beyond the last path."""
+        count = self.weights[0].shape[1]
+        return [
+            jnp.where(n < count, self.weights[r][data.epoch, jnp.minimum(n, count - 1)], 0.0)
+            for _, data, r in model.each_block()
+        ]
+
 
 class StateMoments(NamedTuple):
     """What rows see of the states of one recursion."""
@@ -114,22 +126,30 @@ def conditional_ensemble(
 
 def first_paths(targets: tuple[Targets, ...], found: Ensemble) -> tuple[Any, ...]:
     """One path (T, K, 1, ...) of each recursion out of many."""
-    pairs = zip(targets, found.states, strict=True)
-    return tuple(
-        jax.tree.map(lambda leaf, own=own: along_targets(own.place, leaf[:, 0])[:, :, None], states)
-        for own, states in pairs
-    )
+    return jax.tree.map(lambda leaf: leaf[:, :, None], _by_target(targets, found.path(0)))
+
+
+def _by_target(targets: tuple[Targets, ...], states: tuple[Any, ...]) -> tuple[Any, ...]:
+    """States (E leading) of each recursion as (T, K, ...)."""
+    pairs = zip(targets, states, strict=True)
+    return tuple(jax.tree.map(partial(along_targets, own.place), path) for own, path in pairs)
+
+
+@jax.jit
+def vectors_of(model: Model, states: tuple[Any, ...]) -> tuple[jax.Array, ...]:
+    """What rows see of particles (E, N leading) of each recursion, (E, N, n)."""
+    return jax.vmap(model.vectors_of, 1, 1)(states)
 
 
 @jax.jit
 def state_moments(model: Model, found: Ensemble) -> tuple[StateMoments, ...]:
     """Mean and variance of what rows see of the states of each recursion."""
-    parts = []
-    for r, (states, weights) in enumerate(zip(found.states, found.weights, strict=True)):
-        seen = jax.vmap(partial(model.vectors, r))(states)  # (E, N, n)
+
+    def moments(_: Any, seen: jax.Array, weights: jax.Array) -> StateMoments:
         mean = jnp.einsum("en,enu->eu", weights, seen)
-        parts.append(StateMoments(mean, jnp.einsum("en,enu->eu", weights, (seen - mean[:, None]) ** 2)))
-    return tuple(parts)
+        return StateMoments(mean, jnp.einsum("en,enu->eu", weights, (seen - mean[:, None]) ** 2))
+
+    return model.each(moments, vectors_of(model, found.states), found.weights)
 
 
 @jax.jit
@@ -137,18 +157,17 @@ def nearest_states(model: Model, found: Ensemble) -> tuple[Any, ...]:
     """States (E leading) that stand for the particles: their mean, or, of a motion without linear form, the particle
     that is nearest to the mean of all that rows see, in units of its sd, so that it is on the road (Paper A 43).
     """
-    chosen = []
-    for r, (states, weights) in enumerate(zip(found.states, found.weights, strict=True)):
-        if model.sampled[r] is None:
-            chosen.append(jnp.einsum("en,enu->eu", weights, states))
-            continue
-        seen = jax.vmap(partial(model.vectors, r))(states)
+
+    def nearest(_: Any, states: Any, seen: jax.Array, weights: jax.Array, form: Any) -> Any:
+        if form is None:
+            return jnp.einsum("en,enu->eu", weights, states)
         off = seen - jnp.einsum("en,enu->eu", weights, seen)[:, None]
         variance = jnp.einsum("en,enu->eu", weights, off**2)[:, None]
         away = jnp.sum(off**2 / jnp.maximum(variance, 1e-12), 2)
         best = jnp.argmin(jnp.where(weights > 0, away, jnp.inf), 1)
-        chosen.append(jax.tree.map(lambda leaf, k=best: jax.vmap(lambda own, j: own[j])(leaf, k), states))
-    return tuple(chosen)
+        return jax.tree.map(lambda leaf: jax.vmap(lambda own, j: own[j])(leaf, best), states)
+
+    return model.each(nearest, found.states, vectors_of(model, found.states), found.weights, model.sampled)
 
 
 def at_states(model: Model, states: tuple[Any, ...], z: jax.Array, levels: jax.Array) -> Expectation:
@@ -170,18 +189,12 @@ def over_paths(
     count = -(-N // AT_ONCE)
 
     def one(n: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        there = n < N
-        k = jnp.minimum(n, N - 1)
-        at = At(tuple(jax.tree.map(lambda leaf: leaf[:, k], own) for own in found.states), z, levels)
-        shares = [
-            jnp.where(there, found.weights[r][data.epoch, k], 0.0)
-            for data, r in zip(model.rows, model.recursion, strict=True)
-        ]
+        at, shares = At(found.path(jnp.minimum(n, N - 1)), z, levels), found.row_weights(model, n)
         lins = model.linearise_biases(at, expected=True)
         information, score = model.of_biases(scaled(lins, [share[:, None] for share in shares]))
         if observed:
             information = model.curvature_by_biases(at, shares)
-        return information, score, jnp.where(there, score * N, 0.0)
+        return information, score, jnp.where(n < N, score * N, 0.0)
 
     def some(carry: Any, k: jax.Array) -> tuple[Any, None]:
         information, score, each = jax.vmap(one)(k * AT_ONCE + jnp.arange(AT_ONCE))
@@ -202,16 +215,9 @@ def log_likelihood_over(model: Model, found: Ensemble, z: jax.Array, levels: jax
     N = found.weights[0].shape[1]
 
     def one(n: jax.Array) -> jax.Array:
-        k, there = jnp.minimum(n, N - 1), n < N
-        states = tuple(jax.tree.map(lambda leaf: leaf[:, k], own) for own in found.states)
-        parts = zip(model.rows, model.recursion, model.log_likelihood(At(states, z, levels)), strict=True)
-        return sum(
-            (
-                jnp.sum(jnp.where(there, found.weights[r][data.epoch, k], 0.0)[:, None] * part)
-                for data, r, part in parts
-            ),
-            jnp.zeros(()),
-        )
+        told = model.log_likelihood(At(found.path(jnp.minimum(n, N - 1)), z, levels))
+        pairs = zip(found.row_weights(model, n), told, strict=True)
+        return sum((jnp.sum(share[:, None] * part) for share, part in pairs), jnp.zeros(()))
 
     def some(total: jax.Array, k: jax.Array) -> tuple[jax.Array, None]:
         return total + jnp.sum(jax.vmap(one)(k * AT_ONCE + jnp.arange(AT_ONCE))), None
@@ -221,8 +227,7 @@ def log_likelihood_over(model: Model, found: Ensemble, z: jax.Array, levels: jax
 
 def log_motion_over(targets: tuple[Targets, ...], found: Ensemble, levels: jax.Array) -> jax.Array:
     """Log density () of the steps of all targets expected over paths: by it the levels of process noise are learnt."""
-    parts = zip(targets, found.states, strict=True)
-    paths = tuple(jax.tree.map(lambda leaf, own=own: along_targets(own.place, leaf), states) for own, states in parts)
+    paths = _by_target(targets, found.states)
 
     def one(n: jax.Array) -> jax.Array:
         alone = jax.tree.map(lambda leaf: leaf[:, :, n][:, :, None], paths)

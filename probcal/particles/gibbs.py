@@ -29,7 +29,7 @@ from probcal.inference.posterior import Chains, conclude_draws
 from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
-from probcal.model.model import At, Model
+from probcal.model.model import At, Model, Recursion
 from probcal.modes.grid import follow_states, track_mode
 from probcal.particles.conditional import conditional_path
 from probcal.particles.em import climb
@@ -225,7 +225,7 @@ class ParticleGibbs(Sampler):
             """Log density of each group."""
             total = jnp.zeros(groups).at[held.group].add(-0.5 * z * (prior @ z))
             told = held.model.log_likelihood(At(at, z, levels))
-            for data, part, own in zip(held.model.rows, told, held.of_sensor, strict=True):
+            for _, data, _, part, own in held.model.each_block(told, held.of_sensor):
                 total = total.at[own[data.sensor]].add(jnp.sum(part, 1))
             return total
 
@@ -286,11 +286,11 @@ def groups_of(model: Model, coupling: np.ndarray) -> tuple[jax.Array, tuple[jax.
 
 def states_of(held: Held, paths: tuple[Any, ...]) -> tuple[Any, ...]:
     """States (E leading) of each recursion along paths (T, K, 1, ...)."""
-    found = []
-    for own, part, recursion in zip(held.targets, paths, held.model.recursions, strict=True):
-        E = recursion.time.shape[0]
-        found.append(jax.tree.map(lambda leaf, own=own, E=E: place_by_epoch(own.place, leaf[:, :, 0], E), part))
-    return tuple(found)
+
+    def states(part: Recursion, own: Targets, path: Any) -> Any:
+        return jax.tree.map(lambda leaf: place_by_epoch(own.place, leaf[:, :, 0], part.time.shape[0]), path)
+
+    return held.model.each(states, held.targets, paths)
 
 
 @partial(jax.jit, static_argnames=("method", "form"))
@@ -306,7 +306,7 @@ def run_particle_sweeps(method: ParticleGibbs, form: Form, held: Held, chain: Gi
         given = conditional(form, held.natural, sample.phi)
         variance = given.variance[:M]
         gamma = jnp.clip(1.0 - given.alpha[:M] * variance, 0.0, 1.0)
-        vectors = tuple(held.model.vectors(r, x) for r, x in enumerate(states_of(held, chain.paths)))
+        vectors = held.model.vectors_of(states_of(held, chain.paths))
         density = sample.joint + log_prior(form, held.natural, sample.theta, sample.phi)
         return chain, Draw(sample.theta, sample.phi, gamma, variance, vectors, density, sample.stats)
 

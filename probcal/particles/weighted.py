@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
@@ -22,7 +21,14 @@ from probcal.labels import listed
 from probcal.misfit import rejection_text
 from probcal.model.model import Model
 from probcal.modes.grid import follow_states, track_mode
-from probcal.particles.ensemble import Ensemble, ensemble, nearest_states, observed_over_paths, state_moments
+from probcal.particles.ensemble import (
+    Ensemble,
+    ensemble,
+    nearest_states,
+    observed_over_paths,
+    state_moments,
+    vectors_of,
+)
 from probcal.particles.proposals import check_proposal
 from probcal.particles.settings import ParticleSettings, check_installed
 from probcal.particles.targets import Targets, targets_of
@@ -124,8 +130,7 @@ class Paths:
         moments, single, model, walked = [], [], self.problem.model, self.along_paths()
         for k, own in enumerate(z):
             found = walked.at(own, levels, jax.random.fold_in(key, k))
-            first = tuple(jax.tree.map(lambda leaf: leaf[:, 0], x) for x in found.states)  # paths come in no order
-            single.append([np.asarray(x) for x in single_vectors(model, first)])
+            single.append([np.asarray(x) for x in single_vectors(model, found.path(0))])  # paths come in no order
             moments.append([(np.asarray(m.mean), np.asarray(m.variance)) for m in state_moments(model, found)])
         tracks = []
         for column in zip(*moments, strict=True):
@@ -309,16 +314,7 @@ def regressed_scores(away: np.ndarray, scores: np.ndarray, logs: np.ndarray, pri
     return ScoreSlope(information, 0.5 * np.sqrt(variance) / np.diag(covariance), K)
 
 
-@jax.jit
-def vectors_of(model: Model, states: tuple[Any, ...]) -> tuple[jax.Array, ...]:
-    """What rows see of particles (E, N leading) of each recursion."""
-    return tuple(jax.vmap(partial(model.vectors, r))(x) for r, x in enumerate(states))
-
-
-@jax.jit
-def single_vectors(model: Model, states: tuple[Any, ...]) -> tuple[jax.Array, ...]:
-    """What rows see of states (E leading) of each recursion."""
-    return tuple(model.vectors(r, x) for r, x in enumerate(states))
+single_vectors = jax.jit(Model.vectors_of)
 
 
 @jax.jit
@@ -456,8 +452,8 @@ def judged_tracks(problem: Problem, point: Point, found: Ensemble) -> tuple[Stat
 def fewest(found: Ensemble) -> int:
     """The least number of different smoothed particles at any epoch."""
     least = 10**9
-    for states, weights in zip(found.states, found.weights, strict=True):
-        columns = [np.asarray(leaf).reshape(*weights.shape, -1) for leaf in jax.tree.leaves(states)]
+    for r, weights in enumerate(found.weights):
+        columns = [np.asarray(leaf).reshape(*weights.shape, -1) for leaf in jax.tree.leaves(found.states[r])]
         together, heavy = np.concatenate(columns, 2), np.asarray(weights) > 1e-6
         for there, epoch in zip(heavy, together, strict=True):
             least = min(least, len(np.unique(epoch[there], axis=0)))
@@ -468,12 +464,10 @@ def unexplained(problem: Problem, point: Point) -> str:
     """A sentence on targets whose rows no path explains, or on rejected sensors; else empty."""
     squares, there = squares_by_epoch(problem.model, point)
     found = []
-    for epochs, square, count in zip(problem.epochs, squares, there, strict=True):
-        for name in dict.fromkeys(epochs.target):
-            mine = epochs.target == name
-            mean = float(np.asarray(square)[mine].sum() / max(np.asarray(count)[mine].sum(), 1))
-            if not mean <= ABSURD:
-                found.append((mean, str(name)))
+    for name, _, square, count in problem.tracks(squares, there):
+        mean = float(square.sum() / max(count.sum(), 1))
+        if not mean <= ABSURD:
+            found.append((mean, name))
     if not found:
         return rejection_text(rejected(problem, point))
     named = listed([f'"{name}"' for _, name in sorted(found, reverse=True)])

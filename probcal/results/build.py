@@ -101,7 +101,7 @@ def _sample(draws: Draws) -> dict[str, Any]:
 
 def bands(tracks: Sequence[Tracks], before: Point) -> list[Band]:
     """Tracks with their means without calibration."""
-    return [Band(own.mean, own.sd, np.asarray(old)) for own, old in zip(tracks, before.states, strict=True)]
+    return [Band(own.mean, own.sd, np.asarray(before.states[r])) for r, own in enumerate(tracks)]
 
 
 def _posterior_group(answer: Answer, draws: Draws) -> xr.Dataset:
@@ -268,10 +268,7 @@ def add_mirrors(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
     }
     names = [other.name for other in others]
     group = xr.Dataset(values, coords={"mirror": names, **bias_coords(problem)}, attrs={"same": SAME})
-    places = [
-        np.stack([np.asarray(other.point.states[r])[:, slice(*epochs.position)] for other in others])
-        for r, epochs in enumerate(problem.epochs)
-    ]
+    places = [np.stack(own) for own in zip(*(problem.positions(other.point.states) for other in others), strict=True)]
     axes = {"axis": list(AXES[: problem.network.dimension])}
     tracks = by_target(problem, {"position": (("mirror", "time", "axis"), places)}, axes)
     tree["mirror"] = xr.DataTree.from_dict({"/": group, **{f"track/{name}": own for name, own in tracks.items()}})

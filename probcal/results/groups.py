@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import numpy as np
 
 from probcal.geodesy import GEODETIC
 from probcal.labels import AXES
 from probcal.lazy import Later
+from probcal.model.model import Recursion
 from probcal.results.views import view_variables
 
 if TYPE_CHECKING:
@@ -104,22 +106,22 @@ def track_groups(
     if len(states):
         columns["state"] = (("chain", "draw", "time", "component"), states)
     found = by_target(problem, columns, chains or {})
-    for r, (part, epochs) in enumerate(zip(problem.model.recursions, problem.epochs, strict=True)):
-        for k, tail in enumerate(part.tails):
-            for name in dict.fromkeys(epochs.target):
-                weight = np.asarray(tail.weight)[epochs.target == name]
-                found[node_of(name)][weight_name(problem, r, k)] = ("time", weight)
+    for name, _, weights in problem.tracks(map(weights_of_tails, problem.model.recursions)):
+        for variable, weight in weights.items():
+            found[node_of(name)][variable] = ("time", weight)
     return {f"track/{name}": group for name, group in found.items()}
 
 
-def weight_name(problem: Problem, r: int, k: int) -> str:
-    """What the precisions of tail k of recursion r are called: what it drives, and a number where several families do.
+def weights_of_tails(part: Recursion) -> dict[str, jax.Array]:
+    """Precisions (E,) of the noise of each tail, named by what it drives, with a number where several families do.
 
     1 is what is declared; an epoch of 0.1 has noise of three times the std.
     """
-    tails = problem.model.recursions[r].tails
-    twin = [tail.name for tail in tails[:k]].count(tails[k].name)
-    return f"weight_{tails[k].name}{f'_{1 + twin}' if twin else ''}"
+    found: dict[str, jax.Array] = {}
+    for k, tail in enumerate(part.tails):
+        twin = [other.name for other in part.tails[:k]].count(tail.name)
+        found[f"weight_{tail.name}{f'_{1 + twin}' if twin else ''}"] = tail.weight
+    return found
 
 
 def node_of(target: str) -> str:

@@ -62,10 +62,7 @@ def _grid(problem: Problem, point: Point) -> tuple[np.ndarray, np.ndarray, float
         labels = [f"{node.name}.position_{axis}" for axis in AXES[:d]]
         moved = [z[problem.labels.index(label)] if label in problem.labels else 0.0 for label in labels]
         parts.append((node.position + moved)[None] if node.path is None else node.path.position)
-    flown = [
-        np.asarray(problem.model.vectors(r, point.states[r]))[:, slice(*epochs.position)]
-        for r, epochs in enumerate(problem.epochs)
-    ]
+    flown = problem.positions(problem.model.vectors_of(point.states))
     whole = np.concatenate([*parts, *flown])
     whole = whole[np.isfinite(whole).all(1)]
     low, high = whole.min(0)[:2], whole.max(0)[:2]
@@ -83,7 +80,7 @@ def _over(problem: Problem, point: Point, s: int, grid: tuple[np.ndarray, np.nda
     x, y, height = grid
     flat = [part.ravel() for part in np.meshgrid(x, y)]
     places = np.stack([*flat, np.full(len(flat[0]), height)][: problem.network.dimension], 1)
-    for block, data, index, r in zip(model.blocks, model.rows, problem.row_index, model.recursion, strict=True):
+    for block, data, r, index in model.each_block(problem.row_index):
         mine = np.flatnonzero(problem.measurements.sensor[index] == s)
         if len(mine):
             one = {name: np.asarray(getattr(data, name))[mine[:1]] for name in Seen._fields}

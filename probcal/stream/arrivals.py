@@ -247,7 +247,7 @@ class Arrivals:
         owners: list[list[np.ndarray]] = [[np.zeros((len(time), 0, 2), int)] for _ in model.recursions]
         numbers: list[list[np.ndarray]] = [[np.zeros((len(time), 0, 2))] for _ in model.recursions]
         first = np.cumsum([0, *(len(s.type.expand(network.dimension)) for s in network.sensors)])
-        for block_rows, block, r, size in zip(found.rows, model.rows, model.recursion, self.sizes, strict=True):
+        for _, block, r, block_rows, size in model.each_block(found.rows, self.sizes):
             mine, epoch = np.flatnonzero(seen)[block_rows], place[starts[r] + np.asarray(block.epoch)]
             row[mine] = epoch
             there, C = np.asarray(block.mask) > 0, block.mask.shape[1]

@@ -9,8 +9,7 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
-from probcal.gaussian.mode import Point, factors
-from probcal.gaussian.recursion import trajectory
+from probcal.gaussian.mode import Point, driven_states
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form
 from probcal.model.model import Model
@@ -49,13 +48,9 @@ def draw_prior(form: Form, model: Model, first: Precision, key: jax.Array) -> Si
     z = inverse.T @ jax.random.normal(keys[1], alpha.shape)
     z = jnp.where(form.hierarchy.active(phi, form.biases), z, 0.0)
     levels = model.level_spread * jax.random.normal(keys[2], model.level_spread.shape)
-    states, noises = [], []
-    for r, part in enumerate(model.recursions):
-        noise = model.draw_noises(keys[3], r, 1)[:, :, 0]
-        path = trajectory(part.F, factors(part, levels), part.drift[:, :, None], noise[:, :, None])
-        states.append(path[:, :, 0])
-        noises.append(noise)
-    point = Point(tuple(states), tuple(noises), z, levels)
+    noises = tuple(model.draw_noises(keys[3], r, 1)[:, :, 0] for r in range(len(model.recursions)))
+    states = model.each(lambda part, u: driven_states(part, levels, u), noises)
+    point = Point(states, noises, z, levels)
     return SimulatedTruth(phi, point, draw_data(model, point, keys[4]))
 
 
@@ -68,7 +63,7 @@ def draw_data(model: Model, point: Point, key: jax.Array) -> tuple[jax.Array, ..
 def far_start(problem: Problem) -> float:
     """How wide the start of a target is, in extents of the network: above 1 the prior's tracks pass far from it."""
     widest = 0.0
-    for part, epochs in zip(problem.model.recursions, problem.epochs, strict=True):
+    for part, epochs in problem.model.each_layout(problem.epochs):
         begins = ~np.asarray(part.F).any((1, 2))
         spread = np.sqrt((np.asarray(part.L) ** 2).sum(2))[begins][:, slice(*epochs.position)]
         widest = max(widest, float(spread.max(initial=0.0)))

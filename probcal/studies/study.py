@@ -129,10 +129,9 @@ def _given(method: Maximiser, prior: Prior, run: _Run, oracle: bool) -> Given:
 def _position_rmse(run: _Run, states: Sequence[np.ndarray]) -> float:
     """Root mean square position error in m over the epochs that the truth covers, NaN if it covers none."""
     squares = []
-    for epochs, x, true in zip(run.problem.epochs, states, run.places, strict=True):
-        span = slice(*epochs.position)
+    for place, true in zip(run.problem.positions(states), run.places, strict=True):
         known = np.isfinite(true).all(1)
-        squares.append(((x[:, span] - true)[known] ** 2).sum(1))
+        squares.append(((place - true)[known] ** 2).sum(1))
     joined = np.concatenate(squares)
     return float(np.sqrt(joined.mean())) if len(joined) else np.nan
 

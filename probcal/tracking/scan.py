@@ -59,7 +59,7 @@ def watch_of(problem: Problem) -> tuple[Watch, tuple[View, ...]]:
     of_type = {network.types.index(block.type): b for b, block in enumerate(model.blocks)}
     told = [network.sensors[s].detection for s in scans.sensor]
     numbers, rows, density = [], [], []
-    for data_, block, index, names in zip(model.rows, model.blocks, own.row_index, own.columns, strict=True):
+    for block, data_, _, index, names in model.each_block(own.row_index, own.columns):
         of = scans.of_row[index]
         size = int(np.bincount(of, minlength=K).max())
         rows.append(padded_rows(data_, of, K, size, data_, block))
@@ -118,7 +118,7 @@ def detected(model: Model, scan: Scan, views: tuple[View, ...], x: jax.Array, z:
             return jnp.ones(())
         seen = scan.epoch.rows[b]
         first = Seen(*(leaf[:1] for leaf in seen))
-        data = model.rows[b]._replace(epoch=jnp.zeros(1, int), **first._asdict())
+        data = first.rows_of(model.rows[b])
         return jnp.clip(jnp.asarray(look(model.blocks[b], data, model.vectors(0, x[None]), z, view)[0], float), 0, 1)
 
     pairs = [(b, view) for b in range(len(model.blocks)) for view in views]

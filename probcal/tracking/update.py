@@ -48,7 +48,7 @@ def rows_from(model: Model, scan: Scan, x: jax.Array, at: Biases) -> SlotRows:
     lins = model.linearise_at(scan.epoch, (x[None],), at.z, at.levels)
     told = model.log_likelihood_at(scan.epoch, (x[None],), at.z, at.levels)
     density, score, information = [], [], []
-    for lin, part, data, seen in zip(lins, told, model.rows, scan.epoch.rows, strict=True):
+    for _, data, _, seen, lin, part in model.each_block(scan.epoch.rows, lins, told):
         wide = _biased(data, seen, lin, at)
         there = lin.weight > 0
         share = 1.0 / (1.0 + lin.weight * wide)  # of the information that is left
@@ -110,10 +110,8 @@ def updated_by_points(
     values = jax.vmap(lambda x: model.predict_at(scan.epoch, (x[None],), at.z))(points)
     lins = model.linearise_at(scan.epoch, (mean[None],), at.z, at.levels)  # its derivatives by the biases
     density, information, pull = [], [], []
-    for block, data, seen, lin, centre, value in zip(
-        model.blocks, model.rows, scan.epoch.rows, lins, centres, values, strict=True
-    ):
-        here = data._replace(epoch=jnp.zeros_like(seen.sensor), **seen._asdict())
+    for block, data, _, seen, lin, centre, value in model.each_block(scan.epoch.rows, lins, centres, values):
+        here = seen.rows_of(data)
         there = seen.mask > 0
         off = jnp.where(there[None], waist.difference(block, value, centre[None]), 0.0)  # (2 n, D, C)
         middle = jnp.mean(off, 0)

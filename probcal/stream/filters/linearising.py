@@ -32,13 +32,8 @@ def centre(belief: Augmented, own: Slots) -> About:
 
 def here(model: Model, epoch: Epoch, r: int) -> list[tuple[int, Block, Rows]]:
     """Blocks that see recursion r, with their rows at an epoch."""
-    found = []
-    for b, (block, data, own, seen) in enumerate(
-        zip(model.blocks, model.rows, model.recursion, epoch.rows, strict=True)
-    ):
-        if own == r:
-            found.append((b, block, data._replace(epoch=jnp.zeros_like(seen.sensor), **seen._asdict())))
-    return found
+    blocks = enumerate(model.each_block(epoch.rows))
+    return [(b, block, seen.rows_of(data)) for b, (block, data, own, seen) in blocks if own == r]
 
 
 def linearised(model: Model, epoch: Epoch, r: int, at: About, levels: jax.Array, odds: float = 0.0) -> list[WhiteRow]:

@@ -186,7 +186,7 @@ def _one_scan(
         lins = model.linearise_at(scan.epoch, (x[None],), fit.z, levels)
         told = model.log_likelihood_at(scan.epoch, (x[None],), fit.z, levels)
         found = []
-        for data, seen, lin, own in zip(model.rows, scan.epoch.rows, lins, told, strict=True):
+        for _, data, _, seen, lin, own in model.each_block(scan.epoch.rows, lins, told):
             there = lin.weight > 0
             variance = jnp.where(there, 1.0 / jnp.where(there, lin.weight, 1.0), 1.0)
             bias = jnp.zeros((*lin.bias.shape[:2], len(fit.z) + 1))
