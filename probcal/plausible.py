@@ -274,9 +274,10 @@ def _sizes(column: Column) -> Iterator[Doubt]:
     if size == 0.0:
         return
     std, own = data.std[rows, j], np.maximum(np.abs(value), 1e-300)
+    huge = rows[(std < NARROW * size) & (std < NARROW * own)]
 
     def why(words: str, row: int) -> str:
-        return (
+        return _jump(column, huge, row) or (
             f"{column.where(row, '_std')} a std of {data.std[row, j]:g} is many orders of magnitude {words} than the"
             f" values (here {data.value[row, j]:.3g}); check the units of both, or leave the cell blank"
         )
@@ -286,3 +287,20 @@ def _sizes(column: Column) -> Iterator[Doubt]:
         ("larger", std > WIDE * size, std > WIDE * own),
     ):  # of large values that make a proper std small, their row is named
         yield Doubt(rows[off & alone if (off & alone).any() else off], partial(why, words))
+
+
+def _jump(column: Column, huge: np.ndarray, row: int) -> str:
+    """The one jump that parts the rows `huge` of a sensor from its others; empty without one."""
+    data, j = column.data, column.number
+    mine = column.rows[data.sensor[column.rows] == data.sensor[row]]
+    mine = mine[np.argsort(data.time[mine], kind="stable")]
+    edges = np.flatnonzero(np.diff(np.isin(mine, huge)))
+    if len(edges) != 1:
+        return ""
+    k = int(edges[0]) + 1
+    before, after = (float(np.median(data.value[part, j])) for part in (mine[:k], mine[k:]))
+    return (
+        f"{column.where(row)} the values of {data.table.frame['sensor'].iloc[row]} jump at"
+        f" {data.time[mine[k]]:.6g} s from about {before:.3g} to {after:.3g} {column.channel.unit};"
+        " correct its clock or counter there, or leave out the rows on one side"
+    )

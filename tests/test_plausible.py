@@ -69,7 +69,11 @@ EPOCH = 1.7e9  # s since 1970, in 2023
         (lambda d: d.assign(range_std=1e12), "many orders of magnitude larger"),
         (
             lambda d: d.assign(range=d["range"] + np.where(d["time"] > 6.0, 1.07e11, 0.0), range_std=40.0),
-            'row 21 column "range_std": a std of 40 is many orders of magnitude smaller than the values (here 1.07e+',
+            'row 21 column "range": the values of radar_0 jump at 7 s from about 45.3 to 1.07e+11 m; correct its clock',
+        ),
+        (
+            lambda d: d.assign(range=d["range"] + np.where(d["time"] % 2 > 0, 1.07e11, 0.0), range_std=40.0),
+            'row 3 column "range_std": a std of 40 is many orders of magnitude smaller than the values (here 1.07e+',
         ),
         (
             lambda d: kilometres(d).assign(range_std=1.0),
