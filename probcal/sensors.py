@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.geometry import bearing, elevation, norm
-from probcal.noise import Bernoulli
+from probcal.noise import Bernoulli, Mixture, Unknown
 from probcal.sensor import Bias, Channel, sensor
 
 CLOSE = 1e-3  # m, distance below which a level or a direction no longer changes
@@ -60,6 +60,22 @@ def flight_time(target, pose, *, range_offset=Bias("m", 1.0)):
     The clock is known unless its node frees it; where it does, fix the range_offset.
     """
     return dict(range=norm(target.position - pose.position) + pose.clock + range_offset)
+
+
+@sensor(
+    range=Channel(
+        "m",
+        std=Unknown(0.1),
+        noise=Mixture(Unknown(0.1), Unknown(5.0), late="exponential"),
+    ),
+)
+def uwb(target, pose, *, range_offset=Bias("m", 0.3, zeros="none")):
+    """Ultra-wideband range |p - s| + range_offset + noise, of which some come late, by reflection.
+
+    The noise is normal. With an unknown probability the direct path is blocked, which adds an
+    exponential delay (Guvenc and Chong 2009). The offset is an antenna delay, which is never zero.
+    """
+    return dict(range=norm(target.position - pose.position) + range_offset)
 
 
 @sensor(range_rate=Channel("m/s", std=0.5))
@@ -216,6 +232,26 @@ def camera_3d(
     """Column and row of a pinhole image, in focal lengths right of and below the principal point (as `camera`)."""
     column, row = _image(pose.local(target.position))
     return dict(column=(1 + focal_scale) * column + principal_column, row=(1 + focal_scale) * row + principal_row)
+
+
+@sensor(column=Channel("1", std=0.002), row=Channel("1", std=0.002))
+def rolling_camera(
+    target,
+    pose,
+    *,
+    line_delay=Bias("s", 0.01, nominal=0.02),
+    focal_scale=Bias("1", 0.02),
+):
+    """Pinhole image of a camera at rest with a rolling shutter (Oth and others 2013).
+
+    A row of the image is exposed line_delay * row seconds after that of the principal point, whose
+    time is stated: row = image(p(t + line_delay * row)). `line_delay` is that of one focal length.
+    """
+    late = 0.0
+    for _ in range(3):  # each step divides the error by the focal lengths crossed in one delay
+        column, row = (1 + focal_scale) * _image(pose.local(target.at(late).position))
+        late = line_delay * row
+    return dict(column=column, row=row)
 
 
 @sensor(present=Channel("1", noise=Bernoulli()))

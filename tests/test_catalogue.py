@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from contracts import check_tree, only
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import probcal
@@ -55,11 +56,12 @@ MOMENT = RandomWalk("moment", "A m2", 20.0, (0.0, 5000.0), per_axis=True)
 EXTRAS = {"toa": EMISSION, "rss": POWER, "rss_slope": POWER, "sound": POWER, "magnetometer": MOMENT,
           "magnetometer_3d": MOMENT, "microphone": RandomWalk("sound_power", "dB", 0.2, (60.0, 5.0)),
           "geophone": RandomWalk("ground_power", "dB", 0.2, (60.0, 5.0))}  # fmt: skip
-DIMENSIONS = {"ranger": (2, 3), "flight_time": (2, 3), "doppler": (2, 3), "toa": (2, 3), "tdoa": (2, 3), "doa": (2, 3),
-              "doa_3d": (3,), "radar": (2, 3), "radar_3d": (3,), "rss": (2, 3), "rss_slope": (2, 3),
-              "rss_difference": (2, 3), "sound": (2, 3), "microphone": (2, 3), "geophone": (2, 3),
-              "magnetometer": (2,), "magnetometer_3d": (3,), "camera": (2, 3), "camera_3d": (3,), "presence": (2, 3),
-              "position": (2, 3), "cross_track": (2, 3), "altitude": (3,)}  # fmt: skip
+DIMENSIONS = {"ranger": (2, 3), "flight_time": (2, 3), "uwb": (2, 3), "doppler": (2, 3), "toa": (2, 3),
+              "tdoa": (2, 3), "doa": (2, 3), "doa_3d": (3,), "radar": (2, 3), "radar_3d": (3,), "rss": (2, 3),
+              "rss_slope": (2, 3), "rss_difference": (2, 3), "sound": (2, 3), "microphone": (2, 3), "geophone": (2, 3),
+              "magnetometer": (2,), "magnetometer_3d": (3,), "camera": (2, 3), "camera_3d": (3,),
+              "rolling_camera": (3,), "presence": (2, 3), "position": (2, 3), "cross_track": (2, 3),
+              "altitude": (3,)}  # fmt: skip
 # Types that see too little of a target by themselves: their nodes carry ranges too. A dipole in space falls off so
 # steeply that the automatic start from magnetometers alone misses the track in 2 of 8 seeds.
 HELPED = ("doppler", "cross_track", "altitude", "magnetometer_3d")
@@ -387,8 +389,9 @@ def one_row(kind, nodes, state, time=5.0):
 
 @partial(jax.jit, static_argnums=0)
 def evaluate(block, data, states, z):
-    """Predicted channels of the rows, and what is linearised there."""
-    return rows.predict(block, data, states, z), rows.linearise(block, data, states, z, states[0, :0], expected=True)
+    """Predicted channels of the rows, and what is linearised there, noise levels at their guesses."""
+    levels = jax.numpy.zeros(sum(len(own.number) for own in block.unknown) + 1)
+    return rows.predict(block, data, states, z), rows.linearise(block, data, states, z, levels, expected=True)
 
 
 def evaluated(kind, nodes, state, biases, time=5.0):
@@ -464,11 +467,22 @@ def local(d, heading=0.9):
     return np.array([[c, s], [-s, c]]) @ LINE[2] if d == 2 else AXES.inv().apply(LINE[3])
 
 
+def exposed(delay):
+    """Column and row, enlarged by 2 %, at the instant at which the row is exposed, by Brent's method."""
+
+    def seen(t):
+        line = AXES.inv().apply(LINE[3] + t * np.array(V[3]))
+        return 1.02 * -line[1:] / line[0]
+
+    return seen(brentq(lambda t: delay * seen(t)[1] - t, -1.0, 1.0, xtol=1e-14))
+
+
 STATED = {"heading": 0.8, "pitch": 0.2, "roll": -0.1}
 TURNED = {"a.heading": 0.1, "a.pitch": 0.05}
 FORMULAS = {
     "ranger": (2, {}, {}, {"it.range_offset": 2.0, "it.range_scale": 0.1}, lambda: [1.1 * 50 + 2]),
     "flight_time": (3, {"clock": 5.0}, {}, {"a.clock": 1.5, "it.range_offset": 2.0}, lambda: [FAR[3] + 6.5 + 2]),
+    "uwb": (2, {}, {}, {"it.range_offset": 2.0}, lambda: [52]),
     "toa": (2, {"clock": 5.0}, {"emission": 100.0}, {"a.clock": 1.5}, lambda: [50 + 100 + 6.5]),
     "tdoa": (2, {"clock": 5.0}, {}, {"it.difference_offset": 1.0, "a.clock": 1.5}, lambda: [30 - 50 + 4 - 6.5 + 1]),
     "doppler": (3, {}, {}, {"it.rate_offset": 0.4}, lambda: [LINE[3] @ V[3] / FAR[3] + 0.4]),
@@ -495,6 +509,7 @@ FORMULAS = {
                lambda: [1.02 * np.tan(0.9 - np.arctan2(4, 3)) + 0.01]),
     "camera_3d": (3, STATED, {}, TURNED | {"it.focal_scale": 0.02, "it.principal_column": 0.01},
                   lambda: 1.02 * -local(3)[1:] / local(3)[0] + [0.01, 0]),
+    "rolling_camera": (3, STATED, {}, TURNED | {"it.line_delay": 0.03, "it.focal_scale": 0.02}, lambda: exposed(0.05)),
     "presence": (2, {}, {}, {"it.radius": 1.0, "it.width": 0.5}, lambda: [(11 - 50) / 2.5]),
     "position": (3, STATED, {}, TURNED, lambda: local(3)),
     "cross_track": (2, {"heading": 0.8}, {}, {"a.heading": 0.1}, lambda: [40 * np.cos(0.9) - 30 * np.sin(0.9)]),
@@ -642,6 +657,6 @@ def test_gradients_are_finite_where_a_target_stands_on_a_node():
         states[:, :d] = CORNERS[d]
         b = [block.type for block in problem.model.blocks].index(kind)
         with jax.enable_x64(True):
-            arrays = (jax.numpy.asarray(states), jax.numpy.zeros(len(problem.labels)), jax.numpy.zeros(0))
+            arrays = map(jax.numpy.asarray, (states, np.zeros(len(problem.labels)), np.zeros(len(problem.levels))))
             lin = LINEARISE(problem.model.blocks[b], problem.model.rows[b], *arrays, expected=True)
         assert all(np.isfinite(np.asarray(part)).all() for part in lin), name
