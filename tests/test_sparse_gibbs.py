@@ -285,6 +285,25 @@ def test_a_chain_leaves_where_the_model_has_no_density():
         assert not np.array_equal(at, density.at)
 
 
+def test_a_turn_that_diverges_ends_before_numbers_overflow(monkeypatch):
+    """Beside the Gaussian stands a quartic, steeper than kicks can follow: the turn is refused."""
+    problem = worlds.linear("plane")[0]
+    with jax.enable_x64(True):
+        density = density_of(problem, jax.tree.map(jnp.asarray, worlds.resting(problem)))
+        given = _Given.of(density, np.ones(problem.model.biases))
+
+        def quartic(self, at):
+            return -1e6 * np.sum((at - self.at) ** 4), -4e6 * (at - self.at) ** 3
+
+        monkeypatch.setattr(JointDensity, "rest", quartic)
+        start = density.at + 1.0
+        with np.errstate(over="raise", invalid="raise"):
+            at, rest, rate, _ = given.turned(start, quartic(density, start)[0], 64, np.random.default_rng(0))
+    assert rate == 0.0
+    assert rest == quartic(density, start)[0]
+    assert np.array_equal(at, start)
+
+
 @pytest.mark.ci
 def test_chains_that_take_no_turn_are_no_answer(monkeypatch):
     turned = _Given.turned

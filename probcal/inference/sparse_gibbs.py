@@ -232,7 +232,10 @@ class _Given:
             c, s = whole if 0 < k < kicks else half
             step, speed = c * step + s * speed, c * speed - s * step
             if k < kicks:
-                speed = speed + angle * self.factor.solve(self.density.rest(self.mean + step)[1])
+                value, slope = self.density.rest(self.mean + step)
+                if not abs(value) < 1e100:  # nats: it diverges, and so does the turn back
+                    return at, rest, 0.0, begun
+                speed = speed + angle * self.factor.solve(slope)
         there, _ = self.density.rest(self.mean + step)
         gain = before - (self.energy(step, speed) - there)
         rate = float(np.exp(min(gain, 0.0))) if np.isfinite(gain) else float(np.isfinite(there) > np.isfinite(rest))
