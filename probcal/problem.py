@@ -395,8 +395,8 @@ class Problem:
         """
         data, frame = self.measurements, self.measurements.table.frame.copy()
         value = data.value.copy()
-        for channels, index, mask, new in zip(self.columns, self.row_index, self.model.measured, y, strict=True):
-            there = np.asarray(mask) > 0
+        for _, rows, _, channels, index, new in self.model.each_block(self.columns, self.row_index, y):
+            there = np.asarray(rows.mask) > 0
             for c, name in enumerate(channels):
                 value[index[there[:, c]], data.channels.index(name)] = np.asarray(new)[there[:, c], c]
         names, units = header(data.table)

@@ -75,7 +75,7 @@ MUTATIONS = [
     # model/model.py
     Mutation("jnp.where(tail.on, tail.family.mixing_information(tail.size), 1.0)", "jnp.ones_like(tail.weight)", "test_tails.py"),
     # results/groups.py
-    Mutation("mine = np.flatnonzero(owners == name)", "mine = np.flatnonzero(owners == owners[0])", "test_exact.py"),
+    Mutation("mine = np.flatnonzero(member[there])", "mine = np.flatnonzero((epochs.target == epochs.target[0])[there])", "test_exact.py"),
     # linalg.py
     Mutation("(seen / (1.0 + std))", "(seen / std)", "test_exact.py"),
     Mutation("least = LOST * jnp", "least = 1e7 * LOST * jnp", "test_diffuse.py"),

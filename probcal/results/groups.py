@@ -60,11 +60,10 @@ def datum_of(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
     data, network = problem.measurements, problem.network
     picks: list[Any] = []
     columns = []
-    parts = zip(problem.columns, problem.row_index, problem.model.measured, problem.model.values, strict=True)
-    for names_, index, there, values in parts:
-        where = np.nonzero(np.asarray(there))
+    for _, rows, _, names_, index in problem.model.each_block(problem.columns, problem.row_index):
+        where = np.nonzero(np.asarray(rows.mask))
         picks.append(where)
-        columns.append((index[where[0]], np.array(names_)[where[1]], np.asarray(values)[where]))
+        columns.append((index[where[0]], np.array(names_)[where[1]], np.asarray(rows.y)[where]))
     row = np.concatenate([c[0] for c in columns])
     names = np.array([s.name for s in network.sensors])
     coords = {
@@ -144,9 +143,9 @@ def by_target(
     found = dict[str, xr.Dataset]()
     for r, epochs in enumerate(problem.epochs):
         there = np.ones(len(epochs.time), bool) if kept is None else kept[r]
-        times, owners = epochs.time[there], np.asarray(epochs.target, str)[there]
-        for name in dict.fromkeys(np.asarray(epochs.target, str).tolist()):
-            mine = np.flatnonzero(owners == name)
+        times = epochs.time[there]
+        for name, member in epochs.members.items():
+            mine = np.flatnonzero(member[there])
             values = {
                 key: (dims, np.take(np.asarray(parts[r]), mine, dims.index("time")))
                 for key, (dims, parts) in variables.items()

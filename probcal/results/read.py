@@ -100,10 +100,7 @@ def tracks(tree: xr.DataTree) -> pd.DataFrame:
 
 def saved_states(problem: Problem, tracked: Mapping[str, xr.Dataset]) -> list[np.ndarray]:
     """Draws of the states (chain, draw, E, n) of each recursion that the tracks of a tree hold."""
-    return [
-        np.concatenate([tracked[name]["state"].values for name in dict.fromkeys(map(str, epochs.target))], 2)
-        for epochs in problem.epochs
-    ]
+    return [np.concatenate([tracked[name]["state"].values for name in epochs.members], 2) for epochs in problem.epochs]
 
 
 @checked

@@ -57,19 +57,18 @@ def _undone(problem: Problem, suspects: Sequence[str]) -> Iterator[tuple[str, Pr
         except InputError:
             continue
         yield f"the rows of {pair[0]} and {pair[1]} look exchanged: exchange their names", other
-    for block, (channels, rows) in enumerate(zip(problem.columns, problem.row_index, strict=True)):
+    blocks = enumerate(problem.model.each_block(problem.columns, problem.row_index))
+    for b, (block, data, _, channels, rows) in blocks:
         names = np.array([s.name for s in problem.network.sensors])[problem.measurements.sensor[rows]]
-        whole = f"all {problem.model.blocks[block].type.name} sensors", np.ones(len(rows), bool)
+        whole = f"all {block.type.name} sensors", np.ones(len(rows), bool)
         for c, name in enumerate(channels):
-            channel = problem.model.blocks[block].channels[c]
+            channel = block.channels[c]
             for owner, mine in (whole, *((own, names == own) for own in suspects)):
                 if not mine.any() or (owner != whole[0] and mine.all()):
                     continue
-                for cause, values in _values(
-                    np.asarray(problem.model.rows[block].y)[:, c], channel.unit, channel.period
-                ):
+                for cause, values in _values(np.asarray(data.y)[:, c], channel.unit, channel.period):
                     y = [np.array(rows.y) for rows in problem.model.rows]
-                    y[block][mine, c] = values[mine]
+                    y[b][mine, c] = values[mine]
                     yield f"values of {name} of {owner} {cause}", problem.redrawn(y)
 
 

@@ -713,8 +713,7 @@ class Online:
         if not self.check.lost:
             return batch.epochs
         begun, rows = [0] * len(batch.owners), list[Any]()
-        parts: Any = batch.epochs.rows
-        for seen, r in zip(parts, self._problem.model.recursion, strict=True):
+        for _, _, r, seen in self._problem.model.each_block(batch.epochs.rows):
             mask = np.asarray(seen.mask)
             size = mask.shape[1] * mask.shape[2]
             owner = batch.owners[r][:, begun[r] : begun[r] + size, 0].reshape(mask.shape)

@@ -193,12 +193,9 @@ def _middle(problem: Problem, point: Point, points: Points) -> dict[str, _Quanti
 
 def _position_rmse(problem: Problem, point: Point, points: Points) -> float:
     """Root mean square error in m of the mean positions, over all epochs."""
-    squares = []
-    for r, epochs in enumerate(problem.epochs):
-        span = slice(*epochs.position)
-        error = points.states[r][:, :, span].mean(0) - np.asarray(point.states[r])[:, span]
-        squares.append((error**2).sum(1))
-    return float(np.sqrt(np.concatenate(squares).mean()))
+    means = [draws.mean(0) for draws in points.states]
+    away = problem.positions(jax.tree.map(np.subtract, means, list(point.states)))
+    return float(np.sqrt(np.concatenate([(own**2).sum(1) for own in away]).mean()))
 
 
 def _effective(draws: np.ndarray, chains: int) -> tuple[float, float]:
