@@ -8,9 +8,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pandas as pd
 
+from probcal.gaussian.engine import Embedded, Estimate, Sampled
+from probcal.gaussian.linearised import linearise_rows
+from probcal.gaussian.mode import factors, find_tracks, log_likelihood, mixing_gain
+from probcal.model.model import scaled
 from probcal.motion import ConstantVelocity, Motion, RandomWalk, Static, White
 
 AXES = "xyz"
@@ -331,3 +336,154 @@ def kalman(problem, alpha):
         later, P_later = smoothed[0]
         smoothed.insert(0, (m + gain @ (later - ahead), P + gain @ (P_later - P_ahead) @ gain.T))
     return evidence, smoothed
+
+
+class NaiveEngine:
+    """A third engine: rows of whitened noises and biases as one dense matrix in NumPy, everything by its inverse."""
+
+    name, traceable = "naive", False
+
+    def at(self, model, point, rows=None):
+        return Naive(model, point, linearise_rows(model, point) if rows is None else rows)
+
+
+class Naive:
+    """The posterior at a point, as `gaussian.engine.Expansion`: variables are all whitened noises, then the biases."""
+
+    def __init__(self, model, point, rows):
+        self.model, self.point, self.rows, self.M = model, point, rows, model.biases
+        self.kept = None, None
+        self.maps, start = [], 0  # states (E, n, U) of each recursion by all noises
+        total = sum(part.drift.size for part in model.recursions)
+        for part in model.recursions:
+            E, n = part.drift.shape
+            own, L = np.zeros((E, n, total)), np.asarray(factors(part, point.levels))
+            for e in range(E):
+                own[e] = np.asarray(part.F[e]) @ own[e - 1]
+                own[e, :, start + e * n : start + (e + 1) * n] += L[e]
+            self.maps.append(own)
+            start += E * n
+        self.U, self.u = total, np.concatenate([np.asarray(u).ravel() for u in point.noises])
+        H, w, s = self.H, self.w, self.s = [], [], []
+        for block, data, r, lin in zip(model.blocks, model.rows, model.recursion, rows, strict=True):
+            for k in range(len(data.epoch)):
+                for c in range(data.y.shape[1]):
+                    row = np.zeros(total + self.M + 1)
+                    row[:total] = np.asarray(lin.state[k, c]) @ self.maps[r][int(data.epoch[k])][list(block.used)]
+                    np.add.at(row, total + np.asarray(data.bias[data.sensor[k]]), np.asarray(lin.bias[k, c]))
+                    H.append(row[:-1]), w.append(float(lin.weight[k, c])), s.append(float(lin.score[k, c]))
+        self.H, self.w, self.s = np.array(H), np.array(w), np.array(s)
+        self.joint = self.H.T @ (self.w[:, None] * self.H)
+        self.joint[: self.U, : self.U] += np.eye(self.U)
+        self.slope = self.H.T @ self.s
+        self.slope[: self.U] -= self.u
+        if model.tilt is not None:
+            self.joint[self.U :, self.U :] += np.asarray(model.tilt.curvature)
+            self.slope[self.U :] += np.asarray(model.tilt.pull(point.z))
+
+    def whole(self, factors):
+        found = self.joint.copy()
+        found[self.U :, self.U :] += np.asarray(factors.matrix(self.M))
+        return found
+
+    def covariance(self, factors):
+        if self.kept[0] is not factors:
+            self.kept = factors, np.linalg.inv(self.whole(factors))
+        return self.kept[1]
+
+    def density(self):
+        levels = np.sum((np.asarray(self.point.levels) / np.asarray(self.model.level_spread)) ** 2)
+        told = float(_told(self.model, self.point))
+        return told - 0.5 * (self.u @ self.u + levels + np.linalg.slogdet(self.joint[: self.U, : self.U])[1])
+
+    def score(self):
+        """By differences of the density, tracks at their mode."""
+
+        def density(z):
+            return Naive(self.model, *_settled(self.model, self.point, z)).density()
+
+        z, h = np.asarray(self.point.z), 1e-4
+        return np.array([(density(z + h * e) - density(z - h * e)) / (2 * h) for e in np.eye(self.M)])
+
+    def log_det(self, factors):
+        return Estimate(
+            np.linalg.slogdet(self.whole(factors))[1] - np.linalg.slogdet(self.joint[: self.U, : self.U])[1]
+        )
+
+    def solve(self, factors, right):
+        return self.covariance(factors)[self.U :, self.U :] @ np.asarray(right)
+
+    def apply(self, columns):
+        W, B = self.joint[: self.U, : self.U], self.joint[: self.U, self.U :]
+        return (self.joint[self.U :, self.U :] - B.T @ np.linalg.solve(W, B)) @ np.asarray(columns)
+
+    def moved(self, dz):
+        W, B = self.joint[: self.U, : self.U], self.joint[: self.U, self.U :]
+        return self._at(np.linalg.solve(W, self.slope[: self.U] - B @ np.asarray(dz)), dz)
+
+    def _at(self, du, dz):
+        noises, states, start = [], [], 0
+        for own, x, u in zip(self.maps, self.point.states, self.point.noises, strict=True):
+            noises.append(np.asarray(u) + du[start : start + x.size].reshape(x.shape))
+            states.append(np.asarray(x) + own @ du)
+            start += x.size
+        return self.point._replace(states=tuple(states), noises=tuple(noises), z=np.asarray(self.point.z) + dz)
+
+    def marginals(self, factors, members):
+        whole, M = np.zeros((self.M + 1,) * 2), self.M
+        whole[:M, :M] = self.covariance(factors)[self.U :, self.U :]
+        return whole[members[:, :, None], members[:, None, :]] + (members == M)[:, :, None] * np.eye(members.shape[1])
+
+    def states(self, factors):
+        own = self.covariance(factors)[: self.U, : self.U]
+        return tuple(part @ own @ part.transpose(0, 2, 1) for part in self.maps)
+
+    def noises(self, factors):
+        own, start = np.diag(self.covariance(factors)), 0
+        found = []
+        for x in self.point.states:
+            found.append(own[start : start + x.size].reshape(x.shape))
+            start += x.size
+        return tuple(found)
+
+    def _by_row(self, values):
+        cuts = np.cumsum([data.y.size for data in self.model.rows])[:-1]
+        return tuple(v.reshape(d.y.shape) for v, d in zip(np.split(values, cuts), self.model.rows, strict=True))
+
+    def predicted(self, factors):
+        return self._by_row(np.sum((self.H @ self.covariance(factors)) * self.H, 1))
+
+    def leverages(self, factors):
+        W, B = self.joint[: self.U, : self.U], self.joint[: self.U, self.U :]
+        follows = self.H[:, self.U :] - self.H[:, : self.U] @ np.linalg.solve(W, B)
+        own = self.covariance(factors)[self.U :, self.U :]
+        return self._by_row(self.w * np.sum((follows @ own) * follows, 1))
+
+    def sample(self, factors, key, count):
+        rng, P = np.random.default_rng(np.asarray(jax.random.key_data(key))), self.covariance(factors)
+        middle = self.moved(self.solve(factors, self.score() + np.asarray(factors.pull(self.point.z))))
+        drawn = rng.multivariate_normal(np.zeros(len(P)), P, count)
+        states = (np.asarray(x) + np.einsum("enu,du->den", own, drawn[:, : self.U])
+                  for own, x in zip(self.maps, middle.states, strict=True))  # fmt: skip
+        return Sampled(np.asarray(middle.z) + drawn[:, self.U :], tuple(states))
+
+    def weighed(self, weights):
+        return Naive(self.model.weighted(weights), self.point, scaled(self.rows, weights))
+
+    def embedded(self, factors, columns):
+        C = np.concatenate([np.asarray(own).reshape(-1, own.shape[2]) for own in columns])
+        across, P = self.H.T @ (self.w[:, None] * C), self.covariance(factors)
+        slope = self.slope.copy()
+        slope[self.U :] += np.asarray(factors.pull(self.point.z))
+        return Embedded(C.T @ (self.w[:, None] * C) - across.T @ P @ across, C.T @ self.s - across.T @ P @ slope)
+
+
+@jax.jit
+def _told(model, point):
+    return log_likelihood(model, point) + mixing_gain(model)
+
+
+def _settled(model, point, z):
+    """Point at biases z with its tracks at their mode, and rows linearised there."""
+    at = find_tracks(model, point._replace(z=jax.numpy.asarray(z)), 50, 1e-13)
+    return at, linearise_rows(model, at)

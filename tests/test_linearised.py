@@ -35,19 +35,17 @@ def test_solves_are_those_of_numpy(precision):
         solves = Dense.of(matrix)
         return (
             solves.solve(right), solves.solve(right[:, 0]), solves.apply(right), solves.log_determinant(),
-            solves.marginals(), solves.covariance(), solves.block(jnp.asarray([4, 1])), *solves.smallest(2),
+            solves.marginals(), solves.covariance(),
         )  # fmt: skip
 
     with jax.enable_x64(True):
-        *found, values, vectors = answers(jnp.asarray(precision), jnp.asarray(right))
+        found = answers(jnp.asarray(precision), jnp.asarray(right))
     expected = (
         covariance @ right, covariance @ right[:, 0], precision @ right, np.linalg.slogdet(precision)[1],
-        np.diag(covariance), covariance, covariance[np.ix_([4, 1], [4, 1])],
+        np.diag(covariance), covariance,
     )  # fmt: skip
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9)
-    np.testing.assert_allclose(values, np.linalg.eigvalsh(precision)[:2], rtol=1e-9)
-    np.testing.assert_allclose(precision @ np.asarray(vectors), np.asarray(vectors) * np.asarray(values), atol=1e-9)
 
 
 def test_draws_of_solves_have_their_covariance(precision):
@@ -70,7 +68,7 @@ def test_one_linearisation_has_all_moments():
         at = linearise(problem.model, mode)
         found, again = jax.jit(at.laplace)(prior), laplace(problem.model, mode, prior)
         leverages = sum(float(np.sum(part)) for part in at.leverages(found.covariance))
-        marginals = jax.jit(lambda: at.given(prior).marginals())()
+        marginals = jax.jit(lambda: Dense.of(at.information + prior.matrix()).marginals())()
     order = [naive.labels.index(label) for label in problem.labels]
     np.testing.assert_allclose(found.covariance, known.z[1][np.ix_(order, order)], rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(found.evidence, known.evidence, rtol=1e-10)

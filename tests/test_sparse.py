@@ -28,7 +28,7 @@ from probcal.gaussian.products import Products
 from probcal.gaussian.room import check_room
 from probcal.geometry import bearing, norm
 from probcal.inference import calibrate
-from probcal.inference.sparse import gains_by_sparse, takes_sparse
+from probcal.inference.blockwise import gains_by_sparse, takes_sparse
 from probcal.modes import automatic_start
 from probcal.results.blocks import covariance_of
 
@@ -46,7 +46,7 @@ def dense():
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 def test_the_sparse_form_ends_where_the_dense_one_does(library, dense, monkeypatch):
     """Means within 1e-4 sds; variances, tracks and evidence exact, or within 6 standard errors where estimated."""
-    monkeypatch.setattr("probcal.inference.sparse.exact", lambda: library is Cholmod)
+    monkeypatch.setattr("probcal.inference.blockwise.exact", lambda: library is Cholmod)
     sparse = fitted(pc.MAP(form="sparse"), pc.Gaussian())
     a, b = (tree["calibration"].to_dataset() for tree in (dense, sparse))
     assert sparse.attrs["status"] == dense.attrs["status"] == "converged"
@@ -378,7 +378,7 @@ def test_forms_are_words():
 
 
 def test_precisions_need_exact_variances(monkeypatch):
-    monkeypatch.setattr("probcal.inference.sparse.exact", lambda: False)
+    monkeypatch.setattr("probcal.inference.blockwise.exact", lambda: False)
     with pytest.raises(InputError, match=r"install probcal\[sparse\], or take MAP"):
         fitted(pc.EA(form="sparse"))
 
@@ -530,23 +530,38 @@ def test_a_network_that_ran_along_what_no_row_tells_is_no_answer():
 
 
 @pytest.mark.ci
-def test_observability_of_many_biases_is_that_of_few(monkeypatch):
-    """Shares, sds, leverages, tracks and what is open, without a matrix of all biases."""
+@pytest.mark.parametrize("whole", [True, False], ids=["a matrix of all", "screened"])
+@pytest.mark.parametrize("anchored", [True, False], ids=["anchored", "unanchored"])
+def test_observability_by_the_sparse_engine_is_that_by_the_dense_one(whole, anchored, monkeypatch):
+    """Shares, sds, leverages, tracks, what is open and what removes it, with a matrix of all biases and without."""
     pytest.importorskip("sparsax", reason="sparsax is an extra")
-    problem = drawn()[0]
+    problem = drawn()[0] if anchored else pc.Problem(unanchored()[0], MOTION["car"], unanchored()[1])
     with jax.enable_x64(True):
         point = automatic_start(problem)
     wanted = pc.observability(problem, point=point)
-    monkeypatch.setattr(sys.modules["probcal.analysis.observability"], "too_large", lambda model: True)
+    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 0)
+    if not whole:
+        monkeypatch.setattr("probcal.gaussian.choose.WHOLE", 0)
     found = pc.observability(problem, point=point)
     for group, names in {"bias": ("share", "sd"), "datum": ("leverage",), "sensor": ("leverage",)}.items():
         for name in names:
             np.testing.assert_allclose(found[group][name], wanted[group][name], rtol=1e-5, atol=1e-7)
     assert found["bias"]["verdict"].values.tolist() == wanted["bias"]["verdict"].values.tolist()
     assert found["target"].attrs["motion"] == pytest.approx(wanted["target"].attrs["motion"], abs=1e-5)
-    np.testing.assert_allclose(found["track/mast"]["sd"], wanted["track/mast"]["sd"], rtol=1e-6)
+    np.testing.assert_allclose(found["track/car"]["sd"], wanted["track/car"]["sd"], rtol=1e-6)
     assert found.attrs["status"] == wanted.attrs["status"]
-    assert set(found["direction"]["direction"].values) == set(wanted["direction"]["direction"].values)
+    own, other = (tree["direction"].to_dataset().sortby("direction") for tree in (found, wanted))
+    common = "all nodes" if not (whole or anchored) else ""  # of single sensors a screen names what all share, too
+    assert {d for d in own["direction"].values if common in d} == {d for d in other["direction"].values if common in d}
+    assert not any("not verified" in text for text in own["remedy"].values.tolist())
+    if whole:
+        if anchored:  # without the null space of the rows a gauge is one direction by itself
+            assert own["remedy"].values.tolist() == other["remedy"].values.tolist()
+            assert own["kind"].values.tolist() == other["kind"].values.tolist()
+        np.testing.assert_allclose(found["bias"]["information"], wanted["bias"]["information"], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(found["spectrum"]["information"], wanted["spectrum"]["information"], atol=1e-5)
+    else:
+        assert "rigid motions, common shifts" in found.attrs["screened"]
 
 
 @pytest.mark.ci
@@ -667,10 +682,10 @@ def test_surveys_of_many_biases_tell_what_those_of_few_do(monkeypatch):
     assert few.attrs["looked"] < found.attrs["looked"]
     assert few["anchor"].values[0] == found["anchor"].values[0]
     for module, ask, said in (
-        ("planning", pc.next_anchors, "next_anchors of 15 biases needs exact variances"),
-        ("observability", pc.observability, "observability of 15 biases needs exact variances"),
+        ("analysis.planning", pc.next_anchors, "next_anchors of 15 biases needs exact variances"),
+        ("gaussian.sparse", pc.observability, "exact variances of a network of 15 biases are those of sparsax"),
     ):
-        monkeypatch.setattr(sys.modules[f"probcal.analysis.{module}"], "exact", lambda: False)
+        monkeypatch.setattr(sys.modules[f"probcal.{module}"], "exact", lambda: False)
         with pytest.raises(InputError, match=said):
             ask(problem, point=point)
 

@@ -207,8 +207,7 @@ def test_more_sweeps_a_draw_begin_the_sums_anew():
     """Of draws two sweeps apart what is summed are the sweeps since, of all chains."""
     problem = drawn()[0]
     with jax.enable_x64(True):
-        joint, method = JointPrecision.of(problem.model), Gibbs(**SHORT)
-        runs = chains_of(problem, method, joint)
+        runs = chains_of(problem, Gibbs(**SHORT))
         state = runs.first()
         state, _ = runs.advance(state, 1, None)
         assert state.summed.tolist() == [0, 0], "the first 25 are warm-up"
@@ -222,16 +221,19 @@ def test_more_sweeps_a_draw_begin_the_sums_anew():
         assert not np.array_equal(draws.theta, first.theta)
 
 
-def chains_of(problem, method, joint):
-    from probcal.gaussian.sparse_mode import find_sparse_mode
+def chains_of(problem, method):
+    from probcal.gaussian.climb import climb_to_mode
+    from probcal.gaussian.engine import Factors
+    from probcal.gaussian.sparse import SparseEngine
     from probcal.inference.hierarchy import hierarchy_of
     from probcal.inference.posed import Form
 
     prior = pc.Horseshoe()
-    mode = find_sparse_mode(problem.model, joint, automatic_start(problem), np.ones(problem.model.biases), 60, 1e-3)
+    engine, factors = SparseEngine(), Factors.alone(np.ones(problem.model.biases))
+    mode = climb_to_mode(lambda at: engine.settled(problem.model, at), automatic_start(problem), factors, 60, 1e-3).at
     form = Form(problem.model.biases, hierarchy_of(prior, problem))
     first = prior.precision(problem.labels, problem.surveyed)
-    return _SparseChains(method, form, first, problem.model, joint, mode.system, jax.random.key(0))
+    return _SparseChains(method, form, first, engine, mode, jax.random.key(0))
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ import pandas as pd
 
 from probcal.errors import InputError
 from probcal.gaussian.cholesky import Factor, SuperLU
+from probcal.gaussian.engine import Factors
 from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.linearised import linearise_rows
 from probcal.gaussian.mode import Point
@@ -65,7 +66,7 @@ class Informed:
     @cached_property
     def whole(self) -> Factor:
         """The factor of states and biases; sparsax keeps one at a time, so no other is made by it here."""
-        return self.joint.factor(self.entries, np.ones(self.model.biases))
+        return self.joint.factor(self.entries, Factors.alone(np.ones(self.model.biases)))
 
     @cached_property
     def held(self) -> Factor:

@@ -17,6 +17,7 @@ import xarray as xr
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
 from probcal.errors import InputError, nearest
 from probcal.gaussian import cholesky
+from probcal.gaussian.engine import Factors
 from probcal.gaussian.joint import JointPrecision, too_large
 from probcal.gaussian.linearised import Trajectory, linearise_rows, state_variances, trajectories_of
 from probcal.gaussian.mode import Compressed, compress, eliminate_compressed
@@ -109,8 +110,10 @@ def _by_sparse(
     alone = np.bincount(joint.places.row[on], values[on], joint.places.size)[joint.states :]
     ridge = LOST * np.where(alone > 0, alone, 1.0) * (prior == 0)
     try:
-        variance, _ = joint.factor(values, prior + ridge).inverse_diagonal()
-        loose = joint.factor(values, prior + 10.0 * ridge).inverse_diagonal()[0] if ridge.any() else variance
+        variance, _ = joint.factor(values, Factors.alone(prior + ridge)).inverse_diagonal()
+        loose = (
+            joint.factor(values, Factors.alone(prior + 10.0 * ridge)).inverse_diagonal()[0] if ridge.any() else variance
+        )
     except np.linalg.LinAlgError:
         raise InputError(
             "bounds: rounding hides which biases of so many have none; survey or fix some of those that"

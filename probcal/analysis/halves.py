@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.analysis.pieces import LEAST
+from probcal.gaussian.engine import Factors
 from probcal.gaussian.joint import JointPrecision
-from probcal.gaussian.sparse_mode import SparseSystem
+from probcal.gaussian.sparse import SparseExpansion
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
 
@@ -83,8 +84,9 @@ class Divided:
     Raises `MemoryError` where there is no room for a factor.
     """
 
-    def __init__(self, model: Model, system: SparseSystem, alpha: np.ndarray, late: list[np.ndarray], seed: int = 0):
-        self.factor, self.joint, self.alpha = system.factor(alpha), system.joint, alpha
+    def __init__(self, system: SparseExpansion, alpha: np.ndarray, late: list[np.ndarray], seed: int = 0):
+        self.factor, self.joint, self.alpha = system.solved(Factors.alone(alpha)).factor, system.joint, alpha
+        model = system.model
         self.z, self.late = np.asarray(system.point.z), late
         self.half = _Half(model, system.rows, self.joint, late)
         whole = _Half(model, system.rows, self.joint, [np.ones(len(own)) for own in late])

@@ -20,8 +20,8 @@ from probcal.analysis.halves import SAMPLED, Divided, Halves, drifts_of
 from probcal.gaussian import cholesky
 from probcal.identifiability.directions import shared_in_blocks
 from probcal.inference import residuals
+from probcal.inference.blockwise import BlockPosterior, declared_blocks
 from probcal.inference.fitted import JudgedLarge, take_up_large
-from probcal.inference.sparse import SparsePosterior, declared_blocks
 from probcal.inference.widen import Rejection, rejection, widened
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -64,13 +64,13 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
 
 def _declared(fit: JudgedLarge, tree: xr.DataTree, answer: Answer | None) -> SensorBlocks:
     """Covariance of z by sensor that a prior of the declared scales leaves."""
-    if answer is not None and isinstance(answer.posterior, SparsePosterior):
+    if answer is not None and isinstance(answer.posterior, BlockPosterior):
         return answer.posterior.declared
     told = tree["calibration"].to_dataset()
     if "sd_error" in told:  # no factor was made, or none that has exact variances
         apart = 1.0 - told["contraction"].values
         return SensorBlocks(len(apart), np.arange(len(apart))[:, None], apart[:, None, None])
-    return declared_blocks(fit.problem, fit.system)
+    return declared_blocks(fit.at)
 
 
 def _middle(problem: Problem) -> float | None:
@@ -124,7 +124,7 @@ def _verdicts(
     if tree.attrs["status"] not in INVALID and not without and middle is not None:
         late = [problem.measurements.time[index] >= middle for index in problem.row_index]
         with suppress(MemoryError, np.linalg.LinAlgError):  # no room for a factor: no halves
-            halves = Divided(problem.model, fit.system, alpha, late)
+            halves = Divided(fit.at, alpha, late)
             freed = residuals.innovations_large(fit, gamma, halves.own_shift())  # a change does not hide itself
             wide = residuals.scatter_of(fit.data, freed, rejected.channels.members)
             own = residuals.inflation(fit, wide.size * wide.memory, rejected.channels.group)

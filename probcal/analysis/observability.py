@@ -4,22 +4,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.analysis.verdict import narrowed
 from probcal.errors import InputError
-from probcal.gaussian.cholesky import exact
-from probcal.gaussian.joint import JointPrecision, blocks_of, too_large
-from probcal.gaussian.linearised import Linearisation, linearise, linearise_rows
+from probcal.gaussian.choose import choose, information_of
+from probcal.gaussian.engine import Factors
+from probcal.gaussian.joint import blocks_of, too_large
 from probcal.gaussian.mode import Point
-from probcal.identifiability.directions import marginal, open_alone, open_together, weak_directions
+from probcal.identifiability.directions import marginal, screened_directions, weak_directions
 from probcal.identifiability.gauge import NULL, gauge, unfixed
-from probcal.identifiability.remedies import WEAK
+from probcal.identifiability.remedies import WEAK, Direction
 from probcal.problem import Problem
-from probcal.results.answer import Tracks, tracks_of
+from probcal.results.answer import Tracks
 from probcal.results.blocks import SensorBlocks
 from probcal.results.build import bands
 from probcal.results.groups import bias_coords, constant_group, datum_of, direction_group, gather, track_groups
@@ -33,6 +32,9 @@ RULE = (
 
 NOT_FINITE = "observability: the rows have no finite derivatives at the start; is a target at the place of a sensor?"
 NAMED = 20  # combinations of single sensors that are named where biases are many
+SCREENED = (
+    "of so many biases rigid motions, common shifts and the combinations of each sensor were looked at; no spectrum"
+)
 
 
 @float64
@@ -45,103 +47,69 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     bound on its sd, the information matrix), `spectrum`, `direction` (gauge and weak ones with words and remedies),
     `datum`, `sensor` and `target` (how many biases each determines: their leverages, which add up with what the motion
     tells), `track`. Attributes: `status` (determined; weak; open, where the data say next to nothing of a direction),
-    `rule`, counts. A network too large for matrices of all biases has no spectrum and no information matrix; its
-    directions are those of single sensors and what all share. Raises `InputError` where no bias is free.
+    `rule`, counts. Of more than 600 biases there is no spectrum and no information matrix; their directions are those
+    of single sensors and what all share (`screened` says so). Raises `InputError` where no bias is free.
 
     >>> observability(problem).attrs["status"]
     'determined'
     """
     check_free(problem)
     point = standpoint(problem, point, truth)
-    if too_large(problem.model):
-        return _of_many(problem, point)
-    at = linearise(problem.model.by_information(), point)
-    found = _information(at)
-    null = gauge(problem, point)
-    directions = weak_directions(problem, found.information, point, null)
-    groups = {
-        "bias": _biases(problem, found.share, np.sqrt(np.diag(found.covariance)), found.information),
-        "spectrum": _spectrum(found.information),
-        **_leverage_groups(problem, at.leverages(jnp.asarray(found.covariance)), found.share),
-        **track_groups(problem, bands(tracks_of(at, jnp.asarray(found.covariance)), point)),
-        "constant_data": constant_group(problem),
-    }
-    if directions:
-        groups["direction"] = direction_group(problem.labels, directions)
-    free = ~problem.surveyed
-    values = np.linalg.eigvalsh(marginal(found.information, free)) if free.any() else np.full(1, np.inf)
-    result = xr.DataTree.from_dict(groups)
-    result.attrs.update(
-        status=_status(max(float(values[0]), 0.0), null.countable and null.basis.shape[1] > 0), rule=RULE,
-        countable=int(null.countable), data=problem.measurements.table.source,
-        gauge=null.basis.shape[1] if null.countable else 0,
-        weak=int((values < WEAK).sum()),
-    )  # fmt: skip
-    return result
-
-
-def _of_many(problem: Problem, point: Point) -> xr.DataTree:
-    """The same of biases too many for a matrix of all: no spectrum and no information matrix."""
-    model, M = problem.model.by_information(), problem.model.biases
-    joint, lins = JointPrecision.of(model), linearise_rows(model, point)
-    entries = joint.values(model, lins, point.levels)
-    if not np.isfinite(entries).all():
+    model, scales = problem.model.by_information(), Factors.alone(np.ones(problem.model.biases))
+    at = choose(model).at(model, point)
+    information = information_of(at)
+    if not all(np.isfinite(own).all() for lin in at.rows for own in lin):
         raise InputError(NOT_FINITE)
-    if not exact():
-        raise InputError(f"observability of {M} biases needs exact variances, of sparsax: install probcal[sparse]")
-    factor, members = joint.factor(entries, np.ones(M)), blocks_of(model)
-    together = open_together(problem, point, lambda columns: factor.solve(joint.of_biases(columns))[joint.states :])
-    free = unfixed(problem, point, np.stack([d.vector for d in together], 1)) if together else ()
-    together = tuple(replace(d, kind="gauge" if own else d.kind) for d, own in zip(together, free, strict=True))
-    inverse = factor.inverse_entries()
-    blocks = SensorBlocks(M, members, joint.block_values(members, joint.pairs(members), inverse))
-    alone, count = open_alone(problem, point, members, blocks.covariance, NAMED)
-    held = joint.states_alone(entries)
-    inside = np.zeros_like(inverse)
-    inside[joint.places.column < joint.states] = held.inverse_entries()
-    variances = [joint.predicted_variances(model, lins, values) for values in (inverse, inside)]
-    parts = [np.asarray(lin.weight) * (a - b) for lin, a, b in zip(lins, *variances, strict=True)]
+    members = np.arange(model.biases)[:, None] if information is not None else blocks_of(model)
+    leverages, states = at.leverages(scales), at.states(scales)
+    blocks = SensorBlocks(model.biases, members, np.asarray(at.marginals(scales, members)))
     share = np.clip(1.0 - blocks.variance, 0.0, 1.0)
-    spread = joint.state_values(inverse[joint.places.diagonal])
-    tracked = [Tracks(np.asarray(x), np.sqrt(own)) for x, own in zip(point.states, spread, strict=True)]
+    spread = [np.sqrt(np.maximum(np.diagonal(np.asarray(own), axis1=1, axis2=2), 0.0)) for own in states]
+    tracked = [Tracks(np.asarray(x), own) for _, x, own in model.each_layout(point.states, spread)]
     groups = {
-        "bias": _biases(problem, share, np.sqrt(blocks.variance)),
-        **_leverage_groups(problem, parts, share),
+        "bias": _biases(problem, share, np.sqrt(blocks.variance), information),
+        **_leverage_groups(problem, leverages, share),
         **track_groups(problem, bands(tracked, point)),
         "constant_data": constant_group(problem),
     }
-    directions = (*together, *alone)
+    if information is None:
+        directions, weak = screened_directions(problem, at, blocks, NAMED)
+        gauges = sum(own.kind == "gauge" for own in directions)
+        least, countable = min((own.information for own in directions), default=WEAK), True
+    else:
+        groups["spectrum"] = _spectrum(information)
+        directions, values, gauges, countable = _directions(problem, information, point)
+        least, weak = float(values[0]), int((values < WEAK).sum())
     if directions:
         groups["direction"] = direction_group(problem.labels, directions)
-    least = min((d.information for d in directions), default=WEAK)
-    gauges = sum(d.kind == "gauge" for d in directions)
     result = xr.DataTree.from_dict(groups)
     result.attrs.update(
-        status=_status(least, gauges > 0), rule=RULE, countable=1, data=problem.measurements.table.source,
-        gauge=gauges, weak=len(together) + count,
+        status=_status(max(least, 0.0), gauges > 0), rule=RULE, countable=int(countable),
+        data=problem.measurements.table.source, gauge=gauges, weak=weak,
     )  # fmt: skip
+    if information is None:
+        result.attrs["screened"] = SCREENED
     return result
 
 
-class Information:
-    """Information (M, M) of the data about z, and the covariance (M, M) under a prior of one scale (or the survey)."""
+def _directions(
+    problem: Problem, information: np.ndarray, point: Point
+) -> tuple[tuple[Direction, ...], np.ndarray, int, bool]:
+    """Weak directions by name, eigenvalues of the marginal information, number of gauges, and whether these count.
 
-    def __init__(self, information: np.ndarray):
-        self.information = information
-        values, vectors = np.linalg.eigh(information)  # what rounding leaves below 0 is nothing
-        self.covariance = (vectors / (1.0 + np.maximum(values, 0.0))) @ vectors.T
-
-    @property
-    def share(self) -> np.ndarray:
-        """Share of each answer (M,) that the data give."""
-        return np.clip(1.0 - np.diag(self.covariance), 0.0, 1.0)
-
-
-def _information(at: Linearisation) -> Information:
-    information = np.asarray(at.information)
-    if not np.isfinite(information).all():
-        raise InputError(NOT_FINITE)
-    return Information(information)
+    Where the states have no room for their response to all biases each direction is tried by itself.
+    """
+    free = ~problem.surveyed
+    values = np.linalg.eigvalsh(marginal(information, free)) if free.any() else np.full(1, np.inf)
+    if not too_large(problem.model):
+        null = gauge(problem, point)
+        found = weak_directions(problem, information, point, null)
+        return found, values, null.basis.shape[1] if null.countable else 0, null.countable
+    found = weak_directions(problem, information, point)
+    if found:
+        own = unfixed(problem, point, np.stack([direction.vector for direction in found], 1))
+        found = tuple(replace(d, kind="gauge" if free else d.kind) for d, free in zip(found, own, strict=True))
+    return found, values, sum(direction.kind == "gauge" for direction in found), True
 
 
 def _status(least: float, gauge: bool) -> str:

@@ -16,6 +16,7 @@ from probcal.analysis.additions import Informed, gains_of_passes, gains_of_senso
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
 from probcal.gaussian.cholesky import exact
+from probcal.gaussian.engine import Factors
 from probcal.gaussian.joint import JointPrecision, too_large
 from probcal.gaussian.linearised import linearise_rows, marginal_information
 from probcal.gaussian.mode import Point
@@ -149,7 +150,7 @@ def _anchors_of_many(problem: Problem, point: Point, survey: float) -> xr.Datase
     anchors = _anchors(problem)
     names, members = list(anchors), _padded(list(anchors.values()), M)
     there = (members < M)[:, :, None] & (members < M)[:, None, :]
-    inverse = joint.factor(entries, np.ones(M)).inverse_entries()
+    inverse = joint.factor(entries, Factors.alone(np.ones(M))).inverse_entries()
     covariance = np.where(there, joint.block_values(members, joint.pairs(members), inverse), 0.0)
     eye = np.eye(members.shape[1])
     own = 0.5 * np.linalg.slogdet(eye + covariance / survey**2)[1]

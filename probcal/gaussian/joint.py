@@ -6,7 +6,7 @@ entries few are not zero. One Cholesky factor solves what `eliminate` and a Schu
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import cholesky
 from probcal.gaussian.cholesky import Entries, Factor, factorise, mirrored
+from probcal.gaussian.engine import Factors
 from probcal.gaussian.mode import factors
 from probcal.gaussian.products import Products
 from probcal.gaussian.room import ROOM, dense_numbers
@@ -91,10 +92,15 @@ class JointPrecision:
     states: int  # number of variables that are states
     count: int  # of all values of `_values`
     members: np.ndarray | None  # biases (B, p) of each sensor, where there is no factor of them
+    extra: np.ndarray  # (X, 2) further pairs of biases that have a place, before all others
 
     @classmethod
-    def of(cls, model: Model, *, products: bool = False) -> JointPrecision:
-        """The pattern of a model, whose biases are factorised, or known by products alone."""
+    def of(cls, model: Model, *, products: bool = False, pairs: Sequence[np.ndarray] = ()) -> JointPrecision:
+        """The pattern of a model, whose biases are factorised, or known by products alone.
+
+        All biases of a row of `pairs` (B, p), M of none, have an entry with each other, and of a tilt those that it
+        couples.
+        """
         slots, driven, start = [], [], 0
         for part in model.recursions:
             E, n = part.drift.shape
@@ -106,7 +112,12 @@ class JointPrecision:
             slots.append(np.where(base[:, None] >= 0, base[:, None] + np.arange(n), -1))
             driven.append(own)
             start += n * int(own.sum())
+        extra = _pairs_of(model, pairs)
         rows, columns, times = _entries(model, slots, driven, start)
+        rows, columns = (
+            np.concatenate([start + own, rest]) for own, rest in zip(extra.T, (rows, columns), strict=True)
+        )
+        times = np.concatenate([np.ones(len(extra)), times])
         kept = np.flatnonzero((rows >= 0) & (columns >= 0))
         low, high = np.minimum(rows, columns)[kept], np.maximum(rows, columns)[kept]
         size = start + model.biases
@@ -115,7 +126,7 @@ class JointPrecision:
         diagonal[low[on]] = on
         places = Entries(low.astype(np.int32), high.astype(np.int32), size, diagonal)
         members = blocks_of(model) if products else None
-        return cls(places, kept, times[kept], tuple(slots), tuple(driven), start, len(rows), members)
+        return cls(places, kept, times[kept], tuple(slots), tuple(driven), start, len(rows), members, extra)
 
     @property
     def exact(self) -> bool:
@@ -125,15 +136,26 @@ class JointPrecision:
     def values(self, model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> np.ndarray:
         """Entries (entries,) of the precision of data and motion, the biases without prior."""
         found = np.asarray(_values(model, tuple(jnp.asarray(own) for own in self.driven), lins, levels))
-        return found[self.kept] * self.times
+        tilt = (
+            np.zeros(len(self.extra)) if model.tilt is None else np.asarray(model.tilt.curvature)[tuple(self.extra.T)]
+        )
+        return np.concatenate([tilt, found])[self.kept] * self.times
 
-    def factor(self, values: np.ndarray, alpha: np.ndarray) -> Factor:
-        """Factorise the precision with prior precisions alpha (M,) of the biases."""
+    def factor(self, values: np.ndarray, factors: Factors) -> Factor:
+        """Factorise the precision with Gaussian factors, each pair of whose biases has a place."""
         whole = values.copy()
-        whole[-len(alpha) :] += alpha  # the last entries are the diagonal of the biases
+        for group in factors.groups:
+            pairs, precision = self.pairs(np.asarray(group.members)), np.asarray(group.precision)
+            upper = np.triu(np.ones(pairs.shape[1:], bool))[None] & (pairs >= 0)
+            np.add.at(whole, pairs[upper], precision[upper])
         if self.members is None:
             return factorise(self.places, whole)
         return Products(self.states_alone(whole), mirrored(self.places, whole), self.states, self.members)
+
+    def holds(self, members: np.ndarray) -> bool:
+        """Whether all pairs of biases (B, p) of a row have a place."""
+        there = members < self.places.size - self.states
+        return bool((self.pairs(members) >= 0)[there[:, :, None] & there[:, None, :]].all())
 
     def block_values(self, members: np.ndarray, pairs: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Covariances (B, p, p) of biases (B, p), of their `pairs` in the inverse at the places of the entries."""
@@ -151,16 +173,28 @@ class JointPrecision:
         there = (high < self.places.size) & (keys[order][at] == wanted)
         return np.where(there, order[at], -1)
 
-    def predicted_variances(self, model: Model, lins: tuple[Linearised, ...], inverse: np.ndarray) -> list[np.ndarray]:
-        """Variance (N, C) of each predicted value of each block, from the inverse at the places of the entries."""
-        whole, at = np.zeros(self.count), 0
+    def steps(self, model: Model, inverse: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Covariances (E, n, n) of each state of each recursion, of the one before, and between that and it.
+
+        From the inverse at the places of the entries; 0 where states are known, or come from none.
+        """
+        whole, at = np.zeros(self.count), len(self.extra)
         whole[self.kept] = inverse
-        states = []
+        found = []
         for part in model.recursions:
             E, n = part.drift.shape
             half = n * (n + 1) // 2
-            states.append(_symmetric(whole[at : at + E * half].reshape(E, half), n))
+            own, before = (whole[at + k * E * half : at + (k + 1) * E * half].reshape(E, half) for k in (0, 1))
+            across = whole[at + 2 * E * half : at + E * (2 * half + n * n)].reshape(E, n, n)
+            found.append((_symmetric(own, n), _symmetric(before, n), across))
             at += E * (2 * half + n * n)
+        return found
+
+    def predicted_variances(self, model: Model, lins: tuple[Linearised, ...], inverse: np.ndarray) -> list[np.ndarray]:
+        """Variance (N, C) of each predicted value of each block, from the inverse at the places of the entries."""
+        whole, states = np.zeros(self.count), [own for own, _, _ in self.steps(model, inverse)]
+        whole[self.kept] = inverse
+        at = len(self.extra) + sum(len(x) * x.shape[1] * (2 * x.shape[1] + 1) for x in states)
         found = []
         for block, data, lin, r in zip(model.blocks, model.rows, lins, model.recursion, strict=True):
             (N, p), u, S = (len(data.epoch), data.bias.shape[1]), len(block.used), len(data.bias)
@@ -211,6 +245,14 @@ class JointPrecision:
         """A right-hand side (n,) with entries (M,) or (M, K) for the biases alone."""
         return np.concatenate([np.zeros((self.states, *pull.shape[1:])), pull])
 
+    def variables(self, states: Sequence[Any], biases: Any) -> np.ndarray:
+        """What belongs to states (E, n, K) of each recursion and to biases (M, K), summed by variable, (n, K)."""
+        found = np.zeros((self.places.size + 1, biases.shape[1]))  # of known states last
+        for own, x in zip(self.slots, states, strict=True):
+            np.add.at(found, own, np.asarray(x))
+        found[self.states : -1] = biases
+        return found[:-1]
+
     def state_values(self, values: np.ndarray) -> list[np.ndarray]:
         """Of values (n,) of all variables those of the states (E, n) of each recursion, 0 where they are known."""
         padded = np.append(values, 0.0)
@@ -223,6 +265,18 @@ class JointPrecision:
             if own.any():
                 total += 2.0 * float(np.sum(np.linalg.slogdet(np.asarray(factors(part, levels))[own])[1]))
         return total
+
+
+def _pairs_of(model: Model, pairs: Sequence[np.ndarray]) -> np.ndarray:
+    """Further pairs (X, 2) of biases, low first, each once; those of a tilt too."""
+    M = model.biases
+    tilted = model.tilt is not None and np.any(np.asarray(model.tilt.curvature))
+    found = [np.zeros((0, 2), int)]
+    for own in (*pairs, *((np.arange(M)[None],) if tilted else ())):
+        i, j = np.triu_indices(own.shape[1])
+        found.append(np.sort(np.stack([own[:, i].ravel(), own[:, j].ravel()], 1), 1))
+    every = np.unique(np.concatenate(found), axis=0)
+    return every[every[:, 1] < M]
 
 
 def _symmetric(upper: np.ndarray, n: int) -> np.ndarray:

@@ -65,10 +65,6 @@ class Linearisation(NamedTuple):
         """Information (M, M) of the data about the biases, trajectories marginalised."""
         return self.solved.information
 
-    def given(self, prior: Precision) -> Dense:
-        """The precision of the biases under a prior, ready to be solved."""
-        return Dense.of(self.information + prior.matrix())
-
     def laplace(self, prior: Precision) -> LaplaceApproximation:
         """Covariance of the biases, gamma and evidence under a prior (see `laplace`)."""
         return laplace_of(self.model, self.point, self.solved, prior)

@@ -5,16 +5,19 @@ is the share of its answer that the data give. It is a gauge when no row fixes i
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
+from probcal.gaussian.engine import Expansion, Factors
 from probcal.gaussian.mode import Point
-from probcal.identifiability.gauge import Gauge
+from probcal.identifiability.gauge import Gauge, unfixed
 from probcal.identifiability.patterns import DILATION, Pattern, cause, common_shifts, rigid_motions
-from probcal.identifiability.remedies import WEAK, Direction, with_remedies
+from probcal.identifiability.remedies import TRIED, WEAK, Direction, with_remedies
 from probcal.identifiability.spaces import complete, inside, orthonormal, readable
 from probcal.identifiability.wording import amount, in_words, involved, name_without_owner, owner_of
 from probcal.problem import Problem
+from probcal.results.blocks import SensorBlocks
 
 ALONG = 0.1  # share of the largest entry above which a component moves along with a rigid motion
 APART = 0.5  # part of a unit direction outside those already named that makes it a new one
@@ -40,7 +43,7 @@ def weak_directions(
     if gauge is not None and gauge.countable:
         naming.name_gauge(gauge.basis[free])
     naming.name_weak()
-    return tuple(with_remedies(problem, naming.known, naming.found, naming.anchors))
+    return tuple(with_remedies(problem, naming.known, np.flatnonzero(free), naming.found, naming.anchors))
 
 
 def marginal(information: np.ndarray, free: np.ndarray) -> np.ndarray:
@@ -177,45 +180,71 @@ def combination(problem: Problem, labels: list[str], vector: np.ndarray, why: st
     return Pattern(name, f"{amounts} together hardly change the data{why}", vector, "", alone)
 
 
-def open_together(problem: Problem, point: Point, times: Callable[[np.ndarray], np.ndarray]) -> tuple[Direction, ...]:
-    """Rigid motions and common shifts that the data leave to the prior, for biases too many for a matrix (M, M).
+def screened_directions(
+    problem: Problem, at: Expansion, blocks: SensorBlocks, most: int
+) -> tuple[tuple[Direction, ...], int]:
+    """Directions that the data leave to the prior where biases are too many for a matrix of all, and their number.
 
-    `times` multiplies columns (M, K) by the covariance that a prior of the declared scales leaves. The information
-    about a combination is one over its variance, less that of the prior; what moves along is what the data cannot tell
-    from it. Remedies are not verified.
+    Looked at are rigid motions and common shifts, and combinations of the biases of each sensor, at most `most` of them
+    named, the weakest first. `blocks` is what a prior of the declared scales leaves of each. The information about a
+    combination is one over its variance, less that of the prior; what moves along is what the data cannot tell from
+    it. A remedy is kept where the information about the biases that it may fix says so, all others uncertain.
     """
+    scales = Factors.alone(np.ones(len(problem.labels)))
+    together = _open_together(problem, at, scales)
+    alone, count = alone_directions(problem, at.point, blocks, most)
+    return (*together, *alone), len(together) + count
+
+
+def _open_together(problem: Problem, at: Expansion, scales: Factors) -> tuple[Direction, ...]:
     patterns = list[tuple[Pattern, np.ndarray]]()
-    for pattern in (*rigid_motions(problem, np.asarray(point.z)), *common_shifts(problem)):
+    for pattern in (*rigid_motions(problem, np.asarray(at.point.z)), *common_shifts(problem)):
         vector = np.where(problem.surveyed, 0.0, pattern.vector)
         if np.count_nonzero(vector) > 1:
             patterns.append((pattern, vector / np.linalg.norm(vector)))
     if not patterns:
         return ()
-    columns = np.stack([vector for _, vector in patterns], 1)
-    moved, found = times(columns), list[Direction]()
+    moved = np.asarray(at.solve(scales, np.stack([vector for _, vector in patterns], 1)))
+    found, anchors = list[Direction](), list[tuple[tuple[str, ...], ...]]()
     for (pattern, vector), along in zip(patterns, moved.T, strict=True):
         information = max(1.0 / float(vector @ along) - 1.0, 0.0)
         if information < WEAK:
             unit = along / np.linalg.norm(along)
             found.append(Direction(pattern.name, pattern.words, "weak", information, unit, (), pattern.remedy))
-    return tuple(found)
+            anchors.append(_strongest(problem, pattern.anchors, unit))
+    if not found:
+        return ()
+    own = unfixed(problem, at.point, np.stack([direction.vector for direction in found], 1))
+    found = [replace(d, kind="gauge" if free else d.kind) for d, free in zip(found, own, strict=True)]
+    among = np.array(sorted({problem.labels.index(name) for groups in anchors for group in groups for name in group}))
+    known = np.linalg.inv(np.asarray(at.marginals(scales, among[None]))[0]) - np.eye(len(among))
+    return tuple(with_remedies(problem, known, among, found, anchors))
 
 
-def open_alone(
-    problem: Problem, point: Point, members: np.ndarray, covariance: np.ndarray, most: int
+def _strongest(
+    problem: Problem, anchors: tuple[tuple[str, ...], ...], vector: np.ndarray
+) -> tuple[tuple[str, ...], ...]:
+    """The free biases of groups of which one is to be fixed, those groups that a direction (M,) moves most."""
+    free = {label for label, own in zip(problem.labels, problem.surveyed, strict=True) if not own}
+    groups = [tuple(label for label in group if label in free) for group in anchors]
+    moved = {group: sum(vector[problem.labels.index(label)] ** 2 for label in group) for group in groups if group}
+    return tuple(sorted(moved, key=lambda group: -moved[group])[:TRIED])
+
+
+def alone_directions(
+    problem: Problem, point: Point, blocks: SensorBlocks, most: int
 ) -> tuple[tuple[Direction, ...], int]:
     """Combinations of the biases of single sensors that the data leave to the prior, the weakest first, and how many.
 
-    `covariance` (B, p, p) is what a prior of the declared scales leaves of the biases (B, p) of each, M of none; at
-    most `most` are named. Remedies are not verified.
+    At most `most` are named.
     """
-    M = len(problem.labels)
+    M, members = len(problem.labels), blocks.members
     free = np.append(~problem.surveyed, False)[members]
-    values, vectors = np.linalg.eigh(np.where(free[:, :, None] & free[:, None, :], covariance, 0.0))
+    values, vectors = np.linalg.eigh(np.where(free[:, :, None] & free[:, None, :], blocks.covariance, 0.0))
     information = 1.0 / np.maximum(values, 1e-300) - 1.0
     weak = np.argwhere(information < WEAK)
     weak = weak[np.argsort(information[tuple(weak.T)], kind="stable")]
-    found, why = list[Direction](), cause(problem, point) if len(weak) else ""
+    found, why = dict[int, list[tuple[Direction, Pattern]]](), cause(problem, point) if len(weak) else ""
     for b, k in weak[:most]:
         own = members[b][free[b]]
         part = vectors[b, free[b], k]
@@ -223,9 +252,15 @@ def open_alone(
         vector[own] = part
         pattern = combination(problem, [problem.labels[m] for m in own], part, why)
         strength = max(float(information[b, k]), 0.0)
-        remedy = f"fix or survey {pattern.anchors[0][0]} (not verified)"
-        found.append(Direction(pattern.name, pattern.words, "weak", strength, vector, (), remedy))
-    return tuple(found), len(weak)
+        found.setdefault(int(b), []).append(
+            (Direction(pattern.name, pattern.words, "weak", strength, vector, (), ""), pattern)
+        )
+    done = list[Direction]()
+    for b, pairs in found.items():
+        own = members[b][free[b]]
+        known = np.linalg.inv(blocks.covariance[b][np.ix_(free[b], free[b])]) - np.eye(len(own))
+        done += with_remedies(problem, known, own, [one for one, _ in pairs], [p.anchors for _, p in pairs])
+    return tuple(sorted(done, key=lambda direction: direction.information)), len(weak)
 
 
 def shared_in_blocks(

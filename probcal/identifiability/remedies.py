@@ -40,14 +40,15 @@ class Direction:
 
 
 def with_remedies(
-    problem: Problem, known: np.ndarray, found: list[Direction], anchors: list[tuple[tuple[str, ...], ...]]
-) -> Iterator[Direction]:
+    problem: Problem, known: np.ndarray, among: np.ndarray, found: list[Direction],
+    anchors: list[tuple[tuple[str, ...], ...]],
+) -> Iterator[Direction]:  # fmt: skip
     """The directions with the biases whose fixing, or survey, removes each, together with those before it.
 
-    A remedy is kept only if the information (F, F) recomputed with it has a weak direction less.
+    A remedy is kept only if the information (F, F) about the biases `among` (F,), recomputed with it, has a weak
+    direction less.
     """
-    labels = [label for label, surveyed in zip(problem.labels, problem.surveyed, strict=True) if not surveyed]
-    scales = problem.scales[~problem.surveyed]
+    labels, scales = [problem.labels[m] for m in among], problem.scales[among]
     done: list[int] = []
     fixed: tuple[str, ...] = ()
     left = _count(known, done)  # weak directions still to be removed
@@ -69,7 +70,7 @@ def with_remedies(
             yield replace(direction, remedy=general)
             continue
         fixed = tuple(labels[m] for m in chosen)
-        std = _survey(known, done, chosen, left, scales, direction.vector[~problem.surveyed])
+        std = _survey(known, done, chosen, left, scales, direction.vector[among])
         units = {problem.biases[problem.labels.index(label)].unit for label in fixed}
         std = std if len(units) == 1 else None
         survey = f", or survey it to {std:g} {units.pop().strip('1')}".rstrip() if std is not None else ""

@@ -13,6 +13,7 @@ from probcal.gaussian.information import update_levels
 from probcal.gaussian.linearised import laplace_of
 from probcal.gaussian.marginal import find_marginal_mode
 from probcal.gaussian.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, mixing_gain
+from probcal.inference.blockwise import FORMS, PRODUCTS
 from probcal.inference.ending import astray
 from probcal.inference.hierarchy import held, hierarchy_of
 from probcal.inference.integrate import Integration, likelihood
@@ -31,7 +32,6 @@ from probcal.inference.run import (
     reweighted,
     valued,
 )
-from probcal.inference.sparse import FORMS, PRODUCTS
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
@@ -140,7 +140,7 @@ class EA(Maximiser):
     printed is in `benchmarks/papers/paper_b.py`. `update` of maximised precisions is "mackay" (Paper B 25) or "em"
     (Paper C 40; the same fixed points, slower). `tolerance` is the change of log evidence, in nats, at which it stops;
     `iterations` caps the outer loop. `form` "auto" takes the dense form where its matrices need up to 240 MB, unless an
-    epoch sees less than a quarter of more than 500 biases, the sparse one else (see `inference.sparse`); "dense" and
+    epoch sees less than a quarter of more than 500 biases, the sparse one else (see `inference.blockwise`); "dense" and
     "sparse" take that one, "matrix-free" is for `MAP`.
     Raises `InputError` for another update, trajectory, form or kind of precisions.
 

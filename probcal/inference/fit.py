@@ -13,22 +13,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
+from probcal.gaussian.choose import choose
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.joint import too_large
 from probcal.gaussian.linearised import linearise
 from probcal.gaussian.mode import Point
-from probcal.gaussian.sparse_mode import settle_each, settled_variances
 from probcal.gaussian.tails import settle
 from probcal.identifiability.directions import weak_directions
 from probcal.identifiability.remedies import Direction
 from probcal.identifiability.watch import runs, strained_starts
+from probcal.inference.blockwise import BlockPosterior
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.manifest import stored_run
 from probcal.inference.methods import EA, NUTS, check_problem, choose_prior
 from probcal.inference.progress import Monitor, OnProgress
 from probcal.inference.run import Context, Method, ParticleSmoother
 from probcal.inference.solve import solve
-from probcal.inference.sparse import SparsePosterior
 from probcal.inference.storage import Storage
 from probcal.inference.widen import judge_fit, judge_tracks
 from probcal.labels import NODE, START, listed
@@ -173,7 +173,7 @@ def _interrupted(answer: Answer, monitor: Monitor) -> Answer:
 def _directions(answer: Answer) -> tuple[Direction, ...]:
     """What the data leave open where the answer stands."""
     information = answer.posterior.summary.information
-    if isinstance(answer.posterior, SparsePosterior):
+    if isinstance(answer.posterior, BlockPosterior):
         return answer.posterior.open
     if information is None or not linear_form(answer) or not np.isfinite(information).all():
         return ()
@@ -191,7 +191,7 @@ def _advised(answer: Answer, directions: Sequence[Direction]) -> str:
     if not directions or answer.status is Status.MISFIT:
         return answer.message
     named = "; ".join(direction.sentence for direction in directions[:NAMED])
-    count = answer.posterior.weak if isinstance(answer.posterior, SparsePosterior) else len(directions)
+    count = answer.posterior.weak if isinstance(answer.posterior, BlockPosterior) else len(directions)
     named += f"; and {count - NAMED} more" if count > NAMED else ""
     about = "Weakly determined by the data" if answer.status.settled else "The data do not fix"
     return f"{answer.message} {about}: {named}.".strip()
@@ -203,7 +203,7 @@ def _watched(answer: Answer) -> Answer:
     if not linear_form(answer) or not answer.status.valid or not np.isfinite(np.asarray(point.z)).all():
         return answer
     found, status = [answer.message] if answer.message else [], answer.status
-    for run in runs(problem, point, many=isinstance(answer.posterior, SparsePosterior)):
+    for run in runs(problem, point, many=isinstance(answer.posterior, BlockPosterior)):
         if run.gauge:
             status = Status.GAUGE
             found.append(
@@ -313,9 +313,10 @@ def track(
 def _many_tracks(problem: Problem, found: Calibrated) -> tuple[list[Tracks], Point, Point]:
     """Tracks at a calibration, and points without and with it, where the response of states to
     biases does not fit."""
-    z = jnp.asarray(found.z)
-    before = settle_each(problem.model, grid_start(problem, jnp.asarray(problem.first_z), 30))
-    after = settle_each(problem.model, grid_start(problem, z, 30))
-    variances = settled_variances(problem.model, after, found.root)
-    tracks = problem.model.each(lambda _, x, own: Tracks(np.asarray(x), np.sqrt(own)), after.states, variances)
-    return list(tracks), before, after
+    engine = choose(problem.model)
+    before, at = (
+        engine.settled(problem.model, grid_start(problem, jnp.asarray(z), 30)) for z in (problem.first_z, found.z)
+    )
+    spread = at.followed(found.root)
+    tracks = problem.model.each(lambda _, x, own: Tracks(np.asarray(x), np.sqrt(own)), at.point.states, spread)
+    return list(tracks), before.point, at.point

@@ -13,12 +13,11 @@ import numpy as np
 from probcal import linalg
 from probcal.errors import InputError
 from probcal.gaussian.information import at_levels
-from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.linearised import Linearisation, linearise
 from probcal.gaussian.mode import Eliminated, Point
 from probcal.gaussian.places import tilt_at
-from probcal.gaussian.sparse_mode import SparseSystem, system_at
-from probcal.inference.sparse import SparsePosterior
+from probcal.gaussian.sparse import SparseEngine, SparseExpansion
+from probcal.inference.blockwise import BlockPosterior
 from probcal.lazy import Later
 from probcal.model.model import Recursion
 from probcal.model.motions import level_logs
@@ -77,7 +76,7 @@ class Fitted(Judged):
 class JudgedLarge(Judged):
     """A fit in sparse form taken up again."""
 
-    system: SparseSystem
+    at: SparseExpansion
     blocks: SensorBlocks  # of the covariance of z
 
 
@@ -85,13 +84,14 @@ def take_up_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) ->
     """The fit of a problem in sparse form, as `take_up`."""
     problem, data, picks = identified(problem, tree, answer)
     posterior = None if answer is None else answer.posterior
-    if isinstance(posterior, SparsePosterior):
-        system = posterior.system
+    if isinstance(posterior, BlockPosterior):
+        at = posterior.at
     else:
         point = point_of(problem, tree) if posterior is None else posterior.point
-        system = system_at(problem.model, JointPrecision.of(problem.model), point)
+        at = SparseEngine().settled(problem.model, point)
+    assert isinstance(at, SparseExpansion)
     blocks = SensorBlocks.read(tree["calibration"].to_dataset(), problem.labels, problem.scales)
-    return JudgedLarge(problem, system.point, system.rows, system.solved, picks, data, system, blocks)
+    return JudgedLarge(problem, at.point, at.rows, at.eliminated, picks, data, at, blocks)
 
 
 def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) -> Fitted:

@@ -60,7 +60,7 @@ class BlockMarginals(NamedTuple):
 
     mean: np.ndarray  # (M,)
     covariance: np.ndarray  # (B, p, p) of each block; 1 on the diagonal where a block has fewer
-    whole: np.ndarray  # what else the likelihood found on the way, for whoever made it
+    whole: Any  # what else the likelihood found on the way, for whoever made it
 
 
 class BiasLikelihood(Protocol):

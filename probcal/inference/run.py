@@ -21,11 +21,11 @@ from probcal.gaussian.linearised import LaplaceApproximation, compress_and_elimi
 from probcal.gaussian.mode import Eliminated, Point, cost
 from probcal.gaussian.places import places_of, tilt_of
 from probcal.gaussian.tails import expected_mixing, rewhitened
+from probcal.inference.blockwise import blockwise_answer, takes_sparse
 from probcal.inference.ending import FAR, conclude
 from probcal.inference.hierarchy import held, learnt_groups
 from probcal.inference.integrate import Integration, integrate
 from probcal.inference.progress import Monitor
-from probcal.inference.sparse import sparse_answer, takes_sparse
 from probcal.inference.storage import Storage
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, PRECISION_BOUNDS, Precision, Prior
@@ -164,7 +164,7 @@ class Maximiser(Method, ABC):
         reached, and it climbs again with what they add. What is too large for the dense form is solved in sparse form.
         """
         if takes_sparse(self, problem):
-            return sparse_answer(self, problem, prior, start, context)
+            return blockwise_answer(self, problem, prior, start, context)
         state, trace = self.climb(problem, prior, start, context)
         chosen = places_of(problem.model, state.point) if self.integrates_places else None
         if chosen is not None and any(np.any(own.on) for own in chosen):

@@ -12,10 +12,10 @@ from probcal.errors import FitError, InputError
 from probcal.gaussian.joint import too_large
 from probcal.gaussian.mode import Point
 from probcal.gaussian.room import check_room
+from probcal.inference.blockwise import PRODUCTS, check_sparse, gains_by_sparse, side_climb, takes_sparse
 from probcal.inference.methods import MAP
 from probcal.inference.progress import Monitor, Stopped
 from probcal.inference.run import Context, Maximiser, Method
-from probcal.inference.sparse import PRODUCTS, check_sparse, gains_by_sparse, sparse_climb, takes_sparse
 from probcal.inference.sparse_gibbs import check_gibbs
 from probcal.labels import SCENE, START, listed
 from probcal.modes import further_starts
@@ -167,11 +167,11 @@ def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point
         found = method.answer(problem, prior, start, context)
         used = cast("Method", found.method)  # "matrix-free" where memory held no factor
         try:
-            return _beside_mirrors(found, used, context, sparse_climb(problem, getattr(used, "form", "")))
+            return _beside_mirrors(found, used, context, side_climb(problem, getattr(used, "form", "")))
         except MemoryError:
             unseen = "Memory did not hold what looking at the other side of a mirror takes."
             return replace(found, message=f"{found.message} {unseen}".strip())
-    climb = sparse_climb(problem, "sparse")
+    climb = side_climb(problem, "sparse")
     try:
         sides = other_sides(problem, climb.mode(start)[0], climb)
     except MemoryError:  # which the method says

@@ -20,10 +20,14 @@ import numpy as np
 
 from probcal.errors import FitError, InputError
 from probcal.gaussian.cholesky import Factor
-from probcal.gaussian.joint import JointPrecision, blocks_of, missing
+from probcal.gaussian.climb import climb_to_mode, settle_each
+from probcal.gaussian.engine import Factors, Spread
+from probcal.gaussian.joint import blocks_of, missing
 from probcal.gaussian.joint_density import JointDensity, point_of_variables, variables_of
 from probcal.gaussian.mode import Point, log_density
-from probcal.gaussian.sparse_mode import SparseSystem, find_sparse_mode, system_at
+from probcal.gaussian.sparse import SparseEngine, SparseExpansion
+from probcal.identifiability.directions import alone_directions, screened_directions
+from probcal.inference.blockwise import NAMED, BlockPosterior, declared_blocks, diverged, told_columns
 from probcal.inference.chains import Draw, Sample
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.mixed import mixing
@@ -32,14 +36,6 @@ from probcal.inference.posterior import RARE, bias_status, judge_chains, values_
 from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
-from probcal.inference.sparse import (
-    SparsePosterior,
-    declared_blocks,
-    diverged,
-    open_directions,
-    told_columns,
-    unheld_directions,
-)
 from probcal.model.model import Model
 from probcal.priors import PRECISION_BOUNDS, Horseshoe, Precision, Prior
 from probcal.problem import Problem
@@ -113,24 +109,24 @@ class Gibbs(Sampler):
         """Draws of the posterior from a start, and what they say."""
         check_gibbs(problem, prior)
         began = time.perf_counter()
-        model, joint = problem.model, JointPrecision.of(problem.model)
+        model, engine = problem.model, SparseEngine()
         form = Form(model.biases, hierarchy_of(prior, problem))
         first = prior.precision(problem.labels, problem.surveyed)
-        declared = np.ones(model.biases) if form.hierarchy.learnt else np.asarray(first.alpha)
+        factors = Factors.alone(np.ones(model.biases) if form.hierarchy.learnt else np.asarray(first.alpha))
         try:
-            mode = find_sparse_mode(model, joint, start, declared, STEPS, 1e-3)
-            together = unheld_directions(problem, mode.system, mode.factor) if prior.proper else ()
-            runs = _SparseChains(self, form, first, model, joint, mode.system, context.key)
+            mode = climb_to_mode(lambda at: engine.settled(model, at), start, factors, STEPS, 1e-3).at
+            assert isinstance(mode, SparseExpansion)
+            runs = _SparseChains(self, form, first, engine, mode, context.key)
             drawn, thin, stopped = drawn_by(self, runs, 1, context.monitor, context.storage, context.threads)
             natural = Natural(jnp.zeros((0, 0)), jnp.zeros(0), model.level_spread, first)
             seconds = time.perf_counter() - began
             run = SamplerRun(self, self, form, natural, None, drawn, seconds, stopped, "", (), thin)
             mixed = mixing(run.z)
-            posterior = SparseChains.drawn(problem, prior, run, runs, mode.system, mixed)
+            posterior = SparseChains.drawn(problem, prior, run, runs, mixed)
         except MemoryError:
             raise FitError(
-                f"the sparse factor of {joint.states} state entries and {model.biases} biases does not fit in memory:"
-                " take fewer sensors or a shorter time"
+                f"the sparse factor of {model.state_size} state entries and {model.biases} biases does not fit in"
+                " memory: take fewer sensors or a shorter time"
             ) from None
         except np.linalg.LinAlgError:
             if prior.proper:
@@ -138,8 +134,9 @@ class Gibbs(Sampler):
                     "Gibbs: the precision under some draw of the hyper-parameters is singular in double precision:"
                     " survey or fix what no row tells"
                 ) from None
-            raise diverged(problem, joint, start, declared) from None
-        found, weak = open_directions(problem, posterior.point, posterior.declared, together)
+            raise diverged(problem, engine.at(model, start), factors) from None
+        named = alone_directions(problem, posterior.point, posterior.declared, NAMED)  # a flat prior has no more
+        found, weak = screened_directions(problem, posterior.at, posterior.declared, NAMED) if prior.proper else named
         posterior = replace(posterior, open=found, weak=weak)
         status, message = judge_chains(problem, prior, run, mixed, posterior.point)
         if (rate := float(np.asarray(drawn.stats["acceptance_rate"]).mean(1).min())) < RARE:
@@ -204,7 +201,7 @@ class _Given:
     @classmethod
     def of(cls, density: JointDensity, alpha: np.ndarray) -> _Given:
         """Factorise the precision that precisions alpha (M,) leave."""
-        factor = density.joint.factor(density.entries, alpha)
+        factor = density.joint.factor(density.entries, Factors.alone(alpha))
         pull = density.slope.copy()
         pull[density.joint.states :] -= alpha * density.at[density.joint.states :]
         return cls(density, factor, alpha, density.at + factor.solve(pull))
@@ -267,11 +264,10 @@ class _SparseChains:
     """All chains, one after the other: the library keeps one factor at a time, and takes all processors for it."""
 
     def __init__(
-        self, method: Gibbs, form: Form, first: Precision, model: Any, joint: JointPrecision, mode: SparseSystem,
-        key: jax.Array,
-    ):  # fmt: skip
-        self.method, self.form, self.prior, self.model, self.joint = method, form, first, model, joint
-        self.mode, self.key = mode, key
+        self, method: Gibbs, form: Form, first: Precision, engine: SparseEngine, mode: SparseExpansion, key: jax.Array
+    ):
+        self.method, self.form, self.prior, self.engine = method, form, first, engine
+        self.mode, self.key, self.model, self.joint = mode, key, mode.model, mode.joint
         self.state: SparseState | None = None  # where the chains stood last
         self._density: JointDensity | None = None
         self._last: _Given | None = None
@@ -308,8 +304,8 @@ class _SparseChains:
                 given = self._given(density, phi)
                 z = (given.mean + given.factor.draw(rng, 1)[0])[states:]
                 total += given.mean[states:] * (2 * k >= PILOT)
-            moved = self.mode.moved(self.model, total / (PILOT - PILOT // 2) - np.asarray(self.mode.point.z))
-            density = self._at(variables_of(self.joint, system_at(self.model, self.joint, moved).point))
+            moved = self.mode.moved(total / (PILOT - PILOT // 2) - np.asarray(self.mode.point.z))
+            density = self._at(variables_of(self.joint, settle_each(self.model, moved)))
             given = self._given(density, phi)
         else:
             given = _Given.of(density, scales)
@@ -426,7 +422,7 @@ def _covariances(z: np.ndarray, members: np.ndarray, variance: np.ndarray) -> np
 
 
 @dataclass(frozen=True, eq=False)
-class SparseChains(SparsePosterior):
+class SparseChains(BlockPosterior):
     """The draws of the biases by sparse factors, and moments of the states."""
 
     run: SamplerRun | None = None
@@ -436,9 +432,8 @@ class SparseChains(SparsePosterior):
 
     @classmethod
     def drawn(
-        cls, problem: Problem, prior: Prior, run: SamplerRun, runs: _SparseChains, mode: SparseSystem,
-        mixed: Mapping[str, np.ndarray],
-    ) -> SparseChains:  # fmt: skip
+        cls, problem: Problem, prior: Prior, run: SamplerRun, runs: _SparseChains, mixed: Mapping[str, np.ndarray]
+    ) -> SparseChains:
         """The posterior of a run, what the data leave open not yet said."""
         z, model, M, state = run.z, problem.model, run.form.biases, runs.state
         assert state is not None
@@ -453,17 +448,18 @@ class SparseChains(SparsePosterior):
         alpha = np.clip((1 - gamma) / np.maximum(blocks.variance, 1e-300), *PRECISION_BOUNDS)
         held = np.isin(np.arange(M), run.form.hierarchy.learnt, invert=True)
         alpha = np.where(held, np.asarray(run.posed.first.alpha), alpha)
-        joint, system = mode.joint, system_at(model, mode.joint, mode.moved(model, mean - np.asarray(mode.point.z)))
-        declared = declared_blocks(problem, system)
+        joint, at = runs.joint, runs.engine.settled(model, runs.mode.moved(mean - np.asarray(runs.mode.point.z)))
+        declared = declared_blocks(at)
         columns = dict(mixed) | told_columns(declared) | {"inclusion": (np.abs(z) > ROPE).mean((0, 1))}
         summary = Summary(
             "exact", "sampled", mean, None, lower, upper, gamma, alpha, None, np.zeros(0), None, columns, blocks
         )
         middle = np.asarray(state.reference)[: joint.states] + total / count
         whole = np.concatenate([np.maximum(variance, 0.0), blocks.variance])
-        point = point_of_variables(model, joint, system.point, np.concatenate([middle, mean]))
+        spread = Spread(blocks.variance, np.zeros(M), tuple(joint.state_values(whole)))
+        point = point_of_variables(model, joint, at.point, np.concatenate([middle, mean]))
         return cls(
-            problem, prior, system.point, summary, system, system.entries, alpha, whole, declared, (), 0, None, run,
+            problem, prior, at.point, summary, at, Factors.alone(alpha), spread, declared, (), 0, None, run,
             tuple(np.asarray(x) for x in point.states),
         )  # fmt: skip
 

@@ -13,11 +13,10 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.information import rejected
-from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.linearised import Linearisation
 from probcal.gaussian.mode import Eliminated, Point, factors
 from probcal.gaussian.scans import recur_squared
-from probcal.gaussian.sparse_mode import system_at
+from probcal.gaussian.sparse import SparseEngine
 from probcal.inference import residuals
 from probcal.inference.fitted import Fitted, Judged, JudgedLarge, take_up, take_up_large
 from probcal.inference.residuals import LAGGED, NOTABLE, PRACTICAL, Channels, Innovations
@@ -388,8 +387,8 @@ def judge_tracks(
         dz = fit.covariance @ np.asarray(at.solved.score)
         found = residuals.innovations(fit, residuals.measured_kurtosis(fit), dz).innovations
         return _judged(fit, found, tree, known.root, rejection_text(rejected(problem, at.point)))
-    system = system_at(problem.model, JointPrecision.of(problem.model), at)
-    large = JudgedLarge(problem, system.point, system.rows, system.solved, picks, data, system, known.blocks)
+    here = SparseEngine().settled(problem.model, at)
+    large = JudgedLarge(problem, here.point, here.rows, here.eliminated, picks, data, here, known.blocks)
     hidden = rejection_text(rejected(problem, at))
     return _judged(large, residuals.innovations_given(large), tree, known.root, hidden)
 

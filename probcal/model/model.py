@@ -340,6 +340,14 @@ class Model(Stepwise):
             parts[r] = parts[r].at[:, jnp.asarray(block.used, int)].add(summed)
         return parts
 
+    def onto_biases(self, lins: Sequence[Linearised], columns: Sequence[jax.Array]) -> jax.Array:
+        """Columns (N, C, K) of data taken back to the biases by their Jacobians, (M, K)."""
+        found = jnp.zeros((self.biases + 1, columns[0].shape[2]))
+        for data, lin, column in zip(self.rows, lins, columns, strict=True):
+            own = jax.ops.segment_sum(jnp.einsum("ncp,nck->npk", lin.bias, column), data.sensor, data.bias.shape[0])
+            found = found.at[data.bias].add(own)
+        return found[: self.biases]
+
     # sums and indices
 
     def by_epoch(self, values: Sequence[jax.Array]) -> list[jax.Array]:

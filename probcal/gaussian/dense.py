@@ -1,0 +1,196 @@
+"""The dense engine: matrices of all biases and the response of every state to each; it may stand inside jit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.engine import Embedded, Estimate, Factors, Sampled, Spread, density_of
+from probcal.gaussian.linearised import (
+    Linearisation,
+    compress_and_eliminate,
+    linearise_rows,
+    trajectories_of,
+)
+from probcal.gaussian.marginal import SETTLED, TRACK_STEPS, volume_slope
+from probcal.gaussian.mode import Eliminated, Point, find_tracks, follow
+from probcal.gaussian.solves import Dense
+from probcal.model.model import Data, Model, scaled
+from probcal.model.rows import Linearised
+
+
+@dataclass(frozen=True)
+class DenseEngine:
+    """Matrices of all biases: the fastest where they fit."""
+
+    name: ClassVar[str] = "dense"
+    traceable: ClassVar[bool] = True
+
+    def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> DenseExpansion:
+        """The posterior at a consistent point; rows as the caller linearised them."""
+        rows = linearise_rows(model, point) if rows is None else tuple(rows)
+        system, solved = compress_and_eliminate(model, point, rows)
+        trajectories = trajectories_of(model, point.levels, solved)
+        return DenseExpansion(Linearisation(model, point, rows, system, solved, trajectories))
+
+    def settled(self, model: Model, point: Point) -> DenseExpansion:
+        """The same at the modes of its trajectories for its biases."""
+        return self.at(model, find_tracks(model, point, TRACK_STEPS, SETTLED))
+
+
+@dataclass(frozen=True, eq=False)
+class DenseExpansion:
+    """The posterior at a point, as `engine.Expansion`."""
+
+    linear: Linearisation
+
+    @property
+    def model(self) -> Model:
+        """The model."""
+        return self.linear.model
+
+    @property
+    def point(self) -> Point:
+        """Where it is expanded."""
+        return self.linear.point
+
+    @property
+    def rows(self) -> tuple[Linearised, ...]:
+        """The linearised rows of each block."""
+        return self.linear.rows
+
+    @property
+    def eliminated(self) -> Eliminated:
+        """The system, trajectories eliminated."""
+        return self.linear.solved
+
+    @cached_property
+    def _density(self) -> float:
+        return float(density_of(self.model, self.point, self.linear.solved.logdet))
+
+    def density(self) -> float:
+        """Log density of the data given the biases at the point, up to the constant of the noises."""
+        return self._density
+
+    @cached_property
+    def _slope(self) -> jax.Array:
+        solved = self.linear.solved
+        return solved.score - 0.5 * volume_slope(self.model, self.point, solved)[0]
+
+    def score(self) -> jax.Array:
+        """Its slope (M,) by the biases, the volume of the trajectories with it."""
+        return self._slope
+
+    def log_det(self, factors: Factors) -> Estimate:
+        """Log determinant of the precision of the biases."""
+        return Estimate(float(_solved(self.linear.information, factors).log_determinant()))
+
+    def solve(self, factors: Factors, right: Any) -> jax.Array:
+        """Covariance of the biases times right, (M,) or (M, K)."""
+        return _solved(self.linear.information, factors).solve(jnp.asarray(right))
+
+    def apply(self, columns: Any) -> jax.Array:
+        """Information of the data about the biases times columns, (M,) or (M, K)."""
+        return self.linear.information @ jnp.asarray(columns)
+
+    def moved(self, dz: Any) -> Point:
+        """The point with the biases moved by dz (M,), all tracks following."""
+        return _moved(self.model, self.point, self.linear.solved, jnp.asarray(dz))
+
+    def covariance(self, factors: Factors) -> jax.Array:
+        """Covariance (M, M) of the biases."""
+        return _solved(self.linear.information, factors).covariance()
+
+    def marginals(self, factors: Factors, members: np.ndarray) -> jax.Array:
+        """Covariances (B, p, p) of biases (B, p), M of none: 1 on its diagonal."""
+        M = self.model.biases
+        whole = jnp.zeros((M + 1, M + 1)).at[:M, :M].set(self.covariance(factors))
+        none = (members == M)[:, :, None] * np.eye(members.shape[1])[None]
+        return whole[members[:, :, None], members[:, None, :]] + none
+
+    def spread(self, factors: Factors) -> Spread:
+        """Variance of every bias and state."""
+        covariance = self.covariance(factors)
+        own = np.asarray(jnp.diagonal(covariance))
+        return Spread(own, np.zeros_like(own), tuple(np.asarray(v) for v in self.linear.variances(covariance)))
+
+    def states(self, factors: Factors) -> tuple[jax.Array, ...]:
+        """Covariance (E, n, n) of every state of each recursion."""
+        return _state_covariances(self.linear, self.covariance(factors))
+
+    def noises(self, factors: Factors) -> tuple[jax.Array, ...]:
+        """Variance (E, n) of every whitened noise of each recursion."""
+        return self.linear.noise_variances(self.covariance(factors))
+
+    def predicted(self, factors: Factors) -> Data:
+        """Variance (N, C) of each predicted value."""
+        return self.linear.predicted_variances(self.covariance(factors))
+
+    def leverages(self, factors: Factors) -> Data:
+        """Leverage of every datum (N, C) on the biases: w times the part of its variance that the biases cause."""
+        return self.linear.leverages(self.covariance(factors))
+
+    def sample(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
+        """Biases and trajectories drawn around the mean that the factors make."""
+        keys, inverse = jax.random.split(key), _solved(self.linear.information, factors)
+        step = inverse.solve(self.score() + factors.pull(self.point.z))
+        z = (self.point.z + step)[None] + inverse.draw(keys[0], count)
+        return Sampled(z, self.linear.draw(z, keys[1]))
+
+    def followed(self, root: Any) -> list[np.ndarray]:
+        """Variance (E, n) of every state where the biases have the covariance root root', root (M, R)."""
+        whole = root @ root.T
+        whole = whole if isinstance(whole, np.ndarray) else whole.toarray()
+        return [np.asarray(own) for own in self.linear.variances(jnp.asarray(whole))]
+
+    def weighed(self, weights: Data) -> DenseExpansion:
+        """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
+        return DenseEngine().at(self.model.weighted(weights), self.point, scaled(self.rows, weights))
+
+    def embedded(self, factors: Factors, columns: Data) -> Embedded:
+        """Information about K more parameters and its score, by which each predicted value changes as columns (N, C, K) say."""
+        return _embedded(self.linear, factors, jnp.asarray(factors.pull(self.point.z)), columns)
+
+
+@jax.jit
+def _solved(information: jax.Array, factors: Factors) -> Dense:
+    return Dense.of(information + factors.matrix(len(information)))
+
+
+_moved = jax.jit(follow)
+
+
+@jax.jit
+def _state_covariances(at: Linearisation, covariance: jax.Array) -> tuple[jax.Array, ...]:
+    return tuple(
+        own.covariance + jnp.einsum("eni,ij,emj->enm", own.response, covariance, own.response)
+        for own in at.trajectories
+    )
+
+
+@jax.jit
+def _embedded(at: Linearisation, factors: Factors, pull: jax.Array, columns: Data) -> Embedded:
+    """Rows of the parameters beside those of states and biases, both eliminated."""
+    model, rows, solved = at.model, at.rows, at.solved
+    free = follow(model, at.point, solved, jnp.zeros_like(at.point.z))
+    relaxed = [(after - before)[:, :, None] for _, after, before in model.each_layout(free.states, at.point.states)]
+    scores = [
+        lin.score - lin.weight * by[:, :, 0] for *_, lin, by in model.each_block(rows, model.by_state(rows, relaxed))
+    ]
+    weighted = tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, columns))
+    onto = model.onto_states(rows, weighted)
+    moved = model.each(lambda part, kept, b: rec.smooth(part.F, kept.gain, b).states, solved.parts, onto)
+    left = jax.tree.map(jnp.subtract, tuple(columns), model.by_state(rows, moved))
+    both = tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, left))
+    across = model.onto_biases(rows, both)
+    bias = Dense.of(at.information + factors.matrix(model.biases)).solve(across)
+    pairs = list(model.each_block(columns, both, scores))
+    information = sum(jnp.einsum("nck,ncl->kl", own, rest) for *_, own, rest, _ in pairs)
+    score = sum(jnp.einsum("nck,nc->k", own, pulled) for *_, own, _, pulled in pairs)
+    return Embedded(information - across.T @ bias, score - bias.T @ (solved.score + pull))

@@ -1,0 +1,249 @@
+"""The posterior linearised at a point, and who solves it: what every engine gives, whatever its algebra.
+
+The density of the biases z, trajectories integrated by Laplace's formula, is a Gaussian of the data, the information S
+of `model` about z, times a sum of Gaussian factors. `at.solve(factors, right)` is (S + P)^-1 right, P their precision.
+An engine is a class with the members of `Engine` that gives an `Expansion`; `choose` alone knows sizes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.gaussian.mode import Eliminated, Point, log_density, mixing_gain
+from probcal.model.model import Data, Model
+from probcal.model.rows import Linearised
+from probcal.priors import Precision
+
+
+class Estimate(NamedTuple):
+    """A number and its standard error, 0 where it is exact."""
+
+    value: float
+    error: float = 0.0
+
+
+class Group(NamedTuple):
+    """Gaussian factors exp(pull' z - z' precision z / 2) of a few biases each."""
+
+    members: Any  # (B, p) biases, M of none
+    precision: Any  # (B, p, p)
+    pull: Any  # (B, p)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """A sum of Gaussian factors on few biases each: precisions, correlations, surveys, sites, integrated places."""
+
+    groups: tuple[Group, ...] = ()
+
+    @classmethod
+    def alone(cls, precision: Any) -> Factors:
+        """One factor a bias around zero, of precisions (M,)."""
+        own = np.asarray(precision)
+        return cls((Group(np.arange(len(own))[:, None], own[:, None, None], np.zeros((len(own), 1))),))
+
+    @classmethod
+    def of(cls, prior: Precision) -> Factors:
+        """The factors of a Gaussian prior around zero."""
+        if prior.coupling is None:
+            return cls.alone(prior.alpha)
+        whole = np.asarray(prior.matrix())
+        return cls((Group(np.arange(len(whole))[None], whole[None], np.zeros((1, len(whole)))),))
+
+    def __add__(self, other: Factors) -> Factors:
+        return Factors((*self.groups, *other.groups))
+
+    def matrix(self, biases: int) -> jax.Array:
+        """The precision (M, M)."""
+        found = jnp.zeros((biases + 1, biases + 1))
+        for own in self.groups:
+            found = found.at[own.members[:, :, None], own.members[:, None, :]].add(own.precision)
+        return found[:biases, :biases]
+
+    def pull(self, z: Any) -> Any:
+        """Slope (M,) of the sum at z."""
+        padded = np.append(np.asarray(z), 0.0)
+        found = np.zeros_like(padded)
+        for own in self.groups:
+            np.add.at(found, own.members, own.pull - np.einsum("bij,bj->bi", own.precision, padded[own.members]))
+        return found[:-1]
+
+    def value(self, z: Any) -> float:
+        """Logarithm of the product at z, 0 at zero."""
+        padded, total = np.append(np.asarray(z), 0.0), 0.0
+        for own in self.groups:
+            z_own = padded[own.members]
+            half = np.einsum("bi,bij,bj->", z_own, own.precision, z_own)
+            total += float(np.sum(own.pull * z_own) - 0.5 * half)
+        return total
+
+    def diagonal(self, biases: int) -> np.ndarray:
+        """Diagonal (M,) of the precision."""
+        found = np.zeros(biases + 1)
+        for own in self.groups:
+            np.add.at(found, own.members, np.diagonal(np.asarray(own.precision), axis1=1, axis2=2))
+        return found[:-1]
+
+    @property
+    def members(self) -> list[np.ndarray]:
+        """Biases (B, p) of each group."""
+        return [np.asarray(own.members) for own in self.groups]
+
+
+class Sampled(NamedTuple):
+    """Draws of biases and trajectories together."""
+
+    z: Any  # (D, M)
+    states: Sequence[Any]  # (D, E, n) of each recursion
+
+
+class Spread(NamedTuple):
+    """Variances with their standard errors, 0 where they are exact."""
+
+    biases: np.ndarray  # (M,)
+    error: np.ndarray  # (M,) of these
+    states: tuple[np.ndarray, ...]  # (E, n) of each recursion
+
+
+class Embedded(NamedTuple):
+    """The data about K further parameters at zero, the trajectories and biases eliminated."""
+
+    information: Any  # (K, K)
+    score: Any  # (K,)
+
+    @property
+    def estimate(self) -> np.ndarray:
+        """Their values (K,) by one step from the point."""
+        return np.linalg.lstsq(np.asarray(self.information), np.asarray(self.score), rcond=None)[0]
+
+
+class Expansion(Protocol):
+    """The posterior expanded about a point, trajectories eliminated. Variances are those that the factors leave."""
+
+    @property
+    def model(self) -> Model:
+        """The model."""
+
+    @property
+    def point(self) -> Point:
+        """Where it is expanded."""
+
+    @property
+    def rows(self) -> tuple[Linearised, ...]:
+        """The linearised rows of each block."""
+
+    @property
+    def eliminated(self) -> Eliminated:
+        """The trajectories, eliminated at held biases or with these."""
+
+    def density(self) -> float:
+        """Log density of the data given the biases at the point, up to the constant of the noises."""
+
+    def score(self) -> jax.Array:
+        """Its slope (M,) by the biases, the volume of the trajectories with it."""
+
+    def log_det(self, factors: Factors) -> Estimate:
+        """Log determinant of the precision of the biases."""
+
+    def solve(self, factors: Factors, right: Any) -> Any:
+        """Covariance of the biases times right, (M,) or (M, K)."""
+
+    def apply(self, columns: Any) -> Any:
+        """Information of the data about the biases times columns, (M,) or (M, K)."""
+
+    def moved(self, dz: Any) -> Point:
+        """The point with the biases moved by dz (M,), all tracks following."""
+
+    def marginals(self, factors: Factors, members: np.ndarray) -> Any:
+        """Covariances (B, p, p) of biases (B, p), M of none: 1 on its diagonal."""
+
+    def spread(self, factors: Factors) -> Spread:
+        """Variance of every bias and state; estimated where the engine has no exact ones."""
+
+    def states(self, factors: Factors) -> tuple[Any, ...]:
+        """Covariance (E, n, n) of every state of each recursion."""
+
+    def noises(self, factors: Factors) -> tuple[Any, ...]:
+        """Variance (E, n) of every whitened noise of each recursion."""
+
+    def predicted(self, factors: Factors) -> tuple[Any, ...]:
+        """Variance (N, C) of each predicted value."""
+
+    def leverages(self, factors: Factors) -> tuple[Any, ...]:
+        """Leverage of every datum (N, C) on the biases: w times the part of the above that the biases cause."""
+
+    def sample(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
+        """Biases and trajectories drawn around the mean that the factors make."""
+
+    def followed(self, root: Any) -> list[np.ndarray]:
+        """Variance (E, n) of every state where the biases have the covariance root root', root (M, R)."""
+
+    def weighed(self, weights: Data) -> Expansion:
+        """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
+
+    def embedded(self, factors: Factors, columns: Data) -> Embedded:
+        """Information about K more parameters and its score, by which each predicted value changes as columns (N, C, K) say."""
+
+
+class Engine(Protocol):
+    """A way to linearise and solve."""
+
+    name: ClassVar[str]
+    traceable: ClassVar[bool]  # whether it may stand inside jit and vmap; else the host drives it
+
+    def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> Expansion:
+        """The posterior at a consistent point whose trajectories are at their mode; rows as the caller linearised
+        them, by default with the expected information."""
+
+    def settled(self, model: Model, point: Point) -> Expansion:
+        """The same at the modes of its trajectories for its biases."""
+
+
+def mean(at: Expansion, factors: Factors) -> Any:
+    """Mean (M,) of the biases: one step from the point."""
+    return np.asarray(at.point.z) + np.asarray(at.solve(factors, at.score() + factors.pull(at.point.z)))
+
+
+def evidence(at: Expansion, prior: Precision, factors: Factors | None = None) -> Estimate:
+    """Log evidence at the mode under a Gaussian prior, trajectories and biases integrated by Laplace's formula.
+
+    `factors` are those of the prior, for who has them. A precision of 0 is a flat prior: its density counts as one.
+    """
+    factors = Factors.of(prior) if factors is None else factors
+    volume = at.log_det(factors)
+    own = 0.5 * float(prior.log_determinant()) + factors.value(at.point.z)
+    return Estimate(at.density() + own - 0.5 * volume.value, 0.5 * volume.error)
+
+
+def noise_score(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.Array, ...]]:
+    """Terms of the slope of the log evidence by each log noise level, biases and trajectories integrated.
+
+    Of every datum (N, C) of each block, and of every whitened noise (E, n) of each recursion.
+    """
+    model, point = at.model, at.point
+    spread = tuple(jnp.asarray(own) for own in at.predicted(factors))
+    driven = tuple(jnp.asarray(own) for own in at.noises(factors))
+    return _noise_terms(model, point, spread, driven)
+
+
+@jax.jit
+def density_of(model: Model, point: Point, volume: jax.Array) -> jax.Array:
+    """Log density of the data at a point whose trajectories have a posterior precision of log determinant `volume`."""
+    spread = jnp.sum((point.levels / model.level_spread) ** 2)
+    return log_density(model, point) + mixing_gain(model) - 0.5 * (spread + volume)
+
+
+@jax.jit
+def _noise_terms(
+    model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]
+) -> tuple[Data, tuple[jax.Array, ...]]:
+    parts = zip(model.level_score(point), model.information(point), spread, model.measured, strict=True)
+    rows = tuple(score + weight * own - there for score, weight, own, there in parts)
+    return rows, jax.tree.map(lambda u, variance: u**2 + variance - 1.0, tuple(point.noises), driven)

@@ -1,0 +1,310 @@
+"""The sparse engine: one factor of the joint precision of all states and biases (CHOLMOD, or SuperLU without it)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal import linalg
+from probcal.errors import InputError
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.cholesky import Factor, exact
+from probcal.gaussian.climb import settle_each
+from probcal.gaussian.engine import Embedded, Estimate, Factors, Sampled, Spread, density_of
+from probcal.gaussian.joint import JointPrecision
+from probcal.gaussian.linearised import linearise_rows
+from probcal.gaussian.marginal import volume_slope
+from probcal.gaussian.mode import Eliminated, Point, eliminate_rows, factors
+from probcal.model.model import Data, Model, scaled
+from probcal.model.rows import Linearised
+
+COLUMNS = 256  # of a root of the covariance at once
+
+
+@dataclass(frozen=True)
+class SparseEngine:
+    """Nothing of size (M, M) or (E, n, M): what an epoch sees of the biases is few entries of a sparse matrix."""
+
+    products: bool = False  # no factor of the biases: conjugate gradients, and estimates with their errors
+    _patterns: list[tuple[Model, JointPrecision]] = field(default_factory=list, compare=False)  # of the last model
+
+    name: ClassVar[str] = "sparse"
+    traceable: ClassVar[bool] = False
+
+    def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> SparseExpansion:
+        """The posterior at a consistent point; rows as the caller linearised them."""
+        if not (self._patterns and self._patterns[0][0] is model):
+            self._patterns[:] = [(model, JointPrecision.of(model, products=self.products))]
+        rows = linearise_rows(model, point) if rows is None else tuple(rows)
+        return SparseExpansion(model, point, rows, self._patterns[0][1])
+
+    def settled(self, model: Model, point: Point) -> SparseExpansion:
+        """The same at the modes of its trajectories for its biases."""
+        return self.at(model, settle_each(model, point))
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """The joint precision with some factors, factorised."""
+
+    of: Factors
+    joint: JointPrecision
+    factor: Factor
+
+    @cached_property
+    def inverse(self) -> np.ndarray:
+        """The inverse at the place of each entry; raises `InputError` where the library has none."""
+        check_exact(self.joint)
+        return self.factor.inverse_entries()
+
+    def biases(self, right: Any) -> np.ndarray:
+        """Covariance of the biases times right, (M,) or (M, K)."""
+        return self.factor.solve(self.joint.of_biases(np.asarray(right)))[self.joint.states :]
+
+
+@dataclass(frozen=True, eq=False)
+class SparseExpansion:
+    """The posterior at a point, as `engine.Expansion`; of the factors that were asked for last the factor is kept."""
+
+    model: Model
+    point: Point
+    rows: tuple[Linearised, ...]
+    joint: JointPrecision
+    _kept: list[_Solved] = field(default_factory=list)
+
+    @cached_property
+    def entries(self) -> np.ndarray:
+        """Entries of the joint precision, the biases without prior."""
+        return self.joint.values(self.model, self.rows, self.point.levels)
+
+    @cached_property
+    def eliminated(self) -> Eliminated:
+        """The trajectories eliminated at held biases."""
+        return _held(self.model, self.point, self.rows)
+
+    @cached_property
+    def _relaxed(self) -> tuple[Data, jax.Array]:
+        """Scores (N, C) of the data, and slope (M,) of the log-likelihood, with every track at its mode."""
+        return _relaxed(self.model, self.point, self.rows, self.eliminated)
+
+    def solved(self, factors: Factors) -> _Solved:
+        """The joint precision with factors; pairs of biases that are new to its pattern are given a place there."""
+        if not (self._kept and self._kept[0].of is factors):
+            self._kept.clear()
+            joint, entries = self.joint, self.entries
+            if new := [own for own in factors.members if not joint.holds(own)]:
+                joint = JointPrecision.of(self.model, pairs=new)
+                entries = joint.values(self.model, self.rows, self.point.levels)
+            self._kept.append(_Solved(factors, joint, joint.factor(entries, factors)))
+        return self._kept[0]
+
+    @cached_property
+    def known(self) -> np.ndarray:
+        """The inverse of the precision of the states alone, biases known, at the place of each entry; 0 elsewhere."""
+        check_exact(self.joint)
+        found = np.zeros(len(self.entries))
+        inside = self.joint.places.column < self.joint.states
+        found[inside] = self.joint.states_alone(self.entries).inverse_entries()
+        return found
+
+    @cached_property
+    def _density(self) -> float:
+        return float(density_of(self.model, self.point, self.eliminated.logdet))
+
+    def density(self) -> float:
+        """Log density of the data given the biases at the point, up to the constant of the noises."""
+        return self._density
+
+    @cached_property
+    def _slope(self) -> jax.Array:
+        return self._relaxed[1] - 0.5 * volume_slope(self.model, self.point, self.eliminated)[0]
+
+    def score(self) -> jax.Array:
+        """Its slope (M,) by the biases, the volume of the trajectories with it."""
+        return self._slope
+
+    def log_det(self, factors: Factors) -> Estimate:
+        """Log determinant of the precision of the biases."""
+        whole, error = self.solved(factors).factor.log_determinant()
+        own = float(self.eliminated.logdet) - self.joint.correction(self.model, self.point.levels)
+        return Estimate(whole - own, error)
+
+    def solve(self, factors: Factors, right: Any) -> np.ndarray:
+        """Covariance of the biases times right, (M,) or (M, K)."""
+        return self.solved(factors).biases(right)
+
+    def apply(self, columns: Any) -> np.ndarray:
+        """Information of the data about the biases times columns, (M,) or (M, K)."""
+        columns = jnp.asarray(columns)
+        found = _informed(self.model, self.rows, self.eliminated, columns.reshape(len(columns), -1))
+        return np.asarray(found).reshape(columns.shape)
+
+    def moved(self, dz: Any) -> Point:
+        """The point with the biases moved by dz (M,), all tracks following."""
+        return _followed(self.model, self.point, self.rows, self.eliminated, jnp.asarray(dz))
+
+    def marginals(self, factors: Factors, members: np.ndarray) -> np.ndarray:
+        """Covariances (B, p, p) of biases (B, p), M of none: 1 on its diagonal.
+
+        Where the pattern lacks a pair of them all are solved for.
+        """
+        found, M = self.solved(factors), self.model.biases
+        if found.joint.holds(members):
+            return found.joint.block_values(members, found.joint.pairs(members), found.inverse)
+        asked = np.unique(members[members < M])
+        unit = np.zeros((M, len(asked)))
+        unit[asked, np.arange(len(asked))] = 1.0
+        whole = np.concatenate([found.biases(unit), np.zeros((1, len(asked)))])
+        column = np.minimum(np.searchsorted(asked, members), len(asked) - 1)
+        none = members == M
+        block = np.where(none[:, None, :], 0.0, whole[members[:, :, None], column[:, None, :]])
+        return block + none[:, :, None] * np.eye(members.shape[1])[None]
+
+    def spread(self, factors: Factors) -> Spread:
+        """Variance of every bias and state; from draws where there is no selected inverse."""
+        found, joint = self.solved(factors), self.joint
+        if joint.exact:
+            variance = found.inverse[found.joint.places.diagonal]
+            error = np.zeros_like(variance)
+        else:
+            variance, error = found.factor.inverse_diagonal()
+        states = tuple(joint.state_values(variance))
+        return Spread(variance[joint.states :], error[joint.states :], states)
+
+    def states(self, factors: Factors) -> tuple[np.ndarray, ...]:
+        """Covariance (E, n, n) of every state of each recursion."""
+        found = self.solved(factors)
+        return tuple(own for own, _, _ in found.joint.steps(self.model, found.inverse))
+
+    def noises(self, factors: Factors) -> tuple[np.ndarray, ...]:
+        """Variance (E, n) of every whitened noise of each recursion."""
+        found = self.solved(factors)
+        steps = tuple(tuple(map(jnp.asarray, own)) for own in found.joint.steps(self.model, found.inverse))
+        variances = _noise_variances(self.model, self.point, steps)
+        return self.model.each(lambda _, on, own: np.where(on[:, None], own, 1.0), self.joint.driven, variances)
+
+    def predicted(self, factors: Factors) -> tuple[np.ndarray, ...]:
+        """Variance (N, C) of each predicted value."""
+        found = self.solved(factors)
+        return tuple(found.joint.predicted_variances(self.model, self.rows, found.inverse))
+
+    def leverages(self, factors: Factors) -> tuple[np.ndarray, ...]:
+        """Leverage of every datum (N, C) on the biases: w times the part of its variance that the biases cause."""
+        both = self.predicted(factors)
+        alone = self.joint.predicted_variances(self.model, self.rows, self.known)
+        parts = self.model.each_block(self.rows, both, alone)
+        return tuple(np.asarray(lin.weight) * (own - held) for *_, lin, own, held in parts)
+
+    def sample(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
+        """Biases and trajectories drawn around the mean that the factors make."""
+        found, rng = self.solved(factors), np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        drawn = found.factor.draw(rng, count)
+        middle = self.moved(found.biases(self.score() + factors.pull(self.point.z)))
+        padded = np.concatenate([drawn, np.zeros((count, 1))], 1)  # no variable: -1
+        states = self.model.each(lambda _, x, own: np.asarray(x) + padded[:, own], middle.states, self.joint.slots)
+        return Sampled(np.asarray(middle.z) + drawn[:, self.joint.states :], states)
+
+    def followed(self, root: Any) -> list[np.ndarray]:
+        """Variance (E, n) of every state where the biases have the covariance root root', root (M, R).
+
+        What each column of the root moves is found for some columns at a time. Raises `numpy.linalg.LinAlgError` where
+        a track is open.
+        """
+        factor, across = self.joint.states_alone(self.entries), self.joint.across(self.entries)
+        variance, _ = factor.inverse_diagonal()
+        for start in range(0, root.shape[1], COLUMNS):
+            pulled = across @ root[:, start : start + COLUMNS]
+            variance += np.sum(factor.solve(pulled if isinstance(pulled, np.ndarray) else pulled.toarray()) ** 2, 1)
+        return self.joint.state_values(variance)
+
+    def weighed(self, weights: Data) -> SparseExpansion:
+        """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
+        return SparseExpansion(self.model.weighted(weights), self.point, scaled(self.rows, weights), self.joint)
+
+    def embedded(self, factors: Factors, columns: Data) -> Embedded:
+        """Information about K more parameters and its score, by which each predicted value changes as columns (N, C, K) say."""
+        found, (scores, pull) = self.solved(factors), self._relaxed
+        own, score, states, biases = _columns(self.model, self.rows, scores, columns)
+        right = self.joint.variables(states, biases)
+        step = found.factor.solve(self.joint.of_biases(np.asarray(pull + factors.pull(self.point.z))))
+        return Embedded(np.asarray(own) - right.T @ found.factor.solve(right), np.asarray(score) - right.T @ step)
+
+
+def check_exact(joint: JointPrecision) -> None:
+    """Raise `InputError` where no library is there that gives exact variances."""
+    if not exact():
+        M = joint.places.size - joint.states
+        raise InputError(f"exact variances of a network of {M} biases are those of sparsax: install probcal[sparse]")
+
+
+@jax.jit
+def _held(model: Model, point: Point, rows: tuple[Linearised, ...]) -> Eliminated:
+    return eliminate_rows(model, point, rows, joint=False)
+
+
+@jax.jit
+def _followed(model: Model, point: Point, rows: tuple[Linearised, ...], held: Eliminated, dz: jax.Array) -> Point:
+    """Tracks at their smoothed response to a step of the biases, by columns of the rows: no (E, n, M) is made."""
+    columns = model.onto_states(rows, _weighted(model, rows, model.by_bias(rows, -dz[:, None])))
+
+    def one(x: jax.Array, u: jax.Array, part: Any, kept: Any, column: jax.Array) -> tuple[jax.Array, jax.Array]:
+        drift = -(factors(part, point.levels) @ u[:, :, None])
+        smooth = rec.smooth(part.F, kept.gain, kept.pull[:, :, None] + column, drift)
+        return x + smooth.states[:, :, 0], smooth.noises[:, :, 0]
+
+    moved = point.trajectories.map(one, model.recursions, held.parts, columns)
+    return point._replace(trajectories=moved, z=point.z + dz)
+
+
+def _weighted(model: Model, rows: tuple[Linearised, ...], columns: Data) -> Data:
+    """Columns (N, C, K) of the data times their weights."""
+    return tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, columns))
+
+
+@jax.jit
+def _relaxed(model: Model, point: Point, rows: tuple[Linearised, ...], held: Eliminated) -> tuple[Data, jax.Array]:
+    free = _followed(model, point, rows, held, jnp.zeros_like(point.z))
+    away = [(after - before)[:, :, None] for _, after, before in model.each_layout(free.states, point.states)]
+    moved = _weighted(model, rows, model.by_state(rows, away))
+    scores = tuple(lin.score - own[:, :, 0] for *_, lin, own in model.each_block(rows, moved))
+    pull = model.onto_biases(rows, tuple(own[:, :, None] for own in scores))[:, 0]
+    return scores, pull if model.tilt is None else pull + model.tilt.pull(point.z)
+
+
+@jax.jit
+def _informed(model: Model, rows: tuple[Linearised, ...], held: Eliminated, z: jax.Array) -> jax.Array:
+    """Information about the biases times z (M, K): the rows' own, less what the tracks take up."""
+    columns = model.onto_states(rows, _weighted(model, rows, model.by_bias(rows, -z)))
+    states = model.each(lambda part, kept, own: rec.smooth(part.F, kept.gain, own).states, held.parts, columns)
+    found = model.onto_biases(rows, _weighted(model, rows, model.responses(rows, states, z)))
+    return found if model.tilt is None else found + model.tilt.curvature @ z
+
+
+@jax.jit
+def _columns(model: Model, rows: tuple[Linearised, ...], scores: Data, columns: Data) -> tuple[Any, ...]:
+    """Of columns (N, C, K) of further parameters their own information and score, and those with states and biases."""
+    weighted = _weighted(model, rows, columns)
+    pairs = list(model.each_block(columns, weighted, scores))
+    information = sum(jnp.einsum("nck,ncl->kl", own, w) for *_, own, w, _ in pairs)
+    score = sum(jnp.einsum("nck,nc->k", own, pull) for *_, own, _, pull in pairs)
+    return information, score, model.onto_states(rows, weighted), model.onto_biases(rows, weighted)
+
+
+@jax.jit
+def _noise_variances(model: Model, point: Point, steps: tuple[tuple[jax.Array, ...], ...]) -> tuple[jax.Array, ...]:
+    """Variances (E, n) of whitened noises, of the covariances of a state, of the one before, and between them."""
+
+    def one(part: Any, step: tuple[jax.Array, ...]) -> jax.Array:
+        own, before, across = step
+        both, L = part.F @ across, factors(part, point.levels)
+        spread = own - both - both.mT + part.F @ before @ part.F.mT
+        reached = jnp.any(L != 0, (1, 2))[:, None, None]
+        inverse = linalg.inverses(jnp.where(reached, L, jnp.eye(L.shape[1])[None]))
+        return jnp.einsum("eij,ejk,eik->ei", inverse, spread, inverse)
+
+    return model.each(one, steps)

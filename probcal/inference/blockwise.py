@@ -1,0 +1,325 @@
+"""Fits whose dense form does not fit: the marginal mode by sparse factors, precisions integrated by propagation.
+
+`EA()` and `MAP()` come here by themselves (`form="auto"`): where the matrices of the dense form take more than 240 MB,
+and where there are more than 500 biases of which an epoch sees few, which is faster. Where memory does not hold the
+factor either, `MAP` goes on by products alone (`form="matrix-free"`).
+What needs the whole covariance of the biases is not there; variances and gamma of each are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probcal.errors import FitError, InputError
+from probcal.gaussian.cholesky import exact
+from probcal.gaussian.climb import climb_to_mode
+from probcal.gaussian.engine import Estimate, Expansion, Factors, Group, Spread, evidence, mean
+from probcal.gaussian.information import mean_square
+from probcal.gaussian.joint import blocks_of, is_thin, missing, prefers_sparse
+from probcal.gaussian.mode import Point
+from probcal.gaussian.sparse import SparseEngine
+from probcal.identifiability.directions import alone_directions, screened_directions
+from probcal.identifiability.remedies import Direction
+from probcal.inference.ending import conclude_at
+from probcal.inference.hierarchy import held, hierarchy_of
+from probcal.inference.integrate import quantile
+from probcal.inference.posed import Form
+from probcal.inference.propagate import BlockMarginals, Blocks, Propagation
+from probcal.modes.mirrors import SideClimb
+from probcal.priors import PRECISION_BOUNDS, Flat, Gaussian, Precision, Prior
+from probcal.problem import Problem
+from probcal.results.answer import HALF, Answer, Draws, Posterior, Summary, Tracks
+from probcal.results.blocks import SensorBlocks
+from probcal.results.schema import INTERVAL, ROPE
+
+if TYPE_CHECKING:
+    from probcal.inference.run import Context, Maximiser
+
+CHAINS, NUMBERS, MOST = 4, 400_000, 250  # of the draws of all biases that a tree holds, and draws of a chain
+STEPS = 60  # of the climb
+HELD = 30.0  # nats that a node may fit worse on its other side, tracks held, and is still tried: each is a climb
+NAMED = 20  # combinations of single sensors that are named
+PRODUCTS = "matrix-free"
+SPARSE = ("sparse", PRODUCTS)
+FORMS = ("auto", "dense", *SPARSE)
+
+
+def takes_sparse(method: Maximiser, problem: Problem) -> bool:
+    """Whether a method is to solve a problem in its sparse form; raises `InputError` where that was asked in vain."""
+    form = getattr(method, "form", "dense")
+    lacks = missing(problem.model)
+    if form in SPARSE and lacks:
+        raise InputError(f'{method.name}(form="{form}") does not take {lacks}: give form="dense"')
+    return bool(form in SPARSE or (form == "auto" and not lacks and prefers_sparse(problem.model)))
+
+
+def gains_by_sparse(method: Maximiser, problem: Problem, prior: Prior, starts: int) -> bool:
+    """Whether a fit that may take either form is faster in the sparse one, and loses nothing that was asked."""
+    either = getattr(method, "form", "dense") == "auto" and not missing(problem.model)
+    return either and is_thin(problem.model) and not _lacking(method, prior, starts)
+
+
+def check_sparse(method: Maximiser, prior: Prior, starts: int) -> None:
+    """Raise `InputError` naming what a sparse fit does not do."""
+    if wrong := _lacking(method, prior, starts):
+        if getattr(method, "form", "") == PRODUCTS:
+            raise InputError(f'{method.name}(form="{PRODUCTS}") takes {wrong}')
+        raise InputError(f"{method.name} on a network of this size is solved in sparse form, which takes {wrong}")
+
+
+def _lacking(method: Maximiser, prior: Prior, starts: int) -> str:
+    """What a sparse fit takes in the place of what was asked; empty where it does that."""
+    wrong = ""
+    if getattr(method, "trajectory", "") != "marginal":
+        wrong = 'trajectory="marginal" alone'
+    elif prior.correlation:
+        wrong = "a prior without correlations"
+    elif getattr(method, "form", "") == PRODUCTS and not isinstance(prior, (Gaussian, Flat)):
+        wrong = "precisions that are given (MAP() with Gaussian() or Flat())"
+    elif not (method.integrates(prior) if hasattr(method, "integrates") else isinstance(prior, (Gaussian, Flat))):
+        wrong = (
+            "precisions that are integrated or given (EA() with Horseshoe() or ARD(rate=0.5), MAP() with Gaussian())"
+        )
+    elif starts > 1:
+        wrong = "one start"
+    elif not (exact() or isinstance(prior, (Gaussian, Flat))):
+        wrong = "exact variances, of sparsax, to integrate precisions: install probcal[sparse], or take MAP()"
+    return wrong
+
+
+@dataclass(frozen=True, eq=False)
+class ExpansionLikelihood:
+    """The likelihood at a point as a propagation reads it, by what any engine gives."""
+
+    expand: Callable[[Point], Expansion]
+    here: Expansion
+
+    @property
+    def z(self) -> np.ndarray:
+        """Biases (M,) of the point."""
+        return np.asarray(self.here.point.z)
+
+    def marginals(self, members: np.ndarray, sites: Blocks) -> BlockMarginals:
+        """Marginals of the blocks, and the factors that are the sites."""
+        factors = Factors((Group(members, sites.precision, sites.pull),))
+        covariance = np.asarray(self.here.marginals(factors, members))
+        return BlockMarginals(np.asarray(mean(self.here, factors)), covariance, factors)
+
+    def at(self, z: np.ndarray) -> ExpansionLikelihood:
+        """The likelihood at other biases (M,), every track following."""
+        return replace(self, here=self.expand(self.here.moved(z - self.z)))
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPosterior(Posterior):
+    """Marginals of the biases of each sensor and of the states: no covariance of all biases is held."""
+
+    at: Expansion
+    factors: Factors  # of the prior, or the sites in its place
+    spread: Spread  # under these
+    declared: SensorBlocks  # what a prior of the declared scales leaves
+    open: tuple[Direction, ...]  # combinations that the data leave to the prior, those of many sensors first
+    weak: int  # how many there are; some have no name
+    evidence_error: float | None = None  # standard error of the log evidence, where that is estimated
+
+    chained: ClassVar[bool] = False
+    held: ClassVar[bool] = True
+
+    @property
+    def sound(self) -> bool:
+        """Whether every number is finite."""
+        return bool(np.isfinite(self.summary.sd).all() and np.isfinite(self.summary.mean).all())
+
+    @property
+    def states(self) -> Sequence[np.ndarray]:
+        """States (E, n) of each recursion at the point."""
+        return [np.asarray(x) for x in self.point.states]
+
+    def tracks(self) -> Sequence[Tracks]:
+        """States at the point, and their sd with the biases uncertain."""
+        pairs = self.problem.model.each_layout(self.states, self.spread.states)
+        return [Tracks(x, np.sqrt(np.maximum(own, 0.0))) for _, x, own in pairs]
+
+    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
+        """Draws of the biases from the Gaussian with their means, sds and correlations, few where they are many."""
+        self.check_kept(keep)
+        M = len(self.summary.mean)
+        count = CHAINS * int(np.clip(NUMBERS // (CHAINS * M), 2, MOST))
+        drawn = np.asarray(self.at.sample(self.factors, key, count).z) - np.asarray(mean(self.at, self.factors))
+        normal = drawn / np.sqrt(self.spread.biases)
+        z = (self.summary.mean + self.summary.sd * normal).reshape(CHAINS, -1, M)
+        levels = np.zeros((*z.shape[:2], 0))
+        return Draws(z, levels, [], np.arange(z.shape[1]), [], [])
+
+    def check_kept(self, keep: tuple[str, ...]) -> None:
+        """Raise `InputError` for draws of what would take too much room."""
+        if {"states", "replicas"} & set(keep):
+            raise InputError(
+                "fit(save=...): a fit in sparse form keeps no draws of states or replicas; leave save out, or give"
+                ' form="dense"'
+            )
+
+    def log_prior(self, draws: Draws) -> np.ndarray | None:
+        """None: it takes as much room as the draws."""
+        return None
+
+    @property
+    def pull(self) -> np.ndarray:
+        """Linear term (M,) of the log-likelihood of z about zero, trajectories integrated."""
+        return np.asarray(self.at.apply(np.asarray(self.at.point.z))) + np.asarray(self.at.score())
+
+    @property
+    def attrs(self) -> Mapping[str, float]:
+        """The limit of inclusion, how many directions are weak, and the error of an evidence that is estimated."""
+        estimated = {} if self.evidence_error is None else {"log_evidence_error": self.evidence_error}
+        return {"rope": ROPE, "sparse": 1.0, "weak": float(self.weak)} | estimated
+
+
+def blockwise_answer(method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
+    """The answer of `EA` or `MAP` by blocks of sensors; raises `FitError` where a flat prior leaves no interval."""
+    model, products = problem.model, getattr(method, "form", "") == PRODUCTS
+    engine = SparseEngine(products)
+    integrated = hasattr(method, "integrates") and method.integrates(prior)
+    first = prior.precision(problem.labels, problem.surveyed)
+    declared = Precision.single(jnp.ones(model.biases)) if integrated else first
+    factors = Factors.of(declared)
+
+    def told(k: int, value: float) -> bool:
+        context.monitor.tell(method.name, min(k, method.iterations), method.iterations, value, bound=True)
+        return bool(context.monitor.stopped)
+
+    def expand(point: Point) -> Expansion:
+        return engine.settled(model, point)
+
+    try:
+        mode = climb_to_mode(expand, start, factors, min(STEPS, method.iterations), 1e-2 * method.tolerance, told)
+        worth = evidence(mode.at, declared, factors)
+        form = Form(model.biases, hierarchy_of(prior, problem)) if integrated else None
+        if form is not None and form.hierarchy.learnt:  # else every bias has a survey
+            posterior, settled = _integrated(problem, prior, form, first, expand, mode.at, worth, context.key, told)
+        else:
+            posterior, settled = _gaussian(problem, prior, mode.at, worth, first), True
+    except MemoryError:
+        size = f"{model.state_size} state entries and {model.biases} biases"
+        if products:
+            raise FitError(
+                f"memory does not hold {size}, not even without a factor: take fewer sensors or a shorter time"
+            ) from None
+        if getattr(method, "form", "") == "auto" and isinstance(prior, (Gaussian, Flat)):
+            return blockwise_answer(replace(cast("Any", method), form=PRODUCTS), problem, prior, start, context)
+        raise FitError(
+            f"the sparse factor of {size} does not fit in memory:"
+            f' MAP(form="{PRODUCTS}") makes none; or take fewer sensors or a shorter time'
+        ) from None
+    except np.linalg.LinAlgError:
+        raise diverged(problem, engine.at(model, start), factors) from None
+    square = float(mean_square(model, posterior.point))
+    return conclude_at(
+        problem, method, prior, posterior, mode.trace, square, len(mode.trace), converged=mode.converged and settled,
+        refused=mode.refused, evidence=worth.value, stopped=context.monitor.stopped,
+    )  # fmt: skip
+
+
+def diverged(problem: Problem, at: Expansion, factors: Factors) -> FitError:
+    """What to say where the precision at a point with the factors of a prior is not positive definite."""
+    told = np.append(np.zeros(problem.model.biases), 0.0)
+    for *_, read, lin in problem.model.each_block(problem.model.read, at.rows):
+        own = np.einsum("ncp,nc->np", np.asarray(lin.bias) ** 2, np.asarray(lin.weight))
+        np.add.at(told, read, own)
+    nothing = np.flatnonzero(told[:-1] + np.asarray(factors.diagonal(problem.model.biases)) == 0)
+    silent = ", ".join([problem.labels[m] for m in nothing][:NAMED])
+    why = f"no row tells {silent}" if silent else "the information matrix is singular"
+    return FitError(f"The fit diverged: {why}; the estimate is invalid. Use a prior, or fix some biases.")
+
+
+def side_climb(problem: Problem, form: str) -> SideClimb:
+    """To the marginal mode, with its log evidence, or without a factor its log marginal density.
+
+    An estimated log determinant of the biases would blur what tells the sides apart; reflected it is nearly the same.
+    """
+    engine, scales = SparseEngine(form == PRODUCTS), Precision.single(jnp.ones(problem.model.biases))
+    factors = Factors.of(scales)
+
+    def mode(point: Point) -> tuple[Point, float]:
+        try:
+            found = climb_to_mode(lambda at: engine.settled(problem.model, at), point, factors, STEPS, 1e-3)
+            worth = -found.value if engine.products else evidence(found.at, scales, factors).value
+            return found.at.point, worth
+        except (np.linalg.LinAlgError, FitError):  # not positive definite, or conjugate gradients did not end
+            return point, -np.inf
+
+    return SideClimb(mode, lambda _, evidence: evidence, HELD)
+
+
+def blocks_at(at: Expansion, factors: Factors, spread: Spread) -> SensorBlocks:
+    """Covariances of the biases of each sensor; their variances alone where these are estimated."""
+    M = at.model.biases
+    if spread.error.any():
+        return SensorBlocks(M, np.arange(M)[:, None], spread.biases[:, None, None])
+    members = blocks_of(at.model)
+    return SensorBlocks(M, members, np.asarray(at.marginals(factors, members)))
+
+
+def declared_blocks(at: Expansion) -> SensorBlocks:
+    """Covariances of the biases of each sensor under a prior of the declared scales, at a point."""
+    scales = Factors.alone(np.ones(at.model.biases))
+    return blocks_at(at, scales, at.spread(scales))
+
+
+def _gaussian(problem: Problem, prior: Prior, at: Expansion, worth: Estimate, first: Precision) -> BlockPosterior:
+    """The Gaussian at a mode under precisions `first`; `worth` is its log evidence."""
+    factors, z, alpha = Factors.of(first), np.asarray(at.point.z), np.asarray(first.alpha)
+    spread = at.spread(factors)
+    blocks = blocks_at(at, factors, spread)
+    half, gamma = HALF * np.sqrt(spread.biases), np.clip(1.0 - alpha * spread.biases, 0.0, 1.0)
+    declared = blocks if prior.proper else blocks.under_scales()
+    errors = {"sd_error": 0.5 * spread.error / spread.biases} if spread.error.any() else {}
+    summary = Summary(
+        "Laplace", "given", z, None, z - half, z + half, gamma, alpha, None, np.zeros(0),
+        worth.value if prior.proper else None, told_columns(declared) | errors, blocks=blocks,
+    )  # fmt: skip
+    named = alone_directions(problem, at.point, declared, NAMED)  # a flat prior leaves no room for more
+    found = screened_directions(problem, at, declared, NAMED) if prior.proper else named
+    estimated = worth.error if prior.proper and worth.error else None
+    return BlockPosterior(problem, prior, at.point, summary, at, factors, spread, declared, *found, estimated)
+
+
+def told_columns(declared: SensorBlocks) -> dict[str, np.ndarray]:
+    """A column with the share that data narrow each bias, of its declared scale."""
+    return {"contraction": np.clip(1.0 - declared.variance, 0.0, 1.0)}
+
+
+def _integrated(
+    problem: Problem, prior: Prior, form: Form, first: Precision, expand: Callable[[Point], Expansion], at: Expansion,
+    worth: Estimate, key: jax.Array, told: Any,
+) -> tuple[BlockPosterior, bool]:  # fmt: skip
+    """The marginals that a hierarchy makes of the likelihood, this taken anew at their mean."""
+    found = screened_directions(problem, at, declared_blocks(at), NAMED)
+    work = Propagation.of(form, first, ExpansionLikelihood(expand, at), blocks_of(problem.model), key)
+    work.run(told)
+    swept, last, begun, likelihood = work.swept, work.found, work.begun, work.likelihood
+    assert swept is not None
+    assert last is not None
+    assert begun is not None
+    assert isinstance(likelihood, ExpansionLikelihood)
+    middle, own, here = work.mean, work.variance, likelihood.here
+    declared = SensorBlocks(len(middle), work.members, begun.covariance)
+    tail, alone = 0.5 * (1.0 - INTERVAL), np.asarray(work.first.alpha)
+    lower, upper = (np.asarray(quantile(swept.means, swept.sds, share)) for share in (tail, 1.0 - tail))
+    alpha = np.clip((1 - swept.gamma) / np.maximum(own, 1e-300), *PRECISION_BOUNDS)
+    alpha = np.where(held(prior, problem), alone, alpha)
+    summary = Summary(
+        "mixture", "integrated", middle, None, lower, upper, swept.gamma, alpha, None, np.zeros(0), worth.value,
+        told_columns(declared), SensorBlocks(len(middle), work.members, swept.covariance),
+    )  # fmt: skip
+    point = here.moved(middle - np.asarray(here.point.z))
+    posterior = BlockPosterior(
+        problem, prior, point, summary, here, last.whole, here.spread(last.whole), declared, *found
+    )
+    return posterior, work.settled

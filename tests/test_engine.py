@@ -1,0 +1,162 @@
+"""One contract for all engines: at one point every member of an expansion agrees with that of every other."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference import NaiveEngine
+from sparse_worlds import drawn, drawn_in_space, loud_ear
+
+import probcal as pc
+from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.engine import Factors, Group, evidence, mean, noise_score
+from probcal.gaussian.linearised import laplace
+from probcal.gaussian.mode import find_tracks
+from probcal.gaussian.sparse import SparseEngine
+from probcal.model.model import Tilt
+from probcal.modes import automatic_start
+from probcal.noise import StudentT
+
+ENGINES = [DenseEngine, pytest.param(SparseEngine, id="SparseEngine")]
+
+
+@pc.sensor(range=pc.Channel("m", std=pc.Unknown(1.0), noise=StudentT(4.0)))
+def sonar(target, pose, *, range_offset=pc.Bias("m", 2.0, drift=pc.Drift([0.0, 6.0], scale=1.0))):
+    """Range of unknown noise with heavy tails."""
+    return dict(range=pc.geometry.norm(target.position - pose.position) + range_offset)
+
+
+def loud():
+    """Unknown levels and heavy tails of data and of process noise, a bias that drifts."""
+    places = [(0.0, 0.0), (300.0, 0.0), (0.0, 300.0), (300.0, 300.0)]
+    nodes = [pc.Node(f"n{k}", p, scale={"position": 3.0} if k > 1 else None) for k, p in enumerate(places)]
+    network = pc.Network([*(sonar.on(node) for node in nodes[:3]), loud_ear.on(nodes[3])])
+    time = np.arange(12.0)
+    way = np.stack([60 + 15 * time, 100 + 40 * np.sin(time / 4)], 1)
+    run = pc.simulate(network, pc.ConstantVelocity(1.0), time, key=2, tracks={"t": way})
+    return pc.Problem(network, pc.ConstantVelocity(pc.Unknown(1.0), noise=StudentT(4.0)), run.table)
+
+
+WORLDS = ("flat", *(pytest.param(name, marks=pytest.mark.ci) for name in ("space", "loud", "correlated", "placed")))
+
+
+@cache
+def expanded(name):
+    """A model, a point whose tracks are at their mode, and the factors of a prior, of sites and of a survey."""
+    if name == "loud":
+        problem = loud()
+    else:  # three targets in 2-D, one of which rests; two in 3-D with mixed sensors
+        problem = (drawn_in_space if name == "space" else drawn)()[0]
+        run = pc.simulate(problem.network, problem.motion, np.arange(7.0), key=1)
+        rows = run.table.sample(frac=0.7, random_state=1)  # at times of their own
+        rows.loc[rows.index[::9], rows.columns[3:].intersection(["azimuth"])] = np.nan
+        problem = pc.Problem(problem.network, problem.motion, rows)
+    with jax.enable_x64(True):
+        M, rng = problem.model.biases, np.random.default_rng(5)
+        model = problem.model
+        if name == "placed":  # what integrated places add
+            root = rng.standard_normal((M, M))
+            model = model.with_tilt(Tilt(np.zeros(M), np.array(0.4), rng.standard_normal(M), root @ root.T / M))
+        point = automatic_start(problem)
+        point = find_tracks(model, point._replace(z=point.z + 0.1 * rng.standard_normal(M)), 50, 1e-13)
+        prior = pc.Gaussian(correlation={"*.position_x": 0.5} if name == "correlated" else ())
+        factors = Factors.of(prior.precision(problem.labels, problem.surveyed))
+        members = np.stack([np.arange(M), np.roll(np.arange(M), 1)], 1)[:3]
+        site = np.broadcast_to(np.array([[2.0, 0.5], [0.5, 1.0]]), (3, 2, 2))
+        sites = Factors((Group(members, jnp.asarray(site), jnp.asarray(rng.standard_normal((3, 2)))),))
+        return problem, model, point, factors + sites
+
+
+@cache
+def at(engine, name):
+    """An expansion at the point of a world."""
+    with jax.enable_x64(True):
+        _, model, point, _ = expanded(name)
+        return engine().at(model, point)
+
+
+def agree(one, other, tolerance=1e-8):
+    """Trees of arrays agree to a share of the largest entry of each."""
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        a, b = np.asarray(a), np.asarray(b)
+        assert a.shape == b.shape
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * max(np.abs(b).max(initial=0.0), 1e-12))
+
+
+def embedded_columns(model, rng):
+    """Columns (N, C, 3) of three further parameters."""
+    return tuple(jnp.asarray(rng.standard_normal((*data.y.shape, 3))) for data in model.rows)
+
+
+MEMBERS = {  # what each is asked with
+    "density": lambda own, *_: own.density(),
+    "log_det": lambda own, factors, *_: own.log_det(factors).value,
+    "solve": lambda own, factors, M: (own.solve(factors, np.eye(M)), own.solve(factors, np.ones(M))),
+    "apply": lambda own, _, M: (own.apply(np.eye(M)), own.apply(np.ones(M))),
+    "moved": lambda own, _, M: own.moved(0.1 * np.arange(M)),
+    "marginals": lambda own, factors, M: own.marginals(factors, np.array([[0, 1, M], [M - 1, 2, 0]])),
+    "states": lambda own, factors, _: own.states(factors),
+    "noises": lambda own, factors, _: own.noises(factors),
+    "predicted": lambda own, factors, _: own.predicted(factors),
+    "leverages": lambda own, factors, _: own.leverages(factors),
+    "noise_score": lambda own, factors, _: noise_score(own, factors),
+    "weighed": lambda own, factors, M: (
+        own.weighed(some_rows(own.model)).solve(factors, np.ones(M)), own.weighed(some_rows(own.model)).apply(np.eye(M))
+    ),
+    "embedded": lambda own, factors, _: own.embedded(factors, embedded_columns(own.model, np.random.default_rng(7))),
+}  # fmt: skip
+
+
+def some_rows(model):
+    """Weights (N, 1) that leave every third row out and count every second of the rest by a half."""
+    return tuple(jnp.asarray(np.resize([0.0, 0.5, 1.0], len(data.epoch))[:, None]) for data in model.rows)
+
+
+@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("member", MEMBERS)
+@pytest.mark.parametrize("engine", ENGINES)
+def test_every_member_of_an_engine_is_that_of_the_naive_one(engine, member, name):
+    with jax.enable_x64(True):
+        _, model, _, factors = expanded(name)
+        ask = MEMBERS[member]
+        agree(*(ask(at(own, name), factors, model.biases) for own in (engine, NaiveEngine)))
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_score_is_the_slope_of_the_density(engine, name):
+    with jax.enable_x64(True):
+        agree(at(engine, name).score(), at(NaiveEngine, name).score(), 1e-4)
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("engine", [*ENGINES, NaiveEngine])
+def test_draws_have_the_mean_and_covariance_of_the_biases_and_states(engine, name):
+    with jax.enable_x64(True):
+        _, model, _, factors = expanded(name)
+        own, M, count = at(engine, name), model.biases, 4000
+        found = own.sample(factors, jax.random.key(3), count)
+        z, covariance = np.asarray(found.z), np.asarray(own.solve(factors, np.eye(M)))
+        sd = np.sqrt(np.diag(covariance))
+        np.testing.assert_allclose((z.mean(0) - mean(own, factors)) / sd, 0.0, atol=5 / count**0.5)
+        np.testing.assert_allclose(np.cov((z / sd).T), covariance / np.outer(sd, sd), atol=8 / count**0.5)
+        for drawn_, spread in zip(found.states, own.states(factors), strict=True):
+            own_sd = np.sqrt(np.maximum(np.diagonal(np.asarray(spread), axis1=1, axis2=2), 0.0))
+            np.testing.assert_allclose(np.asarray(drawn_).std(0), own_sd, rtol=6 / (2 * count) ** 0.5, atol=1e-9)
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("name", ["flat", "space", "loud", "correlated"])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_evidence_is_that_of_laplaces_formula(engine, name):
+    with jax.enable_x64(True):
+        problem, model, point, _ = expanded(name)
+        prior = pc.Gaussian(correlation={"*.position_x": 0.5} if name == "correlated" else ())
+        prior = prior.precision(problem.labels, problem.surveyed)
+        found = evidence(at(engine, name), prior)
+        assert found.error == 0
+        np.testing.assert_allclose(found.value, float(laplace(model, point, prior).evidence), rtol=1e-10, atol=1e-8)
