@@ -154,7 +154,7 @@ class DenseExpansion:
         return DenseEngine().at(self.model.weighted(weights), self.point, scaled(self.rows, weights))
 
     def embedded(self, factors: Factors, columns: Data) -> Embedded:
-        """Information about K more parameters and its score, by which each predicted value changes as columns (N, C, K) say."""
+        """Information and score of K more parameters, by which predicted values change as columns (N, C, K)."""
         return _embedded(self.linear, factors, jnp.asarray(factors.pull(self.point.z)), columns)
 
 

@@ -189,7 +189,7 @@ class Expansion(Protocol):
         """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
 
     def embedded(self, factors: Factors, columns: Data) -> Embedded:
-        """Information about K more parameters and its score, by which each predicted value changes as columns (N, C, K) say."""
+        """Information and score of K more parameters, by which predicted values change as columns (N, C, K)."""
 
 
 class Engine(Protocol):

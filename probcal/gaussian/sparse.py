@@ -227,7 +227,7 @@ class SparseExpansion:
         return SparseExpansion(self.model.weighted(weights), self.point, scaled(self.rows, weights), self.joint)
 
     def embedded(self, factors: Factors, columns: Data) -> Embedded:
-        """Information about K more parameters and its score, by which each predicted value changes as columns (N, C, K) say."""
+        """Information and score of K more parameters, by which predicted values change as columns (N, C, K)."""
         found, (scores, pull) = self.solved(factors), self._relaxed
         own, score, states, biases = _columns(self.model, self.rows, scores, columns)
         right = self.joint.variables(states, biases)
