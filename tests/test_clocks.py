@@ -225,3 +225,26 @@ def test_a_clock_that_runs_counts_from_the_rows_of_its_calibration(dated):
     since = later.measurements.time[mine] - applied.begin
     ahead = found.loc["n1.time_offset", "mean"] + found.loc["n1.time_rate", "mean"] * since
     assert np.allclose(applied.moved[mine], ahead, rtol=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("offset", "scale"), [(10.0, 10.0), (-10.0, 3.0), (10.0, 1.0)])
+def test_an_offset_far_beyond_the_reach_is_never_determined_and_wrong(offset, scale):
+    """Turns within a second, rows every two: of ten times the reach, other lags fit as tracks do."""
+    time, confident = np.arange(0.0, 80.0, 2.0), 0
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        rate, phase, size = (rng.uniform(low, high, (2, 3)) for low, high in ((0.5, 1.5), (0, 6.3), (10, 40)))
+
+        def way(t, rate=rate, phase=phase, size=size):
+            return np.array([200, 120]) + np.sum(size * np.sin(t[:, None, None] * rate + phase), 2)
+
+        rows = late_rows((0.0, offset, 0.0), 100 + seed, way, time)
+        problem = pc.Problem(network(scale), pc.ConstantAcceleration(20.0), rows)
+        tree = pc.assess(problem, pc.fit(problem))
+        table = pc.summary(tree).set_index("bias")
+        confident += tree.attrs["status"] == "converged"
+        truth = [offset if label == "n1.time_offset" else 0.0 for label in table.index]
+        sure = (table["verdict"] == "determined") & (np.abs(table["mean"] - truth) > 4 * table["sd"])
+        assert not sure.any(), table[sure]
+    assert confident, "the verdicts are put to the test"

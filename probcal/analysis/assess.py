@@ -20,7 +20,7 @@ from probcal.analysis import (
     shape,
     verdict,
 )
-from probcal.analysis.beside import mirror_doubts, mirror_findings
+from probcal.analysis.beside import lag_doubts, mirror_doubts, mirror_findings
 from probcal.analysis.findings import Finding, alarms, completed, of_invalid
 from probcal.analysis.large import assess_large
 from probcal.analysis.pieces import Change, Pieces
@@ -176,7 +176,7 @@ def _verdicts(
     def around() -> list[np.ndarray]:  # draws of chains lie on both sides
         return [np.asarray(variance) for variance in fit.at.variances(jnp.asarray(fit.covariance))]
 
-    doubts |= mirror_doubts(fit, tree, around)
+    doubts |= mirror_doubts(fit, tree, around) | lag_doubts(fit, found)
     words, reasons = verdict.judge_biases(
         problem, status, ended, known, drifts, disagreements, first, _shared(tree), doubts
     )

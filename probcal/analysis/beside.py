@@ -6,8 +6,10 @@ import numpy as np
 import xarray as xr
 
 from probcal.analysis.findings import Finding
-from probcal.inference.fitted import Judged, saved_by_epoch
+from probcal.inference import residuals
+from probcal.inference.fitted import Fitted, Judged, saved_by_epoch
 from probcal.labels import PIECE, SCENE
+from probcal.modes.clocks import EXPLAINED, turning_time
 from probcal.modes.reflections import touched
 from probcal.results.read import each_track
 
@@ -56,3 +58,16 @@ def _saved(fit: Judged, tree: xr.DataTree) -> list[np.ndarray]:
     """Variances (E, n) of the states of each recursion from the saved tracks."""
     tracked = dict(each_track(tree))
     return [saved_by_epoch(epochs, tracked, "sd", "targets") ** 2 for epochs in fit.problem.epochs]
+
+
+def lag_doubts(fit: Fitted, found: residuals.Filtered) -> dict[int, str]:
+    """Why clocks are in doubt whose rows the fit explains badly: another lag may explain them.
+
+    The slope tells of lags within the reach of the search alone, however much sds are widened.
+    """
+    mean, timed = found.innovations.spread(slice(None)), fit.problem.timed
+    if not timed or mean < EXPLAINED:
+        return {}
+    reach = turning_time(fit.problem, fit.point)
+    said = f"a lag more than {reach:.2g} s away may explain innovations of mean square {mean:.2g}"
+    return {m: said for m, label in enumerate(fit.problem.labels) if label in timed}
