@@ -205,7 +205,9 @@ def warehouse_of(seed, zeros, noise, rate=10.0):
     import probcal as pc
     from probcal import noise as families
 
-    @pc.sensor(range=pc.Channel("m", std=pc.Unknown(0.1), noise=eval(f"families.{noise}", {"families": families})))
+    @pc.sensor(
+        range=pc.Channel("m", std=pc.Unknown(0.1), noise=eval(f"families.{noise}", {"families": families, "pc": pc}))
+    )
     def uwb(target, pose, *, range_offset=pc.Bias("m", 0.3, zeros=zeros)):
         return dict(range=pc.geometry.norm(target.position - pose.position) + range_offset)
 
@@ -259,7 +261,10 @@ def coverage(mean, sd, lower, upper, true, sure):
     }  # fmt: skip
 
 
-@situation(*itertools.product(DECLARED, ("StudentT(4)", "Mixture(0.1, 10, 12)")))
+LATE_NOISE = 'Mixture(pc.Unknown(0.1), pc.Unknown(8.0), late="exponential")'  # what a user would declare now
+
+
+@situation(*itertools.product(DECLARED, ("StudentT(4)", "Mixture(0.1, 10, 12)", LATE_NOISE)))
 def warehouse(seed, declared, noise):
     """Delays that are never zero, declared so and not, at ten ranges a second of each anchor."""
     return kinds(seed, declared, noise)

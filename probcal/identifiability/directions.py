@@ -191,12 +191,13 @@ def screened_directions(
     it. A remedy is kept where the information about the biases that it may fix says so, all others uncertain.
     """
     scales = Factors.alone(np.ones(len(problem.labels)))
-    together = _open_together(problem, at, scales)
+    together = shared_directions(problem, at, scales)
     alone, count = alone_directions(problem, at.point, blocks, most)
     return (*together, *alone), len(together) + count
 
 
-def _open_together(problem: Problem, at: Expansion, scales: Factors) -> tuple[Direction, ...]:
+def shared_directions(problem: Problem, at: Expansion, scales: Factors) -> tuple[Direction, ...]:
+    """Rigid motions and common shifts that the data leave to a prior of the declared scales, of these factors."""
     patterns = list[tuple[Pattern, np.ndarray]]()
     for pattern in (*rigid_motions(problem, np.asarray(at.point.z)), *common_shifts(problem)):
         vector = np.where(problem.surveyed, 0.0, pattern.vector)

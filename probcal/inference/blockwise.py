@@ -24,7 +24,7 @@ from probcal.gaussian.information import mean_square
 from probcal.gaussian.joint import blocks_of, is_thin, missing, prefers_sparse
 from probcal.gaussian.mode import Point
 from probcal.gaussian.sparse import SparseEngine
-from probcal.identifiability.directions import alone_directions, screened_directions
+from probcal.identifiability.directions import alone_directions, screened_directions, shared_directions
 from probcal.identifiability.remedies import Direction
 from probcal.inference.ending import conclude_at
 from probcal.inference.hierarchy import held, hierarchy_of
@@ -202,7 +202,12 @@ def blockwise_answer(method: Maximiser, problem: Problem, prior: Prior, start: P
         worth = evidence(mode.at, declared, factors)
         form = Form(model.biases, hierarchy_of(prior, problem)) if integrated else None
         if form is not None and form.hierarchy.learnt:  # else every bias has a survey
-            posterior, settled = _integrated(problem, prior, form, first, expand, mode.at, worth, context.key, told)
+            together = shared_directions(problem, mode.at, factors)  # while its factor is at hand
+            posterior, settled = _integrated(
+                problem, prior, form, first, ExpansionLikelihood(expand, mode.at), worth, context.key, told
+            )
+            alone, count = alone_directions(problem, posterior.point, posterior.declared, NAMED)
+            posterior = replace(posterior, open=(*together, *alone), weak=len(together) + count)
         else:
             posterior, settled = _gaussian(problem, prior, mode.at, worth, first), True
     except MemoryError:
@@ -296,19 +301,18 @@ def told_columns(declared: SensorBlocks) -> dict[str, np.ndarray]:
 
 
 def _integrated(
-    problem: Problem, prior: Prior, form: Form, first: Precision, expand: Callable[[Point], Expansion], at: Expansion,
-    worth: Estimate, key: jax.Array, told: Any,
+    problem: Problem, prior: Prior, form: Form, first: Precision, likelihood: ExpansionLikelihood, worth: Estimate,
+    key: jax.Array, told: Any,
 ) -> tuple[BlockPosterior, bool]:  # fmt: skip
-    """The marginals that a hierarchy makes of the likelihood, this taken anew at their mean."""
-    found = screened_directions(problem, at, declared_blocks(at), NAMED)
-    work = Propagation.of(form, first, ExpansionLikelihood(expand, at), blocks_of(problem.model), key)
+    """The marginals that a hierarchy makes of a likelihood, this taken anew at their mean; nothing said to be open."""
+    work = Propagation.of(form, first, likelihood, blocks_of(problem.model), key)
     work.run(told)
-    swept, last, begun, likelihood = work.swept, work.found, work.begun, work.likelihood
+    swept, last, begun, ended = work.swept, work.found, work.begun, work.likelihood
     assert swept is not None
     assert last is not None
     assert begun is not None
-    assert isinstance(likelihood, ExpansionLikelihood)
-    middle, own, here = work.mean, work.variance, likelihood.here
+    assert isinstance(ended, ExpansionLikelihood)
+    middle, own, here = work.mean, work.variance, ended.here
     declared = SensorBlocks(len(middle), work.members, begun.covariance)
     tail, alone = 0.5 * (1.0 - INTERVAL), np.asarray(work.first.alpha)
     lower, upper = (np.asarray(quantile(swept.means, swept.sds, share)) for share in (tail, 1.0 - tail))
@@ -319,7 +323,5 @@ def _integrated(
         told_columns(declared), SensorBlocks(len(middle), work.members, swept.covariance),
     )  # fmt: skip
     point = here.moved(middle - np.asarray(here.point.z))
-    posterior = BlockPosterior(
-        problem, prior, point, summary, here, last.whole, here.spread(last.whole), declared, *found
-    )
-    return posterior, work.settled
+    spread = here.spread(last.whole)
+    return BlockPosterior(problem, prior, point, summary, here, last.whole, spread, declared, (), 0), work.settled
