@@ -66,8 +66,8 @@ def test_slope_and_curvature_are_those_of_the_evidence():
     members = members_of(problem)
     assert [level.label for level in members.levels] == ["fixer.place_std", "fixer.rate_std", "motion.velocity_std"]
     assert [(index == 0).sum() for index in members.rows] == [2 * problem.measurements.measured[:, 0].sum()]
-    found = slopes(problem.model, fit.point, np.asarray(fit.prior.matrix()), members)
-    asked = ask(fit, members, np.asarray(fit.prior.matrix()))
+    found = slopes(fit.expansion, fit.factors, members)
+    asked = ask(fit, members, fit.factors)
     step, names = 0.005, {"place": 0.5, "rate": 0.2, "motion": 0.4}
     middle = evidence()
     sides = {

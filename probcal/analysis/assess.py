@@ -65,8 +65,8 @@ def assess(
 
     Limits have a false-alarm rate of 1 %: of one epoch in `epoch_check`, else of all comparisons of a kind together.
     Refits of large networks are one step from the fit (attribute `refits` of the group). Of a misfit nothing is left
-    out and no halves are compared. A fit in sparse form is judged by its innovations, by its halves, and by how much
-    the data narrow each bias (`probcal.analysis.large`), not by its noise levels. Raises `InputError` where the tree is
+    out and no halves are compared. A fit in sparse form is judged by its innovations, its halves, its noise levels, and
+    by how much the data narrow each bias (`probcal.analysis.large`). Raises `InputError` where the tree is
     no fit of the problem.
 
     >>> checked = assess(problem, tree)

@@ -13,7 +13,7 @@ from contextlib import suppress
 import numpy as np
 import xarray as xr
 
-from probcal.analysis import checks, pieces, verdict
+from probcal.analysis import checks, levels, pieces, verdict
 from probcal.analysis.beside import mirror_doubts, mirror_findings
 from probcal.analysis.findings import Finding, completed, of_invalid
 from probcal.analysis.halves import SAMPLED, Divided, Halves, drifts_of
@@ -35,8 +35,8 @@ SHARED = 1.8  # sd that an open combination of one scale may put a bias off
 def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> xr.DataTree:
     """A copy of the tree of a fit in sparse form with what its innovations say and a verdict a bias.
 
-    Groups as of `assess`: `datum_check`, `epoch_check`, `channel_check`, `sensor_check`, `target_check`, `verdict`,
-    `finding`. Raises `InputError` where the tree is no fit of the problem.
+    Groups as of `assess`: `datum_check`, `epoch_check`, `channel_check`, `sensor_check`, `target_check`, `level_check`,
+    `verdict`, `finding`. Raises `InputError` where the tree is no fit of the problem.
     """
     fit = take_up_large(problem, tree, answer)
     found = residuals.innovations_large(fit, tree["calibration"].to_dataset()["gamma"].values)
@@ -51,7 +51,14 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
     findings += checks.outlying(fit, found)
     findings += checks.wrapping(fit, tree)
     rejected, declared = rejection(fit, found, channels), _declared(fit, tree, answer)
-    groups["verdict"] = _verdicts(fit, tree, rejected, declared, found.excess, groups)
+    hanging, asked_of = dict[int, str](), list[Finding]()
+    if tree.attrs["status"] not in INVALID and cholesky.exact() and "sd_error" not in tree["calibration"]:
+        with suppress(MemoryError):
+            asked, asked_of, hanging = levels.check_levels(fit, tree)
+            groups |= {} if asked is None else {"level_check": asked}
+    groups["verdict"] = _verdicts(fit, tree, rejected, declared, found.excess, groups, hanging)
+    if not (any(f.kind == "outliers" for f in findings) or (groups["verdict"]["verdict"] == "drifting").any()):
+        findings += asked_of  # else the levels are only a sign of these
     if "halves" in groups and (unsolved := groups["halves"].attrs["unsolved"]):
         text = f"{unsolved} more biases may differ between the halves than were looked at: so many are no drift of one"
         findings.append(Finding("halves", "fit", text))
@@ -113,6 +120,7 @@ def _verdicts(
     declared: SensorBlocks,
     excess: float,
     groups: dict[str, xr.Dataset],
+    hanging: dict[int, str],
 ) -> xr.Dataset:
     """Group `verdict`; adds the group `halves` where the recording can be divided."""
     problem, group = fit.problem, tree["calibration"].to_dataset()
@@ -136,7 +144,7 @@ def _verdicts(
         float(np.sqrt(verdict.limit_of(M))), verdict.explained_part(z, alpha, gamma, excess),
     )  # fmt: skip
     shared = shared_in_blocks(problem, fit.point, declared.members, declared.covariance, SHARED)
-    ended, doubts = group["status"].values.tolist(), mirror_doubts(fit, tree)
+    ended, doubts = group["status"].values.tolist(), hanging | mirror_doubts(fit, tree)
     words, reasons = verdict.judge_biases(
         problem, Status(tree.attrs["status"]), ended, known, drifts, {}, first, shared, doubts
     )

@@ -17,13 +17,10 @@ import xarray as xr
 
 from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import limit_of
-from probcal.gaussian.linearised import Linearisation, linearise
-from probcal.gaussian.marginal import SETTLED, TRACK_STEPS, volume_slope
-from probcal.gaussian.mode import Point, find_tracks
-from probcal.inference.fitted import Fitted
+from probcal.gaussian.engine import Engine, Expansion, Factors, noise_score
+from probcal.inference.fitted import Judged
 from probcal.inference.residuals import PRACTICAL
 from probcal.labels import listed
-from probcal.model.model import Data, Model
 from probcal.model.motions import by_component, linear_of
 from probcal.motion import as_motion
 from probcal.motion.base import level_label
@@ -34,6 +31,7 @@ from probcal.results.groups import bias_coords
 STEP = 0.1  # of a log level to either side
 FEWEST = 30  # noises below which nothing is said of their level
 TURNS, LONGEST, NEAR = 4, 1.0, 0.15  # most expansions, the longest step of a log level in one, and one that is the last
+SUSPECT = 4.0  # chi-square of a look at a large network from which its levels are expanded
 NEGLIGIBLE = 6.0  # chi-square up to which a step is chance, and is not followed
 CLIMBS, SETTLED_Z = 3, 0.01  # most steps of z to its mode, and scales within which it is there
 MOST = 12  # levels that are looked at, those of the most noises
@@ -69,7 +67,7 @@ class Slopes(NamedTuple):
 
     level: np.ndarray  # (K,)
     z: np.ndarray  # (M,)
-    information: np.ndarray  # (M, M) about z
+    alone: np.ndarray  # (K,) information about each log level if every noise stood alone
 
 
 class Wanted(NamedTuple):
@@ -78,7 +76,7 @@ class Wanted(NamedTuple):
     step: np.ndarray  # (K,) of the log levels
     sd: np.ndarray  # (K,)
     square: np.ndarray  # (K,) of each step alone over its variance
-    shift: np.ndarray  # (K, M) of z with the step of each level
+    shift: np.ndarray | None  # (K, M) of z with the step of each level; None where it was not worked out
 
 
 def members_of(problem: Problem, *, moving: bool = True) -> Members:
@@ -135,48 +133,28 @@ def _with_unknown(problem: Problem, number: np.ndarray, index: np.ndarray, found
     return index
 
 
-@jax.jit
-def _terms(at: Linearisation, covariance: jax.Array) -> tuple[Data, tuple[jax.Array, ...]]:
-    """What the slope of the log evidence by each log level is a sum of, for a covariance (M, M) of z.
-
-    Of every datum (N, C) of the blocks, and of every whitened noise (E, n) of the recursions.
-    """
-    model, point = at.model, at.point
-    data = zip(
-        model.level_score(point), model.information(point), at.predicted_variances(covariance), model.measured,
-        strict=True,
-    )  # fmt: skip
-    rows = tuple(square + weight * spread - there for square, weight, spread, there in data)
-    driven = zip(point.noises, at.noise_variances(covariance), strict=True)
-    return rows, tuple(u**2 + spread - 1.0 for u, spread in driven)
+def slopes(at: Expansion, factors: Factors, members: Members) -> Slopes:
+    """Slopes of the log evidence at a point with trajectories at their mode, under the factors of a prior."""
+    found = noise_score(at, factors)
+    alone = members.sums(found.rows_information, found.noises_information)
+    return Slopes(members.sums(found.rows, found.noises), np.asarray(at.score()), alone)
 
 
-def slopes(model: Model, point: Point, prior: np.ndarray, members: Members) -> Slopes:
-    """Slopes of the log evidence at a point with trajectories at their mode, `prior` (M, M) the precision of z."""
-    at = linearise(model, point)
-    information = np.asarray(at.information)
-    rows, noises = _terms(at, jax.device_put(np.linalg.inv(information + prior)))
-    volume, _ = volume_slope(model, point, at.solved)
-    score = np.asarray(at.solved.score) - 0.5 * np.asarray(volume)
-    return Slopes(members.sums(rows, noises), score, information)
-
-
-def _at(model: Model, point: Point, members: Members, step: np.ndarray, z: np.ndarray) -> tuple[Model, Point]:
-    """The model with the levels a step (K,) of their logs away, trajectories at their mode there, biases moved by z."""
+def _at(engine: Engine, at: Expansion, members: Members, step: np.ndarray, z: np.ndarray) -> Expansion:
+    """The posterior with the levels a step (K,) of their logs away, trajectories at their mode, biases moved by z."""
     factor = np.append(np.exp(step), 1.0)  # what has no level goes last
+    model, point = at.model, at.point
     rows = tuple(
         own._replace(std=jax.device_put(np.asarray(own.std) * factor[index]))
-        for own, index in zip(model.rows, members.rows, strict=True)
+        for _, own, _, index in model.each_block(members.rows)
     )
     scales = [factor[index] for index in members.noises]
-    recursions = tuple(
-        part._replace(L=jax.device_put(np.asarray(part.L) * scale[:, None, :]))
-        for part, scale in zip(model.recursions, scales, strict=True)
+    recursions = model.each(
+        lambda part, scale: part._replace(L=jax.device_put(np.asarray(part.L) * scale[:, None, :])), scales
     )
-    noises = tuple(jax.device_put(np.asarray(u) / scale) for u, scale in zip(point.noises, scales, strict=True))
-    other = replace(model, rows=rows, recursions=recursions)
+    noises = model.each(lambda _, u, scale: jax.device_put(np.asarray(u) / scale), point.noises, scales)
     moved = point._replace(noises=noises, z=jax.device_put(np.asarray(point.z) + z))
-    return other, find_tracks(other, moved, TRACK_STEPS, SETTLED)
+    return engine.settled(replace(model, rows=rows, recursions=recursions), moved)
 
 
 class _Expansion(NamedTuple):
@@ -189,27 +167,27 @@ class _Expansion(NamedTuple):
 
 
 def _expanded(
-    fit: Fitted, prior: np.ndarray, model: Model, point: Point, members: Members, moved: np.ndarray
-) -> tuple[_Expansion | None, Point]:
+    fit: Judged, engine: Engine, factors: Factors, at: Expansion, members: Members, moved: np.ndarray
+) -> tuple[_Expansion | None, Expansion]:
     """The expansion where the levels have moved already, (K,), at the mode of z near a point; None without a maximum.
 
-    Also the mode.
+    Also the posterior at the mode.
     """
     K, none = len(members.levels), np.zeros(len(members.levels))
-    here = slopes(model, point, prior, members)
+    here = slopes(at, factors, members)
     for _ in range(CLIMBS):
-        away = np.linalg.solve(here.information + prior, here.z - prior @ np.asarray(point.z))
+        away = np.asarray(at.solve(factors, here.z + factors.pull(at.point.z)))
         if not np.abs(away).max(initial=0.0) > SETTLED_Z:
             break
-        _, point = _at(model, point, members, none, away)
-        here = slopes(model, point, prior, members)
-    still, beside = np.zeros(len(point.z)), list[tuple[Slopes, Slopes]]()
+        at = _at(engine, at, members, none, away)
+        here = slopes(at, factors, members)
+    still, beside = np.zeros(len(at.point.z)), list[tuple[Slopes, Slopes]]()
     for unit in np.eye(K):
-        up, down = (slopes(*_at(model, point, members, s * unit, still), prior, members) for s in (STEP, -STEP))
+        up, down = (slopes(_at(engine, at, members, s * unit, still), factors, members) for s in (STEP, -STEP))
         beside.append((up, down))
     pull = np.array([(up.z - down.z) / (2 * STEP) for up, down in beside])  # (K, M)
     curved = -np.array([(up.level - down.level) / (2 * STEP) for up, down in beside])
-    follow = np.linalg.solve(here.information + prior, pull.T).T
+    follow = np.asarray(at.solve(factors, pull.T)).T
     matrix, slope = 0.5 * (curved + curved.T) - pull @ follow.T, here.level
     unknown = np.array([level.unknown for level in members.levels])
     own = np.flatnonzero(unknown >= 0)
@@ -220,68 +198,83 @@ def _expanded(
     slope[own] -= np.asarray(fit.point.levels)[unknown[own]] / spread**2
     alone = np.diag(curved) + known
     if not (np.isfinite(matrix).all() and np.isfinite(slope).all() and (alone > 0).all()):
-        return None, point
+        return None, at
     matrix = matrix + np.diag(known)
     if not np.linalg.eigvalsh(matrix).min() > 0:  # far from the maximum: each level by itself
         matrix = np.diag(alone)
-    return _Expansion(slope, np.linalg.inv(matrix), pull, follow), point
+    return _Expansion(slope, np.linalg.inv(matrix), pull, follow), at
 
 
-def ask(fit: Fitted, members: Members, prior: np.ndarray) -> Wanted | None:
+def ask(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
     """Where the evidence is largest in all log levels, from the fit on; None where it has no maximum.
 
-    `prior` (M, M) is the precision of z that is held. What biases move is their covariance times what their score
+    `factors` are those of the prior of z that is held. What biases move is their covariance times what their score
     changes, the slope of any posterior mean by what is added to the score.
 
     The slope of N noises of mean square r^2 is N (r^2 exp(-2 t) - 1): a Newton step d stands for t = -log(1 - 2 d) / 2.
     """
-    model, point, K = fit.problem.model, fit.point, len(members.levels)
-    step, shift, square = np.zeros(K), np.zeros((K, len(point.z))), np.zeros(K)
+    engine, at, K = fit.engine, fit.expansion, len(members.levels)
+    step, shift, square = np.zeros(K), np.zeros((K, len(at.point.z))), np.zeros(K)
     sd = np.zeros(K)
+    if not engine.traceable and (screened := _screened(fit, slopes(at, factors, members), members)) is not None:
+        return screened
     for turn in range(TURNS):
-        found, point = _expanded(fit, prior, model, point, members, step)
+        found, at = _expanded(fit, engine, factors, at, members, step)
         if found is None:
             return None if turn == 0 else Wanted(step, sd, square, shift)
         newton, sd = found.covariance @ found.slope, np.sqrt(np.diag(found.covariance))
         square = newton**2 / sd**2 if turn == 0 else square
         bent = -0.5 * np.log(np.maximum(1.0 - 2.0 * newton, np.exp(-2.0 * LONGEST)))
         own = np.clip(bent, -LONGEST, LONGEST)
-        step, shift = step + own, shift + own[:, None] * (found.pull @ fit.covariance)
+        step, shift = step + own, shift + own[:, None] * fit.times(found.pull.T).T
         if np.abs(own).max() < NEAR or not (newton**2 > NEGLIGIBLE * sd**2).any():
             break
-        model, point = _at(model, point, members, own, own @ found.follow)
+        at = _at(engine, at, members, own, own @ found.follow)
     return Wanted(step, sd, square, shift)
 
 
-def check_levels(fit: Fitted, tree: xr.DataTree) -> tuple[xr.Dataset | None, list[Finding], dict[int, str]]:
+def _screened(fit: Judged, here: Slopes, members: Members) -> Wanted | None:
+    """What one look at a large network says: None where some level may be another, which is then expanded."""
+    unknown = np.array([level.unknown >= 0 for level in members.levels])
+    alone = np.maximum(here.alone, 1e-300)
+    step, sd = here.level / alone, alone**-0.5
+    if unknown.any() or (np.abs(step) > NEAR).any() or (step**2 > SUSPECT * sd**2).any():
+        return None
+    return Wanted(step, sd, (step / sd) ** 2, None)
+
+
+def check_levels(fit: Judged, tree: xr.DataTree) -> tuple[xr.Dataset | None, list[Finding], dict[int, str]]:
     """Group `level_check`, findings on declared levels, and why the answer of some biases is in doubt with them.
 
     `factor` is what the data ask for over what the fit had (all levels together), `factor_sd` its sd, `square` the
-    chi-square of that alone, `shift` what every bias would move with it, in its unit. Of process noise nothing is said
+    chi-square of that alone, `shift` what every bias would move with it, in its unit; a large network whose levels one
+    look finds right has no `shift`. Of process noise nothing is said
     where it was left out of the fit. Where precisions were integrated the declared scales are held.
     """
     members = members_of(fit.problem, moving=tree.attrs.get("motion") != "left out")
     integrated = tree.attrs["precisions"] == "integrated"
-    prior = np.eye(len(fit.point.z)) if integrated else np.asarray(fit.prior.matrix())
+    factors = Factors.alone(np.ones(len(fit.point.z))) if integrated else fit.factors
     asked = None
     if members.levels and fit.problem.model.biases:
         with suppress(np.linalg.LinAlgError):  # a flat prior on biases that the data leave open
-            asked = ask(fit, members, prior)
+            asked = ask(fit, members, factors)
     if asked is None:
         return None, [], {}
     problem, limit = fit.problem, limit_of(sum(level.unknown < 0 for level in members.levels))
-    sd = np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
+    sd = np.maximum(fit.sd, 1e-150)
     factor = np.exp(np.clip(asked.step, -FARTHEST, FARTHEST))
     sure = np.array([level.unknown < 0 for level in members.levels]) & (asked.square > limit)
-    moved = np.where(sure[:, None], asked.shift / sd, 0.0)
+    shift = np.zeros((len(sure), len(sd))) if asked.shift is None else asked.shift
+    moved = np.where(sure[:, None], shift / sd, 0.0)
     findings = []
     for k in np.flatnonzero(sure & ((np.abs(np.log(factor)) > np.log(PRACTICAL)) | (np.abs(moved) > HANGS).any(1))):
         text = _sentence(members.levels[k], factor[k], asked.sd[k] * factor[k])
         findings.append(Finding("level", members.levels[k].label, text + _moved(problem, moved[k])))
-    values = {
-        "factor": ("level", factor), "factor_sd": ("level", asked.sd * factor), "square": ("level", asked.square),
-        "shift": (("level", "bias_label"), asked.shift * problem.scales),
+    values: dict[str, Any] = {
+        "factor": ("level", factor), "factor_sd": ("level", asked.sd * factor), "square": ("level", asked.square)
     }  # fmt: skip
+    if asked.shift is not None:
+        values["shift"] = (("level", "bias_label"), asked.shift * problem.scales)
     group = xr.Dataset(values, bias_coords(problem) | {"level": _names(members.levels)})
     group.attrs |= {"limit": float(limit)}
     return group, findings, _doubts(members, moved, factor)

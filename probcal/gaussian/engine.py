@@ -222,15 +222,23 @@ def evidence(at: Expansion, prior: Precision, factors: Factors | None = None) ->
     return Estimate(at.density() + own - 0.5 * volume.value, 0.5 * volume.error)
 
 
-def noise_score(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.Array, ...]]:
-    """Terms of the slope of the log evidence by each log noise level, biases and trajectories integrated.
+class NoiseScore(NamedTuple):
+    """Terms of the slope of the log evidence by log noise levels, and of its information if each noise stood alone.
 
     Of every datum (N, C) of each block, and of every whitened noise (E, n) of each recursion.
     """
-    model, point = at.model, at.point
+
+    rows: Data
+    noises: tuple[jax.Array, ...]
+    rows_information: Data
+    noises_information: tuple[jax.Array, ...]
+
+
+def noise_score(at: Expansion, factors: Factors) -> NoiseScore:
+    """Terms by log noise levels, biases and trajectories integrated; the slope is exact, the information near."""
     spread = tuple(jnp.asarray(own) for own in at.predicted(factors))
     driven = tuple(jnp.asarray(own) for own in at.noises(factors))
-    return _noise_terms(model, point, spread, driven)
+    return _noise_terms(at.model, at.point, spread, driven)
 
 
 @jax.jit
@@ -241,9 +249,9 @@ def density_of(model: Model, point: Point, volume: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def _noise_terms(
-    model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]
-) -> tuple[Data, tuple[jax.Array, ...]]:
-    parts = zip(model.level_score(point), model.information(point), spread, model.measured, strict=True)
-    rows = tuple(score + weight * own - there for score, weight, own, there in parts)
-    return rows, jax.tree.map(lambda u, variance: u**2 + variance - 1.0, tuple(point.noises), driven)
+def _noise_terms(model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]) -> NoiseScore:
+    shares = jax.tree.map(jnp.multiply, model.information(point), spread)  # of each datum that its prediction makes up
+    rows = jax.tree.map(lambda score, own, there: score + own - there, model.level_score(point), shares, model.measured)
+    noises = jax.tree.map(lambda u, variance: u**2 + variance - 1.0, tuple(point.noises), driven)
+    told = jax.tree.map(lambda own, there: 2.0 * there * (1.0 - own) ** 2, shares, model.measured)
+    return NoiseScore(rows, noises, told, jax.tree.map(lambda own: 2.0 * (1.0 - own) ** 2, driven))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,8 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
+from probcal.gaussian.dense import DenseEngine, DenseExpansion
+from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.linearised import Linearisation, linearise
 from probcal.gaussian.mode import Eliminated, Point
@@ -39,7 +42,7 @@ else:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class Judged(ABC):
     """The problem of a fit, the point where it ended, and its rows linearised there, for every
     check."""
 
@@ -53,6 +56,27 @@ class Judged:
     def flat(self, parts: Any) -> np.ndarray:
         """Arrays (..., N, C) of the blocks as one (..., data)."""
         return gather([np.asarray(part) for part in parts], self.picks)
+
+    engine: ClassVar[Engine]  # by which it was solved
+
+    @property
+    @abstractmethod
+    def expansion(self) -> Expansion:
+        """The posterior at the point."""
+
+    @property
+    @abstractmethod
+    def factors(self) -> Factors:
+        """Those of the prior, with the precisions that the fit ended with."""
+
+    @property
+    @abstractmethod
+    def sd(self) -> np.ndarray:
+        """Standard deviation (M,) of z."""
+
+    @abstractmethod
+    def times(self, columns: np.ndarray) -> np.ndarray:
+        """The covariance of z times columns (M, K)."""
 
     @property
     def readers(self) -> np.ndarray:
@@ -71,6 +95,27 @@ class Fitted(Judged):
     prior: Precision
     covariance: np.ndarray  # (M, M) of z
 
+    engine = DenseEngine()
+
+    @property
+    def expansion(self) -> Expansion:
+        """The posterior at the point."""
+        return DenseExpansion(self.at)
+
+    @property
+    def factors(self) -> Factors:
+        """Those of the prior."""
+        return Factors.of(self.prior)
+
+    @property
+    def sd(self) -> np.ndarray:
+        """Standard deviation (M,) of z."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    def times(self, columns: np.ndarray) -> np.ndarray:
+        """The covariance of z times columns (M, K)."""
+        return self.covariance @ columns
+
 
 @dataclass(frozen=True, eq=False)
 class JudgedLarge(Judged):
@@ -78,6 +123,28 @@ class JudgedLarge(Judged):
 
     at: SparseExpansion
     blocks: SensorBlocks  # of the covariance of z
+    alpha: np.ndarray  # (M,) precisions of the prior
+
+    engine = SparseEngine()
+
+    @property
+    def expansion(self) -> Expansion:
+        """The posterior at the point."""
+        return self.at
+
+    @property
+    def factors(self) -> Factors:
+        """Those of the prior."""
+        return Factors.alone(self.alpha)
+
+    @property
+    def sd(self) -> np.ndarray:
+        """Standard deviation (M,) of z."""
+        return np.sqrt(self.blocks.variance)
+
+    def times(self, columns: np.ndarray) -> np.ndarray:
+        """The covariance of z times columns (M, K)."""
+        return np.asarray(self.at.solve(self.factors, columns))
 
 
 def take_up_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> JudgedLarge:
@@ -91,7 +158,8 @@ def take_up_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) ->
         at = SparseEngine().settled(problem.model, point)
     assert isinstance(at, SparseExpansion)
     blocks = SensorBlocks.read(tree["calibration"].to_dataset(), problem.labels, problem.scales)
-    return JudgedLarge(problem, at.point, at.rows, at.eliminated, picks, data, at, blocks)
+    alpha = tree["calibration"].to_dataset()["precision"].values
+    return JudgedLarge(problem, at.point, at.rows, at.eliminated, picks, data, at, blocks, alpha)
 
 
 def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) -> Fitted:

@@ -388,7 +388,9 @@ def judge_tracks(
         found = residuals.innovations(fit, residuals.measured_kurtosis(fit), dz).innovations
         return _judged(fit, found, tree, known.root, rejection_text(rejected(problem, at.point)))
     here = SparseEngine().settled(problem.model, at)
-    large = JudgedLarge(problem, here.point, here.rows, here.eliminated, picks, data, here, known.blocks)
+    large = JudgedLarge(
+        problem, here.point, here.rows, here.eliminated, picks, data, here, known.blocks, np.zeros(len(known.z))
+    )
     hidden = rejection_text(rejected(problem, at))
     return _judged(large, residuals.innovations_given(large), tree, known.root, hidden)
 
