@@ -229,7 +229,7 @@ MUTATIONS = [
     Mutation("slope[:M] -= prior @ pieces.z", "slope[:M] += prior @ pieces.z", "test_assess.py"),
     Mutation("np.eye(q) + np.ones((q, q))", "np.eye(q)", "test_assess.py"),
     Mutation("expected = np.maximum(whole - used, 1e-9)", "expected = np.maximum(whole, 1e-9)", "test_assess.py"),
-    Mutation("u**2 + spread - 1.0", "u**2 - 1.0", "test_asked_levels.py"),
+    Mutation("u**2 + variance - 1.0", "u**2 - 1.0", "test_asked_levels.py"),
     Mutation("change: np.ndarray = steps[1] - steps[0]", "change: np.ndarray = 0.0 * steps[1]", "test_asked_levels.py"),
     Mutation("and again.sum() < TOGETHER * count", "", "test_asked_levels.py"),
     Mutation("slice(row, row + size), slice(row, row + width))) row += size", "slice(row, row + size), slice(row, row + width)))\n        row += width", "test_tails.py"),
