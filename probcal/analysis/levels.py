@@ -17,7 +17,7 @@ import xarray as xr
 
 from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import limit_of
-from probcal.gaussian.engine import Engine, Expansion, Factors, noise_score
+from probcal.gaussian.engine import Engine, Expansion, Factors, noise_information, noise_score
 from probcal.inference.fitted import Judged
 from probcal.inference.residuals import PRACTICAL
 from probcal.labels import listed
@@ -67,7 +67,6 @@ class Slopes(NamedTuple):
 
     level: np.ndarray  # (K,)
     z: np.ndarray  # (M,)
-    alone: np.ndarray  # (K,) information about each log level if every noise stood alone
 
 
 class Wanted(NamedTuple):
@@ -135,9 +134,7 @@ def _with_unknown(problem: Problem, number: np.ndarray, index: np.ndarray, found
 
 def slopes(at: Expansion, factors: Factors, members: Members) -> Slopes:
     """Slopes of the log evidence at a point with trajectories at their mode, under the factors of a prior."""
-    found = noise_score(at, factors)
-    alone = members.sums(found.rows_information, found.noises_information)
-    return Slopes(members.sums(found.rows, found.noises), np.asarray(at.score()), alone)
+    return Slopes(members.sums(*noise_score(at, factors)), np.asarray(at.score()))
 
 
 def _at(engine: Engine, at: Expansion, members: Members, step: np.ndarray, z: np.ndarray) -> Expansion:
@@ -216,7 +213,7 @@ def ask(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
     engine, at, K = fit.engine, fit.expansion, len(members.levels)
     step, shift, square = np.zeros(K), np.zeros((K, len(at.point.z))), np.zeros(K)
     sd = np.zeros(K)
-    if not engine.traceable and (screened := _screened(fit, slopes(at, factors, members), members)) is not None:
+    if not engine.traceable and (screened := _screened(at, factors, members)) is not None:
         return screened
     for turn in range(TURNS):
         found, at = _expanded(fit, engine, factors, at, members, step)
@@ -233,11 +230,11 @@ def ask(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
     return Wanted(step, sd, square, shift)
 
 
-def _screened(fit: Judged, here: Slopes, members: Members) -> Wanted | None:
+def _screened(at: Expansion, factors: Factors, members: Members) -> Wanted | None:
     """What one look at a large network says: None where some level may be another, which is then expanded."""
     unknown = np.array([level.unknown >= 0 for level in members.levels])
-    alone = np.maximum(here.alone, 1e-300)
-    step, sd = here.level / alone, alone**-0.5
+    alone = np.maximum(members.sums(*noise_information(at, factors)), 1e-300)
+    step, sd = members.sums(*noise_score(at, factors)) / alone, alone**-0.5
     if unknown.any() or (np.abs(step) > NEAR).any() or (step**2 > SUSPECT * sd**2).any():
         return None
     return Wanted(step, sd, (step / sd) ** 2, None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian import recursion as rec
-from probcal.gaussian.engine import Embedded, Estimate, Factors, Sampled, Spread, density_of
+from probcal.gaussian.engine import Embedded, Estimate, Factors, Sampled, Spread, density_of, mean
 from probcal.gaussian.linearised import (
     Linearisation,
     compress_and_eliminate,
@@ -49,6 +49,7 @@ class DenseExpansion:
     """The posterior at a point, as `engine.Expansion`."""
 
     linear: Linearisation
+    _kept: list[Any] = field(default_factory=list)  # the factors that were asked for last, and their covariance
 
     @property
     def model(self) -> Model:
@@ -79,21 +80,21 @@ class DenseExpansion:
         return self._density
 
     @cached_property
-    def _slope(self) -> jax.Array:
-        solved = self.linear.solved
-        return solved.score - 0.5 * volume_slope(self.model, self.point, solved)[0]
+    def _slope(self) -> np.ndarray:
+        volume, _ = volume_slope(self.model, self.point, self.eliminated)
+        return np.asarray(self.eliminated.score) - 0.5 * np.asarray(volume)
 
-    def score(self) -> jax.Array:
+    def score(self) -> np.ndarray:
         """Its slope (M,) by the biases, the volume of the trajectories with it."""
         return self._slope
 
     def log_det(self, factors: Factors) -> Estimate:
         """Log determinant of the precision of the biases."""
-        return Estimate(float(_solved(self.linear.information, factors).log_determinant()))
+        return Estimate(float(_solved(self._precision(factors)).log_determinant()))
 
-    def solve(self, factors: Factors, right: Any) -> jax.Array:
+    def solve(self, factors: Factors, right: Any) -> np.ndarray:
         """Covariance of the biases times right, (M,) or (M, K)."""
-        return _solved(self.linear.information, factors).solve(jnp.asarray(right))
+        return np.asarray(self.covariance(factors)) @ np.asarray(right)
 
     def apply(self, columns: Any) -> jax.Array:
         """Information of the data about the biases times columns, (M,) or (M, K)."""
@@ -103,9 +104,15 @@ class DenseExpansion:
         """The point with the biases moved by dz (M,), all tracks following."""
         return _moved(self.model, self.point, self.linear.solved, jnp.asarray(dz))
 
+    def _precision(self, factors: Factors) -> np.ndarray:
+        return np.asarray(self.linear.information) + factors.matrix(self.model.biases)
+
     def covariance(self, factors: Factors) -> jax.Array:
         """Covariance (M, M) of the biases."""
-        return _solved(self.linear.information, factors).covariance()
+        if not (self._kept and self._kept[0] is factors):
+            inverse = np.linalg.inv(self._precision(factors))
+            self._kept[:] = [factors, jax.device_put(0.5 * (inverse + inverse.T))]
+        return self._kept[1]
 
     def marginals(self, factors: Factors, members: np.ndarray) -> jax.Array:
         """Covariances (B, p, p) of biases (B, p), M of none: 1 on its diagonal."""
@@ -138,9 +145,8 @@ class DenseExpansion:
 
     def sample(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
         """Biases and trajectories drawn around the mean that the factors make."""
-        keys, inverse = jax.random.split(key), _solved(self.linear.information, factors)
-        step = inverse.solve(self.score() + factors.pull(self.point.z))
-        z = (self.point.z + step)[None] + inverse.draw(keys[0], count)
+        keys, inverse = jax.random.split(key), _solved(self._precision(factors))
+        z = mean(self, factors)[None] + inverse.draw(keys[0], count)
         return Sampled(z, self.linear.draw(z, keys[1]))
 
     def followed(self, root: Any) -> list[np.ndarray]:
@@ -155,12 +161,11 @@ class DenseExpansion:
 
     def embedded(self, factors: Factors, columns: Data) -> Embedded:
         """Information and score of K more parameters, by which predicted values change as columns (N, C, K)."""
-        return _embedded(self.linear, factors, jnp.asarray(factors.pull(self.point.z)), columns)
+        pull = self.eliminated.score + factors.pull(self.point.z)
+        return _embedded(self.linear, self.covariance(factors), pull, columns)
 
 
-@jax.jit
-def _solved(information: jax.Array, factors: Factors) -> Dense:
-    return Dense.of(information + factors.matrix(len(information)))
+_solved = jax.jit(Dense.of)
 
 
 _moved = jax.jit(follow)
@@ -175,7 +180,7 @@ def _state_covariances(at: Linearisation, covariance: jax.Array) -> tuple[jax.Ar
 
 
 @jax.jit
-def _embedded(at: Linearisation, factors: Factors, pull: jax.Array, columns: Data) -> Embedded:
+def _embedded(at: Linearisation, covariance: jax.Array, pull: jax.Array, columns: Data) -> Embedded:
     """Rows of the parameters beside those of states and biases, both eliminated."""
     model, rows, solved = at.model, at.rows, at.solved
     free = follow(model, at.point, solved, jnp.zeros_like(at.point.z))
@@ -189,8 +194,8 @@ def _embedded(at: Linearisation, factors: Factors, pull: jax.Array, columns: Dat
     left = jax.tree.map(jnp.subtract, tuple(columns), model.by_state(rows, moved))
     both = tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, left))
     across = model.onto_biases(rows, both)
-    bias = Dense.of(at.information + factors.matrix(model.biases)).solve(across)
+    bias = covariance @ across
     pairs = list(model.each_block(columns, both, scores))
     information = sum(jnp.einsum("nck,ncl->kl", own, rest) for *_, own, rest, _ in pairs)
     score = sum(jnp.einsum("nck,nc->k", own, pulled) for *_, own, _, pulled in pairs)
-    return Embedded(information - across.T @ bias, score - bias.T @ (solved.score + pull))
+    return Embedded(information - across.T @ bias, score - bias.T @ pull)

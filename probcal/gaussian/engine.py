@@ -36,7 +36,6 @@ class Group(NamedTuple):
     pull: Any  # (B, p)
 
 
-@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Factors:
     """A sum of Gaussian factors on few biases each: precisions, correlations, surveys, sites, integrated places."""
@@ -60,11 +59,11 @@ class Factors:
     def __add__(self, other: Factors) -> Factors:
         return Factors((*self.groups, *other.groups))
 
-    def matrix(self, biases: int) -> jax.Array:
+    def matrix(self, biases: int) -> np.ndarray:
         """The precision (M, M)."""
-        found = jnp.zeros((biases + 1, biases + 1))
+        found = np.zeros((biases + 1, biases + 1))
         for own in self.groups:
-            found = found.at[own.members[:, :, None], own.members[:, None, :]].add(own.precision)
+            np.add.at(found, (own.members[:, :, None], own.members[:, None, :]), np.asarray(own.precision))
         return found[:biases, :biases]
 
     def pull(self, z: Any) -> Any:
@@ -146,7 +145,7 @@ class Expansion(Protocol):
     def density(self) -> float:
         """Log density of the data given the biases at the point, up to the constant of the noises."""
 
-    def score(self) -> jax.Array:
+    def score(self) -> Any:
         """Its slope (M,) by the biases, the volume of the trajectories with it."""
 
     def log_det(self, factors: Factors) -> Estimate:
@@ -222,23 +221,17 @@ def evidence(at: Expansion, prior: Precision, factors: Factors | None = None) ->
     return Estimate(at.density() + own - 0.5 * volume.value, 0.5 * volume.error)
 
 
-class NoiseScore(NamedTuple):
-    """Terms of the slope of the log evidence by log noise levels, and of its information if each noise stood alone.
+def noise_score(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.Array, ...]]:
+    """Terms of the slope of the log evidence by log noise levels, biases and trajectories integrated.
 
     Of every datum (N, C) of each block, and of every whitened noise (E, n) of each recursion.
     """
-
-    rows: Data
-    noises: tuple[jax.Array, ...]
-    rows_information: Data
-    noises_information: tuple[jax.Array, ...]
+    return _noise_terms(at.model, at.point, tuple(at.predicted(factors)), tuple(at.noises(factors)))
 
 
-def noise_score(at: Expansion, factors: Factors) -> NoiseScore:
-    """Terms by log noise levels, biases and trajectories integrated; the slope is exact, the information near."""
-    spread = tuple(jnp.asarray(own) for own in at.predicted(factors))
-    driven = tuple(jnp.asarray(own) for own in at.noises(factors))
-    return _noise_terms(at.model, at.point, spread, driven)
+def noise_information(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.Array, ...]]:
+    """The same of the information about log noise levels, if every noise stood alone."""
+    return _noise_information(at.model, at.point, tuple(at.predicted(factors)), tuple(at.noises(factors)))
 
 
 @jax.jit
@@ -249,9 +242,18 @@ def density_of(model: Model, point: Point, volume: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def _noise_terms(model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]) -> NoiseScore:
-    shares = jax.tree.map(jnp.multiply, model.information(point), spread)  # of each datum that its prediction makes up
-    rows = jax.tree.map(lambda score, own, there: score + own - there, model.level_score(point), shares, model.measured)
-    noises = jax.tree.map(lambda u, variance: u**2 + variance - 1.0, tuple(point.noises), driven)
-    told = jax.tree.map(lambda own, there: 2.0 * there * (1.0 - own) ** 2, shares, model.measured)
-    return NoiseScore(rows, noises, told, jax.tree.map(lambda own: 2.0 * (1.0 - own) ** 2, driven))
+def _noise_terms(
+    model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]
+) -> tuple[Data, tuple[jax.Array, ...]]:
+    parts = (model.level_score(point), model.information(point), spread, model.measured)
+    rows = jax.tree.map(lambda score, weight, own, there: score + weight * own - there, *parts)
+    return rows, jax.tree.map(lambda u, variance: u**2 + variance - 1.0, tuple(point.noises), driven)
+
+
+@jax.jit
+def _noise_information(
+    model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]
+) -> tuple[Data, tuple[jax.Array, ...]]:
+    parts = (model.information(point), spread, model.measured)
+    rows = jax.tree.map(lambda weight, own, there: 2.0 * there * (1.0 - weight * own) ** 2, *parts)
+    return rows, jax.tree.map(lambda own: 2.0 * (1.0 - own) ** 2, driven)
