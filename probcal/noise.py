@@ -524,6 +524,31 @@ class Growing:
         """Which values are legal: all."""
         return self.noise.check(y)
 
+    def square(self, y, predicted, std):
+        """Square of each standardised score, 1 expected, of asinh(slope value / std) / slope, whose std is 1.
+
+        In the channel's own unit a far prediction has a std so wide that no residual counts (Bartlett 1947).
+        """
+        y, predicted = (jnp.arcsinh(self.slope * value / std) / self.slope for value in (y, predicted))
+        one = jnp.ones_like(predicted)
+        return self.noise.score(y, predicted, one, None) ** 2 / self.noise.information(predicted, one)
+
+
+class GrowingWithMeasured(Growing):
+    """The same with the std at the measured value, for starts: no step moves it, and no far prediction widens it."""
+
+    def log_likelihood(self, y, predicted, std, period):
+        """Log density of each datum."""
+        return self.noise.log_likelihood(y, predicted, self.spread(y, std), period)
+
+    def score(self, y, predicted, std, period):
+        """Derivative of the log density by the predicted value."""
+        return self.noise.score(y, predicted, self.spread(y, std), period)
+
+    def weight(self, y, predicted, std, period):
+        """Positive curvature used by a step."""
+        return self.noise.weight(y, predicted, self.spread(y, std), period)
+
 
 def _estimated(family: Any) -> bool:
     """True where parameters of a family are estimated: arrays replace the numbers."""

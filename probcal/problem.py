@@ -37,7 +37,7 @@ from probcal.model.motions import (
 )
 from probcal.model.rows import Block, Rows, addresses, late_by, make_block, pose_entries, pose_vector
 from probcal.model.sampled import SampledMotion
-from probcal.model.variants import aligned
+from probcal.model.variants import aligned, at_measured
 from probcal.motion import Known, Layout, LinearMotion, Static, Target, White, as_motion, flow_of, labels_of
 from probcal.motion.components import Remembered
 from probcal.network import BiasRecord, Network, Node
@@ -438,6 +438,14 @@ class Problem:
     def untilted(self) -> Problem:
         """The same problem with no such term, which holds near one point only."""
         return self if self.model.tilt is None else self.with_tilt(Tilt.none(self.model.biases))
+
+    def at_measured(self) -> Problem:
+        """The same problem with growing stds at the measured values, for starts; itself where none grows."""
+        if (model := at_measured(self.model)) is self.model:
+            return self
+        other = copy(self)
+        other.model = model
+        return other
 
     def with_mixing(self, weights: Mixing) -> Problem:
         """The same problem with other precisions (E,) of the process noises that are not Gaussian."""

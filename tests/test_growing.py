@@ -21,6 +21,7 @@ from probcal import (
     Node,
     Problem,
     StudentT,
+    Target,
     Unknown,
     fit,
     sensor,
@@ -30,6 +31,7 @@ from probcal.errors import InputError
 from probcal.geometry import norm
 from probcal.model.model import At
 from probcal.model.rows import parameter_score
+from probcal.modes.grid import grid_start
 from probcal.noise import Growing, Grows, Normal, level_at
 
 FAMILIES = [Normal(), StudentT(4.0), Mixture(0.2, 6.0, late="exponential")]
@@ -59,6 +61,52 @@ def test_growing_noise_agrees_with_its_density(inner, predicted):
     assert (weight > 0).all()
     below = np.concatenate([[0.0], np.cumsum(0.5 * (p[1:] + p[:-1]) * np.diff(y))])
     assert stats.kstest(drawn, lambda value: np.interp(value, y, below)).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("inner", FAMILIES, ids=repr)
+def test_squares_are_one_under_the_model(inner):
+    family, one = Growing(inner, 0.02), jnp.ones(20_000)
+    y = family.sample(jax.random.key(1), 10.0 * one, 0.03 * one)
+    assert float(family.square(y, 10.0 * one, 0.03 * one).mean()) == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_square_is_large_where_the_prediction_is_far_off():
+    """The standardised score is near one there, since the std is as wide as the residual."""
+    family, y, far, std = Growing(Normal(), 0.02), jnp.array([10.0]), jnp.array([500.0]), jnp.array([0.03])
+    scored = float((family.score(y, far, std, None) ** 2 / family.information(far, std))[0])
+    assert scored == pytest.approx(1.0, abs=0.01)
+    assert float(family.square(y, far, std)[0]) > 1000.0
+
+
+def walked(slope, noise=None, key=0):
+    """A walk of 40 s seen by four range sensors: the problem, and the true positions (E, 2)."""
+    start = {"position": ((30.0, 30.0), 10.0), "velocity": ((0.0, 0.0), 2.0)}
+    network, motion = ranges(Grows(0.03, slope), noise), Target(ConstantVelocity(0.5), start)
+    run = simulate(network, motion, np.arange(0.0, 40.0), key=key, share=1.0)
+    return Problem(network, motion, run.table), run.truth.tracks[["position_x", "position_y"]].to_numpy()
+
+
+def away(point, path):
+    """Root mean square distance in m of the track at a point from the true positions."""
+    return float(np.sqrt(np.mean(np.sum((np.asarray(point.states[0])[:, :2] - path) ** 2, 1))))
+
+
+@pytest.mark.parametrize("key", [0, 1])
+def test_a_start_finds_the_track_where_the_std_grows(key):
+    problem, path = walked(0.02, key=key)
+    with jax.enable_x64(True):
+        assert away(grid_start(problem, jnp.zeros(len(problem.labels)), 30), path) < 3.0  # offsets are 0.5 m
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", FAMILIES, ids=repr)
+@pytest.mark.parametrize("slope", [0.02, 0.1])
+def test_a_fit_finds_the_track_where_the_std_grows(noise, slope):
+    problem, path = walked(slope, noise)
+    tree = fit(problem, MAP(), prior=Gaussian())
+    track = tree["track/target"].to_dataset().sel(component=["position_x", "position_y"])
+    assert tree.attrs["status"] == "converged"
+    assert np.mean(((track["mean"].values - path) / track["sd"].values) ** 2) < 4.0
 
 
 def ranges(std, noise=None, dimension=2):

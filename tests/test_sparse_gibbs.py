@@ -27,7 +27,7 @@ SHORT = {"chains": 2, "warmup": 25, "draws": 50, "patience": 1}
 
 def density_of(problem, point):
     joint = JointPrecision.of(problem.model)
-    return JointDensity.of(problem.model, joint, point, variables_of(joint, point))
+    return JointDensity.of(problem.model, joint, point, variables_of(problem.model, joint, point))
 
 
 @pytest.mark.slow
@@ -41,7 +41,7 @@ def test_the_joint_density_is_that_of_its_point_and_its_slope_that_of_difference
         rng = np.random.default_rng(0)
         at = density.at + 0.1 * rng.standard_normal(len(density.at))
         there = point_of_variables(problem.model, density.joint, point, at)
-        np.testing.assert_allclose(variables_of(density.joint, there), at)
+        np.testing.assert_allclose(variables_of(problem.model, density.joint, there), at)
         value, slope = density.looked(at)
         assert value == pytest.approx(float(log_density(problem.model, there)), rel=1e-9)
         for k in rng.integers(len(at), size=12):
@@ -104,7 +104,7 @@ def test_the_density_of_a_draw_is_the_joint_one_at_its_point(prior):
         run, joint = posterior.run, JointPrecision.of(problem.model)
         for d in range(4):
             states = tuple(jnp.asarray(x[0, d]) for x in run.states)
-            at = variables_of(joint, start._replace(states=states, z=jnp.asarray(run.z[0, d])))
+            at = variables_of(problem.model, joint, start._replace(states=states, z=jnp.asarray(run.z[0, d])))
             point = point_of_variables(problem.model, joint, start, at)
             phi = {name: jnp.asarray(leaf[0, d]) for name, leaf in posterior.hyper.items()}
             assert posterior.log_joint(point, phi) == pytest.approx(run.draws.density[0, d], rel=1e-9)

@@ -82,7 +82,7 @@ class Informed:
     def reach(self) -> dict[SensorType, float]:
         """The largest distance in m between target and nodes at which each type of sensor has a row."""
         found, d = dict.fromkeys(self.problem.network.types, 0.0), self.problem.network.dimension
-        for block, data, r in zip(self.model.blocks, self.model.rows, self.model.recursion, strict=True):
+        for block, data, r in self.model.each_block():
             places = np.asarray(self.point.states[r])[np.asarray(data.epoch), slice(*self.problem.epochs[r].position)]
             away = np.linalg.norm(np.asarray(data.pose)[:, :, :d] - places[:, None], axis=2).max(1)
             there = np.asarray(data.mask).any(1)

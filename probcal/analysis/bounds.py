@@ -177,7 +177,7 @@ def _tree(
         covariance = (covariance * np.outer(problem.scales, problem.scales))[np.ix_(bounded, bounded)]
         bias = bias.assign_coords(bias_label_other=labels[bounded])
         bias["covariance"] = (("bias_label", "bias_label_other"), covariance)
-    place = [np.sqrt(v[:, slice(*epochs.position)].sum(1)) for epochs, v in zip(problem.epochs, variances, strict=True)]
+    place = [np.sqrt(v.sum(1)) for v in problem.positions(variances)]
     spread = (("time", "component"), [np.sqrt(v) for v in variances])
     tracks = by_target(problem, {"sd": spread, "position_rmse": (("time",), place)})
     groups = {

@@ -208,10 +208,10 @@ class _Half:
         self, model: Model, rows: tuple[Linearised, ...], joint: JointPrecision, late: list[np.ndarray]
     ):  # fmt: skip
         self.joint, self.biases, self.reads = joint, model.biases, model.read
-        self._form = tuple((tuple(block.used), r) for block, r in zip(model.blocks, model.recursion, strict=True))
+        self._form = tuple((tuple(block.used), r) for block, _, r in model.each_block())
         self._parts = tuple(
             (_only(lin, on), np.asarray(read), data.epoch)
-            for lin, read, data, on in zip(rows, model.read, model.rows, late, strict=True)
+            for _, data, _, lin, read, on in model.each_block(rows, model.read, late)
         )
 
     def score(self) -> np.ndarray:

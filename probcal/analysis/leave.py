@@ -64,7 +64,7 @@ def _stepped(
     before, after = jax.vmap(lambda end: cost(model, end, prior))(ends)
     least = jnp.where(after < before, after, before)
     square = sum(jnp.sum(u**2) for u in moved.noises) + prior.square(moved.z)
-    dx = [(x - before_)[:, :, None] for x, before_ in zip(moved.states, point.states, strict=True)]
+    dx = model.each(lambda _, x, before_: (x - before_)[:, :, None], moved.states, point.states)
     for lin, change in zip(lins, model.responses(lins, dx, (moved.z - point.z)[:, None]), strict=True):
         square = square + jnp.sum((standardised(lin.score, lin.weight) - jnp.sqrt(lin.weight) * change[:, :, 0]) ** 2)
     return Refit(-least - 0.5 * (solved.logdet + logdet), square)

@@ -301,9 +301,9 @@ def _pattern(problem: Problem) -> tuple[str, Problem]:
 
 def _states_of(problem: Problem, point: Point, name: str) -> np.ndarray:
     """States (E, n) of one target at a point."""
-    for epochs, states in zip(problem.epochs, point.states, strict=True):
-        if (epochs.target == name).any():
-            return np.asarray(states)[epochs.target == name]
+    for own, _, states in problem.tracks(point.states):
+        if own == name:
+            return states
     raise KeyError(name)
 
 
@@ -323,9 +323,7 @@ def _state(epochs: Epochs, like: np.ndarray, path: np.ndarray) -> np.ndarray:
 def _area(problem: Problem, point: Point) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corner (d,) of nodes and tracks with a margin; in 3-D the height is that of the tracks."""
     d = problem.network.dimension
-    places = [problem.node_positions]
-    for epochs, states in zip(problem.epochs, point.states, strict=True):
-        places.append(np.asarray(states)[:, slice(*epochs.position)])
+    places = [problem.node_positions, *problem.positions(point.states)]
     low, high = (np.concatenate(places).min(0), np.concatenate(places).max(0))
     margin = MARGIN * max(float((high - low)[:2].max()), 1.0)
     low, high = low - margin, high + margin

@@ -57,9 +57,11 @@ def true_point(problem: Problem, truth: Truth | None) -> tuple[jax.Array, tuple[
         start = standpoint(problem, None, None)
         start = start if truth is None else track_mode(problem, start._replace(z=z))
         z = start.z
-        states = tuple(
-            jnp.where(gone[None, :, None], found[None], mean)
-            for gone, found, mean in zip(missing, start.states, states, strict=True)
+        states = problem.model.each(
+            lambda _, gone, found, mean: jnp.where(gone[None, :, None], found[None], mean),
+            missing,
+            start.states,
+            states,
         )
     return z[None], on_tracks_of(problem, given, states)
 

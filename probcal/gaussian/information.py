@@ -75,6 +75,16 @@ def mean_square(model: Model, point: Point) -> jax.Array:
     return (squares + point.trajectories.square) / jnp.maximum(count, 1)
 
 
+def growing_square(model: Model, point: Point) -> float:
+    """Mean square of the data whose std grows with the predicted value, 0 where there are none."""
+    grown = [own.growing for own in model.blocks]
+    if not any(grown):
+        return 0.0
+    pairs = list(zip(grown, squares_of(model, point), model.measured, strict=True))
+    square, count = (sum(float(np.asarray(pair[k])[:, list(pair[0])].sum()) for pair in pairs) for k in (1, 2))
+    return square / max(count, 1.0)
+
+
 def state_covariances(model: Model, point: Point) -> tuple[jax.Array, ...]:
     """Covariances (E, n, n) of every smoothed state at held biases, linearised at a point."""
     compressed = model.of_states(model.linearise(point, expected=True))

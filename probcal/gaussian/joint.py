@@ -196,7 +196,7 @@ class JointPrecision:
         whole[self.kept] = inverse
         at = len(self.extra) + sum(len(x) * x.shape[1] * (2 * x.shape[1] + 1) for x in states)
         found = []
-        for block, data, lin, r in zip(model.blocks, model.rows, lins, model.recursion, strict=True):
+        for block, data, r, lin in model.each_block(lins):
             (N, p), u, S = (len(data.epoch), data.bias.shape[1]), len(block.used), len(data.bias)
             both = whole[at : at + N * p * u].reshape(N, p, u)
             at += N * p * u
@@ -261,7 +261,7 @@ class JointPrecision:
     def correction(self, model: Model, levels: jax.Array) -> float:
         """Twice the sum of log |L|, by which log det W of whitened noises is above that of the states."""
         total = 0.0
-        for part, own in zip(model.recursions, self.driven, strict=True):
+        for part, own in model.each_layout(self.driven):
             if own.any():
                 total += 2.0 * float(np.sum(np.linalg.slogdet(np.asarray(factors(part, levels))[own])[1]))
         return total
@@ -320,14 +320,14 @@ def _entries(
         columns.append(column.ravel())
         times.append(np.broadcast_to(count, row.shape).ravel())
 
-    for part, own, drives in zip(model.recursions, slots, driven, strict=True):
+    for part, own, drives in model.each_layout(slots, driven):
         i, j = np.triu_indices(own.shape[1])
         add(own[:, i], own[:, j])
         follows = drives & np.any(np.asarray(part.F) != 0, (1, 2))
         before = np.where(follows[:, None], np.concatenate([np.full_like(own[:1], -1), own[:-1]]), -1)
         add(before[:, i], before[:, j])  # of the motion to the next epoch
         add(before[:, :, None], own[:, None, :])
-    for block, data, r in zip(model.blocks, model.rows, model.recursion, strict=True):
+    for block, data, r in model.each_block():
         reached = slots[r][np.asarray(data.epoch)][:, list(block.used)]  # (N, u)
         bias = np.asarray(data.bias)
         free = np.where(bias < M, states + bias, -1)
@@ -342,14 +342,14 @@ def _entries(
 def _values(model: Model, driven: tuple[jax.Array, ...], lins: tuple[Linearised, ...], levels: jax.Array) -> jax.Array:
     """Values of the blocks of the joint precision in the order of `_entries`, the diagonal of the biases zero."""
     found = []
-    for (J, _), part, own in zip(model.of_states(lins), model.recursions, driven, strict=True):
+    for part, (J, _), own in model.each_layout(model.of_states(lins), driven):
         n = J.shape[1]
         i, j = np.triu_indices(n)
         root = jnp.where(own[:, None, None], factors(part, levels), jnp.eye(n)[None])
         inverse = jnp.where(own[:, None, None], linalg.inverses(root), 0.0)
         back = inverse @ part.F
         found += [(J + inverse.mT @ inverse)[:, i, j], (back.mT @ back)[:, i, j], -(back.mT @ inverse)]
-    for data, lin in zip(model.rows, lins, strict=True):
+    for _, data, _, lin in model.each_block(lins):
         found.append(jnp.einsum("ncp,nc,ncu->npu", lin.bias, lin.weight, lin.state))
         own = jnp.einsum("ncp,nc,ncq->npq", lin.bias, lin.weight, lin.bias)
         i, j = np.triu_indices(own.shape[1])

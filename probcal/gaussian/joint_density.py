@@ -66,10 +66,10 @@ class JointDensity:
         return value - self.value - float(step @ (self.slope - 0.5 * bent)), slope - self.slope + bent
 
 
-def variables_of(joint: JointPrecision, point: Point) -> np.ndarray:
+def variables_of(model: Model, joint: JointPrecision, point: Point) -> np.ndarray:
     """The variables (n,) of a point: states, then biases."""
     found = np.zeros(joint.places.size)
-    for own, x in zip(joint.slots, point.states, strict=True):
+    for _, own, x in model.each_layout(joint.slots, point.states):
         there = own >= 0
         found[own[there]] = np.asarray(x)[there]
     found[joint.states :] = np.asarray(point.z)
@@ -88,7 +88,7 @@ def _slots(joint: JointPrecision) -> tuple[jax.Array, ...]:
 def _roots(model: Model, joint: JointPrecision, point: Point) -> tuple[jax.Array, ...]:
     """Inverse roots (E, n, n) of the process noise of each recursion, 0 where there is none."""
     found = []
-    for part, drives in zip(model.recursions, joint.driven, strict=True):
+    for part, drives in model.each_layout(joint.driven):
         root = jnp.where(drives[:, None, None], factors(part, point.levels), jnp.eye(part.F.shape[1])[None])
         found.append(jnp.where(drives[:, None, None], linalg.inverses(root), 0.0))
     return tuple(found)
@@ -98,7 +98,7 @@ def _placed(
     model: Model, point: Point, slots: tuple[jax.Array, ...], roots: tuple[jax.Array, ...], at: jax.Array
 ) -> Point:
     states, noises = [], []
-    for part, own, root, known in zip(model.recursions, slots, roots, point.states, strict=True):
+    for part, own, root, known in model.each_layout(slots, roots, point.states):
         x = jnp.where(own >= 0, at[own], known)
         before = jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
         left = x - jnp.einsum("eij,ej->ei", part.F, before) - part.drift

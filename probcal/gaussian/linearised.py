@@ -93,7 +93,7 @@ class Linearisation(NamedTuple):
         The leverage is w c' Sigma c, c the derivative of the predicted value by z with the trajectory following. Those
         of all data and a rest, what the motion tells, add up to tr(Sigma G), the number of biases that are determined.
         """
-        return tuple(lin.weight * own for lin, own in zip(self.rows, self._by_bias(covariance), strict=True))
+        return tuple(lin.weight * own for *_, lin, own in self.model.each_block(self.rows, self._by_bias(covariance)))
 
     def _by_bias(self, covariance: jax.Array) -> Data:
         """Variance (N, C) of each predicted value by the biases, trajectories following."""
@@ -111,7 +111,7 @@ class Linearisation(NamedTuple):
     @jax.jit
     def _around(self, z: jax.Array, simulated: list[tuple[jax.Array, rec.Smoothed]]) -> tuple[jax.Array, ...]:
         drawn = []
-        for own, mean, (prior, smooth) in zip(self.trajectories, self.point.states, simulated, strict=True):
+        for _, own, mean, (prior, smooth) in self.model.each_layout(self.trajectories, self.point.states, simulated):
             free = prior - smooth.states + own.response @ (z - self.point.z[None, :]).T
             drawn.append(jnp.moveaxis(mean[:, :, None] + free, 2, 0))
         return tuple(drawn)
@@ -124,7 +124,7 @@ class Linearisation(NamedTuple):
     def _simulated(self, key: jax.Array, count: int) -> list[tuple[jax.Array, rec.Smoothed]]:
         """Trajectories (E, n, count) drawn from the motion, less its drift, and what smoothing makes of their data."""
         found = []
-        parts = zip(self.model.recursions, self.trajectories, self.solved.parts, strict=True)
+        parts = self.model.each_layout(self.trajectories, self.solved.parts)
         for r, (part, own, kept) in enumerate(parts):
             noise = jax.random.normal(jax.random.fold_in(key, r), (2, *part.drift.shape, count))
             prior = rec.trajectory(part.F, own.L, jnp.zeros((*part.drift.shape, 1)), noise[0])
@@ -156,7 +156,7 @@ def linearise(model: Model, point: Point) -> Linearisation:
 def trajectories_of(model: Model, levels: jax.Array, solved: Eliminated) -> tuple[Trajectory, ...]:
     """Trajectories of each recursion given the biases, where they were eliminated at log levels (H,)."""
     found = []
-    for part, kept in zip(model.recursions, solved.parts, strict=True):
+    for part, kept in model.each_layout(solved.parts):
         L = factors(part, levels)
         values, vectors = linalg.spectrum(kept.J)
         half = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]

@@ -56,7 +56,7 @@ def volume_slope(
     """
     spread = [
         rec.covariances(part.F, factors(part, point.levels), kept.gain)[0]
-        for part, kept in zip(model.recursions, solved.parts, strict=True)
+        for part, kept in model.each_layout(solved.parts)
     ]
 
     if only is not None:
@@ -93,16 +93,16 @@ def _adjoint(
     """
 
     def smooth(right: States) -> States:
-        parts = zip(solved.parts, spread, right, strict=True)
-        return tuple(rec.respond(kept.gain, P, b[:, :, None])[:, :, 0] for kept, P, b in parts)
+        parts = model.each_layout(solved.parts, spread, right)
+        return tuple(rec.respond(kept.gain, P, b[:, :, None])[:, :, 0] for _, kept, P, b in parts)
 
     score = jax.grad(lambda x: log_likelihood(model, At(x, point.z, point.levels)))
 
     def rest(x: States) -> States:
         """What the observed information adds to the expected, times x."""
         observed = jax.jvp(score, (point.states,), (x,))[1]
-        parts = zip(solved.parts, observed, x, strict=True)
-        return tuple(-own - jnp.einsum("eij,ej->ei", kept.J, v) for kept, own, v in parts)
+        parts = model.each_layout(solved.parts, observed, x)
+        return tuple(-own - jnp.einsum("eij,ej->ei", kept.J, v) for _, kept, own, v in parts)
 
     def on(state: Any) -> jax.Array:
         *_, left, count, positive = state

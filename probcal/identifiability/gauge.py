@@ -46,7 +46,7 @@ def free_states(model: Model, point: Point, hold: tuple[jax.Array, ...]) -> Free
     compressed = compress(model, lins)
     known = information = compressed.information
     ranks = []
-    for (J, _), cross, precision in zip(compressed.states, compressed.crosses, hold, strict=True):
+    for _, (J, _), cross, precision in model.each_layout(compressed.states, compressed.crosses, hold):
         root = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision))
         flat = linalg.forward(root, cross).reshape(-1, cross.shape[2])
         information = information - linalg.gram(flat)
@@ -74,7 +74,7 @@ def within(model: Model, point: Point, hold: tuple[jax.Array, ...], basis: jax.A
 def held_states(problem: Problem) -> tuple[jax.Array, ...]:
     """Precision (E, n) of the states that are known beforehand: those of `Known` targets."""
     found = []
-    for epochs, part in zip(problem.epochs, problem.model.recursions, strict=True):
+    for part, epochs in problem.model.each_layout(problem.epochs):
         precision = np.zeros(part.drift.shape)
         spread = np.asarray(jnp.sum(part.L**2, 2))
         for name in dict.fromkeys(epochs.target):

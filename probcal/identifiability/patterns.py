@@ -102,16 +102,15 @@ def rigid_motions(problem: Problem, z: np.ndarray) -> list[Pattern]:
 def cause(problem: Problem, point: Point) -> str:
     """Why a combination may be weak: all targets pass along one direction, each on one line, where that is so."""
     lines = []
-    for epochs, states in zip(problem.epochs, point.states, strict=True):
-        places = np.asarray(states)[:, slice(*epochs.position)]
-        for name in dict.fromkeys(epochs.target[epochs.target != NOBODY]):
-            path = places[epochs.target == name]
-            if len(path) < 3:
-                return ""
-            _, sizes, along = np.linalg.svd(path - path.mean(0), full_matrices=False)
-            if sizes[1] > STRAIGHT * sizes[0]:
-                return ""
-            lines.append(along[0])
+    for name, _, path in problem.tracks(problem.positions(point.states)):
+        if name == NOBODY:
+            continue
+        if len(path) < 3:
+            return ""
+        _, sizes, along = np.linalg.svd(path - path.mean(0), full_matrices=False)
+        if sizes[1] > STRAIGHT * sizes[0]:
+            return ""
+        lines.append(along[0])
     if not lines or np.abs(np.array(lines) @ lines[0]).min() < 1 - STRAIGHT:
         return ""
     return ": the target passed on one line" if len(lines) == 1 else ": the targets passed along parallel lines"

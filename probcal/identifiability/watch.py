@@ -54,7 +54,7 @@ def runs(problem: Problem, point: Point, *, many: bool = False) -> list[Run]:
 def strained_starts(problem: Problem, point: Point) -> list[tuple[str, float]]:
     """Targets whose first position or velocity lies far out in a start that was never declared, and prior sd."""
     found = []
-    for epochs, noises, part in zip(problem.epochs, point.noises, problem.model.recursions, strict=True):
+    for part, epochs, noises in problem.model.each_layout(problem.epochs, point.noises):
         begins, u = ~np.asarray(part.F).any((1, 2)), np.asarray(noises)
         for name in dict.fromkeys(epochs.target):
             target = problem.target(str(name))

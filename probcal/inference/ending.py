@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from probcal.gaussian.draws import residuals
-from probcal.gaussian.information import rejected, squares_of
+from probcal.gaussian.information import growing_square, rejected, squares_of
 from probcal.gaussian.mode import Point
 from probcal.inference.mixture import MixturePosterior
 from probcal.labels import listed
@@ -31,6 +31,8 @@ FALL = 1.0  # nats below its best at which an evidence may end
 # Monte Carlo error of a mean in sd, or of an sd over it, above which a message states it
 INEXACT = 0.03
 ABSURD = 100.0  # mean square a datum, 1 expected, beyond which a fit explains nothing
+# the same of data whose std grows, which is then known to a factor of three: wrong modes leave 14 and more
+GROWN = 9.0
 
 
 def conclude(
@@ -173,9 +175,10 @@ def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
 
     Empty where the point explains the data, and robust noise rejects no sensor.
     """
-    if square <= ABSURD:
+    grown = growing_square(problem.model, point)
+    if square <= ABSURD and grown <= GROWN:
         return rejection_text(rejected(problem, point))
-    return misfit_text(square, (_remains(problem, at) for at in _points(problem, point, square)))
+    return misfit_text(max(square, grown), (_remains(problem, at) for at in _points(problem, point, square)))
 
 
 def _points(problem: Problem, point: Point, square: float) -> Iterator[Point]:

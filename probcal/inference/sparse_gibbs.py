@@ -292,7 +292,7 @@ class _SparseChains:
         """Chains at draws under the declared scales; the reference at the mean of sweeps on the Gaussian."""
         M, states, begin = self.form.biases, self.joint.states, self.form.hierarchy.begin
         key = jax.random.fold_in(self.key, 1)
-        density, rng = self._at(variables_of(self.joint, self.mode.point)), self._rng(0)
+        density, rng = self._at(variables_of(self.model, self.joint, self.mode.point)), self._rng(0)
         scales = np.ones(M) if self.form.hierarchy.learnt else np.asarray(self.prior.alpha)
         wide = _Given.of(density, scales)
         at = wide.mean[None] + wide.factor.draw(rng, self.method.chains)
@@ -305,7 +305,7 @@ class _SparseChains:
                 z = (given.mean + given.factor.draw(rng, 1)[0])[states:]
                 total += given.mean[states:] * (2 * k >= PILOT)
             moved = self.mode.moved(total / (PILOT - PILOT // 2) - np.asarray(self.mode.point.z))
-            density = self._at(variables_of(self.joint, settle_each(self.model, moved)))
+            density = self._at(variables_of(self.model, self.joint, settle_each(self.model, moved)))
             given = self._given(density, phi)
         else:
             given = _Given.of(density, scales)

@@ -17,7 +17,7 @@ from probcal.errors import InputError, nearest
 from probcal.geometry import wrap
 from probcal.motion import Layout, view
 from probcal.network import ANGLES, MOVING, Network, Node
-from probcal.noise import AdditiveNoise, Bernoulli, Growing, level_at, with_values
+from probcal.noise import AdditiveNoise, Bernoulli, Growing, GrowingWithMeasured, level_at, with_values
 from probcal.sensor import Channel, Sensor, SensorType
 from probcal.types import PoseView
 
@@ -56,6 +56,12 @@ class Block:
     unknown: tuple[Parameter, ...] = ()  # of the noise families of its channels
     # channels whose noise is remembered, and the state entry of each sensor (of each of its pieces)
     memory: tuple[tuple[int, tuple[int, ...]], ...] = ()
+    at_measured: bool = False  # whether a std that grows is that at the measured value
+
+    @property
+    def growing(self) -> tuple[int, ...]:
+        """Channels whose std grows with the predicted value."""
+        return tuple(c for c, channel in enumerate(self.channels) if isinstance(channel.noise, Growing))
 
     @property
     def seen(self) -> tuple[int, ...]:
@@ -324,13 +330,9 @@ def noise_std(rows: Rows, levels: jax.Array) -> jax.Array:
 def std_at(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
     """Std of the noise (N, C) at the predicted values, with which it may grow."""
     std, families = noise_std(rows, levels), _families(block, rows, levels)
-    if not any(isinstance(family, Growing) for family in families):
-        return std
-    parts = [
-        family.spread(predicted[:, c], std[:, c]) if isinstance(family, Growing) else std[:, c]
-        for c, family in enumerate(families)
-    ]
-    return jnp.stack(parts, 1)
+    for c in block.growing:
+        std = std.at[:, c].set(families[c].spread(predicted[:, c], std[:, c]))
+    return std
 
 
 def _families(
@@ -349,13 +351,17 @@ def _families(
         log = jnp.asarray(levels)[places]
         log = log if offset is None else log + offset[:, k]
         values.setdefault(own.channel, {})[own.name] = level_at(own.guess, own.odds, log)
-    families = enumerate(channel.noise for channel in block.channels)
-    return [with_values(family, values[c]) if c in values else family for c, family in families]
+    families: list[Any] = [channel.noise for channel in block.channels]
+    for c, own_values in values.items():
+        families[c] = with_values(families[c], own_values)
+    for c in block.growing if block.at_measured else ():
+        families[c] = GrowingWithMeasured(families[c].noise, families[c].slope)
+    return families
 
 
 def families_at(block: Block, levels: np.ndarray) -> list[Any]:
     """Noise family of each channel with numbers for its unknown parameters, in the middle of those of its sensors."""
-    families = [channel.noise for channel in block.channels]
+    families: list[Any] = [channel.noise for channel in block.channels]
     for own in (own for own in block.unknown if own.name):
         value = level_at(own.guess, own.odds, float(levels[list(own.number)].mean()))
         families[own.channel] = with_values(families[own.channel], {own.name: float(value)})
@@ -376,7 +382,7 @@ def _by_channel(
 
 def innovation(block: Block, rows: Rows, predicted: jax.Array) -> jax.Array:
     """Measured minus predicted, wrapped, zero where missing, shape (N, C)."""
-    families = [channel.noise for channel in block.channels]
+    families: list[Any] = [channel.noise for channel in block.channels]
     return rows.mask * _by_channel(block, families, "innovation", rows.y, predicted)
 
 
@@ -555,6 +561,10 @@ def square(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) ->
     """
     score, information = weigh(block, rows, predicted, levels, expected=True)
     found = standardised(score, information) ** 2
+    std, families = noise_std(rows, levels), _families(block, rows, levels)
+    for c in block.growing:
+        own = families[c].square(rows.y[:, c], predicted[:, c], std[:, c])
+        found = found.at[:, c].set(jnp.where(rows.mask[:, c] > 0, own, 0.0))
     events = np.array([isinstance(channel.noise, Bernoulli) for channel in block.channels])
     if not events.any():
         return found

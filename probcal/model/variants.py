@@ -27,6 +27,13 @@ def part(model: Model, r: int) -> Model:
     )
 
 
+def at_measured(model: Model) -> Model:
+    """The model whose growing stds are those at the measured values, for starts; itself where none grows."""
+    if not any(block.growing for block in model.blocks):
+        return model
+    return replace(model, blocks=tuple(replace(own, at_measured=bool(own.growing)) for own in model.blocks))
+
+
 def counts(model: Model, of: Callable[[np.ndarray], np.ndarray]) -> list[np.ndarray]:
     """Counts (E,) at each epoch of each recursion: sums of what `of` makes of the mask (N, C), a number (N,) a row."""
     found = [np.zeros(recursion.drift.shape[0]) for recursion in model.recursions]

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.mode import Point, cost, find_mode
+from probcal.gaussian.mode import Mode, Point, cost, find_mode
+from probcal.model import variants
 from probcal.model.model import Model
 from probcal.modes.bearings import by_directions, turned
 from probcal.modes.grid import grid_start
@@ -48,9 +49,10 @@ def optima(problem: Problem, iterations: int = 30, stopped: Callable[[], bool] =
     Once `stopped` no other start than the first is tried.
     """
     check_linear(problem)
+    measured = problem.at_measured()
     first = grid_start(problem, jax.device_put(problem.first_z), iterations)
     found = [_polished(problem, first, iterations)]
-    if (z := turned(problem, first)) is not None:
+    if (z := turned(measured, first)) is not None:
         found.append(_polished(problem, first._replace(z=jax.device_put(z)), iterations))
     for family in FAMILIES:
         for z in family(problem):
@@ -59,7 +61,7 @@ def optima(problem: Problem, iterations: int = 30, stopped: Callable[[], bool] =
             placed = grid_start(problem, jax.device_put(problem.first_z + z), iterations)
             found.append(_polished(problem, placed, iterations))
     best = min(found, key=_order)
-    for tracked in exchanged(problem, first, best.point, best.settled):
+    for tracked in exchanged(measured, first, best.point, best.settled):
         if stopped():
             break
         value = min(float(sparse_cost(problem.model, tracked)), _polished(problem, tracked, iterations).value)
@@ -79,9 +81,16 @@ def _order(optimum: Optimum) -> float:
 
 def _polished(problem: Problem, tracked: Point, iterations: int) -> Optimum:
     """The joint mode at the declared scales next to a point."""
-    scales = Precision.single(jnp.ones(problem.model.biases))
-    mode = find_mode(problem.model, tracked, scales, iterations, 1e-3)
+    mode = mode_from_start(problem.model, tracked, iterations)
     return Optimum(float(sparse_cost(problem.model, mode.point)), mode.point, bool(mode.converged))
+
+
+def mode_from_start(model: Model, start: Point, iterations: int) -> Mode:
+    """The joint mode at the declared scales next to a start, by that with growing stds at the measured values."""
+    scales = Precision.single(jnp.ones(model.biases))
+    if (measured := variants.at_measured(model)) is not model:
+        start = find_mode(measured, start, scales, iterations, 1e-3).point
+    return find_mode(model, start, scales, iterations, 1e-3)
 
 
 @jax.jit

@@ -8,10 +8,9 @@ import numpy as np
 
 from probcal.gaussian.information import squares_of
 from probcal.gaussian.joint import too_large
-from probcal.gaussian.mode import Point, find_mode
-from probcal.modes.automatic import sparse_cost
+from probcal.gaussian.mode import Point
+from probcal.modes.automatic import mode_from_start, sparse_cost
 from probcal.modes.grid import follow_states, grid_start
-from probcal.priors import Precision
 from probcal.problem import Problem
 
 SPAN = 4.0  # scales to either side within which the offset of a clock is looked for
@@ -90,8 +89,7 @@ def _parts(problem: Problem) -> Iterator[tuple[np.ndarray, list[int]]]:
 
 
 def _polished(problem: Problem, point: Point, steps: int) -> _Tried:
-    scales = Precision.single(jnp.ones(problem.model.biases))
-    mode = find_mode(problem.model, point, scales, steps, 1e-3)
+    mode = mode_from_start(problem.model, point, steps)
     value = float(sparse_cost(problem.model, mode.point))
     return _Tried(problem, mode.point, value if np.isfinite(value) else np.inf)
 

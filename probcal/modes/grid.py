@@ -259,7 +259,11 @@ def follow_states(problem: Problem, states: list[np.ndarray]) -> Point:
 
 
 def grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
-    """Trajectories from the data alone at biases z (M,): grid, Viterbi path, motion model, iterated EKS."""
+    """Trajectories from the data alone at biases z (M,): grid, Viterbi path, motion model, iterated EKS.
+
+    A std that grows is that at the measured value: at the prediction it makes far places fit all data about as well.
+    """
+    problem = problem.at_measured()
     places = candidates(problem)
     tracks, precisions = [], []
     for r, epochs in enumerate(problem.epochs):

@@ -241,8 +241,8 @@ def precisions_of(problem: Problem, prior: Prior) -> str:
 
 def tracks_of(at: Linearisation, covariance: jax.Array) -> list[Tracks]:
     """States of each recursion at a point, and their sd for a covariance (M, M) of the biases."""
-    pairs = zip(at.point.states, at.variances(covariance), strict=True)
-    return [Tracks(np.asarray(x), np.sqrt(np.maximum(np.asarray(variance), 0.0))) for x, variance in pairs]
+    pairs = at.model.each_layout(at.point.states, at.variances(covariance))
+    return [Tracks(np.asarray(x), np.sqrt(np.maximum(np.asarray(variance), 0.0))) for _, x, variance in pairs]
 
 
 def log_prior_normal(z: np.ndarray, precision: np.ndarray) -> np.ndarray:
