@@ -10,6 +10,7 @@ import numpy as np
 
 from probcal.gaussian.draws import residuals
 from probcal.gaussian.information import growing_square, rejected, squares_of
+from probcal.gaussian.joint import too_large
 from probcal.gaussian.mode import Point
 from probcal.inference.mixture import MixturePosterior
 from probcal.labels import listed
@@ -31,8 +32,9 @@ FALL = 1.0  # nats below its best at which an evidence may end
 # Monte Carlo error of a mean in sd, or of an sd over it, above which a message states it
 INEXACT = 0.03
 ABSURD = 100.0  # mean square a datum, 1 expected, beyond which a fit explains nothing
-# the same of data whose std grows, which is then known to a factor of three: wrong modes leave 14 and more
+# the same of data whose std grows, which is then known to a factor of three: wrong modes leave 8 to 80
 GROWN = 9.0
+DOUBTED = 2.0  # the same, from which the automatic start is looked at: a wrong mode leaves twice as much
 
 
 def conclude(
@@ -173,21 +175,33 @@ def verdict(end: End) -> Status:
 def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
     """The misfit of a point whose residuals have this mean square, its likely cause and what to do.
 
-    Empty where the point explains the data, and robust noise rejects no sensor.
+    Empty where the point explains the data, and robust noise rejects no sensor. A std that grows hides a
+    misfit: then the automatic start is compared.
     """
     grown = growing_square(problem.model, point)
+    if square <= ABSURD and grown > DOUBTED and not (_drawn(problem) or too_large(problem.model)):
+        least = growing_square(problem.model, automatic_start(problem))
+        if 2.0 * least < grown:
+            return (
+                f"The fit ended in a wrong mode: mean square a datum {grown:.2g}, where the automatic start leaves"
+                f" {least:.2g}. Fit again without a start, or with starts=4."
+            )
     if square <= ABSURD and grown <= GROWN:
         return rejection_text(rejected(problem, point))
     return misfit_text(max(square, grown), (_remains(problem, at) for at in _points(problem, point, square)))
 
 
+def _drawn(problem: Problem) -> bool:
+    """True where a motion has no linear form, and so no automatic start."""
+    return any(part.L.shape[1] == 0 for part in problem.model.recursions)
+
+
 def _points(problem: Problem, point: Point, square: float) -> Iterator[Point]:
     """The point of a misfit where it is finite, and tracks with the biases as stated, which no
     wrong bias bends."""
-    drawn = any(part.L.shape[1] == 0 for part in problem.model.recursions)  # a motion of no linear form has no start
-    if np.isfinite(square) or drawn:
+    if np.isfinite(square) or _drawn(problem):
         yield point
-    if not drawn:
+    if not _drawn(problem):
         yield track_mode(problem, uncalibrated(problem, automatic_start(problem)))
 
 
