@@ -1,5 +1,6 @@
 """A bent network of radars and ears for tests of the sparse form, and the libraries of factors."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -19,6 +20,9 @@ def radar(target, pose, *, range_offset=pc.Bias("m", 3.0), gain=pc.Bias("1", 0.0
     """Range with an offset of its own and a gain of its type, and azimuth."""
     line = pose.local(target.position)
     return dict(range=(1 + gain) * norm(line) + range_offset, azimuth=bearing(line))
+
+
+half_radar = replace(radar, channels=radar.channels | {"range": pc.Channel("m", std=1.0)})
 
 
 @pc.sensor(azimuth=pc.Channel("rad", std=0.01, wrap=True))

@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from reference import NaiveEngine
-from sparse_worlds import drawn, drawn_in_space, loud_ear
+from sparse_worlds import LIBRARIES, drawn, drawn_in_space, loud_ear
 
 import probcal as pc
 from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.engine import Factors, Group, evidence, mean, noise_score
+from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import find_tracks
 from probcal.gaussian.sparse import SparseEngine
@@ -107,6 +108,16 @@ MEMBERS = {  # what each is asked with
     ),
     "embedded": lambda own, factors, _: own.embedded(factors, embedded_columns(own.model, np.random.default_rng(7))),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+def test_marginals_need_no_selected_inverse(library):
+    """Of the biases of two sensors, which stand together in the pattern, by whatever factorises."""
+    with jax.enable_x64(True):
+        _, model, point, factors = expanded("flat")
+        members = blocks_of(model)[:2]
+        found = SparseEngine().at(model, point).marginals(factors, members)
+        agree(found, at(NaiveEngine, "flat").marginals(factors, members))
 
 
 def some_rows(model):

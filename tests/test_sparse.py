@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import worlds
 import xarray as xr
-from sparse_worlds import LIBRARIES, MOTION, TIME, drawn, ear, loud_ear, radar
+from sparse_worlds import LIBRARIES, MOTION, TIME, drawn, ear, half_radar, loud_ear, radar
 
 import probcal as pc
 from probcal.analysis.nees import of_biases
@@ -21,12 +21,15 @@ from probcal.cli import check
 from probcal.errors import FitError, InputError
 from probcal.files import Outputs
 from probcal.gaussian.cholesky import Cholmod, Entries, factorise, mirrored
+from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.engine import Factors
 from probcal.gaussian.joint import JointPrecision, blocks_of, missing
 from probcal.gaussian.linearised import linearise_rows
 from probcal.gaussian.mode import compress
 from probcal.gaussian.products import Products
 from probcal.gaussian.room import check_room
 from probcal.geometry import bearing, norm
+from probcal.identifiability.directions import shared_directions
 from probcal.inference import calibrate
 from probcal.inference.blockwise import gains_by_sparse, takes_sparse
 from probcal.modes import automatic_start
@@ -425,6 +428,28 @@ def test_a_sparse_fit_is_assessed_as_a_dense_one(dense):
 
 
 @pytest.mark.ci
+def test_levels_of_a_sound_network_are_found_right_by_one_look():
+    """Near those that the dense form expands; a std declared half is expanded, and found as there."""
+    places = [(0.0, 0.0), (400.0, 0.0), (0.0, 400.0), (400.0, 400.0)]
+    nodes = [pc.Node(f"n{k}", place, scale={"position": 5.0} if k else None) for k, place in enumerate(places)]
+    sound, wrong = (pc.Network([kind.on(node) for node in nodes]) for kind in (radar, half_radar))
+    motion = pc.Target(pc.ConstantVelocity(1.0), {"position": (200.0, 50.0), "velocity": (0.0, 5.0)})
+    table = pc.simulate(sound, motion, np.arange(300.0), key=7).table
+    for network, expanded in ((sound, False), (wrong, True)):
+        problem = pc.Problem(network, motion, table)
+        trees = (calibrate(problem, pc.MAP(form=form), prior=pc.Gaussian())[0] for form in ("dense", "sparse"))
+        wanted, found = (pc.assess(problem, tree)["level_check"].to_dataset() for tree in trees)
+        assert ("shift" in found) is expanded
+        assert found["level"].values.tolist() == wanted["level"].values.tolist()
+        off = np.abs(found["factor"] - wanted["factor"]) / wanted["factor_sd"]
+        assert (off < (0.02 if expanded else 1.0)).all()
+        wider = found["factor_sd"].values / wanted["factor_sd"].values  # one look bounds it from above
+        assert (wider < ([1.01] * 3 if expanded else [1.1, 1.1, 3.0])).all()
+        assert (wider > 0.99).all()
+        assert (found["square"] > found.attrs["limit"]).any() == expanded
+
+
+@pytest.mark.ci
 def test_data_that_scatter_more_than_declared_widen_a_sparse_fit():
     """By what the innovations call for: sd, interval, covariance of each sensor and draws together."""
     problem = drawn()[0]
@@ -543,7 +568,7 @@ def test_observability_by_the_sparse_engine_is_that_by_the_dense_one(whole, anch
     wanted = pc.observability(problem, point=point)
     monkeypatch.setattr("probcal.gaussian.joint.ROOM", 0)
     if not whole:
-        monkeypatch.setattr("probcal.gaussian.choose.WHOLE", 0)
+        monkeypatch.setattr("probcal.gaussian.sparse.WHOLE", 0)
     found = pc.observability(problem, point=point)
     for group, names in {"bias": ("share", "sd"), "datum": ("leverage",), "sensor": ("leverage",)}.items():
         for name in names:
@@ -564,6 +589,31 @@ def test_observability_by_the_sparse_engine_is_that_by_the_dense_one(whole, anch
         np.testing.assert_allclose(found["spectrum"]["information"], wanted["spectrum"]["information"], atol=1e-5)
     else:
         assert "rigid motions, common shifts" in found.attrs["screened"]
+
+
+def test_what_a_screen_advises_removes_what_all_sensors_share():
+    """Fixed, the biases that it names leave no direction of all nodes; without those of the last one is left."""
+    network, table = unanchored()
+    problem = pc.Problem(network, MOTION["car"], table)
+    with jax.enable_x64(True):
+        at = DenseEngine().at(problem.model, automatic_start(problem))
+        found = shared_directions(problem, at, Factors.alone(np.ones(problem.model.biases)))
+    assert [own.kind for own in found][:3] == ["gauge"] * 3  # two translations and a rotation
+    advised = [own.fix for own in found]
+    assert all(advised)
+
+    def left(fixed):
+        rest = pc.Problem(network, MOTION["car"], table, fix=[label for own in fixed for label in own])
+        return weak_of_all(pc.observability(rest))
+
+    assert not left(advised)
+    assert left([advised[0]])
+
+
+def weak_of_all(tree):
+    """Directions that all nodes share."""
+    named = tree["direction"]["direction"].values.tolist() if "direction" in tree.children else []
+    return [name for name in named if any(word in name for word in ("all nodes", "rotation", "dilation"))]
 
 
 @pytest.mark.ci

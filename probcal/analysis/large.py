@@ -51,14 +51,14 @@ def assess_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> 
     findings += checks.outlying(fit, found)
     findings += checks.wrapping(fit, tree)
     rejected, declared = rejection(fit, found, channels), _declared(fit, tree, answer)
-    hanging, asked_of = dict[int, str](), list[Finding]()
+    doubts, levelled = dict[int, str](), list[Finding]()
     if tree.attrs["status"] not in INVALID and cholesky.exact() and "sd_error" not in tree["calibration"]:
         with suppress(MemoryError):
-            asked, asked_of, hanging = levels.check_levels(fit, tree)
+            asked, levelled, doubts = levels.check_levels(fit, tree)
             groups |= {} if asked is None else {"level_check": asked}
-    groups["verdict"] = _verdicts(fit, tree, rejected, declared, found.excess, groups, hanging)
+    groups["verdict"] = _verdicts(fit, tree, rejected, declared, found.excess, groups, doubts)
     if not (any(f.kind == "outliers" for f in findings) or (groups["verdict"]["verdict"] == "drifting").any()):
-        findings += asked_of  # else the levels are only a sign of these
+        findings += levelled  # else the levels are only a sign of these
     if "halves" in groups and (unsolved := groups["halves"].attrs["unsolved"]):
         text = f"{unsolved} more biases may differ between the halves than were looked at: so many are no drift of one"
         findings.append(Finding("halves", "fit", text))
@@ -120,7 +120,7 @@ def _verdicts(
     declared: SensorBlocks,
     excess: float,
     groups: dict[str, xr.Dataset],
-    hanging: dict[int, str],
+    doubts: dict[int, str],
 ) -> xr.Dataset:
     """Group `verdict`; adds the group `halves` where the recording can be divided."""
     problem, group = fit.problem, tree["calibration"].to_dataset()
@@ -144,7 +144,7 @@ def _verdicts(
         float(np.sqrt(verdict.limit_of(M))), verdict.explained_part(z, alpha, gamma, excess),
     )  # fmt: skip
     shared = shared_in_blocks(problem, fit.point, declared.members, declared.covariance, SHARED)
-    ended, doubts = group["status"].values.tolist(), hanging | mirror_doubts(fit, tree)
+    ended, doubts = group["status"].values.tolist(), doubts | mirror_doubts(fit, tree)
     words, reasons = verdict.judge_biases(
         problem, Status(tree.attrs["status"]), ended, known, drifts, {}, first, shared, doubts
     )

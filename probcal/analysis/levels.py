@@ -213,7 +213,7 @@ def ask(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
     engine, at, K = fit.engine, fit.expansion, len(members.levels)
     step, shift, square = np.zeros(K), np.zeros((K, len(at.point.z))), np.zeros(K)
     sd = np.zeros(K)
-    if not engine.traceable and (screened := _screened(at, factors, members)) is not None:
+    if not engine.cheap and (screened := _screened(at, factors, members)) is not None:
         return screened
     for turn in range(TURNS):
         found, at = _expanded(fit, engine, factors, at, members, step)
@@ -231,11 +231,10 @@ def ask(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
 
 
 def _screened(at: Expansion, factors: Factors, members: Members) -> Wanted | None:
-    """What one look at a large network says: None where some level may be another, which is then expanded."""
-    unknown = np.array([level.unknown >= 0 for level in members.levels])
+    """The levels by one look; None where some level may be another, which is then expanded."""
     alone = np.maximum(members.sums(*noise_information(at, factors)), 1e-300)
     step, sd = members.sums(*noise_score(at, factors)) / alone, alone**-0.5
-    if unknown.any() or (np.abs(step) > NEAR).any() or (step**2 > SUSPECT * sd**2).any():
+    if (np.abs(step) > NEAR).any() or (step**2 > SUSPECT * sd**2).any():
         return None
     return Wanted(step, sd, (step / sd) ** 2, None)
 
@@ -244,8 +243,8 @@ def check_levels(fit: Judged, tree: xr.DataTree) -> tuple[xr.Dataset | None, lis
     """Group `level_check`, findings on declared levels, and why the answer of some biases is in doubt with them.
 
     `factor` is what the data ask for over what the fit had (all levels together), `factor_sd` its sd, `square` the
-    chi-square of that alone, `shift` what every bias would move with it, in its unit; a large network whose levels one
-    look finds right has no `shift`. Of process noise nothing is said
+    chi-square of that alone, `shift` what every bias would move with it, in its unit. A large network whose levels one
+    look finds right has no `shift`, and its `factor_sd` are upper bounds. Of process noise nothing is said
     where it was left out of the fit. Where precisions were integrated the declared scales are held.
     """
     members = members_of(fit.problem, moving=tree.attrs.get("motion") != "left out")

@@ -1,4 +1,5 @@
-"""What the data of a problem can and cannot determine: information of all biases, trajectories marginalised."""
+"""What the data of a problem can and cannot determine: information of all biases, trajectories
+marginalised."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,9 +11,9 @@ import xarray as xr
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.analysis.verdict import narrowed
 from probcal.errors import InputError
-from probcal.gaussian.choose import choose, information_of
+from probcal.gaussian.choose import choose
 from probcal.gaussian.engine import Factors
-from probcal.gaussian.joint import blocks_of, too_large
+from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point
 from probcal.identifiability.directions import marginal, screened_directions, weak_directions
 from probcal.identifiability.gauge import NULL, gauge, unfixed
@@ -47,8 +48,9 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     bound on its sd, the information matrix), `spectrum`, `direction` (gauge and weak ones with words and remedies),
     `datum`, `sensor` and `target` (how many biases each determines: their leverages, which add up with what the motion
     tells), `track`. Attributes: `status` (determined; weak; open, where the data say next to nothing of a direction),
-    `rule`, counts. Of more than 600 biases there is no spectrum and no information matrix; their directions are those
-    of single sensors and what all share (`screened` says so). Raises `InputError` where no bias is free.
+    `rule`, counts. A large network of more than 600 biases has no spectrum and no information matrix; its directions
+    are those of single sensors and those that all share (`screened` says so). Raises `InputError` where no bias is
+    free.
 
     >>> observability(problem).attrs["status"]
     'determined'
@@ -56,10 +58,11 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     check_free(problem)
     point = standpoint(problem, point, truth)
     model, scales = problem.model.by_information(), Factors.alone(np.ones(problem.model.biases))
-    at = choose(model).at(model, point)
-    information = information_of(at)
+    engine = choose(model)
+    at = engine.at(model, point)
     if not all(np.isfinite(own).all() for lin in at.rows for own in lin):
         raise InputError(NOT_FINITE)
+    information = at.information()
     members = np.arange(model.biases)[:, None] if information is not None else blocks_of(model)
     leverages, states = at.leverages(scales), at.states(scales)
     blocks = SensorBlocks(model.biases, members, np.asarray(at.marginals(scales, members)))
@@ -78,7 +81,7 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
         least, countable = min((own.information for own in directions), default=WEAK), True
     else:
         groups["spectrum"] = _spectrum(information)
-        directions, values, gauges, countable = _directions(problem, information, point)
+        directions, values, gauges, countable = _directions(problem, information, point, exact=engine.cheap)
         least, weak = float(values[0]), int((values < WEAK).sum())
     if directions:
         groups["direction"] = direction_group(problem.labels, directions)
@@ -93,15 +96,17 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
 
 
 def _directions(
-    problem: Problem, information: np.ndarray, point: Point
+    problem: Problem, information: np.ndarray, point: Point, *, exact: bool
 ) -> tuple[tuple[Direction, ...], np.ndarray, int, bool]:
-    """Weak directions by name, eigenvalues of the marginal information, number of gauges, and whether these count.
+    """Weak directions by name, eigenvalues of the marginal information, number of gauges, and
+    whether these count.
 
-    Where the states have no room for their response to all biases each direction is tried by itself.
+    Gauges are the null space of the rows where that is `exact`; else each direction is tried by
+    itself.
     """
     free = ~problem.surveyed
     values = np.linalg.eigvalsh(marginal(information, free)) if free.any() else np.full(1, np.inf)
-    if not too_large(problem.model):
+    if exact:
         null = gauge(problem, point)
         found = weak_directions(problem, information, point, null)
         return found, values, null.basis.shape[1] if null.countable else 0, null.countable
@@ -113,7 +118,8 @@ def _directions(
 
 
 def _status(least: float, gauge: bool) -> str:
-    """What the least information of any direction means for a fit; a gauge is never determined by its motion alone."""
+    """What the least information of any direction means for a fit; a gauge is never determined by
+    its motion alone."""
     word = narrowed(1.0 - 1.0 / (1.0 + least))
     if word == "prior only":
         return "open"

@@ -14,10 +14,9 @@ weak         s < 0.5 (information below 1), or one scale along a combination of 
              that the data ask for or if the biases that drift were free to, or it lies beyond the
              limit of its survey by a misfit that is mostly elsewhere, or it is another one in an
              answer that fits as well (a mirror, all biases where a target touches it), or the
-             answer is far from Gaussian, or it is a clock and the innovations have a mean square
-             of 2 or more, which another lag may explain, or the fit is no answer (not converged,
-             at bound,
-             diverged), or the chains of the bias have not mixed, or it was pruned: held at zero by
+             answer is far from Gaussian, or it is a clock and another lag may explain the
+             innovations (their mean square is 2 or more), or the fit is no answer (not converged,
+             at bound, diverged), or the chains of the bias have not mixed, or it was pruned: held at zero by
              a precision that was maximised; all are "conflicting" where the fit explains nothing
              (misfit)
 determined   none of these

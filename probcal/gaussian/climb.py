@@ -1,7 +1,7 @@
 """To the mode of the marginal density of the biases, by what any engine gives; the host drives it.
 
-The step is that of the posterior at the point under the factors of a prior, and what the secants of the last steps say
-of log det W (L-BFGS around it); each track is settled by steps of its own.
+The step is that of the posterior at the point under the factors of a prior, and what the secants of
+the last steps say of log det W (L-BFGS around it); each track is settled by steps of its own.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ SMALL = 1e-9  # of the density: what a step that promises less cannot show
 
 @jax.jit
 def settle_each(model: Model, point: Point) -> Point:
-    """Every track at its mode for the biases, each with a step length of its own: none waits for another.
+    """Every track at its mode for the biases, each with a step length of its own: none waits for
+    another.
 
     A track that no part of a step improves stays where it is: on a cusp, where it grazes a sensor.
     """
@@ -70,7 +71,8 @@ def settle_each(model: Model, point: Point) -> Point:
 
 
 class Climbed(NamedTuple):
-    """Where a climb ended: the posterior there, negative log marginal density with the prior, and how it went."""
+    """The end of a climb: the posterior there, its negative log marginal density with the prior,
+    and how it went."""
 
     at: Expansion
     value: float
@@ -83,11 +85,13 @@ def climb_to_mode(
     expand: Callable[[Point], Expansion], start: Point, factors: Factors, iterations: int, tolerance: float,
     told: Callable[[int, float], bool] | None = None,
 ) -> Climbed:  # fmt: skip
-    """Climb to the mode of the marginal density times factors until a step promises less than tolerance.
+    """Climb to the mode of the marginal density times factors until a step promises less than
+    tolerance.
 
-    `expand` gives the posterior at a point whose tracks it settles first. A step that does not bring its share of what
-    it promises is halved. It ends where `told`, called with the number of steps and the density, says so. Raises
-    `numpy.linalg.LinAlgError` where the precision is not positive definite: a flat prior on what no data tell.
+    `expand` gives the posterior at a point whose tracks it settles first. A step that does not
+    bring its share of what it promises is halved. It ends where `told`, called with the number of
+    steps and the density, says so. Raises `numpy.linalg.LinAlgError` where the precision is not
+    positive definite: a flat prior on what no data tell.
     """
 
     def looked(point: Point) -> tuple[Expansion, float]:

@@ -1,4 +1,4 @@
-"""The dense engine: matrices of all biases and the response of every state to each; it may stand inside jit."""
+"""The dense engine: matrices of all biases, and the response of every state to each."""
 
 from __future__ import annotations
 
@@ -29,8 +29,7 @@ from probcal.model.rows import Linearised
 class DenseEngine:
     """Matrices of all biases: the fastest where they fit."""
 
-    name: ClassVar[str] = "dense"
-    traceable: ClassVar[bool] = True
+    cheap: ClassVar[bool] = True
 
     def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> DenseExpansion:
         """The posterior at a consistent point; rows as the caller linearised them."""
@@ -58,7 +57,7 @@ class DenseExpansion:
 
     @property
     def point(self) -> Point:
-        """Where it is expanded."""
+        """The point of the expansion."""
         return self.linear.point
 
     @property
@@ -100,12 +99,16 @@ class DenseExpansion:
         """Information of the data about the biases times columns, (M,) or (M, K)."""
         return self.linear.information @ jnp.asarray(columns)
 
+    def information(self) -> np.ndarray:
+        """The information (M, M) itself."""
+        return np.asarray(self.linear.information)
+
     def moved(self, dz: Any) -> Point:
         """The point with the biases moved by dz (M,), all tracks following."""
         return _moved(self.model, self.point, self.linear.solved, jnp.asarray(dz))
 
     def _precision(self, factors: Factors) -> np.ndarray:
-        return np.asarray(self.linear.information) + factors.matrix(self.model.biases)
+        return self.information() + factors.matrix(self.model.biases)
 
     def covariance(self, factors: Factors) -> jax.Array:
         """Covariance (M, M) of the biases."""
@@ -140,7 +143,8 @@ class DenseExpansion:
         return self.linear.predicted_variances(self.covariance(factors))
 
     def leverages(self, factors: Factors) -> Data:
-        """Leverage of every datum (N, C) on the biases: w times the part of its variance that the biases cause."""
+        """Leverage of every datum (N, C) on the biases: w times the part of its variance that the
+        biases cause."""
         return self.linear.leverages(self.covariance(factors))
 
     def sample(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
@@ -150,7 +154,8 @@ class DenseExpansion:
         return Sampled(z, self.linear.draw(z, keys[1]))
 
     def followed(self, root: Any) -> list[np.ndarray]:
-        """Variance (E, n) of every state where the biases have the covariance root root', root (M, R)."""
+        """Variance (E, n) of every state where the biases have the covariance root root', root (M,
+        R)."""
         whole = root @ root.T
         whole = whole if isinstance(whole, np.ndarray) else whole.toarray()
         return [np.asarray(own) for own in self.linear.variances(jnp.asarray(whole))]
@@ -160,14 +165,13 @@ class DenseExpansion:
         return DenseEngine().at(self.model.weighted(weights), self.point, scaled(self.rows, weights))
 
     def embedded(self, factors: Factors, columns: Data) -> Embedded:
-        """Information and score of K more parameters, by which predicted values change as columns (N, C, K)."""
+        """Information and score of K more parameters, by which predicted values change as columns
+        (N, C, K)."""
         pull = self.eliminated.score + factors.pull(self.point.z)
         return _embedded(self.linear, self.covariance(factors), pull, columns)
 
 
 _solved = jax.jit(Dense.of)
-
-
 _moved = jax.jit(follow)
 
 

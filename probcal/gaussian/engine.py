@@ -1,8 +1,10 @@
-"""The posterior linearised at a point, and who solves it: what every engine gives, whatever its algebra.
+"""The posterior linearised at a point, and who solves it: what every engine gives, whatever its
+algebra.
 
-The density of the biases z, trajectories integrated by Laplace's formula, is a Gaussian of the data, the information S
-of `model` about z, times a sum of Gaussian factors. `at.solve(factors, right)` is (S + P)^-1 right, P their precision.
-An engine is a class with the members of `Engine` that gives an `Expansion`; `choose` alone knows sizes.
+The density of the biases z, trajectories integrated by Laplace's formula, is a Gaussian of the
+data, the information S of `model` about z, times a sum of Gaussian factors. `at.solve(factors,
+right)` is (S + P)^-1 right, P their precision. An engine is a class with the members of `Engine`
+that gives an `Expansion`; `choose` alone knows sizes.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ class Group(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """A sum of Gaussian factors on few biases each: precisions, correlations, surveys, sites, integrated places."""
+    """A sum of Gaussian factors on few biases each: precisions, correlations, surveys, sites,
+    integrated places."""
 
     groups: tuple[Group, ...] = ()
 
@@ -117,14 +120,12 @@ class Embedded(NamedTuple):
     information: Any  # (K, K)
     score: Any  # (K,)
 
-    @property
-    def estimate(self) -> np.ndarray:
-        """Their values (K,) by one step from the point."""
-        return np.linalg.lstsq(np.asarray(self.information), np.asarray(self.score), rcond=None)[0]
-
 
 class Expansion(Protocol):
-    """The posterior expanded about a point, trajectories eliminated. Variances are those that the factors leave."""
+    """The posterior expanded about a point, trajectories eliminated.
+
+    Variances are those that the factors leave.
+    """
 
     @property
     def model(self) -> Model:
@@ -132,7 +133,7 @@ class Expansion(Protocol):
 
     @property
     def point(self) -> Point:
-        """Where it is expanded."""
+        """The point of the expansion."""
 
     @property
     def rows(self) -> tuple[Linearised, ...]:
@@ -157,6 +158,9 @@ class Expansion(Protocol):
     def apply(self, columns: Any) -> Any:
         """Information of the data about the biases times columns, (M,) or (M, K)."""
 
+    def information(self) -> np.ndarray | None:
+        """The information (M, M) itself; None where the biases are too many for it."""
+
     def moved(self, dz: Any) -> Point:
         """The point with the biases moved by dz (M,), all tracks following."""
 
@@ -176,30 +180,32 @@ class Expansion(Protocol):
         """Variance (N, C) of each predicted value."""
 
     def leverages(self, factors: Factors) -> tuple[Any, ...]:
-        """Leverage of every datum (N, C) on the biases: w times the part of the above that the biases cause."""
+        """Leverage of every datum (N, C) on the biases: w times the part of the above that the
+        biases cause."""
 
     def sample(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
         """Biases and trajectories drawn around the mean that the factors make."""
 
     def followed(self, root: Any) -> list[np.ndarray]:
-        """Variance (E, n) of every state where the biases have the covariance root root', root (M, R)."""
+        """Variance (E, n) of every state where the biases have the covariance root root', root (M,
+        R)."""
 
     def weighed(self, weights: Data) -> Expansion:
         """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
 
     def embedded(self, factors: Factors, columns: Data) -> Embedded:
-        """Information and score of K more parameters, by which predicted values change as columns (N, C, K)."""
+        """Information and score of K more parameters, by which predicted values change as columns
+        (N, C, K)."""
 
 
 class Engine(Protocol):
     """A way to linearise and solve."""
 
-    name: ClassVar[str]
-    traceable: ClassVar[bool]  # whether it may stand inside jit and vmap; else the host drives it
+    cheap: ClassVar[bool]  # whether expansions cost so little that many are made without a look first
 
     def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> Expansion:
-        """The posterior at a consistent point whose trajectories are at their mode; rows as the caller linearised
-        them, by default with the expected information."""
+        """The posterior at a consistent point; rows as the caller linearised them, by default with
+        the expected information."""
 
     def settled(self, model: Model, point: Point) -> Expansion:
         """The same at the modes of its trajectories for its biases."""
@@ -211,9 +217,11 @@ def mean(at: Expansion, factors: Factors) -> Any:
 
 
 def evidence(at: Expansion, prior: Precision, factors: Factors | None = None) -> Estimate:
-    """Log evidence at the mode under a Gaussian prior, trajectories and biases integrated by Laplace's formula.
+    """Log evidence at the mode under a Gaussian prior, trajectories and biases integrated by
+    Laplace's formula.
 
-    `factors` are those of the prior, for who has them. A precision of 0 is a flat prior: its density counts as one.
+    `factors` are those of the prior, for who has them. A precision of 0 is a flat prior: its
+    density counts as one.
     """
     factors = Factors.of(prior) if factors is None else factors
     volume = at.log_det(factors)
@@ -222,7 +230,8 @@ def evidence(at: Expansion, prior: Precision, factors: Factors | None = None) ->
 
 
 def noise_score(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.Array, ...]]:
-    """Terms of the slope of the log evidence by log noise levels, biases and trajectories integrated.
+    """Terms of the slope of the log evidence by log noise levels, biases and trajectories
+    integrated.
 
     Of every datum (N, C) of each block, and of every whitened noise (E, n) of each recursion.
     """
@@ -230,13 +239,15 @@ def noise_score(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.Array,
 
 
 def noise_information(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.Array, ...]]:
-    """The same of the information about log noise levels, if every noise stood alone."""
+    """The same of the information about log noise levels, less what noises that hang together add:
+    a lower bound."""
     return _noise_information(at.model, at.point, tuple(at.predicted(factors)), tuple(at.noises(factors)))
 
 
 @jax.jit
 def density_of(model: Model, point: Point, volume: jax.Array) -> jax.Array:
-    """Log density of the data at a point whose trajectories have a posterior precision of log determinant `volume`."""
+    """Log density of the data at a point whose trajectories have a posterior precision of log
+    determinant `volume`."""
     spread = jnp.sum((point.levels / model.level_spread) ** 2)
     return log_density(model, point) + mixing_gain(model) - 0.5 * (spread + volume)
 

@@ -1,7 +1,9 @@
-"""The joint precision of all states and biases as a sparse matrix, for networks whose dense form does not fit.
+"""The joint precision of all states and biases as a sparse matrix, for networks whose dense form
+does not fit.
 
-A row couples the state of its epoch with the biases of its sensor, and motion one epoch with the next: of the n^2
-entries few are not zero. One Cholesky factor solves what `eliminate` and a Schur complement do where it is dense.
+A row couples the state of its epoch with the biases of its sensor, and motion one epoch with the
+next: of the n^2 entries few are not zero. One Cholesky factor solves what `eliminate` and a Schur
+complement do where it is dense.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ def too_large(model: Model) -> bool:
 
 
 def missing(model: Model) -> str:
-    """What a model has that the sparse form does not take, in words; empty where it takes the model."""
+    """What a model has that the sparse form does not take, in words; empty where it takes the
+    model."""
     if model.level_spread.shape[0]:
         return "unknown noise levels"
     if model.tailed:
@@ -78,10 +81,12 @@ def _fixes(part: Any) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class JointPrecision:
-    """Where the entries of the joint precision of a model come from: states first, then the M biases.
+    """Where the entries of the joint precision of a model come from: states first, then the M
+    biases.
 
-    `kept` (entries,) are their places among all values of `_values`, `times` (entries,) what each counts. A state that
-    stays what it was has the variables of the epoch before; one that is known has none, -1 in `slots`.
+    `kept` (entries,) are their places among all values of `_values`, `times` (entries,) what each
+    counts. A state that stays what it was has the variables of the epoch before; one that is known
+    has none, -1 in `slots`.
     """
 
     places: Entries
@@ -98,8 +103,8 @@ class JointPrecision:
     def of(cls, model: Model, *, products: bool = False, pairs: Sequence[np.ndarray] = ()) -> JointPrecision:
         """The pattern of a model, whose biases are factorised, or known by products alone.
 
-        All biases of a row of `pairs` (B, p), M of none, have an entry with each other, and of a tilt those that it
-        couples.
+        Biases in one row of `pairs` (B, p), M of none, have an entry with each other, as those have
+        that integrated places couple.
         """
         slots, driven, start = [], [], 0
         for part in model.recursions:
@@ -136,10 +141,10 @@ class JointPrecision:
     def values(self, model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> np.ndarray:
         """Entries (entries,) of the precision of data and motion, the biases without prior."""
         found = np.asarray(_values(model, tuple(jnp.asarray(own) for own in self.driven), lins, levels))
-        tilt = (
-            np.zeros(len(self.extra)) if model.tilt is None else np.asarray(model.tilt.curvature)[tuple(self.extra.T)]
-        )
-        return np.concatenate([tilt, found])[self.kept] * self.times
+        more = np.zeros(len(self.extra))
+        if model.tilt is not None:
+            more = np.asarray(model.tilt.curvature)[tuple(self.extra.T)]
+        return np.concatenate([more, found])[self.kept] * self.times
 
     def factor(self, values: np.ndarray, factors: Factors) -> Factor:
         """Factorise the precision with Gaussian factors, each pair of whose biases has a place."""
@@ -158,12 +163,14 @@ class JointPrecision:
         return bool((self.pairs(members) >= 0)[there[:, :, None] & there[:, None, :]].all())
 
     def block_values(self, members: np.ndarray, pairs: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-        """Covariances (B, p, p) of biases (B, p), of their `pairs` in the inverse at the places of the entries."""
+        """Covariances (B, p, p) of biases (B, p), of their `pairs` in the inverse at the places of
+        the entries."""
         none = members == self.places.size - self.states
         return np.where(pairs >= 0, inverse[pairs], np.eye(members.shape[1])[None] * none[:, None])
 
     def pairs(self, members: np.ndarray) -> np.ndarray:
-        """Where the entries (B, p, p) of pairs of biases (B, p) are, -1 where there is no pair; M is no bias."""
+        """Where the entries (B, p, p) of pairs of biases (B, p) are, -1 where there is no pair; M
+        is no bias."""
         keys = self.places.row.astype(np.int64) * self.places.size + self.places.column
         order = np.argsort(keys, kind="stable")
         low = np.minimum(members[:, :, None], members[:, None, :]) + self.states
@@ -174,7 +181,8 @@ class JointPrecision:
         return np.where(there, order[at], -1)
 
     def steps(self, model: Model, inverse: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Covariances (E, n, n) of each state of each recursion, of the one before, and between that and it.
+        """Covariances (E, n, n) of each state of each recursion, of the one before, and between
+        that and it.
 
         From the inverse at the places of the entries; 0 where states are known, or come from none.
         """
@@ -191,7 +199,8 @@ class JointPrecision:
         return found
 
     def predicted_variances(self, model: Model, lins: tuple[Linearised, ...], inverse: np.ndarray) -> list[np.ndarray]:
-        """Variance (N, C) of each predicted value of each block, from the inverse at the places of the entries."""
+        """Variance (N, C) of each predicted value of each block, from the inverse at the places of
+        the entries."""
         whole, states = np.zeros(self.count), [own for own, _, _ in self.steps(model, inverse)]
         whole[self.kept] = inverse
         at = len(self.extra) + sum(len(x) * x.shape[1] * (2 * x.shape[1] + 1) for x in states)
@@ -214,7 +223,8 @@ class JointPrecision:
         self, values: np.ndarray, first: int = 0, stop: int | None = None,
         library: Callable[[Entries, np.ndarray], Factor] | None = None,
     ) -> Factor:  # fmt: skip
-        """Factorise the precision of the states at held biases, or of those from `first` to `stop` of whole tracks."""
+        """Factorise the precision of the states at held biases, or of those from `first` to `stop`
+        of whole tracks."""
         stop = self.states if stop is None else stop
         row, column = self.places.row, self.places.column
         own = (row >= first) & (column < stop)
@@ -246,7 +256,8 @@ class JointPrecision:
         return np.concatenate([np.zeros((self.states, *pull.shape[1:])), pull])
 
     def variables(self, states: Sequence[Any], biases: Any) -> np.ndarray:
-        """What belongs to states (E, n, K) of each recursion and to biases (M, K), summed by variable, (n, K)."""
+        """What belongs to states (E, n, K) of each recursion and to biases (M, K), summed by
+        variable, (n, K)."""
         found = np.zeros((self.places.size + 1, biases.shape[1]))  # of known states last
         for own, x in zip(self.slots, states, strict=True):
             np.add.at(found, own, np.asarray(x))
@@ -254,12 +265,14 @@ class JointPrecision:
         return found[:-1]
 
     def state_values(self, values: np.ndarray) -> list[np.ndarray]:
-        """Of values (n,) of all variables those of the states (E, n) of each recursion, 0 where they are known."""
+        """Of values (n,) of all variables those of the states (E, n) of each recursion, 0 where
+        they are known."""
         padded = np.append(values, 0.0)
         return [padded[own] for own in self.slots]
 
     def correction(self, model: Model, levels: jax.Array) -> float:
-        """Twice the sum of log |L|, by which log det W of whitened noises is above that of the states."""
+        """Twice the sum of log |L|, by which log det W of whitened noises is above that of the
+        states."""
         total = 0.0
         for part, own in model.each_layout(self.driven):
             if own.any():
@@ -288,7 +301,8 @@ def _symmetric(upper: np.ndarray, n: int) -> np.ndarray:
 
 
 def blocks_of(model: Model) -> np.ndarray:
-    """Biases (B, p) of each sensor that no sensor before has, M of none; those of no sensor by themselves."""
+    """Biases (B, p) of each sensor that no sensor before has, M of none; those of no sensor by
+    themselves."""
     M = model.biases
     taken, members = np.zeros(M + 1, bool), list[np.ndarray]()
     taken[M] = True
@@ -340,7 +354,8 @@ def _entries(
 
 @jax.jit
 def _values(model: Model, driven: tuple[jax.Array, ...], lins: tuple[Linearised, ...], levels: jax.Array) -> jax.Array:
-    """Values of the blocks of the joint precision in the order of `_entries`, the diagonal of the biases zero."""
+    """Values of the blocks of the joint precision in the order of `_entries`, the diagonal of the
+    biases zero."""
     found = []
     for part, (J, _), own in model.each_layout(model.of_states(lins), driven):
         n = J.shape[1]

@@ -1,4 +1,5 @@
-"""The sparse engine: one factor of the joint precision of all states and biases (CHOLMOD, or SuperLU without it)."""
+"""The sparse engine: one factor of the joint precision of all states and biases (CHOLMOD, or
+SuperLU without it)."""
 
 from __future__ import annotations
 
@@ -24,24 +25,27 @@ from probcal.model.model import Data, Model, scaled
 from probcal.model.rows import Linearised
 
 COLUMNS = 256  # of a root of the covariance at once
+WHOLE, TOGETHER = 600, 64  # biases up to which a matrix of all is made on request (its eigenvalues take 0.2 s), and
+# its columns at once
 
 
 @dataclass(frozen=True)
 class SparseEngine:
-    """Nothing of size (M, M) or (E, n, M): what an epoch sees of the biases is few entries of a sparse matrix."""
+    """Nothing of size (M, M) or (E, n, M): what an epoch sees of the biases is few entries of a
+    sparse matrix."""
 
     products: bool = False  # no factor of the biases: conjugate gradients, and estimates with their errors
     _patterns: list[tuple[Model, JointPrecision]] = field(default_factory=list, compare=False)  # of the last model
 
-    name: ClassVar[str] = "sparse"
-    traceable: ClassVar[bool] = False
+    cheap: ClassVar[bool] = False
 
     def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> SparseExpansion:
         """The posterior at a consistent point; rows as the caller linearised them."""
-        if not (self._patterns and self._patterns[0][0] is model):
-            self._patterns[:] = [(model, JointPrecision.of(model, products=self.products))]
+        last = next((joint for own, joint in self._patterns if own is model), None)
+        joint = JointPrecision.of(model, products=self.products) if last is None else last
+        self._patterns[:] = [(model, joint)]
         rows = linearise_rows(model, point) if rows is None else tuple(rows)
-        return SparseExpansion(model, point, rows, self._patterns[0][1])
+        return SparseExpansion(model, point, rows, joint)
 
     def settled(self, model: Model, point: Point) -> SparseExpansion:
         """The same at the modes of its trajectories for its biases."""
@@ -69,7 +73,8 @@ class _Solved:
 
 @dataclass(frozen=True, eq=False)
 class SparseExpansion:
-    """The posterior at a point, as `engine.Expansion`; of the factors that were asked for last the factor is kept."""
+    """The posterior at a point, as `engine.Expansion`; of the factors that were asked for last the
+    factor is kept."""
 
     model: Model
     point: Point
@@ -89,11 +94,13 @@ class SparseExpansion:
 
     @cached_property
     def _relaxed(self) -> tuple[Data, jax.Array]:
-        """Scores (N, C) of the data, and slope (M,) of the log-likelihood, with every track at its mode."""
+        """Scores (N, C) of the data, and slope (M,) of the log-likelihood, with every track at its
+        mode."""
         return _relaxed(self.model, self.point, self.rows, self.eliminated)
 
     def solved(self, factors: Factors) -> _Solved:
-        """The joint precision with factors; pairs of biases that are new to its pattern are given a place there."""
+        """The joint precision with factors; pairs of biases that are new to its pattern are given a
+        place there."""
         if not (self._kept and self._kept[0].of is factors):
             self._kept.clear()
             joint, entries = self.joint, self.entries
@@ -105,7 +112,8 @@ class SparseExpansion:
 
     @cached_property
     def known(self) -> np.ndarray:
-        """The inverse of the precision of the states alone, biases known, at the place of each entry; 0 elsewhere."""
+        """The inverse of the precision of the states alone, biases known, at the place of each
+        entry; 0 elsewhere."""
         check_exact(self.joint)
         found = np.zeros(len(self.entries))
         inside = self.joint.places.column < self.joint.states
@@ -144,6 +152,15 @@ class SparseExpansion:
         found = _informed(self.model, self.rows, self.eliminated, columns.reshape(len(columns), -1))
         return np.asarray(found).reshape(columns.shape)
 
+    def information(self) -> np.ndarray | None:
+        """The information (M, M) itself, some columns at a time; None of more than `WHOLE` biases."""
+        M = self.model.biases
+        if M > WHOLE:
+            return None
+        unit = np.eye(M)
+        found = np.concatenate([self.apply(unit[:, k : k + TOGETHER]) for k in range(0, M, TOGETHER)], 1)
+        return 0.5 * (found + found.T)
+
     def moved(self, dz: Any) -> Point:
         """The point with the biases moved by dz (M,), all tracks following."""
         return _followed(self.model, self.point, self.rows, self.eliminated, jnp.asarray(dz))
@@ -151,10 +168,10 @@ class SparseExpansion:
     def marginals(self, factors: Factors, members: np.ndarray) -> np.ndarray:
         """Covariances (B, p, p) of biases (B, p), M of none: 1 on its diagonal.
 
-        Where the pattern lacks a pair of them all are solved for.
+        Where the pattern lacks a pair of them, or its inverse is not exact, all are solved for.
         """
         found, M = self.solved(factors), self.model.biases
-        if found.joint.holds(members):
+        if found.joint.exact and found.joint.holds(members):
             return found.joint.block_values(members, found.joint.pairs(members), found.inverse)
         asked = np.unique(members[members < M])
         unit = np.zeros((M, len(asked)))
@@ -194,7 +211,8 @@ class SparseExpansion:
         return tuple(found.joint.predicted_variances(self.model, self.rows, found.inverse))
 
     def leverages(self, factors: Factors) -> tuple[np.ndarray, ...]:
-        """Leverage of every datum (N, C) on the biases: w times the part of its variance that the biases cause."""
+        """Leverage of every datum (N, C) on the biases: w times the part of its variance that the
+        biases cause."""
         both = self.predicted(factors)
         alone = self.joint.predicted_variances(self.model, self.rows, self.known)
         parts = self.model.each_block(self.rows, both, alone)
@@ -210,10 +228,11 @@ class SparseExpansion:
         return Sampled(np.asarray(middle.z) + drawn[:, self.joint.states :], states)
 
     def followed(self, root: Any) -> list[np.ndarray]:
-        """Variance (E, n) of every state where the biases have the covariance root root', root (M, R).
+        """Variance (E, n) of every state where the biases have the covariance root root', root (M,
+        R).
 
-        What each column of the root moves is found for some columns at a time. Raises `numpy.linalg.LinAlgError` where
-        a track is open.
+        What each column of the root moves is found for some columns at a time. Raises
+        `numpy.linalg.LinAlgError` where a track is open.
         """
         factor, across = self.joint.states_alone(self.entries), self.joint.across(self.entries)
         variance, _ = factor.inverse_diagonal()
@@ -227,7 +246,8 @@ class SparseExpansion:
         return SparseExpansion(self.model.weighted(weights), self.point, scaled(self.rows, weights), self.joint)
 
     def embedded(self, factors: Factors, columns: Data) -> Embedded:
-        """Information and score of K more parameters, by which predicted values change as columns (N, C, K)."""
+        """Information and score of K more parameters, by which predicted values change as columns
+        (N, C, K)."""
         found, (scores, pull) = self.solved(factors), self._relaxed
         own, score, states, biases = _columns(self.model, self.rows, scores, columns)
         right = self.joint.variables(states, biases)
@@ -249,7 +269,8 @@ def _held(model: Model, point: Point, rows: tuple[Linearised, ...]) -> Eliminate
 
 @jax.jit
 def _followed(model: Model, point: Point, rows: tuple[Linearised, ...], held: Eliminated, dz: jax.Array) -> Point:
-    """Tracks at their smoothed response to a step of the biases, by columns of the rows: no (E, n, M) is made."""
+    """Tracks at their smoothed response to a step of the biases, by columns of the rows: no (E, n,
+    M) is made."""
     columns = model.onto_states(rows, _weighted(model, rows, model.by_bias(rows, -dz[:, None])))
 
     def one(x: jax.Array, u: jax.Array, part: Any, kept: Any, column: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -287,7 +308,8 @@ def _informed(model: Model, rows: tuple[Linearised, ...], held: Eliminated, z: j
 
 @jax.jit
 def _columns(model: Model, rows: tuple[Linearised, ...], scores: Data, columns: Data) -> tuple[Any, ...]:
-    """Of columns (N, C, K) of further parameters their own information and score, and those with states and biases."""
+    """Of columns (N, C, K) of further parameters their own information and score, and those with
+    states and biases."""
     weighted = _weighted(model, rows, columns)
     pairs = list(model.each_block(columns, weighted, scores))
     information = sum(jnp.einsum("nck,ncl->kl", own, w) for *_, own, w, _ in pairs)
@@ -297,7 +319,8 @@ def _columns(model: Model, rows: tuple[Linearised, ...], scores: Data, columns: 
 
 @jax.jit
 def _noise_variances(model: Model, point: Point, steps: tuple[tuple[jax.Array, ...], ...]) -> tuple[jax.Array, ...]:
-    """Variances (E, n) of whitened noises, of the covariances of a state, of the one before, and between them."""
+    """Variances (E, n) of whitened noises, of the covariances of a state, of the one before, and
+    between them."""
 
     def one(part: Any, step: tuple[jax.Array, ...]) -> jax.Array:
         own, before, across = step

@@ -1,9 +1,11 @@
-"""Fits whose dense form does not fit: the marginal mode by sparse factors, precisions integrated by propagation.
+"""Fits whose dense form does not fit: the marginal mode by sparse factors, precisions integrated by
+propagation.
 
-`EA()` and `MAP()` come here by themselves (`form="auto"`): where the matrices of the dense form take more than 240 MB,
-and where there are more than 500 biases of which an epoch sees few, which is faster. Where memory does not hold the
-factor either, `MAP` goes on by products alone (`form="matrix-free"`).
-What needs the whole covariance of the biases is not there; variances and gamma of each are.
+`EA()` and `MAP()` come here by themselves (`form="auto"`): where the matrices of the dense form
+take more than 240 MB, and where there are more than 500 biases of which an epoch sees few, which is
+faster. Where memory does not hold the factor either, `MAP` goes on by products alone
+(`form="matrix-free"`). What needs the whole covariance of the biases is not there; variances and
+gamma of each are.
 """
 
 from __future__ import annotations
@@ -51,7 +53,8 @@ FORMS = ("auto", "dense", *SPARSE)
 
 
 def takes_sparse(method: Maximiser, problem: Problem) -> bool:
-    """Whether a method is to solve a problem in its sparse form; raises `InputError` where that was asked in vain."""
+    """Whether a method is to solve a problem in its sparse form; raises `InputError` where that was
+    asked in vain."""
     form = getattr(method, "form", "dense")
     lacks = missing(problem.model)
     if form in SPARSE and lacks:
@@ -60,7 +63,8 @@ def takes_sparse(method: Maximiser, problem: Problem) -> bool:
 
 
 def gains_by_sparse(method: Maximiser, problem: Problem, prior: Prior, starts: int) -> bool:
-    """Whether a fit that may take either form is faster in the sparse one, and loses nothing that was asked."""
+    """Whether a fit that may take either form is faster in the sparse one, and loses nothing that
+    was asked."""
     either = getattr(method, "form", "dense") == "auto" and not missing(problem.model)
     return either and is_thin(problem.model) and not _lacking(method, prior, starts)
 
@@ -118,7 +122,8 @@ class ExpansionLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class BlockPosterior(Posterior):
-    """Marginals of the biases of each sensor and of the states: no covariance of all biases is held."""
+    """Marginals of the biases of each sensor and of the states: no covariance of all biases is
+    held."""
 
     at: Expansion
     factors: Factors  # of the prior, or the sites in its place
@@ -147,7 +152,8 @@ class BlockPosterior(Posterior):
         return [Tracks(x, np.sqrt(np.maximum(own, 0.0))) for _, x, own in pairs]
 
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
-        """Draws of the biases from the Gaussian with their means, sds and correlations, few where they are many."""
+        """Draws of the biases from the Gaussian with their means, sds and correlations, few where
+        they are many."""
         self.check_kept(keep)
         M = len(self.summary.mean)
         count = CHAINS * int(np.clip(NUMBERS // (CHAINS * M), 2, MOST))
@@ -176,13 +182,15 @@ class BlockPosterior(Posterior):
 
     @property
     def attrs(self) -> Mapping[str, float]:
-        """The limit of inclusion, how many directions are weak, and the error of an evidence that is estimated."""
+        """The limit of inclusion, how many directions are weak, and the error of an evidence that
+        is estimated."""
         estimated = {} if self.evidence_error is None else {"log_evidence_error": self.evidence_error}
         return {"rope": ROPE, "sparse": 1.0, "weak": float(self.weak)} | estimated
 
 
 def blockwise_answer(method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
-    """The answer of `EA` or `MAP` by blocks of sensors; raises `FitError` where a flat prior leaves no interval."""
+    """The answer of `EA` or `MAP` by blocks of sensors; raises `FitError` where a flat prior leaves
+    no interval."""
     model, products = problem.model, getattr(method, "form", "") == PRODUCTS
     engine = SparseEngine(products)
     integrated = hasattr(method, "integrates") and method.integrates(prior)
@@ -232,7 +240,8 @@ def blockwise_answer(method: Maximiser, problem: Problem, prior: Prior, start: P
 
 
 def diverged(problem: Problem, at: Expansion, factors: Factors) -> FitError:
-    """What to say where the precision at a point with the factors of a prior is not positive definite."""
+    """What to say where the precision at a point with the factors of a prior is not positive
+    definite."""
     told = np.append(np.zeros(problem.model.biases), 0.0)
     for *_, read, lin in problem.model.each_block(problem.model.read, at.rows):
         own = np.einsum("ncp,nc->np", np.asarray(lin.bias) ** 2, np.asarray(lin.weight))
@@ -246,7 +255,8 @@ def diverged(problem: Problem, at: Expansion, factors: Factors) -> FitError:
 def side_climb(problem: Problem, form: str) -> SideClimb:
     """To the marginal mode, with its log evidence, or without a factor its log marginal density.
 
-    An estimated log determinant of the biases would blur what tells the sides apart; reflected it is nearly the same.
+    An estimated log determinant of the biases would blur what tells the sides apart; reflected it
+    is nearly the same.
     """
     engine, scales = SparseEngine(form == PRODUCTS), Precision.single(jnp.ones(problem.model.biases))
     factors = Factors.of(scales)
@@ -304,7 +314,8 @@ def _integrated(
     problem: Problem, prior: Prior, form: Form, first: Precision, likelihood: ExpansionLikelihood, worth: Estimate,
     key: jax.Array, told: Any,
 ) -> tuple[BlockPosterior, bool]:  # fmt: skip
-    """The marginals that a hierarchy makes of a likelihood, this taken anew at their mean; nothing said to be open."""
+    """The marginals that a hierarchy makes of a likelihood, this taken anew at their mean; nothing
+    said to be open."""
     work = Propagation.of(form, first, likelihood, blocks_of(problem.model), key)
     work.run(told)
     swept, last, begun, ended = work.swept, work.found, work.begun, work.likelihood

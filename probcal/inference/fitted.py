@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +57,10 @@ class Judged(ABC):
         """Arrays (..., N, C) of the blocks as one (..., data)."""
         return gather([np.asarray(part) for part in parts], self.picks)
 
-    engine: ClassVar[Engine]  # by which it was solved
+    @property
+    @abstractmethod
+    def engine(self) -> Engine:
+        """By which it was solved."""
 
     @property
     @abstractmethod
@@ -95,7 +98,10 @@ class Fitted(Judged):
     prior: Precision
     covariance: np.ndarray  # (M, M) of z
 
-    engine = DenseEngine()
+    @property
+    def engine(self) -> Engine:
+        """The dense one."""
+        return DenseEngine()
 
     @property
     def expansion(self) -> Expansion:
@@ -125,7 +131,10 @@ class JudgedLarge(Judged):
     blocks: SensorBlocks  # of the covariance of z
     alpha: np.ndarray  # (M,) precisions of the prior
 
-    engine = SparseEngine()
+    @property
+    def engine(self) -> Engine:
+        """The sparse one."""
+        return SparseEngine()
 
     @property
     def expansion(self) -> Expansion:

@@ -1,8 +1,10 @@
-"""The trajectories of all targets as one value, and the loops over state layouts and blocks that everything shares.
+"""The trajectories of all targets as one value, and the loops over state layouts and blocks that
+everything shares.
 
-Targets whose states have the same components share a state layout: their epochs stand in one recursion. A model has
-one entry per state layout in `recursions`, and one entry per block in `blocks`, `rows` and `recursion`. The loops over
-these entries stand here; elsewhere a function is applied to each.
+Targets whose states have the same components share a state layout: their epochs stand in one
+recursion. A model has one entry per state layout in `recursions`, and one entry per block in
+`blocks`, `rows` and `recursion`. The loops over these entries stand here; elsewhere a function is
+applied to each.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -52,11 +54,13 @@ class Loops:
         return zip(self.recursions, *of_each, strict=True)
 
     def each(self, function: Callable[..., Any], *of_each: Iterable[Any]) -> tuple[Any, ...]:
-        """`function(recursion, *own)` for each state layout, `own` its entry of each sequence in `of_each`."""
+        """`function(recursion, *own)` for each state layout, `own` its entry of each sequence in
+        `of_each`."""
         return tuple(starmap(function, self.each_layout(*of_each)))
 
     def each_block(self, *of_each: Iterable[Any]) -> Iterator[tuple[Any, ...]]:
-        """Each block, its rows, and the number of the recursion that it reads; then its entry of each of `of_each`."""
+        """Each block, its rows, and the number of the recursion that it reads; then its entry of
+        each of `of_each`."""
         return zip(self.blocks, self.rows, self.recursion, *of_each, strict=True)
 
     def by_target(self, values: Iterable[jax.Array]) -> tuple[jax.Array, ...]:
