@@ -10,7 +10,7 @@ from reference import NaiveEngine
 from sparse_worlds import LIBRARIES, drawn, drawn_in_space, loud_ear
 
 import probcal as pc
-from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.dense import DenseEngine, DenseExpansion
 from probcal.gaussian.engine import Factors, Group, evidence, mean, noise_score
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.linearised import laplace
@@ -118,6 +118,18 @@ def test_marginals_need_no_selected_inverse(library):
         members = blocks_of(model)[:2]
         found = SparseEngine().at(model, point).marginals(factors, members)
         agree(found, at(NaiveEngine, "flat").marginals(factors, members))
+
+
+def test_what_rounding_leaves_below_zero_is_no_information():
+    """A target in a sensor: the information loses its digits, the variances stay those of a prior."""
+    with jax.enable_x64(True):
+        whole, M = at(DenseEngine, "flat"), expanded("flat")[1].biases
+        worse = whole.information().copy()
+        worse[0, 0] -= 3.0 * np.trace(worse)
+        lost = whole.linear._replace(solved=whole.eliminated._replace(information=jnp.asarray(worse)))
+        variance = np.asarray(DenseExpansion(lost).marginals(Factors.alone(np.ones(M)), np.arange(M)[:, None]))
+        assert (variance > 0.0).all()
+        assert (variance <= 1.0 + 1e-9).all()
 
 
 def some_rows(model):

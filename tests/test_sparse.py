@@ -620,7 +620,7 @@ def weak_of_all(tree):
 def test_check_of_a_large_network_says_what_is_open(monkeypatch, capsys, tmp_path):
     """The command line with the sparse form: biases that the data tell least of, directions, status, files."""
     pytest.importorskip("sparsax", reason="sparsax is an extra")
-    for name in ("analysis.observability", "cli.check", "analysis.standpoint", "analysis.planning"):
+    for name in ("gaussian.choose", "cli.check", "analysis.standpoint", "analysis.planning"):
         monkeypatch.setattr(sys.modules[f"probcal.{name}"], "too_large", lambda model: True)
     monkeypatch.setattr("probcal.cli.check.MANY", 10)
     monkeypatch.setattr("probcal.cli.check.SHOWN", 5)

@@ -108,7 +108,16 @@ class DenseExpansion:
         return _moved(self.model, self.point, self.linear.solved, jnp.asarray(dz))
 
     def _precision(self, factors: Factors) -> np.ndarray:
-        return self.information() + factors.matrix(self.model.biases)
+        """The precision of the biases; where rounding makes it indefinite, of the nearest information
+        without negative eigenvalues."""
+        information, own = self.information(), factors.matrix(self.model.biases)
+        try:
+            np.linalg.cholesky(information + own)
+        except np.linalg.LinAlgError:
+            if np.isfinite(information).all():
+                values, vectors = np.linalg.eigh(information)
+                information = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        return information + own
 
     def covariance(self, factors: Factors) -> jax.Array:
         """Covariance (M, M) of the biases."""
