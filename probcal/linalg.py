@@ -275,3 +275,10 @@ def singular(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Singular values (descending) of a matrix and its left singular vectors (columns)."""
     vectors, values, _ = jnp.linalg.svd(matrix, full_matrices=False)
     return values, vectors
+
+
+def symmetric_root(covariance: np.ndarray) -> np.ndarray:
+    """The symmetric root (M, M) of a covariance: it does not turn with rounding, and may be singular."""
+    values, vectors = (np.asarray(part) for part in spectrum(jnp.asarray(covariance)))
+    root: np.ndarray = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return root

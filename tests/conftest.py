@@ -31,7 +31,7 @@ MOST_BYTES = 1_000_000_000  # of kernels kept there
 TOGETHER = {  # files that share worlds run in one worker, one after the other; these begin, the longest first
     "test_exact.py": "linear", "test_methods.py": "linear", "test_samplers.py": "linear", "test_svi.py": "linear",
     "test_drift.py": "linear", "test_kernels.py": "linear", "test_metamorphic.py": "bent", "test_bounds.py": "bent",
-    "test_degenerate.py": "linear", "test_sparse.py": "sparse", "test_halves.py": "sparse",
+    "test_degenerate.py": "linear", "test_sparse.py": "sparse", "test_segments.py": "sparse",
 }  # fmt: skip
 NEEDS = {  # the wings that all tests of a file need; it is not collected where one is missing
     "../README.md": "adapters doa particles roads rss stream studies tracking",

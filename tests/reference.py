@@ -375,11 +375,11 @@ class Naive:
         self.H, self.w, self.s = np.array(H), np.array(w), np.array(s)
         self.joint = self.H.T @ (self.w[:, None] * self.H)
         self.joint[: self.U, : self.U] += np.eye(self.U)
-        self.slope = self.H.T @ self.s
-        self.slope[: self.U] -= self.u
+        self.pulled = self.H.T @ self.s
+        self.pulled[: self.U] -= self.u
         if model.tilt is not None:
             self.joint[self.U :, self.U :] += np.asarray(model.tilt.curvature)
-            self.slope[self.U :] += np.asarray(model.tilt.pull(point.z))
+            self.pulled[self.U :] += np.asarray(model.tilt.pull(point.z))
 
     def whole(self, factors):
         found = self.joint.copy()
@@ -405,6 +405,10 @@ class Naive:
         z, h = np.asarray(self.point.z), 1e-4
         return np.array([(density(z + h * e) - density(z - h * e)) / (2 * h) for e in np.eye(self.M)])
 
+    def slope(self):
+        relaxed = np.linalg.solve(self.joint[: self.U, : self.U], self.pulled[: self.U])
+        return self.pulled[self.U :] - self.joint[self.U :, : self.U] @ relaxed
+
     def log_det(self, factors):
         return Estimate(
             np.linalg.slogdet(self.whole(factors))[1] - np.linalg.slogdet(self.joint[: self.U, : self.U])[1]
@@ -419,7 +423,7 @@ class Naive:
 
     def moved(self, dz):
         W, B = self.joint[: self.U, : self.U], self.joint[: self.U, self.U :]
-        return self._at(np.linalg.solve(W, self.slope[: self.U] - B @ np.asarray(dz)), dz)
+        return self._at(np.linalg.solve(W, self.pulled[: self.U] - B @ np.asarray(dz)), dz)
 
     def _at(self, du, dz):
         noises, states, start = [], [], 0
@@ -473,7 +477,7 @@ class Naive:
     def embedded(self, factors, columns):
         C = np.concatenate([np.asarray(own).reshape(-1, own.shape[2]) for own in columns])
         across, P = self.H.T @ (self.w[:, None] * C), self.covariance(factors)
-        slope = self.slope.copy()
+        slope = self.pulled.copy()
         slope[self.U :] += np.asarray(factors.pull(self.point.z))
         return Embedded(C.T @ (self.w[:, None] * C) - across.T @ P @ across, C.T @ self.s - across.T @ P @ slope)
 

@@ -1,10 +1,8 @@
 """`assess`: is the answer of a fit good? Innovations, predictive checks, left-out data, halves, and verdicts."""
 
-from functools import partial
-from typing import NamedTuple
+from contextlib import suppress
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
@@ -17,18 +15,21 @@ from probcal.analysis import (
     predictive,
     process,
     scaling,
+    segments,
     shape,
     verdict,
 )
 from probcal.analysis.beside import lag_doubts, mirror_doubts, mirror_findings
 from probcal.analysis.findings import Finding, alarms, completed, of_invalid
-from probcal.analysis.large import assess_large
-from probcal.analysis.pieces import Change, Pieces
-from probcal.analysis.verdict import RATE, limit_of
+from probcal.analysis.pieces import Change, Contrast
+from probcal.analysis.segments import Compared, Grid
+from probcal.analysis.verdict import RATE
+from probcal.gaussian import cholesky
+from probcal.identifiability.directions import shared_in_blocks
 from probcal.identifiability.remedies import WEAK
 from probcal.inference import residuals
-from probcal.inference.fitted import Fitted, take_up
-from probcal.inference.widen import rejection, unwidened, widened
+from probcal.inference.fitted import Judged, take_up
+from probcal.inference.widen import Rejection, rejection, unwidened, widened
 from probcal.labels import listed
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -38,9 +39,7 @@ from probcal.simulate import Key, Truth, as_key
 from probcal.status import INVALID, Status
 from probcal.types import float64
 
-QUARTERS = 4
 SHARED = 1.8  # sd that an open combination of one scale may put a bias off; of four with a free common part, about 1.9
-COPIES = 2000  # most biases of all pieces together
 
 
 @float64
@@ -64,19 +63,17 @@ def assess(
     intervals, covariance and draws of the biases are widened by what they call for, and a finding says so.
 
     Limits have a false-alarm rate of 1 %: of one epoch in `epoch_check`, else of all comparisons of a kind together.
-    Refits of large networks are one step from the fit (attribute `refits` of the group). Of a misfit nothing is left
-    out and no halves are compared. A fit in sparse form is judged by its innovations, its halves, its noise levels, and
-    by how much the data narrow each bias (`probcal.analysis.large`). Raises `InputError` where the tree is
-    no fit of the problem.
+    Refits of large networks are one step from the fit (attribute `refits` of the group), and
+    without matrices of all biases only the sensors and targets of the largest mean squares are left
+    out (`sensor_left`, `target_left`). Of a misfit nothing is left out and no halves are compared;
+    nor is anything that needs a factor of the biases where the fit has none. Raises `InputError`
+    where the tree is no fit of the problem.
 
     >>> checked = assess(problem, tree)
     >>> checked["verdict"]["verdict"].sel(bias_label="sonar_1.range_offset").item()
     'determined'
     """
     tree = unwidened(tree)  # what a fit made of its innovations is judged anew
-    if tree.attrs.get("sparse", 0):
-        with np.errstate(all="ignore" if _absurd(tree) else None):
-            return assess_large(problem, tree, answer)
     fit = take_up(problem, tree, answer)
     with np.errstate(all="ignore" if _absurd(tree) else None):  # squares of absurd residuals overflow
         return _assessed(fit, tree, truth, as_key(key))
@@ -86,11 +83,13 @@ def _absurd(tree: xr.DataTree) -> bool:
     return bool(tree.attrs["status"] == "misfit")
 
 
-def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Array) -> xr.DataTree:
-    keys = jax.random.split(key, 3)
-    drawn = predictive.draws_of(fit, tree, keys[0])
-    replicas = predictive.check_replicas(fit, drawn, keys[1])
-    found = residuals.innovations(fit, replicas.kurtosis)
+def _assessed(fit: Judged, tree: xr.DataTree, truth: Truth | None, key: jax.Array) -> xr.DataTree:
+    keys, group = jax.random.split(key, 3), tree["calibration"].to_dataset()
+    without = "log_evidence_error" in tree.attrs or ("sd_error" in group and cholesky.exact())  # a factor of the biases
+    whole = fit.engine.cheap or not without
+    drawn = predictive.draws_of(fit, tree, keys[0]) if whole else None
+    replicas = None if drawn is None else predictive.check_replicas(fit, drawn, keys[1])
+    found = residuals.innovations(fit, residuals.measured_kurtosis(fit) if replicas is None else replicas.kurtosis)
     groups: dict[str, xr.Dataset] = {"epoch_check": xr.Dataset()} | checks.by_epoch(fit, found.innovations)
     groups["datum_check"], findings = checks.by_datum(fit, found.innovations, tree)
     channels = residuals.channels_of(fit.data, found.innovations)
@@ -101,14 +100,23 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
         findings += more
     findings += checks.outlying(fit, found.innovations)
     findings += checks.wrapping(fit, tree)
-    findings += [] if _absurd(tree) else checks.left_out(fit, tree, groups) + process.check_process_noise(fit, keys[2])
+    if not _absurd(tree) and whole:
+        findings += checks.left_out(fit, tree, groups) + process.check_process_noise(fit, keys[2])
     bent = None if tree.attrs["status"] in INVALID else shape.check_shape(fit, tree)
     findings += [] if bent is None else [bent]
-    hanging, more = dict[int, str](), list[Finding]()
-    if tree.attrs["status"] not in INVALID:
-        asked, more, hanging = levels.check_levels(fit, tree)
-        groups |= {} if asked is None else {"level_check": asked}
-    groups["verdict"] = _verdicts(fit, tree, found, channels, groups, bent, hanging)
+    doubts, more = dict[int, str](), list[Finding]()
+    if tree.attrs["status"] not in INVALID and (fit.engine.cheap or (whole and cholesky.exact())):
+        with suppress(MemoryError):
+            asked, more, doubts = levels.check_levels(fit, tree)
+            groups |= {} if asked is None else {"level_check": asked}
+    rejected = rejection(fit, found.innovations, channels)
+    grid, compared = segments.grid_for(fit), None
+    if grid.patterns and not _absurd(tree) and whole:
+        compared = segments.compare_segments(fit, found, channels, grid)
+    if compared is not None and compared.alone:
+        groups["halves"] = segments.group_of(fit.problem, compared, grid)
+    groups["verdict"] = _verdicts(fit, tree, found, rejected, compared, grid, bent, doubts)
+    findings += _unlooked(compared)
     if not (any(f.kind == "outliers" for f in findings) or (groups["verdict"]["verdict"] == "drifting").any()):
         findings += more  # else the levels are only a sign of these
     findings += mirror_findings(tree)
@@ -120,66 +128,57 @@ def _assessed(fit: Fitted, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     scaled = scaling.power_scaling(tree) if leave.weighable(tree) else None
     if scaled is not None:
         groups["sensitivity"] = scaled
-    if truth is not None:
+    if truth is not None and drawn is not None and fit.engine.cheap:
         _score(fit, tree, drawn, truth, groups)
-    rejected = rejection(fit, found.innovations, channels)
-    result, text = widened(fit, rejected, tree, residuals.root_of(fit.covariance))
+    result, text = widened(fit, rejected, tree, fit.root)
     return completed(result, text, groups, findings)
 
 
+def _unlooked(compared: Compared | None) -> list[Finding]:
+    if compared is None or not compared.unsolved:
+        return []
+    text = f"{compared.unsolved} more biases may change than were looked at together: so many are no drift of one"
+    return [Finding("halves", "fit", text)]
+
+
 def _verdicts(
-    fit: Fitted,
-    tree: xr.DataTree,
-    found: residuals.Filtered,
-    channels: residuals.Channels,
-    groups: dict[str, xr.Dataset],
-    bent: Finding | None,
-    hanging: dict[int, str],
-) -> xr.Dataset:
-    """Group `verdict`; adds the group `halves` where the recording can be divided."""
+    fit: Judged, tree: xr.DataTree, found: residuals.Filtered, rejected: Rejection, compared: Compared | None,
+    grid: Grid, bent: Finding | None, doubts: dict[int, str],
+) -> xr.Dataset:  # fmt: skip
+    """Group `verdict`."""
     problem, calibration = fit.problem, tree["calibration"].to_dataset()
-    M, inflation, square = problem.model.biases, np.ones(problem.model.biases), np.zeros(problem.model.biases)
-    drifts, disagreements, first = dict[int, str](), dict[int, str](), ""
-    grid = _grid(problem)
-    if grid.patterns and not _absurd(tree):
-        divided = pieces.divide(fit, grid.piece, grid.pieces)
-        wide = {name: _inflation(fit, found, channels, divided, grid, member) for name, member in grid.members.items()}
-        inflation = wide.get("halves", inflation)
-        if "halves" in grid.patterns:
-            alone = pieces.contrasts(divided, grid.patterns["halves"])
-            square[list(alone)] = [c.square / inflation[m] for m, c in alone.items()]
-            if alone:
-                groups["halves"] = _halves(problem, alone, inflation, grid.edges[len(grid.edges) // 2], limit_of(M))
-        changes = pieces.changing(divided, grid.patterns, wide, partial(limit_of, M))
-        shapes = pieces.contrasts(divided, grid.quarters) if changes and grid.quarters.shape[1] > 1 else {}
-        if changes:
-            first = problem.labels[changes[0].bias]
-            hanging = hanging | _touched(fit, divided, changes, grid.patterns)
-        for change in changes:
+    M, limit = problem.model.biases, verdict.limit_of(problem.model.biases)
+    square, drifts, disagreements, first = np.zeros(M), dict[int, str](), dict[int, str](), ""
+    inflation = np.ones(M) if fit.engine.cheap else rejected.inflation
+    if compared is not None:
+        inflation = compared.inflation
+        square[list(compared.alone)] = [c.square / inflation[m] for m, c in compared.alone.items()]
+        if compared.changes:
+            first = problem.labels[compared.changes[0].bias]
+            doubts = doubts | _touched(fit, compared)
+        for change in compared.changes:
             if change.name == "halves":
-                text = _drift(problem, change, inflation, limit_of(M))
-                drifts[change.bias] = text + _shape(shapes.get(change.bias), grid.edges)
+                text = _drift(problem, change, inflation, limit)
+                drifts[change.bias] = text + _shape(compared.shapes.get(change.bias), grid.edges)
             else:
-                disagreements[change.bias] = _disagreement(problem, change, limit_of(M, change.contrast.freedom))
-    z, alpha, gamma = np.asarray(fit.point.z), np.asarray(fit.prior.alpha), calibration["gamma"].values
+                freedom = verdict.limit_of(M, change.contrast.freedom)
+                disagreements[change.bias] = _disagreement(problem, change, freedom)
+    z, alpha, gamma = np.asarray(fit.point.z), calibration["precision"].values, calibration["gamma"].values
+    contraction, shared = _told(fit, tree)
     known = verdict.Grounds(
-        verdict.contraction(calibration["information"].values), square,
-        verdict.pull(z, alpha, gamma, inflation), float(np.sqrt(limit_of(M))),
+        contraction, square, verdict.pull(z, alpha, gamma, inflation), float(np.sqrt(limit)),
         verdict.explained_part(z, alpha, gamma, found.innovations.excess),
     )  # fmt: skip
     ended = calibration["status"].values.tolist()
     status = Status(tree.attrs["status"])
-    doubts = (
-        hanging if bent is None else dict.fromkeys(range(M), "the answer is far from Gaussian, so its interval is none")
-    )
+    if bent is not None:
+        doubts = dict.fromkeys(range(M), "the answer is far from Gaussian, so its interval is none")
 
     def around() -> list[np.ndarray]:  # draws of chains lie on both sides
-        return [np.asarray(variance) for variance in fit.at.variances(jnp.asarray(fit.covariance))]
+        return fit.expansion.followed(fit.root)
 
-    doubts |= mirror_doubts(fit, tree, around) | lag_doubts(fit, found)
-    words, reasons = verdict.judge_biases(
-        problem, status, ended, known, drifts, disagreements, first, _shared(tree), doubts
-    )
+    doubts |= mirror_doubts(fit, tree, around if fit.whole else None) | lag_doubts(fit, found)
+    words, reasons = verdict.judge_biases(problem, status, ended, known, drifts, disagreements, first, shared, doubts)
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": known.contraction}
     values |= {"inflation": inflation}
     group = xr.Dataset({name: ("bias_label", value) for name, value in values.items()}, bias_coords(problem))
@@ -187,13 +186,21 @@ def _verdicts(
     return group
 
 
-def _touched(fit: Fitted, divided: Pieces, changes: list[Change], patterns: pieces.Patterns) -> dict[int, str]:
+def _touched(fit: Judged, compared: Compared) -> dict[int, str]:
     """Why the answers of biases are in doubt that would move by more than `HANGS` sd if others may change."""
-    free = [(change.bias, patterns[change.name]) for change in changes]
-    moved = pieces.freed(divided, free) / np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
-    others = listed([fit.problem.labels[change.bias] for change in changes], 1)
+    moved = compared.moved / np.maximum(fit.sd, 1e-150)
+    others = listed([fit.problem.labels[change.bias] for change in compared.changes], 1)
     told = np.flatnonzero(np.abs(moved) > levels.HANGS).tolist()
     return {m: f"it would move by {abs(moved[m]):.1f} sd if {others} may change" for m in told}
+
+
+def _told(fit: Judged, tree: xr.DataTree) -> tuple[np.ndarray, dict[int, str]]:
+    """Contraction (M,) of each bias, and the open combinations that would put some far off."""
+    declared = fit.declared(tree)
+    if declared is None:
+        return verdict.contraction(tree["calibration"].to_dataset()["information"].values), _shared(tree)
+    shared = shared_in_blocks(fit.problem, fit.point, declared.members, declared.covariance, SHARED)
+    return np.clip(1.0 - declared.variance, 0.0, 1.0), shared
 
 
 def _shared(tree: xr.DataTree) -> dict[int, str]:
@@ -218,74 +225,6 @@ def _shared(tree: xr.DataTree) -> dict[int, str]:
     return found
 
 
-class _Grid(NamedTuple):
-    """The pieces of a recording, parts of its time by groups of targets, and what may differ between them."""
-
-    piece: np.ndarray  # (rows,) of the table
-    pieces: int
-    edges: np.ndarray  # times at which the parts begin
-    quarters: np.ndarray  # (pieces, parts - 1) which part
-    patterns: pieces.Patterns  # halves (pieces, 1), targets (pieces, groups - 1)
-    members: pieces.Patterns  # (pieces,) what has biases of its own while the noise behind a pattern is measured
-
-
-def _grid(problem: Problem) -> _Grid:
-    """Quarters of equal numbers of rows (halves where biases are many) by targets (in groups where they are many)."""
-    M, time = problem.model.biases, problem.measurements.time
-    edges = _edges(time[problem.measurements.measured.any(1)], QUARTERS if QUARTERS * M <= COPIES else 2)
-    parts = len(edges)
-    groups = _groups(problem, parts)
-    part = np.searchsorted(edges[1:], time, side="right")
-    piece = part * groups + problem.measurements.target % groups
-    quarters, patterns, members = np.kron(np.eye(parts)[:, 1:], np.ones((groups, 1))), {}, {}
-    if parts > 1:
-        patterns["halves"] = np.repeat(2 * np.arange(parts) // parts, groups)[:, None].astype(float)
-        members["halves"] = np.repeat(np.arange(parts), groups)
-    if groups > 1:
-        patterns["targets"] = np.kron(np.ones((parts, 1)), np.eye(groups)[:, 1:])
-        members["targets"] = np.tile(np.arange(groups), parts)
-    return _Grid(piece, parts * groups, edges, quarters, patterns, members)
-
-
-def _groups(problem: Problem, parts: int) -> int:
-    """Number of groups of targets: every target alone while the biases of all pieces are not too many."""
-    return max(1, min(len(problem.measurements.target_names), COPIES // (parts * problem.model.biases)))
-
-
-def _edges(time: np.ndarray, count: int) -> np.ndarray:
-    """Times at which pieces of equal numbers of rows begin; fewer where there are hardly any times."""
-    edges = np.quantile(time, np.arange(count) / count, method="inverted_cdf")
-    if len(np.unique(edges)) == count and len(np.unique(time)) >= 2 * count:
-        return edges
-    return _edges(time, 2) if count > 2 else edges[:1]
-
-
-def _inflation(
-    fit: Fitted,
-    found: residuals.Filtered,
-    channels: residuals.Channels,
-    divided: Pieces,
-    grid: _Grid,
-    member: np.ndarray,
-) -> np.ndarray:
-    """How much wider (M,) the variance of a change is than the model says: overdispersion and correlation in time.
-
-    Both are measured on innovations from which the own biases of every `member` (pieces,) are taken (each quarter, or
-    each target), so that a change does not hide itself: the mean square of a sensor's channel (at least 1) times how
-    many of its innovations count as one. A bias has the mean of the channels that tell of it, by their information,
-    and not less than the mean of all.
-    """
-    own, piece = pieces.own_biases(divided, member), grid.piece
-    step = np.concatenate([own, np.zeros((len(own), 1))], 1)
-    shift = [
-        jnp.asarray(step[piece[index][:, None], np.asarray(bias)])
-        for index, bias in zip(fit.problem.row_index, fit.problem.model.read, strict=True)
-    ]
-    freed = found.innovations._replace(value=residuals.moved_innovations(fit, found, shift))
-    wide = residuals.scatter_of(fit.data, freed, channels.members)
-    return residuals.inflation(fit, wide.size * wide.memory, channels.group)
-
-
 def _drift(problem: Problem, change: Change, inflation: np.ndarray, limit: float) -> str:
     """Reason of a bias whose halves differ: by how much."""
     contrast = change.contrast
@@ -293,7 +232,7 @@ def _drift(problem: Problem, change: Change, inflation: np.ndarray, limit: float
     return pieces.changed(problem, change.bias, float(contrast.estimate[0]), float(sd), limit)
 
 
-def _shape(shape: pieces.Contrast | None, edges: np.ndarray) -> str:
+def _shape(shape: Contrast | None, edges: np.ndarray) -> str:
     """Whether quarters tell of a jump, and where, or of a drift."""
     if shape is None:
         return ""
@@ -312,24 +251,8 @@ def _disagreement(problem: Problem, change: Change, limit: float) -> str:
     return f"the targets disagree, {most} ({found})"
 
 
-def _halves(
-    problem: Problem, contrast: dict[int, pieces.Contrast], inflation: np.ndarray, middle: float, limit: float
-) -> xr.Dataset:
-    """Group `halves`: second half less first of each bias alone, in its unit, corrected sd, and their ratio."""
-    index = list(contrast)
-    scale = problem.scales[index]
-    change = np.array([contrast[m].estimate[0] for m in index]) * scale
-    sd = np.sqrt(inflation[index] / np.array([contrast[m].information[0, 0] for m in index])) * scale
-    group = xr.Dataset(
-        {"change": ("bias_label", change), "sd": ("bias_label", sd), "t": ("bias_label", change / sd)},
-        bias_coords(problem, index),
-    )
-    group.attrs |= {"time": float(middle), "limit": float(np.sqrt(limit)), "rate": RATE}
-    return group
-
-
 def _score(
-    fit: Fitted, tree: xr.DataTree, drawn: predictive.FitDraws, truth: Truth, groups: dict[str, xr.Dataset]
+    fit: Judged, tree: xr.DataTree, drawn: predictive.FitDraws, truth: Truth, groups: dict[str, xr.Dataset]
 ) -> None:
     """Add NEES of positions by epoch to `epoch_check`, and those of all positions and biases to its attributes."""
     tracked = dict(each_target(tree))

@@ -7,11 +7,11 @@ import xarray as xr
 
 from probcal.analysis.findings import Finding
 from probcal.inference import residuals
-from probcal.inference.fitted import Fitted, Judged, saved_by_epoch
+from probcal.inference.fitted import Judged
 from probcal.labels import PIECE, SCENE
 from probcal.modes.clocks import EXPLAINED, turning_time
 from probcal.modes.reflections import touched
-from probcal.results.read import each_track
+from probcal.results.read import each_track, saved_by_epoch
 
 BEYOND = 2.0  # sd that an answer as good may be away
 
@@ -60,7 +60,7 @@ def _saved(fit: Judged, tree: xr.DataTree) -> list[np.ndarray]:
     return [saved_by_epoch(epochs, tracked, "sd", "targets") ** 2 for epochs in fit.problem.epochs]
 
 
-def lag_doubts(fit: Fitted, found: residuals.Filtered) -> dict[int, str]:
+def lag_doubts(fit: Judged, found: residuals.Filtered) -> dict[int, str]:
     """Why clocks are in doubt whose rows the fit explains badly: another lag may explain them.
 
     The slope tells of lags within the reach of the search alone, however much sds are widened.

@@ -10,7 +10,7 @@ from probcal.analysis import leave, predictive
 from probcal.analysis.findings import NAMES, Finding
 from probcal.analysis.verdict import RATE
 from probcal.inference import residuals
-from probcal.inference.fitted import Fitted, Judged
+from probcal.inference.fitted import Judged
 from probcal.inference.residuals import LAGGED, NOTABLE, PRACTICAL, codes
 from probcal.labels import listed
 from probcal.noise import Normal
@@ -24,6 +24,7 @@ GAIN = 5.0  # nats that a calibration must win before it is a finding
 NEAR_TURN = 1.0  # rad of a full turn within which a residual tells of a missing wrap
 WIDE = np.pi / 3  # noise std in rad above which a wrapped angle is ambiguous
 FAR = 2 * np.pi / 3  # rad beyond which a wrapped residual may belong to the next turn
+LOOKED = 4  # sensors, and targets, of a large network that are left out
 SHARE = 0.01  # of a channel's data beyond which its residuals are
 
 
@@ -217,15 +218,21 @@ def by_datum(fit: Judged, found: residuals.Innovations, tree: xr.DataTree) -> tu
     return xr.Dataset({name: ("datum", v) for name, v in values.items()}, coords, attrs), findings
 
 
-def left_out(fit: Fitted, tree: xr.DataTree, groups: dict[str, xr.Dataset]) -> list[Finding]:
-    """Add to the groups `sensor_check` and `target_check` what the rest says of each; returns findings."""
+def left_out(fit: Judged, tree: xr.DataTree, groups: dict[str, xr.Dataset]) -> list[Finding]:
+    """Add to the groups `sensor_check` and `target_check` what the rest says of each; returns findings.
+
+    Of a large network those of the largest mean squares are left out, and stand in `sensor_left` and `target_left`.
+    """
     findings = list[Finding]()
-    for name, found in (("sensor", leave.leave_sensors(fit)), ("target", leave.leave_targets(fit))):
+    for name, leaves in (("sensor", leave.leave_sensors), ("target", leave.leave_targets)):
         check = groups[f"{name}_check"]
         if leave.tailed(tree) and check.sizes[name] > 1:
             group, labels = codes(fit.data, [name])
             check["pareto_k"] = (name, leave.psis(tree, group, len(labels)).pareto_k)
-        if found is None:
+        if not fit.engine.cheap:
+            worst = np.sort(np.argsort(-check["nis"].values, kind="stable")[:LOOKED])
+            check = groups[f"{name}_left"] = check.isel({name: worst})
+        if (found := leaves(fit, check[name].values.tolist())) is None:
             continue
         names = check[name].values.tolist()
         order = [found.names.index(n) for n in names]

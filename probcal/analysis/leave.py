@@ -7,7 +7,7 @@ predictive density of what was left out is the difference of two Laplace evidenc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,15 +17,14 @@ import pandas as pd
 import xarray as xr
 from scipy import special
 
-from probcal import linalg
-from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
-from probcal.gaussian.mode import Eliminated, Point, cost, find_mode, follow, smooth_tracks
+from probcal.gaussian.engine import Expansion, Factors
+from probcal.gaussian.mode import Point, cost, find_mode, smooth_tracks
 from probcal.gaussian.places import tilt_at
-from probcal.inference.fitted import Fitted
+from probcal.inference.fitted import Judged
 from probcal.inference.pose import TAILED
 from probcal.inference.psis import smoothed
 from probcal.model import variants
-from probcal.model.model import Model, scaled
+from probcal.model.model import Model
 from probcal.model.rows import Linearised, standardised
 from probcal.priors import Precision
 from probcal.results.read import summed_log_likelihood
@@ -34,6 +33,7 @@ STEPS = 20  # Gauss-Newton steps of a refit
 TOLERANCE = 1e-5  # nats
 WORK = 3e9  # operations of all eliminations beyond which a refit is one step from the fit
 PLACED = 100  # refits up to which the places of targets at rest are integrated anew
+PINNED = 1e12  # precision by which a bias is held at zero
 TARGETS = 32  # beyond which targets are not left out one by one
 
 
@@ -44,74 +44,68 @@ class Refit(NamedTuple):
     square: jax.Array  # least squares of all innovations, noises and biases in the linearised problem
 
 
-@jax.jit
-def _stepped(
-    model: Model, point: Point, prior: Precision, lins: Sequence[Linearised], solved: Eliminated, held: Any
-) -> Refit:
+def _stepped(at: Expansion, factors: Factors, held: np.ndarray, prior: Precision) -> Refit:
     """One Fisher-scoring step from a point to the mode, and Laplace's evidence there; biases in `held` (M,) go to 0.
 
     The step counts only where it raises the density: at a mode it changes nothing, on a linear problem it is exact.
     """
-    both = held[:, None] | held[None, :]
-    eye = jnp.eye(len(held))
-    matrix = solved.information + prior.matrix()
-    away = jnp.where(held, -point.z, 0.0)
-    slope = jnp.where(held, away, solved.score - prior.pull(point.z) - matrix @ away)
-    inverse, logdet = linalg.inverse_and_logdet(jnp.where(both, eye, matrix))
-    start = point._replace(z=point.z + away)
-    moved = follow(model, point, solved, inverse @ slope)
+    z = np.asarray(at.point.z)
+    pinned = factors + Factors.alone(np.where(held, PINNED, 0.0))
+    start = at.point._replace(z=jnp.asarray(np.where(held, 0.0, z)))
+    moved = at.moved(at.solve(pinned, np.asarray(at.slope()) + pinned.pull(z)))
+    least, square = _ends(at.model, at.point, start, moved, prior, at.rows)
+    volume = at.log_det(pinned).value - np.count_nonzero(held) * np.log(PINNED) + at.eliminated.logdet
+    return Refit(-least - 0.5 * volume, square)
+
+
+@jax.jit
+def _ends(
+    model: Model, point: Point, start: Point, moved: Point, prior: Precision, lins: Sequence[Linearised]
+) -> tuple[jax.Array, jax.Array]:
+    """The lesser cost of a start and of a step from it, and the least squares of all at the step."""
     ends = jax.tree.map(lambda a, b: jnp.stack([a, b]), start, moved)
     before, after = jax.vmap(lambda end: cost(model, end, prior))(ends)
-    least = jnp.where(after < before, after, before)
     square = sum(jnp.sum(u**2) for u in moved.noises) + prior.square(moved.z)
     dx = model.each(lambda _, x, before_: (x - before_)[:, :, None], moved.states, point.states)
     for lin, change in zip(lins, model.responses(lins, dx, (moved.z - point.z)[:, None]), strict=True):
         square = square + jnp.sum((standardised(lin.score, lin.weight) - jnp.sqrt(lin.weight) * change[:, :, 0]) ** 2)
-    return Refit(-least - 0.5 * (solved.logdet + logdet), square)
+    return jnp.where(after < before, after, before), square
 
 
 class _Refits:
     """Refits of a problem with data masked, precisions changed or biases held at 0."""
 
-    def __init__(self, fit: Fitted, jobs: int):
+    def __init__(self, fit: Judged, jobs: int):
         model = fit.problem.model
-        sizes = model.state_size
-        self.fit, self.quick = fit, 2.0 * jobs * sizes * model.biases**2 > WORK
+        work = 2.0 * jobs * model.state_size * model.biases**2
+        self.fit, self.quick = fit, work > WORK or not fit.whole
         self.placed = fit.problem.tilted and jobs <= PLACED and not self.quick
 
     def run(self, out: np.ndarray | None, alpha: np.ndarray, held: np.ndarray) -> tuple[float, float]:
         """Evidence and least squares without the rows (of the table) in `out`, at precisions alpha (M,)."""
-        fit, model = self.fit, self.fit.problem.model
+        fit, model, point, at = self.fit, self.fit.problem.model, self.fit.point, self.fit.expansion
         prior = fit.prior._replace(alpha=jnp.asarray(alpha))
-        model = fit.problem.model if out is None else masked(fit, out)
-        point, lins = fit.point, fit.lins
-        if out is not None and self.placed:
-            point = smooth_tracks(model, point)
-            model = model.with_tilt(tilt_at(model, point))
+        weights = None if out is None else [~out[index][:, None] for index in fit.problem.row_index]
         if not self.quick:
+            model = model if weights is None else model.weighted(weights)
+            if weights is not None and self.placed:
+                point = smooth_tracks(model, point)
+                model = model.with_tilt(tilt_at(model, point))
             frozen = variants.without(model, held)
             start = point._replace(z=jnp.asarray(np.where(held, 0.0, point.z)))
-            point = find_mode(frozen, start, prior, STEPS, TOLERANCE).point
-            lins = linearise_rows(frozen, point)
-            (_, solved), model = compress_and_eliminate(frozen, point, lins), frozen
-        elif out is None:
-            solved = fit.at.solved
-        else:
-            lins = scaled(lins, model.measured)
-            _, solved = compress_and_eliminate(model, point, lins)
-        found = _stepped(model, point, prior, lins, solved, jnp.asarray(held))
-        return float(found.evidence) + 0.5 * _logdet(fit.prior.coupled(), alpha, held), float(found.square)
+            at = fit.engine.at(frozen, find_mode(frozen, start, prior, STEPS, TOLERANCE).point)
+        elif weights is not None:
+            at = at.weighed(tuple(jnp.asarray(own) for own in weights))
+        found = _stepped(at, Factors.of(prior), held, prior)
+        return float(found.evidence) + 0.5 * _logdet(fit.prior.coupling, alpha, held), float(found.square)
 
 
-def masked(fit: Fitted, out: np.ndarray) -> Model:
-    """The model without the rows of the table in `out` (rows,) boolean."""
-    return fit.problem.model.weighted([~out[index][:, None] for index in fit.problem.row_index])
-
-
-def _logdet(coupling: jax.Array, alpha: np.ndarray, held: np.ndarray) -> float:
+def _logdet(coupling: jax.Array | None, alpha: np.ndarray, held: np.ndarray) -> float:
     """Log determinant of the prior of the biases that are not held, a flat one counted as one."""
-    own, coupled = np.where(alpha > 0, alpha, 1.0)[~held], np.asarray(coupling)[np.ix_(~held, ~held)]
-    return float(np.linalg.slogdet(np.diag(own) + coupled)[1] if coupled.any() else np.log(own).sum())
+    own = np.where(alpha > 0, alpha, 1.0)[~held]
+    if coupling is None:
+        return float(np.log(own).sum())
+    return float(np.linalg.slogdet(np.diag(own) + np.asarray(coupling)[np.ix_(~held, ~held)])[1])
 
 
 class Left(NamedTuple):
@@ -125,18 +119,19 @@ class Left(NamedTuple):
     quick: bool  # one step from the fit instead of a search
 
 
-def leave_sensors(fit: Fitted) -> Left | None:
-    """Every sensor with data left out, None for a single one; the biases that only it reads have their declared scales.
+def leave_sensors(fit: Judged, chosen: Collection[str]) -> Left | None:
+    """Chosen sensors left out, None for a single one; the biases that only it reads have their declared scales.
 
     `elpd` less `stated` says how much better the sensor fits the rest calibrated than as stated.
     """
     problem, readers = fit.problem, fit.readers
-    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.model.biases, bool)
+    alpha, none = fit.factors.diagonal(problem.model.biases), np.zeros(problem.model.biases, bool)
     sensor = problem.measurements.sensor
     counted = set(fit.data["sensor"])  # some have rows of weight 0 only
     present = [s for s in np.unique(sensor) if problem.network.sensors[s].name in counted]
     if len(present) < 2:
         return None
+    present = [s for s in present if problem.network.sensors[s].name in chosen]
     refits, rows = _Refits(fit, 3 * len(present)), []
     for s in present:
         own = readers[s] & (readers.sum(0) == 1)
@@ -146,14 +141,15 @@ def leave_sensors(fit: Fitted) -> Left | None:
     return _left([problem.network.sensors[s].name for s in present], rows, fit.data["sensor"], refits.quick)
 
 
-def leave_targets(fit: Fitted) -> Left | None:
-    """Every target left out; None where there is one only, or more than 32."""
+def leave_targets(fit: Judged, chosen: Collection[str]) -> Left | None:
+    """Chosen targets left out; None where there is one only, or more than 32 are chosen."""
     problem, target = fit.problem, fit.problem.measurements.target
     counted = set(fit.data["target"])
     present = [t for t in np.unique(target) if problem.measurements.target_names[t] in counted]
-    if not 1 < len(present) <= TARGETS:
+    if len(present) < 2 or len(chosen) > TARGETS:
         return None
-    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.model.biases, bool)
+    present = [t for t in present if problem.measurements.target_names[t] in chosen]
+    alpha, none = fit.factors.diagonal(problem.model.biases), np.zeros(problem.model.biases, bool)
     refits = _Refits(fit, len(present))
     whole = refits.run(None, alpha, none)
     rows = [[refits.run(target == t, alpha, none), whole, whole] for t in present]

@@ -6,13 +6,12 @@ between the pieces while all others stay common: exact on a linear problem.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.linearised import compress_and_eliminate
-from probcal.inference.fitted import Fitted
+from probcal.inference.fitted import Judged
 from probcal.model import variants
 from probcal.model.model import Model
 from probcal.problem import Problem
@@ -29,6 +28,7 @@ class Pieces(NamedTuple):
     score: np.ndarray  # (P M,) of the log-likelihood
     prior: np.ndarray  # (M, M) precision of what the pieces share
     z: np.ndarray  # (M,) the fit
+    level: Any = 1.0  # (P,) what all pieces have in common: each once, or the first where the others are differences
 
 
 class Contrast(NamedTuple):
@@ -57,20 +57,16 @@ class Contrast(NamedTuple):
         return float((direction @ self.information @ self.estimate) ** 2) / known if known > LEAST else 0.0
 
 
-def divide(fit: Fitted, piece: np.ndarray, count: int) -> Pieces:
+def divide(fit: Judged, piece: np.ndarray, count: int) -> Pieces:
     """Give every piece its own biases; `piece` (rows,) is that of each row of the table, below `count`."""
     model = copied(fit, piece, count)
-    point = fit.point._replace(z=jnp.asarray(np.tile(fit.point.z, count)))
-    _, solved = compress_and_eliminate(model, point, tuple(fit.lins))
-    return Pieces(
-        np.asarray(solved.information),
-        np.asarray(solved.score),
-        np.asarray(fit.prior.matrix()),
-        np.asarray(fit.point.z),
-    )
+    at = fit.engine.at(model, fit.point._replace(z=jnp.asarray(np.tile(fit.point.z, count))), tuple(fit.lins))
+    information, prior = at.information(), fit.factors.matrix(fit.problem.model.biases)
+    assert information is not None
+    return Pieces(information, np.asarray(at.slope()), prior, np.asarray(fit.point.z))
 
 
-def copied(fit: Fitted, piece: np.ndarray, count: int) -> Model:
+def copied(fit: Judged, piece: np.ndarray, count: int) -> Model:
     """The problem with a table of sensors for every piece, each pointing to its own biases."""
     return variants.split(fit.problem.model, [piece[index] for index in fit.problem.row_index], count)
 
@@ -83,11 +79,12 @@ def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.
     """
     M = len(pieces.z)
     P, held = len(pieces.score) // M, [m for m, _ in free]
+    level = np.broadcast_to(pieces.level, P)[:, None]
     G, g = pieces.information.reshape(P, M, P, M), pieces.score.reshape(P, M)
     prior = pieces.prior.copy()
     prior[held, :], prior[:, held] = 0.0, 0.0
     # parameters: the M common values, then the coefficients of what differs already
-    to = np.concatenate([np.tile(np.eye(M), (P, 1)), *(np.kron(own, np.eye(M)[:, [m]]) for m, own in free)], 1)
+    to = np.concatenate([np.kron(level, np.eye(M)), *(np.kron(own, np.eye(M)[:, [m]]) for m, own in free)], 1)
     crosses = (pieces.information @ to).reshape(P, M, -1)
     K, slope = to.T @ pieces.information @ to, to.T @ pieces.score
     K[:M, :M] += prior
@@ -103,29 +100,38 @@ def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.
             others = inverse - np.outer(column, column) / column[m]  # inverse of K without its row and column m
             pull = slope.copy()
             pull[:M] += prior[:, m] * pieces.z[m]
-            columns = np.concatenate([pattern, np.ones((P, 1))], 1)
+            columns = np.concatenate([pattern, level], 1)
         cross = columns.T @ crosses[:, m]
         information = columns.T @ G[:, m, :, m] @ columns - cross @ others @ cross.T
         score = columns.T @ g[:, m] - cross @ others @ pull
-        if m not in held:
-            level = information[-1]
-            if level[-1] <= LEAST:
-                continue
-            score = score[:-1] - level[:-1] * score[-1] / level[-1]
-            information = information[:-1, :-1] - np.outer(level[:-1], level[:-1]) / level[-1]
-        information = 0.5 * (information + information.T)
-        values, vectors = np.linalg.eigh(information)
-        seen = values > LEAST
-        if seen.any():
-            estimate = vectors[:, seen] @ ((vectors[:, seen].T @ score) / values[seen])
-            found[m] = Contrast(estimate, information, int(seen.sum()))
+        one = _contrast(information, score) if m in held else beside_level(information, score, LEAST)
+        if one is not None:
+            found[m] = one
     return found
+
+
+def beside_level(information: np.ndarray, score: np.ndarray, least: float) -> Contrast | None:
+    """A contrast of information and score with those of a common level last; None where that is not told."""
+    level = information[-1]
+    if level[-1] <= least:
+        return None
+    score = score[:-1] - level[:-1] * score[-1] / level[-1]
+    return _contrast(information[:-1, :-1] - np.outer(level[:-1], level[:-1]) / level[-1], score, least)
+
+
+def _contrast(information: np.ndarray, score: np.ndarray, least: float = LEAST) -> Contrast | None:
+    information = 0.5 * (information + information.T)
+    values, vectors = np.linalg.eigh(information)
+    seen = values > least
+    if not seen.any():
+        return None
+    return Contrast(vectors[:, seen] @ ((vectors[:, seen].T @ score) / values[seen]), information, int(seen.sum()))
 
 
 def freed(pieces: Pieces, free: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
     """Change (M,) of what all pieces have in common, in z, where the biases in `free` differ along their patterns."""
     M, held = len(pieces.z), [m for m, _ in free]
-    same = np.tile(np.eye(M), (len(pieces.score) // M, 1))
+    same = np.kron(np.broadcast_to(pieces.level, len(pieces.score) // M)[:, None], np.eye(M))
     steps = []
     for columns in (same, np.concatenate([same, *(np.kron(own, np.eye(M)[:, [m]]) for m, own in free)], 1)):
         prior = pieces.prior.copy()

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal.gaussian.draws import draw
-from probcal.inference.fitted import Fitted, Judged
+from probcal.inference.fitted import Judged
 from probcal.inference.residuals import all_gaussian, exact_kurtosis
 from probcal.model.model import At, Model
 from probcal.model.motions import level_logs
@@ -93,16 +92,16 @@ def check_replicas(fit: Judged, drawn: FitDraws, key: jax.Array) -> Predictive:
     return Predictive(fit.flat(parts[0]), fit.flat(parts[1]), kurtosis, drawn.z.shape[0])
 
 
-def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> FitDraws:
+def draws_of(fit: Judged, tree: xr.DataTree, key: jax.Array) -> FitDraws:
     """Up to 400 draws of a fit, biases and levels as its tree has them.
 
     The states are those of the tree where it holds them; else a trajectory is drawn for each draw of the biases, from
-    the Gaussian of the problem linearised at the fit.
+    the Gaussian of the problem linearised at the fit; of large networks biases and states together.
     """
     posterior, problem = tree["posterior"].to_dataset(), fit.problem
     tracked = dict(each_track(tree))
     total = posterior.sizes["chain"] * posterior.sizes["draw"]
-    most = min(DRAWS, total, max(VALUES // problem.model.state_size, LEAST))
+    most = min(DRAWS, total if fit.engine.cheap else DRAWS, max(VALUES // problem.model.state_size, LEAST))
     chosen = np.linspace(0, total - 1, most).astype(int)
 
     def thin(values: np.ndarray) -> Any:
@@ -113,8 +112,8 @@ def draws_of(fit: Fitted, tree: xr.DataTree, key: jax.Array) -> FitDraws:
     if "level" in posterior:
         levels = jnp.asarray(level_logs(problem.levels, thin(posterior["level"].values)))
     if any("state" not in track for track in tracked.values()):
-        drawn = draw(fit.at, z, levels, key)
-        return FitDraws(z, levels, drawn.states, None)
+        z, states = fit.drawn(z, levels, key)
+        return FitDraws(z, levels, tuple(states), None)
     states = tuple(jnp.asarray(thin(own)) for own in saved_states(problem, tracked))
     replicas = tree["posterior_predictive"].to_dataset()["y"] if "posterior_predictive" in tree.children else None
     if replicas is None or replicas.sizes["draw"] < posterior.sizes["draw"]:

@@ -12,7 +12,8 @@ import jax
 import numpy as np
 
 from probcal.analysis.findings import Finding
-from probcal.inference.fitted import Fitted
+from probcal.gaussian.linearised import simulated
+from probcal.inference.fitted import Judged
 from probcal.motion.base import GAUSSIAN, Component, level_name
 from probcal.noise import Normal, guess_of
 
@@ -35,7 +36,7 @@ class Driven(NamedTuple):
     replicas: np.ndarray  # (epochs, entries, D) likewise
 
 
-def check_process_noise(fit: Fitted, key: jax.Array) -> list[Finding]:
+def check_process_noise(fit: Judged, key: jax.Array) -> list[Finding]:
     """Findings on the process noises of every target whose motion declares Gaussian ones."""
     size = max(sum(part.drift.size for part in fit.problem.model.recursions), 1)
     count = int(min(REPLICAS, MOST / size))
@@ -62,10 +63,11 @@ def check_process_noise(fit: Fitted, key: jax.Array) -> list[Finding]:
     return found
 
 
-def _driven(fit: Fitted, key: jax.Array, count: int) -> Iterator[Driven]:
+def _driven(fit: Judged, key: jax.Array, count: int) -> Iterator[Driven]:
     """The noises that the data say something of, those of a start left out."""
     problem = fit.problem
-    drawn = fit.at.smoothed_noises(key, count)
+    both = simulated(problem.model, fit.solved, fit.noise_roots, key, count)
+    drawn = [smooth.noises for _, smooth in both]
     for name, _, part, smoothed, columns in problem.tracks(problem.model.recursions, fit.point.noises, drawn):
         mine, active = ~part.first, part.L.any(1)
         for component, own in problem.noise_columns(name):

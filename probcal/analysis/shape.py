@@ -10,7 +10,7 @@ import xarray as xr
 
 from probcal.analysis.findings import Finding
 from probcal.gaussian.mode import log_likelihood
-from probcal.inference.fitted import Fitted
+from probcal.inference.fitted import Judged
 from probcal.results.read import summed_log_likelihood
 
 LINEAR, MOST = 0.5, 0.75  # nats a datum: at most of a linear model, and from which it is a finding
@@ -19,7 +19,7 @@ GAUSSIAN = ("Laplace", "mixture")  # kinds of answers that draw from Gaussians a
 _log_likelihood = jax.jit(log_likelihood)
 
 
-def check_shape(fit: Fitted, tree: xr.DataTree) -> Finding | None:
+def check_shape(fit: Judged, tree: xr.DataTree) -> Finding | None:
     """A finding where the draws of a Gaussian answer fit the data far worse than its mode."""
     drawn = summed_log_likelihood(tree)
     if tree.attrs["approximate"] not in GAUSSIAN or drawn is None:

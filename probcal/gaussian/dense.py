@@ -19,7 +19,7 @@ from probcal.gaussian.linearised import (
     trajectories_of,
 )
 from probcal.gaussian.marginal import SETTLED, TRACK_STEPS, volume_slope
-from probcal.gaussian.mode import Eliminated, Point, find_tracks, follow
+from probcal.gaussian.mode import Compressed, Eliminated, Point, find_tracks, follow
 from probcal.gaussian.solves import Dense
 from probcal.model.model import Data, Model, scaled
 from probcal.model.rows import Linearised
@@ -34,9 +34,7 @@ class DenseEngine:
     def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> DenseExpansion:
         """The posterior at a consistent point; rows as the caller linearised them."""
         rows = linearise_rows(model, point) if rows is None else tuple(rows)
-        system, solved = compress_and_eliminate(model, point, rows)
-        trajectories = trajectories_of(model, point.levels, solved)
-        return DenseExpansion(Linearisation(model, point, rows, system, solved, trajectories))
+        return DenseExpansion(model, point, rows, *compress_and_eliminate(model, point, rows))
 
     def settled(self, model: Model, point: Point) -> DenseExpansion:
         """The same at the modes of its trajectories for its biases."""
@@ -47,32 +45,29 @@ class DenseEngine:
 class DenseExpansion:
     """The posterior at a point, as `engine.Expansion`."""
 
-    linear: Linearisation
+    model: Model
+    point: Point
+    rows: tuple[Linearised, ...]
+    system: Compressed
+    eliminated: Eliminated
     _kept: list[Any] = field(default_factory=list)  # the factors that were asked for last, and their covariance
 
-    @property
-    def model(self) -> Model:
-        """The model."""
-        return self.linear.model
+    @classmethod
+    def of(cls, linear: Linearisation) -> DenseExpansion:
+        """The expansion of a linearisation."""
+        found = cls(*linear[:5])
+        vars(found)["linear"] = linear
+        return found
 
-    @property
-    def point(self) -> Point:
-        """The point of the expansion."""
-        return self.linear.point
-
-    @property
-    def rows(self) -> tuple[Linearised, ...]:
-        """The linearised rows of each block."""
-        return self.linear.rows
-
-    @property
-    def eliminated(self) -> Eliminated:
-        """The system, trajectories eliminated."""
-        return self.linear.solved
+    @cached_property
+    def linear(self) -> Linearisation:
+        """The trajectories with it."""
+        trajectories = trajectories_of(self.model, self.point.levels, self.eliminated)
+        return Linearisation(self.model, self.point, self.rows, self.system, self.eliminated, trajectories)
 
     @cached_property
     def _density(self) -> float:
-        return float(density_of(self.model, self.point, self.linear.solved.logdet))
+        return float(density_of(self.model, self.point, self.eliminated.logdet))
 
     def density(self) -> float:
         """Log density of the data given the biases at the point, up to the constant of the noises."""
@@ -87,6 +82,10 @@ class DenseExpansion:
         """Its slope (M,) by the biases, the volume of the trajectories with it."""
         return self._slope
 
+    def slope(self) -> np.ndarray:
+        """Slope (M,) of the log-likelihood by the biases, tracks following, without it."""
+        return np.asarray(self.eliminated.score)
+
     def log_det(self, factors: Factors) -> Estimate:
         """Log determinant of the precision of the biases."""
         return Estimate(float(_solved(self._precision(factors)).log_determinant()))
@@ -97,19 +96,18 @@ class DenseExpansion:
 
     def apply(self, columns: Any) -> jax.Array:
         """Information of the data about the biases times columns, (M,) or (M, K)."""
-        return self.linear.information @ jnp.asarray(columns)
+        return self.eliminated.information @ jnp.asarray(columns)
 
     def information(self) -> np.ndarray:
         """The information (M, M) itself."""
-        return np.asarray(self.linear.information)
+        return np.asarray(self.eliminated.information)
 
     def moved(self, dz: Any) -> Point:
         """The point with the biases moved by dz (M,), all tracks following."""
-        return _moved(self.model, self.point, self.linear.solved, jnp.asarray(dz))
+        return _moved(self.model, self.point, self.eliminated, jnp.asarray(dz))
 
     def _precision(self, factors: Factors) -> np.ndarray:
-        """The precision of the biases; where rounding makes it indefinite, of the nearest information
-        without negative eigenvalues."""
+        """The precision of the biases; what rounding leaves below zero is no information."""
         information, own = self.information(), factors.matrix(self.model.biases)
         try:
             np.linalg.cholesky(information + own)

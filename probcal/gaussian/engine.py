@@ -149,6 +149,9 @@ class Expansion(Protocol):
     def score(self) -> Any:
         """Its slope (M,) by the biases, the volume of the trajectories with it."""
 
+    def slope(self) -> Any:
+        """Slope (M,) of the log-likelihood by the biases, tracks following, without it."""
+
     def log_det(self, factors: Factors) -> Estimate:
         """Log determinant of the precision of the biases."""
 

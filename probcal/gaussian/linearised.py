@@ -4,6 +4,7 @@ Rows carry the expected information. Given the biases each trajectory is Gaussia
 so are the biases, `Eliminated`, and what a prior makes of these is solved by `Dense` (Schur complement).
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -116,20 +117,45 @@ class Linearisation(NamedTuple):
             drawn.append(jnp.moveaxis(mean[:, :, None] + free, 2, 0))
         return tuple(drawn)
 
-    def smoothed_noises(self, key: jax.Array, count: int) -> tuple[jax.Array, ...]:
-        """Smoothed noises (E, n, count) of each recursion for data drawn from the linearised model, biases held."""
-        return tuple(smooth.noises for _, smooth in self._simulated(key, count))
-
-    @partial(jax.jit, static_argnames="count")
     def _simulated(self, key: jax.Array, count: int) -> list[tuple[jax.Array, rec.Smoothed]]:
-        """Trajectories (E, n, count) drawn from the motion, less its drift, and what smoothing makes of their data."""
-        found = []
-        parts = self.model.each_layout(self.trajectories, self.solved.parts)
-        for r, (part, own, kept) in enumerate(parts):
-            noise = jax.random.normal(jax.random.fold_in(key, r), (2, *part.drift.shape, count))
-            prior = rec.trajectory(part.F, own.L, jnp.zeros((*part.drift.shape, 1)), noise[0])
-            found.append((prior, rec.smooth(part.F, kept.gain, kept.J @ prior + own.half @ noise[1])))
-        return found
+        roots = [(own.L, own.half) for own in self.trajectories]
+        return simulated(self.model, self.solved, roots, key, count)
+
+
+@partial(jax.jit, static_argnames="count")
+def simulated(
+    model: Model, solved: Eliminated, roots: Sequence[tuple[jax.Array, jax.Array]], key: jax.Array, count: int
+) -> list[tuple[jax.Array, rec.Smoothed]]:
+    """Trajectories (E, n, count) drawn from the motion, less its drift, and what smoothing makes of their data.
+
+    `roots` (E, n, n) of each recursion are those of its process noise and of the information of its rows.
+    """
+    found = []
+    for r, (part, (L, half), kept) in enumerate(model.each_layout(roots, solved.parts)):
+        noise = jax.random.normal(jax.random.fold_in(key, r), (2, *part.drift.shape, count))
+        prior = rec.trajectory(part.F, L, jnp.zeros((*part.drift.shape, 1)), noise[0])
+        found.append((prior, rec.smooth(part.F, kept.gain, kept.J @ prior + half @ noise[1])))
+    return found
+
+
+@jax.jit
+def roots_of(model: Model, levels: jax.Array, solved: Eliminated) -> list[tuple[jax.Array, jax.Array]]:
+    """Roots (E, n, n) of the process noise and of the information of the rows."""
+    return [(factors(part, levels), _half(kept.J)) for part, kept in model.each_layout(solved.parts)]
+
+
+@jax.jit
+def held_noises(model: Model, levels: jax.Array, solved: Eliminated) -> tuple[jax.Array, ...]:
+    """Variance (E, n) of every whitened noise of each recursion, the biases known."""
+    return model.each(
+        lambda part, kept: jnp.diagonal(rec.covariances(part.F, factors(part, levels), kept.gain)[1], axis1=1, axis2=2),
+        solved.parts,
+    )
+
+
+def _half(J: jax.Array) -> jax.Array:
+    values, vectors = linalg.spectrum(J)
+    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
 
 
 @jax.jit
@@ -158,8 +184,7 @@ def trajectories_of(model: Model, levels: jax.Array, solved: Eliminated) -> tupl
     found = []
     for part, kept in model.each_layout(solved.parts):
         L = factors(part, levels)
-        values, vectors = linalg.spectrum(kept.J)
-        half = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
+        half = _half(kept.J)
         response = rec.smooth(part.F, kept.gain, kept.cross)
         states, noises = rec.covariances(part.F, L, kept.gain)
         spread = jnp.diagonal(noises, axis1=1, axis2=2)

@@ -136,6 +136,10 @@ class SparseExpansion:
         """Its slope (M,) by the biases, the volume of the trajectories with it."""
         return self._slope
 
+    def slope(self) -> jax.Array:
+        """Slope (M,) of the log-likelihood by the biases, tracks following, without it."""
+        return self._relaxed[1]
+
     def log_det(self, factors: Factors) -> Estimate:
         """Log determinant of the precision of the biases."""
         whole, error = self.solved(factors).factor.log_determinant()
@@ -173,14 +177,16 @@ class SparseExpansion:
         found, M = self.solved(factors), self.model.biases
         if found.joint.exact and found.joint.holds(members):
             return found.joint.block_values(members, found.joint.pairs(members), found.inverse)
-        asked = np.unique(members[members < M])
-        unit = np.zeros((M, len(asked)))
-        unit[asked, np.arange(len(asked))] = 1.0
-        whole = np.concatenate([found.biases(unit), np.zeros((1, len(asked)))])
-        column = np.minimum(np.searchsorted(asked, members), len(asked) - 1)
-        none = members == M
-        block = np.where(none[:, None, :], 0.0, whole[members[:, :, None], column[:, None, :]])
-        return block + none[:, :, None] * np.eye(members.shape[1])[None]
+        asked, none = np.unique(members[members < M]), members == M
+        block = none[:, :, None] * np.eye(members.shape[1])[None]
+        for start in range(0, len(asked), COLUMNS):
+            own = asked[start : start + COLUMNS]
+            unit = np.zeros((M, len(own)))
+            unit[own, np.arange(len(own))] = 1.0
+            whole = np.concatenate([found.biases(unit), np.zeros((1, len(own)))])
+            b, j = np.nonzero(np.isin(members, own))
+            block[b, :, j] = whole[members[b], np.searchsorted(own, members[b, j])[:, None]]
+        return block
 
     def spread(self, factors: Factors) -> Spread:
         """Variance of every bias and state; from draws where there is no selected inverse."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +15,14 @@ import numpy as np
 from probcal import linalg
 from probcal.errors import InputError
 from probcal.gaussian.dense import DenseEngine, DenseExpansion
+from probcal.gaussian.draws import draw
 from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.information import at_levels
-from probcal.gaussian.linearised import Linearisation, linearise
+from probcal.gaussian.linearised import Linearisation, held_noises, linearise, roots_of
 from probcal.gaussian.mode import Eliminated, Point
 from probcal.gaussian.places import tilt_at
 from probcal.gaussian.sparse import SparseEngine, SparseExpansion
-from probcal.inference.blockwise import BlockPosterior
+from probcal.inference.blockwise import BlockPosterior, declared_blocks
 from probcal.lazy import Later
 from probcal.model.model import Recursion
 from probcal.model.motions import level_logs
@@ -31,7 +33,7 @@ from probcal.problem import Epochs, Problem
 from probcal.results.answer import Answer
 from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import datum_of, gather, weights_of_tails
-from probcal.results.read import each_track
+from probcal.results.read import each_track, saved_by_epoch
 from probcal.results.schema import matrix_of
 
 if TYPE_CHECKING:
@@ -39,6 +41,9 @@ if TYPE_CHECKING:
     import xarray as xr
 else:
     pd, xr = Later("pandas"), Later("xarray")
+
+
+COLUMNS = 16  # bias directions that are filtered together
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +57,9 @@ class Judged(ABC):
     solved: Eliminated
     picks: list[Any]  # where each block keeps its data
     data: pd.DataFrame  # sensor, channel, target, time, row of every datum
+    prior: Precision  # with the precisions that the fit ended with
+
+    whole: ClassVar[bool]  # whether the covariance of all biases is held
 
     def flat(self, parts: Any) -> np.ndarray:
         """Arrays (..., N, C) of the blocks as one (..., data)."""
@@ -68,9 +76,9 @@ class Judged(ABC):
         """The posterior at the point."""
 
     @property
-    @abstractmethod
     def factors(self) -> Factors:
-        """Those of the prior, with the precisions that the fit ended with."""
+        """Those of the prior."""
+        return Factors.of(self.prior)
 
     @property
     @abstractmethod
@@ -80,6 +88,44 @@ class Judged(ABC):
     @abstractmethod
     def times(self, columns: np.ndarray) -> np.ndarray:
         """The covariance of z times columns (M, K)."""
+
+    @property
+    @abstractmethod
+    def root(self) -> Any:
+        """A root (M, R) of the covariance of z.
+
+        Of the biases of each sensor alone where that of all is not held.
+        """
+
+    @property
+    @abstractmethod
+    def roots(self) -> list[jax.Array]:
+        """Directions (M, K) of the biases whose squares add up to their covariance.
+
+        None where that is not held.
+        """
+
+    def shared(self) -> np.ndarray | None:
+        """Degrees of freedom that the biases took of each datum (D,), where no roots tell them."""
+        return None
+
+    def declared(self, tree: xr.DataTree) -> SensorBlocks | None:
+        """Covariance of z by sensor that the declared scales leave, where that of all is not held."""
+        return None
+
+    @abstractmethod
+    def drawn(self, z: jax.Array, levels: jax.Array, key: jax.Array) -> tuple[jax.Array, Sequence[jax.Array]]:
+        """Draws of biases (D, M), those of the fit where its whole covariance is held, with trajectories (D, E, n)."""
+
+    @cached_property
+    def noise_roots(self) -> list[tuple[jax.Array, jax.Array]]:
+        """Roots (E, n, n) of the process noise and of the information of the rows."""
+        return roots_of(self.problem.model, self.point.levels, self.solved)
+
+    @cached_property
+    def held_noises(self) -> Sequence[jax.Array]:
+        """Variance (E, n) of every whitened noise of each recursion, the biases known."""
+        return held_noises(self.problem.model, self.point.levels, self.solved)
 
     @property
     def readers(self) -> np.ndarray:
@@ -92,11 +138,12 @@ class Judged(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Fitted(Judged):
-    """A problem linearised where its fit ended, and the prior with the precisions that the fit ended with."""
+    """A fit whose covariance is held."""
 
     at: Linearisation
-    prior: Precision
     covariance: np.ndarray  # (M, M) of z
+
+    whole: ClassVar[bool] = True
 
     @property
     def engine(self) -> Engine:
@@ -106,12 +153,7 @@ class Fitted(Judged):
     @property
     def expansion(self) -> Expansion:
         """The posterior at the point."""
-        return DenseExpansion(self.at)
-
-    @property
-    def factors(self) -> Factors:
-        """Those of the prior."""
-        return Factors.of(self.prior)
+        return DenseExpansion.of(self.at)
 
     @property
     def sd(self) -> np.ndarray:
@@ -122,6 +164,33 @@ class Fitted(Judged):
         """The covariance of z times columns (M, K)."""
         return self.covariance @ columns
 
+    @property
+    def root(self) -> np.ndarray:
+        """The symmetric root (M, M) of the covariance."""
+        return linalg.symmetric_root(self.covariance)
+
+    @property
+    def roots(self) -> list[jax.Array]:
+        """Columns of the symmetric root of the covariance."""
+        M = self.problem.model.biases
+        chunk = max(min(COLUMNS, M), 1)
+        root = np.pad(self.root, ((0, 0), (0, -M % chunk)))
+        return [jnp.asarray(part) for part in np.split(root, max(root.shape[1] // chunk, 1), axis=1)]
+
+    def drawn(self, z: jax.Array, levels: jax.Array, key: jax.Array) -> tuple[jax.Array, Sequence[jax.Array]]:
+        """The biases, and a trajectory for each draw of these."""
+        return z, draw(self.at, z, levels, key).states
+
+    @cached_property
+    def noise_roots(self) -> list[tuple[jax.Array, jax.Array]]:
+        """Roots (E, n, n) of the process noise and of the information of the rows."""
+        return [(own.L, own.half) for own in self.at.trajectories]
+
+    @cached_property
+    def held_noises(self) -> Sequence[jax.Array]:
+        """Variance (E, n) of every whitened noise of each recursion, the biases known."""
+        return [own.spread for own in self.at.trajectories]
+
 
 @dataclass(frozen=True, eq=False)
 class JudgedLarge(Judged):
@@ -129,7 +198,10 @@ class JudgedLarge(Judged):
 
     at: SparseExpansion
     blocks: SensorBlocks  # of the covariance of z
-    alpha: np.ndarray  # (M,) precisions of the prior
+    gamma: np.ndarray | None  # (M,) how well the data determine each bias; None where they did not see the biases
+    scaled: SensorBlocks | None = None  # of that covariance under a prior of the declared scales, where it is known
+
+    whole: ClassVar[bool] = False
 
     @property
     def engine(self) -> Engine:
@@ -142,36 +214,51 @@ class JudgedLarge(Judged):
         return self.at
 
     @property
-    def factors(self) -> Factors:
-        """Those of the prior."""
-        return Factors.alone(self.alpha)
-
-    @property
     def sd(self) -> np.ndarray:
         """Standard deviation (M,) of z."""
         return np.sqrt(self.blocks.variance)
+
+    def shared(self) -> np.ndarray:
+        """The sum of gamma, shared by the variance that the biases of its sensor give each datum.
+
+        Below zero where the data did not see the biases, which then add to what is expected.
+        """
+        told = np.maximum(self.flat(self.blocks.predicted(self.problem.model.read, self.lins)), 0.0)
+        if self.gamma is None:
+            return -told
+        return np.minimum(told * (self.gamma.sum() / max(told.sum(), 1e-300)), 0.9)
+
+    def declared(self, tree: xr.DataTree) -> SensorBlocks:
+        """Covariance of z by sensor that a prior of the declared scales leaves."""
+        told = tree["calibration"].to_dataset()
+        if self.scaled is not None:
+            return self.scaled
+        if "sd_error" in told:  # no factor was made, or none that has exact variances
+            apart = 1.0 - told["contraction"].values
+            return SensorBlocks(len(apart), np.arange(len(apart))[:, None], apart[:, None, None])
+        return declared_blocks(self.at)
 
     def times(self, columns: np.ndarray) -> np.ndarray:
         """The covariance of z times columns (M, K)."""
         return np.asarray(self.at.solve(self.factors, columns))
 
+    @property
+    def root(self) -> Any:
+        """A sparse root (M, R)."""
+        return self.blocks.root()
 
-def take_up_large(problem: Problem, tree: xr.DataTree, answer: Answer | None) -> JudgedLarge:
-    """The fit of a problem in sparse form, as `take_up`."""
-    problem, data, picks = identified(problem, tree, answer)
-    posterior = None if answer is None else answer.posterior
-    if isinstance(posterior, BlockPosterior):
-        at = posterior.at
-    else:
-        point = point_of(problem, tree) if posterior is None else posterior.point
-        at = SparseEngine().settled(problem.model, point)
-    assert isinstance(at, SparseExpansion)
-    blocks = SensorBlocks.read(tree["calibration"].to_dataset(), problem.labels, problem.scales)
-    alpha = tree["calibration"].to_dataset()["precision"].values
-    return JudgedLarge(problem, at.point, at.rows, at.eliminated, picks, data, at, blocks, alpha)
+    @property
+    def roots(self) -> list[jax.Array]:
+        """None: the covariance of all is not held."""
+        return [jnp.zeros((self.problem.model.biases, 0))]
+
+    def drawn(self, z: jax.Array, levels: jax.Array, key: jax.Array) -> tuple[jax.Array, Sequence[jax.Array]]:
+        """Biases and trajectories drawn together around the mean."""
+        found = self.at.sample(self.factors, key, len(levels))
+        return jnp.asarray(found.z), [jnp.asarray(own) for own in found.states]
 
 
-def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) -> Fitted:
+def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) -> Judged:
     """The fit of a problem from its tree, and from the answer behind it where that is at hand.
 
     Biases, precisions and levels are those of the tree; without an answer the trajectories are brought to their mode
@@ -179,6 +266,8 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
     """
     problem, datum, picks = identified(problem, fit, answer)
     group = fit["calibration"].to_dataset()
+    if fit.attrs.get("sparse", 0):
+        return _taken_large(problem, fit, answer, datum, picks)
     covariance = matrix_of(group, "covariance", "assess").values / np.outer(problem.scales, problem.scales)
     if answer is None:
         point = point_of(problem, fit)
@@ -187,7 +276,24 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
         at = linearise(problem.model, point)
     else:
         at = answer.posterior.linearised
-    return Fitted(problem, at.point, at.rows, at.solved, picks, datum, at, _prior(group), covariance)
+    return Fitted(problem, at.point, at.rows, at.solved, picks, datum, _prior(group), at, covariance)
+
+
+def _taken_large(
+    problem: Problem, tree: xr.DataTree, answer: Answer | None, data: pd.DataFrame, picks: list[Any]
+) -> JudgedLarge:
+    posterior, group = None if answer is None else answer.posterior, tree["calibration"].to_dataset()
+    scaled = None
+    if isinstance(posterior, BlockPosterior):
+        at, scaled = posterior.at, posterior.declared
+    else:
+        point = point_of(problem, tree) if posterior is None else posterior.point
+        at = SparseEngine().settled(problem.model, point)
+    assert isinstance(at, SparseExpansion)
+    blocks = SensorBlocks.read(group, problem.labels, problem.scales)
+    prior = Precision.single(jnp.asarray(group["precision"].values))
+    own = (problem, at.point, at.rows, at.eliminated, picks, data, prior)
+    return JudgedLarge(*own, at, blocks, group["gamma"].values, scaled)
 
 
 def identified(problem: Problem, fit: xr.DataTree, answer: Answer | None) -> tuple[Problem, pd.DataFrame, list[Any]]:
@@ -217,17 +323,6 @@ def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
         return tuple(jnp.asarray(saved_by_epoch(epochs, tracked, name, "process noise")) for name in names)
 
     return problem.with_mixing(problem.model.each(saved, problem.epochs))
-
-
-def saved_by_epoch(epochs: Epochs, tracked: dict[str, xr.Dataset], name: str, what: str) -> np.ndarray:
-    """A variable of the tracks of a tree at the epochs of a recursion, (E, ...)."""
-    parts = []
-    for target, mine in epochs.members.items():
-        own = tracked.get(target)
-        if own is None or name not in own or own.sizes["time"] != mine.sum():
-            raise InputError(f"assess: the tree was fitted with other {what}; give the problem as it was fitted")
-        parts.append(own[name].values)
-    return np.concatenate(parts)
 
 
 def point_of(problem: Problem, fit: xr.DataTree) -> Point:

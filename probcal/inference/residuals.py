@@ -18,7 +18,7 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import Eliminated, Point, factors
-from probcal.inference.fitted import Fitted, Judged, JudgedLarge
+from probcal.inference.fitted import Judged
 from probcal.lazy import Later
 from probcal.model.model import Data, Model, Recursion
 from probcal.model.rows import Linearised, standardised
@@ -34,7 +34,6 @@ PRACTICAL = 1.25  # factor from 1 within which a NIS beyond its limits is no fin
 # sd of its lag-1 correlation from which a channel is called correlated, beside its Ljung-Box test
 LAGGED = 2.5
 NOTABLE = 0.1  # lag-1 correlation, and mean, of innovations within which neither is
-COLUMNS = 16  # bias directions that are filtered together
 LAGS = 10  # of the Ljung-Box statistic
 LONGEST = 200  # lags over which a correlation in time is followed
 FEWEST = 20  # data below which whiteness is not judged
@@ -141,15 +140,6 @@ def _innovations(
     return [(c[:, :, 0], jnp.sum(c[:, :, 1:] ** 2, 2), k) for c, k in zip(white, kept, strict=True)]
 
 
-def innovations_at(
-    model: Model, point: Point, lins: Sequence[Linearised], filters: list[Filter], shift: list[jax.Array]
-) -> list[tuple[jax.Array, jax.Array]]:
-    """Of each block the innovations with the biases of every row moved by `shift` (N, p), and the share of itself that
-    S^-1/2 leaves a datum; each (N, C)."""
-    found = _innovations(model, point, lins, filters, shift, jnp.zeros((model.biases, 0)))
-    return [(value, kept) for value, _, kept in found]
-
-
 class Filtered(NamedTuple):
     """The filters of a fit, its innovations, and the bias directions (M, K) behind their degrees of freedom."""
 
@@ -182,81 +172,33 @@ def measured_kurtosis(fit: Judged) -> np.ndarray:
     value = fit.flat([standardised(lin.score, lin.weight) for lin in fit.lins])
     group, _ = codes(fit.data, ["sensor", "channel"])
     second, fourth = (np.bincount(group, value**k) / np.bincount(group) for k in (2, 4))
-    return exact_kurtosis(fit, (fourth / np.maximum(second, 1e-300) ** 2)[group] - 3.0)
+    return exact_kurtosis(fit, (fourth / np.maximum(second**2, 1e-300))[group] - 3.0)
 
 
-def root_of(covariance: np.ndarray) -> np.ndarray:
-    """The symmetric root (M, M) of a covariance, which does not turn with rounding; that of few
-    draws is singular."""
-    values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(covariance)))
-    root: np.ndarray = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return root
-
-
-def innovations(fit: Fitted, kurtosis: np.ndarray, dz: np.ndarray | None = None) -> Filtered:
+def innovations(fit: Judged, kurtosis: np.ndarray, dz: np.ndarray | None = None) -> Filtered:
     """Innovations of all data with the biases `dz` (M,) from their means, for noise of excess
     kurtosis (D,).
 
     A sum of squares over some data expects their number less what the biases used: over all data the sum of gamma,
-    over a share of them the trace of B (G + A)^-1 B', B their responses to the biases.
+    over a share of them the trace of B (G + A)^-1 B', B their responses to the biases. Where the covariance of all
+    biases is not held the sum is shared among the data by the variance that the biases of the own sensor give each.
     """
     model = fit.problem.model
-    filters = prepare(fit.solved)
-    root = root_of(fit.covariance)
-    chunk = max(min(COLUMNS, model.biases), 1)
-    root = np.pad(root, ((0, 0), (0, -model.biases % chunk)))
-    roots = [jnp.asarray(part) for part in np.split(root, max(root.shape[1] // chunk, 1), axis=1)]
+    filters, roots = prepare(fit.solved), fit.roots
     moved = np.zeros(model.biases + 1) if dz is None else np.append(dz, 0.0)
     shift = [jnp.asarray(moved[np.asarray(read)]) for read in model.read]
     found = [_innovations(model, fit.point, fit.lins, filters, shift, part) for part in roots]
     value, _, kept = (fit.flat(parts) for parts in zip(*found[0], strict=True))
     used = np.sum([fit.flat([own for _, own, _ in part]) for part in found], axis=0)
-    return Filtered(filters, Innovations(value, used, kurtosis * kept**4, expected_squares(fit, kept)), roots)
+    shared = fit.shared()
+    return Filtered(
+        filters,
+        Innovations(value, used if shared is None else shared, kurtosis * kept**4, expected_squares(fit, kept)),
+        roots,
+    )
 
 
-def innovations_large(
-    fit: JudgedLarge,
-    gamma: np.ndarray,
-    shift: Sequence[np.ndarray] | None = None,
-) -> Innovations:
-    """Innovations of a fit in sparse form, biases at their means or shifted (N, p) from row to row.
-
-    The degrees of freedom that the biases used, the sum of `gamma` (M,), are shared among the data
-    by the variance that the biases of the own sensor give each of them.
-    """
-    moved = [jnp.zeros((lin.bias.shape[0], lin.bias.shape[2])) for lin in fit.lins]
-    moved = moved if shift is None else [jnp.asarray(own) for own in shift]
-    found = innovations_at(fit.problem.model, fit.point, fit.lins, prepare(fit.solved), moved)
-    value, kept = (fit.flat(parts) for parts in zip(*found, strict=True))
-    told = np.maximum(fit.flat(_told(fit)), 0.0)
-    used = np.minimum(told * (gamma.sum() / max(told.sum(), 1e-300)), 0.9)
-    return Innovations(value, used, measured_kurtosis(fit) * kept**4, expected_squares(fit, kept))
-
-
-def innovations_given(fit: JudgedLarge) -> Innovations:
-    """Innovations of data that the biases of a fit in sparse form did not see: these add to what is
-    expected."""
-    found = innovations_large(fit, np.zeros(fit.problem.model.biases))
-    return found._replace(used=-np.maximum(fit.flat(_told(fit)), 0.0))
-
-
-def _told(fit: JudgedLarge) -> list[np.ndarray]:
-    """Variance of each predicted value (N, C) of each block by the biases of its sensor, over that
-    of its noise."""
-    M = fit.problem.model.biases
-    own, place = (np.append(values, 0) for values in fit.blocks.located())
-    found = []
-    for read, lin in zip(fit.problem.model.read, fit.lins, strict=True):
-        bias = np.asarray(read)
-        block, at = own[bias], place[bias]
-        same = (block[:, :, None] == block[:, None, :]) & (bias < M)[:, :, None] & (bias < M)[:, None, :]
-        matrix = np.where(same, fit.blocks.covariance[block[:, :, None], at[:, :, None], at[:, None, :]], 0.0)
-        along = np.asarray(lin.bias)
-        found.append(np.asarray(lin.weight) * np.einsum("ncp,npq,ncq->nc", along, matrix, along))
-    return found
-
-
-def moved_innovations(fit: Fitted, known: Filtered, shift: list[jax.Array]) -> np.ndarray:
+def moved_innovations(fit: Judged, known: Filtered, shift: list[jax.Array]) -> np.ndarray:
     """Innovations (D,) with the biases of every row of each block moved by `shift` (N, p) in z."""
     model = fit.problem.model
     found = _innovations(model, fit.point, fit.lins, known.filters, shift, known.roots[0])
@@ -401,6 +343,15 @@ def inflation(fit: Judged, wide: np.ndarray, group: np.ndarray) -> np.ndarray:
         weighed += np.bincount(bias, (own * times).ravel(), M + 1)
         start += len(row)
     return np.maximum(weighed[:M] / np.maximum(told[:M], 1e-300), np.mean(wide[group]))
+
+
+def told_alone(fit: Judged) -> np.ndarray:
+    """Information (M,) of the rows about each bias, all else known."""
+    told = np.zeros(fit.problem.model.biases + 1)
+    for *_, read, lin in fit.problem.model.each_block(fit.problem.model.read, fit.lins):
+        own = np.einsum("nc,ncp->np", np.asarray(lin.weight), np.asarray(lin.bias) ** 2)
+        told += np.bincount(read.ravel(), own.ravel(), len(told))
+    return told[:-1]
 
 
 def memory(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> float:

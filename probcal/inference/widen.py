@@ -18,7 +18,7 @@ from probcal.gaussian.mode import Eliminated, Point, factors
 from probcal.gaussian.scans import recur_squared
 from probcal.gaussian.sparse import SparseEngine
 from probcal.inference import residuals
-from probcal.inference.fitted import Fitted, Judged, JudgedLarge, take_up, take_up_large
+from probcal.inference.fitted import COLUMNS, Fitted, Judged, JudgedLarge, take_up
 from probcal.inference.residuals import LAGGED, NOTABLE, PRACTICAL, Channels, Innovations
 from probcal.lazy import Later
 from probcal.misfit import rejection_text
@@ -109,7 +109,7 @@ def scattered(fit: Judged, found: Innovations, high: bool) -> str:
     return " ".join(sentences)
 
 
-def unmoved(fit: Fitted) -> str:
+def unmoved(fit: Judged) -> str:
     """A sentence on the component whose smoothed process noises are nearest to nothing, if less
     than `UNMOVED`.
 
@@ -117,8 +117,7 @@ def unmoved(fit: Fitted) -> str:
     variance.
     """
     problem, found = fit.problem, dict[str, float]()
-    spreads = [own.spread for own in fit.at.trajectories]
-    for name, _, part, noises, spread in problem.tracks(problem.model.recursions, fit.point.noises, spreads):
+    for name, _, part, noises, spread in problem.tracks(problem.model.recursions, fit.point.noises, fit.held_noises):
         expected = np.where(part.L.any(1), 1.0 - spread, 0.0)
         for component, columns in problem.noise_columns(name):
             told = float(expected[~part.first, columns].sum())
@@ -164,7 +163,7 @@ def before_data(model: Model, levels: jax.Array) -> list[jax.Array]:
 def _noises(fit: Judged, rejected: Rejection, rng: np.random.Generator) -> tuple[Data, Data]:
     """Unit noise (N, C, K) of each block as the model has it, and with the size and memory that
     each channel shows."""
-    white = rng.standard_normal((len(fit.data), residuals.COLUMNS))
+    white = rng.standard_normal((len(fit.data), COLUMNS))
     red = np.empty_like(white)
     target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
     for mine, size, memory in zip(rejected.channels.members, *rejected.scatter, strict=True):
@@ -198,10 +197,10 @@ def track_factors(
     simulated with the smoother of the fit.
     """
     model, rng = fit.problem.model, np.random.default_rng(0)
-    chunks = int(np.clip(NUMBERS // (residuals.COLUMNS * max(len(fit.data), 1)), 1, CHUNKS))
+    chunks = int(np.clip(NUMBERS // (COLUMNS * max(len(fit.data), 1)), 1, CHUNKS))
     more = [np.zeros(part.drift.shape) for part in model.recursions]
     for _ in range(chunks):
-        biases = root @ rng.standard_normal((root.shape[1], residuals.COLUMNS))
+        biases = root @ rng.standard_normal((root.shape[1], COLUMNS))
         plain, shown = _noises(fit, rejected, rng)
         for sign, noise, moved in ((-1, plain, biases), (1, shown, wide[:, None] * biases)):
             errors = _errors(model, fit.lins, fit.solved, noise, jnp.asarray(moved))
@@ -353,13 +352,9 @@ def judge_fit(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
     widened by that."""
     if tree.attrs["status"] in INVALID:
         return tree
-    if tree.attrs.get("sparse", 0):
-        large = take_up_large(answer.problem, tree, answer)
-        found = residuals.innovations_large(large, tree["calibration"].to_dataset()["gamma"].values)
-        return _judged(large, found, tree, large.blocks.root(), "", UNASSESSED)
     fit = take_up(answer.problem, tree, answer)
     found = residuals.innovations(fit, residuals.measured_kurtosis(fit)).innovations
-    return _judged(fit, found, tree, residuals.root_of(fit.covariance), unmoved(fit), UNASSESSED)
+    return _judged(fit, found, tree, fit.root, unmoved(fit), UNASSESSED)
 
 
 def judge_tracks(
@@ -383,16 +378,16 @@ def judge_tracks(
         information = root.T @ np.asarray(at.information) @ root
         values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(information)))
         root = root @ (vectors / np.sqrt(1.0 + np.maximum(values, 0.0)))
-        fit = Fitted(problem, at.point, at.rows, at.solved, picks, data, at, open_, root @ root.T)
+        fit = Fitted(problem, at.point, at.rows, at.solved, picks, data, open_, at, root @ root.T)
         dz = fit.covariance @ np.asarray(at.solved.score)
         found = residuals.innovations(fit, residuals.measured_kurtosis(fit), dz).innovations
         return _judged(fit, found, tree, known.root, rejection_text(rejected(problem, at.point)))
     here = SparseEngine().settled(problem.model, at)
-    large = JudgedLarge(
-        problem, here.point, here.rows, here.eliminated, picks, data, here, known.blocks, np.zeros(len(known.z))
-    )
+    flat = Precision.single(jnp.zeros(len(known.z)))
+    large = JudgedLarge(problem, here.point, here.rows, here.eliminated, picks, data, flat, here, known.blocks, None)
     hidden = rejection_text(rejected(problem, at))
-    return _judged(large, residuals.innovations_given(large), tree, known.root, hidden)
+    found = residuals.innovations(large, residuals.measured_kurtosis(large)).innovations
+    return _judged(large, found, tree, known.root, hidden)
 
 
 def _judged(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.model.model import Model
-from probcal.model.rows import BY_ROW, Rows
+from probcal.model.rows import BY_ROW, Block, Rows
 
 
 def part(model: Model, r: int) -> Model:
@@ -95,6 +95,39 @@ def split(model: Model, piece: Sequence[np.ndarray], count: int) -> Model:
         }
 
     return replace(model.with_rows(copied, piece), biases=count * M, tilt=None)
+
+
+def differing(model: Model, along: Sequence[np.ndarray]) -> Model:
+    """Further biases by which the M may differ from row to row: q of each, times `along` (N, q) of every row.
+
+    After the M come those of the first column, then of the next.
+    """
+    M, q = model.biases, along[0].shape[1]
+
+    def stepped(data: Rows, own: np.ndarray) -> dict[str, Any]:
+        pattern, which = np.unique(own, axis=0, return_inverse=True)
+        S, bias, scale, base = (data.bias.shape[0], *(np.asarray(a) for a in (data.bias, data.scale, data.base)))
+        last = (1 + q) * M  # that of none
+        first = np.where(bias < M, bias, last)
+        biases, scales = [], []
+        for row in pattern:
+            more = [np.where((bias < M) & (row[j] != 0), bias + (1 + j) * M, last) for j in range(q)]
+            biases.append(np.concatenate([first, *more], 1))
+            scales.append(np.concatenate([scale, *(row[j] * scale for j in range(q))], 1))
+        wide = np.concatenate([base, np.zeros((S, q * base.shape[1]))], 1)
+        return {
+            "sensor": np.asarray(data.sensor) + S * which.ravel(),
+            "bias": np.concatenate(biases),
+            "scale": np.concatenate(scales),
+            "base": np.tile(wide, (len(pattern), 1)),
+        }
+
+    def read(block: Block, data: Rows) -> Block:
+        own = (*range(data.bias.shape[1] - len(block.steps)), *block.steps)
+        return replace(block, steps=(*block.steps, *q * own))
+
+    blocks = tuple(read(block, data) for block, data, _ in model.each_block())
+    return replace(model.with_rows(stepped, along), blocks=blocks, biases=(1 + q) * M, tilt=None)
 
 
 def placed(model: Model, mine: Sequence[jax.Array], place: jax.Array) -> Model:

@@ -72,7 +72,7 @@ def plot_nis(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
 
 def plot_left_out(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw, for each sensor, how many nats better the rest predicts its data calibrated than as stated."""
-    check = tree["sensor_check"].to_dataset()
+    check = tree["sensor_left" if "sensor_left" in tree.children else "sensor_check"].to_dataset()
     if "difference" not in check:
         check = check.assign(difference=xr.zeros_like(check["nis"]))
     gain = check["difference"].values

@@ -12,6 +12,8 @@ from probcal.results.schema import matrix_of
 if TYPE_CHECKING:
     import xarray as xr
 
+    from probcal.model.rows import Linearised
+
 
 class SensorBlocks(NamedTuple):
     """What a fit in sparse form knows of the covariance of M biases; those of two sensors count as independent."""
@@ -59,6 +61,22 @@ class SensorBlocks(NamedTuple):
         over, there = 1.0 / np.append(scales, 1.0)[members], members < M
         covariance *= over[:, :, None] * over[:, None, :] * (there[:, :, None] & there[:, None, :])
         return cls(M, members, covariance + np.eye(p)[None] * ~there[:, :, None])
+
+    def predicted(self, read: Sequence[np.ndarray], rows: Sequence[Linearised]) -> list[np.ndarray]:
+        """Variance of each predicted value (N, C) by the biases of its sensor, over that of its noise.
+
+        `read` (N, p) are those that each row of a block reads.
+        """
+        own, place = (np.append(values, 0) for values in self.located())
+        found = []
+        for bias, lin in zip(read, rows, strict=True):
+            block, at, along = own[bias], place[bias], np.asarray(lin.bias)
+            there = bias < self.biases
+            same = (block[:, :, None] == block[:, None, :]) & there[:, :, None] & there[:, None, :]
+            covariance = self.covariance[block[:, :, None], at[:, :, None], at[:, None, :]]
+            spread = np.einsum("ncp,npq,ncq->nc", along, np.where(same, covariance, 0.0), along)
+            found.append(np.asarray(lin.weight) * spread)
+        return found
 
     def widened(self, wide: np.ndarray) -> SensorBlocks:
         """With the sd of each bias times `wide` (M,)."""

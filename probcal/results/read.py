@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from probcal.network import Network
-    from probcal.problem import Problem
+    from probcal.problem import Epochs, Problem
 
 
 @checked
@@ -259,3 +259,14 @@ def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
         return Calibrated(problem, mean / problem.scales, levels, SensorBlocks.read(group, labels, problem.scales))
     spread = covariance_of(group, labels, "a calibration") / np.outer(problem.scales, problem.scales)
     return Calibrated(problem, mean / problem.scales, levels, spread)
+
+
+def saved_by_epoch(epochs: Epochs, tracked: dict[str, xr.Dataset], name: str, what: str) -> np.ndarray:
+    """A variable of the tracks of a tree at the epochs of a recursion, (E, ...)."""
+    parts = []
+    for target, mine in epochs.members.items():
+        own = tracked.get(target)
+        if own is None or name not in own or own.sizes["time"] != mine.sum():
+            raise InputError(f"assess: the tree was fitted with other {what}; give the problem as it was fitted")
+        parts.append(own[name].values)
+    return np.concatenate(parts)
