@@ -52,7 +52,7 @@ def main():
     parser.add_argument("--drift", type=float, help="assess the fit, three radars' ranges so many m longer later on")
     chosen = parser.parse_args()
     kind, prior = METHODS[chosen.method]
-    method, found = pc.Gibbs() if kind is pc.Gibbs else kind(form=chosen.form), []
+    method, found = pc.Gibbs() if kind is pc.Gibbs else kind(engine=chosen.form), []
     for side in chosen.side:
         targets = chosen.targets or max(1, round(20 * (side / 100) ** 2))
         given = {"side": side, "targets": targets, "epochs": chosen.epochs, "reach": chosen.reach}

@@ -12,9 +12,9 @@ import jax
 import numpy as np
 import pandas as pd
 
-from probcal.gaussian.engine import Embedded, Estimate, Sampled
+from probcal.gaussian.engine import Embedded, Estimate, Sampled, Spread
 from probcal.gaussian.linearised import linearise_rows
-from probcal.gaussian.mode import factors, find_tracks, log_likelihood, mixing_gain
+from probcal.gaussian.mode import eliminate_rows, factors, find_tracks, log_likelihood, mixing_gain
 from probcal.model.model import scaled
 from probcal.motion import ConstantVelocity, Motion, RandomWalk, Static, White
 
@@ -341,10 +341,13 @@ def kalman(problem, alpha):
 class NaiveEngine:
     """A third engine: rows of whitened noises and biases as one dense matrix in NumPy, everything by its inverse."""
 
-    name, traceable = "naive", False
+    cheap = False
 
     def at(self, model, point, rows=None):
         return Naive(model, point, linearise_rows(model, point) if rows is None else rows)
+
+    def settled(self, model, point):
+        return Naive(model, *_settled(model, point, point.z))
 
 
 class Naive:
@@ -420,6 +423,18 @@ class Naive:
     def apply(self, columns):
         W, B = self.joint[: self.U, : self.U], self.joint[: self.U, self.U :]
         return (self.joint[self.U :, self.U :] - B.T @ np.linalg.solve(W, B)) @ np.asarray(columns)
+
+    def information(self):
+        return self.apply(np.eye(self.M))
+
+    @property
+    def eliminated(self):
+        return eliminate_rows(self.model, self.point, self.rows, joint=False)
+
+    def spread(self, factors):
+        own = self.covariance(factors)
+        states = tuple(np.diagonal(part, axis1=1, axis2=2) for part in self.states(factors))
+        return Spread(np.diag(own)[self.U :], np.zeros(self.M), states)
 
     def moved(self, dz):
         W, B = self.joint[: self.U, : self.U], self.joint[: self.U, self.U :]

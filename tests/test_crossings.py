@@ -67,7 +67,7 @@ def on_the_wrong_side(problem, label, shift):
 def test_a_node_that_stands_on_the_other_side_is_found(form):
     """The path bends by 4 m, which tells the sides apart; every climb begins on the stated one."""
     problem = beside(0, 4.0, **{"b0.position_y": -20.0})
-    tree = probcal.fit(problem, MAP(form=form), prior=Gaussian())
+    tree = probcal.fit(problem, MAP(engine=form), prior=Gaussian())
     mean, sd = bias(tree, "b0.position_y")
     assert abs(mean + 20.0) < 4 * sd < 4.0
     assert tree.attrs["status"] == "converged"

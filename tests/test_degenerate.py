@@ -174,13 +174,13 @@ METHODS = {
     "EA": EA(),
     "EA, joint": EA(trajectory="joint"),
     "EA, maximised": EA(precisions="maximised"),
-    "EA, sparse": EA(form="sparse"),
+    "EA, sparse": EA(engine="sparse"),
     "as printed": EA.as_printed(),
     "EMEA": EMEA(iterations=5),
     "EM": EM(),
     "MAP": MAP(),
-    "MAP, sparse": MAP(form="sparse"),
-    "MAP, matrix-free": MAP(form="matrix-free"),
+    "MAP, sparse": MAP(engine="sparse"),
+    "MAP, matrix-free": MAP(engine="matrix-free"),
     "least squares": LeastSquares(),
 }
 if installed("probcal.particles"):

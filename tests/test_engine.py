@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import worlds
 from reference import NaiveEngine
 from sparse_worlds import LIBRARIES, drawn, drawn_in_space, loud_ear
 
@@ -17,9 +18,11 @@ from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import find_tracks
 from probcal.gaussian.sparse import SparseEngine
+from probcal.inference.fit import calibrate
 from probcal.model.model import Tilt
 from probcal.modes import automatic_start
 from probcal.noise import StudentT
+from probcal.types import float64
 
 ENGINES = [DenseEngine, pytest.param(SparseEngine, id="SparseEngine")]
 
@@ -132,6 +135,29 @@ def test_what_rounding_leaves_below_zero_is_no_information():
         variance = np.asarray(lost.marginals(Factors.alone(np.ones(M)), np.arange(M)[:, None]))
         assert (variance > 0.0).all()
         assert (variance <= 1.0 + 1e-9).all()
+
+
+@pytest.mark.ci
+def test_a_third_engine_runs_fit_and_assess():
+    """A stranger's class with the members of `Engine`: answer and verdicts are those of the dense one."""
+    problem, trees = worlds.small(scans=8), []
+    for engine in ("dense", NaiveEngine()):
+        tree, answer = float64(calibrate)(problem, pc.MAP(engine=engine), prior=pc.Gaussian())
+        trees.append(pc.assess(problem, tree, answer=answer))
+    one, other = (tree["calibration"].to_dataset() for tree in trees)
+    off = np.abs(one["mean"] - other["mean"]) / one["sd"]
+    assert off.max() < 0.02
+    np.testing.assert_allclose(other["sd"], one["sd"], rtol=0.02)
+    assert trees[1].attrs["log_evidence"] == pytest.approx(trees[0].attrs["log_evidence"], abs=1e-3)
+    one, other = (tree["verdict"]["verdict"].values.tolist() for tree in trees)
+    assert other == one
+    one, other = (tree["halves"]["t"].values for tree in trees)
+    np.testing.assert_allclose(other, one, atol=0.02)
+
+
+def test_the_old_word_for_an_engine_says_the_new_one():
+    with pytest.warns(FutureWarning, match=r'MAP\(form="sparse"\) is MAP\(engine="sparse"\) now'):
+        assert pc.MAP(form="sparse").engine == "sparse"
 
 
 def some_rows(model):

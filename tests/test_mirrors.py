@@ -97,7 +97,7 @@ def test_a_limit_ends_the_search_for_mirror_images():
 )
 def test_a_mirror_is_reported_with_its_biases_and_they_are_weak(name, form):
     problem, _ = networks.setting(0, name, share=1.0)
-    given = {} if form == "auto" else {"method": probcal.MAP(form=form), "prior": probcal.Gaussian()}
+    given = {} if form == "auto" else {"method": probcal.MAP(engine=form), "prior": probcal.Gaussian()}
     tree = probcal.fit(problem, **given)
     assert "Another answer fits as well" in tree.attrs["message"]
     assert "Survey a position off that" in tree.attrs["message"]
@@ -144,7 +144,7 @@ def test_a_scene_on_the_wrong_side_is_turned_in_sparse_form(seed, form):
         (line,) = planes(problem, z)
         start = track_mode(problem, reflect(problem, start, line, [np.ones(120, bool)], z))
     assert off(start.states[0], path) > 15
-    tree = probcal.fit(problem, probcal.MAP(form=form), prior=probcal.Gaussian(), start=start)
+    tree = probcal.fit(problem, probcal.MAP(engine=form), prior=probcal.Gaussian(), start=start)
     assert off(only(tree)["mean"].values, path) < 4
 
 
@@ -153,7 +153,7 @@ def test_pieces_are_looked_at_again_where_the_scene_went_over():
     """The scene reflected fits better by 16 nats, and from there a piece of it by 17 more: 21 m off before."""
     problem, path = beside(53)
     start = on_the_wrong_side(problem, 53)
-    tree = probcal.fit(problem, probcal.MAP(form="sparse"), prior=probcal.Gaussian(), start=start)
+    tree = probcal.fit(problem, probcal.MAP(engine="sparse"), prior=probcal.Gaussian(), start=start)
     assert off(only(tree)["mean"].values, path) < 4
 
 
@@ -178,7 +178,7 @@ def test_a_short_piece_of_one_of_two_targets_is_turned(seed, form):
     In the second scene eight shorter pieces fit better, and come back when they are polished.
     """
     problem, paths = crossing(seed)
-    tree = probcal.fit(problem, probcal.MAP(form=form), prior=probcal.Gaussian())
+    tree = probcal.fit(problem, probcal.MAP(engine=form), prior=probcal.Gaussian())
     for name, path in paths.items():
         track = tree[f"track/{name}"].to_dataset()
         there = np.round(track["time"].values * 2).astype(int)
@@ -189,9 +189,9 @@ def test_a_short_piece_of_one_of_two_targets_is_turned(seed, form):
 @pytest.mark.parametrize(
     ("method", "prior"),
     [
-        (probcal.MAP(form="sparse"), probcal.Gaussian()),
-        (probcal.MAP(form="matrix-free"), probcal.Gaussian()),
-        pytest.param(probcal.EA(form="sparse"), None, marks=pytest.mark.ci),
+        (probcal.MAP(engine="sparse"), probcal.Gaussian()),
+        (probcal.MAP(engine="matrix-free"), probcal.Gaussian()),
+        pytest.param(probcal.EA(engine="sparse"), None, marks=pytest.mark.ci),
         pytest.param(probcal.Gibbs(chains=1, warmup=5, draws=20, patience=1), probcal.Gaussian(), marks=pytest.mark.ci),
     ],
     ids=["map", "matrix-free", "ea", "gibbs"],
@@ -227,7 +227,7 @@ def test_an_answer_outlives_the_memory_that_its_other_side_takes():
         raise MemoryError
 
     with patch("probcal.inference.solve.other_sides", refused):
-        tree = probcal.fit(problem, probcal.MAP(form="sparse"), prior=probcal.Gaussian())
+        tree = probcal.fit(problem, probcal.MAP(engine="sparse"), prior=probcal.Gaussian())
     assert tree.attrs["status"] == "converged"
     assert "Memory did not hold" in tree.attrs["message"]
     assert "mirror" not in tree.children
@@ -236,7 +236,7 @@ def test_an_answer_outlives_the_memory_that_its_other_side_takes():
 @pytest.mark.slow
 def test_nodes_that_span_the_plane_have_no_mirror_in_sparse_form():
     problem, _ = networks.setting(1, "beacons")
-    tree = probcal.fit(problem, probcal.MAP(form="sparse"), prior=probcal.Gaussian())
+    tree = probcal.fit(problem, probcal.MAP(engine="sparse"), prior=probcal.Gaussian())
     assert "mirror" not in tree.children
     assert "nother answer" not in tree.attrs["message"]
 
@@ -437,8 +437,8 @@ def test_an_answer_that_did_not_converge_takes_no_ones_place(monkeypatch):
 
 def test_sides_without_a_factor_are_compared_by_their_density(monkeypatch):
     """The evidences differ by what their estimates are off."""
-    ends = {4.0: Stub(4.0, 97.0, method=probcal.MAP(form="matrix-free"))}
-    found = beside_others(monkeypatch, (None, [("across", 4.0, 0.0)]), ends, probcal.MAP(form="matrix-free"))
+    ends = {4.0: Stub(4.0, 97.0, method=probcal.MAP(engine="matrix-free"))}
+    found = beside_others(monkeypatch, (None, [("across", 4.0, 0.0)]), ends, probcal.MAP(engine="matrix-free"))
     assert listed(found) == [("across", 0.0, 4.0)]
 
 

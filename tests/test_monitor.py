@@ -123,7 +123,7 @@ def test_an_interrupted_climb_keeps_the_best_answer_so_far():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [lambda: pc.EA(form="sparse"), lambda: pc.EM(pc.Particles(50), iterations=60)])
+@pytest.mark.parametrize("make", [lambda: pc.EA(engine="sparse"), lambda: pc.EM(pc.Particles(50), iterations=60)])
 def test_climbs_in_sparse_form_and_by_particles_are_interrupted(make):
     problem = worlds.linear("plane")[0]
 

@@ -43,14 +43,14 @@ def fitted(method, prior=None):
 
 @pytest.fixture(scope="module")
 def dense():
-    return fitted(pc.MAP(form="dense"), pc.Gaussian())
+    return fitted(pc.MAP(engine="dense"), pc.Gaussian())
 
 
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 def test_the_sparse_form_ends_where_the_dense_one_does(library, dense, monkeypatch):
     """Means within 1e-4 sds; variances, tracks and evidence exact, or within 6 standard errors where estimated."""
     monkeypatch.setattr("probcal.inference.blockwise.exact", lambda: library is Cholmod)
-    sparse = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    sparse = fitted(pc.MAP(engine="sparse"), pc.Gaussian())
     a, b = (tree["calibration"].to_dataset() for tree in (dense, sparse))
     assert sparse.attrs["status"] == dense.attrs["status"] == "converged"
     assert "covariance" not in b
@@ -80,9 +80,9 @@ def test_the_sparse_form_ends_where_the_dense_one_does(library, dense, monkeypat
 def test_propagation_agrees_with_sweeps_over_all_biases(prior, form, monkeypatch):
     """Within what the Monte Carlo error of both leaves: 0.4 sds, a third of an sd; most intervals hold the truth."""
     pytest.importorskip("sparsax", reason="sparsax is an extra")
-    swept = fitted(pc.EA(form="dense"), prior)
+    swept = fitted(pc.EA(engine="dense"), prior)
     monkeypatch.setattr("probcal.inference.ea.MANY", 0)
-    propagated = fitted(pc.EA(form=form), prior)
+    propagated = fitted(pc.EA(engine=form), prior)
     assert propagated.attrs["status"] == swept.attrs["status"] == "converged"
     a, b = (tree["calibration"].to_dataset() for tree in (swept, propagated))
     sd = a["sd"].values
@@ -96,7 +96,10 @@ def test_propagation_agrees_with_sweeps_over_all_biases(prior, form, monkeypatch
 
 @pytest.mark.ci
 def test_draws_have_the_means_and_sds(dense):
-    group, draws = dense["calibration"].to_dataset(), fitted(pc.MAP(form="sparse"), pc.Gaussian())["posterior"]["bias"]
+    group, draws = (
+        dense["calibration"].to_dataset(),
+        fitted(pc.MAP(engine="sparse"), pc.Gaussian())["posterior"]["bias"],
+    )
     flat = draws.values.reshape(-1, draws.shape[-1])
     np.testing.assert_allclose(
         (flat.mean(0) - group["mean"].values) / group["sd"].values, 0.0, atol=5 / len(flat) ** 0.5
@@ -271,7 +274,7 @@ def test_draws_resolve_directions_that_data_leave_to_a_wide_prior(least, monkeyp
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 def test_a_fit_without_factors_of_the_biases_ends_where_the_dense_one_does(library, dense, monkeypatch):
     """Means within 1e-4 sds, sds, gamma and evidence within 6 of their standard errors, which are small."""
-    free = fitted(pc.MAP(form="matrix-free"), pc.Gaussian())
+    free = fitted(pc.MAP(engine="matrix-free"), pc.Gaussian())
     a, b = (tree["calibration"].to_dataset() for tree in (dense, free))
     assert free.attrs["status"] == "converged"
     sd, error = a["sd"].values, b["sd_error"].values
@@ -306,7 +309,7 @@ def test_a_flat_prior_on_what_no_row_tells_is_no_fit():
     with pytest.raises(
         FitError, match=r"diverged: no row tells b\.heading; the estimate is invalid. Use a prior, or fix"
     ):
-        pc.fit(pc.Problem(problem.network, MOTION, table), pc.MAP(form="sparse"), prior=pc.Flat())
+        pc.fit(pc.Problem(problem.network, MOTION, table), pc.MAP(engine="sparse"), prior=pc.Flat())
 
 
 def test_a_singular_matrix_is_no_fit(monkeypatch):
@@ -315,7 +318,7 @@ def test_a_singular_matrix_is_no_fit(monkeypatch):
 
     monkeypatch.setattr("probcal.gaussian.joint.factorise", singular)
     with pytest.raises(FitError, match="the information matrix is singular"):
-        fitted(pc.MAP(form="sparse"), pc.Flat())
+        fitted(pc.MAP(engine="sparse"), pc.Flat())
 
 
 def test_a_factor_that_memory_does_not_hold_is_replaced_by_products_or_said(monkeypatch):
@@ -332,8 +335,8 @@ def test_a_factor_that_memory_does_not_hold_is_replaced_by_products_or_said(monk
     tree = fitted(pc.MAP(), pc.Gaussian())
     assert tree.attrs["status"] == "converged"
     assert "matrix-free" in tree.attrs["settings"]
-    for method in (pc.MAP(form="sparse"), pc.EA()):
-        with pytest.raises(FitError, match=r'does not fit in memory: MAP\(form="matrix-free"\) makes none'):
+    for method in (pc.MAP(engine="sparse"), pc.EA()):
+        with pytest.raises(FitError, match=r'does not fit in memory: MAP\(engine="matrix-free"\) makes none'):
             fitted(method)
     monkeypatch.setattr("probcal.gaussian.joint.factorise", full)
     with pytest.raises(FitError, match="not even without a factor: take fewer sensors or a shorter time"):
@@ -355,21 +358,26 @@ def test_a_library_that_has_no_room_says_so(said, monkeypatch):
 @pytest.mark.parametrize(
     ("method", "prior", "settings", "said"),
     [
-        (pc.MAP(form="sparse", trajectory="joint"), pc.Gaussian(), {}, 'takes trajectory="marginal" alone'),
-        (pc.MAP(form="sparse"), pc.Gaussian(correlation={"*.heading": 0.5}), {}, "takes a prior without correlations"),
-        (pc.EA(form="sparse", precisions="maximised"), None, {}, "precisions that are integrated or given"),
-        (pc.MAP(form="sparse"), pc.Gaussian(), {"starts": 3}, "takes one start"),
-        (pc.MAP(form="sparse"), pc.Gaussian(), {"save": ("states",)}, "keeps no draws of states or replicas"),
-        (pc.EA(form="matrix-free"), None, {}, "takes precisions that are given (MAP() with Gaussian() or Flat())"),
-        (pc.MAP(form="matrix-free"), pc.Gaussian(), {"starts": 3}, "takes one start"),
+        (pc.MAP(engine="sparse", trajectory="joint"), pc.Gaussian(), {}, 'takes trajectory="marginal" alone'),
+        (
+            pc.MAP(engine="sparse"),
+            pc.Gaussian(correlation={"*.heading": 0.5}),
+            {},
+            "takes a prior without correlations",
+        ),
+        (pc.EA(engine="sparse", precisions="maximised"), None, {}, "precisions that are integrated or given"),
+        (pc.MAP(engine="sparse"), pc.Gaussian(), {"starts": 3}, "takes one start"),
+        (pc.MAP(engine="sparse"), pc.Gaussian(), {"save": ("states",)}, "keeps no draws of states or replicas"),
+        (pc.EA(engine="matrix-free"), None, {}, "takes precisions that are given (MAP() with Gaussian() or Flat())"),
+        (pc.MAP(engine="matrix-free"), pc.Gaussian(), {"starts": 3}, "takes one start"),
     ],
 )
 def test_what_a_sparse_fit_does_not_do_is_said(method, prior, settings, said):
     with pytest.raises(InputError) as error:
         pc.fit(drawn()[0], method, prior=prior, **settings)
     assert said in str(error.value)
-    if method.form == "matrix-free":
-        assert '(form="matrix-free") takes' in str(error.value)
+    if method.engine == "matrix-free":
+        assert '(engine="matrix-free") takes' in str(error.value)
     elif "save" not in settings:
         assert "on a network of this size is solved in sparse form, which takes" in str(error.value)
 
@@ -377,13 +385,13 @@ def test_what_a_sparse_fit_does_not_do_is_said(method, prior, settings, said):
 def test_forms_are_words():
     for method in (pc.EA, pc.MAP):
         with pytest.raises(InputError, match="give one of auto, dense, sparse"):
-            method(form="thin")
+            method(engine="thin")
 
 
 def test_precisions_need_exact_variances(monkeypatch):
     monkeypatch.setattr("probcal.inference.blockwise.exact", lambda: False)
     with pytest.raises(InputError, match=r"install probcal\[sparse\], or take MAP"):
-        fitted(pc.EA(form="sparse"))
+        fitted(pc.EA(engine="sparse"))
 
 
 def test_what_has_no_sparse_form_is_named():
@@ -394,13 +402,13 @@ def test_what_has_no_sparse_form_is_named():
         pd.DataFrame({"time": [0.0, 1.0], "sensor": ["a", "a"], "azimuth": [0.1, 0.2]}),
     )
     assert missing(problem.model) == ""
-    with pytest.raises(InputError, match='form="sparse"\\) does not take unknown noise levels: give form="dense"'):
-        takes_sparse(pc.MAP(form="sparse"), levels)
+    with pytest.raises(InputError, match='engine="sparse"\\) does not take unknown noise levels: give engine="dense"'):
+        takes_sparse(pc.MAP(engine="sparse"), levels)
     assert not takes_sparse(pc.MAP(), problem)
 
 
 def test_what_needs_the_whole_covariance_says_so():
-    tree = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    tree = fitted(pc.MAP(engine="sparse"), pc.Gaussian())
     with pytest.raises(InputError, match="needs the covariance of all biases, which a fit in sparse form"):
         of_biases(tree, drawn()[1], 0.01)
 
@@ -409,7 +417,7 @@ def test_what_needs_the_whole_covariance_says_so():
 def test_a_sparse_fit_is_assessed_as_a_dense_one(dense):
     """The same innovations, contractions and verdicts; sums of squares over about the same degrees of freedom."""
     problem = drawn()[0]
-    sparse = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    sparse = fitted(pc.MAP(engine="sparse"), pc.Gaussian())
     wanted, found = (pc.assess(problem, tree) for tree in (dense, sparse))
     np.testing.assert_allclose(found["datum_check"]["innovation"], wanted["datum_check"]["innovation"], atol=2e-3)
     assert found["datum_check"].attrs["used"] == pytest.approx(wanted["datum_check"].attrs["used"], rel=0.2)
@@ -437,7 +445,7 @@ def test_levels_of_a_sound_network_are_found_right_by_one_look():
     table = pc.simulate(sound, motion, np.arange(300.0), key=7).table
     for network, expanded in ((sound, False), (wrong, True)):
         problem = pc.Problem(network, motion, table)
-        trees = (calibrate(problem, pc.MAP(form=form), prior=pc.Gaussian())[0] for form in ("dense", "sparse"))
+        trees = (calibrate(problem, pc.MAP(engine=form), prior=pc.Gaussian())[0] for form in ("dense", "sparse"))
         wanted, found = (pc.assess(problem, tree)["level_check"].to_dataset() for tree in trees)
         assert ("shift" in found) is expanded
         assert found["level"].values.tolist() == wanted["level"].values.tolist()
@@ -456,7 +464,7 @@ def test_data_that_scatter_more_than_declared_widen_a_sparse_fit():
     table = problem.measurements.table.frame.copy()
     table["range"] += np.random.default_rng(0).normal(0.0, 5.0, len(table))
     noisy = pc.Problem(problem.network, MOTION, table)
-    dense, sparse = (calibrate(noisy, pc.MAP(form=form), prior=pc.Gaussian())[0] for form in ("dense", "sparse"))
+    dense, sparse = (calibrate(noisy, pc.MAP(engine=form), prior=pc.Gaussian())[0] for form in ("dense", "sparse"))
     wanted, found = pc.assess(noisy, dense), pc.assess(noisy, sparse)
     assert "innovations reject the model" in found.attrs["message"]
     before, a, b = (tree["calibration"].to_dataset() for tree in (sparse, wanted, found))
@@ -471,7 +479,7 @@ def test_data_that_scatter_more_than_declared_widen_a_sparse_fit():
 @pytest.mark.parametrize("many", [False, True])
 def test_tracks_of_a_sparse_calibration_have_the_covariance_of_each_sensor(dense, many, monkeypatch):
     """As the dense one with nothing between sensors, with all biases at once and by columns."""
-    sparse = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    sparse = fitted(pc.MAP(engine="sparse"), pc.Gaussian())
     apart = dense.copy(deep=True)
     group = apart["calibration"].to_dataset()
     owner = np.array(sparse["calibration"]["block"].values)
@@ -493,7 +501,7 @@ def test_tracks_of_a_sparse_calibration_have_the_covariance_of_each_sensor(dense
 
 def test_the_covariance_of_each_sensor_is_that_of_the_dense_form(dense):
     """Of any two biases of a sensor; what a drift and a picture of two biases read."""
-    sparse = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    sparse = fitted(pc.MAP(engine="sparse"), pc.Gaussian())
     group, whole = sparse["calibration"].to_dataset(), dense["calibration"]["covariance"]
     labels = group["bias_label"].values.tolist()
     assert sorted(np.bincount(group["block"].values)) == [1, 1, 4, 4, 5], "a radar also has the gain of its type"
@@ -513,7 +521,7 @@ def test_a_dense_form_that_fits_no_machine_is_refused(monkeypatch):
 
 def test_what_the_data_leave_open_is_named_as_in_the_dense_form(dense):
     """Combinations of single sensors by their information; those of all by the variance of their sum."""
-    sparse = fitted(pc.MAP(form="sparse"), pc.Gaussian())
+    sparse = fitted(pc.MAP(engine="sparse"), pc.Gaussian())
     a, b = (tree["direction"].to_dataset().sortby("information") for tree in (dense, sparse))
     assert a["direction"].values.tolist() == b["direction"].values.tolist()
     np.testing.assert_allclose(b["information"], a["information"], rtol=0.03)
@@ -537,7 +545,7 @@ def unanchored():
 def test_what_all_sensors_share_is_open_in_both_forms():
     """A translation and a rotation of all nodes, one with the information the dense form has."""
     problem = pc.Problem(unanchored()[0], MOTION["car"], unanchored()[1])
-    dense, sparse = (pc.fit(problem, pc.MAP(form=form), prior=pc.Gaussian()) for form in ("dense", "sparse"))
+    dense, sparse = (pc.fit(problem, pc.MAP(engine=form), prior=pc.Gaussian()) for form in ("dense", "sparse"))
     names = [set(tree["direction"]["direction"].values.tolist()) for tree in (dense, sparse)]
     assert {name for name in names[0] if "all nodes" in name} == {name for name in names[1] if "all nodes" in name}
     assert {f"translation of all nodes along {axis}" for axis in "xy"} <= names[1] & names[0]
@@ -551,7 +559,7 @@ def test_a_network_that_ran_along_what_no_row_tells_is_no_answer():
     motion = pc.Target(pc.ConstantVelocity(1.0), start={"position": ((-150.0, 120.0), 1.0)})
     problem = pc.Problem(network, motion, table)
     for form in ("dense", "sparse"):
-        tree = pc.fit(problem, pc.MAP(form=form), prior=pc.Gaussian())
+        tree = pc.fit(problem, pc.MAP(engine=form), prior=pc.Gaussian())
         assert tree.attrs["status"] == "along a gauge", form
         assert "along translation of all nodes along x, which no row fixes: it is invalid" in tree.attrs["message"]
 
@@ -645,7 +653,7 @@ def test_few_of_many_biases_at_an_epoch_take_the_sparse_form(monkeypatch):
     monkeypatch.setattr("probcal.gaussian.joint.THIN", 100.0)
     assert gains_by_sparse(*settings)
     assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(), 2)
-    assert not gains_by_sparse(pc.MAP(form="dense"), problem, pc.Gaussian(), 1)
+    assert not gains_by_sparse(pc.MAP(engine="dense"), problem, pc.Gaussian(), 1)
     assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(correlation={"*": 0.1}), 1)
     monkeypatch.setattr("probcal.gaussian.joint.THIN", 1e-6)
     assert not gains_by_sparse(*settings)

@@ -1,10 +1,10 @@
 """Fits whose dense form does not fit: the marginal mode by sparse factors, precisions integrated by
 propagation.
 
-`EA()` and `MAP()` come here by themselves (`form="auto"`): where the matrices of the dense form
+`EA()` and `MAP()` come here by themselves (`engine="auto"`): where the matrices of the dense form
 take more than 240 MB, and where there are more than 500 biases of which an epoch sees few, which is
 faster. Where memory does not hold the factor either, `MAP` goes on by products alone
-(`form="matrix-free"`). What needs the whole covariance of the biases is not there; variances and
+(`engine="matrix-free"`). What needs the whole covariance of the biases is not there; variances and
 gamma of each are.
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 from probcal.errors import FitError, InputError
 from probcal.gaussian.cholesky import exact
 from probcal.gaussian.climb import climb_to_mode
-from probcal.gaussian.engine import Estimate, Expansion, Factors, Group, Spread, evidence, mean
+from probcal.gaussian.engine import Engine, Estimate, Expansion, Factors, Group, Spread, evidence, mean
 from probcal.gaussian.information import mean_square
 from probcal.gaussian.joint import blocks_of, is_thin, missing, prefers_sparse
 from probcal.gaussian.mode import Point
@@ -49,31 +49,32 @@ HELD = 30.0  # nats that a node may fit worse on its other side, tracks held, an
 NAMED = 20  # combinations of single sensors that are named
 PRODUCTS = "matrix-free"
 SPARSE = ("sparse", PRODUCTS)
-FORMS = ("auto", "dense", *SPARSE)
+ENGINES = ("auto", "dense", *SPARSE)
 
 
 def takes_sparse(method: Maximiser, problem: Problem) -> bool:
     """Whether a method is to solve a problem in its sparse form; raises `InputError` where that was
     asked in vain."""
-    form = getattr(method, "form", "dense")
+    asked = getattr(method, "engine", "dense")
+    given = asked not in ("auto", "dense")
     lacks = missing(problem.model)
-    if form in SPARSE and lacks:
-        raise InputError(f'{method.name}(form="{form}") does not take {lacks}: give form="dense"')
-    return bool(form in SPARSE or (form == "auto" and not lacks and prefers_sparse(problem.model)))
+    if given and lacks:
+        raise InputError(f'{method.name}(engine="{asked}") does not take {lacks}: give engine="dense"')
+    return bool(given or (asked == "auto" and not lacks and prefers_sparse(problem.model)))
 
 
 def gains_by_sparse(method: Maximiser, problem: Problem, prior: Prior, starts: int) -> bool:
     """Whether a fit that may take either form is faster in the sparse one, and loses nothing that
     was asked."""
-    either = getattr(method, "form", "dense") == "auto" and not missing(problem.model)
+    either = getattr(method, "engine", "dense") == "auto" and not missing(problem.model)
     return either and is_thin(problem.model) and not _lacking(method, prior, starts)
 
 
 def check_sparse(method: Maximiser, prior: Prior, starts: int) -> None:
     """Raise `InputError` naming what a sparse fit does not do."""
     if wrong := _lacking(method, prior, starts):
-        if getattr(method, "form", "") == PRODUCTS:
-            raise InputError(f'{method.name}(form="{PRODUCTS}") takes {wrong}')
+        if getattr(method, "engine", "") == PRODUCTS:
+            raise InputError(f'{method.name}(engine="{PRODUCTS}") takes {wrong}')
         raise InputError(f"{method.name} on a network of this size is solved in sparse form, which takes {wrong}")
 
 
@@ -84,7 +85,7 @@ def _lacking(method: Maximiser, prior: Prior, starts: int) -> str:
         wrong = 'trajectory="marginal" alone'
     elif prior.correlation:
         wrong = "a prior without correlations"
-    elif getattr(method, "form", "") == PRODUCTS and not isinstance(prior, (Gaussian, Flat)):
+    elif getattr(method, "engine", "") == PRODUCTS and not isinstance(prior, (Gaussian, Flat)):
         wrong = "precisions that are given (MAP() with Gaussian() or Flat())"
     elif not (method.integrates(prior) if hasattr(method, "integrates") else isinstance(prior, (Gaussian, Flat))):
         wrong = (
@@ -168,7 +169,7 @@ class BlockPosterior(Posterior):
         if {"states", "replicas"} & set(keep):
             raise InputError(
                 "fit(save=...): a fit in sparse form keeps no draws of states or replicas; leave save out, or give"
-                ' form="dense"'
+                ' engine="dense"'
             )
 
     def log_prior(self, draws: Draws) -> np.ndarray | None:
@@ -191,8 +192,8 @@ class BlockPosterior(Posterior):
 def blockwise_answer(method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
     """The answer of `EA` or `MAP` by blocks of sensors; raises `FitError` where a flat prior leaves
     no interval."""
-    model, products = problem.model, getattr(method, "form", "") == PRODUCTS
-    engine = SparseEngine(products)
+    model, products = problem.model, getattr(method, "engine", "") == PRODUCTS
+    engine = engine_of(getattr(method, "engine", ""))
     integrated = hasattr(method, "integrates") and method.integrates(prior)
     first = prior.precision(problem.labels, problem.surveyed)
     declared = Precision.single(jnp.ones(model.biases)) if integrated else first
@@ -224,11 +225,11 @@ def blockwise_answer(method: Maximiser, problem: Problem, prior: Prior, start: P
             raise FitError(
                 f"memory does not hold {size}, not even without a factor: take fewer sensors or a shorter time"
             ) from None
-        if getattr(method, "form", "") == "auto" and isinstance(prior, (Gaussian, Flat)):
-            return blockwise_answer(replace(cast("Any", method), form=PRODUCTS), problem, prior, start, context)
+        if getattr(method, "engine", "") == "auto" and isinstance(prior, (Gaussian, Flat)):
+            return blockwise_answer(replace(cast("Any", method), engine=PRODUCTS), problem, prior, start, context)
         raise FitError(
             f"the sparse factor of {size} does not fit in memory:"
-            f' MAP(form="{PRODUCTS}") makes none; or take fewer sensors or a shorter time'
+            f' MAP(engine="{PRODUCTS}") makes none; or take fewer sensors or a shorter time'
         ) from None
     except np.linalg.LinAlgError:
         raise diverged(problem, engine.at(model, start), factors) from None
@@ -252,19 +253,24 @@ def diverged(problem: Problem, at: Expansion, factors: Factors) -> FitError:
     return FitError(f"The fit diverged: {why}; the estimate is invalid. Use a prior, or fix some biases.")
 
 
-def side_climb(problem: Problem, form: str) -> SideClimb:
+def engine_of(asked: Any) -> Engine:
+    """The engine of a large network by its name, or itself."""
+    return SparseEngine(asked == PRODUCTS) if isinstance(asked, str) else asked
+
+
+def side_climb(problem: Problem, asked: Any) -> SideClimb:
     """To the marginal mode, with its log evidence, or without a factor its log marginal density.
 
     An estimated log determinant of the biases would blur what tells the sides apart; reflected it
     is nearly the same.
     """
-    engine, scales = SparseEngine(form == PRODUCTS), Precision.single(jnp.ones(problem.model.biases))
+    engine, scales = engine_of(asked), Precision.single(jnp.ones(problem.model.biases))
     factors = Factors.of(scales)
 
     def mode(point: Point) -> tuple[Point, float]:
         try:
             found = climb_to_mode(lambda at: engine.settled(problem.model, at), point, factors, STEPS, 1e-3)
-            worth = -found.value if engine.products else evidence(found.at, scales, factors).value
+            worth = -found.value if asked == PRODUCTS else evidence(found.at, scales, factors).value
             return found.at.point, worth
         except (np.linalg.LinAlgError, FitError):  # not positive definite, or conjugate gradients did not end
             return point, -np.inf

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -21,8 +21,8 @@ from probcal.gaussian.information import at_levels
 from probcal.gaussian.linearised import Linearisation, held_noises, linearise, roots_of
 from probcal.gaussian.mode import Eliminated, Point
 from probcal.gaussian.places import tilt_at
-from probcal.gaussian.sparse import SparseEngine, SparseExpansion
-from probcal.inference.blockwise import BlockPosterior, declared_blocks
+from probcal.gaussian.sparse import SparseEngine
+from probcal.inference.blockwise import BlockPosterior, declared_blocks, engine_of
 from probcal.lazy import Later
 from probcal.model.model import Recursion
 from probcal.model.motions import level_logs
@@ -196,17 +196,18 @@ class Fitted(Judged):
 class JudgedLarge(Judged):
     """A fit in sparse form taken up again."""
 
-    at: SparseExpansion
+    at: Expansion
     blocks: SensorBlocks  # of the covariance of z
     gamma: np.ndarray | None  # (M,) how well the data determine each bias; None where they did not see the biases
     scaled: SensorBlocks | None = None  # of that covariance under a prior of the declared scales, where it is known
+    solver: Engine = field(default_factory=SparseEngine)
 
     whole: ClassVar[bool] = False
 
     @property
     def engine(self) -> Engine:
-        """The sparse one."""
-        return SparseEngine()
+        """That of the fit, the sparse one where it came from a file."""
+        return self.solver
 
     @property
     def expansion(self) -> Expansion:
@@ -283,17 +284,16 @@ def _taken_large(
     problem: Problem, tree: xr.DataTree, answer: Answer | None, data: pd.DataFrame, picks: list[Any]
 ) -> JudgedLarge:
     posterior, group = None if answer is None else answer.posterior, tree["calibration"].to_dataset()
-    scaled = None
+    scaled, solver = None, engine_of(getattr(answer.method, "engine", "") if answer is not None else "")
     if isinstance(posterior, BlockPosterior):
         at, scaled = posterior.at, posterior.declared
     else:
         point = point_of(problem, tree) if posterior is None else posterior.point
         at = SparseEngine().settled(problem.model, point)
-    assert isinstance(at, SparseExpansion)
     blocks = SensorBlocks.read(group, problem.labels, problem.scales)
     prior = Precision.single(jnp.asarray(group["precision"].values))
     own = (problem, at.point, at.rows, at.eliminated, picks, data, prior)
-    return JudgedLarge(*own, at, blocks, group["gamma"].values, scaled)
+    return JudgedLarge(*own, at, blocks, group["gamma"].values, scaled, solver)
 
 
 def identified(problem: Problem, fit: xr.DataTree, answer: Answer | None) -> tuple[Problem, pd.DataFrame, list[Any]]:

@@ -152,7 +152,7 @@ def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> Me
         return method
     if isinstance(method, Maximiser) and gains_by_sparse(method, problem, prior, starts):
         sparse: Any = method  # of those that have a form
-        return replace(sparse, form="sparse")
+        return replace(sparse, engine="sparse")
     check_room(problem.model)
     return None
 
@@ -167,7 +167,7 @@ def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point
         found = method.answer(problem, prior, start, context)
         used = cast("Method", found.method)  # "matrix-free" where memory held no factor
         try:
-            return _beside_mirrors(found, used, context, side_climb(problem, getattr(used, "form", "")))
+            return _beside_mirrors(found, used, context, side_climb(problem, getattr(used, "engine", "")))
         except MemoryError:
             unseen = "Memory did not hold what looking at the other side of a mirror takes."
             return replace(found, message=f"{found.message} {unseen}".strip())
@@ -305,7 +305,7 @@ def _like_first(
 
 def _weight(answer: Answer) -> float:
     """What sides are compared by: the evidence, or where that is estimated the log marginal density of the biases."""
-    if getattr(answer.method, "form", "") == PRODUCTS and answer.trace is not None:
+    if getattr(answer.method, "engine", "") == PRODUCTS and answer.trace is not None:
         return float(answer.trace[-1])
     return answer.objective
 

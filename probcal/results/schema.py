@@ -92,7 +92,7 @@ def matrix_of(group: Any, name: str, whose: str) -> Any:
     if name not in group:
         raise InputError(
             f"{whose} needs the {name} of all biases, which a fit in sparse form does not hold: fit fewer sensors, or"
-            ' take EA(form="dense") where it fits'
+            ' take EA(engine="dense") where it fits'
         )
     return group[name]
 
