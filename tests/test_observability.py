@@ -470,7 +470,7 @@ def test_planning_works_for_every_kind(kinds, dimension, scale, motion, monkeypa
     wanted = [plan(problem, point=point)["gain"].values for plan in (next_passes, next_sensors)]
     with monkeypatch.context() as patch:
         patch.setattr("probcal.analysis.additions.REACHED", 100.0)
-        for name in ("joint", "room"):
+        for name in ("choose", "room"):
             patch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
         for plan, gain in zip((next_passes, next_sensors), wanted, strict=True):
             np.testing.assert_allclose(plan(problem, point=point)["gain"].values, gain, rtol=1e-5, atol=1e-6)

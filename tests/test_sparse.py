@@ -330,7 +330,7 @@ def test_a_factor_that_memory_does_not_hold_is_replaced_by_products_or_said(monk
         "probcal.gaussian.joint.factorise",
         lambda places, values: full(places, values) if places.size > states else kept(places, values),
     )
-    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 100)
+    monkeypatch.setattr("probcal.gaussian.choose.ROOM", 100)
     states = JointPrecision.of(drawn()[0].model).states
     tree = fitted(pc.MAP(), pc.Gaussian())
     assert tree.attrs["status"] == "converged"
@@ -486,7 +486,7 @@ def test_tracks_of_a_sparse_calibration_have_the_covariance_of_each_sensor(dense
     group["covariance"] = group["covariance"] * (owner[:, None] == owner[None])
     apart["calibration"] = group
     wanted = pc.track(drawn()[0], apart)
-    monkeypatch.setattr(sys.modules["probcal.inference.fit"], "too_large", lambda model: many)
+    monkeypatch.setattr("probcal.gaussian.choose.prefers_sparse", lambda model: many)
     found, whole = pc.track(drawn()[0], sparse), pc.track(drawn()[0], apart)
     for name in ("car", "van", "mast"):
         one = wanted[f"track/{name}"].to_dataset()
@@ -574,7 +574,7 @@ def test_observability_by_the_sparse_engine_is_that_by_the_dense_one(whole, anch
     with jax.enable_x64(True):
         point = automatic_start(problem)
     wanted = pc.observability(problem, point=point)
-    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 0)
+    monkeypatch.setattr("probcal.gaussian.choose.ROOM", 0)
     if not whole:
         monkeypatch.setattr("probcal.gaussian.sparse.WHOLE", 0)
     found = pc.observability(problem, point=point)
@@ -628,8 +628,7 @@ def weak_of_all(tree):
 def test_check_of_a_large_network_says_what_is_open(monkeypatch, capsys, tmp_path):
     """The command line with the sparse form: biases that the data tell least of, directions, status, files."""
     pytest.importorskip("sparsax", reason="sparsax is an extra")
-    for name in ("gaussian.choose", "cli.check", "analysis.standpoint", "analysis.planning"):
-        monkeypatch.setattr(sys.modules[f"probcal.{name}"], "too_large", lambda model: True)
+    monkeypatch.setattr("probcal.gaussian.choose.prefers_sparse", lambda model: True)
     monkeypatch.setattr("probcal.cli.check.MANY", 10)
     monkeypatch.setattr("probcal.cli.check.SHOWN", 5)
     given = {"side": 3, "targets": 1, "epochs": 40}
@@ -649,13 +648,13 @@ def test_few_of_many_biases_at_an_epoch_take_the_sparse_form(monkeypatch):
     problem = drawn()[0]
     settings = (pc.MAP(), problem, pc.Gaussian(), 1)
     assert not gains_by_sparse(*settings)
-    monkeypatch.setattr("probcal.gaussian.joint.MANY", 5)
-    monkeypatch.setattr("probcal.gaussian.joint.THIN", 100.0)
+    monkeypatch.setattr("probcal.gaussian.choose.MANY", 5)
+    monkeypatch.setattr("probcal.gaussian.choose.THIN", 100.0)
     assert gains_by_sparse(*settings)
     assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(), 2)
     assert not gains_by_sparse(pc.MAP(engine="dense"), problem, pc.Gaussian(), 1)
     assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(correlation={"*": 0.1}), 1)
-    monkeypatch.setattr("probcal.gaussian.joint.THIN", 1e-6)
+    monkeypatch.setattr("probcal.gaussian.choose.THIN", 1e-6)
     assert not gains_by_sparse(*settings)
 
 
@@ -693,7 +692,7 @@ def test_a_fit_of_many_data_keeps_what_a_mail_holds(monkeypatch, tmp_path):
 def test_bounds_by_sparse_factors_are_those_of_the_dense_form(kind, library, monkeypatch):
     problem, truth = drawn()
     wanted = pc.bounds(problem, kind=kind, truth=truth, draws=3)
-    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 0)
+    monkeypatch.setattr("probcal.gaussian.choose.ROOM", 0)
     found = pc.bounds(problem, kind=kind, truth=truth, draws=3)
     close = 1e-6 if library is Cholmod else 0.15  # 512 draws tell a variance to 6 %
     a, b = (tree["bias"].to_dataset() for tree in (wanted, found))
@@ -718,7 +717,7 @@ def test_what_has_no_bound_has_none_by_sparse_factors(library, monkeypatch):
     placed = [(turned_ear if s.type is ear else s.type).on(s.nodes[0]) for s in problem.network.sensors]
     problem = pc.Problem(pc.Network(placed), MOTION, problem.measurements.table)
     wanted = pc.bounds(problem, kind="parametric", truth=pc.Truth(truth.tracks))
-    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 0)
+    monkeypatch.setattr("probcal.gaussian.choose.ROOM", 0)
     found = pc.bounds(problem, kind="parametric", truth=pc.Truth(truth.tracks))
     open_ = found["unbounded"]["bias_label"].values.tolist()
     assert set(open_) == {"d.heading", "e.heading", *(f"{s.name}.offset" for s in problem.network.sensors[3:])}
@@ -731,7 +730,7 @@ def test_surveys_of_many_biases_tell_what_those_of_few_do(monkeypatch):
     pytest.importorskip("sparsax", reason="sparsax is an extra")
     problem, _ = drawn()
     wanted = pc.next_anchors(problem)
-    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 0)
+    monkeypatch.setattr("probcal.gaussian.choose.ROOM", 0)
     point = automatic_start(problem)
     found, same = pc.next_anchors(problem, point=point), wanted.drop_vars("weak")
     xr.testing.assert_allclose(found.sortby("anchor"), same.sortby("anchor"), rtol=1e-6)
@@ -768,7 +767,7 @@ def test_passes_of_a_large_network_tell_what_those_of_a_small_one_do(library, mo
     problem, point = all_seen()
     lines = [[(0.0, 0.0), (300.0, 300.0)], [(100.0, 100.0), (250.0, 200.0)], [(9e5, 0.0), (9e5, 100.0)]]
     wanted = pc.next_passes(problem, point=point, passes=lines[:2])
-    for name in ("joint", "room"):
+    for name in ("choose", "room"):
         monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
     monkeypatch.setattr("probcal.analysis.additions.REACHED", 2.0)
     found = pc.next_passes(problem, point=point, passes=lines)
@@ -786,7 +785,7 @@ def test_passes_of_a_large_network_tell_what_those_of_a_small_one_do(library, mo
 def test_a_pass_is_seen_by_the_sensors_that_it_comes_near_to(library, monkeypatch):
     """Where sensors reach so far as they did, those beyond see nothing: as if they had no row."""
     problem, point = all_seen()
-    for name in ("joint", "room"):
+    for name in ("choose", "room"):
         monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
     line = [[(0.0, 0.0), (300.0, 300.0)]]
     gains = []
@@ -803,7 +802,7 @@ def test_sensors_of_a_large_network_tell_what_those_of_a_small_one_do(library, m
     problem, point = all_seen()
     places = [(100.0, 50.0), (200.0, 200.0), (0.0, 300.0)]
     wanted = pc.next_sensors(problem, point=point, places=places)
-    for name in ("joint", "room"):
+    for name in ("choose", "room"):
         monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
     monkeypatch.setattr("probcal.analysis.additions.REACHED", 2.0)
     found = pc.next_sensors(problem, point=point, places=[*places, (9e5, 0.0)])
@@ -832,7 +831,7 @@ def both_forms(problem, point, monkeypatch, reached=100.0, **asked):
               zip(calls, ("passes", "places"), strict=True)]]  # fmt: skip
     with monkeypatch.context() as patch:
         patch.setattr("probcal.analysis.additions.REACHED", reached)
-        for name in ("joint", "room"):
+        for name in ("choose", "room"):
             patch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
         gains.append([call(problem, point=point, **{name: given})["gain"].values for (call, given), name in
                       zip(calls, ("passes", "places"), strict=True)])  # fmt: skip
@@ -864,7 +863,7 @@ def test_what_planning_of_a_large_network_cannot_say_it_says(monkeypatch):
     problem = pc.Problem(network, pc.ConstantVelocity(1.0), run.table)
     with jax.enable_x64(True):
         point = automatic_start(problem)
-    for name in ("joint", "room"):
+    for name in ("choose", "room"):
         monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
     with pytest.raises(InputError, match="pass 0 runs over the place of a sensor that has no derivative there"):
         pc.next_passes(problem, point=point, passes=[[(0.0, 0.0), (0.0, 0.0)]])
@@ -893,7 +892,7 @@ def test_what_planning_of_a_large_network_cannot_say_it_says(monkeypatch):
     + [pytest.param(pc.log_evidence, id="log_evidence")],
 )
 def test_what_needs_the_dense_form_says_so_where_there_is_no_room(asked, monkeypatch):
-    for name in ("joint", "room"):
+    for name in ("choose", "room"):
         monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
     with pytest.raises(InputError, match=r"the dense form of 15 biases .* for all else take fewer sensors"):
         asked(drawn()[0])
@@ -904,7 +903,7 @@ def test_bounds_that_rounding_hides_are_none(monkeypatch):
     def singular(*_):
         raise np.linalg.LinAlgError("not positive definite")
 
-    monkeypatch.setattr("probcal.gaussian.joint.ROOM", 0)
+    monkeypatch.setattr("probcal.gaussian.choose.ROOM", 0)
     monkeypatch.setattr("probcal.gaussian.joint.JointPrecision.factor", singular)
     with pytest.raises(InputError, match=r'rounding hides which biases of so many have none; .* take kind="posterior"'):
         pc.bounds(drawn()[0], kind="hybrid", truth=drawn()[1], draws=1)

@@ -17,8 +17,9 @@ import xarray as xr
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
 from probcal.errors import InputError, nearest
 from probcal.gaussian import cholesky
+from probcal.gaussian.choose import choose
 from probcal.gaussian.engine import Factors
-from probcal.gaussian.joint import JointPrecision, too_large
+from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.linearised import Trajectory, linearise_rows, state_variances, trajectories_of
 from probcal.gaussian.mode import Compressed, compress, eliminate_compressed
 from probcal.labels import NOBODY, listed
@@ -75,7 +76,7 @@ def bounds(
         z = jnp.broadcast_to(true_biases(problem, given), (draws, model.biases))
         z = jax.random.normal(keys[1], z.shape) if kind == "posterior" else z
     prior = np.ones(model.biases) if kind == "posterior" else problem.surveyed.astype(float)
-    if too_large(problem.model):
+    if not choose(problem.model).cheap:
         variance, bounded, spread = _by_sparse(model, levels, z, states, prior)
         return _tree(problem, kind, len(z), np.sqrt(variance), None, bounded, spread)
     compressed = average(model, levels, z, states)

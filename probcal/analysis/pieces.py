@@ -13,7 +13,6 @@ import numpy as np
 
 from probcal.inference.fitted import Judged
 from probcal.model import variants
-from probcal.model.model import Model
 from probcal.problem import Problem
 
 Limit = Callable[[int], float]  # chi-square by degrees of freedom
@@ -59,16 +58,11 @@ class Contrast(NamedTuple):
 
 def divide(fit: Judged, piece: np.ndarray, count: int) -> Pieces:
     """Give every piece its own biases; `piece` (rows,) is that of each row of the table, below `count`."""
-    model = copied(fit, piece, count)
+    model = variants.split(fit.problem.model, [piece[index] for index in fit.problem.row_index], count)
     at = fit.engine.at(model, fit.point._replace(z=jnp.asarray(np.tile(fit.point.z, count))), tuple(fit.lins))
     information, prior = at.information(), fit.factors.matrix(fit.problem.model.biases)
     assert information is not None
     return Pieces(information, np.asarray(at.slope()), prior, np.asarray(fit.point.z))
-
-
-def copied(fit: Judged, piece: np.ndarray, count: int) -> Model:
-    """The problem with a table of sensors for every piece, each pointing to its own biases."""
-    return variants.split(fit.problem.model, [piece[index] for index in fit.problem.row_index], count)
 
 
 def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.ndarray]] = ()) -> dict[int, Contrast]:

@@ -16,8 +16,9 @@ from probcal.analysis.additions import Informed, gains_of_passes, gains_of_senso
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
 from probcal.gaussian.cholesky import exact
+from probcal.gaussian.choose import choose
 from probcal.gaussian.engine import Factors
-from probcal.gaussian.joint import JointPrecision, too_large
+from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.linearised import linearise_rows, marginal_information
 from probcal.gaussian.mode import Point
 from probcal.gaussian.room import check_room
@@ -55,7 +56,7 @@ def next_passes(
     a pass that meets more biases than matrices can be made of.
     """
     check_free(problem)
-    large = too_large(problem.model)
+    large = not choose(problem.model).cheap
     if not large:
         check_room(problem.model)
     point = standpoint(problem, point, truth)
@@ -106,7 +107,7 @@ def next_anchors(
         raise InputError(f"next_anchors: survey={survey} must be positive, a std over the scale of a bias")
     check_free(problem)
     point = standpoint(problem, point, truth)
-    if too_large(problem.model):
+    if not choose(problem.model).cheap:
         return _anchors_of_many(problem, point, survey)
     known = _information(problem, point)
     whole = known + np.eye(len(known))
@@ -208,7 +209,7 @@ def next_sensors(
     True
     """
     check_free(problem)
-    large = too_large(problem.model)
+    large = not choose(problem.model).cheap
     if not large:
         check_room(problem.model)
     point = standpoint(problem, point, truth)

@@ -8,7 +8,7 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.gaussian import recursion as rec
-from probcal.gaussian.joint import too_large
+from probcal.gaussian.choose import choose
 from probcal.gaussian.mode import Point, factors
 from probcal.modes import automatic_start
 from probcal.modes.grid import grid_start, track_mode
@@ -30,7 +30,7 @@ def check_free(problem: Problem) -> None:
 def standpoint(problem: Problem, point: Point | None, truth: Truth | None) -> Point:
     """The point where a problem is looked at: a given one, that of a truth, else the automatic start."""
     if point is not None or truth is None:
-        if point is None and too_large(problem.model):
+        if point is None and not choose(problem.model).cheap:
             return grid_start(problem, jnp.asarray(problem.first_z), START_STEPS)
         return automatic_start(problem) if point is None else point
     z, states = true_point(problem, truth)

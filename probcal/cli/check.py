@@ -15,7 +15,7 @@ from probcal.cli.models import load_problem, on_network
 from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs
-from probcal.gaussian.joint import too_large
+from probcal.gaussian.choose import choose
 from probcal.gaussian.mode import Point
 from probcal.inference.progress import Monitor
 from probcal.labels import NOBODY
@@ -38,7 +38,7 @@ def run(
 ) -> int:  # fmt: skip
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
     problem = on_network(load_problem(model, data, fix, given)[1], network)
-    if too_large(problem.model):
+    if not choose(problem.model).cheap:
         return _check_many(problem, model, outputs)
     with shown() as progress:
         monitor = Monitor(progress)

@@ -22,30 +22,8 @@ from probcal.gaussian.cholesky import Entries, Factor, factorise, mirrored
 from probcal.gaussian.engine import Factors
 from probcal.gaussian.mode import factors
 from probcal.gaussian.products import Products
-from probcal.gaussian.room import ROOM, dense_numbers
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
-
-MANY, THIN = 500, 0.25  # biases, and the share of them that an epoch sees, from which the sparse form is the faster
-
-
-def prefers_sparse(model: Model) -> bool:
-    """Whether the matrices of the dense form take more than 240 MB."""
-    return dense_numbers(model) > ROOM
-
-
-def is_thin(model: Model) -> bool:
-    """Whether an epoch sees few of many biases: more than 500, less than a quarter of them."""
-    if model.biases <= MANY:
-        return False
-    seen = sum(int(np.sum(np.asarray(data.bias)[np.asarray(data.sensor)] < model.biases)) for data in model.rows)
-    epochs = sum(part.drift.shape[0] for part in model.recursions)
-    return seen < THIN * epochs * model.biases
-
-
-def too_large(model: Model) -> bool:
-    """Whether a model has a sparse form and the dense one takes more than 240 MB."""
-    return prefers_sparse(model) and not missing(model)
 
 
 def missing(model: Model) -> str:

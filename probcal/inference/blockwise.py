@@ -20,10 +20,11 @@ import numpy as np
 
 from probcal.errors import FitError, InputError
 from probcal.gaussian.cholesky import exact
+from probcal.gaussian.choose import is_thin, prefers_sparse
 from probcal.gaussian.climb import climb_to_mode
 from probcal.gaussian.engine import Engine, Estimate, Expansion, Factors, Group, Spread, evidence, mean
 from probcal.gaussian.information import mean_square
-from probcal.gaussian.joint import blocks_of, is_thin, missing, prefers_sparse
+from probcal.gaussian.joint import blocks_of, missing
 from probcal.gaussian.mode import Point
 from probcal.gaussian.sparse import SparseEngine
 from probcal.identifiability.directions import alone_directions, screened_directions, shared_directions

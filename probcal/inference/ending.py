@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from probcal.gaussian.choose import choose
 from probcal.gaussian.draws import residuals
 from probcal.gaussian.information import growing_square, rejected, squares_of
-from probcal.gaussian.joint import too_large
 from probcal.gaussian.mode import Point
 from probcal.inference.mixture import MixturePosterior
 from probcal.labels import listed
@@ -179,7 +179,7 @@ def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
     misfit: then the automatic start is compared.
     """
     grown = growing_square(problem.model, point)
-    if square <= ABSURD and grown > DOUBTED and not (_drawn(problem) or too_large(problem.model)):
+    if square <= ABSURD and grown > DOUBTED and choose(problem.model).cheap and not _drawn(problem):
         least = growing_square(problem.model, automatic_start(problem))
         if 2.0 * least < grown:
             return (

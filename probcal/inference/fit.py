@@ -15,7 +15,6 @@ import numpy as np
 from probcal.errors import FitError, InputError
 from probcal.gaussian.choose import choose
 from probcal.gaussian.information import at_levels
-from probcal.gaussian.joint import too_large
 from probcal.gaussian.linearised import linearise
 from probcal.gaussian.mode import Point
 from probcal.gaussian.tails import settle
@@ -295,7 +294,7 @@ def track(
     if smoother is not None:
         return smoother.tracked(problem, found.z, found.covariance, found.levels, as_key(key))
     check_linear(problem)
-    if too_large(problem.model):
+    if not choose(problem.model).cheap:
         tracks, before, after = _many_tracks(problem, found)
         return judge_tracks(build_tracks(problem, bands(tracks, before)), problem, found, after)
     covariance = jnp.asarray(found.covariance)

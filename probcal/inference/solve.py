@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.gaussian.joint import too_large
+from probcal.gaussian.choose import choose
 from probcal.gaussian.mode import Point
 from probcal.gaussian.room import check_room
 from probcal.inference.blockwise import PRODUCTS, check_sparse, gains_by_sparse, side_climb, takes_sparse
@@ -53,7 +53,7 @@ def solve(
         problem, start = taken_there(problem, start)
     else:
         problem = first_times(problem, lambda: bool(monitor.stopped))
-        if all(form is None for form in problem.model.sampled) and not too_large(problem.model):
+        if all(form is None for form in problem.model.sampled) and choose(problem.model).cheap:
             found = optima_of(problem, stopped=lambda: bool(monitor.stopped))
             problem, point = settled_times(problem, found[0].point)
             start = point if len(found) == 1 and starts == 1 else None

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.choose import choose
 from probcal.gaussian.information import squares_of
-from probcal.gaussian.joint import too_large
 from probcal.gaussian.mode import Point
 from probcal.modes.automatic import mode_from_start, sparse_cost
 from probcal.modes.grid import follow_states, grid_start
@@ -39,7 +39,7 @@ def first_times(problem: Problem, stopped: Callable[[], bool] = lambda: False) -
     part around each of its steps.
     """
     problem = problem.retimed(problem.first_z)
-    if too_large(problem.model):
+    if not choose(problem.model).cheap:
         return problem
     for rows, columns in _parts(problem):
         part = problem if rows.all() else problem.select(rows)
