@@ -47,12 +47,12 @@ def main():
     parser.add_argument("--epochs", type=int, default=1000)
     parser.add_argument("--reach", type=float, default=large_network.REACH)
     parser.add_argument("--method", choices=METHODS, default="ea")
-    parser.add_argument("--form", default="auto")
+    parser.add_argument("--engine", default="auto")
     parser.add_argument("--save", type=Path, help="write the fit, to say how large its file is")
     parser.add_argument("--drift", type=float, help="assess the fit, three radars' ranges so many m longer later on")
     chosen = parser.parse_args()
     kind, prior = METHODS[chosen.method]
-    method, found = pc.Gibbs() if kind is pc.Gibbs else kind(engine=chosen.form), []
+    method, found = pc.Gibbs() if kind is pc.Gibbs else kind(engine=chosen.engine), []
     for side in chosen.side:
         targets = chosen.targets or max(1, round(20 * (side / 100) ** 2))
         given = {"side": side, "targets": targets, "epochs": chosen.epochs, "reach": chosen.reach}

@@ -25,6 +25,7 @@ from probcal.analysis.pieces import Change, Contrast
 from probcal.analysis.segments import Compared, Grid
 from probcal.analysis.verdict import RATE
 from probcal.gaussian import cholesky
+from probcal.gaussian.draws import many_data
 from probcal.identifiability.directions import shared_in_blocks
 from probcal.identifiability.remedies import WEAK
 from probcal.inference import residuals
@@ -66,8 +67,8 @@ def assess(
     Refits of large networks are one step from the fit (attribute `refits` of the group), and
     without matrices of all biases only the sensors and targets of the largest mean squares are left
     out (`sensor_left`, `target_left`). Of a misfit nothing is left out and no halves are compared;
-    nor is anything that needs a factor of the biases where the fit has none. Raises `InputError`
-    where the tree is no fit of the problem.
+    nor is anything that needs a factor of the biases where the fit has none. A large network of
+    more than 500,000 data has no replicas. Raises `InputError` where the tree is no fit of the problem.
 
     >>> checked = assess(problem, tree)
     >>> checked["verdict"]["verdict"].sel(bias_label="sonar_1.range_offset").item()
@@ -87,7 +88,8 @@ def _assessed(fit: Judged, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     keys, group = jax.random.split(key, 3), tree["calibration"].to_dataset()
     without = "log_evidence_error" in tree.attrs or ("sd_error" in group and cholesky.exact())  # a factor of the biases
     whole = fit.engine.cheap or not without
-    drawn = predictive.draws_of(fit, tree, keys[0]) if whole else None
+    drawable = fit.engine.cheap or (whole and not many_data(fit.problem.model))
+    drawn = predictive.draws_of(fit, tree, keys[0]) if drawable else None
     replicas = None if drawn is None else predictive.check_replicas(fit, drawn, keys[1])
     found = residuals.innovations(fit, residuals.measured_kurtosis(fit) if replicas is None else replicas.kurtosis)
     groups: dict[str, xr.Dataset] = {"epoch_check": xr.Dataset()} | checks.by_epoch(fit, found.innovations)
