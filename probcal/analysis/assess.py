@@ -68,7 +68,8 @@ def assess(
     without matrices of all biases only the sensors and targets of the largest mean squares are left
     out (`sensor_left`, `target_left`). Of a misfit nothing is left out and no halves are compared;
     nor is anything that needs a factor of the biases where the fit has none. A large network of
-    more than 500,000 data has no replicas. Raises `InputError` where the tree is no fit of the problem.
+    more than 500,000 data has no replicas. Raises `InputError` where the tree is no fit of the
+    problem.
 
     >>> checked = assess(problem, tree)
     >>> checked["verdict"]["verdict"].sel(bias_label="sonar_1.range_offset").item()

@@ -125,11 +125,8 @@ def compare_segments(
         wide = residuals.scatter_of(fit.data, freed, channels.members)
         return residuals.inflation(fit, wide.size * wide.memory, channels.group)
 
-    if fit.engine.cheap:
-        by: _ByPieces | _ByDifferences = _ByPieces(fit, grid)
-        return by.compared({name: inflation(by.own_shift(name)) for name in grid.patterns})
     with suppress(MemoryError, np.linalg.LinAlgError):
-        by = _ByDifferences(fit, grid)
+        by = _ByPieces(fit, grid) if fit.engine.cheap else _ByDifferences(fit, grid)
         return by.compared({name: inflation(by.own_shift(name)) for name in grid.patterns})
     return None
 
