@@ -119,7 +119,7 @@ def _assessed(fit: Judged, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     if compared is not None and compared.alone:
         groups["halves"] = segments.group_of(fit.problem, compared, grid)
     groups["verdict"] = _verdicts(fit, tree, found, rejected, compared, grid, bent, doubts)
-    findings += _unlooked(compared)
+    findings += [] if compared is None else _not_compared(compared.unsolved)
     if not (any(f.kind == "outliers" for f in findings) or (groups["verdict"]["verdict"] == "drifting").any()):
         findings += more  # else the levels are only a sign of these
     findings += mirror_findings(tree)
@@ -137,11 +137,9 @@ def _assessed(fit: Judged, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     return completed(result, text, groups, findings)
 
 
-def _unlooked(compared: Compared | None) -> list[Finding]:
-    if compared is None or not compared.unsolved:
-        return []
-    text = f"{compared.unsolved} more biases may change than were looked at together: so many are no drift of one"
-    return [Finding("halves", "fit", text)]
+def _not_compared(count: int) -> list[Finding]:
+    text = f"{count} more biases may have changed and were not compared: so many are rarely drifts of single biases"
+    return [Finding("halves", "fit", text)] if count else []
 
 
 def _verdicts(

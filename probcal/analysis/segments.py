@@ -163,7 +163,7 @@ class _ByDifferences:
 
     def __init__(self, fit: Judged, grid: Grid):
         model, M = fit.problem.model, fit.problem.model.biases
-        self.fit, self.grid, self.columns = fit, grid, dict[str, list[int]]()
+        self.fit, self.columns = fit, dict[str, list[int]]()
         along = list[np.ndarray]()
         for name, pattern in grid.patterns.items():
             self.columns[name] = [1 + len(along) + j for j in range(pattern.shape[1])]
@@ -225,7 +225,7 @@ class _ByDifferences:
         M, columns = len(self.alpha), [*self.columns[name], 0]
         members = self._places(np.arange(M), columns)
         information, score = self._told(self.pinned, self.step, members, self.prior[members])
-        least = self.held * 1e-9  # ten times what rounding leaves
+        least = self.held * 1e-9  # a thousandth of what is told with all else known
         found = (pieces.beside_level(a, b, floor) for a, b, floor in zip(information, score, least, strict=True))
         return {m: one for m, one in enumerate(found) if one is not None}
 
