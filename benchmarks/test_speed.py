@@ -20,7 +20,8 @@ from probcal import ARD, EMEA, Bias, ConstantVelocity, Drift, Network, Node, Pro
 from probcal.analysis import next_passes, observability
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point, find_mode
-from probcal.inference.run import Context, maximise
+from probcal.inference.method import Context
+from probcal.inference.run import maximise
 from probcal.modes import automatic_start
 from probcal.modes.grid import project, track_mode
 from probcal.priors import Precision

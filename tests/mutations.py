@@ -128,7 +128,7 @@ MUTATIONS = [
     Mutation("jnp.exp(point.levels - levels)", "jnp.exp(levels - point.levels)", "test_formulas.py"),
     Mutation("(squares + point.trajectories.square)", "squares", "test_guards.py"),
     # gaussian/draws.py
-    Mutation("free = prior - smooth.states", "free = prior + smooth.states", "test_exact.py"),
+    Mutation("x[:, :, None] + prior - smooth.states", "x[:, :, None] + prior + smooth.states", "test_exact.py"),
     Mutation("jax.random.normal(key, (count, M)) @ root.T", "jax.random.normal(key, (count, M)) @ root", "test_exact.py"),
     Mutation("kept.J @ prior + half @ noise[1]", "kept.J @ prior", "test_exact.py"),
     # identifiability/gauge.py

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from probcal.gaussian.engine import Embedded, Estimate, Sampled, Spread
-from probcal.gaussian.linearised import linearise_rows
+from probcal.gaussian.linearised import given_biases, linearise_rows
 from probcal.gaussian.mode import eliminate_rows, factors, find_tracks, log_likelihood, mixing_gain
 from probcal.model.model import scaled
 from probcal.motion import ConstantVelocity, Motion, RandomWalk, Static, White
@@ -430,6 +430,9 @@ class Naive:
     @property
     def eliminated(self):
         return eliminate_rows(self.model, self.point, self.rows, joint=False)
+
+    def given_biases(self):
+        return given_biases(self.model, self.point.levels, self.eliminated)
 
     def spread(self, factors):
         own = self.covariance(factors)

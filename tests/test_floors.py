@@ -255,7 +255,7 @@ def test_every_mutation_still_has_its_line():
 
 
 BY_MODULE = {  # names that a reader meets behind their module: `rows.predict`, `cli.fit.run`
-    "linearise", "log_likelihood", "predict", "run", "sample", "slopes",
+    "log_likelihood", "predict", "run", "sample", "slopes",
 }  # fmt: skip
 
 

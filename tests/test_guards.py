@@ -40,7 +40,8 @@ from probcal.geometry import bearing, norm
 from probcal.inference.ending import End, conclude, misfit_sentence
 from probcal.inference.ending import verdict as status_of
 from probcal.inference.fit import calibrate
-from probcal.inference.run import Context, first_state, given_of
+from probcal.inference.method import Context
+from probcal.inference.run import first_state, given_of
 from probcal.misfit import MisfitData, misfit_text
 from probcal.modes import automatic_start
 from probcal.noise import Bernoulli

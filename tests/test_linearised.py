@@ -7,7 +7,8 @@ import pytest
 from worlds import exact, linear, resting
 
 from probcal import EA, MAP, Gaussian, assess, fit
-from probcal.gaussian.linearised import laplace, linearise
+from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.linearised import laplace, leverages
 from probcal.gaussian.mode import find_mode
 from probcal.gaussian.solves import Dense
 from probcal.inference import calibrate
@@ -65,17 +66,14 @@ def test_one_linearisation_has_all_moments():
     with jax.enable_x64(True):
         prior = Precision.single(jnp.ones(problem.model.biases))
         mode = find_mode(problem.model, resting(problem), prior, 50, 1e-12).point
-        at = linearise(problem.model, mode)
-        found, again = jax.jit(at.laplace)(prior), laplace(problem.model, mode, prior)
-        leverages = sum(float(np.sum(part)) for part in at.leverages(found.covariance))
-        marginals = jax.jit(lambda: Dense.of(at.information + prior.matrix()).marginals())()
+        at, found = DenseEngine().at(problem.model, mode), laplace(problem.model, mode, prior)
+        told = sum(float(np.sum(a)) for a in leverages(problem.model, at.rows, at.trajectories, found.covariance))
+        marginals = jax.jit(lambda: Dense.of(at.information() + prior.matrix()).marginals())()
     order = [naive.labels.index(label) for label in problem.labels]
     np.testing.assert_allclose(found.covariance, known.z[1][np.ix_(order, order)], rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(found.evidence, known.evidence, rtol=1e-10)
     np.testing.assert_allclose(marginals, np.diag(found.covariance), rtol=1e-10)
-    for one, other in zip(found, again, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-14)
-    assert 0 < leverages <= np.trace(np.asarray(found.covariance) @ np.asarray(found.information)) + 1e-9
+    assert 0 < told <= np.trace(np.asarray(found.covariance) @ np.asarray(found.information)) + 1e-9
 
 
 @float64

@@ -30,7 +30,7 @@ from probcal import (
     simulate,
 )
 from probcal.errors import InputError
-from probcal.gaussian.linearised import linearise
+from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import find_mode
 from probcal.noise import Bernoulli, Memory
 from probcal.priors import Precision
@@ -91,8 +91,7 @@ def test_evidence_and_offsets_are_those_of_the_dense_covariance(dimension):
     with jax.enable_x64(True):
         prior = Precision.single(jnp.ones(problem.model.biases))
         point = find_mode(problem.model, resting(problem), prior, 30, 1e-12).point
-        at = linearise(problem.model, point)
-        found = at.laplace(prior)
+        found = laplace(problem.model, point, prior)
         z = np.asarray(point.z)
     assert float(found.evidence) == pytest.approx(expected, rel=1e-9)
     own = [(data["sensor"] == label.split(".")[0]) & (data["channel"] != "east") for label in problem.labels]

@@ -19,7 +19,8 @@ from worlds import resting
 
 import probcal
 from probcal import Bias, Channel, sensor
-from probcal.gaussian.linearised import linearise
+from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import find_mode
 from probcal.geometry import norm
 from probcal.modes.recognise import seen_directions
@@ -53,9 +54,9 @@ def solved(model, start):
     """Whether the mode was reached, its point, covariance and evidence, and the variance of every state."""
     alone = Precision.single(jnp.ones(model.biases))
     mode = find_mode(model, start, alone, 500, 1e-11)
-    at = linearise(model, mode.point)
-    found = at.laplace(alone)
-    return mode.converged, mode.point, found.covariance, found.evidence, at.variances(found.covariance)
+    found = laplace(model, mode.point, alone)
+    variances = DenseEngine().at(model, mode.point).variances(found.covariance)
+    return mode.converged, mode.point, found.covariance, found.evidence, variances
 
 
 def estimate(problem):

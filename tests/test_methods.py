@@ -16,12 +16,14 @@ from worlds import linear, resting
 import probcal
 from probcal import ARD, EA, EM, EMEA, MAP, Cubature, Extended, Flat, Gaussian, Laplace, Mixture, StudentT, Unscented
 from probcal.errors import InputError
+from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.draws import draw_trajectories
 from probcal.gaussian.esteps import EStep, Expected
-from probcal.gaussian.linearised import linearise
 from probcal.gaussian.mode import cost, find_mode
 from probcal.inference import METHODS, table
+from probcal.inference.method import Context
 from probcal.inference.methods import choose_prior
-from probcal.inference.run import Context, maximise
+from probcal.inference.run import maximise
 from probcal.inference.sampler import Sampler
 from probcal.model.model import At
 from probcal.noise import AdditiveNoise, Normal
@@ -212,7 +214,7 @@ class Drawn(EStep):
 
     def __call__(self, model, point, prior, carry, key):
         mode = find_mode(model, point, prior, 20, 1e-9, joint=False).point
-        states = linearise(model, mode).draw(jnp.tile(mode.z, (self.count, 1)), key)
+        states = draw_trajectories(DenseEngine().at(model, mode), jnp.tile(mode.z, (self.count, 1)), key)
         found = jax.vmap(lambda x: model.of_biases(model.linearise(At(x, mode.z, mode.levels), expected=False)))(states)
         information, score = (part.mean(0) for part in found)
         return Expected(mode, information, score, jnp.inf, jnp.zeros((), bool)), carry + self.count

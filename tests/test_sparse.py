@@ -33,7 +33,7 @@ from probcal.identifiability.directions import shared_directions
 from probcal.inference import calibrate
 from probcal.inference.blockwise import gains_by_sparse, takes_sparse
 from probcal.modes import automatic_start
-from probcal.results.blocks import covariance_of
+from probcal.results.blocks import SensorBlocks
 
 
 def fitted(method, prior=None):
@@ -416,9 +416,14 @@ def test_what_needs_the_whole_covariance_says_so():
 @pytest.mark.ci
 def test_a_sparse_fit_is_assessed_as_a_dense_one(dense):
     """The same innovations, contractions and verdicts; sums of squares over about the same degrees of freedom."""
-    problem = drawn()[0]
+    problem, simulated = drawn()
+    truth = pc.Truth(simulated.tracks, dict.fromkeys(problem.labels, 0.0) | dict(simulated.biases))
     sparse = fitted(pc.MAP(engine="sparse"), pc.Gaussian())
-    wanted, found = (pc.assess(problem, tree) for tree in (dense, sparse))
+    wanted, found = (pc.assess(problem, tree, truth=truth) for tree in (dense, sparse))
+    for name in ("nees_bias", "nees_bias_count", "nees_bias_upper"):
+        assert found["epoch_check"].attrs[name] == pytest.approx(wanted["epoch_check"].attrs[name], rel=1e-3)
+    a, b = (tree["epoch_check/car"].attrs["nees"] for tree in (wanted, found))
+    assert b == pytest.approx(a, rel=0.15)
     np.testing.assert_allclose(found["datum_check"]["innovation"], wanted["datum_check"]["innovation"], atol=2e-3)
     assert found["datum_check"].attrs["used"] == pytest.approx(wanted["datum_check"].attrs["used"], rel=0.2)
     for name in ("sensor", "target"):
@@ -471,7 +476,8 @@ def test_data_that_scatter_more_than_declared_widen_a_sparse_fit():
     assert b["widened"].values.max() > 1.3
     np.testing.assert_allclose(b["widened"], a["widened"], rtol=0.25)
     np.testing.assert_allclose(b["sd"], before["sd"] * b["widened"])
-    np.testing.assert_allclose(np.diag(covariance_of(b, b["bias_label"].values, "a test")), b["sd"] ** 2, rtol=1e-9)
+    variance = SensorBlocks.read(b, b["bias_label"].values, "a test").variance
+    np.testing.assert_allclose(variance, b["sd"] ** 2, rtol=1e-9)
     drawn_sd = [tree["posterior"]["bias"].std(("chain", "draw")).values for tree in (sparse, found)]
     np.testing.assert_allclose(drawn_sd[1], drawn_sd[0] * b["widened"].values)
 
@@ -506,7 +512,8 @@ def test_the_covariance_of_each_sensor_is_that_of_the_dense_form(dense):
     labels = group["bias_label"].values.tolist()
     assert sorted(np.bincount(group["block"].values)) == [1, 1, 4, 4, 5], "a radar also has the gain of its type"
     for chosen in (labels, labels[::-2], ["c.heading", "b.position_x", "b.range_offset"]):
-        found, dims = covariance_of(group, chosen, "a test"), {"bias_label": chosen, "bias_label_other": chosen}
+        found = SensorBlocks.read(group, chosen, "a test").matrix()
+        dims = {"bias_label": chosen, "bias_label_other": chosen}
         own = group["block"].sel(bias_label=chosen).values
         np.testing.assert_allclose(found, whole.sel(dims) * (own[:, None] == own[None]), rtol=1e-5, atol=1e-9)
 

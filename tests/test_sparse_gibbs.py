@@ -17,7 +17,7 @@ from probcal.gaussian.joint_density import JointDensity, point_of_variables, var
 from probcal.gaussian.mode import log_density
 from probcal.geometry import norm
 from probcal.inference import calibrate
-from probcal.inference.run import Context
+from probcal.inference.method import Context
 from probcal.inference.solve import solve
 from probcal.inference.sparse_gibbs import Gibbs, _Given, _SparseChains
 from probcal.modes import automatic_start

@@ -19,7 +19,8 @@ from probcal.cli.options import parse_values
 from probcal.diagnostics import study_table
 from probcal.errors import InputError
 from probcal.inference.fit import calibrate
-from probcal.inference.run import State, stepped
+from probcal.inference.method import State
+from probcal.inference.run import stepped
 from probcal.plots import plot_study
 from probcal.status import Status
 from probcal.studies.study import ORACLE

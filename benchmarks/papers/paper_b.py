@@ -18,7 +18,8 @@ from probcal.gaussian import recursion as rec
 from probcal.gaussian.linearised import LaplaceApproximation
 from probcal.gaussian.mode import Point, compress, factors, log_likelihood, smooth_tracks
 from probcal.inference.ea import learnt
-from probcal.inference.run import Given, State, valued
+from probcal.inference.method import Given, State
+from probcal.inference.run import valued
 from probcal.model.model import Model
 from probcal.priors import Precision, Prior
 

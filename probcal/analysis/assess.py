@@ -131,7 +131,7 @@ def _assessed(fit: Judged, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     scaled = scaling.power_scaling(tree) if leave.weighable(tree) else None
     if scaled is not None:
         groups["sensitivity"] = scaled
-    if truth is not None and drawn is not None and fit.engine.cheap:
+    if truth is not None and drawn is not None:
         _score(fit, tree, drawn, truth, groups)
     result, text = widened(fit, rejected, tree, fit.root)
     return completed(result, text, groups, findings)
@@ -267,7 +267,7 @@ def _score(
                 check = groups[name].assign_coords(nees_time=tracked[target]["time"].values[found.known])
                 groups[name] = check.assign(nees=("nees_time", found.value))
                 groups[name].attrs |= {"nees": found.mean, "nees_lower": found.lower, "nees_upper": found.upper}
-    biases = nees.of_biases(tree, truth, RATE)
+    biases = nees.of_biases(tree, truth, RATE) if fit.whole else nees.of_all_biases(fit, truth, RATE)
     if biases is not None:
         names = ("nees_bias", "nees_bias_count", "nees_bias_lower", "nees_bias_upper")
         groups["epoch_check"].attrs |= dict(zip(names, biases, strict=True))

@@ -8,6 +8,7 @@ import xarray as xr
 from scipy import special
 
 from probcal import linalg
+from probcal.inference.fitted import Judged
 from probcal.labels import AXES
 from probcal.results.schema import matrix_of
 from probcal.simulate import Truth
@@ -74,6 +75,19 @@ def of_biases(tree: xr.DataTree, truth: Truth, rate: float) -> tuple[float, int,
     spread = variance > len(variance) * np.finfo(float).eps * variance.max(initial=1.0)
     along = ((error[free] / sd[free]) @ vectors)[spread]
     value = np.inf if (np.abs(error[~free]) > EXACT).any() else float(np.sum(along**2 / variance[spread]))
-    rank = int(spread.sum())
+    return _judged(value, int(spread.sum()), rate)
+
+
+def of_all_biases(fit: Judged, truth: Truth, rate: float) -> tuple[float, int, float, float] | None:
+    """The same where the covariance of all is not held, by their precision; None where the truth lacks one."""
+    if not set(fit.problem.labels) <= set(truth.biases):
+        return None
+    known = np.array([truth.biases[label] for label in fit.problem.labels]) / fit.problem.scales
+    error = np.asarray(fit.point.z) - known
+    told = np.asarray(fit.expansion.apply(error)) + fit.factors.pull(known) - fit.factors.pull(known + error)
+    return _judged(float(error @ told), len(error), rate)
+
+
+def _judged(value: float, rank: int, rate: float) -> tuple[float, int, float, float]:
     lower, upper = special.chdtri(rank, [1 - rate / 2, rate / 2]) if rank else (0.0, 0.0)
     return value, rank, float(lower), float(upper)

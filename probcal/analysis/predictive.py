@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from probcal.gaussian.draws import draw
 from probcal.inference.fitted import Judged
 from probcal.inference.residuals import all_gaussian, exact_kurtosis
 from probcal.model.model import At, Model
@@ -96,12 +97,12 @@ def draws_of(fit: Judged, tree: xr.DataTree, key: jax.Array) -> FitDraws:
     """Up to 400 draws of a fit, biases and levels as its tree has them.
 
     The states are those of the tree where it holds them; else a trajectory is drawn for each draw of the biases, from
-    the Gaussian of the problem linearised at the fit; of large networks biases and states together.
+    the Gaussian of the problem linearised at the fit.
     """
     posterior, problem = tree["posterior"].to_dataset(), fit.problem
     tracked = dict(each_track(tree))
     total = posterior.sizes["chain"] * posterior.sizes["draw"]
-    most = min(DRAWS, total if fit.engine.cheap else DRAWS, max(VALUES // problem.model.state_size, LEAST))
+    most = min(DRAWS, total, max(VALUES // problem.model.state_size, LEAST))
     chosen = np.linspace(0, total - 1, most).astype(int)
 
     def thin(values: np.ndarray) -> Any:
@@ -112,8 +113,8 @@ def draws_of(fit: Judged, tree: xr.DataTree, key: jax.Array) -> FitDraws:
     if "level" in posterior:
         levels = jnp.asarray(level_logs(problem.levels, thin(posterior["level"].values)))
     if any("state" not in track for track in tracked.values()):
-        z, states = fit.drawn(z, levels, key)
-        return FitDraws(z, levels, tuple(states), None)
+        states = tuple(map(jnp.asarray, draw(fit.expansion, z, levels, key).states))
+        return FitDraws(z, levels, states, None)
     states = tuple(jnp.asarray(thin(own)) for own in saved_states(problem, tracked))
     replicas = tree["posterior_predictive"].to_dataset()["y"] if "posterior_predictive" in tree.children else None
     if replicas is None or replicas.sizes["draw"] < posterior.sizes["draw"]:

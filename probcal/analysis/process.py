@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from probcal.analysis.findings import Finding
-from probcal.gaussian.linearised import simulated
+from probcal.gaussian.draws import simulated
 from probcal.inference.fitted import Judged
 from probcal.motion.base import GAUSSIAN, Component, level_name
 from probcal.noise import Normal, guess_of
@@ -66,8 +66,8 @@ def check_process_noise(fit: Judged, key: jax.Array) -> list[Finding]:
 def _driven(fit: Judged, key: jax.Array, count: int) -> Iterator[Driven]:
     """The noises that the data say something of, those of a start left out."""
     problem = fit.problem
-    both = simulated(problem.model, fit.solved, fit.noise_roots, key, count)
-    drawn = [smooth.noises for _, smooth in both]
+    still = [np.zeros((*part.drift.shape, count)) for part in problem.model.recursions]
+    drawn = [smooth.noises for _, smooth in simulated(fit.expansion, still, key)]
     for name, _, part, smoothed, columns in problem.tracks(problem.model.recursions, fit.point.noises, drawn):
         mine, active = ~part.first, part.L.any(1)
         for component, own in problem.noise_columns(name):

@@ -19,7 +19,7 @@ from probcal.errors import FitError, InputError, nearest
 if TYPE_CHECKING:
     import xarray as xr
 
-    from probcal.inference.run import Method
+    from probcal.inference.method import Method
     from probcal.network import Network
     from probcal.priors import Prior
     from probcal.problem import Problem

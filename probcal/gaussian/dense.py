@@ -11,11 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian import recursion as rec
+from probcal.gaussian.draws import draw_trajectories
 from probcal.gaussian.engine import Embedded, Estimate, Factors, Sampled, Spread, density_of, mean
 from probcal.gaussian.linearised import (
-    Linearisation,
+    Trajectory,
     compress_and_eliminate,
+    leverages,
     linearise_rows,
+    noise_variances,
+    predicted_variances,
+    state_variances,
     trajectories_of,
 )
 from probcal.gaussian.marginal import SETTLED, TRACK_STEPS, volume_slope
@@ -52,18 +57,14 @@ class DenseExpansion:
     eliminated: Eliminated
     _kept: list[Any] = field(default_factory=list)  # the factors that were asked for last, and their covariance
 
-    @classmethod
-    def of(cls, linear: Linearisation) -> DenseExpansion:
-        """The expansion of a linearisation."""
-        found = cls(*linear[:5])
-        vars(found)["linear"] = linear
-        return found
-
     @cached_property
-    def linear(self) -> Linearisation:
-        """The trajectories with it."""
-        trajectories = trajectories_of(self.model, self.point.levels, self.eliminated)
-        return Linearisation(self.model, self.point, self.rows, self.system, self.eliminated, trajectories)
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """The trajectories given the biases, with their response to these."""
+        return trajectories_of(self.model, self.point.levels, self.eliminated)
+
+    def given_biases(self) -> tuple[Trajectory, ...]:
+        """The trajectories of each recursion given the biases."""
+        return self.trajectories
 
     @cached_property
     def _density(self) -> float:
@@ -135,37 +136,43 @@ class DenseExpansion:
         """Variance of every bias and state."""
         covariance = self.covariance(factors)
         own = np.asarray(jnp.diagonal(covariance))
-        return Spread(own, np.zeros_like(own), tuple(np.asarray(v) for v in self.linear.variances(covariance)))
+        states = tuple(np.asarray(v) for v in self.variances(covariance))
+        return Spread(own, np.zeros_like(own), states)
 
     def states(self, factors: Factors) -> tuple[jax.Array, ...]:
         """Covariance (E, n, n) of every state of each recursion."""
-        return _state_covariances(self.linear, self.covariance(factors))
+        return _state_covariances(self.trajectories, self.covariance(factors))
 
     def noises(self, factors: Factors) -> tuple[jax.Array, ...]:
         """Variance (E, n) of every whitened noise of each recursion."""
-        return self.linear.noise_variances(self.covariance(factors))
+        return noise_variances(self.trajectories, self.covariance(factors))
 
     def predicted(self, factors: Factors) -> Data:
         """Variance (N, C) of each predicted value."""
-        return self.linear.predicted_variances(self.covariance(factors))
+        covariance = self.covariance(factors)
+        return predicted_variances(self.model, self.rows, self.trajectories, covariance)
 
     def leverages(self, factors: Factors) -> Data:
         """Leverage of every datum (N, C) on the biases: w times the part of its variance that the
         biases cause."""
-        return self.linear.leverages(self.covariance(factors))
+        return leverages(self.model, self.rows, self.trajectories, self.covariance(factors))
 
     def sample(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
         """Biases and trajectories drawn around the mean that the factors make."""
         keys, inverse = jax.random.split(key), _solved(self._precision(factors))
         z = mean(self, factors)[None] + inverse.draw(keys[0], count)
-        return Sampled(z, self.linear.draw(z, keys[1]))
+        return Sampled(z, draw_trajectories(self, jnp.asarray(z), keys[1]))
 
     def followed(self, root: Any) -> list[np.ndarray]:
         """Variance (E, n) of every state where the biases have the covariance root root', root (M,
         R)."""
         whole = root @ root.T
         whole = whole if isinstance(whole, np.ndarray) else whole.toarray()
-        return [np.asarray(own) for own in self.linear.variances(jnp.asarray(whole))]
+        return [np.asarray(own) for own in self.variances(jnp.asarray(whole))]
+
+    def variances(self, covariance: jax.Array) -> tuple[jax.Array, ...]:
+        """Variance (E, n) of every state of each recursion, for a covariance (M, M) of the biases."""
+        return state_variances(self.trajectories, covariance)
 
     def weighed(self, weights: Data) -> DenseExpansion:
         """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
@@ -175,7 +182,7 @@ class DenseExpansion:
         """Information and score of K more parameters, by which predicted values change as columns
         (N, C, K)."""
         pull = self.eliminated.score + factors.pull(self.point.z)
-        return _embedded(self.linear, self.covariance(factors), pull, columns)
+        return _embedded(self.model, self.point, self.rows, self.eliminated, self.covariance(factors), pull, columns)
 
 
 _solved = jax.jit(Dense.of)
@@ -183,19 +190,25 @@ _moved = jax.jit(follow)
 
 
 @jax.jit
-def _state_covariances(at: Linearisation, covariance: jax.Array) -> tuple[jax.Array, ...]:
+def _state_covariances(trajectories: tuple[Trajectory, ...], covariance: jax.Array) -> tuple[jax.Array, ...]:
     return tuple(
-        own.covariance + jnp.einsum("eni,ij,emj->enm", own.response, covariance, own.response)
-        for own in at.trajectories
+        own.covariance + jnp.einsum("eni,ij,emj->enm", own.response, covariance, own.response) for own in trajectories
     )
 
 
 @jax.jit
-def _embedded(at: Linearisation, covariance: jax.Array, pull: jax.Array, columns: Data) -> Embedded:
+def _embedded(
+    model: Model,
+    point: Point,
+    rows: tuple[Linearised, ...],
+    solved: Eliminated,
+    covariance: jax.Array,
+    pull: jax.Array,
+    columns: Data,
+) -> Embedded:
     """Rows of the parameters beside those of states and biases, both eliminated."""
-    model, rows, solved = at.model, at.rows, at.solved
-    free = follow(model, at.point, solved, jnp.zeros_like(at.point.z))
-    relaxed = [(after - before)[:, :, None] for _, after, before in model.each_layout(free.states, at.point.states)]
+    free = follow(model, point, solved, jnp.zeros_like(point.z))
+    relaxed = [(after - before)[:, :, None] for _, after, before in model.each_layout(free.states, point.states)]
     scores = [
         lin.score - lin.weight * by[:, :, 0] for *_, lin, by in model.each_block(rows, model.by_state(rows, relaxed))
     ]

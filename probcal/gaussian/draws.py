@@ -1,5 +1,6 @@
 """Independent draws of trajectories from the Laplace approximation at a point, and what the data say at each."""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -8,9 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
-from probcal.gaussian.linearised import Linearisation
-from probcal.gaussian.mode import Point
+from probcal.gaussian import recursion as rec
+from probcal.gaussian.engine import Expansion
+from probcal.gaussian.mode import Eliminated, Point
 from probcal.model.model import At, Data, Model
+from probcal.model.rows import Linearised
 
 PASS = 200  # draws that are made at once
 VALUES = 4_000_000  # of all states that are drawn at once, at most
@@ -46,7 +49,7 @@ def draw_biases(point: Point, covariance: jax.Array, key: jax.Array, count: int)
 
 
 def draw(
-    at: Linearisation, z: jax.Array, levels: jax.Array, key: jax.Array, keep: tuple[str, ...] = ("states",)
+    at: Expansion, z: jax.Array, levels: jax.Array, key: jax.Array, keep: tuple[str, ...] = ("states",)
 ) -> JointDraws:
     """A trajectory for each draw of the biases z (D, M), and what is to be kept of them.
 
@@ -61,7 +64,7 @@ def draw(
         chosen = np.minimum(np.arange(start, start + size), count - 1)  # the last pass is filled with its last draw
         seeds = jax.random.split(jax.random.fold_in(key, k))
         mine = jnp.asarray(biases[chosen])
-        states = at.draw(mine, seeds[0])
+        states = draw_trajectories(at, mine, seeds[0])
         by_datum: tuple[Data, Data] = ((), ())
         if {"log_likelihood", "replicas"} & set(keep):
             told, again = predictive(at.model, log_levels[chosen], mine, states, seeds[1], keep)
@@ -69,6 +72,53 @@ def draw(
         kept = JointDraws(states if "states" in keep else (), *by_datum)
         passes.append(jax.tree.map(lambda leaf, most=count - start: np.asarray(leaf)[:most], kept))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *passes)
+
+
+def draw_trajectories(at: Expansion, z: jax.Array, key: jax.Array) -> tuple[jax.Array, ...]:
+    """Trajectories (D, E, n) of each recursion given biases z (D, M).
+
+    Draws from the motion, less their smoothed selves, all as columns of one pass (Durbin and Koopman 2002).
+    """
+    return _around(at.model, at.point, simulated(at, _pulled(at.model, at.point, at.rows, z), key))
+
+
+def simulated(at: Expansion, pulls: Sequence[Any], key: jax.Array) -> list[tuple[jax.Array, rec.Smoothed]]:
+    """Trajectories (E, n, D) drawn from the motion, less its drift, and the smoothed ones of their data.
+
+    `pulls` (E, n, D) are added to the scores of the states.
+    """
+    return _simulated(at.model, at.eliminated, [(own.L, own.half) for own in at.given_biases()], pulls, key)
+
+
+@jax.jit
+def _simulated(
+    model: Model,
+    solved: Eliminated,
+    roots: Sequence[tuple[jax.Array, jax.Array]],
+    pulls: Sequence[Any],
+    key: jax.Array,
+) -> list[tuple[jax.Array, rec.Smoothed]]:
+    found = []
+    for r, (part, (L, half), kept, pull) in enumerate(model.each_layout(roots, solved.parts, pulls)):
+        noise = jax.random.normal(jax.random.fold_in(key, r), (2, *pull.shape))
+        prior = rec.trajectory(part.F, L, jnp.zeros((*part.drift.shape, 1)), noise[0])
+        found.append((prior, rec.smooth(part.F, kept.gain, kept.J @ prior + half @ noise[1] + pull)))
+    return found
+
+
+@jax.jit
+def _pulled(model: Model, point: Point, rows: Sequence[Linearised], z: jax.Array) -> tuple[jax.Array, ...]:
+    """The pull on the states (E, n, D) of biases z (D, M) in the place of a point's."""
+    along = model.by_bias(rows, (z - point.z[None, :]).T)
+    weighted = tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, along))
+    return tuple(model.onto_states(rows, weighted))
+
+
+@jax.jit
+def _around(model: Model, point: Point, both: list[tuple[jax.Array, rec.Smoothed]]) -> tuple[jax.Array, ...]:
+    pairs = model.each_layout(point.states, both)
+    drawn = [x[:, :, None] + prior - smooth.states for _, x, (prior, smooth) in pairs]
+    return tuple(jnp.moveaxis(x, 2, 0) for x in drawn)
 
 
 @partial(jax.jit, static_argnames="keep")

@@ -143,6 +143,9 @@ class Expansion(Protocol):
     def eliminated(self) -> Eliminated:
         """The trajectories, eliminated at held biases or with these."""
 
+    def given_biases(self) -> Sequence[Any]:
+        """The trajectories of each recursion given the biases, as `linearised.GivenBiases`."""
+
     def density(self) -> float:
         """Log density of the data given the biases at the point, up to the constant of the noises."""
 

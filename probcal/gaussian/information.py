@@ -6,8 +6,9 @@ import numpy as np
 
 from probcal import linalg
 from probcal.gaussian import recursion as rec
+from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.draws import residuals
-from probcal.gaussian.linearised import linearise
+from probcal.gaussian.linearised import noise_variances, predicted_variances
 from probcal.gaussian.mode import Point, factors
 from probcal.misfit import Rejected
 from probcal.model.model import Data, Model, Recursion
@@ -103,11 +104,11 @@ def update_levels(model: Model, point: Point, covariance: jax.Array) -> Point:
     trajectory stays; its whitened noises are rescaled.
     """
     H = point.levels.shape[0]
-    at = linearise(model, point)
-    spread = at.predicted_variances(covariance)
+    at = DenseEngine().at(model, point)
+    spread = predicted_variances(model, at.rows, at.trajectories, covariance)
     count, square = model.by_level(model.measured), model.by_level(model.level_score(point))
     variance = model.by_level(jax.tree.map(jnp.multiply, model.information(point), spread))
-    for part, u, own in model.each_layout(point.noises, at.noise_variances(covariance)):
+    for part, u, own in model.each_layout(point.noises, noise_variances(at.trajectories, covariance)):
         active = jnp.any(part.L != 0, 1)
         count = count.at[part.level].add(active)
         square = square.at[part.level].add(active * u**2)

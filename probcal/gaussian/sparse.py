@@ -18,7 +18,7 @@ from probcal.gaussian.cholesky import Factor, exact
 from probcal.gaussian.climb import settle_each
 from probcal.gaussian.engine import Embedded, Estimate, Factors, Sampled, Spread, density_of
 from probcal.gaussian.joint import JointPrecision
-from probcal.gaussian.linearised import linearise_rows
+from probcal.gaussian.linearised import GivenBiases, given_biases, linearise_rows
 from probcal.gaussian.marginal import volume_slope
 from probcal.gaussian.mode import Eliminated, Point, eliminate_rows, factors
 from probcal.model.model import Data, Model, scaled
@@ -91,6 +91,14 @@ class SparseExpansion:
     def eliminated(self) -> Eliminated:
         """The trajectories eliminated at held biases."""
         return _held(self.model, self.point, self.rows)
+
+    def given_biases(self) -> tuple[GivenBiases, ...]:
+        """The trajectories of each recursion given the biases."""
+        return self._given
+
+    @cached_property
+    def _given(self) -> tuple[GivenBiases, ...]:
+        return given_biases(self.model, self.point.levels, self.eliminated)
 
     @cached_property
     def _relaxed(self) -> tuple[Data, jax.Array]:

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.linearised import linearise
+from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.linearised import noise_variances
 from probcal.gaussian.mode import Point, smooth_tracks
 from probcal.model.model import Mixing, Model, Recursion
 from probcal.problem import Problem
@@ -26,7 +27,8 @@ def expected_mixing(model: Model, point: Point, covariance: jax.Array) -> Mixing
         means = [tail.family.mixing_mean(s, tail.size) for tail, s in zip(part.tails, squares, strict=True)]
         return tuple(jnp.where(tail.on, w, 1.0) for tail, w in zip(part.tails, means, strict=True))
 
-    return model.each(means, point.noises, linearise(model, point).noise_variances(covariance))
+    trajectories = DenseEngine().at(model, point).trajectories
+    return model.each(means, point.noises, noise_variances(trajectories, covariance))
 
 
 def rewhitened(model: Model, point: Point, weights: Mixing) -> Point:

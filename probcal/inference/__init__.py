@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from probcal.gaussian.esteps import Cubature, EStep, Extended, Unscented
     from probcal.inference.evidence import Evidence, log_evidence
     from probcal.inference.fit import calibrate, fit, track
+    from probcal.inference.method import Method
     from probcal.inference.methods import (
         EA,
         EM,
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
         table,
     )
     from probcal.inference.model import numpyro_model
-    from probcal.inference.run import Method
     from probcal.inference.svi import SVI
 
 __all__ = lazy(
@@ -29,9 +29,9 @@ __all__ = lazy(
     {
         "probcal.inference.evidence": "Evidence log_evidence",
         "probcal.inference.fit": "calibrate fit track",
+        "probcal.inference.method": "Method",
         "probcal.inference.methods": "EA EM EMEA MAP METHODS NUTS Collapsed Gibbs LeastSquares table",
         "probcal.inference.model": "numpyro_model",
-        "probcal.inference.run": "Method",
         "probcal.inference.svi": "SVI",
         "probcal.gaussian.esteps": "Cubature EStep Extended Unscented",
     },

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ from probcal.identifiability.remedies import Direction
 from probcal.inference.ending import conclude_at
 from probcal.inference.hierarchy import held, hierarchy_of
 from probcal.inference.integrate import quantile
+from probcal.inference.method import Context, Iterated
 from probcal.inference.posed import Form
 from probcal.inference.propagate import BlockMarginals, Blocks, Propagation
 from probcal.modes.mirrors import SideClimb
@@ -40,9 +41,6 @@ from probcal.problem import Problem
 from probcal.results.answer import HALF, Answer, Draws, Posterior, Summary, Tracks
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
-
-if TYPE_CHECKING:
-    from probcal.inference.run import Context, Maximiser
 
 CHAINS, NUMBERS, MOST = 4, 400_000, 250  # of the draws of all biases that a tree holds, and draws of a chain
 STEPS = 60  # of the climb
@@ -53,7 +51,7 @@ SPARSE = ("sparse", PRODUCTS)
 ENGINES = ("auto", "dense", *SPARSE)
 
 
-def takes_sparse(method: Maximiser, problem: Problem) -> bool:
+def takes_sparse(method: Iterated, problem: Problem) -> bool:
     """Whether a method is to solve a problem in its sparse form; raises `InputError` where that was
     asked in vain."""
     asked = getattr(method, "engine", "dense")
@@ -64,14 +62,14 @@ def takes_sparse(method: Maximiser, problem: Problem) -> bool:
     return bool(given or (asked == "auto" and not lacks and prefers_sparse(problem.model)))
 
 
-def gains_by_sparse(method: Maximiser, problem: Problem, prior: Prior, starts: int) -> bool:
+def gains_by_sparse(method: Iterated, problem: Problem, prior: Prior, starts: int) -> bool:
     """Whether a fit that may take either form is faster in the sparse one, and loses nothing that
     was asked."""
     either = getattr(method, "engine", "dense") == "auto" and not missing(problem.model)
     return either and is_thin(problem.model) and not _lacking(method, prior, starts)
 
 
-def check_sparse(method: Maximiser, prior: Prior, starts: int) -> None:
+def check_sparse(method: Iterated, prior: Prior, starts: int) -> None:
     """Raise `InputError` naming what a sparse fit does not do."""
     if wrong := _lacking(method, prior, starts):
         if getattr(method, "engine", "") == PRODUCTS:
@@ -79,7 +77,7 @@ def check_sparse(method: Maximiser, prior: Prior, starts: int) -> None:
         raise InputError(f"{method.name} on a network of this size is solved in sparse form, which takes {wrong}")
 
 
-def _lacking(method: Maximiser, prior: Prior, starts: int) -> str:
+def _lacking(method: Iterated, prior: Prior, starts: int) -> str:
     """What a sparse fit takes in the place of what was asked; empty where it does that."""
     wrong = ""
     if getattr(method, "trajectory", "") != "marginal":
@@ -153,13 +151,19 @@ class BlockPosterior(Posterior):
         pairs = self.problem.model.each_layout(self.states, self.spread.states)
         return [Tracks(x, np.sqrt(np.maximum(own, 0.0))) for _, x, own in pairs]
 
+    @property
+    def expansion(self) -> Expansion:
+        """The posterior expanded about the point."""
+        return self.at
+
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """Draws of the biases from the Gaussian with their means, sds and correlations, few where
         they are many."""
         self.check_kept(keep)
         M = len(self.summary.mean)
         count = CHAINS * int(np.clip(NUMBERS // (CHAINS * M), 2, MOST))
-        drawn = np.asarray(self.at.sample(self.factors, key, count).z) - np.asarray(mean(self.at, self.factors))
+        drawn = np.asarray(self.at.sample(self.factors, key, count).z)
+        drawn = drawn - np.asarray(mean(self.at, self.factors))
         normal = drawn / np.sqrt(self.spread.biases)
         z = (self.summary.mean + self.summary.sd * normal).reshape(CHAINS, -1, M)
         levels = np.zeros((*z.shape[:2], 0))
@@ -178,11 +182,6 @@ class BlockPosterior(Posterior):
         return None
 
     @property
-    def pull(self) -> np.ndarray:
-        """Linear term (M,) of the log-likelihood of z about zero, trajectories integrated."""
-        return np.asarray(self.at.apply(np.asarray(self.at.point.z))) + np.asarray(self.at.score())
-
-    @property
     def attrs(self) -> Mapping[str, float]:
         """The limit of inclusion, how many directions are weak, and the error of an evidence that
         is estimated."""
@@ -190,7 +189,7 @@ class BlockPosterior(Posterior):
         return {"rope": ROPE, "sparse": 1.0, "weak": float(self.weak)} | estimated
 
 
-def blockwise_answer(method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
+def blockwise_answer(method: Iterated, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
     """The answer of `EA` or `MAP` by blocks of sensors; raises `FitError` where a flat prior leaves
     no interval."""
     model, products = problem.model, getattr(method, "engine", "") == PRODUCTS

@@ -21,21 +21,11 @@ from probcal.inference.blockwise import ENGINES, PRODUCTS
 from probcal.inference.ending import astray
 from probcal.inference.hierarchy import held, hierarchy_of
 from probcal.inference.integrate import Integration, likelihood
+from probcal.inference.method import Context, Given, State
 from probcal.inference.posed import Form
 from probcal.inference.pruned import without_far_modes
 from probcal.inference.relevance import best_precisions
-from probcal.inference.run import (
-    Context,
-    Given,
-    Maximiser,
-    State,
-    first_precision,
-    given_of,
-    learn,
-    maximise,
-    reweighted,
-    valued,
-)
+from probcal.inference.run import Maximiser, first_precision, given_of, learn, maximise, reweighted, valued
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem

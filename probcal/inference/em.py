@@ -12,7 +12,8 @@ from probcal.gaussian.information import update_levels
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point, cost, mixing_gain
 from probcal.gaussian.solves import Dense
-from probcal.inference.run import Context, Given, Maximiser, ParticleSmoother, State, learn, reweighted, valued
+from probcal.inference.method import Context, Given, ParticleSmoother, State
+from probcal.inference.run import Maximiser, learn, reweighted, valued
 from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
 from probcal.problem import Problem

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from probcal.gaussian.choose import choose
 from probcal.gaussian.draws import residuals
 from probcal.gaussian.information import growing_square, rejected, squares_of
 from probcal.gaussian.mode import Point
+from probcal.inference.integrate import Integrated, Integration
+from probcal.inference.method import Iterated, State
 from probcal.inference.mixture import MixturePosterior
 from probcal.labels import listed
 from probcal.misfit import MisfitData, misfit_text, rejection_text
@@ -22,10 +24,6 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer, NormalPosterior, Posterior, Summary, uncalibrated
 from probcal.results.groups import datum_of, gather
 from probcal.status import Status
-
-if TYPE_CHECKING:
-    from probcal.inference.integrate import Integrated, Integration
-    from probcal.inference.run import Maximiser, State
 
 FAR = 10.0  # scales from the stated value beyond which an estimate is none
 FALL = 1.0  # nats below its best at which an evidence may end
@@ -39,7 +37,7 @@ DOUBTED = 2.0  # the same, from which the automatic start is looked at: a wrong 
 
 def conclude(
     problem: Problem,
-    method: Maximiser,
+    method: Iterated,
     prior: Prior,
     state: State,
     trace: np.ndarray,
@@ -81,7 +79,7 @@ def uncertain(labels: Sequence[str], mixed: Integrated) -> str:
 
 
 def conclude_at(
-    problem: Problem, method: Maximiser, prior: Prior, posterior: Posterior, trace: np.ndarray, square: float,
+    problem: Problem, method: Iterated, prior: Prior, posterior: Posterior, trace: np.ndarray, square: float,
     iterations: int, *, converged: bool, refused: bool, evidence: float, lost: float = 0.0, stopped: str = "",
 ) -> Answer:  # fmt: skip
     """The answer of a climb that ended at a posterior: whether it converged, never left its start, lost evidence."""

@@ -15,7 +15,6 @@ import numpy as np
 from probcal.errors import FitError, InputError
 from probcal.gaussian.choose import choose
 from probcal.gaussian.information import at_levels
-from probcal.gaussian.linearised import linearise
 from probcal.gaussian.mode import Point
 from probcal.gaussian.tails import settle
 from probcal.identifiability.directions import weak_directions
@@ -24,22 +23,21 @@ from probcal.identifiability.watch import runs, strained_starts
 from probcal.inference.blockwise import BlockPosterior
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.manifest import stored_run
+from probcal.inference.method import Context, Method, ParticleSmoother
 from probcal.inference.methods import EA, NUTS, check_problem, choose_prior
 from probcal.inference.progress import Monitor, OnProgress
-from probcal.inference.run import Context, Method, ParticleSmoother
 from probcal.inference.solve import solve
 from probcal.inference.storage import Storage
 from probcal.inference.widen import judge_fit, judge_tracks
 from probcal.labels import NODE, START, listed
 from probcal.lazy import Later
-from probcal.modes import automatic_start
-from probcal.modes.grid import grid_start, track_mode
+from probcal.modes.grid import grid_start
 from probcal.modes.mirrors import SAME, Mirrored
 from probcal.priors import AnyPrior
 from probcal.problem import Problem, check_linear
-from probcal.results.answer import Answer, Tracks, tracks_of, uncalibrated
+from probcal.results.answer import Answer, tracks_of
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
-from probcal.results.read import Calibrated, apply
+from probcal.results.read import apply
 from probcal.simulate import Key, as_key
 from probcal.status import Status
 from probcal.types import float64
@@ -294,28 +292,16 @@ def track(
     if smoother is not None:
         return smoother.tracked(problem, found.z, found.covariance, found.levels, as_key(key))
     check_linear(problem)
-    if not choose(problem.model).cheap:
-        tracks, before, after = _many_tracks(problem, found)
-        return judge_tracks(build_tracks(problem, bands(tracks, before)), problem, found, after)
-    covariance = jnp.asarray(found.covariance)
-    start = at_levels(problem.model, automatic_start(problem), jnp.asarray(found.levels))
-    before = track_mode(problem, uncalibrated(problem, start))
-    after = track_mode(problem, start._replace(z=jnp.asarray(found.z)))
+    engine = choose(problem.model)
+    before, after = (
+        at_levels(problem.model, grid_start(problem, jnp.asarray(z), 30), jnp.asarray(found.levels))
+        for z in (problem.first_z, found.z)
+    )
+    before = engine.settled(problem.model, before).point
     if problem.model.tailed:
+        covariance = jnp.asarray(found.covariance)
         _, before = settle(problem, before, jnp.zeros_like(covariance))
         problem, after = settle(problem, after, covariance)
-    at = linearise(problem.model, after)
-    tree = build_tracks(problem, bands(tracks_of(at, covariance), before))
-    return judge_tracks(tree, problem, found, at)
-
-
-def _many_tracks(problem: Problem, found: Calibrated) -> tuple[list[Tracks], Point, Point]:
-    """Tracks at a calibration, and points without and with it, where the response of states to
-    biases does not fit."""
-    engine = choose(problem.model)
-    before, at = (
-        engine.settled(problem.model, grid_start(problem, jnp.asarray(z), 30)) for z in (problem.first_z, found.z)
-    )
-    spread = at.followed(found.root)
-    tracks = problem.model.each(lambda _, x, own: Tracks(np.asarray(x), np.sqrt(own)), at.point.states, spread)
-    return list(tracks), before.point, at.point
+    at = engine.settled(problem.model, after)
+    tree = build_tracks(problem, bands(tracks_of(at, found.spread), before))
+    return judge_tracks(tree, problem, found, engine, at)

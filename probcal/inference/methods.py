@@ -14,8 +14,9 @@ from probcal.errors import InputError
 from probcal.inference.collapsed import Collapsed
 from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
+from probcal.inference.method import Method
 from probcal.inference.nuts import NUTS
-from probcal.inference.run import Maximiser, Method
+from probcal.inference.run import Maximiser
 from probcal.inference.sparse_gibbs import Gibbs
 from probcal.inference.svi import SVI
 from probcal.lazy import Later

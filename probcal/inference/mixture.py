@@ -19,6 +19,7 @@ from probcal.inference.posed import Form
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Draws, Posterior, Summary, Tracks, log_prior_normal, tracks_of
+from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import ROPE
 
 
@@ -71,7 +72,7 @@ class MixturePosterior(Posterior):
 
     def tracks(self) -> Sequence[Tracks]:
         """States at the mean of the biases, and their sd with the biases uncertain."""
-        return tracks_of(self.linearised, jnp.asarray(self.summary.covariance))
+        return tracks_of(self.expansion, SensorBlocks.of(self.summary.whole))
 
     def _kept(self) -> np.ndarray:
         """Which draws of each chain are kept: fewer where the data are many."""
@@ -82,7 +83,7 @@ class MixturePosterior(Posterior):
         """Draws of the mixture with a trajectory each, as many as the size of the data lets be kept."""
         z = np.asarray(self.found.z)[:, self._kept()]
         shape, M = z.shape[:2], z.shape[2]
-        drawn = draw(self.linearised, jnp.asarray(z.reshape(-1, M)), self.point.levels, key, keep)
+        drawn = draw(self.expansion, jnp.asarray(z.reshape(-1, M)), self.point.levels, key, keep)
         states, likelihood, replicas = ([np.asarray(a).reshape(*shape, *a.shape[1:]) for a in part] for part in drawn)
         levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
         return Draws(z, levels, states, np.arange(shape[1]), likelihood, replicas)

@@ -14,7 +14,7 @@ import numpy as np
 
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point, find_mode, smooth_tracks
-from probcal.inference.run import Given, State
+from probcal.inference.method import Given, State
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, PRECISION_BOUNDS
 

@@ -184,7 +184,7 @@ def innovations(fit: Judged, kurtosis: np.ndarray, dz: np.ndarray | None = None)
     biases is not held the sum is shared among the data by the variance that the biases of the own sensor give each.
     """
     model = fit.problem.model
-    filters, roots = prepare(fit.solved), fit.roots
+    filters, roots = prepare(fit.expansion.eliminated), fit.roots
     moved = np.zeros(model.biases + 1) if dz is None else np.append(dz, 0.0)
     shift = [jnp.asarray(moved[np.asarray(read)]) for read in model.read]
     found = [_innovations(model, fit.point, fit.lins, filters, shift, part) for part in roots]

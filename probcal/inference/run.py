@@ -1,15 +1,14 @@
-"""What methods share, and the outer loop of those that climb to a point: jitted chunks, progress.
+"""The outer loop of methods that climb to a point: jitted chunks, progress.
 
-A method is a frozen dataclass that inherits `Maximiser` or `sampler.Sampler`. A `Maximiser` has `iterate`, a pure step
+A `Maximiser` has `iterate`, a pure step
 of its outer loop, and where needed `close`, what it computes at the end of a chunk; `maximise` drives one fit and
 a study many at once.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,16 +24,12 @@ from probcal.inference.blockwise import blockwise_answer, takes_sparse
 from probcal.inference.ending import FAR, conclude
 from probcal.inference.hierarchy import held, learnt_groups
 from probcal.inference.integrate import Integration, integrate
-from probcal.inference.progress import Monitor
-from probcal.inference.storage import Storage
-from probcal.model.model import Mixing, Model
+from probcal.inference.method import Context, Given, Iterated, State
+from probcal.model.model import Model
 from probcal.priors import ARD, PRECISION_BOUNDS, Precision, Prior
 from probcal.priors import Laplace as LaplacePrior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 CHUNK = 5  # outer iterations between two reports of progress
 STALLED = 8  # climbs on the host after which one that gains nothing is given up
@@ -42,120 +37,8 @@ TILTS, ASIDE = 12, 0.02  # most climbs with integrated places, and sds by which 
 SLACK = 0.02  # nats by which the density of integrated places may fall by rounding
 
 
-class Given(NamedTuple):
-    """What stays the same during the outer loop."""
-
-    prior: Precision  # first precisions, and the couplings of correlated biases
-    surveyed: jax.Array  # (M,) biases whose precision is never learnt
-    group: jax.Array  # (M,) which learnt precision governs each bias
-    tolerance: jax.Array  # ()
-
-
-class State(NamedTuple):
-    """Where the outer loop stands: `found` belongs to `point` and `alpha`; an objective of -inf: nothing found yet."""
-
-    point: Point
-    alpha: jax.Array  # (M,)
-    found: LaplaceApproximation
-    objective: jax.Array  # ()
-    worth: jax.Array  # () what is maximised where precisions or levels are learnt: evidence and their hyper-prior
-    best: jax.Array  # () the best of it so far
-    refused: jax.Array  # () whether no step of any search has lowered the cost yet, though one promised to
-    done: jax.Array  # ()
-    seed: jax.Array  # key of what the method draws next
-    carry: Any  # what the method keeps between two iterations, a pytree of fixed form
-    mixing: Mixing  # weights of process noise that is not Gaussian
-
-
-class Context(NamedTuple):
-    """What a run is given beside the problem."""
-
-    key: jax.Array
-    monitor: Monitor = Monitor()  # what says how far it is, and when to stop: this one never does
-    storage: Storage | None = None  # where a sampler keeps its draws
-    threads: int | None = None
-    fallback: Any = None  # the sampler that takes over where a collapse does not fit
-
-
-class Method(ABC):
-    """What every method inherits: a frozen dataclass of static fields."""
-
-    name: ClassVar[str]
-    priors: ClassVar[tuple[type, ...]]  # the first is its own
-    intervals: ClassVar[str]  # what the intervals are worth
-    climbs: ClassVar[bool] = True  # to a mode; others start at the joint mode where noise levels are unknown
-    sparsely: ClassVar[bool] = False  # whether it works by sparse factors, whatever the size
-
-    @property
-    def by_particles(self) -> bool:
-        """Whether trajectories are particles, so that any motion will do and no start is needed."""
-        return False
-
-    @abstractmethod
-    def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
-        """Solve a problem from a start."""
-
-    def first_prior(self) -> Prior:
-        """The prior where none is given."""
-        found: Prior = self.priors[0]()
-        return found
-
-    def takes(self, prior: Prior) -> bool:
-        """Whether the method can be used with a prior."""
-        return isinstance(prior, self.priors)
-
-    def note(self, prior: Prior) -> str:
-        """What the intervals are worth with these settings and a prior."""
-        return self.intervals
-
-    def remark(self, prior: Prior) -> str:
-        """What the message of a fit says of the method under a prior; empty where nothing is to be said."""
-        return ""
-
-    def prepare(self, problem: Problem) -> Problem:
-        """The problem that is solved in the place of the given one."""
-        return problem
-
-    def configured(
-        self, problem: Problem, prior: Prior, context: Context, fit: "FitLabelled"
-    ) -> "tuple[xr.DataTree, Answer]":
-        """The tree and the answer of detections that name no target; `fit` fits rows that do.
-
-        Raises `InputError`: most methods take rows that name their targets.
-        """
-        assert problem.scans is not None
-        raise InputError(
-            f"{int(problem.scans.count.sum())} detections in {problem.measurements.table.source} name no target: take"
-            f" SelfConfiguration({self.name.replace('-', '')}()), on the command line --method self-config, or name"
-            " them, as in problem.assigned(track_objects(problem).rows)"
-        )
-
-    def check_kept(self, problem: Problem, keep: tuple[str, ...]) -> None:  # noqa: B027
-        """Raise `InputError` where an answer could not give the draws that are to be kept."""
-
-
-type FitLabelled = Callable[[Problem, Method], tuple[xr.DataTree, Answer]]  # of rows that name their targets
-
-
-class ParticleSmoother(ABC):
-    """What the core asks of particles."""
-
-    @abstractmethod
-    def climbed(self, problem: Problem, method: "Maximiser", prior: Prior, start: Point, context: Context) -> Answer:
-        """The answer of EM whose E-step draws particles, from the biases of a start."""
-
-    @abstractmethod
-    def tracked(
-        self, problem: Problem, z: np.ndarray, covariance: np.ndarray, levels: np.ndarray, key: jax.Array
-    ) -> "xr.DataTree":
-        """Tracks by particles at biases z (M,) of a covariance (M, M)."""
-
-
-class Maximiser(Method, ABC):
+class Maximiser(Iterated, ABC):
     """A method that climbs to a point by a pure `iterate` and reports a Gaussian there."""
-
-    iterations: int  # most outer iterations
-    tolerance: float  # change of the objective at which it stops
 
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Climb from a start until it is done or its iterations are spent.

@@ -13,9 +13,9 @@ from probcal.gaussian.mode import Point
 from probcal.inference.chains import Sample
 from probcal.inference.hierarchy import Phi
 from probcal.inference.leaps import Place
+from probcal.inference.method import Context, Method
 from probcal.inference.posed import Form, Posed
 from probcal.inference.posterior import conclude_draws
-from probcal.inference.run import Context, Method
 from probcal.inference.sampling import sample
 from probcal.priors import ARD, Prior
 from probcal.problem import Problem

@@ -13,9 +13,10 @@ from probcal.gaussian.choose import choose
 from probcal.gaussian.mode import Point
 from probcal.gaussian.room import check_room
 from probcal.inference.blockwise import PRODUCTS, check_sparse, gains_by_sparse, side_climb, takes_sparse
+from probcal.inference.method import Context, Method
 from probcal.inference.methods import MAP
 from probcal.inference.progress import Monitor, Stopped
-from probcal.inference.run import Context, Maximiser, Method
+from probcal.inference.run import Maximiser
 from probcal.inference.sparse_gibbs import check_gibbs
 from probcal.labels import SCENE, START, listed
 from probcal.modes import further_starts

@@ -30,10 +30,10 @@ from probcal.identifiability.directions import alone_directions, screened_direct
 from probcal.inference.blockwise import NAMED, BlockPosterior, declared_blocks, diverged, told_columns
 from probcal.inference.chains import Draw, Sample
 from probcal.inference.hierarchy import Phi, hierarchy_of
+from probcal.inference.method import Context
 from probcal.inference.mixed import mixing
 from probcal.inference.posed import Form, Natural, Posed
 from probcal.inference.posterior import RARE, bias_status, judge_chains, values_by_datum
-from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
 from probcal.model.model import Model

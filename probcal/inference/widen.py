@@ -12,13 +12,12 @@ import numpy as np
 
 from probcal import linalg
 from probcal.gaussian import recursion as rec
+from probcal.gaussian.engine import Engine, Expansion
 from probcal.gaussian.information import rejected
-from probcal.gaussian.linearised import Linearisation
-from probcal.gaussian.mode import Eliminated, Point, factors
+from probcal.gaussian.mode import Eliminated, factors
 from probcal.gaussian.scans import recur_squared
-from probcal.gaussian.sparse import SparseEngine
 from probcal.inference import residuals
-from probcal.inference.fitted import COLUMNS, Fitted, Judged, JudgedLarge, take_up
+from probcal.inference.fitted import COLUMNS, Judged, take_up
 from probcal.inference.residuals import LAGGED, NOTABLE, PRACTICAL, Channels, Innovations
 from probcal.lazy import Later
 from probcal.misfit import rejection_text
@@ -116,8 +115,8 @@ def unmoved(fit: Judged) -> str:
     Under the model a whitened noise has mean square one, of which smoothing leaves one less its
     variance.
     """
-    problem, found = fit.problem, dict[str, float]()
-    for name, _, part, noises, spread in problem.tracks(problem.model.recursions, fit.point.noises, fit.held_noises):
+    problem, found, driven = fit.problem, dict[str, float](), [own.spread for own in fit.expansion.given_biases()]
+    for name, _, part, noises, spread in problem.tracks(problem.model.recursions, fit.point.noises, driven):
         expected = np.where(part.L.any(1), 1.0 - spread, 0.0)
         for component, columns in problem.noise_columns(name):
             told = float(expected[~part.first, columns].sum())
@@ -203,7 +202,7 @@ def track_factors(
         biases = root @ rng.standard_normal((root.shape[1], COLUMNS))
         plain, shown = _noises(fit, rejected, rng)
         for sign, noise, moved in ((-1, plain, biases), (1, shown, wide[:, None] * biases)):
-            errors = _errors(model, fit.lins, fit.solved, noise, jnp.asarray(moved))
+            errors = _errors(model, fit.lins, fit.expansion.eliminated, noise, jnp.asarray(moved))
             more = [own + sign * np.asarray(error) / chunks for own, error in zip(more, errors, strict=True)]
     dims, found, most = ("time", "component"), {}, before_data(model, fit.point.levels)
     for name, own in by_target(fit.problem, {"more": (dims, more), "most": (dims, most)}).items():
@@ -290,13 +289,11 @@ def _widen_biases(result: xr.DataTree, group: xr.Dataset, wide: np.ndarray) -> N
     mean = group["mean"].values
     ends = {name: mean + wide * (group[name].values - mean) for name in ("lower", "upper")}
     columns = {"sd": group["sd"].values * wide, **ends, "widened": wide}
-    if "block" in group:
-        scales = np.ones(len(wide))
-        spread = SensorBlocks.read(group, group["bias_label"].values.tolist(), scales).widened(wide).columns(scales)
-    else:
-        spread = {"covariance": (group["covariance"].dims, group["covariance"].values * np.outer(wide, wide))}
+    scales = np.ones(len(wide))
+    spread = SensorBlocks.read(group, group["bias_label"].values.tolist(), "widened").widened(wide)
+    grown = spread.columns(scales) if "block" in group else {"covariance": (group["covariance"].dims, spread.matrix())}
     group = group.assign({name: ("bias_label", values) for name, values in columns.items()})
-    result["calibration"] = xr.DataTree(group.assign(spread))
+    result["calibration"] = xr.DataTree(group.assign(grown))
     draws = result["posterior"].to_dataset()
     drawn = (draws["bias"] - draws["bias"].mean(("chain", "draw"))) * xr.DataArray(wide - 1.0, dims="bias_label")
     result["posterior"] = xr.DataTree(draws.assign(bias=draws["bias"] + drawn))
@@ -357,37 +354,24 @@ def judge_fit(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
     return _judged(fit, found, tree, fit.root, unmoved(fit), UNASSESSED)
 
 
-def judge_tracks(
-    tree: xr.DataTree,
-    problem: Problem,
-    known: Calibrated,
-    at: Linearisation | Point,
-) -> xr.DataTree:
+def judge_tracks(tree: xr.DataTree, problem: Problem, known: Calibrated, engine: Engine, at: Expansion) -> xr.DataTree:
     """A copy of tracks at a calibration, judged and widened likewise.
 
-    `at` is the linearisation or, of many, the point.
-
-    The biases are taken where rows and calibration together put them, so that an error within the
-    sds of the calibration is no misfit. Of many biases it raises what the innovations are expected
-    to scatter.
+    The biases are taken where rows and calibration together put them, so that an error within the sds of the
+    calibration is no misfit. Where the covariance of all is not held it raises what the innovations are expected to
+    scatter.
     """
     datum, picks = datum_of(problem)
     data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
-    if isinstance(at, Linearisation):
-        root, open_ = known.root, Precision.single(jnp.zeros(problem.model.biases))
-        information = root.T @ np.asarray(at.information) @ root
-        values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(information)))
-        root = root @ (vectors / np.sqrt(1.0 + np.maximum(values, 0.0)))
-        fit = Fitted(problem, at.point, at.rows, at.solved, picks, data, open_, at, root @ root.T)
-        dz = fit.covariance @ np.asarray(at.solved.score)
-        found = residuals.innovations(fit, residuals.measured_kurtosis(fit), dz).innovations
-        return _judged(fit, found, tree, known.root, rejection_text(rejected(problem, at.point)))
-    here = SparseEngine().settled(problem.model, at)
-    flat = Precision.single(jnp.zeros(len(known.z)))
-    large = JudgedLarge(problem, here.point, here.rows, here.eliminated, picks, data, flat, here, known.blocks, None)
-    hidden = rejection_text(rejected(problem, at))
-    found = residuals.innovations(large, residuals.measured_kurtosis(large)).innovations
-    return _judged(large, found, tree, known.root, hidden)
+    flat, root, spread, dz = Precision.single(jnp.zeros(len(known.z))), known.spread.root(), known.spread, None
+    if spread.whole and (information := at.information()) is not None:
+        values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(root.T @ information @ root)))
+        both = root @ (vectors / np.sqrt(1.0 + np.maximum(values, 0.0)))
+        spread = SensorBlocks.of(both @ both.T)
+        dz = spread.matrix() @ np.asarray(at.slope())
+    fit = Judged(problem, at, picks, data, flat, spread, engine)
+    found = residuals.innovations(fit, residuals.measured_kurtosis(fit), dz).innovations
+    return _judged(fit, found, tree, root, rejection_text(rejected(problem, at.point)))
 
 
 def _judged(

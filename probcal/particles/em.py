@@ -12,7 +12,8 @@ import numpy as np
 
 from probcal import linalg
 from probcal.inference.hierarchy import held
-from probcal.inference.run import Context, Given, Maximiser, bare, check_method, given_of, learn
+from probcal.inference.method import Context, Given
+from probcal.inference.run import bare, check_method, given_of, learn
 from probcal.model.model import At, Model
 from probcal.particles.ensemble import (
     Ensemble,
@@ -219,7 +220,7 @@ def _beginning(
 
 
 def climb_by_particles(
-    problem: Problem, method: Maximiser, how: ParticleSettings, prior: Prior, z: Any, context: Context
+    problem: Problem, method: Any, how: ParticleSettings, prior: Prior, z: Any, context: Context
 ) -> Answer:
     """Run the loop from biases z (M,) and conclude: a Gaussian about them, its information by
     scores."""

@@ -24,9 +24,9 @@ from probcal.gaussian.mode import Point
 from probcal.inference.chains import Draw, Sample
 from probcal.inference.draws import slice_step
 from probcal.inference.hierarchy import Phi, hierarchy_of
+from probcal.inference.method import Context
 from probcal.inference.posed import Form, Natural, Posed, conditional, log_prior, prior_precision
 from probcal.inference.posterior import Chains, conclude_draws
-from probcal.inference.run import Context
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
 from probcal.model.model import At, Model, Recursion

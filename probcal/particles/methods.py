@@ -1,7 +1,7 @@
 """The methods by particles, by their names on the command line: method, and the prior where not the method's first."""
 
 from probcal.inference.em import EM, EMEA
-from probcal.inference.run import Method
+from probcal.inference.method import Method
 from probcal.particles.gibbs import ParticleGibbs
 from probcal.particles.particles import Particles
 from probcal.priors import Prior

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from probcal.gaussian.mode import Point
-from probcal.inference.run import Context, Maximiser, ParticleSmoother
+from probcal.inference.method import Context, Iterated, ParticleSmoother
 from probcal.particles.em import climb_by_particles
 from probcal.particles.settings import ParticleSettings
 from probcal.particles.weighted import track_by_particles
@@ -48,7 +48,7 @@ class Particles(ParticleSettings, ParticleSmoother):
     'backward'
     """
 
-    def climbed(self, problem: Problem, method: Maximiser, prior: Prior, start: Point, context: Context) -> Answer:
+    def climbed(self, problem: Problem, method: Iterated, prior: Prior, start: Point, context: Context) -> Answer:
         """The answer of EM whose E-step draws particles, from the biases of a start."""
         return climb_by_particles(problem, method, self, prior, start.z, context)
 

@@ -16,7 +16,7 @@ from probcal.gaussian.draws import draw_biases, draws_a_chain, predictive
 from probcal.gaussian.information import rejected
 from probcal.gaussian.mode import Point
 from probcal.inference.ending import ABSURD, FAR, low_and_far
-from probcal.inference.run import Given, Maximiser
+from probcal.inference.method import Given
 from probcal.labels import listed
 from probcal.misfit import rejection_text
 from probcal.model.model import Model
@@ -347,7 +347,7 @@ def log_mean(logs: np.ndarray) -> tuple[float, float]:
 
 
 def conclude_particles(
-    problem: Problem, method: Maximiser, how: ParticleSettings, prior: Prior, given: Given,
+    problem: Problem, method: Any, how: ParticleSettings, prior: Prior, given: Given,
     targets: tuple[Targets, ...], ended: Ended, key: jax.Array,
 ) -> Answer:  # fmt: skip
     """The answer of a climb by particles."""
@@ -486,7 +486,7 @@ def scatter(problem: Problem, point: Point) -> tuple[float, float]:
 
 
 def _judged(
-    posterior: EnsemblePosterior, method: Maximiser, ended: Ended, low: bool, far: bool, ahead: float, slope: ScoreSlope
+    posterior: EnsemblePosterior, method: Any, ended: Ended, low: bool, far: bool, ahead: float, slope: ScoreSlope
 ) -> tuple[Status, str]:
     """Status of a climb by particles, and a sentence; `ahead` is how far a Newton step would go, in sd a bias."""
     if misfit := unexplained(posterior.problem, posterior.point):

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from probcal.analysis.compare import Fits, chosen_pair, fits_by_name, interchangeable, plugged_in
 from probcal.plots.base import LINEAR, ROWS, colour, ellipse_patch, new_axes, plain_text, probability, write_figure
-from probcal.results.blocks import covariance_of
+from probcal.results.blocks import SensorBlocks
 from probcal.status import INVALID
 
 SCATTER = 2_000  # draws of one fit in the picture of a pair
@@ -98,7 +98,7 @@ def plot_pair(fits: Fits, labels: Sequence[str], names: Sequence[str] | None = N
     for k, (name, tree) in enumerate(known.items()):
         group = tree["calibration"].to_dataset().sel(bias_label=[first, second])
         if name == plugged:
-            covariance = covariance_of(group, [first, second], "plot_pair")
+            covariance = SensorBlocks.read(group, [first, second], "plot_pair").matrix()
             style: dict[str, Any] = {"facecolor": "none", "edgecolor": colour(k), "linewidth": 1.8, "zorder": 4}
             ax.add_patch(ellipse_patch(group["mean"].values.tolist(), covariance, probability(tree), **style))
             ax.plot(*group["mean"].values, "+", color=colour(k), markersize=9, markeredgewidth=1.8, zorder=4)

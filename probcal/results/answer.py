@@ -17,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.draws import draw, draw_biases, draws_a_chain
-from probcal.gaussian.linearised import LaplaceApproximation, Linearisation, linearise
-from probcal.gaussian.marginal import volume_slope
+from probcal.gaussian.engine import Expansion
+from probcal.gaussian.linearised import LaplaceApproximation
 from probcal.gaussian.mode import Point
 from probcal.modes.grid import track_mode
 from probcal.modes.mirrors import Mirrored
@@ -151,9 +152,9 @@ class Posterior(ABC):
 
         Its slope at the point is that of the marginal likelihood, the volume of the trajectories with it.
         """
-        at, information = self.linearised, self.summary.information
-        volume, _ = volume_slope(at.model, at.point, at.solved)
-        return information @ np.asarray(at.point.z) + np.asarray(at.solved.score - 0.5 * volume)
+        at, information = self.expansion, self.summary.information
+        z = np.asarray(at.point.z)
+        return np.asarray(at.apply(z) if information is None else information @ z) + np.asarray(at.score())
 
     @property
     def variables(self) -> Mapping[str, Any]:
@@ -175,10 +176,14 @@ class Posterior(ABC):
         """Numbers of the whole run."""
         return {}
 
+    @property
+    def expansion(self) -> Expansion:
+        """The posterior expanded about the point."""
+        return self._expanded
+
     @cached_property
-    def linearised(self) -> Linearisation:
-        """The problem linearised at the point, made once."""
-        return linearise(self.problem.model, self.point)
+    def _expanded(self) -> Expansion:
+        return DenseEngine().at(self.problem.model, self.point)
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,14 +217,14 @@ class NormalPosterior(Posterior):
 
     def tracks(self) -> Sequence[Tracks]:
         """States at the point, and their sd with the biases uncertain."""
-        return tracks_of(self.linearised, self.found.covariance)
+        return tracks_of(self.expansion, SensorBlocks.of(np.asarray(self.found.covariance)))
 
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """Independent draws, as many as the size of the data lets be kept."""
         shape = (CHAINS, draws_a_chain(self.problem.model.size, CHAINS))
         keys = jax.random.split(key)
         z = draw_biases(self.point, self.found.covariance, keys[0], shape[0] * shape[1])
-        drawn = draw(self.linearised, z, self.point.levels, keys[1], keep)
+        drawn = draw(self.expansion, z, self.point.levels, keys[1], keep)
 
         def split(a: Any) -> np.ndarray:
             return np.asarray(a).reshape(*shape, *a.shape[1:])
@@ -239,9 +244,9 @@ def precisions_of(problem: Problem, prior: Prior) -> str:
     return "maximised" if prior.learns and not problem.surveyed.all() else "given"
 
 
-def tracks_of(at: Linearisation, covariance: jax.Array) -> list[Tracks]:
-    """States of each recursion at a point, and their sd for a covariance (M, M) of the biases."""
-    pairs = at.model.each_layout(at.point.states, at.variances(covariance))
+def tracks_of(at: Expansion, spread: SensorBlocks) -> list[Tracks]:
+    """States of each recursion at a point, and their sd for a covariance of the biases."""
+    pairs = at.model.each_layout(at.point.states, at.followed(spread.root()))
     return [Tracks(np.asarray(x), np.sqrt(np.maximum(np.asarray(variance), 0.0))) for _, x, variance in pairs]
 
 

@@ -1,4 +1,4 @@
-"""Covariances of the biases of each sensor by themselves, where there is no room for one of all biases."""
+"""The covariance of biases: of all, or of those of each sensor by themselves where there is no room for that."""
 
 from __future__ import annotations
 
@@ -16,11 +16,21 @@ if TYPE_CHECKING:
 
 
 class SensorBlocks(NamedTuple):
-    """What a fit in sparse form knows of the covariance of M biases; those of two sensors count as independent."""
+    """The covariance of M biases, as far as a fit knows it; those of two blocks count as independent."""
 
     biases: int  # M
     members: np.ndarray  # (B, p) biases of each block, M of none
     covariance: np.ndarray  # (B, p, p); 1 on the diagonal where a block has fewer
+
+    @classmethod
+    def of(cls, covariance: np.ndarray) -> SensorBlocks:
+        """All biases in one block, by their covariance (M, M)."""
+        return cls(len(covariance), np.arange(len(covariance))[None], covariance[None])
+
+    @property
+    def whole(self) -> bool:
+        """Whether the covariance of all biases is held."""
+        return self.members.shape == (1, self.biases)
 
     @property
     def variance(self) -> np.ndarray:
@@ -49,8 +59,17 @@ class SensorBlocks(NamedTuple):
         }  # fmt: skip
 
     @classmethod
-    def read(cls, group: xr.Dataset, labels: Sequence[str], scales: np.ndarray) -> SensorBlocks:
-        """Those of some biases, z over the scales (M,), as a group `calibration` has them."""
+    def read(
+        cls, group: xr.Dataset, labels: Sequence[str], whose: str, scales: np.ndarray | None = None
+    ) -> SensorBlocks:
+        """Those of some biases as a group `calibration` has them; over the scales (M,) where these are given.
+
+        Raises `InputError` where it has none.
+        """
+        scales = np.ones(len(labels)) if scales is None else scales
+        if "block" not in group:
+            held = matrix_of(group, "covariance", whose).sel(bias_label=list(labels), bias_label_other=list(labels))
+            return cls.of(held.values / np.outer(scales, scales))
         own = group[["block", "block_place", "block_covariance"]].sel(bias_label=list(labels))
         number = np.unique(own["block"].values, return_inverse=True)[1]
         place, M, p = own["block_place"].values, len(labels), group.sizes["place"]
@@ -95,7 +114,11 @@ class SensorBlocks(NamedTuple):
         return self._replace(covariance=np.linalg.inv(np.linalg.inv(self.covariance) + eye))
 
     def root(self) -> Any:
-        """A sparse root (M, B p) of the covariance."""
+        """A root (M, R) of the covariance, sparse where sensors are independent."""
+        if self.whole:
+            from probcal import linalg  # loads JAX
+
+            return linalg.symmetric_root(self.matrix())
         from scipy.sparse import csc_array  # loaded where it is used
 
         B, p = self.members.shape
@@ -105,14 +128,3 @@ class SensorBlocks(NamedTuple):
         values, vectors = np.linalg.eigh(np.where(there & there.mT, self.covariance, 0.0))
         root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]  # of rank 0 too, as of chains that stand still
         return csc_array((root[there], (row[there], column[there])), (self.biases, B * p))
-
-
-def covariance_of(group: xr.Dataset, labels: Sequence[str], whose: str) -> np.ndarray:
-    """The covariance of some biases in their units, from a group `calibration`; in sparse form by sensor.
-
-    Raises `InputError` where the group holds neither.
-    """
-    if "block" in group:
-        return SensorBlocks.read(group, labels, np.ones(len(labels))).matrix()
-    matrix = matrix_of(group, "covariance", whose).sel(bias_label=list(labels), bias_label_other=list(labels))
-    return np.asarray(matrix.values)

@@ -9,7 +9,7 @@ import pandas as pd
 
 from probcal.errors import checked
 from probcal.labels import step_of
-from probcal.results.blocks import covariance_of
+from probcal.results.blocks import SensorBlocks
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -49,9 +49,10 @@ def drift_table(tree: xr.DataTree) -> pd.DataFrame:
             continue
         for since in sorted({max(time, start) for time, _ in own} | {start}):
             so_far = [name, *(label for time, label in own if time <= since)]
-            members = [labels.index(label) for label in so_far if label in units]
+            names = [label for label in so_far if label in units]
+            members = [labels.index(label) for label in names]
             held = sum(fixed.get(label, 0.0) for label in so_far)
             lower, upper = held + np.quantile(draws[..., members].sum(-1), [tail, 1 - tail])
-            sd = np.sqrt(covariance_of(group, [labels[m] for m in members], "drift_table").sum())
+            sd = np.sqrt(SensorBlocks.read(group, names, "drift_table").matrix().sum())
             table.append((name, units[known[0]], since, held + mean[members].sum(), sd, lower, upper))
     return pd.DataFrame(table, columns=columns)

@@ -187,17 +187,12 @@ def _check_moments(tree: xr.DataTree, path: Path) -> None:
         raise InputError(
             f"{path}: calibration/lower of {labels[upside[0]]} lies above its upper; the file was changed, fit again"
         )
-    if "block" in group:
-        try:
-            name, blocks = (
-                "block_covariance",
-                SensorBlocks.read(group, labels, np.ones(len(labels))).covariance,
-            )
-        except (IndexError, ValueError):
-            raise InputError(f"{path}: calibration/block names no block; the file was changed, fit again") from None
-    else:
-        name, blocks = "covariance", group["covariance"].values[None]
-    if not _semi_definite(blocks):
+    name = "block_covariance" if "block" in group else "covariance"
+    try:
+        spread = SensorBlocks.read(group, labels, str(path))
+    except (IndexError, ValueError):
+        raise InputError(f"{path}: calibration/block names no block; the file was changed, fit again") from None
+    if not _semi_definite(spread.covariance):
         raise InputError(f"{path}: calibration/{name} is no covariance matrix; the file was changed, fit again")
 
 

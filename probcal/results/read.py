@@ -12,7 +12,7 @@ import numpy as np
 
 from probcal.errors import InputError, checked
 from probcal.labels import NOBODY
-from probcal.results.blocks import SensorBlocks, covariance_of
+from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import MORE, SUMMARY
 from probcal.status import INVALID
 
@@ -125,28 +125,12 @@ class Calibrated:
     problem: Problem
     z: np.ndarray  # (M,)
     levels: np.ndarray  # (H,) log factors
-    spread: np.ndarray | SensorBlocks  # covariance (M, M), or what a fit in sparse form has of it
+    spread: SensorBlocks  # of its covariance
 
     @property
     def covariance(self) -> np.ndarray:
         """Covariance (M, M) of z."""
-        return self.spread.matrix() if isinstance(self.spread, SensorBlocks) else self.spread
-
-    @property
-    def blocks(self) -> SensorBlocks:
-        """The covariance of z by sensor, of one held as a matrix the variances."""
-        if isinstance(self.spread, SensorBlocks):
-            return self.spread
-        M = len(self.z)
-        return SensorBlocks(M, np.arange(M)[:, None], np.diag(self.spread)[:, None, None])
-
-    @property
-    def root(self) -> Any:
-        """A root (M, R) of the covariance, sparse where sensors are independent."""
-        if isinstance(self.spread, SensorBlocks):
-            return self.spread.root()
-        values, vectors = np.linalg.eigh(self.spread)
-        return vectors * np.sqrt(np.maximum(values, 0.0))
+        return self.spread.matrix()
 
 
 def held_by(calibration: xr.DataTree, labels: Sequence[str]) -> dict[str, float]:
@@ -255,9 +239,7 @@ def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
     if problem.levels and "level" in calibration.children:
         found = calibration["level"].to_dataset()["std"].to_series()
         levels = np.array([level.log(found.get(level.label, level.guess)) for level in problem.levels])
-    if "block" in group:
-        return Calibrated(problem, mean / problem.scales, levels, SensorBlocks.read(group, labels, problem.scales))
-    spread = covariance_of(group, labels, "a calibration") / np.outer(problem.scales, problem.scales)
+    spread = SensorBlocks.read(group, labels, "a calibration", problem.scales)
     return Calibrated(problem, mean / problem.scales, levels, spread)
 
 

@@ -25,10 +25,10 @@ from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point, find_mode
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.identity import identity_of, points_digest, seed_text
+from probcal.inference.method import Context, Method
 from probcal.inference.methods import NUTS, check_problem, choose_prior
 from probcal.inference.posed import Form
 from probcal.inference.progress import Monitor, OnProgress
-from probcal.inference.run import Context, Method
 from probcal.inference.sampler import Sampler
 from probcal.inference.solve import solve
 from probcal.inference.spread import check_scheduler, spread

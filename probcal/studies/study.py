@@ -20,21 +20,10 @@ from probcal.gaussian.mode import Point
 from probcal.inference.ending import conclude
 from probcal.inference.identity import identity, problem_digest
 from probcal.inference.integrate import Integrated, Integration, integrate
+from probcal.inference.method import Context, Given, Method, State
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
 from probcal.inference.progress import Monitor, OnProgress
-from probcal.inference.run import (
-    Context,
-    Given,
-    Maximiser,
-    Method,
-    State,
-    check_method,
-    first_precision,
-    first_state,
-    given_of,
-    kernel,
-    stepped,
-)
+from probcal.inference.run import Maximiser, check_method, first_precision, first_state, given_of, kernel, stepped
 from probcal.inference.solve import solve
 from probcal.inference.spread import check_scheduler, spread
 from probcal.inference.storage import Storage

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from probcal.errors import FitError
-from probcal.inference.run import Context, Method
+from probcal.inference.method import Context, Method
 from probcal.inference.solve import solve
 from probcal.lazy import Later
 from probcal.priors import Prior

@@ -1,7 +1,7 @@
 """The methods for detections without names, by their names on the command line."""
 
 from probcal.inference.ea import EA
-from probcal.inference.run import Method
+from probcal.inference.method import Method
 from probcal.priors import Prior
 from probcal.tracking.selfconfig import SelfConfiguration
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from probcal.errors import FitError, InputError
 from probcal.gaussian.mode import Point
-from probcal.inference.run import Context, FitLabelled, Method
+from probcal.inference.method import Context, FitLabelled, Method
 from probcal.lazy import Later
 from probcal.priors import Prior
 from probcal.problem import Problem
