@@ -127,6 +127,9 @@ MUTATIONS = [
     Mutation("@ moved[epoch] + by_bias", "@ moved[epoch] - by_bias", "test_formulas.py test_observability.py"),
     Mutation("jnp.exp(point.levels - levels)", "jnp.exp(levels - point.levels)", "test_formulas.py"),
     Mutation("(squares + point.trajectories.square)", "squares", "test_guards.py"),
+    # gaussian/jointly.py
+    Mutation("slopes.z - model.onto_biases(", "slopes.z + model.onto_biases(", "test_engine.py"),
+    Mutation("own, lin.score - lin.weight * by[:, :, 0]", "own, lin.score", "test_engine.py"),
     # gaussian/draws.py
     Mutation("x[:, :, None] + prior - smooth.states", "x[:, :, None] + prior + smooth.states", "test_exact.py"),
     Mutation("jax.random.normal(key, (count, M)) @ root.T", "jax.random.normal(key, (count, M)) @ root", "test_exact.py"),

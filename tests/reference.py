@@ -12,7 +12,8 @@ import jax
 import numpy as np
 import pandas as pd
 
-from probcal.gaussian.engine import Embedded, Estimate, Sampled, Spread
+from probcal.gaussian.engine import Estimate, Sampled, Spread
+from probcal.gaussian.jointly import Embedded, Variables
 from probcal.gaussian.linearised import given_biases, linearise_rows
 from probcal.gaussian.mode import eliminate_rows, factors, find_tracks, log_likelihood, mixing_gain
 from probcal.model.model import scaled
@@ -481,13 +482,23 @@ class Naive:
         own = self.covariance(factors)[self.U :, self.U :]
         return self._by_row(self.w * np.sum((follows @ own) * follows, 1))
 
-    def sample(self, factors, key, count):
+    def deviations(self, factors, key, count):
         rng, P = np.random.default_rng(np.asarray(jax.random.key_data(key))), self.covariance(factors)
-        middle = self.moved(self.solve(factors, self.score() + np.asarray(factors.pull(self.point.z))))
         drawn = rng.multivariate_normal(np.zeros(len(P)), P, count)
-        states = (np.asarray(x) + np.einsum("enu,du->den", own, drawn[:, : self.U])
-                  for own, x in zip(self.maps, middle.states, strict=True))  # fmt: skip
-        return Sampled(np.asarray(middle.z) + drawn[:, self.U :], tuple(states))
+        return Sampled(
+            drawn[:, self.U :], tuple(np.einsum("enu,du->den", own, drawn[:, : self.U]) for own in self.maps)
+        )
+
+    @property
+    def held_states(self):
+        own = np.linalg.inv(self.joint[: self.U, : self.U])
+        return tuple(part @ own @ part.transpose(0, 2, 1) for part in self.maps)
+
+    def respond(self, factors, slopes):
+        by_states = sum(np.einsum("enu,enk->uk", own, b) for own, b in zip(self.maps, slopes.states, strict=True))
+        found = self.covariance(factors) @ np.concatenate([by_states, slopes.z])
+        states = (np.einsum("enu,uk->enk", own, found[: self.U]) for own in self.maps)
+        return Variables(tuple(states), found[self.U :])
 
     def weighed(self, weights):
         return Naive(self.model.weighted(weights), self.point, scaled(self.rows, weights))

@@ -31,7 +31,7 @@ FLOORS = {
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names}
 METHODS = (  # algorithms
     "inference.ea", "inference.em", "inference.collapsed", "inference.nuts", "tracking.selfconfig",
-    "inference.sparse_gibbs", "inference.svi", "particles.gibbs",
+    "inference.joint_gibbs", "inference.svi", "particles.gibbs",
 )  # fmt: skip
 SHARED = tuple(
     f"inference.{name}"

@@ -17,6 +17,11 @@ def choose(model: Model) -> Engine:
     return SparseEngine() if prefers_sparse(model) and not missing(model) else DenseEngine()
 
 
+def choose_fast(model: Model) -> Engine:
+    """The engine that solves fastest under many factors: sparse also where an epoch sees few of many biases."""
+    return SparseEngine() if is_thin(model) and not missing(model) else choose(model)
+
+
 def prefers_sparse(model: Model) -> bool:
     """Whether the matrices of the dense form take more than 240 MB."""
     return dense_numbers(model) > ROOM

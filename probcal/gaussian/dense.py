@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian import recursion as rec
 from probcal.gaussian.draws import draw_trajectories
-from probcal.gaussian.engine import Embedded, Estimate, Factors, Sampled, Spread, density_of, mean
+from probcal.gaussian.engine import Estimate, Factors, Sampled, Spread, density_of
 from probcal.gaussian.linearised import (
     Trajectory,
     compress_and_eliminate,
@@ -55,7 +54,7 @@ class DenseExpansion:
     rows: tuple[Linearised, ...]
     system: Compressed
     eliminated: Eliminated
-    _kept: list[Any] = field(default_factory=list)  # the factors that were asked for last, and their covariance
+    _kept: list[Any] = field(default_factory=list)  # the factors asked for last, precision and covariance
 
     @cached_property
     def trajectories(self) -> tuple[Trajectory, ...]:
@@ -65,6 +64,11 @@ class DenseExpansion:
     def given_biases(self) -> tuple[Trajectory, ...]:
         """The trajectories of each recursion given the biases."""
         return self.trajectories
+
+    @property
+    def held_states(self) -> tuple[jax.Array, ...]:
+        """Covariance (E, n, n) of every state of each recursion, the biases known."""
+        return tuple(own.covariance for own in self.trajectories)
 
     @cached_property
     def _density(self) -> float:
@@ -109,6 +113,8 @@ class DenseExpansion:
 
     def _precision(self, factors: Factors) -> np.ndarray:
         """The precision of the biases; what rounding leaves below zero is no information."""
+        if self._kept and self._kept[0] is factors:
+            return self._kept[1]
         information, own = self.information(), factors.matrix(self.model.biases)
         try:
             np.linalg.cholesky(information + own)
@@ -121,9 +127,10 @@ class DenseExpansion:
     def covariance(self, factors: Factors) -> jax.Array:
         """Covariance (M, M) of the biases."""
         if not (self._kept and self._kept[0] is factors):
-            inverse = np.linalg.inv(self._precision(factors))
-            self._kept[:] = [factors, jax.device_put(0.5 * (inverse + inverse.T))]
-        return self._kept[1]
+            precision = self._precision(factors)
+            inverse = np.linalg.inv(precision)
+            self._kept[:] = [factors, precision, jax.device_put(0.5 * (inverse + inverse.T))]
+        return self._kept[2]
 
     def marginals(self, factors: Factors, members: np.ndarray) -> jax.Array:
         """Covariances (B, p, p) of biases (B, p), M of none: 1 on its diagonal."""
@@ -157,11 +164,12 @@ class DenseExpansion:
         biases cause."""
         return leverages(self.model, self.rows, self.trajectories, self.covariance(factors))
 
-    def sample(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
-        """Biases and trajectories drawn around the mean that the factors make."""
-        keys, inverse = jax.random.split(key), _solved(self._precision(factors))
-        z = mean(self, factors)[None] + inverse.draw(keys[0], count)
-        return Sampled(z, draw_trajectories(self, jnp.asarray(z), keys[1]))
+    def deviations(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
+        """Biases and states drawn around zero, as they differ from their mean."""
+        keys = jax.random.split(key)
+        dz = _solved(self._precision(factors)).draw(keys[0], count)
+        states = draw_trajectories(self, self.point.z[None] + dz, keys[1])
+        return Sampled(dz, self.model.each(lambda _, x, mean: x - mean[None], states, self.point.states))
 
     def followed(self, root: Any) -> list[np.ndarray]:
         """Variance (E, n) of every state where the biases have the covariance root root', root (M,
@@ -178,12 +186,6 @@ class DenseExpansion:
         """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
         return DenseEngine().at(self.model.weighted(weights), self.point, scaled(self.rows, weights))
 
-    def embedded(self, factors: Factors, columns: Data) -> Embedded:
-        """Information and score of K more parameters, by which predicted values change as columns
-        (N, C, K)."""
-        pull = self.eliminated.score + factors.pull(self.point.z)
-        return _embedded(self.model, self.point, self.rows, self.eliminated, self.covariance(factors), pull, columns)
-
 
 _solved = jax.jit(Dense.of)
 _moved = jax.jit(follow)
@@ -194,32 +196,3 @@ def _state_covariances(trajectories: tuple[Trajectory, ...], covariance: jax.Arr
     return tuple(
         own.covariance + jnp.einsum("eni,ij,emj->enm", own.response, covariance, own.response) for own in trajectories
     )
-
-
-@jax.jit
-def _embedded(
-    model: Model,
-    point: Point,
-    rows: tuple[Linearised, ...],
-    solved: Eliminated,
-    covariance: jax.Array,
-    pull: jax.Array,
-    columns: Data,
-) -> Embedded:
-    """Rows of the parameters beside those of states and biases, both eliminated."""
-    free = follow(model, point, solved, jnp.zeros_like(point.z))
-    relaxed = [(after - before)[:, :, None] for _, after, before in model.each_layout(free.states, point.states)]
-    scores = [
-        lin.score - lin.weight * by[:, :, 0] for *_, lin, by in model.each_block(rows, model.by_state(rows, relaxed))
-    ]
-    weighted = tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, columns))
-    onto = model.onto_states(rows, weighted)
-    moved = model.each(lambda part, kept, b: rec.smooth(part.F, kept.gain, b).states, solved.parts, onto)
-    left = jax.tree.map(jnp.subtract, tuple(columns), model.by_state(rows, moved))
-    both = tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, left))
-    across = model.onto_biases(rows, both)
-    bias = covariance @ across
-    pairs = list(model.each_block(columns, both, scores))
-    information = sum(jnp.einsum("nck,ncl->kl", own, rest) for *_, own, rest, _ in pairs)
-    score = sum(jnp.einsum("nck,nc->k", own, pulled) for *_, own, _, pulled in pairs)
-    return Embedded(information - across.T @ bias, score - bias.T @ pull)

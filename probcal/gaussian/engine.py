@@ -114,13 +114,6 @@ class Spread(NamedTuple):
     states: tuple[np.ndarray, ...]  # (E, n) of each recursion
 
 
-class Embedded(NamedTuple):
-    """The data about K further parameters at zero, the trajectories and biases eliminated."""
-
-    information: Any  # (K, K)
-    score: Any  # (K,)
-
-
 class Expansion(Protocol):
     """The posterior expanded about a point, trajectories eliminated.
 
@@ -145,6 +138,10 @@ class Expansion(Protocol):
 
     def given_biases(self) -> Sequence[Any]:
         """The trajectories of each recursion given the biases, as `linearised.GivenBiases`."""
+
+    @property
+    def held_states(self) -> tuple[Any, ...]:
+        """Covariance (E, n, n) of every state of each recursion, the biases known."""
 
     def density(self) -> float:
         """Log density of the data given the biases at the point, up to the constant of the noises."""
@@ -189,8 +186,8 @@ class Expansion(Protocol):
         """Leverage of every datum (N, C) on the biases: w times the part of the above that the
         biases cause."""
 
-    def sample(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
-        """Biases and trajectories drawn around the mean that the factors make."""
+    def deviations(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
+        """Biases and states drawn around zero, as they differ from their mean."""
 
     def followed(self, root: Any) -> list[np.ndarray]:
         """Variance (E, n) of every state where the biases have the covariance root root', root (M,
@@ -198,10 +195,6 @@ class Expansion(Protocol):
 
     def weighed(self, weights: Data) -> Expansion:
         """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
-
-    def embedded(self, factors: Factors, columns: Data) -> Embedded:
-        """Information and score of K more parameters, by which predicted values change as columns
-        (N, C, K)."""
 
 
 class Engine(Protocol):
@@ -215,6 +208,17 @@ class Engine(Protocol):
 
     def settled(self, model: Model, point: Point) -> Expansion:
         """The same at the modes of its trajectories for its biases."""
+
+
+def beyond_gaussian(model: Model) -> str:
+    """What a model has that no expansion holds as a Gaussian of known noise, in words; empty where it has nothing."""
+    if model.level_spread.shape[0]:
+        return "unknown noise levels"
+    if model.tailed:
+        return "process noise that is not Gaussian"
+    if any(form is not None for form in model.sampled):
+        return "a motion without a linear form"
+    return ""
 
 
 def mean(at: Expansion, factors: Factors) -> Any:

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg
 from probcal.gaussian import cholesky
 from probcal.gaussian.cholesky import Entries, Factor, factorise, mirrored
-from probcal.gaussian.engine import Factors
-from probcal.gaussian.mode import factors
+from probcal.gaussian.engine import Factors, beyond_gaussian
+from probcal.gaussian.mode import factors, inverse_factors
 from probcal.gaussian.products import Products
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
@@ -29,12 +29,8 @@ from probcal.model.rows import Linearised
 def missing(model: Model) -> str:
     """What a model has that the sparse form does not take, in words; empty where it takes the
     model."""
-    if model.level_spread.shape[0]:
-        return "unknown noise levels"
-    if model.tailed:
-        return "process noise that is not Gaussian"
-    if any(form is not None for form in model.sampled):
-        return "a motion without a linear form"
+    if found := beyond_gaussian(model):
+        return found
     if any(not np.all(_drives(part) | _carries(part) | _fixes(part)) for part in model.recursions):
         return "a motion whose noise reaches only a part of the state"
     return ""
@@ -118,7 +114,7 @@ class JointPrecision:
 
     def values(self, model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> np.ndarray:
         """Entries (entries,) of the precision of data and motion, the biases without prior."""
-        found = np.asarray(_values(model, tuple(jnp.asarray(own) for own in self.driven), lins, levels))
+        found = np.asarray(_values(model, lins, levels))
         more = np.zeros(len(self.extra))
         if model.tilt is not None:
             more = np.asarray(model.tilt.curvature)[tuple(self.extra.T)]
@@ -149,14 +145,20 @@ class JointPrecision:
     def pairs(self, members: np.ndarray) -> np.ndarray:
         """Where the entries (B, p, p) of pairs of biases (B, p) are, -1 where there is no pair; M
         is no bias."""
-        keys = self.places.row.astype(np.int64) * self.places.size + self.places.column
-        order = np.argsort(keys, kind="stable")
+        order, keys = self._order
         low = np.minimum(members[:, :, None], members[:, None, :]) + self.states
         high = np.maximum(members[:, :, None], members[:, None, :]) + self.states
         wanted = low.astype(np.int64) * self.places.size + high
-        at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
-        there = (high < self.places.size) & (keys[order][at] == wanted)
+        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        there = (high < self.places.size) & (keys[at] == wanted)
         return np.where(there, order[at], -1)
+
+    @cached_property
+    def _order(self) -> tuple[np.ndarray, np.ndarray]:
+        """The entries sorted by their places, and a number of each place, ascending."""
+        keys = self.places.row.astype(np.int64) * self.places.size + self.places.column
+        order = np.argsort(keys, kind="stable")
+        return order, keys[order]
 
     def steps(self, model: Model, inverse: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Covariances (E, n, n) of each state of each recursion, of the one before, and between
@@ -232,15 +234,6 @@ class JointPrecision:
     def of_biases(self, pull: np.ndarray) -> np.ndarray:
         """A right-hand side (n,) with entries (M,) or (M, K) for the biases alone."""
         return np.concatenate([np.zeros((self.states, *pull.shape[1:])), pull])
-
-    def variables(self, states: Sequence[Any], biases: Any) -> np.ndarray:
-        """What belongs to states (E, n, K) of each recursion and to biases (M, K), summed by
-        variable, (n, K)."""
-        found = np.zeros((self.places.size + 1, biases.shape[1]))  # of known states last
-        for own, x in zip(self.slots, states, strict=True):
-            np.add.at(found, own, np.asarray(x))
-        found[self.states : -1] = biases
-        return found[:-1]
 
     def state_values(self, values: np.ndarray) -> list[np.ndarray]:
         """Of values (n,) of all variables those of the states (E, n) of each recursion, 0 where
@@ -331,15 +324,14 @@ def _entries(
 
 
 @jax.jit
-def _values(model: Model, driven: tuple[jax.Array, ...], lins: tuple[Linearised, ...], levels: jax.Array) -> jax.Array:
+def _values(model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> jax.Array:
     """Values of the blocks of the joint precision in the order of `_entries`, the diagonal of the
     biases zero."""
     found = []
-    for part, (J, _), own in model.each_layout(model.of_states(lins), driven):
+    for part, (J, _) in model.each_layout(model.of_states(lins)):
         n = J.shape[1]
         i, j = np.triu_indices(n)
-        root = jnp.where(own[:, None, None], factors(part, levels), jnp.eye(n)[None])
-        inverse = jnp.where(own[:, None, None], linalg.inverses(root), 0.0)
+        inverse = inverse_factors(part, levels)
         back = inverse @ part.F
         found += [(J + inverse.mT @ inverse)[:, i, j], (back.mT @ back)[:, i, j], -(back.mT @ inverse)]
     for _, data, _, lin in model.each_block(lins):

@@ -11,16 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg
 from probcal.errors import InputError
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.cholesky import Factor, exact
 from probcal.gaussian.climb import settle_each
-from probcal.gaussian.engine import Embedded, Estimate, Factors, Sampled, Spread, density_of
+from probcal.gaussian.engine import Estimate, Factors, Sampled, Spread, density_of
 from probcal.gaussian.joint import JointPrecision
+from probcal.gaussian.jointly import follow_biases, times_weights
 from probcal.gaussian.linearised import GivenBiases, given_biases, linearise_rows
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import Eliminated, Point, eliminate_rows, factors
+from probcal.gaussian.mode import Eliminated, Point, eliminate_rows, factors, inverse_factors
 from probcal.model.model import Data, Model, scaled
 from probcal.model.rows import Linearised
 
@@ -101,9 +101,12 @@ class SparseExpansion:
         return given_biases(self.model, self.point.levels, self.eliminated)
 
     @cached_property
-    def _relaxed(self) -> tuple[Data, jax.Array]:
-        """Scores (N, C) of the data, and slope (M,) of the log-likelihood, with every track at its
-        mode."""
+    def held_states(self) -> tuple[jax.Array, ...]:
+        """Covariance (E, n, n) of every state of each recursion, the biases known."""
+        return _held_states(self.model, self.point, self.eliminated)
+
+    @cached_property
+    def _relaxed(self) -> jax.Array:
         return _relaxed(self.model, self.point, self.rows, self.eliminated)
 
     def solved(self, factors: Factors) -> _Solved:
@@ -138,7 +141,7 @@ class SparseExpansion:
 
     @cached_property
     def _slope(self) -> jax.Array:
-        return self._relaxed[1] - 0.5 * volume_slope(self.model, self.point, self.eliminated)[0]
+        return self._relaxed - 0.5 * volume_slope(self.model, self.point, self.eliminated)[0]
 
     def score(self) -> jax.Array:
         """Its slope (M,) by the biases, the volume of the trajectories with it."""
@@ -146,7 +149,7 @@ class SparseExpansion:
 
     def slope(self) -> jax.Array:
         """Slope (M,) of the log-likelihood by the biases, tracks following, without it."""
-        return self._relaxed[1]
+        return self._relaxed
 
     def log_det(self, factors: Factors) -> Estimate:
         """Log determinant of the precision of the biases."""
@@ -232,14 +235,13 @@ class SparseExpansion:
         parts = self.model.each_block(self.rows, both, alone)
         return tuple(np.asarray(lin.weight) * (own - held) for *_, lin, own, held in parts)
 
-    def sample(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
-        """Biases and trajectories drawn around the mean that the factors make."""
+    def deviations(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
+        """Biases and states drawn around zero, as they differ from their mean."""
         found, rng = self.solved(factors), np.random.default_rng(np.asarray(jax.random.key_data(key)))
         drawn = found.factor.draw(rng, count)
-        middle = self.moved(found.biases(self.score() + factors.pull(self.point.z)))
         padded = np.concatenate([drawn, np.zeros((count, 1))], 1)  # no variable: -1
-        states = self.model.each(lambda _, x, own: np.asarray(x) + padded[:, own], middle.states, self.joint.slots)
-        return Sampled(np.asarray(middle.z) + drawn[:, self.joint.states :], states)
+        states = tuple(jnp.asarray(padded[:, own]) for own in self.joint.slots)
+        return Sampled(jnp.asarray(drawn[:, self.joint.states :]), states)
 
     def followed(self, root: Any) -> list[np.ndarray]:
         """Variance (E, n) of every state where the biases have the covariance root root', root (M,
@@ -259,15 +261,6 @@ class SparseExpansion:
         """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
         return SparseExpansion(self.model.weighted(weights), self.point, scaled(self.rows, weights), self.joint)
 
-    def embedded(self, factors: Factors, columns: Data) -> Embedded:
-        """Information and score of K more parameters, by which predicted values change as columns
-        (N, C, K)."""
-        found, (scores, pull) = self.solved(factors), self._relaxed
-        own, score, states, biases = _columns(self.model, self.rows, scores, columns)
-        right = self.joint.variables(states, biases)
-        step = found.factor.solve(self.joint.of_biases(np.asarray(pull + factors.pull(self.point.z))))
-        return Embedded(np.asarray(own) - right.T @ found.factor.solve(right), np.asarray(score) - right.T @ step)
-
 
 def check_exact(joint: JointPrecision) -> None:
     """Raise `InputError` where no library is there that gives exact variances."""
@@ -282,10 +275,15 @@ def _held(model: Model, point: Point, rows: tuple[Linearised, ...]) -> Eliminate
 
 
 @jax.jit
+def _held_states(model: Model, point: Point, held: Eliminated) -> tuple[jax.Array, ...]:
+    return model.each(lambda part, kept: rec.covariances(part.F, factors(part, point.levels), kept.gain)[0], held.parts)
+
+
+@jax.jit
 def _followed(model: Model, point: Point, rows: tuple[Linearised, ...], held: Eliminated, dz: jax.Array) -> Point:
     """Tracks at their smoothed response to a step of the biases, by columns of the rows: no (E, n,
     M) is made."""
-    columns = model.onto_states(rows, _weighted(model, rows, model.by_bias(rows, -dz[:, None])))
+    columns = model.onto_states(rows, times_weights(model, rows, model.by_bias(rows, -dz[:, None])))
 
     def one(x: jax.Array, u: jax.Array, part: Any, kept: Any, column: jax.Array) -> tuple[jax.Array, jax.Array]:
         drift = -(factors(part, point.levels) @ u[:, :, None])
@@ -296,39 +294,23 @@ def _followed(model: Model, point: Point, rows: tuple[Linearised, ...], held: El
     return point._replace(trajectories=moved, z=point.z + dz)
 
 
-def _weighted(model: Model, rows: tuple[Linearised, ...], columns: Data) -> Data:
-    """Columns (N, C, K) of the data times their weights."""
-    return tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, columns))
-
-
 @jax.jit
-def _relaxed(model: Model, point: Point, rows: tuple[Linearised, ...], held: Eliminated) -> tuple[Data, jax.Array]:
+def _relaxed(model: Model, point: Point, rows: tuple[Linearised, ...], held: Eliminated) -> jax.Array:
+    """Slope (M,) of the log-likelihood by the biases with every track at its mode."""
     free = _followed(model, point, rows, held, jnp.zeros_like(point.z))
     away = [(after - before)[:, :, None] for _, after, before in model.each_layout(free.states, point.states)]
-    moved = _weighted(model, rows, model.by_state(rows, away))
+    moved = times_weights(model, rows, model.by_state(rows, away))
     scores = tuple(lin.score - own[:, :, 0] for *_, lin, own in model.each_block(rows, moved))
     pull = model.onto_biases(rows, tuple(own[:, :, None] for own in scores))[:, 0]
-    return scores, pull if model.tilt is None else pull + model.tilt.pull(point.z)
+    return pull if model.tilt is None else pull + model.tilt.pull(point.z)
 
 
 @jax.jit
 def _informed(model: Model, rows: tuple[Linearised, ...], held: Eliminated, z: jax.Array) -> jax.Array:
     """Information about the biases times z (M, K): the rows' own, less what the tracks take up."""
-    columns = model.onto_states(rows, _weighted(model, rows, model.by_bias(rows, -z)))
-    states = model.each(lambda part, kept, own: rec.smooth(part.F, kept.gain, own).states, held.parts, columns)
-    found = model.onto_biases(rows, _weighted(model, rows, model.responses(rows, states, z)))
+    states = follow_biases(model, rows, tuple(kept.gain for kept in held.parts), z)
+    found = model.onto_biases(rows, times_weights(model, rows, model.responses(rows, states, z)))
     return found if model.tilt is None else found + model.tilt.curvature @ z
-
-
-@jax.jit
-def _columns(model: Model, rows: tuple[Linearised, ...], scores: Data, columns: Data) -> tuple[Any, ...]:
-    """Of columns (N, C, K) of further parameters their own information and score, and those with
-    states and biases."""
-    weighted = _weighted(model, rows, columns)
-    pairs = list(model.each_block(columns, weighted, scores))
-    information = sum(jnp.einsum("nck,ncl->kl", own, w) for *_, own, w, _ in pairs)
-    score = sum(jnp.einsum("nck,nc->k", own, pull) for *_, own, _, pull in pairs)
-    return information, score, model.onto_states(rows, weighted), model.onto_biases(rows, weighted)
 
 
 @jax.jit
@@ -338,10 +320,8 @@ def _noise_variances(model: Model, point: Point, steps: tuple[tuple[jax.Array, .
 
     def one(part: Any, step: tuple[jax.Array, ...]) -> jax.Array:
         own, before, across = step
-        both, L = part.F @ across, factors(part, point.levels)
+        both, inverse = part.F @ across, inverse_factors(part, point.levels)
         spread = own - both - both.mT + part.F @ before @ part.F.mT
-        reached = jnp.any(L != 0, (1, 2))[:, None, None]
-        inverse = linalg.inverses(jnp.where(reached, L, jnp.eye(L.shape[1])[None]))
         return jnp.einsum("eij,ejk,eik->ei", inverse, spread, inverse)
 
     return model.each(one, steps)

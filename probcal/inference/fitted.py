@@ -12,6 +12,7 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
+from probcal.gaussian.choose import choose
 from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.information import at_levels
@@ -143,8 +144,9 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
     problem, datum, picks = identified(problem, fit, answer)
     group = fit["calibration"].to_dataset()
     spread = SensorBlocks.read(group, problem.labels, "assess", problem.scales)
-    asked = getattr(answer.method, "engine", "sparse") if answer is not None else "sparse"
-    engine = engine_of(asked) if fit.attrs.get("sparse", 0) else DenseEngine()
+    asked = None if answer is None else getattr(answer.method, "engine", None)
+    large = choose(problem.model) if asked is None else engine_of(asked)
+    engine = large if fit.attrs.get("sparse", 0) else DenseEngine()
     if answer is not None:
         at, scaled = answer.posterior.expansion, getattr(answer.posterior, "declared", None)
     else:

@@ -65,7 +65,7 @@ class Method(ABC):
     priors: ClassVar[tuple[type, ...]]  # the first is its own
     intervals: ClassVar[str]  # what the intervals are worth
     climbs: ClassVar[bool] = True  # to a mode; others start at the joint mode where noise levels are unknown
-    sparsely: ClassVar[bool] = False  # whether it works by sparse factors, whatever the size
+    engined: ClassVar[bool] = False  # whether it asks the engine that suits the size, and no other form
 
     @property
     def by_particles(self) -> bool:

@@ -14,10 +14,10 @@ from probcal.errors import InputError
 from probcal.inference.collapsed import Collapsed
 from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
+from probcal.inference.joint_gibbs import Gibbs
 from probcal.inference.method import Method
 from probcal.inference.nuts import NUTS
 from probcal.inference.run import Maximiser
-from probcal.inference.sparse_gibbs import Gibbs
 from probcal.inference.svi import SVI
 from probcal.lazy import Later
 from probcal.priors import PRIORS, AnyPrior, BernoulliGaussian, Flat, Gaussian, Laplace, Prior, as_prior

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.gaussian.choose import choose
+from probcal.gaussian.choose import choose, choose_fast
 from probcal.gaussian.mode import Point
 from probcal.gaussian.room import check_room
 from probcal.inference.blockwise import PRODUCTS, check_sparse, gains_by_sparse, side_climb, takes_sparse
+from probcal.inference.joint_gibbs import check_gibbs
 from probcal.inference.method import Context, Method
 from probcal.inference.methods import MAP
 from probcal.inference.progress import Monitor, Stopped
 from probcal.inference.run import Maximiser
-from probcal.inference.sparse_gibbs import check_gibbs
 from probcal.labels import SCENE, START, listed
 from probcal.modes import further_starts
 from probcal.modes import optima as optima_of
@@ -143,7 +143,7 @@ def _without(answer: Answer, unseen: str, monitor: Monitor) -> Answer:
 
 def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> Method | None:
     """The method where it solves a problem in sparse form; raises `InputError` where it must, and does not take it."""
-    if method.sparsely:
+    if method.engined:
         if starts > 1:
             raise InputError(f"{method.name} takes one start: its chains begin at different draws (chains=...)")
         check_gibbs(problem, prior)
@@ -172,7 +172,7 @@ def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point
         except MemoryError:
             unseen = "Memory did not hold what looking at the other side of a mirror takes."
             return replace(found, message=f"{found.message} {unseen}".strip())
-    climb = side_climb(problem, "sparse")
+    climb = side_climb(problem, choose_fast(problem.model))
     try:
         sides = other_sides(problem, climb.mode(start)[0], climb)
     except MemoryError:  # which the method says

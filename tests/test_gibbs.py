@@ -1,4 +1,4 @@
-"""Gibbs sampling by sparse factors: exact on linear worlds, as the collapsed sampler elsewhere; and what it refuses."""
+"""Gibbs sampling by split HMC: exact on linear worlds by both engines, as the collapsed sampler elsewhere."""
 
 from unittest.mock import patch
 
@@ -8,68 +8,98 @@ import numpy as np
 import pandas as pd
 import pytest
 import worlds
-from sparse_worlds import LIBRARIES, drawn, drawn_in_space, ear, loud_ear
+from sparse_worlds import LIBRARIES, drawn, drawn_in_space, loud_ear
 
 import probcal as pc
 from probcal.errors import InputError
-from probcal.gaussian.joint import JointPrecision
-from probcal.gaussian.joint_density import JointDensity, point_of_variables, variables_of
+from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.mode import log_density
+from probcal.gaussian.sparse import SparseEngine
 from probcal.geometry import norm
 from probcal.inference import calibrate
+from probcal.inference.joint_gibbs import Gibbs, _Sweeps
 from probcal.inference.method import Context
 from probcal.inference.solve import solve
-from probcal.inference.sparse_gibbs import Gibbs, _Given, _SparseChains
+from probcal.inference.split_hmc import Reference, SplitGaussian, placed, split_variables, variables_of
 from probcal.modes import automatic_start
 
 SHORT = {"chains": 2, "warmup": 25, "draws": 50, "patience": 1}
 
 
-def density_of(problem, point):
-    joint = JointPrecision.of(problem.model)
-    return JointDensity.of(problem.model, joint, point, variables_of(problem.model, joint, point))
+@pytest.fixture(params=[DenseEngine, pytest.param(SparseEngine, id="SparseEngine")])
+def engine(request, monkeypatch):
+    """The engine that `Gibbs` takes, whatever the size."""
+    made = request.param()
+    monkeypatch.setattr("probcal.inference.joint_gibbs.choose_fast", lambda model: made)
+    return made
+
+
+def reference_of(problem, engine=None):
+    """The reference at the known answer of a linear world."""
+    point = jax.tree.map(jnp.asarray, worlds.resting(problem))
+    return Reference((engine or DenseEngine()).at(problem.model, point))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("made", [drawn, pytest.param(drawn_in_space, marks=pytest.mark.slow)])
-def test_the_joint_density_is_that_of_its_point_and_its_slope_that_of_differences(made):
+@pytest.mark.parametrize("made", [drawn, drawn_in_space])
+def test_the_rest_is_what_the_joint_density_has_beyond_its_gaussian(made, engine):
     """Of moving targets, one at rest, bent sensors, in 2-D and 3-D: value to 1e-9, slope to 1e-5 of differences."""
     problem = made()[0]
     with jax.enable_x64(True):
-        point = automatic_start(problem)
-        density = density_of(problem, point)
-        rng = np.random.default_rng(0)
-        at = density.at + 0.1 * rng.standard_normal(len(density.at))
-        there = point_of_variables(problem.model, density.joint, point, at)
-        np.testing.assert_allclose(variables_of(problem.model, density.joint, there), at)
-        value, slope = density.looked(at)
-        assert value == pytest.approx(float(log_density(problem.model, there)), rel=1e-9)
-        for k in rng.integers(len(at), size=12):
-            eps = 1e-5 * np.eye(len(at))[k]
-            other = (density.looked(at + eps)[0] - density.looked(at - eps)[0]) / 2e-5
-            assert slope[k] == pytest.approx(other, rel=1e-5, abs=1e-4)
+        reference = Reference(engine.settled(problem.model, automatic_start(problem)))
+        given, at = SplitGaussian.of(reference, np.ones(problem.model.biases)), reference.at
+        step = given.deviation(jax.random.key(0))
+        there = placed(problem.model, at.point, jnp.asarray(reference.variables + step))
+        (states, z), rows = split_variables(problem.model, jnp.asarray(step)), at.rows
+        du = [u - before for u, before in zip(there.noises, at.point.noises, strict=True)]
+        gaussian = sum(float(-jnp.sum(u * (before + 0.5 * u))) for u, before in zip(du, at.point.noises, strict=True))
+        along = problem.model.responses(rows, [x[:, :, None] for x in states], z[:, None])
+        for lin, own in zip(rows, along, strict=True):
+            gaussian += float(jnp.sum(own[:, :, 0] * (lin.score - 0.5 * lin.weight * own[:, :, 0])))
+        beyond = log_density(problem.model, there) - log_density(problem.model, at.point) - gaussian
+        value, slope = reference.rest(reference.variables + step)
+        value -= reference.rest(reference.variables)[0]
+        assert value == pytest.approx(float(beyond), rel=1e-6, abs=1e-6)
+        assert reference.log_density(reference.variables + step) == pytest.approx(
+            float(log_density(problem.model, there))
+        )
+        for k in np.random.default_rng(0).integers(len(step), size=12):
+            eps = 1e-5 * np.eye(len(step))[k]
+            ends = (reference.rest(reference.variables + step + own)[0] for own in (eps, -eps))
+            assert slope[k] == pytest.approx(np.subtract(*ends) / 2e-5, rel=1e-5, abs=1e-4)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["plane", "extras", "drifting"])
-def test_nothing_is_beside_the_gaussian_of_a_linear_world(name):
-    """The rest is zero wherever one looks, and every turn is taken."""
+def test_nothing_is_beyond_the_gaussian_of_a_linear_world(name, engine):
+    """The rest is the same wherever one looks, and every turn is taken."""
     problem, _ = worlds.linear(name)
     with jax.enable_x64(True):
-        density = density_of(problem, jax.tree.map(jnp.asarray, worlds.resting(problem)))
-        given, rng = _Given.of(density, np.ones(problem.model.biases)), np.random.default_rng(1)
-        at = density.at
+        reference = reference_of(problem, engine)
+        given, at = SplitGaussian.of(reference, np.ones(problem.model.biases)), reference.variables
+        known = reference.rest(at)[0]
         for kicks in (1, 3):
-            at, rest, rate, _ = given.turned(at, density.rest(at)[0], kicks, rng)
-            assert rest == pytest.approx(0.0, abs=1e-7 * abs(density.value))
+            at, rest, rate, _ = given.turned(at, known, kicks, jax.random.key(kicks))
+            assert rest == pytest.approx(known, abs=1e-7 * abs(reference.log_density(at)))
             assert rate == pytest.approx(1.0, abs=1e-5)
-        assert np.abs(density.rest(at)[1]).max() < 1e-6 * np.abs(density.matrix).max()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 @pytest.mark.parametrize("name", ["plane", "drifting"])
-def test_draws_of_a_linear_world_have_its_exact_moments(name, library):
+def test_sparse_draws_of_a_linear_world_have_its_exact_moments(name, library, monkeypatch):
+    monkeypatch.setattr("probcal.inference.joint_gibbs.choose_fast", lambda model: SparseEngine())
+    draws_have_exact_moments(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["space", "drifting"])
+def test_dense_draws_of_a_linear_world_have_its_exact_moments(name):
+    """Those of "space" too, whose noise reaches only a part of the state."""
+    draws_have_exact_moments(name)
+
+
+def draws_have_exact_moments(name):
     """Means within 5 standard errors of the dense joint Gaussian, sds within 5; gamma and tracks too."""
     problem, _ = worlds.linear(name)
     method, start = Gibbs(chains=4, warmup=0, draws=250), worlds.resting(problem)
@@ -101,11 +131,10 @@ def test_the_density_of_a_draw_is_the_joint_one_at_its_point(prior):
     with jax.enable_x64(True):
         start = automatic_start(problem)
         posterior = solve(problem, method, prior, Context(jax.random.key(0), threads=1), start=start).posterior
-        run, joint = posterior.run, JointPrecision.of(problem.model)
+        run = posterior.run
         for d in range(4):
-            states = tuple(jnp.asarray(x[0, d]) for x in run.states)
-            at = variables_of(problem.model, joint, start._replace(states=states, z=jnp.asarray(run.z[0, d])))
-            point = point_of_variables(problem.model, joint, start, at)
+            at = variables_of([x[0, d] for x in run.states], run.z[0, d])
+            point = placed(problem.model, start, jnp.asarray(at))
             phi = {name: jnp.asarray(leaf[0, d]) for name, leaf in posterior.hyper.items()}
             assert posterior.log_joint(point, phi) == pytest.approx(run.draws.density[0, d], rel=1e-9)
 
@@ -154,7 +183,7 @@ def bent(target, pose, *, gain=pc.Bias("1", 1.0)):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("away", [0.0, 0.6])
-def test_a_bias_that_bends_what_is_measured_has_its_posterior(away):
+def test_a_bias_that_bends_what_is_measured_has_its_posterior(away, engine):
     """One bias, known targets: mean and sd by quadrature within 5 standard errors, wherever the Gaussian is taken."""
     network = pc.Network([bent.on(pc.Node("n", (0.0, 0.0)))])
     paths = pd.DataFrame({"time": [0.0, 1.0], "target": "car", "position_x": [1.0, 0.7], "position_y": 0.0})
@@ -167,15 +196,14 @@ def test_a_bias_that_bends_what_is_measured_has_its_posterior(away):
     sd = np.sqrt((weight @ (z - mean) ** 2) / weight.sum())
     with jax.enable_x64(True):
         point = automatic_start(problem)
-        joint = JointPrecision.of(problem.model)
-        density = JointDensity.of(problem.model, joint, point, np.array([mean + away]))
-        given, rng = _Given.of(density, np.ones(1)), np.random.default_rng(0)
+        reference = Reference(engine.at(problem.model, point._replace(z=jnp.array([mean + away]))))
+        given = SplitGaussian.of(reference, np.ones(1))
         for kicks, count in ((1, 1500), (3, 800)):
-            at, rest, rates, draws = density.at, 0.0, [], []
-            for _ in range(count):
-                at, rest, rate, _ = given.turned(at, rest, kicks, rng)
+            at, rest, rates, draws = reference.variables, 0.0, [], []
+            for key in jax.random.split(jax.random.key(kicks), count):
+                at, rest, rate, _ = given.turned(at, rest, kicks, key)
                 rates.append(rate)
-                draws.append(at[0])
+                draws.append(at[-1])
             assert np.mean(rates) > 0.5
             error = sd * np.sqrt(4 / count / np.mean(rates))
             assert np.mean(draws) == pytest.approx(mean, abs=5 * error)
@@ -224,7 +252,6 @@ def test_more_sweeps_a_draw_begin_the_sums_anew():
 def chains_of(problem, method):
     from probcal.gaussian.climb import climb_to_mode
     from probcal.gaussian.engine import Factors
-    from probcal.gaussian.sparse import SparseEngine
     from probcal.inference.hierarchy import hierarchy_of
     from probcal.inference.posed import Form
 
@@ -233,7 +260,7 @@ def chains_of(problem, method):
     mode = climb_to_mode(lambda at: engine.settled(problem.model, at), automatic_start(problem), factors, 60, 1e-3).at
     form = Form(problem.model.biases, hierarchy_of(prior, problem))
     first = prior.precision(problem.labels, problem.surveyed)
-    return _SparseChains(method, form, first, engine, mode, jax.random.key(0))
+    return _Sweeps(method, form, first, engine, mode, jax.random.key(0))
 
 
 @pytest.mark.slow
@@ -242,7 +269,7 @@ def test_draws_of_states_that_take_much_room_are_not_kept(monkeypatch):
     problem = drawn()[0]
     kept = pc.fit(problem, Gibbs(**SHORT), save=("states",))
     assert kept["track/car"]["state"].shape[:2] == (2, 50)
-    monkeypatch.setattr("probcal.inference.sparse_gibbs.NUMBERS", 1000)
+    monkeypatch.setattr("probcal.inference.joint_gibbs.NUMBERS", 1000)
     bare = pc.fit(problem, Gibbs(**SHORT))
     assert "local_scale" in kept["posterior"]
     assert "local_scale" not in bare["posterior"], "2 chains of 50 draws of 11 biases"
@@ -279,42 +306,42 @@ def test_a_chain_leaves_where_the_model_has_no_density():
     """From a place of density zero the first one with a density is taken."""
     problem = worlds.linear("plane")[0]
     with jax.enable_x64(True):
-        density = density_of(problem, jax.tree.map(jnp.asarray, worlds.resting(problem)))
-        given = _Given.of(density, np.ones(problem.model.biases))
-        at, rest, rate, _ = given.turned(density.at, -np.inf, 1, np.random.default_rng(0))
+        reference = reference_of(problem)
+        given, start = SplitGaussian.of(reference, np.ones(problem.model.biases)), reference.variables
+        at, rest, rate, _ = given.turned(start, -np.inf, 1, jax.random.key(0))
         assert rate == 1.0
         assert np.isfinite(rest)
-        assert not np.array_equal(at, density.at)
+        assert not np.array_equal(at, start)
 
 
 def test_a_turn_that_diverges_ends_before_numbers_overflow(monkeypatch):
-    """Beside the Gaussian stands a quartic, steeper than kicks can follow: the turn is refused."""
+    """Beyond the Gaussian stands a quartic, steeper than kicks can follow: the turn is refused."""
     problem = worlds.linear("plane")[0]
     with jax.enable_x64(True):
-        density = density_of(problem, jax.tree.map(jnp.asarray, worlds.resting(problem)))
-        given = _Given.of(density, np.ones(problem.model.biases))
+        reference = reference_of(problem)
+        given = SplitGaussian.of(reference, np.ones(problem.model.biases))
 
         def quartic(self, at):
-            return -1e6 * np.sum((at - self.at) ** 4), -4e6 * (at - self.at) ** 3
+            return -1e6 * np.sum((at - self.variables) ** 4), -4e6 * (at - self.variables) ** 3
 
-        monkeypatch.setattr(JointDensity, "rest", quartic)
-        start = density.at + 1.0
+        monkeypatch.setattr(Reference, "rest", quartic)
+        start = reference.variables + 1.0
         with np.errstate(over="raise", invalid="raise"):
-            at, rest, rate, _ = given.turned(start, quartic(density, start)[0], 64, np.random.default_rng(0))
+            at, rest, rate, _ = given.turned(start, quartic(reference, start)[0], 64, jax.random.key(0))
     assert rate == 0.0
-    assert rest == quartic(density, start)[0]
+    assert rest == quartic(reference, start)[0]
     assert np.array_equal(at, start)
 
 
 @pytest.mark.ci
 def test_chains_that_take_no_turn_are_no_answer(monkeypatch):
-    turned = _Given.turned
+    turned = SplitGaussian.turned
 
-    def stuck(self, at, rest, kicks, rng):
-        _, _, _, speed = turned(self, at, rest, kicks, rng)
+    def stuck(self, at, rest, kicks, key):
+        _, _, _, speed = turned(self, at, rest, kicks, key)
         return at, rest, 0.0, speed
 
-    monkeypatch.setattr(_Given, "turned", stuck)
+    monkeypatch.setattr(SplitGaussian, "turned", stuck)
     problem = worlds.linear("plane")[0]
     tree = pc.fit(problem, Gibbs(**SHORT), start=worlds.resting(problem))
     assert tree.attrs["status"] == "not converged"
@@ -332,14 +359,10 @@ def test_what_it_does_not_take_is_said():
     with pytest.raises(InputError, match=r"Gibbs\(chains=0\): it must be at least 1"):
         Gibbs(chains=0)
     nodes = [pc.Node(name, place, scale={"heading": 0.05}) for name, place in (("p", (0.0, 0.0)), ("q", (300.0, 0.0)))]
-    for kind, motion, what in (
-        (loud_ear, pc.ConstantVelocity(1.0), "unknown noise levels"),
-        (ear, pc.ConstantVelocity(1.0, singular=True), "a motion whose noise reaches only a part of the state"),
-    ):
-        network = pc.Network([kind.on(node) for node in nodes])
-        run = pc.simulate(network, motion, np.arange(5.0), key=0)
-        with pytest.raises(InputError, match=rf"Gibbs\(\) does not take {what}: take Collapsed\(\) or NUTS\(\)"):
-            pc.fit(pc.Problem(network, motion, run.table), Gibbs())
+    network, motion = pc.Network([loud_ear.on(node) for node in nodes]), pc.ConstantVelocity(1.0)
+    run = pc.simulate(network, motion, np.arange(5.0), key=0)
+    with pytest.raises(InputError, match=r"Gibbs\(\) does not take unknown noise levels: take Collapsed\(\) or NUTS"):
+        pc.fit(pc.Problem(network, motion, run.table), Gibbs())
 
 
 @pytest.mark.ci
@@ -347,7 +370,7 @@ def test_memory_that_does_not_hold_a_factor_is_said(monkeypatch):
     def refused(*_):
         raise MemoryError
 
-    monkeypatch.setattr("probcal.gaussian.joint.JointPrecision.factor", refused)
+    monkeypatch.setattr("probcal.inference.joint_gibbs.climb_to_mode", refused)
     with pytest.raises(pc.FitError, match="does not fit in memory: take fewer sensors or a shorter time"):
         pc.fit(drawn()[0], Gibbs(**SHORT))
 
@@ -356,7 +379,7 @@ def test_a_precision_lost_in_rounding_is_said(monkeypatch):
     def lost(*_):
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr(_Given, "of", lost)
+    monkeypatch.setattr(SplitGaussian, "of", lost)
     problem = worlds.linear("plane")[0]
     with pytest.raises(pc.FitError, match="under some draw of the hyper-parameters is singular in double precision"):
         pc.fit(problem, Gibbs(**SHORT), start=worlds.resting(problem))

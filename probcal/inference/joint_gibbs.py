@@ -1,8 +1,7 @@
-"""Gibbs sampling by sparse factors: full Bayes where no dense matrix of the biases fits.
+"""Gibbs sampling of hyper-parameters, trajectories and biases: full Bayes of a network of any size.
 
 One sweep: hyper-parameters given the biases, by their conjugate updates; then all trajectories and biases at once given
-those. A quarter turn about the mean of their sparse Gaussian is an independent draw of that; what the model is beside
-the Gaussian kicks it on the way, and the Metropolis rule makes it exact.
+those, by split HMC (`split_hmc.py`) about an expansion of the engine that suits the size.
 """
 
 from __future__ import annotations
@@ -19,13 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.gaussian.cholesky import Factor
-from probcal.gaussian.climb import climb_to_mode, settle_each
-from probcal.gaussian.engine import Factors, Spread
-from probcal.gaussian.joint import blocks_of, missing
-from probcal.gaussian.joint_density import JointDensity, point_of_variables, variables_of
+from probcal.gaussian.choose import choose_fast
+from probcal.gaussian.climb import climb_to_mode
+from probcal.gaussian.engine import Engine, Expansion, Factors, Spread, beyond_gaussian
+from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point, log_density
-from probcal.gaussian.sparse import SparseEngine, SparseExpansion
 from probcal.identifiability.directions import alone_directions, screened_directions
 from probcal.inference.blockwise import NAMED, BlockPosterior, declared_blocks, diverged, told_columns
 from probcal.inference.chains import Draw, Sample
@@ -36,6 +33,7 @@ from probcal.inference.posed import Form, Natural, Posed
 from probcal.inference.posterior import RARE, bias_status, judge_chains, values_by_datum
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
+from probcal.inference.split_hmc import Reference, SplitGaussian, placed, split_variables, variables_of
 from probcal.model.model import Model
 from probcal.priors import PRECISION_BOUNDS, Horseshoe, Precision, Prior
 from probcal.problem import Problem
@@ -47,14 +45,13 @@ from probcal.status import Status
 STEPS = 60  # of the climb to the mode
 PILOT = 40  # sweeps on the Gaussian alone, the last half of which tells where the reference is taken
 KICKS, TRIED, WANTED = (1, 2, 4, 8, 16, 32, 64), 6, 0.7  # kicks of a turn: the fewest of which so many are taken
-SHORTER = 0.1  # share by which a turn may be shorter than a quarter
 NUMBERS = 4_000_000  # most numbers of draws of states, and of hyper-parameters by bias, that are kept
 
 
-class SparseState(NamedTuple):
+class SweepState(NamedTuple):
     """Where all chains stand, and what they share."""
 
-    at: Any  # (C, n) variables
+    at: Any  # (C, n) states and biases
     phi: Any  # (C, ...) of each hyper-parameter
     made: Any  # () sweeps of a chain
     thin: Any  # () of them from one draw to the next
@@ -83,12 +80,13 @@ class _Chain(NamedTuple):
 
 @dataclass(frozen=True)
 class Gibbs(Sampler):
-    """Exact posterior of biases, hyper-parameters and trajectories, sampled by sparse factors: for large networks.
+    """Exact posterior of biases, hyper-parameters and trajectories, sampled together: for networks of any size.
 
-    Each sweep draws the hyper-parameters given the biases, factorises the joint precision of all states and biases,
-    and moves these together by a Hamiltonian quarter turn about its mean, which splits off the Gaussian (Shahbaba
-    and others 2014): an independent draw where the model is linear, elsewhere kicked as often as it takes to be
-    accepted. Any prior with a density, no correlations; noise levels are known, motions those of the sparse form.
+    Each sweep draws the hyper-parameters given the biases, solves for the Gaussian of all states and biases given
+    those, by sparse factors where the network is large, and moves these together by a Hamiltonian quarter turn about
+    its mean, which splits off the Gaussian (Shahbaba and others 2014): an independent draw where the model is linear,
+    elsewhere kicked as often as it takes to be accepted. Any prior with a density, no correlations; noise levels are
+    known, noises of motions Gaussian.
     Of more than four million numbers no draws of states are kept, their means and sds are. Chains run one after the
     other and start at draws under the declared scales, on the side of a mirror that fits best; they do not visit the
     others, which the answer names. Draws that have not mixed are made anew with 4 times as many sweeps from one to the
@@ -103,29 +101,28 @@ class Gibbs(Sampler):
     name: ClassVar[str] = "Gibbs"
     priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
     chunk: ClassVar[int] = 25
-    sparsely: ClassVar[bool] = True
+    engined: ClassVar[bool] = True
 
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Draws of the posterior from a start, and what they say."""
         check_gibbs(problem, prior)
         began = time.perf_counter()
-        model, engine = problem.model, SparseEngine()
+        model, engine = problem.model, choose_fast(problem.model)
         form = Form(model.biases, hierarchy_of(prior, problem))
         first = prior.precision(problem.labels, problem.surveyed)
         factors = Factors.alone(np.ones(model.biases) if form.hierarchy.learnt else np.asarray(first.alpha))
         try:
             mode = climb_to_mode(lambda at: engine.settled(model, at), start, factors, STEPS, 1e-3).at
-            assert isinstance(mode, SparseExpansion)
-            runs = _SparseChains(self, form, first, engine, mode, context.key)
+            runs = _Sweeps(self, form, first, engine, mode, context.key)
             drawn, thin, stopped = drawn_by(self, runs, 1, context.monitor, context.storage, context.threads)
             natural = Natural(jnp.zeros((0, 0)), jnp.zeros(0), model.level_spread, first)
             seconds = time.perf_counter() - began
             run = SamplerRun(self, self, form, natural, None, drawn, seconds, stopped, "", (), thin)
             mixed = mixing(run.z)
-            posterior = SparseChains.drawn(problem, prior, run, runs, mixed)
+            posterior = GibbsChains.drawn(problem, prior, run, runs, mixed)
         except MemoryError:
             raise FitError(
-                f"the sparse factor of {model.state_size} state entries and {model.biases} biases does not fit in"
+                f"the factor of {model.state_size} state entries and {model.biases} biases does not fit in"
                 " memory: take fewer sensors or a shorter time"
             ) from None
         except np.linalg.LinAlgError:
@@ -174,69 +171,19 @@ class Gibbs(Sampler):
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
         """Not asked: there is no frame."""
-        raise AssertionError("sparse chains have no frame")
+        raise AssertionError("Gibbs has no frame")
 
     def step(self, form: Form, posed: Posed, chain: Any) -> tuple[Any, Sample]:
-        """Not asked: a sweep calls the sparse library, which no kernel holds."""
-        raise AssertionError("a sparse sweep is no kernel")
+        """Not asked: a sweep asks an engine, which no kernel holds."""
+        raise AssertionError("a sweep of Gibbs is no kernel")
 
 
 def check_gibbs(problem: Problem, prior: Prior) -> None:
-    """Raise `InputError` naming what Gibbs sampling by sparse factors does not take."""
-    if lacks := missing(problem.model):
+    """Raise `InputError` naming what `Gibbs` does not take."""
+    if lacks := beyond_gaussian(problem.model):
         raise InputError(f"Gibbs() does not take {lacks}: take Collapsed() or NUTS()")
     if prior.correlation:
         raise InputError("Gibbs() takes a prior without correlations: take Collapsed(), or leave them out")
-
-
-@dataclass(frozen=True, eq=False)
-class _Given:
-    """Trajectories and biases given hyper-parameters: a Gaussian, and what the model is beside it."""
-
-    density: JointDensity
-    factor: Factor
-    alpha: np.ndarray  # (M,)
-    mean: np.ndarray  # (n,)
-
-    @classmethod
-    def of(cls, density: JointDensity, alpha: np.ndarray) -> _Given:
-        """Factorise the precision that precisions alpha (M,) leave."""
-        factor = density.joint.factor(density.entries, Factors.alone(alpha))
-        pull = density.slope.copy()
-        pull[density.joint.states :] -= alpha * density.at[density.joint.states :]
-        return cls(density, factor, alpha, density.at + factor.solve(pull))
-
-    def times(self, vector: np.ndarray) -> np.ndarray:
-        """The precision times a vector (n,)."""
-        found = np.asarray(self.density.matrix @ vector)
-        found[self.density.joint.states :] += self.alpha * vector[self.density.joint.states :]
-        return found
-
-    def energy(self, step: np.ndarray, speed: np.ndarray) -> float:
-        """Half the squares of a deviation and of a speed (n,) by the precision."""
-        return 0.5 * float(step @ self.times(step) + speed @ self.times(speed))
-
-    def turned(
-        self, at: np.ndarray, rest: float, kicks: int, rng: np.random.Generator
-    ) -> tuple[np.ndarray, float, float, np.ndarray]:
-        """Variables (n,) after a turn, the rest of their log density, its acceptance, and the speed it began with."""
-        speed = self.factor.draw(rng, 1)[0]
-        begun, angle = speed, 0.5 * np.pi * (1.0 - SHORTER * rng.random()) / kicks
-        step = at - self.mean
-        before = self.energy(step, speed) - rest
-        whole, half = (np.cos(angle), np.sin(angle)), (np.cos(0.5 * angle), np.sin(0.5 * angle))
-        for k in range(kicks + 1):
-            c, s = whole if 0 < k < kicks else half
-            step, speed = c * step + s * speed, c * speed - s * step
-            if k < kicks:
-                value, slope = self.density.rest(self.mean + step)
-                if not abs(value) < 1e100:  # nats: it diverges, and so does the turn back
-                    return at, rest, 0.0, begun
-                speed = speed + angle * self.factor.solve(slope)
-        there, _ = self.density.rest(self.mean + step)
-        gain = before - (self.energy(step, speed) - there)
-        rate = float(np.exp(min(gain, 0.0))) if np.isfinite(gain) else float(np.isfinite(there) > np.isfinite(rest))
-        return (self.mean + step, there, rate, begun) if rng.random() < rate else (at, rest, rate, begun)
 
 
 @partial(jax.jit, static_argnames="form")
@@ -260,105 +207,107 @@ def _log_prior(form: Form, phi: Phi, first: Precision, z: np.ndarray) -> float:
     return 0.5 * float(np.sum(own)) + float(form.hierarchy.log_prior(phi))
 
 
-class _SparseChains:
-    """All chains, one after the other: the library keeps one factor at a time, and takes all processors for it."""
+class _Sweeps:
+    """All chains, one after the other: a library of sparse factors keeps one at a time, and takes all processors for
+    it."""
 
-    def __init__(
-        self, method: Gibbs, form: Form, first: Precision, engine: SparseEngine, mode: SparseExpansion, key: jax.Array
-    ):
+    def __init__(self, method: Gibbs, form: Form, first: Precision, engine: Engine, mode: Expansion, key: jax.Array):
         self.method, self.form, self.prior, self.engine = method, form, first, engine
-        self.mode, self.key, self.model, self.joint = mode, key, mode.model, mode.joint
-        self.state: SparseState | None = None  # where the chains stood last
-        self._density: JointDensity | None = None
-        self._last: _Given | None = None
+        self.mode, self.key, self.model = mode, key, mode.model
+        self.state: SweepState | None = None  # where the chains stood last
+        self._reference: Reference | None = None
+        self._last: SplitGaussian | None = None
 
     def _rng(self, *which: int) -> np.random.Generator:
         return np.random.default_rng([*np.asarray(jax.random.key_data(self.key)).ravel().tolist(), *which])
 
-    def _at(self, reference: np.ndarray) -> JointDensity:
-        """The Gaussian at a reference (n,), made once."""
-        if self._density is None or not np.array_equal(self._density.at, reference):
-            self._density = JointDensity.of(self.model, self.joint, self.mode.point, reference)
-        return self._density
+    def _at(self, variables: np.ndarray) -> Reference:
+        """The reference at variables (n,), made once."""
+        if self._reference is None or not np.array_equal(self._reference.variables, variables):
+            point = placed(self.model, self.mode.point, jnp.asarray(variables))
+            self._reference = Reference(self.engine.at(self.model, point))
+        return self._reference
 
-    def _given(self, density: JointDensity, phi: Phi) -> _Given:
+    def _given(self, reference: Reference, phi: Phi) -> SplitGaussian:
         """What hyper-parameters leave; factorised once where there are none."""
         alpha, last = np.asarray(_precisions(self.form, phi, self.prior)), self._last
-        if last is None or last.density is not density or not np.array_equal(last.alpha, alpha):
-            self._last = last = _Given.of(density, alpha)
+        if last is None or last.reference is not reference or not np.array_equal(last.alpha, alpha):
+            self._last = last = SplitGaussian.of(reference, alpha)
         return last
 
-    def first(self) -> SparseState:
+    def first(self) -> SweepState:
         """Chains at draws under the declared scales; the reference at the mean of sweeps on the Gaussian."""
-        M, states, begin = self.form.biases, self.joint.states, self.form.hierarchy.begin
-        key = jax.random.fold_in(self.key, 1)
-        density, rng = self._at(variables_of(self.model, self.joint, self.mode.point)), self._rng(0)
+        M, begin, C = self.form.biases, self.form.hierarchy.begin, self.method.chains
+        key, drawn = jax.random.fold_in(self.key, 1), jax.random.fold_in(self.key, 0)
+        reference = self._at(variables_of(self.mode.point.states, self.mode.point.z))
         scales = np.ones(M) if self.form.hierarchy.learnt else np.asarray(self.prior.alpha)
-        wide = _Given.of(density, scales)
-        at = wide.mean[None] + wide.factor.draw(rng, self.method.chains)
-        phis = [begin(jax.random.fold_in(key, c)) for c in range(self.method.chains)]
+        wide = SplitGaussian.of(reference, scales)
+        at = wide.mean[None] + np.stack([wide.deviation(jax.random.fold_in(drawn, c)) for c in range(C)])
+        phis = [begin(jax.random.fold_in(key, c)) for c in range(C)]
         if self.form.hierarchy.learnt:
-            z, phi, total = at[0, states:], phis[0], np.zeros(M)
+            z, phi, total = at[0, -M:], phis[0], np.zeros(M)
             for k in range(PILOT):
-                phi = _updated(self.form, phi, jnp.asarray(z), jax.random.fold_in(key, self.method.chains + k))
-                given = self._given(density, phi)
-                z = (given.mean + given.factor.draw(rng, 1)[0])[states:]
-                total += given.mean[states:] * (2 * k >= PILOT)
+                phi = _updated(self.form, phi, jnp.asarray(z), jax.random.fold_in(key, C + k))
+                given = self._given(reference, phi)
+                z = (given.mean + given.deviation(jax.random.fold_in(drawn, C + k)))[-M:]
+                total += given.mean[-M:] * (2 * k >= PILOT)
             moved = self.mode.moved(total / (PILOT - PILOT // 2) - np.asarray(self.mode.point.z))
-            density = self._at(variables_of(self.model, self.joint, settle_each(self.model, moved)))
-            given = self._given(density, phi)
+            settled = self.engine.settled(self.model, moved).point
+            reference = self._at(variables_of(settled.states, settled.z))
+            given = self._given(reference, phi)
         else:
-            given = _Given.of(density, scales)
-        here = given.mean + given.factor.draw(rng, 1)[0]
-        kicks = self._kicks(given, here, rng)
+            given = wide
+        here = given.mean + given.deviation(jax.random.fold_in(drawn, C + PILOT))
+        kicks = self._kicks(given, here, jax.random.fold_in(drawn, C + PILOT + 1))
         stacked = {name: np.stack([np.asarray(phi[name]) for phi in phis]) for name in phis[0]}
-        return self._begun(at, stacked, density.at, kicks)
+        return self._begun(at, stacked, reference.variables, kicks)
 
-    def _begun(self, at: np.ndarray, phi: Any, reference: np.ndarray, kicks: int) -> SparseState:
-        M, S = self.form.biases, self.joint.states
-        return SparseState(
+    def _begun(self, at: np.ndarray, phi: Any, reference: np.ndarray, kicks: int) -> SweepState:
+        M, S = self.form.biases, self.model.state_size
+        return SweepState(
             at, phi, np.array(0), np.array(1), np.zeros(2, int), np.zeros((2, S)), np.zeros((2, S)), np.zeros((2, M)),
             np.zeros((2, M)), reference, np.array(kicks),
         )  # fmt: skip
 
-    def _kicks(self, given: _Given, at: np.ndarray, rng: np.random.Generator) -> int:
+    def _kicks(self, given: SplitGaussian, at: np.ndarray, key: jax.Array) -> int:
         """The fewest kicks with which turns are taken often enough."""
-        rest, _ = given.density.rest(at)
+        rest, _ = given.reference.rest(at)
         for kicks in KICKS:
             rates = []
-            for _ in range(TRIED):
-                at, rest, rate, _ = given.turned(at, rest, kicks, rng)
+            for k in range(TRIED):
+                own = jax.random.fold_in(jax.random.fold_in(key, kicks), k)
+                at, rest, rate, _ = given.turned(at, rest, kicks, own)
                 rates.append(rate)
             if np.mean(rates) >= WANTED:
                 break
         return kicks
 
-    def restored(self, leaves: list[np.ndarray]) -> SparseState:
+    def restored(self, leaves: list[np.ndarray]) -> SweepState:
         """The state of saved leaves; raises `InputError` where they are those of another."""
-        C, n = self.method.chains, self.joint.places.size
+        C, n = self.method.chains, self.model.state_size + self.form.biases
         phi = jax.eval_shape(self.form.hierarchy.begin, self.key)
         stacked: Any = {name: np.zeros((C, *leaf.shape)) for name, leaf in phi.items()}
         blank = self._begun(np.zeros((C, n)), stacked, np.zeros(n), 1)
         self.state = restored_as(blank, leaves)
         return self.state
 
-    def advance(self, state: SparseState, thin: int, pool: ThreadPoolExecutor) -> tuple[SparseState, Draw]:
+    def advance(self, state: SweepState, thin: int, pool: ThreadPoolExecutor) -> tuple[SweepState, Draw]:
         """All chains one chunk further, every `thin`-th sweep kept."""
-        density, sums = self._at(np.asarray(state.reference)), {name: np.array(getattr(state, name)) for name in SUMS}
+        reference, sums = self._at(np.asarray(state.reference)), {name: np.array(getattr(state, name)) for name in SUMS}
         if int(state.thin) != thin:  # begun anew: what was before is warm-up
             sums = {name: np.stack([np.zeros_like(own[0]), own[0]]) for name, own in sums.items()}
         ends, drawn = list[_Chain](), []
         for c in range(self.method.chains):
             at, phi = np.asarray(state.at[c]), {name: leaf[c] for name, leaf in state.phi.items()}
-            own = _Chain(c, int(state.made), at, phi, density.rest(at)[0], 0.0)
+            own = _Chain(c, int(state.made), at, phi, reference.rest(at)[0], 0.0)
             parts = []
             for _ in range(self.method.chunk):
                 for _ in range(thin):
-                    own, moments = self._swept(density, own, int(state.kicks))
+                    own, moments = self._swept(reference, own, int(state.kicks))
                     if thin > 1 or own.made > self.method.warmup:
                         for name, value in moments.items():
                             sums[name][0] += value
-                parts.append(self._draw(density, own))
+                parts.append(self._draw(reference, own))
             ends.append(own)
             drawn.append(jax.tree.map(lambda *leaves: np.stack(leaves), *parts))
         self.state = state._replace(
@@ -370,41 +319,28 @@ class _SparseChains:
 
     def _states(self, at: np.ndarray) -> tuple[np.ndarray, ...]:
         """States (E, n) of each recursion; nothing where the draws of all would take too much room."""
-        if not self.method.keeps_states(self.model):
-            return ()
-        known = self.mode.point.states
-        return tuple(np.where(own >= 0, at[own], np.asarray(x)) for own, x in zip(self.joint.slots, known, strict=True))
+        return split_variables(self.model, at)[0] if self.method.keeps_states(self.model) else ()
 
-    def _swept(self, density: JointDensity, chain: _Chain, kicks: int) -> tuple[_Chain, dict[str, Any]]:
+    def _swept(self, reference: Reference, chain: _Chain, kicks: int) -> tuple[_Chain, dict[str, Any]]:
         """One sweep of a chain, and what is summed over sweeps."""
-        states = self.joint.states
-        rng = self._rng(1, chain.number, chain.made)
+        states = self.model.state_size
         key = jax.random.fold_in(jax.random.fold_in(self.key, 2 + chain.number), chain.made)
         phi = _updated(self.form, chain.phi, jnp.asarray(chain.at[states:]), key)
-        given = self._given(density, phi)
-        at, rest, rate, speed = given.turned(chain.at, chain.rest, kicks, rng)
-        step, variance = at[:states] - density.at[:states], _variances(given, speed)
+        given = self._given(reference, phi)
+        at, rest, rate, speed = given.turned(chain.at, chain.rest, kicks, jax.random.fold_in(key, 1))
+        step, variance = at[:states] - reference.variables[:states], given.variances(speed)
         gamma = 1.0 - given.alpha * variance
         moments = {"summed": 1, "total": step, "square": step**2, "gamma": gamma, "variance": variance}
         return _Chain(chain.number, chain.made + 1, at, phi, rest, rate), moments
 
-    def _draw(self, density: JointDensity, chain: _Chain) -> Draw:
+    def _draw(self, reference: Reference, chain: _Chain) -> Draw:
         """What is kept of a chain where it stands."""
-        at, z, none = chain.at, chain.at[self.joint.states :], np.zeros(0)
-        step = at - density.at
-        value = density.value + chain.rest + float(step @ (density.slope - 0.5 * (density.matrix @ step)))
-        value += _log_prior(self.form, chain.phi, self.prior, z)
+        at, z, none = chain.at, chain.at[self.model.state_size :], np.zeros(0)
+        value = reference.log_density(at) + _log_prior(self.form, chain.phi, self.prior, z)
         most = NUMBERS / (self.method.chains * self.method.draws)
         phi = {name: np.asarray(leaf) for name, leaf in chain.phi.items() if np.size(leaf) <= most}
         fields: dict[str, Any] = {"theta": z, "phi": phi, "gamma": none, "variance": none, "density": np.array(value)}
         return Draw(**fields | {"states": self._states(at), "stats": {"acceptance_rate": np.array(chain.rate)}})
-
-
-def _variances(given: _Given, drawn: np.ndarray) -> np.ndarray:
-    """Unbiased estimates of the variances (M,) of the biases from a draw (n,) about zero, the rest of each given."""
-    states = given.density.joint.states
-    own = given.density.matrix.diagonal()[states:] + given.alpha
-    return 1.0 / own + (drawn[states:] - given.times(drawn)[states:] / own) ** 2
 
 
 def _covariances(z: np.ndarray, members: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -422,8 +358,8 @@ def _covariances(z: np.ndarray, members: np.ndarray, variance: np.ndarray) -> np
 
 
 @dataclass(frozen=True, eq=False)
-class SparseChains(BlockPosterior):
-    """The draws of the biases by sparse factors, and moments of the states."""
+class GibbsChains(BlockPosterior):
+    """The draws of the biases by `Gibbs`, and moments of the states."""
 
     run: SamplerRun | None = None
     middle: tuple[np.ndarray, ...] = ()  # (E, n) mean states of each recursion
@@ -432,8 +368,8 @@ class SparseChains(BlockPosterior):
 
     @classmethod
     def drawn(
-        cls, problem: Problem, prior: Prior, run: SamplerRun, runs: _SparseChains, mixed: Mapping[str, np.ndarray]
-    ) -> SparseChains:
+        cls, problem: Problem, prior: Prior, run: SamplerRun, runs: _Sweeps, mixed: Mapping[str, np.ndarray]
+    ) -> GibbsChains:
         """The posterior of a run, what the data leave open not yet said."""
         z, model, M, state = run.z, problem.model, run.form.biases, runs.state
         assert state is not None
@@ -448,19 +384,17 @@ class SparseChains(BlockPosterior):
         alpha = np.clip((1 - gamma) / np.maximum(blocks.variance, 1e-300), *PRECISION_BOUNDS)
         held = np.isin(np.arange(M), run.form.hierarchy.learnt, invert=True)
         alpha = np.where(held, np.asarray(run.posed.first.alpha), alpha)
-        joint, at = runs.joint, runs.engine.settled(model, runs.mode.moved(mean - np.asarray(runs.mode.point.z)))
+        at = runs.engine.settled(model, runs.mode.moved(mean - np.asarray(runs.mode.point.z)))
         declared = declared_blocks(at)
         columns = dict(mixed) | told_columns(declared) | {"inclusion": (np.abs(z) > ROPE).mean((0, 1))}
         summary = Summary(
             "exact", "sampled", mean, None, lower, upper, gamma, alpha, None, np.zeros(0), None, columns, blocks
         )
-        middle = np.asarray(state.reference)[: joint.states] + total / count
-        whole = np.concatenate([np.maximum(variance, 0.0), blocks.variance])
-        spread = Spread(blocks.variance, np.zeros(M), tuple(joint.state_values(whole)))
-        point = point_of_variables(model, joint, at.point, np.concatenate([middle, mean]))
+        middle, _ = split_variables(model, np.asarray(state.reference)[: model.state_size] + total / count)
+        variances, _ = split_variables(model, np.maximum(variance, 0.0))
+        spread = Spread(blocks.variance, np.zeros(M), variances)
         return cls(
-            problem, prior, at.point, summary, at, Factors.alone(alpha), spread, declared, (), 0, None, run,
-            tuple(np.asarray(x) for x in point.states),
+            problem, prior, at.point, summary, at, Factors.alone(alpha), spread, declared, (), 0, None, run, middle,
         )  # fmt: skip
 
     def log_joint(self, point: Point, phi: Phi) -> float:
