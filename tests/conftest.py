@@ -20,8 +20,7 @@ from hypothesis import settings
 from xdist.scheduler import LoadFileScheduling
 
 from probcal import kernels
-from probcal.gaussian import cholesky
-from probcal.gaussian.cholesky import Cholmod
+from probcal.gaussian import choose
 from probcal.wings import WingMissing, installed
 
 BUDGET = 5000  # kernels of a whole default run, all workers together (some 4000, by which takes which file)
@@ -202,8 +201,8 @@ def kept_kernels(monkeypatch):
 
 @pytest.fixture
 def library(request, monkeypatch):
-    """A library of factors in the place of the one that is chosen."""
-    if request.param is Cholmod:
+    """The name of a sparse engine, which is the one that is chosen."""
+    if request.param == "cholmod":
         pytest.importorskip("sparsax", reason="sparsax is an extra")
-    monkeypatch.setattr(cholesky, "exact", lambda: request.param is Cholmod)
+    monkeypatch.setattr(choose, "has_cholmod", lambda: request.param == "cholmod")
     return request.param

@@ -502,7 +502,7 @@ def bumped():
     return World(world.network, world.motion, table, world.truth)
 
 
-@world("map-sparse map-matrix-free ea-sparse assess-sparse bounds")
+@world("map-sparse map-iterative ea-sparse assess-sparse bounds")
 def grid():
     """625 radars that each see what passes within 250 m."""
     rng, side = np.random.default_rng(0), 25
@@ -559,8 +559,8 @@ FITS = {
     "map-joint": Fit("climb", pc.MAP(trajectory="joint")),
     "map-l1": Fit("climb", pc.MAP(), pc.Laplace()),
     "ml": Fit("climb", pc.MAP(), pc.Flat()),
-    "map-sparse": Fit("climb", pc.MAP(engine="sparse")),
-    "map-matrix-free": Fit("climb", pc.MAP(engine="matrix-free")),
+    "map-sparse": Fit("climb", pc.MAP(engine="cholmod")),
+    "map-iterative": Fit("climb", pc.MAP(engine="iterative")),
     "least-squares": Fit("climb", pc.LeastSquares()),
     "em": Fit("climb", pc.EM()),
     "em-ml": Fit("climb", pc.EM(), pc.Flat()),
@@ -574,7 +574,7 @@ FITS = {
     "ea-em": Fit("climb", pc.EA.as_printed(update="em", iterations=2000)),
     "ea-spike": Fit("climb", pc.EA(), pc.BernoulliGaussian()),
     "ea-groups": Fit("climb", pc.EA(), pc.ARD(by="owner")),
-    "ea-sparse": Fit("climb", pc.EA(engine="sparse")),
+    "ea-sparse": Fit("climb", pc.EA(engine="cholmod")),
     "starts": Fit("climb", pc.MAP(), starts=3),
     "collapsed": Fit("draws", pc.Collapsed(**SHORT, warmup=50)),
     "collapsed-spike": Fit("draws", pc.Collapsed(**SHORT, warmup=50), pc.BernoulliGaussian()),

@@ -342,7 +342,7 @@ def kalman(problem, alpha):
 class NaiveEngine:
     """A third engine: rows of whitened noises and biases as one dense matrix in NumPy, everything by its inverse."""
 
-    cheap = False
+    cheap, exact = False, True
 
     def at(self, model, point, rows=None):
         return Naive(model, point, linearise_rows(model, point) if rows is None else rows)

@@ -174,13 +174,13 @@ METHODS = {
     "EA": EA(),
     "EA, joint": EA(trajectory="joint"),
     "EA, maximised": EA(precisions="maximised"),
-    "EA, sparse": EA(engine="sparse"),
+    "EA, sparse": EA(engine="cholmod"),
     "as printed": EA.as_printed(),
     "EMEA": EMEA(iterations=5),
     "EM": EM(),
     "MAP": MAP(),
-    "MAP, sparse": MAP(engine="sparse"),
-    "MAP, matrix-free": MAP(engine="matrix-free"),
+    "MAP, sparse": MAP(engine="cholmod"),
+    "MAP, iterative": MAP(engine="iterative"),
     "least squares": LeastSquares(),
 }
 if installed("probcal.particles"):

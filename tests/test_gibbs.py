@@ -12,9 +12,9 @@ from sparse_worlds import LIBRARIES, drawn, drawn_in_space, loud_ear
 
 import probcal as pc
 from probcal.errors import InputError
+from probcal.gaussian.choose import direct_engine
 from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.mode import log_density
-from probcal.gaussian.sparse import SparseEngine
 from probcal.geometry import norm
 from probcal.inference import calibrate
 from probcal.inference.joint_gibbs import Gibbs, _Sweeps
@@ -26,7 +26,7 @@ from probcal.modes import automatic_start
 SHORT = {"chains": 2, "warmup": 25, "draws": 50, "patience": 1}
 
 
-@pytest.fixture(params=[DenseEngine, pytest.param(SparseEngine, id="SparseEngine")])
+@pytest.fixture(params=[DenseEngine, pytest.param(direct_engine, id="sparse")])
 def engine(request, monkeypatch):
     """The engine that `Gibbs` takes, whatever the size."""
     made = request.param()
@@ -88,7 +88,7 @@ def test_nothing_is_beyond_the_gaussian_of_a_linear_world(name, engine):
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 @pytest.mark.parametrize("name", ["plane", "drifting"])
 def test_sparse_draws_of_a_linear_world_have_its_exact_moments(name, library, monkeypatch):
-    monkeypatch.setattr("probcal.inference.joint_gibbs.choose_fast", lambda model: SparseEngine())
+    monkeypatch.setattr("probcal.inference.joint_gibbs.choose_fast", lambda model: direct_engine())
     draws_have_exact_moments(name)
 
 
@@ -250,13 +250,14 @@ def test_more_sweeps_a_draw_begin_the_sums_anew():
 
 
 def chains_of(problem, method):
+    from probcal.gaussian.choose import direct_engine
     from probcal.gaussian.climb import climb_to_mode
     from probcal.gaussian.engine import Factors
     from probcal.inference.hierarchy import hierarchy_of
     from probcal.inference.posed import Form
 
     prior = pc.Horseshoe()
-    engine, factors = SparseEngine(), Factors.alone(np.ones(problem.model.biases))
+    engine, factors = direct_engine(), Factors.alone(np.ones(problem.model.biases))
     mode = climb_to_mode(lambda at: engine.settled(problem.model, at), automatic_start(problem), factors, 60, 1e-3).at
     form = Form(problem.model.biases, hierarchy_of(prior, problem))
     first = prior.precision(problem.labels, problem.surveyed)

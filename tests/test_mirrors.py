@@ -93,7 +93,7 @@ def test_a_limit_ends_the_search_for_mirror_images():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "form"), [("line", "auto"), ("ceiling", "auto"), ("ceiling", "sparse"), ("ceiling", "matrix-free")]
+    ("name", "form"), [("line", "auto"), ("ceiling", "auto"), ("ceiling", "cholmod"), ("ceiling", "iterative")]
 )
 def test_a_mirror_is_reported_with_its_biases_and_they_are_weak(name, form):
     problem, _ = networks.setting(0, name, share=1.0)
@@ -133,7 +133,7 @@ def test_a_piece_on_the_wrong_side_is_turned():
 
 @pytest.mark.ci
 @pytest.mark.parametrize(
-    ("seed", "form"), [(1, "sparse"), pytest.param(3, "sparse", marks=pytest.mark.ci), (1, "matrix-free")]
+    ("seed", "form"), [(1, "cholmod"), pytest.param(3, "cholmod", marks=pytest.mark.ci), (1, "iterative")]
 )
 def test_a_scene_on_the_wrong_side_is_turned_in_sparse_form(seed, form):
     """From the whole track reflected, 20 m off at the most: `converged` there, before other sides were looked at."""
@@ -153,7 +153,7 @@ def test_pieces_are_looked_at_again_where_the_scene_went_over():
     """The scene reflected fits better by 16 nats, and from there a piece of it by 17 more: 21 m off before."""
     problem, path = beside(53)
     start = on_the_wrong_side(problem, 53)
-    tree = probcal.fit(problem, probcal.MAP(engine="sparse"), prior=probcal.Gaussian(), start=start)
+    tree = probcal.fit(problem, probcal.MAP(engine="cholmod"), prior=probcal.Gaussian(), start=start)
     assert off(only(tree)["mean"].values, path) < 4
 
 
@@ -171,7 +171,7 @@ def crossing(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "form"), [(2, "dense"), (2, "sparse"), (2, "matrix-free"), (44, "dense")])
+@pytest.mark.parametrize(("seed", "form"), [(2, "dense"), (2, "cholmod"), (2, "iterative"), (44, "dense")])
 def test_a_short_piece_of_one_of_two_targets_is_turned(seed, form):
     """Ten seconds at the beginning of a track: planes through other beacons cut long pieces that fit much worse.
 
@@ -189,12 +189,12 @@ def test_a_short_piece_of_one_of_two_targets_is_turned(seed, form):
 @pytest.mark.parametrize(
     ("method", "prior"),
     [
-        (probcal.MAP(engine="sparse"), probcal.Gaussian()),
-        (probcal.MAP(engine="matrix-free"), probcal.Gaussian()),
-        pytest.param(probcal.EA(engine="sparse"), None, marks=pytest.mark.ci),
+        (probcal.MAP(engine="cholmod"), probcal.Gaussian()),
+        (probcal.MAP(engine="iterative"), probcal.Gaussian()),
+        pytest.param(probcal.EA(engine="cholmod"), None, marks=pytest.mark.ci),
         pytest.param(probcal.Gibbs(chains=1, warmup=5, draws=20, patience=1), probcal.Gaussian(), marks=pytest.mark.ci),
     ],
-    ids=["map", "matrix-free", "ea", "gibbs"],
+    ids=["map", "iterative", "ea", "gibbs"],
 )
 def test_a_mirror_is_reported_in_sparse_form(method, prior):
     """Nodes on a line, biases free: the other side fits as well to 1e-3 nats, with the places of nodes turned over.
@@ -227,7 +227,7 @@ def test_an_answer_outlives_the_memory_that_its_other_side_takes():
         raise MemoryError
 
     with patch("probcal.inference.solve.other_sides", refused):
-        tree = probcal.fit(problem, probcal.MAP(engine="sparse"), prior=probcal.Gaussian())
+        tree = probcal.fit(problem, probcal.MAP(engine="cholmod"), prior=probcal.Gaussian())
     assert tree.attrs["status"] == "converged"
     assert "Memory did not hold" in tree.attrs["message"]
     assert "mirror" not in tree.children
@@ -236,7 +236,7 @@ def test_an_answer_outlives_the_memory_that_its_other_side_takes():
 @pytest.mark.slow
 def test_nodes_that_span_the_plane_have_no_mirror_in_sparse_form():
     problem, _ = networks.setting(1, "beacons")
-    tree = probcal.fit(problem, probcal.MAP(engine="sparse"), prior=probcal.Gaussian())
+    tree = probcal.fit(problem, probcal.MAP(engine="cholmod"), prior=probcal.Gaussian())
     assert "mirror" not in tree.children
     assert "nother answer" not in tree.attrs["message"]
 
@@ -437,8 +437,8 @@ def test_an_answer_that_did_not_converge_takes_no_ones_place(monkeypatch):
 
 def test_sides_without_a_factor_are_compared_by_their_density(monkeypatch):
     """The evidences differ by what their estimates are off."""
-    ends = {4.0: Stub(4.0, 97.0, method=probcal.MAP(engine="matrix-free"))}
-    found = beside_others(monkeypatch, (None, [("across", 4.0, 0.0)]), ends, probcal.MAP(engine="matrix-free"))
+    ends = {4.0: Stub(4.0, 97.0, method=probcal.MAP(engine="iterative"))}
+    found = beside_others(monkeypatch, (None, [("across", 4.0, 0.0)]), ends, probcal.MAP(engine="iterative"))
     assert listed(found) == [("across", 0.0, 4.0)]
 
 

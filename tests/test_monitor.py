@@ -10,7 +10,7 @@ import worlds
 from terminal import call
 
 import probcal as pc
-from probcal.errors import InputError
+from probcal.errors import FitError, InputError
 from probcal.inference import calibrate
 from probcal.inference.progress import Monitor, Stopped, duration
 from probcal.modes.mirrors import Sides
@@ -123,7 +123,7 @@ def test_an_interrupted_climb_keeps_the_best_answer_so_far():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [lambda: pc.EA(engine="sparse"), lambda: pc.EM(pc.Particles(50), iterations=60)])
+@pytest.mark.parametrize("make", [lambda: pc.EA(engine="cholmod"), lambda: pc.EM(pc.Particles(50), iterations=60)])
 def test_climbs_in_sparse_form_and_by_particles_are_interrupted(make):
     problem = worlds.linear("plane")[0]
 
@@ -152,7 +152,7 @@ def test_ctrl_c_after_the_climb_is_said(monkeypatch):
     assert found.attrs["message"].startswith("Interrupted while other answers were looked for.")
 
 
-def ended(problem, phase, limit=300.0, **options):
+def ended(problem, phase, limit=300.0, method=None, **options):
     """The fit of a problem whose limit passes as a phase begins, its answer and the phases."""
     clock, phases = Clock(), []
 
@@ -161,7 +161,7 @@ def ended(problem, phase, limit=300.0, **options):
         if at.phase == phase:
             clock.now = limit
 
-    tree, _ = calibrate(problem, pc.MAP(), monitor=Monitor(late, limit, clock=clock), **options)
+    tree, _ = calibrate(problem, method or pc.MAP(), monitor=Monitor(late, limit, clock=clock), **options)
     return tree, list(dict.fromkeys(phases))
 
 
@@ -172,6 +172,12 @@ def test_a_limit_ends_the_search_for_other_starts():
     assert "start 3 of 3" not in phases
     assert "Ended by the limit of 300 s before 1 of 3 starts were looked at" in tree.attrs["message"]
     assert (tree.attrs["status"], tree.attrs["interrupted"]) == ("converged", 0)
+
+
+@pytest.mark.ci
+def test_a_limit_in_the_warm_up_leaves_no_answer():
+    with pytest.raises(FitError, match="in the warm-up, before there was a draw"):
+        ended(worlds.linear("plane")[0], "warm-up", method=pc.Gibbs(chains=2, warmup=400, draws=10))
 
 
 MODEL = '''

@@ -17,11 +17,13 @@ import numpy as np
 import pandas as pd
 
 from probcal.errors import InputError
-from probcal.gaussian.cholesky import Factor, SuperLU
+from probcal.gaussian.choose import direct_engine
 from probcal.gaussian.engine import Factors
+from probcal.gaussian.factor import Factor, leading
 from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.linearised import linearise_rows
 from probcal.gaussian.mode import Point
+from probcal.gaussian.superlu import SuperLU
 from probcal.model.model import Model
 from probcal.model.rows import Linearised, pose_vector
 from probcal.network import Network, Node
@@ -66,12 +68,13 @@ class Informed:
     @cached_property
     def whole(self) -> Factor:
         """The factor of states and biases; sparsax keeps one at a time, so no other is made by it here."""
-        return self.joint.factor(self.entries, Factors.alone(np.ones(self.model.biases)))
+        alone = Factors.alone(np.ones(self.model.biases))
+        return direct_engine().library(self.joint.places, self.joint.under(self.entries, alone))
 
     @cached_property
     def held(self) -> Factor:
         """The factor of the states at held biases."""
-        return self.joint.states_alone(self.entries, library=SuperLU)
+        return SuperLU(*self.joint.of_states(self.entries))
 
     @property
     def size(self) -> int:
@@ -215,7 +218,7 @@ def _gains_of_some(
     model = passes.model.by_information()
     joint, lins = JointPrecision.of(model), linearise_rows(model, point)
     entries = joint.values(model, lins, point.levels)
-    across, gains = joint.across(entries), []
+    (across, _), gains = joint.with_biases(entries), []
     for number in some:
         own = [np.flatnonzero((which == number)[np.asarray(data.epoch)]) for data in model.rows]
         met = np.unique(np.concatenate([_biases(model, b)[rows].ravel() for b, rows in enumerate(own)]))
@@ -226,7 +229,7 @@ def _gains_of_some(
         information = _own_information(model, lins, own, met)
         if stop > first and np.isfinite(information).all():
             columns = across[first:stop][:, met].toarray()
-            held = joint.states_alone(entries, first, stop, SuperLU)
+            held = SuperLU(*leading(joint.places, entries, stop, first))
             information = information - columns.T @ held.solve(columns)
         if not np.isfinite(information).all():
             raise InputError(f"pass {number} runs over the place of a sensor that has no derivative there; move it")

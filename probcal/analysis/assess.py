@@ -24,7 +24,6 @@ from probcal.analysis.findings import Finding, alarms, completed, of_invalid
 from probcal.analysis.pieces import Change, Contrast
 from probcal.analysis.segments import Compared, Grid
 from probcal.analysis.verdict import RATE
-from probcal.gaussian import cholesky
 from probcal.gaussian.draws import many_data
 from probcal.identifiability.directions import shared_in_blocks
 from probcal.identifiability.remedies import WEAK
@@ -86,10 +85,8 @@ def _absurd(tree: xr.DataTree) -> bool:
 
 
 def _assessed(fit: Judged, tree: xr.DataTree, truth: Truth | None, key: jax.Array) -> xr.DataTree:
-    keys, group = jax.random.split(key, 3), tree["calibration"].to_dataset()
-    without = "log_evidence_error" in tree.attrs or ("sd_error" in group and cholesky.exact())  # a factor of the biases
-    whole = fit.engine.cheap or not without
-    drawable = fit.engine.cheap or (whole and not many_data(fit.problem.model))
+    keys = jax.random.split(key, 3)
+    drawable = fit.engine.cheap or (fit.engine.exact and not many_data(fit.problem.model))
     drawn = predictive.draws_of(fit, tree, keys[0]) if drawable else None
     replicas = None if drawn is None else predictive.check_replicas(fit, drawn, keys[1])
     found = residuals.innovations(fit, residuals.measured_kurtosis(fit) if replicas is None else replicas.kurtosis)
@@ -103,18 +100,18 @@ def _assessed(fit: Judged, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
         findings += more
     findings += checks.outlying(fit, found.innovations)
     findings += checks.wrapping(fit, tree)
-    if not _absurd(tree) and whole:
+    if not _absurd(tree) and fit.engine.exact:
         findings += checks.left_out(fit, tree, groups) + process.check_process_noise(fit, keys[2])
     bent = None if tree.attrs["status"] in INVALID else shape.check_shape(fit, tree)
     findings += [] if bent is None else [bent]
     doubts, more = dict[int, str](), list[Finding]()
-    if tree.attrs["status"] not in INVALID and (fit.engine.cheap or (whole and cholesky.exact())):
+    if tree.attrs["status"] not in INVALID and fit.engine.exact:
         with suppress(MemoryError):
             asked, more, doubts = levels.check_levels(fit, tree)
             groups |= {} if asked is None else {"level_check": asked}
     rejected = rejection(fit, found.innovations, channels)
     grid, compared = segments.grid_for(fit), None
-    if grid.patterns and not _absurd(tree) and whole:
+    if grid.patterns and not _absurd(tree) and fit.engine.exact:
         compared = segments.compare_segments(fit, found, channels, grid)
     if compared is not None and compared.alone:
         groups["halves"] = segments.group_of(fit.problem, compared, grid)

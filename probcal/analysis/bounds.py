@@ -16,8 +16,7 @@ import xarray as xr
 
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
 from probcal.errors import InputError, nearest
-from probcal.gaussian import cholesky
-from probcal.gaussian.choose import choose
+from probcal.gaussian.choose import choose, direct_engine
 from probcal.gaussian.engine import Factors
 from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.linearised import Trajectory, linearise_rows, state_variances, trajectories_of
@@ -110,11 +109,13 @@ def _by_sparse(
     on = joint.places.row == joint.places.column
     alone = np.bincount(joint.places.row[on], values[on], joint.places.size)[joint.states :]
     ridge = LOST * np.where(alone > 0, alone, 1.0) * (prior == 0)
+
+    def variances(alpha: np.ndarray) -> np.ndarray:
+        return direct_engine().library(joint.places, joint.under(values, Factors.alone(alpha))).inverse_diagonal()[0]
+
     try:
-        variance, _ = joint.factor(values, Factors.alone(prior + ridge)).inverse_diagonal()
-        loose = (
-            joint.factor(values, Factors.alone(prior + 10.0 * ridge)).inverse_diagonal()[0] if ridge.any() else variance
-        )
+        variance = variances(prior + ridge)
+        loose = variances(prior + 10.0 * ridge) if ridge.any() else variance
     except np.linalg.LinAlgError:
         raise InputError(
             "bounds: rounding hides which biases of so many have none; survey or fix some of those that"
@@ -186,8 +187,6 @@ def _tree(
         **{f"track/{name}": group for name, group in tracks.items() if name != node_of(NOBODY)},
     }
     message = _message(labels, bounded, sd > problem.scales[bounded])
-    if covariance is None and not cholesky.exact():
-        message += f" Variances are estimated from {cholesky.PROBES} draws; install probcal[sparse] for exact ones."
     if not bounded.all():
         groups["unbounded"] = xr.Dataset(coords=bias_coords(problem, ~bounded))
     tree = xr.DataTree.from_dict(groups)

@@ -15,11 +15,9 @@ import xarray as xr
 from probcal.analysis.additions import Informed, gains_of_passes, gains_of_sensors, typical_values
 from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
-from probcal.gaussian.cholesky import exact
-from probcal.gaussian.choose import choose
+from probcal.gaussian.choose import choose, direct_engine
 from probcal.gaussian.engine import Factors
-from probcal.gaussian.joint import JointPrecision
-from probcal.gaussian.linearised import linearise_rows, marginal_information
+from probcal.gaussian.linearised import marginal_information
 from probcal.gaussian.mode import Point
 from probcal.gaussian.room import check_room
 from probcal.identifiability.remedies import WEAK
@@ -144,18 +142,14 @@ def _anchors_of_many(problem: Problem, point: Point, survey: float) -> xr.Datase
     that can have the largest, since none has more than its `own`, by solves with the trajectories.
     """
     model, M = problem.model.by_information(), problem.model.biases
-    if not exact():
-        raise InputError(f"next_anchors of {M} biases needs exact variances, of sparsax: install probcal[sparse]")
-    joint = JointPrecision.of(model)
-    entries = joint.values(model, linearise_rows(model, point), point.levels)
+    at = direct_engine().at(model, point)
     anchors = _anchors(problem)
     names, members = list(anchors), _padded(list(anchors.values()), M)
     there = (members < M)[:, :, None] & (members < M)[:, None, :]
-    inverse = joint.factor(entries, Factors.alone(np.ones(M))).inverse_entries()
-    covariance = np.where(there, joint.block_values(members, joint.pairs(members), inverse), 0.0)
+    covariance = np.where(there, at.marginals(Factors.alone(np.ones(M)), members), 0.0)
     eye = np.eye(members.shape[1])
     own = 0.5 * np.linalg.slogdet(eye + covariance / survey**2)[1]
-    held, across, inner = joint.states_alone(entries), joint.across(entries), joint.within(entries)
+    held, (across, inner) = at.library(*at.joint.of_states(at.entries)), at.joint.with_biases(at.entries)
     gain, looked = np.full(len(own), -np.inf), np.argsort(-own, kind="stable")[:LOOKED]
     for mine in np.split(looked, np.arange(AT_ONCE, len(looked), AT_ONCE)):
         if np.sort(gain)[-LISTED:][0] >= own[mine[0]]:  # no other can have more

@@ -34,6 +34,7 @@ class DenseEngine:
     """Matrices of all biases: the fastest where they fit."""
 
     cheap: ClassVar[bool] = True
+    exact: ClassVar[bool] = True
 
     def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> DenseExpansion:
         """The posterior at a consistent point; rows as the caller linearised them."""

@@ -202,6 +202,14 @@ class Engine(Protocol):
 
     cheap: ClassVar[bool]  # whether expansions cost so little that many are made without a look first
 
+    @property
+    def exact(self) -> bool:
+        """True where log determinants and variances are exact.
+
+        Else `log_det` and `spread` estimate them, each with its standard error; `states`, `noises`,
+        `predicted` and `leverages` raise `InputError`.
+        """
+
     def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> Expansion:
         """The posterior at a consistent point; rows as the caller linearised them, by default with
         the expected information."""

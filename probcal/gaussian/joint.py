@@ -8,7 +8,7 @@ complement do where it is dense.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,11 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian import cholesky
-from probcal.gaussian.cholesky import Entries, Factor, factorise, mirrored
 from probcal.gaussian.engine import Factors, beyond_gaussian
+from probcal.gaussian.factor import Entries, leading, mirrored
 from probcal.gaussian.mode import factors, inverse_factors
-from probcal.gaussian.products import Products
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
 
@@ -70,12 +68,11 @@ class JointPrecision:
     driven: tuple[np.ndarray, ...]  # (E,) whether an epoch has variables of its own
     states: int  # number of variables that are states
     count: int  # of all values of `_values`
-    members: np.ndarray | None  # biases (B, p) of each sensor, where there is no factor of them
     extra: np.ndarray  # (X, 2) further pairs of biases that have a place, before all others
 
     @classmethod
-    def of(cls, model: Model, *, products: bool = False, pairs: Sequence[np.ndarray] = ()) -> JointPrecision:
-        """The pattern of a model, whose biases are factorised, or known by products alone.
+    def of(cls, model: Model, pairs: Sequence[np.ndarray] = ()) -> JointPrecision:
+        """The pattern of a model, its biases in blocks of one sensor.
 
         Biases in one row of `pairs` (B, p), M of none, have an entry with each other, as those have
         that integrated places couple.
@@ -103,14 +100,9 @@ class JointPrecision:
         diagonal = np.zeros(size, int)
         on = np.flatnonzero(low == high)
         diagonal[low[on]] = on
-        places = Entries(low.astype(np.int32), high.astype(np.int32), size, diagonal)
-        members = blocks_of(model) if products else None
-        return cls(places, kept, times[kept], tuple(slots), tuple(driven), start, len(rows), members, extra)
-
-    @property
-    def exact(self) -> bool:
-        """Whether entries of the inverse are exact."""
-        return self.members is None and cholesky.exact()
+        blocks = start + blocks_of(model)
+        places = Entries(low.astype(np.int32), high.astype(np.int32), size, diagonal, blocks)
+        return cls(places, kept, times[kept], tuple(slots), tuple(driven), start, len(rows), extra)
 
     def values(self, model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> np.ndarray:
         """Entries (entries,) of the precision of data and motion, the biases without prior."""
@@ -120,16 +112,14 @@ class JointPrecision:
             more = np.asarray(model.tilt.curvature)[tuple(self.extra.T)]
         return np.concatenate([more, found])[self.kept] * self.times
 
-    def factor(self, values: np.ndarray, factors: Factors) -> Factor:
-        """Factorise the precision with Gaussian factors, each pair of whose biases has a place."""
+    def under(self, values: np.ndarray, factors: Factors) -> np.ndarray:
+        """Entries (entries,) with Gaussian factors, each pair of whose biases has a place."""
         whole = values.copy()
         for group in factors.groups:
             pairs, precision = self.pairs(np.asarray(group.members)), np.asarray(group.precision)
             upper = np.triu(np.ones(pairs.shape[1:], bool))[None] & (pairs >= 0)
             np.add.at(whole, pairs[upper], precision[upper])
-        if self.members is None:
-            return factorise(self.places, whole)
-        return Products(self.states_alone(whole), mirrored(self.places, whole), self.states, self.members)
+        return whole
 
     def holds(self, members: np.ndarray) -> bool:
         """Whether all pairs of biases (B, p) of a row have a place."""
@@ -199,37 +189,14 @@ class JointPrecision:
             found.append(total + 2.0 * np.sum((B @ both) * H, 2))
         return found
 
-    def states_alone(
-        self, values: np.ndarray, first: int = 0, stop: int | None = None,
-        library: Callable[[Entries, np.ndarray], Factor] | None = None,
-    ) -> Factor:  # fmt: skip
-        """Factorise the precision of the states at held biases, or of those from `first` to `stop`
-        of whole tracks."""
-        stop = self.states if stop is None else stop
-        row, column = self.places.row, self.places.column
-        own = (row >= first) & (column < stop)
-        where = np.cumsum(own) - 1
-        places = Entries(row[own] - first, column[own] - first, stop - first, where[self.places.diagonal[first:stop]])
-        return (library or factorise)(places, values[own])
+    def of_states(self, values: np.ndarray) -> tuple[Entries, np.ndarray]:
+        """The precision of the states at held biases."""
+        return leading(self.places, values, self.states)
 
-    def across(self, values: np.ndarray) -> Any:
-        """The part (states, M) of the precision between states and biases, sparse."""
-        from scipy.sparse import coo_array  # loaded where it is used
-
-        own = (self.places.row < self.states) & (self.places.column >= self.states)
-        shape = (self.states, self.places.size - self.states)
-        return coo_array((values[own], (self.places.row[own], self.places.column[own] - self.states)), shape).tocsr()
-
-    def within(self, values: np.ndarray) -> Any:
-        """The part (M, M) of the precision of the biases alone, sparse."""
-        from scipy.sparse import coo_array  # loaded where it is used
-
-        own = self.places.row >= self.states
-        row, column = self.places.row[own] - self.states, self.places.column[own] - self.states
-        M, off = self.places.size - self.states, row != column
-        whole = np.concatenate([values[own], values[own][off]])
-        places = np.concatenate([row, column[off]]), np.concatenate([column, row[off]])
-        return coo_array((whole, places), (M, M)).tocsr()
+    def with_biases(self, values: np.ndarray) -> tuple[Any, Any]:
+        """The parts between states and biases (states, M) and of the biases alone (M, M), sparse."""
+        whole = mirrored(self.places, values).tocsr()
+        return whole[: self.states, self.states :], whole[self.states :, self.states :]
 
     def of_biases(self, pull: np.ndarray) -> np.ndarray:
         """A right-hand side (n,) with entries (M,) or (M, K) for the biases alone."""

@@ -1,5 +1,4 @@
-"""The sparse engine: one factor of the joint precision of all states and biases (CHOLMOD, or
-SuperLU without it)."""
+"""Sparse engines: the joint precision of all states and biases, by a library that factorises it."""
 
 from __future__ import annotations
 
@@ -11,11 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.errors import InputError
 from probcal.gaussian import recursion as rec
-from probcal.gaussian.cholesky import Factor, exact
 from probcal.gaussian.climb import settle_each
 from probcal.gaussian.engine import Estimate, Factors, Sampled, Spread, density_of
+from probcal.gaussian.factor import Factor, Library
 from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.jointly import follow_biases, times_weights
 from probcal.gaussian.linearised import GivenBiases, given_biases, linearise_rows
@@ -34,18 +32,23 @@ class SparseEngine:
     """Nothing of size (M, M) or (E, n, M): what an epoch sees of the biases is few entries of a
     sparse matrix."""
 
-    products: bool = False  # no factor of the biases: conjugate gradients, and estimates with their errors
+    library: Library
     _patterns: list[tuple[Model, JointPrecision]] = field(default_factory=list, compare=False)  # of the last model
 
     cheap: ClassVar[bool] = False
 
+    @property
+    def exact(self) -> bool:
+        """True where log determinants and variances are exact."""
+        return self.library.exact
+
     def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> SparseExpansion:
         """The posterior at a consistent point; rows as the caller linearised them."""
         last = next((joint for own, joint in self._patterns if own is model), None)
-        joint = JointPrecision.of(model, products=self.products) if last is None else last
+        joint = JointPrecision.of(model) if last is None else last
         self._patterns[:] = [(model, joint)]
         rows = linearise_rows(model, point) if rows is None else tuple(rows)
-        return SparseExpansion(model, point, rows, joint)
+        return SparseExpansion(model, point, rows, joint, self.library)
 
     def settled(self, model: Model, point: Point) -> SparseExpansion:
         """The same at the modes of its trajectories for its biases."""
@@ -59,12 +62,6 @@ class _Solved:
     of: Factors
     joint: JointPrecision
     factor: Factor
-
-    @cached_property
-    def inverse(self) -> np.ndarray:
-        """The inverse at the place of each entry; raises `InputError` where the library has none."""
-        check_exact(self.joint)
-        return self.factor.inverse_entries()
 
     def biases(self, right: Any) -> np.ndarray:
         """Covariance of the biases times right, (M,) or (M, K)."""
@@ -80,6 +77,7 @@ class SparseExpansion:
     point: Point
     rows: tuple[Linearised, ...]
     joint: JointPrecision
+    library: Library
     _kept: list[_Solved] = field(default_factory=list)
 
     @cached_property
@@ -118,17 +116,16 @@ class SparseExpansion:
             if new := [own for own in factors.members if not joint.holds(own)]:
                 joint = JointPrecision.of(self.model, pairs=new)
                 entries = joint.values(self.model, self.rows, self.point.levels)
-            self._kept.append(_Solved(factors, joint, joint.factor(entries, factors)))
+            self._kept.append(_Solved(factors, joint, self.library(joint.places, joint.under(entries, factors))))
         return self._kept[0]
 
     @cached_property
     def known(self) -> np.ndarray:
         """The inverse of the precision of the states alone, biases known, at the place of each
         entry; 0 elsewhere."""
-        check_exact(self.joint)
         found = np.zeros(len(self.entries))
         inside = self.joint.places.column < self.joint.states
-        found[inside] = self.joint.states_alone(self.entries).inverse_entries()
+        found[inside] = self.library(*self.joint.of_states(self.entries)).inverse
         return found
 
     @cached_property
@@ -186,8 +183,8 @@ class SparseExpansion:
         Where the pattern lacks a pair of them, or its inverse is not exact, all are solved for.
         """
         found, M = self.solved(factors), self.model.biases
-        if found.joint.exact and found.joint.holds(members):
-            return found.joint.block_values(members, found.joint.pairs(members), found.inverse)
+        if self.library.exact and found.joint.holds(members):
+            return found.joint.block_values(members, found.joint.pairs(members), found.factor.inverse)
         asked, none = np.unique(members[members < M]), members == M
         block = none[:, :, None] * np.eye(members.shape[1])[None]
         for start in range(0, len(asked), COLUMNS):
@@ -200,32 +197,27 @@ class SparseExpansion:
         return block
 
     def spread(self, factors: Factors) -> Spread:
-        """Variance of every bias and state; from draws where there is no selected inverse."""
-        found, joint = self.solved(factors), self.joint
-        if joint.exact:
-            variance = found.inverse[found.joint.places.diagonal]
-            error = np.zeros_like(variance)
-        else:
-            variance, error = found.factor.inverse_diagonal()
-        states = tuple(joint.state_values(variance))
-        return Spread(variance[joint.states :], error[joint.states :], states)
+        """Variance of every bias and state; estimated where the library is not exact."""
+        variance, error = self.solved(factors).factor.inverse_diagonal()
+        states = tuple(self.joint.state_values(variance))
+        return Spread(variance[self.joint.states :], error[self.joint.states :], states)
 
     def states(self, factors: Factors) -> tuple[np.ndarray, ...]:
         """Covariance (E, n, n) of every state of each recursion."""
         found = self.solved(factors)
-        return tuple(own for own, _, _ in found.joint.steps(self.model, found.inverse))
+        return tuple(own for own, _, _ in found.joint.steps(self.model, found.factor.inverse))
 
     def noises(self, factors: Factors) -> tuple[np.ndarray, ...]:
         """Variance (E, n) of every whitened noise of each recursion."""
         found = self.solved(factors)
-        steps = tuple(tuple(map(jnp.asarray, own)) for own in found.joint.steps(self.model, found.inverse))
+        steps = tuple(tuple(map(jnp.asarray, own)) for own in found.joint.steps(self.model, found.factor.inverse))
         variances = _noise_variances(self.model, self.point, steps)
         return self.model.each(lambda _, on, own: np.where(on[:, None], own, 1.0), self.joint.driven, variances)
 
     def predicted(self, factors: Factors) -> tuple[np.ndarray, ...]:
         """Variance (N, C) of each predicted value."""
         found = self.solved(factors)
-        return tuple(found.joint.predicted_variances(self.model, self.rows, found.inverse))
+        return tuple(found.joint.predicted_variances(self.model, self.rows, found.factor.inverse))
 
     def leverages(self, factors: Factors) -> tuple[np.ndarray, ...]:
         """Leverage of every datum (N, C) on the biases: w times the part of its variance that the
@@ -250,7 +242,7 @@ class SparseExpansion:
         What each column of the root moves is found for some columns at a time. Raises
         `numpy.linalg.LinAlgError` where a track is open.
         """
-        factor, across = self.joint.states_alone(self.entries), self.joint.across(self.entries)
+        factor, across = self.library(*self.joint.of_states(self.entries)), self.joint.with_biases(self.entries)[0]
         variance, _ = factor.inverse_diagonal()
         for start in range(0, root.shape[1], COLUMNS):
             pulled = across @ root[:, start : start + COLUMNS]
@@ -259,14 +251,8 @@ class SparseExpansion:
 
     def weighed(self, weights: Data) -> SparseExpansion:
         """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
-        return SparseExpansion(self.model.weighted(weights), self.point, scaled(self.rows, weights), self.joint)
-
-
-def check_exact(joint: JointPrecision) -> None:
-    """Raise `InputError` where no library is there that gives exact variances."""
-    if not exact():
-        M = joint.places.size - joint.states
-        raise InputError(f"exact variances of a network of {M} biases are those of sparsax: install probcal[sparse]")
+        rows = scaled(self.rows, weights)
+        return SparseExpansion(self.model.weighted(weights), self.point, rows, self.joint, self.library)
 
 
 @jax.jit

@@ -4,7 +4,7 @@ propagation.
 `EA()` and `MAP()` come here by themselves (`engine="auto"`): where the matrices of the dense form
 take more than 240 MB, and where there are more than 500 biases of which an epoch sees few, which is
 faster. Where memory does not hold the factor either, `MAP` goes on by products alone
-(`engine="matrix-free"`). What needs the whole covariance of the biases is not there; variances and
+(`engine="iterative"`). What needs the whole covariance of the biases is not there; variances and
 gamma of each are.
 """
 
@@ -19,14 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.gaussian.cholesky import exact
-from probcal.gaussian.choose import is_thin, prefers_sparse
+from probcal.gaussian.choose import engine_of, estimates, is_thin
 from probcal.gaussian.climb import climb_to_mode
-from probcal.gaussian.engine import Engine, Estimate, Expansion, Factors, Group, Spread, evidence, mean
+from probcal.gaussian.engine import Estimate, Expansion, Factors, Group, Spread, evidence, mean
 from probcal.gaussian.information import mean_square
 from probcal.gaussian.joint import blocks_of, missing
 from probcal.gaussian.mode import Point
-from probcal.gaussian.sparse import SparseEngine
 from probcal.identifiability.directions import alone_directions, screened_directions, shared_directions
 from probcal.identifiability.remedies import Direction
 from probcal.inference.ending import conclude_at
@@ -46,20 +44,14 @@ CHAINS, NUMBERS, MOST = 4, 400_000, 250  # of the draws of all biases that a tre
 STEPS = 60  # of the climb
 HELD = 30.0  # nats that a node may fit worse on its other side, tracks held, and is still tried: each is a climb
 NAMED = 20  # combinations of single sensors that are named
-PRODUCTS = "matrix-free"
-SPARSE = ("sparse", PRODUCTS)
-ENGINES = ("auto", "dense", *SPARSE)
 
 
 def takes_sparse(method: Iterated, problem: Problem) -> bool:
     """Whether a method is to solve a problem in its sparse form; raises `InputError` where that was
     asked in vain."""
     asked = getattr(method, "engine", "dense")
-    given = asked not in ("auto", "dense")
-    lacks = missing(problem.model)
-    if given and lacks:
-        raise InputError(f'{method.name}(engine="{asked}") does not take {lacks}: give engine="dense"')
-    return bool(given or (asked == "auto" and not lacks and prefers_sparse(problem.model)))
+    engine = engine_of(asked, problem.model)
+    return engine is asked or not engine.cheap
 
 
 def gains_by_sparse(method: Iterated, problem: Problem, prior: Prior, starts: int) -> bool:
@@ -72,8 +64,8 @@ def gains_by_sparse(method: Iterated, problem: Problem, prior: Prior, starts: in
 def check_sparse(method: Iterated, prior: Prior, starts: int) -> None:
     """Raise `InputError` naming what a sparse fit does not do."""
     if wrong := _lacking(method, prior, starts):
-        if getattr(method, "engine", "") == PRODUCTS:
-            raise InputError(f'{method.name}(engine="{PRODUCTS}") takes {wrong}')
+        if estimates(getattr(method, "engine", "auto")):
+            raise InputError(f'{method.name}(engine="iterative") takes {wrong}')
         raise InputError(f"{method.name} on a network of this size is solved in sparse form, which takes {wrong}")
 
 
@@ -84,7 +76,7 @@ def _lacking(method: Iterated, prior: Prior, starts: int) -> str:
         wrong = 'trajectory="marginal" alone'
     elif prior.correlation:
         wrong = "a prior without correlations"
-    elif getattr(method, "engine", "") == PRODUCTS and not isinstance(prior, (Gaussian, Flat)):
+    elif estimates(getattr(method, "engine", "auto")) and not isinstance(prior, (Gaussian, Flat)):
         wrong = "precisions that are given (MAP() with Gaussian() or Flat())"
     elif not (method.integrates(prior) if hasattr(method, "integrates") else isinstance(prior, (Gaussian, Flat))):
         wrong = (
@@ -92,8 +84,6 @@ def _lacking(method: Iterated, prior: Prior, starts: int) -> str:
         )
     elif starts > 1:
         wrong = "one start"
-    elif not (exact() or isinstance(prior, (Gaussian, Flat))):
-        wrong = "exact variances, of sparsax, to integrate precisions: install probcal[sparse], or take MAP()"
     return wrong
 
 
@@ -190,8 +180,8 @@ class BlockPosterior(Posterior):
 def blockwise_answer(method: Iterated, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
     """The answer of `EA` or `MAP` by blocks of sensors; raises `FitError` where a flat prior leaves
     no interval."""
-    model, products = problem.model, getattr(method, "engine", "") == PRODUCTS
-    engine = engine_of(getattr(method, "engine", ""))
+    model, asked = problem.model, getattr(method, "engine", "auto")
+    engine = engine_of(asked, model)
     integrated = hasattr(method, "integrates") and method.integrates(prior)
     first = prior.precision(problem.labels, problem.surveyed)
     declared = Precision.single(jnp.ones(model.biases)) if integrated else first
@@ -219,15 +209,15 @@ def blockwise_answer(method: Iterated, problem: Problem, prior: Prior, start: Po
             posterior, settled = _gaussian(problem, prior, mode.at, worth, first), True
     except MemoryError:
         size = f"{model.state_size} state entries and {model.biases} biases"
-        if products:
+        if not engine.exact:
             raise FitError(
                 f"memory does not hold {size}, not even without a factor: take fewer sensors or a shorter time"
             ) from None
-        if getattr(method, "engine", "") == "auto" and isinstance(prior, (Gaussian, Flat)):
-            return blockwise_answer(replace(cast("Any", method), engine=PRODUCTS), problem, prior, start, context)
+        if asked == "auto" and isinstance(prior, (Gaussian, Flat)):
+            return blockwise_answer(replace(cast("Any", method), engine="iterative"), problem, prior, start, context)
         raise FitError(
             f"the sparse factor of {size} does not fit in memory:"
-            f' MAP(engine="{PRODUCTS}") makes none; or take fewer sensors or a shorter time'
+            ' MAP(engine="iterative") makes none; or take fewer sensors or a shorter time'
         ) from None
     except np.linalg.LinAlgError:
         raise diverged(problem, engine.at(model, start), factors) from None
@@ -251,24 +241,19 @@ def diverged(problem: Problem, at: Expansion, factors: Factors) -> FitError:
     return FitError(f"The fit diverged: {why}; the estimate is invalid. Use a prior, or fix some biases.")
 
 
-def engine_of(asked: Any) -> Engine:
-    """The engine of a large network by its name, or itself."""
-    return SparseEngine(asked == PRODUCTS) if isinstance(asked, str) else asked
-
-
 def side_climb(problem: Problem, asked: Any) -> SideClimb:
     """To the marginal mode, with its log evidence, or without a factor its log marginal density.
 
     An estimated log determinant of the biases would blur what tells the sides apart; reflected it
     is nearly the same.
     """
-    engine, scales = engine_of(asked), Precision.single(jnp.ones(problem.model.biases))
+    engine, scales = engine_of(asked, problem.model), Precision.single(jnp.ones(problem.model.biases))
     factors = Factors.of(scales)
 
     def mode(point: Point) -> tuple[Point, float]:
         try:
             found = climb_to_mode(lambda at: engine.settled(problem.model, at), point, factors, STEPS, 1e-3)
-            worth = -found.value if asked == PRODUCTS else evidence(found.at, scales, factors).value
+            worth = evidence(found.at, scales, factors).value if engine.exact else -found.value
             return found.at.point, worth
         except (np.linalg.LinAlgError, FitError):  # not positive definite, or conjugate gradients did not end
             return point, -np.inf

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import InitVar, dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -12,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.choose import engine_named, estimates
 from probcal.gaussian.engine import Engine
 from probcal.gaussian.information import update_levels
 from probcal.gaussian.linearised import laplace_of
 from probcal.gaussian.marginal import find_marginal_mode
 from probcal.gaussian.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, mixing_gain
-from probcal.inference.blockwise import ENGINES, PRODUCTS
 from probcal.inference.ending import astray
 from probcal.inference.hierarchy import held, hierarchy_of
 from probcal.inference.integrate import Integration, likelihood
@@ -133,9 +132,10 @@ class EA(Maximiser):
     scene whose size only the motion tells. `EA.as_printed()` is the joint mode with precisions maximised; Paper B as
     printed is in `benchmarks/papers/paper_b.py`. `update` of maximised precisions is "mackay" (Paper B 25) or "em"
     (Paper C 40; the same fixed points, slower). `tolerance` is the change of log evidence, in nats, at which it stops;
-    `iterations` caps the outer loop. `engine` "auto" is the dense one where its matrices need up to 240 MB, unless an
-    epoch sees less than a quarter of more than 500 biases, the sparse one else; "dense", "sparse" or an object with the
-    members of `gaussian.engine.Engine` is that one, "matrix-free" is for `MAP`.
+    `iterations` caps the outer loop. `engine` "auto" is "dense" where its matrices need up to 240 MB, unless an epoch
+    sees less than a quarter of more than 500 biases; else "cholmod" where the extra `sparse` is installed, "superlu"
+    without it: the same numbers by another library. An object with the members of `gaussian.engine.Engine` is one of
+    your own; "iterative" is for `MAP`.
     Raises `InputError` for another update, trajectory, engine or kind of precisions.
 
     >>> type(EA().first_prior()), type(EA.as_printed().first_prior())
@@ -160,7 +160,7 @@ class EA(Maximiser):
 
     def __post_init__(self, form: str) -> None:
         known = {"update": RULES, "trajectory": MODES, "precisions": PRECISIONS}
-        check_engine(self, form)
+        object.__setattr__(self, "engine", engine_named(self.name, self.engine, form))
         for field, words in known.items():
             if getattr(self, field) not in words:
                 raise InputError(f'EA({field}="{getattr(self, field)}"): give one of {", ".join(words)}')
@@ -282,25 +282,14 @@ class EA(Maximiser):
         return _iterate(model, prior, given, state, self.update, self.trajectory)
 
 
-def check_engine(method: MAP | EA, form: str) -> None:
-    """Raise `InputError` for an engine that is none; the old word is taken, with a warning."""
-    if form:
-        warnings.warn(
-            f'{method.name}(form="{form}") is {method.name}(engine="{form}") now', FutureWarning, stacklevel=4
-        )
-        object.__setattr__(method, "engine", form)
-    if isinstance(method.engine, str) and method.engine not in ENGINES:
-        raise InputError(f'{method.name}(engine="{method.engine}"): give one of {", ".join(ENGINES)}')
-
-
 @dataclass(frozen=True)
 class MAP(Maximiser):
     """Mode under a given prior with its Laplace covariance: of the marginal, or of trajectories and biases jointly.
 
     `Gaussian` is l2, `Laplace` l1 (thesis 4.13-4.14), `Flat` maximum likelihood; `trajectory` "marginal" or "joint", as
-    in `EA`, places on rings included. `engine` as in `EA`; "matrix-free" makes no factor of the biases: steps by
+    in `EA`, places on rings included. `engine` as in `EA`; "iterative" makes no factor of the biases: steps by
     conjugate gradients, sds (with their relative errors, `sd_error`) and the evidence by draws (see
-    `gaussian.products`). It is for what has no room for a sparse factor; "auto" goes on with it where making one is
+    `gaussian.iterative`). It is for what has no room for a sparse factor; "auto" goes on with it where making one is
     refused for want of memory. Under `Flat` a climb of which a bias still lies more than ten scales from its stated
     value after fifteen steps, or thirty, has diverged and ends there. Raises `InputError` for another trajectory or
     engine.
@@ -319,11 +308,11 @@ class MAP(Maximiser):
     def __post_init__(self, form: str) -> None:
         if self.trajectory not in MODES:
             raise InputError(f'{self.name}(trajectory="{self.trajectory}"): give one of {", ".join(MODES)}')
-        check_engine(self, form)
+        object.__setattr__(self, "engine", engine_named(self.name, self.engine, form))
 
     def remark(self, prior: Prior) -> str:
         """That sds are estimated where no factor of the biases was made."""
-        if self.engine != PRODUCTS:
+        if not estimates(self.engine):
             return ""
         return "No factor of the biases was made: sds and evidence are estimated, each with its standard error."
 

@@ -12,13 +12,13 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
-from probcal.gaussian.choose import choose
+from probcal.gaussian.choose import engine_of
 from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point
 from probcal.gaussian.places import tilt_at
-from probcal.inference.blockwise import declared_blocks, engine_of
+from probcal.inference.blockwise import declared_blocks
 from probcal.lazy import Later
 from probcal.model.model import Recursion
 from probcal.model.motions import level_logs
@@ -121,7 +121,7 @@ class Judged:
         told = tree["calibration"].to_dataset()
         if self.scaled is not None or "information" in told:
             return self.scaled
-        if "sd_error" in told:  # no factor was made, or none that has exact variances
+        if not self.engine.exact:
             apart = 1.0 - told["contraction"].values
             return SensorBlocks(len(apart), np.arange(len(apart))[:, None], apart[:, None, None])
         return declared_blocks(self.expansion)
@@ -144,9 +144,9 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
     problem, datum, picks = identified(problem, fit, answer)
     group = fit["calibration"].to_dataset()
     spread = SensorBlocks.read(group, problem.labels, "assess", problem.scales)
-    asked = None if answer is None else getattr(answer.method, "engine", None)
-    large = choose(problem.model) if asked is None else engine_of(asked)
-    engine = large if fit.attrs.get("sparse", 0) else DenseEngine()
+    asked = getattr(answer.method, "engine", "auto") if answer is not None else "auto"
+    asked = "iterative" if asked == "auto" and "sd_error" in group else asked
+    engine = engine_of(asked, problem.model) if fit.attrs.get("sparse", 0) else DenseEngine()
     if answer is not None:
         at, scaled = answer.posterior.expansion, getattr(answer.posterior, "declared", None)
     else:

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.gaussian.choose import choose, choose_fast
+from probcal.gaussian.choose import choose, choose_fast, estimates, factoriser
 from probcal.gaussian.mode import Point
 from probcal.gaussian.room import check_room
-from probcal.inference.blockwise import PRODUCTS, check_sparse, gains_by_sparse, side_climb, takes_sparse
+from probcal.inference.blockwise import check_sparse, gains_by_sparse, side_climb, takes_sparse
 from probcal.inference.joint_gibbs import check_gibbs
 from probcal.inference.method import Context, Method
 from probcal.inference.methods import MAP
@@ -153,7 +153,7 @@ def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> Me
         return method
     if isinstance(method, Maximiser) and gains_by_sparse(method, problem, prior, starts):
         sparse: Any = method  # of those that have a form
-        return replace(sparse, engine="sparse")
+        return replace(sparse, engine=factoriser())
     check_room(problem.model)
     return None
 
@@ -166,9 +166,9 @@ def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point
     if method.climbs:
         context.monitor.enter("climb", answering=True)
         found = method.answer(problem, prior, start, context)
-        used = cast("Method", found.method)  # "matrix-free" where memory held no factor
+        used = cast("Method", found.method)  # of engine "iterative" where memory held no factor
         try:
-            return _beside_mirrors(found, used, context, side_climb(problem, getattr(used, "engine", "")))
+            return _beside_mirrors(found, used, context, side_climb(problem, getattr(used, "engine", "auto")))
         except MemoryError:
             unseen = "Memory did not hold what looking at the other side of a mirror takes."
             return replace(found, message=f"{found.message} {unseen}".strip())
@@ -306,7 +306,7 @@ def _like_first(
 
 def _weight(answer: Answer) -> float:
     """What sides are compared by: the evidence, or where that is estimated the log marginal density of the biases."""
-    if getattr(answer.method, "engine", "") == PRODUCTS and answer.trace is not None:
+    if estimates(getattr(answer.method, "engine", "dense")) and answer.trace is not None:
         return float(answer.trace[-1])
     return answer.objective
 

@@ -1,19 +1,21 @@
 """The joint precision by its products alone, where no factor of the biases fits: conjugate gradients and Lanczos.
 
 Trajectories are banded and keep a factor of their own. Of what they leave to the M biases, S = C - B'W^-1 B, only
-products are formed; the blocks of the sensors in C precondition it. Solves are exact to a tolerance, variances and the
-log determinant are estimated and come with their standard errors.
+products are formed; the blocks of the sensors in C precondition it. Solves are exact to a tolerance; the variances of
+biases and states, and the log determinant, are estimated and come with their standard errors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
-from probcal.errors import FitError
-from probcal.gaussian.cholesky import BLOCK, Factor, drawn_diagonal
+from probcal.errors import FitError, InputError
+from probcal.gaussian.factor import Entries, Factor, Library, leading, mirrored
 
 TOLERANCE = 1e-9  # share of the first residual that ends a solve
 DRAWN = 1e-2  # share of a draw that its error may have: a bound, which errors stay far below
@@ -21,20 +23,39 @@ STEPS = 2000  # of one solve
 FEW, MANY, PROBED = 128, 512, 500_000  # probes of an estimate: as many as make so many numbers, within bounds
 NUMBERS = 40_000_000  # of the bases that are held at once
 LOOK = 8  # steps between two looks at whether draws are done
+BLOCK = 64  # draws at once
+LACKS = (
+    "without a factor of the biases variances of the biases and of each state are estimated, and there are none of"
+    ' states together, of predictions or of noises: take engine="cholmod" or "superlu"'
+)
 
 
-class Products:
-    """A precision (n, n), states before biases, with the members of `Factor`."""
+@dataclass(frozen=True)
+class Iterative:
+    """Conjugate gradients for the biases; another library factorises the states before them."""
 
-    def __init__(self, held: Factor, whole: Any, states: int, members: np.ndarray):
-        """`held` factorises the states, `whole` is the matrix (sparse); members (B, p) are the biases of each sensor.
+    library: Library
 
-        Each bias stands in one of them; M is no bias. Raises `numpy.linalg.LinAlgError` where a bias has neither data
-        nor prior.
+    exact: ClassVar[bool] = False
+
+    def __call__(self, places: Entries, values: np.ndarray) -> Factor:
+        """Factorise the states; of a matrix without biases this is all."""
+        return Products(self.library, places, values) if len(places.blocks) else self.library(places, values)
+
+
+class Products(Factor):
+    """A precision (n, n), states before biases."""
+
+    def __init__(self, library: Library, places: Entries, values: np.ndarray):
+        """Each bias stands in one of the blocks.
+
+        Raises `numpy.linalg.LinAlgError` where a bias has neither data nor prior.
         """
-        self._held, self._whole, self._states = held, whole, states
-        self._across, self._within = whole[:states, states:].tocsr(), whole[states:, states:].tocsr()
-        self._back, self._members, self._size = self._across.T.tocsr(), members, whole.shape[0] - states
+        self.places, self._whole = places, mirrored(places, values)
+        self._states = states = int(places.blocks.min())
+        self._held = library(*leading(places, values, states))
+        self._across, self._within = self._whole[:states, states:].tocsr(), self._whole[states:, states:].tocsr()
+        self._back, self._members, self._size = self._across.T.tocsr(), places.blocks - states, places.size - states
         self._probes = BLOCK * (int(np.clip(PROBED // self._size, FEW, MANY)) // BLOCK)
         self._lower = np.linalg.cholesky(self._blocks())
         self._inverse = np.linalg.inv(self._lower)
@@ -109,12 +130,25 @@ class Products:
         return whole + float(found.mean()), float(found.std(ddof=1) / np.sqrt(len(found)))
 
     def inverse_diagonal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Diagonal (n,) of the inverse from draws, and its standard error."""
-        return drawn_diagonal(self.draw, self._whole, self._probes)
+        """Diagonal (n,) of the inverse from draws, and its standard error (Siden and others 2018)."""
+        rng, own = np.random.default_rng(0), self._whole.diagonal()
+        total, fourth = np.zeros(len(own)), np.zeros(len(own))
+        for _ in range(self._probes // BLOCK):
+            drawn = self.draw(rng, BLOCK).T
+            middle = drawn - (self._whole @ drawn) / own[:, None]  # the mean of each given all others
+            total += np.sum(middle**2, 1)
+            fourth += np.sum(middle**4, 1)
+        mean = total / self._probes
+        return 1.0 / own + mean, np.sqrt(np.maximum(fourth / self._probes - mean**2, 0.0) / self._probes)
 
-    def inverse_entries(self) -> np.ndarray:
-        """There is none."""
-        raise RuntimeError("products have no selected inverse")
+    @cached_property
+    def inverse(self) -> np.ndarray:
+        """There is none: raises `InputError`."""
+        raise InputError(LACKS)
+
+    def selected(self) -> np.ndarray:
+        """The same."""
+        return self.inverse
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Draws (count, n) around zero with this precision (Chow, Saad 2014)."""
