@@ -54,7 +54,8 @@ def assess(
     - `datum_check`, `epoch_check`, `channel_check`, `sensor_check`, `target_check`: innovations, and their NIS (mean
       square a datum) with limits; whiteness; posterior predictive p-values; PSIS-LOO by row; by sensor and target
       the log predictive density `elpd` of what was left out, and its NIS given the rest.
-    - `level_check`: the noise levels that the data ask for, and what the biases would move with them.
+    - `level_check`: the noise levels that the data ask for, and what the biases would move with them;
+      `linearised` says for which levels of a large network that was worked out.
     - `halves`: what each bias alone would change from the first half of the recording to the second.
     - `sensitivity`: power scaling of prior and likelihood, where the tree holds both.
     - `verdict`: `verdict` and `reason` of every bias (rules in `probcal.analysis.verdict`); `finding`: sentences.

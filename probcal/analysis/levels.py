@@ -6,6 +6,8 @@ all log levels at once, biases following: its slope by a log level is that of Ma
 curvature comes from the slopes a little to either side, trajectories at their mode there.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -61,6 +63,12 @@ class Members(NamedTuple):
             np.add.at(total, index, np.asarray(value))
         return total[:-1]
 
+    def only(self, kept: np.ndarray) -> Members:
+        """Those of some of the levels (K,)."""
+        place = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
+        levels = [level for level, own in zip(self.levels, kept, strict=True) if own]
+        return Members(levels, [place[k] for k in self.rows], [place[k] for k in self.noises])
+
 
 class Slopes(NamedTuple):
     """Slopes of the log evidence at a point: by log levels, and by z before the prior."""
@@ -75,7 +83,8 @@ class Wanted(NamedTuple):
     step: np.ndarray  # (K,) of the log levels
     sd: np.ndarray  # (K,)
     square: np.ndarray  # (K,) of each step alone over its variance
-    shift: np.ndarray | None  # (K, M) of z with the step of each level; None where it was not worked out
+    shift: np.ndarray  # (K, M) of z with the step of each level; NaN where not linearised
+    linearised: np.ndarray  # (K,) whether the posterior was linearised with that level changed
 
 
 def members_of(problem: Problem, *, moving: bool = True) -> Members:
@@ -85,11 +94,8 @@ def members_of(problem: Problem, *, moving: bool = True) -> Members:
     noises = [_of_noises(problem, r, found) for r in range(len(problem.model.recursions))]
     noises = noises if moving else [np.full_like(own, -1) for own in noises]
     counts = np.bincount(np.concatenate([k.ravel() for k in (*rows, *noises)]) + 1, minlength=len(found) + 1)[1:]
-    kept = sorted(k for k in np.argsort(-counts, kind="stable")[:MOST] if counts[k] >= FEWEST)
-    place = np.full(len(found) + 1, -1)
-    place[kept] = np.arange(len(kept))
-    levels = list(found)
-    return Members([levels[k] for k in kept], [place[k] for k in rows], [place[k] for k in noises])
+    kept = (np.argsort(np.argsort(-counts, kind="stable")) < MOST) & (counts >= FEWEST)
+    return Members(list(found), rows, noises).only(kept)
 
 
 def _of_rows(problem: Problem, b: int, found: dict[Level, int]) -> np.ndarray:
@@ -208,17 +214,33 @@ def ask(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
     `factors` are those of the prior of z that is held. What biases move is their covariance times what their score
     changes, the slope of any posterior mean by what is added to the score.
 
+    Where expansions are not cheap one look at the scores says of which levels that is worked out.
+    """
+    if fit.engine.cheap:
+        return _followed(fit, members, factors)
+    look = _screened(fit.expansion, factors, members)
+    if not look.linearised.any():
+        return look
+    asked = _followed(fit, members.only(look.linearised), factors)
+    if asked is None:
+        return None
+    for whole, own in zip(look[:-1], asked[:-1], strict=True):
+        whole[look.linearised] = own
+    return look
+
+
+def _followed(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
+    """Newton steps in all levels together.
+
     The slope of N noises of mean square r^2 is N (r^2 exp(-2 t) - 1): a Newton step d stands for t = -log(1 - 2 d) / 2.
     """
     engine, at, K = fit.engine, fit.expansion, len(members.levels)
     step, shift, square = np.zeros(K), np.zeros((K, len(at.point.z))), np.zeros(K)
-    sd = np.zeros(K)
-    if not engine.cheap and (screened := _screened(at, factors, members)) is not None:
-        return screened
+    sd, every = np.zeros(K), np.ones(K, bool)
     for turn in range(TURNS):
         found, at = _expanded(fit, engine, factors, at, members, step)
         if found is None:
-            return None if turn == 0 else Wanted(step, sd, square, shift)
+            return None if turn == 0 else Wanted(step, sd, square, shift, every)
         newton, sd = found.covariance @ found.slope, np.sqrt(np.diag(found.covariance))
         square = newton**2 / sd**2 if turn == 0 else square
         bent = -0.5 * np.log(np.maximum(1.0 - 2.0 * newton, np.exp(-2.0 * LONGEST)))
@@ -227,25 +249,26 @@ def ask(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
         if np.abs(own).max() < NEAR or not (newton**2 > NEGLIGIBLE * sd**2).any():
             break
         at = _at(engine, at, members, own, own @ found.follow)
-    return Wanted(step, sd, square, shift)
+    return Wanted(step, sd, square, shift, every)
 
 
-def _screened(at: Expansion, factors: Factors, members: Members) -> Wanted | None:
-    """The levels by one look; None where some level may be another, which is then expanded."""
+def _screened(at: Expansion, factors: Factors, members: Members) -> Wanted:
+    """The levels by one look, and which of them may be wrong: those to linearise again."""
     alone = np.maximum(members.sums(*noise_information(at, factors)), 1e-300)
     step, sd = members.sums(*noise_score(at, factors)) / alone, alone**-0.5
-    if (np.abs(step) > NEAR).any() or (step**2 > SUSPECT * sd**2).any():
-        return None
-    return Wanted(step, sd, (step / sd) ** 2, None)
+    suspect = (np.abs(step) > NEAR) | (step**2 > SUSPECT * sd**2)
+    shift = np.full((len(step), at.model.biases), np.nan)
+    return Wanted(step, sd, (step / sd) ** 2, shift, suspect)
 
 
 def check_levels(fit: Judged, tree: xr.DataTree) -> tuple[xr.Dataset | None, list[Finding], dict[int, str]]:
     """Group `level_check`, findings on declared levels, and why the answer of some biases is in doubt with them.
 
     `factor` is what the data ask for over what the fit had (all levels together), `factor_sd` its sd, `square` the
-    chi-square of that alone, `shift` what every bias would move with it, in its unit. A large network whose levels one
-    look finds right has no `shift`, and its `factor_sd` are upper bounds. Of process noise nothing is said
-    where it was left out of the fit. Where precisions were integrated the declared scales are held.
+    chi-square of that alone, `shift` what every bias would move with it, in its unit. Of a large network only levels
+    that one look finds suspect are `linearised` again, the others held; these have no `shift` (NaN), and their
+    `factor_sd` are upper bounds. Of process noise nothing is said where it was left out of the fit. Where precisions
+    were integrated the declared scales are held.
     """
     members = members_of(fit.problem, moving=tree.attrs.get("motion") != "left out")
     integrated = tree.attrs["precisions"] == "integrated"
@@ -260,16 +283,16 @@ def check_levels(fit: Judged, tree: xr.DataTree) -> tuple[xr.Dataset | None, lis
     sd = np.maximum(fit.sd, 1e-150)
     factor = np.exp(np.clip(asked.step, -FARTHEST, FARTHEST))
     sure = np.array([level.unknown < 0 for level in members.levels]) & (asked.square > limit)
-    shift = np.zeros((len(sure), len(sd))) if asked.shift is None else asked.shift
-    moved = np.where(sure[:, None], shift / sd, 0.0)
+    moved = np.where(sure[:, None], asked.shift / sd, 0.0)
     findings = []
     for k in np.flatnonzero(sure & ((np.abs(np.log(factor)) > np.log(PRACTICAL)) | (np.abs(moved) > HANGS).any(1))):
         text = _sentence(members.levels[k], factor[k], asked.sd[k] * factor[k])
         findings.append(Finding("level", members.levels[k].label, text + _moved(problem, moved[k])))
     values: dict[str, Any] = {
-        "factor": ("level", factor), "factor_sd": ("level", asked.sd * factor), "square": ("level", asked.square)
+        "factor": ("level", factor), "factor_sd": ("level", asked.sd * factor), "square": ("level", asked.square),
+        "linearised": ("level", asked.linearised),
     }  # fmt: skip
-    if asked.shift is not None:
+    if asked.linearised.any():
         values["shift"] = (("level", "bias_label"), asked.shift * problem.scales)
     group = xr.Dataset(values, bias_coords(problem) | {"level": _names(members.levels)})
     group.attrs |= {"limit": float(limit)}
