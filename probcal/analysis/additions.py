@@ -1,120 +1,116 @@
-"""What further rows would tell of a network too large for matrices of all biases: a pass, or a sensor.
+"""What further rows would tell: of another pass of a target, or of one more sensor.
 
 Another pass is a target of its own: eliminated, it leaves an information of the few biases that it meets. A sensor adds
-rows to tracks that there are. Either gain is a difference of log determinants, taken on the few variables that the new
-rows touch.
+rows to tracks that there are. Either sees what is as near as any sensor of its type saw a target.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from probcal.analysis.standpoint import check_free, standpoint
 from probcal.errors import InputError
-from probcal.gaussian.choose import direct_engine
-from probcal.gaussian.engine import Factors
-from probcal.gaussian.factor import Factor, leading
-from probcal.gaussian.joint import JointPrecision
+from probcal.gaussian.choose import choose
+from probcal.gaussian.engine import Expansion, Factors
+from probcal.gaussian.held import hold, inform
 from probcal.gaussian.linearised import linearise_rows
 from probcal.gaussian.mode import Point
-from probcal.gaussian.superlu import SuperLU
-from probcal.model.model import Model
+from probcal.labels import NOBODY
+from probcal.model import variants
+from probcal.model.model import Model, scaled
 from probcal.model.rows import Linearised, pose_vector
 from probcal.network import Network, Node
 from probcal.problem import Problem
-from probcal.sensor import Sensor, SensorType
+from probcal.sensor import SensorType
+from probcal.simulate import Truth
+from probcal.table import Table, header, unit_factor
 
-NUMBERS = 40_000_000  # of the right-hand sides of some columns of the inverse
-TOUCHED = 8_000  # variables of which a matrix is made
-ROWS = 1_000_000  # of the passes that are linearised together
+TOUCHED = 8_000  # biases of which a matrix is made
+ROWS = 300_000  # of the passes that are linearised together
 REACHED = 1 + 1e-9  # of the reach of a type
 
 
 @dataclass(frozen=True, eq=False)
 class Informed:
-    """What the data at a point tell, as the joint precision of states and biases under a prior of one scale."""
+    """What the data tell at a point, under a prior of one scale (or the survey) of each bias."""
 
     problem: Problem
-    model: Model
-    point: Point
+    at: Expansion
+    scales: Factors
 
     @classmethod
-    def of(cls, problem: Problem, point: Point) -> Informed:
-        """That of a problem at a point."""
-        return cls(problem, problem.model.by_information(), point)
-
-    @cached_property
-    def joint(self) -> JointPrecision:
-        """Where its entries are."""
-        return JointPrecision.of(self.model)
-
-    @cached_property
-    def entries(self) -> np.ndarray:
-        """Those of data and motion."""
-        found = self.joint.values(self.model, linearise_rows(self.model, self.point), self.point.levels)
-        if not np.isfinite(found).all():
+    def of(cls, problem: Problem, point: Point | None, truth: Truth | None) -> Informed:
+        """That of a problem at a point, a truth, or its start; raises `InputError` where there is none."""
+        check_free(problem)
+        model = problem.model.by_information()
+        at = choose(model).at(model, standpoint(problem, point, truth))
+        if not all(own.all() for own in _finite(at.rows)):
             raise InputError(
                 "the rows have no finite derivatives at the point where they are looked at; is a target at the place of"
                 " a sensor?"
             )
-        return found
-
-    @cached_property
-    def whole(self) -> Factor:
-        """The factor of states and biases; sparsax keeps one at a time, so no other is made by it here."""
-        alone = Factors.alone(np.ones(self.model.biases))
-        return direct_engine().library(self.joint.places, self.joint.under(self.entries, alone))
-
-    @cached_property
-    def held(self) -> Factor:
-        """The factor of the states at held biases."""
-        return SuperLU(*self.joint.of_states(self.entries))
+        return cls(problem, at, Factors.alone(np.ones(model.biases)))
 
     @property
-    def size(self) -> int:
-        """Number of variables."""
-        return self.joint.places.size
+    def point(self) -> Point:
+        """The point."""
+        return self.at.point
+
+    @cached_property
+    def information(self) -> np.ndarray | None:
+        """The information (M, M) of the data; None where the biases are too many for it."""
+        return self.at.information()
+
+    @cached_property
+    def volume(self) -> float:
+        """Log determinant of the precision of the biases."""
+        return self.at.log_det(self.scales).value
+
+    def covariance(self, members: np.ndarray) -> np.ndarray:
+        """Covariance (k, k) of some biases (k,)."""
+        return np.asarray(self.at.marginals(self.scales, members[None]))[0]
 
     @cached_property
     def reach(self) -> dict[SensorType, float]:
-        """The largest distance in m between target and nodes at which each type of sensor has a row."""
-        found, d = dict.fromkeys(self.problem.network.types, 0.0), self.problem.network.dimension
-        for block, data, r in self.model.each_block():
-            places = np.asarray(self.point.states[r])[np.asarray(data.epoch), slice(*self.problem.epochs[r].position)]
-            away = np.linalg.norm(np.asarray(data.pose)[:, :, :d] - places[:, None], axis=2).max(1)
-            there = np.asarray(data.mask).any(1)
-            found[block.type] = max(found[block.type], float(away[there].max(initial=0.0)) * REACHED)
+        """The largest distance in m between target and nodes at which each type of sensor that reads one has a row."""
+        model, found = self.at.model, {kind: 0.0 for kind in self.problem.network.types if kind.reads_target}
+        for block, data, _, away in model.each_block(_away(self.problem, model, self.point)):
+            if block.type in found:
+                there = np.asarray(data.mask).any(1)
+                found[block.type] = max(found[block.type], float(away[there].max(initial=0.0)) * REACHED)
         return found
 
-
-def block_of(factor: Factor, index: np.ndarray, size: int) -> np.ndarray:
-    """Entries (k, k) of the inverse of a factorised matrix (size, size) between some variables (k,)."""
-    found, many = np.empty((len(index), len(index))), max(1, NUMBERS // max(size, 1))
-    for start in range(0, len(index), many):
-        mine = index[start : start + many]
-        eye = np.zeros((size, len(mine)))
-        eye[mine, np.arange(len(mine))] = 1.0
-        found[:, start : start + many] = factor.solve(eye)[index]
-    return 0.5 * (found + found.T)
+    def levels(self, other: Problem) -> jax.Array:
+        """The log levels in the order of another problem of the same types; those it lacks at their guess."""
+        known = dict(zip([own.label for own in self.problem.levels], np.asarray(self.point.levels), strict=True))
+        return jnp.asarray([float(known.get(own.label, 0.0)) for own in other.levels])
 
 
-def _check_touched(what: str, count: int) -> None:
-    """Raise `InputError` where matrices of what rows touch do not fit."""
-    if count > TOUCHED:
-        raise InputError(
-            f"{what} would touch {count} biases and state entries, of which matrices are made: more than {TOUCHED} take"
-            " too much memory; look at fewer sensors or a shorter time"
-        )
+def _finite(rows: Sequence[Linearised]) -> list[np.ndarray]:
+    """Which rows (N,) of each block have derivatives."""
+    return [np.all([np.isfinite(own).reshape(len(own), -1).all(1) for own in lin], 0) for lin in rows]
 
 
-def typical_values(problem: Problem, kind: SensorType) -> dict[str, float]:
-    """A value of each channel of a type in its unit, among the largest that were measured; NaN where none was."""
+def _away(problem: Problem, model: Model, point: Point) -> list[np.ndarray]:
+    """Distance (N,) of each row of each block between its target and the node that is farthest from it."""
+    places, d = problem.positions(point.states), problem.network.dimension
+    return [
+        np.linalg.norm(np.asarray(data.pose)[:, :, :d] - places[r][np.asarray(data.epoch)][:, None], axis=2).max(1)
+        for _, data, r in model.each_block()
+    ]
+
+
+def _typical(problem: Problem, kind: SensorType) -> dict[str, float]:
+    """A row of a type: of each channel a value among the largest that were measured, NaN where none was; and stds,
+    those in the middle of what the table states."""
     data, found = problem.measurements, dict[str, float]()
     ours = np.array([placed.type == kind for placed in problem.network.sensors])[data.sensor]
     for name, channel in kind.expand(problem.network.dimension):
@@ -122,46 +118,41 @@ def typical_values(problem: Problem, kind: SensorType) -> dict[str, float]:
         values = data.value[ours & data.measured[:, j], j]
         at = np.argsort(np.abs(values), kind="stable")
         found[name] = float(channel.turned(values[at[int(0.99 * (len(at) - 1))]])) if len(at) else np.nan
+        stated = ours & data.has_std[:, j]
+        if stated.any():
+            found[f"{name}_std"] = float(np.median(data.std[stated, j]))
     return found
-
-
-def _gain(added: np.ndarray, covariance: np.ndarray) -> float:
-    """1/2 log det of what an information (k, k) makes of a covariance."""
-    return 0.5 * float(np.linalg.slogdet(np.eye(len(added)) + added @ covariance)[1])
 
 
 # Passes
 
 
-def gains_of_passes(told: Informed, name: str, instants: np.ndarray, states: np.ndarray) -> np.ndarray:
-    """Gains (P,) in nats of further passes like that of a target, along states (P, E, n) at instants (E,).
+def informations_of_passes(
+    told: Informed, name: str, instants: np.ndarray, states: np.ndarray
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Further passes of a target along states (P, E, n) at instants (E,) that any sensor sees: number, biases (k,) met,
+    and what it tells of these (k, k).
 
-    Each is seen, with the noise that is declared, by the sensors that it comes as near to as their type sees; by none
-    it tells nothing. A target at rest has one state, seen at all instants. Raises `InputError` for a pass that meets
-    too many biases, or runs over the place of a sensor.
+    A target at rest has one state, seen at all instants. Raises `InputError` for a pass that meets too many biases, or
+    runs over the place of a sensor.
     """
-    found = np.zeros(len(states))
-    if not len(states):
-        return found
-    epochs = next(own for own in told.problem.epochs if (own.target == name).any())
-    span = slice(*epochs.position)
-    paths = np.broadcast_to(states[:, :, span], (len(states), len(instants), span.stop - span.start))
+    (span,) = {epochs.position for epochs in told.problem.epochs if (epochs.target == name).any()}
+    paths = np.broadcast_to(states[:, :, slice(*span)], (len(states), len(instants), span[1] - span[0]))
     seen = [_seen(told, instants, path) for path in paths]
-    values = {kind: typical_values(told.problem, kind) for kind in told.problem.network.types}
-    counts = np.array([sum(map(len, own)) for own in seen])
+    values = {kind: _typical(told.problem, kind) for kind in told.reach}
+    counts = np.array([sum(map(len, own)) for own in seen], int)
     for some in np.split(np.arange(len(states)), np.flatnonzero(np.diff(np.cumsum(counts) // ROWS)) + 1):
         some = some[counts[some] > 0]
         if len(some):
             table = pd.concat([_rows_of_pass(told, instants, seen[k], int(k), values) for k in some.tolist()])
-            found[some] = _gains_of_some(told, name, instants, states, some, table)
-    return found
+            yield from _of_some(told, name, instants, states, some, table)
 
 
 def _seen(told: Informed, instants: np.ndarray, path: np.ndarray) -> list[np.ndarray]:
     """At which of the instants (E,) each sensor sees what is on a path (E, d)."""
     found = []
     for placed in told.problem.network.sensors:
-        near = _farthest(placed.nodes, instants, path) <= told.reach[placed.type]
+        near = _farthest(placed.nodes, instants, path) <= told.reach.get(placed.type, -np.inf)
         found.append(np.flatnonzero(near & _there(placed.nodes, instants)))
     return found
 
@@ -203,57 +194,41 @@ def _rows_of_pass(
     return pd.concat(pieces, ignore_index=True)
 
 
-def _gains_of_some(
+def _of_some(
     told: Informed, name: str, instants: np.ndarray, states: np.ndarray, some: np.ndarray, table: pd.DataFrame
-) -> list[float]:
-    """Gains in nats of some of the passes, whose rows are in one table: one problem, so that kernels are made once."""
-    problem, M = told.problem, told.model.biases
-    motion = {f"pass {k}": problem.target(name) for k in some}
-    passes = Problem(problem.network, motion, table, fix=problem.fixed)
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """The same of some of the passes, whose rows are in one table: one problem, so that kernels are made once.
+
+    Each pass has biases of its own there, so that one column asks every pass about one bias that it meets.
+    """
+    problem, M = told.problem, told.at.model.biases
+    passes = Problem(problem.network, {f"pass {k}": problem.target(name) for k in some}, table, fix=problem.fixed)
     (epochs,) = passes.epochs  # all are alike
-    which = np.array([int(label.partition(" ")[2]) for label in epochs.target])
+    which = np.searchsorted(some, [int(label.partition(" ")[2]) for label in epochs.target])
     k = np.searchsorted(instants, epochs.time) if states.shape[1] > 1 else np.zeros(len(which), int)
-    along = jnp.asarray(states[which, k])
-    point = Point((along,), (jnp.zeros_like(along),), told.point.z, jnp.zeros(0))
-    model = passes.model.by_information()
-    joint, lins = JointPrecision.of(model), linearise_rows(model, point)
-    entries = joint.values(model, lins, point.levels)
-    (across, _), gains = joint.with_biases(entries), []
-    for number in some:
-        own = [np.flatnonzero((which == number)[np.asarray(data.epoch)]) for data in model.rows]
-        met = np.unique(np.concatenate([_biases(model, b)[rows].ravel() for b, rows in enumerate(own)]))
-        met = met[met < M]
-        _check_touched(f"pass {number}", len(met))
-        slots = joint.slots[0][which == number]
-        first, stop = (int(slots.min()), int(slots.max()) + 1) if (slots >= 0).any() else (0, 0)
-        information = _own_information(model, lins, own, met)
-        if stop > first and np.isfinite(information).all():
-            columns = across[first:stop][:, met].toarray()
-            held = SuperLU(*leading(joint.places, entries, stop, first))
-            information = information - columns.T @ held.solve(columns)
-        if not np.isfinite(information).all():
+    along = jnp.asarray(states[some[which], k])
+    pieces = [which[np.asarray(epoch)] for epoch in passes.model.epoch]
+    model, read = variants.of_read(variants.split(passes.model.by_information(), pieces, len(some)))
+    owner, bias = np.divmod(read, M)
+    ends = np.searchsorted(owner, np.arange(len(some) + 1))
+    point = Point((along,), (jnp.zeros_like(along),), told.point.z[bias], told.levels(passes))
+    rows = linearise_rows(model, point)
+    for *_, own, finite in model.each_block(pieces, _finite(rows)):
+        if not finite.all():
+            number = some[own[~finite].min()]
             raise InputError(f"pass {number} runs over the place of a sensor that has no derivative there; move it")
-        gains.append(_gain(information, block_of(told.whole, told.joint.states + met, told.size)))
-    return gains
-
-
-def _biases(model: Model, b: int) -> np.ndarray:
-    """Biases (N, p) of each row of a block, M where there is none."""
-    data = model.rows[b]
-    return np.asarray(data.bias)[np.asarray(data.sensor)]
-
-
-def _own_information(
-    model: Model, lins: tuple[Linearised, ...], own: Sequence[np.ndarray], met: np.ndarray
-) -> np.ndarray:
-    """Information (k, k) about some biases (k,) of some rows of every block, their target known."""
-    found = np.zeros((len(met) + 1, len(met) + 1))
-    for b, rows in enumerate(own):
-        bias = _biases(model, b)[rows]
-        at = np.where(bias < model.biases, np.searchsorted(met, bias), len(met))
-        H, weight = np.asarray(lins[b].bias)[rows], np.asarray(lins[b].weight)[rows]
-        np.add.at(found, (at[:, :, None], at[:, None, :]), np.einsum("ncp,nc,ncq->npq", H, weight, H))
-    return found[:-1, :-1]
+    most = int(np.diff(ends).max())
+    if most > TOUCHED:
+        raise InputError(
+            f"pass {some[np.diff(ends).argmax()]} would meet {most} biases, of which a matrix is made: more than"
+            f" {TOUCHED} take too much memory; look at fewer sensors or a shorter time"
+        )
+    columns = np.zeros((len(read), most))
+    columns[np.arange(len(read)), np.arange(len(read)) - ends[owner]] = 1.0
+    found = inform(model, rows, hold(model, point, rows), columns)
+    for number, first, last in zip(some.tolist(), ends[:-1], ends[1:], strict=True):
+        own = found[first:last, : last - first]
+        yield number, bias[first:last], 0.5 * (own + own.T)
 
 
 # Sensors
@@ -262,105 +237,74 @@ def _own_information(
 def gains_of_sensors(told: Informed, kind: SensorType, places: np.ndarray) -> np.ndarray:
     """Gains (P,) in nats of one more sensor of a type at places (P, d), its pose known and its own biases free.
 
-    It sees every target at every instant at which that is as near as sensors of its type see. Its rows add to the
-    precision of states and biases, and to that of the states at held biases: the log determinant of the biases'
-    information is that of the first less that of the second. Raises `InputError` for a sensor that sees too much.
+    It sees every target at every instant at which that is as near as sensors of its type see; by none it tells nothing.
+    Raises `InputError` for a sensor that stands where a target was.
     """
-    problem, joint = told.problem, told.joint
-    like = next(placed for placed in problem.network.sensors if placed.type == kind)
-    time, target, seen = _instants(told)
-    prefix = "new "
-    taken = [own.name for own in problem.network.sensors] + [node.name for node in problem.network.nodes]
-    while any(name.startswith(prefix) for name in taken):
-        prefix = f"another {prefix}"
-    stated = {name: value for name, value in like.nodes[0].components.items() if name != "heading"}
-    values, placed, pieces = typical_values(problem, kind), dict[int, Sensor](), []
+    wider, new = _with_sensor(told.problem, kind)
+    number = {label: m for m, label in enumerate(told.problem.labels)}
+    old = np.array([number.get(label, -1) for label in wider.labels], int)
+    z = jnp.where(old >= 0, jnp.append(told.point.z, 0.0)[old], 0.0)
+    states = _states_at(told, wider)
+    point = Point(states, tuple(jnp.zeros_like(x) for x in states), z, told.levels(wider))
+    model, gains = wider.model.by_information(), np.zeros(len(places))
+    engine, scales, own = choose(model), Factors.alone(np.ones(len(old))), np.flatnonzero(old < 0)
     for k, place in enumerate(places):
-        node = Node(f"{prefix}{k}", tuple(place), like.nodes[0].components["heading"], **stated)
-        nodes = (node, *like.nodes[1:])
-        near = np.flatnonzero((_farthest(nodes, time, seen) <= told.reach[kind]) & _there(nodes, time))
-        if len(near):
-            placed[k] = kind.on(*nodes, name=node.name)
-            pieces.append(pd.DataFrame({"time": time[near], "sensor": node.name, "target": target[near]} | values))
-    found = np.zeros(len(places))
-    if not pieces:
-        return found
-    network = Network([*problem.network.sensors, *placed.values()], frame=problem.network.frame)
-    wider = Problem(network, problem.motion, pd.concat(pieces, ignore_index=True), fix=problem.fixed)
-    at = [_located(problem, epochs.target, epochs.time) for epochs in wider.epochs]
-    states = tuple(jnp.asarray(np.stack([np.asarray(told.point.states[r])[e] for r, e in own])) for own in at)
-    variables = [np.stack([joint.slots[r][e] for r, e in own]) for own in at]  # of every epoch
-    old = {label: m for m, label in enumerate(problem.labels)}
-    number = np.array([old.get(label, -1) for label in wider.labels] + [-1])
-    z = np.where(number >= 0, np.append(np.asarray(told.point.z), 0.0)[number], 0.0)[:-1]
-    point = Point(states, tuple(jnp.zeros_like(x) for x in states), jnp.asarray(z), jnp.zeros(0))
-    model = wider.model.by_information()
-    lins, first = linearise_rows(model, point), len(problem.network.sensors)
-    for s, k in enumerate(placed):
-        rows, slots = [], []
-        for b, index in enumerate(wider.row_index):
-            own = np.flatnonzero(wider.measurements.sensor[index] == first + s)
-            of_epochs = variables[model.recursion[b]][:, list(model.blocks[b].used)]
-            rows.append(own)
-            slots.append(of_epochs[np.asarray(model.rows[b].epoch)[own]])
-        what = f"a further {kind.name} at ({', '.join(f'{v:.4g}' for v in places[k])}) m"
-        information, index = _added_by_rows(what, told, model, lins, rows, slots, number)
-        on = index < joint.states
-        found[k] = _gain(information, block_of(told.whole, index, told.size))
-        found[k] -= _gain(information[on][:, on], block_of(told.held, index[on], joint.states))
-    return found
+        moved = variants.placed(model, [jnp.asarray(mine) for mine in new], jnp.asarray(place))
+        near = [away <= told.reach.get(kind, np.inf) for away in _away(wider, moved, point)]
+        pairs = list(zip(new, near, strict=True))
+        if not any(bool((mine & there).any()) for mine, there in pairs):
+            continue
+        counted = [(~mine | there).astype(float)[:, None] for mine, there in pairs]
+        at = engine.at(model, point, scaled(linearise_rows(moved, point), counted))
+        if not all(finite.all() for finite in _finite(at.rows)):
+            where = ", ".join(f"{v:.4g}" for v in place)
+            raise InputError(
+                f"a further {kind.name} at ({where}) m would stand where a target was seen, and has no derivative"
+                " there; move it aside"
+            )
+        inner = np.eye(len(own)) + np.asarray(at.apply(np.eye(len(old))[:, own]))[own]
+        gains[k] = 0.5 * (at.log_det(scales).value - np.linalg.slogdet(inner)[1] - told.volume)
+    return gains
 
 
-def _instants(told: Informed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every instant (N,) at which a target (N,) was seen, once, and where that was (N, d)."""
-    problem, data = told.problem, told.problem.measurements
-    _, first = np.unique(np.stack([data.target.astype(float), data.time]), axis=1, return_index=True)
-    target, time = np.array(data.target_names, object)[data.target[first]], data.time[first]
-    places = [
-        np.asarray(told.point.states[r])[e, slice(*problem.epochs[r].position)]
-        for r, e in _located(problem, target, time)
-    ]
-    return time, target, np.stack(places)
+def _states_at(told: Informed, wider: Problem) -> tuple[jax.Array, ...]:
+    """States (E, n) of the targets at the epochs of another problem, those of the nearest epoch not before."""
+    known = {name: (time, own) for name, time, own in told.problem.tracks(told.point.states)}
+    found = []
+    for epochs in wider.epochs:
+        states = np.zeros((len(epochs.time), len(epochs.components)))
+        for name, mine in epochs.members.items():
+            time, own = known[name]
+            states[mine] = own[np.minimum(np.searchsorted(time, epochs.time[mine]), len(time) - 1)]
+        found.append(jnp.asarray(states))
+    return tuple(found)
 
 
-def _located(problem: Problem, target: np.ndarray, time: np.ndarray) -> list[tuple[int, int]]:
-    """Recursion and epoch of instants (N,) of targets (N,); a target at rest has one epoch."""
-    found = np.zeros((len(time), 2), int)
-    for r, epochs in enumerate(problem.epochs):
-        for name in dict.fromkeys(epochs.target.tolist()):
-            mine, own = np.flatnonzero(target == name), np.flatnonzero(epochs.target == name)
-            k = np.minimum(np.searchsorted(epochs.time[own], time[mine]), len(own) - 1)
-            found[mine] = np.stack([np.full(len(mine), r), own[k]], 1)
-    return [(int(r), int(e)) for r, e in found]
-
-
-def _added_by_rows(
-    what: str, told: Informed, model: Model, lins: tuple[Linearised, ...], rows: list[np.ndarray],
-    slots: list[np.ndarray], number: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """What rows of every block add to the precision (k, k) of some variables (k,): their states, biases that there are.
-
-    `slots` (N, u) are the variables of the states of each row, `number` (biases + 1,) those of its biases, -1 of new
-    ones, which are integrated.
-    """
-    places = []
-    for b, (own, slot) in enumerate(zip(rows, slots, strict=True)):
-        bias = _biases(model, b)[own]
-        fresh = told.size + bias  # after all variables that there are
-        at = np.where(number[bias] >= 0, told.joint.states + number[bias], fresh)
-        places.append(np.concatenate([slot, np.where(bias == model.biases, -1, at)], 1))
-    index = np.unique(np.concatenate([at.ravel() for at in places]))
-    index = index[index >= 0]
-    _check_touched(what, len(index))
-    matrix = np.zeros((len(index) + 1, len(index) + 1))
-    for b, (own, at) in enumerate(zip(rows, places, strict=True)):
-        k = np.where(at >= 0, np.searchsorted(index, at), len(index))
-        H = np.concatenate([np.asarray(lins[b].state), np.asarray(lins[b].bias)], 2)[own]
-        weight = np.asarray(lins[b].weight)[own]
-        np.add.at(matrix, (k[:, :, None], k[:, None, :]), np.einsum("ncp,nc,ncq->npq", H, weight, H))
-    if not np.isfinite(matrix).all():
-        raise InputError(f"{what} would stand where a target was seen, and has no derivative there; move it aside")
-    old, new = index < told.size, np.append(index >= told.size, False)
-    inner = matrix[new][:, new] + np.eye(new.sum())
-    cross = matrix[new][:, np.append(old, False)]
-    return matrix[:-1, :-1][old][:, old] - cross.T @ np.linalg.solve(inner, cross), index[old]
+def _with_sensor(problem: Problem, kind: SensorType) -> tuple[Problem, list[np.ndarray]]:
+    """The problem with one more sensor of a type that sees every epoch; which rows (N,) of each block are its own."""
+    network, data = problem.network, problem.measurements
+    like = next(placed for placed in network.sensors if placed.type == kind)
+    taken = {placed.name for placed in network.sensors} | {node.name for node in network.nodes}
+    name = next(f"new_{k}" for k in range(len(taken) + 1) if f"new_{k}" not in taken)
+    stated = {k: v for k, v in like.nodes[0].components.items() if k != "heading"}
+    node = Node(name, like.nodes[0].position, like.nodes[0].components["heading"], **stated)
+    placed = kind.on(node, *like.nodes[1:], name=name)
+    frame = data.table.frame
+    columns = dict(zip(header(data.table)[0], frame.columns, strict=True))
+    there = kind.reads_target & (np.array(data.target_names)[data.target] == NOBODY)
+    seen = frame[~there & _there(placed.nodes, data.time)]
+    seen = seen.drop_duplicates([columns[c] for c in ("time", "target") if c in columns])
+    units, channels = header(data.table)[1], dict(kind.expand(network.dimension))
+    own = {
+        columns[c]: value / unit_factor(data.table, c, units[c], channels[c.removesuffix("_std")].unit)
+        for c, value in _typical(problem, kind).items() if c in columns
+    }  # fmt: skip
+    blank = {column: np.nan for c, column in columns.items() if c not in ("time", "target", "sensor")}
+    rows = seen.assign(**blank).assign(**own, **{columns["sensor"]: name})
+    table = Table(pd.concat([frame, rows], ignore_index=True), data.table.source, np.arange(len(frame) + len(rows)))
+    wider = Problem(
+        Network([*network.sensors, placed], frame=network.frame), problem.motion, table, fix=problem.fixed,
+        epoch=problem.epoch,
+    )  # fmt: skip
+    number, read = len(wider.network.sensors) - 1, wider.measurements.sensor
+    return wider, [read[index] == number for index in wider.row_index]

@@ -1,28 +1,27 @@
 """Cramer-Rao bounds of biases and tracks: what no estimator can do better on a problem, before any fit.
 
-The trajectory is a random nuisance whose density is that of the motion. Where an expectation is taken, the rows are
-compressed at every draw, the compressed systems averaged and the trajectory eliminated from their average: the
-bound of van Trees (1968, 2.4.3) for biases and whitened motion noise together, and the hybrid one (Rockah,
-Schultheiss 1987). Averages of eliminated systems would be no bound.
+The trajectory is a random nuisance whose density is that of the motion. Where an expectation is taken, the information
+of every row is averaged over the draws and the trajectory eliminated from the average: the bound of van Trees (1968,
+2.4.3) for biases and whitened motion noise together, and the hybrid one (Rockah, Schultheiss 1987). Averages of
+eliminated systems would be no bound.
 """
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from probcal import linalg
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
 from probcal.errors import InputError, nearest
-from probcal.gaussian.choose import choose, direct_engine
-from probcal.gaussian.engine import Factors
-from probcal.gaussian.joint import JointPrecision
-from probcal.gaussian.linearised import Trajectory, linearise_rows, state_variances, trajectories_of
-from probcal.gaussian.mode import Compressed, compress, eliminate_compressed
+from probcal.gaussian.choose import choose
+from probcal.gaussian.engine import Expansion, Factors
+from probcal.gaussian.mode import Point
 from probcal.labels import NOBODY, listed
 from probcal.model.model import At, Model
+from probcal.model.rows import Linearised
 from probcal.problem import Problem
 from probcal.results.groups import bias_coords, by_target, node_of
 from probcal.simulate import Key, Truth, as_key
@@ -54,8 +53,8 @@ def bounds(
     by `time` and `component`, `position_rmse` in m). A bias has no bound where it takes part in a direction of which
     the elimination leaves less than 1e-12 of the information that its biases would have with all else known; such
     biases are left out of `bias`, listed in the group `unbounded` and named in the attribute `message`, which also
-    names those whose bound exceeds their scale. Where the dense form takes more than 240 MB the bounds come from sparse
-    factors, and there is no `covariance`.
+    names those whose bound exceeds their scale. A large network of more than 600 biases has no `covariance`; there a
+    bias has no bound where its variance grows with the inverse of a precision of that share of its information.
     Raises `InputError` for an unknown kind or label, tracks with gaps, and draws at which a sensor is not finite.
 
     >>> bounds(problem)["bias"]["sd"].sizes["bias_label"]
@@ -75,83 +74,86 @@ def bounds(
         z = jnp.broadcast_to(true_biases(problem, given), (draws, model.biases))
         z = jax.random.normal(keys[1], z.shape) if kind == "posterior" else z
     prior = np.ones(model.biases) if kind == "posterior" else problem.surveyed.astype(float)
-    if not choose(problem.model).cheap:
-        variance, bounded, spread = _by_sparse(model, levels, z, states, prior)
-        return _tree(problem, kind, len(z), np.sqrt(variance), None, bounded, spread)
-    compressed = average(model, levels, z, states)
-    _check_finite(jax.tree.leaves(compressed))
-    information, trajectories = _eliminated(model, levels, compressed)
-    alone = np.diagonal(compressed.information) + prior
-    covariance, bounded = invert(np.asarray(information) + np.diag(prior), alone)
-    spread = [np.maximum(np.asarray(v), 0.0) for v in state_variances(trajectories, jnp.asarray(covariance))]
-    return _tree(problem, kind, len(z), np.sqrt(np.diagonal(covariance)), covariance, bounded, spread)
+    at = _averaged(model, levels, z, states)
+    alone = _with_all_else_known(at) + prior
+    information = at.information()
+    if information is None:
+        variance, bounded, spread, error = _by_ridge(at, prior, alone)
+        return _tree(problem, kind, len(z), np.sqrt(variance), None, bounded, spread, error)
+    root, bounded = invert(information + np.diag(prior), alone)
+    covariance = root @ root.T
+    return _tree(problem, kind, len(z), np.sqrt(np.diagonal(covariance)), covariance, bounded, at.followed(root))
 
 
-def _check_finite(leaves: Iterable[Any]) -> None:
-    if not all(bool(np.isfinite(leaf).all()) for leaf in leaves):
+def _averaged(model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...]) -> Expansion:
+    """The information of all rows, averaged over points z (D, M) and states (D, E, n), and the trajectories."""
+    rows = _average(model, levels, z, states)
+    if not all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(rows)):
         raise InputError("bounds: a sensor is not finite at the trajectories drawn; give truth=Truth(tracks)")
+    first = tuple(x[0] for x in states)
+    return choose(model).at(model, Point(first, tuple(jnp.zeros_like(x) for x in first), z[0], levels), rows)
 
 
-def _by_sparse(
-    model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...], prior: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Variance (M,) of the biases, who is bounded (M,), and variances (E, n) of the states, by sparse factors.
+@jax.jit
+def _average(model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...]) -> tuple[Linearised, ...]:
+    """Rows of the expected information, averaged over points z (D, M) and states (D, E, n), without scores.
 
-    A share `LOST` of the information that each bias would have with all else known is added where there is no prior.
-    A bias whose variance follows when ten times that is added has no bound.
+    The average of H'WH of a row is the information of as many data as the row reads states and biases.
     """
-    joint = JointPrecision.of(model)
-    values = np.zeros(len(joint.kept))
-    for k in range(len(z)):
-        lins = linearise_rows(model, At(tuple(x[k] for x in states), z[k], levels))
-        values += joint.values(model, lins, levels) / len(z)
-    _check_finite([values])
-    on = joint.places.row == joint.places.column
-    alone = np.bincount(joint.places.row[on], values[on], joint.places.size)[joint.states :]
+
+    def at(z_d: jax.Array, states_d: tuple[jax.Array, ...]) -> list[jax.Array]:
+        lins = model.linearise(At(states_d, z_d, levels), expected=True)
+        both = [(jnp.concatenate([lin.state, lin.bias], 2), lin.weight) for lin in lins]
+        return [jnp.einsum("ncv,nc,ncw->nvw", H, weight, H) for H, weight in both]
+
+    def add(total: list[jax.Array], point: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[list[jax.Array], None]:
+        return jax.tree.map(jnp.add, total, at(*point)), None
+
+    shapes = jax.eval_shape(at, z[0], tuple(x[0] for x in states))
+    total, _ = jax.lax.scan(add, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), (z, states))
+    return tuple(_rooted(own / len(z), len(block.used)) for block, _, _, own in model.each_block(total))
+
+
+def _rooted(information: jax.Array, used: int) -> Linearised:
+    """Data of weight one that have the information (N, v, v), about `used` states and then biases."""
+    size = jnp.sqrt(jnp.diagonal(information, axis1=1, axis2=2))
+    size = jnp.where(size == 0, 1.0, size)
+    values, vectors = linalg.spectrum(information / (size[:, :, None] * size[:, None, :]))
+    root = jnp.sqrt(jnp.maximum(values, 0.0))[:, :, None] * vectors.mT * size[:, None, :]
+    return Linearised(jnp.zeros_like(size), jnp.ones_like(size), root[:, :, :used], root[:, :, used:])
+
+
+def _with_all_else_known(at: Expansion) -> np.ndarray:
+    """Information (M,) about each bias with all other biases and the tracks known."""
+    found = np.zeros(at.model.biases + 1)
+    for *_, lin, read in at.model.each_block(at.rows, at.model.read):
+        np.add.at(found, read, np.einsum("ncp,nc,ncp->np", lin.bias, lin.weight, lin.bias))
+    return found[:-1]
+
+
+def _by_ridge(
+    at: Expansion, prior: np.ndarray, alone: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...], float]:
+    """Variance (M,) of the biases, who is bounded (M,), variances (E, n) of the states, and the largest relative error.
+
+    A share `LOST` of the information `alone` (M,) is added where there is no prior. A bias whose variance follows when
+    ten times that is added has no bound.
+    """
     ridge = LOST * np.where(alone > 0, alone, 1.0) * (prior == 0)
-
-    def variances(alpha: np.ndarray) -> np.ndarray:
-        return direct_engine().library(joint.places, joint.under(values, Factors.alone(alpha))).inverse_diagonal()[0]
-
     try:
-        variance = variances(prior + ridge)
-        loose = variances(prior + 10.0 * ridge) if ridge.any() else variance
+        found = at.spread(Factors.alone(prior + ridge))
+        loose = at.spread(Factors.alone(prior + 10.0 * ridge)) if ridge.any() else found
     except np.linalg.LinAlgError:
         raise InputError(
             "bounds: rounding hides which biases of so many have none; survey or fix some of those that"
             ' observability names, or take kind="posterior"'
         ) from None
-    own, bounded = variance[joint.states :], variance[joint.states :] < FOLLOWS * loose[joint.states :]
-    return own, bounded, joint.state_values(variance)
-
-
-@jax.jit
-def average(model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...]) -> Compressed:
-    """Expected information of compressed rows, averaged over points z (D, M) and states (D, E, n)."""
-
-    def at(z_d: jax.Array, states_d: tuple[jax.Array, ...]) -> Compressed:
-        lins = model.linearise(At(states_d, z_d, levels), expected=True)
-        blind = [lin._replace(score=jnp.zeros_like(lin.score)) for lin in lins]  # a bound does not see the data
-        return compress(model, blind)
-
-    def add(total: Compressed, point: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[Compressed, None]:
-        return jax.tree.map(jnp.add, total, at(*point)), None
-
-    shapes = jax.eval_shape(at, z[0], tuple(x[0] for x in states))
-    total, _ = jax.lax.scan(add, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), (z, states))
-    return jax.tree.map(lambda leaf: leaf / z.shape[0], total)
-
-
-@jax.jit
-def _eliminated(model: Model, levels: jax.Array, compressed: Compressed) -> tuple[jax.Array, tuple[Trajectory, ...]]:
-    """Information (M, M) of z, trajectories marginalised, and these given z."""
-    noises = tuple(jnp.zeros_like(part.drift) for part in model.recursions)
-    solved = eliminate_compressed(model, noises, levels, compressed)
-    return solved.information, trajectories_of(model, levels, solved)
+    error = float(np.max(found.error / found.biases))
+    return found.biases, found.biases < FOLLOWS * loose.biases, found.states, error
 
 
 def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance bound (M, M) from information and its diagonal with all else known (M,), and who is bounded (M,).
+    """Root (M, R) of the covariance bound, from information (M, M) and that with all else known (M,); who is bounded.
 
     A parameter is bounded where its unit vector lies in the range of the information. The range is taken after
     division by what each parameter would have with all else known, which no choice of units changes; the rows of the
@@ -163,15 +165,17 @@ def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.n
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     lost = values <= LOST
     bounded = np.abs(vectors[:, lost]).max(1, initial=0.0) <= INVOLVED
-    inverse = (vectors[:, ~lost] / values[~lost]) @ vectors[:, ~lost].T
-    return inverse / np.outer(size, size), bounded
+    return vectors[:, ~lost] / np.sqrt(values[~lost]) / size[:, None], bounded
 
 
 def _tree(
     problem: Problem, kind: str, count: int, sd: np.ndarray, covariance: np.ndarray | None, bounded: np.ndarray,
-    variances: list[np.ndarray],
+    variances: Sequence[np.ndarray], error: float = 0.0,
 ) -> xr.DataTree:  # fmt: skip
-    """The tree of standard deviations (M,) and a covariance (M, M) of z, and variances (E, n) of the states."""
+    """The tree of standard deviations (M,) and a covariance (M, M) of z, and variances (E, n) of the states.
+
+    `error` is the largest standard error of a variance, over it.
+    """
     labels, sd = np.array(problem.labels, str), (sd * problem.scales)[bounded]
     own = {"sd": sd, "scale": problem.scales[bounded]}
     bias = xr.Dataset({k: ("bias_label", value) for k, value in own.items()}, coords=bias_coords(problem, bounded))
@@ -179,6 +183,7 @@ def _tree(
         covariance = (covariance * np.outer(problem.scales, problem.scales))[np.ix_(bounded, bounded)]
         bias = bias.assign_coords(bias_label_other=labels[bounded])
         bias["covariance"] = (("bias_label", "bias_label_other"), covariance)
+    variances = [np.maximum(v, 0.0) for v in variances]
     place = [np.sqrt(v.sum(1)) for v in problem.positions(variances)]
     spread = (("time", "component"), [np.sqrt(v) for v in variances])
     tracks = by_target(problem, {"sd": spread, "position_rmse": (("time",), place)})
@@ -187,6 +192,8 @@ def _tree(
         **{f"track/{name}": group for name, group in tracks.items() if name != node_of(NOBODY)},
     }
     message = _message(labels, bounded, sd > problem.scales[bounded])
+    if error:
+        message += f" Variances are estimated from draws, to {error:.0%}; install probcal[sparse] for exact ones."
     if not bounded.all():
         groups["unbounded"] = xr.Dataset(coords=bias_coords(problem, ~bounded))
     tree = xr.DataTree.from_dict(groups)

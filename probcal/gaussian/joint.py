@@ -193,10 +193,9 @@ class JointPrecision:
         """The precision of the states at held biases."""
         return leading(self.places, values, self.states)
 
-    def with_biases(self, values: np.ndarray) -> tuple[Any, Any]:
-        """The parts between states and biases (states, M) and of the biases alone (M, M), sparse."""
-        whole = mirrored(self.places, values).tocsr()
-        return whole[: self.states, self.states :], whole[self.states :, self.states :]
+    def across(self, values: np.ndarray) -> Any:
+        """The part (states, M) of the precision between states and biases, sparse."""
+        return mirrored(self.places, values).tocsr()[: self.states, self.states :]
 
     def of_biases(self, pull: np.ndarray) -> np.ndarray:
         """A right-hand side (n,) with entries (M,) or (M, K) for the biases alone."""

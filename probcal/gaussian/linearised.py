@@ -17,7 +17,6 @@ from probcal.gaussian.mode import (
     Eliminated,
     Point,
     compress,
-    eliminate,
     eliminate_compressed,
     factors,
     log_density,
@@ -145,12 +144,6 @@ def trajectories_of(model: Model, levels: jax.Array, solved: Eliminated) -> tupl
         spread = jnp.diagonal(noises, axis1=1, axis2=2)
         found.append(Trajectory(L, half, -response.states, -response.noises, states, spread))
     return tuple(found)
-
-
-@jax.jit
-def marginal_information(model: Model, point: Point) -> jax.Array:
-    """Expected information (M, M) of the data about the biases at a point, trajectories marginalised."""
-    return eliminate(model, point, expected=True).information
 
 
 def laplace(model: Model, point: Point, prior: Precision) -> LaplaceApproximation:

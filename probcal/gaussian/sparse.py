@@ -14,17 +14,17 @@ from probcal.gaussian import recursion as rec
 from probcal.gaussian.climb import settle_each
 from probcal.gaussian.engine import Estimate, Factors, Sampled, Spread, density_of
 from probcal.gaussian.factor import Factor, Library
+from probcal.gaussian.held import hold, inform
 from probcal.gaussian.joint import JointPrecision
-from probcal.gaussian.jointly import follow_biases, times_weights
+from probcal.gaussian.jointly import times_weights
 from probcal.gaussian.linearised import GivenBiases, given_biases, linearise_rows
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import Eliminated, Point, eliminate_rows, factors, inverse_factors
+from probcal.gaussian.mode import Eliminated, Point, factors, inverse_factors
 from probcal.model.model import Data, Model, scaled
 from probcal.model.rows import Linearised
 
 COLUMNS = 256  # of a root of the covariance at once
-WHOLE, TOGETHER = 600, 64  # biases up to which a matrix of all is made on request (its eigenvalues take 0.2 s), and
-# its columns at once
+WHOLE = 600  # biases up to which a matrix of all is made on request (its eigenvalues take 0.2 s)
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class SparseExpansion:
     @cached_property
     def eliminated(self) -> Eliminated:
         """The trajectories eliminated at held biases."""
-        return _held(self.model, self.point, self.rows)
+        return hold(self.model, self.point, self.rows)
 
     def given_biases(self) -> tuple[GivenBiases, ...]:
         """The trajectories of each recursion given the biases."""
@@ -160,17 +160,15 @@ class SparseExpansion:
 
     def apply(self, columns: Any) -> np.ndarray:
         """Information of the data about the biases times columns, (M,) or (M, K)."""
-        columns = jnp.asarray(columns)
-        found = _informed(self.model, self.rows, self.eliminated, columns.reshape(len(columns), -1))
-        return np.asarray(found).reshape(columns.shape)
+        columns = np.asarray(columns)
+        found = inform(self.model, self.rows, self.eliminated, columns.reshape(len(columns), -1))
+        return found.reshape(columns.shape)
 
     def information(self) -> np.ndarray | None:
-        """The information (M, M) itself, some columns at a time; None of more than `WHOLE` biases."""
-        M = self.model.biases
-        if M > WHOLE:
+        """The information (M, M) itself; None of more than `WHOLE` biases."""
+        if self.model.biases > WHOLE:
             return None
-        unit = np.eye(M)
-        found = np.concatenate([self.apply(unit[:, k : k + TOGETHER]) for k in range(0, M, TOGETHER)], 1)
+        found = self.apply(np.eye(self.model.biases))
         return 0.5 * (found + found.T)
 
     def moved(self, dz: Any) -> Point:
@@ -242,22 +240,18 @@ class SparseExpansion:
         What each column of the root moves is found for some columns at a time. Raises
         `numpy.linalg.LinAlgError` where a track is open.
         """
-        factor, across = self.library(*self.joint.of_states(self.entries)), self.joint.with_biases(self.entries)[0]
-        variance, _ = factor.inverse_diagonal()
+        factor, across = self.library(*self.joint.of_states(self.entries)), self.joint.across(self.entries)
+        moved = np.zeros(self.joint.states)
         for start in range(0, root.shape[1], COLUMNS):
             pulled = across @ root[:, start : start + COLUMNS]
-            variance += np.sum(factor.solve(pulled if isinstance(pulled, np.ndarray) else pulled.toarray()) ** 2, 1)
-        return self.joint.state_values(variance)
+            moved += np.sum(factor.solve(pulled if isinstance(pulled, np.ndarray) else pulled.toarray()) ** 2, 1)
+        parts = self.model.each_layout(self.held_states, self.joint.state_values(moved))
+        return [np.diagonal(np.asarray(held), axis1=1, axis2=2) + own for _, held, own in parts]
 
     def weighed(self, weights: Data) -> SparseExpansion:
         """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
         rows = scaled(self.rows, weights)
         return SparseExpansion(self.model.weighted(weights), self.point, rows, self.joint, self.library)
-
-
-@jax.jit
-def _held(model: Model, point: Point, rows: tuple[Linearised, ...]) -> Eliminated:
-    return eliminate_rows(model, point, rows, joint=False)
 
 
 @jax.jit
@@ -289,14 +283,6 @@ def _relaxed(model: Model, point: Point, rows: tuple[Linearised, ...], held: Eli
     scores = tuple(lin.score - own[:, :, 0] for *_, lin, own in model.each_block(rows, moved))
     pull = model.onto_biases(rows, tuple(own[:, :, None] for own in scores))[:, 0]
     return pull if model.tilt is None else pull + model.tilt.pull(point.z)
-
-
-@jax.jit
-def _informed(model: Model, rows: tuple[Linearised, ...], held: Eliminated, z: jax.Array) -> jax.Array:
-    """Information about the biases times z (M, K): the rows' own, less what the tracks take up."""
-    states = follow_biases(model, rows, tuple(kept.gain for kept in held.parts), z)
-    found = model.onto_biases(rows, times_weights(model, rows, model.responses(rows, states, z)))
-    return found if model.tilt is None else found + model.tilt.curvature @ z
 
 
 @jax.jit

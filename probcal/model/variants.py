@@ -97,6 +97,17 @@ def split(model: Model, piece: Sequence[np.ndarray], count: int) -> Model:
     return replace(model.with_rows(copied, piece), biases=count * M, tilt=None)
 
 
+def of_read(model: Model) -> tuple[Model, np.ndarray]:
+    """The model of the biases that its rows read alone, and which (K,) of the M they are."""
+    M = model.biases
+    read = np.unique(np.concatenate([np.zeros(0, int), *(own.ravel() for own in model.read)]))
+    read = read[read < M]
+    number = np.full(M + 1, len(read))
+    number[read] = np.arange(len(read))
+    chosen = model.with_rows(lambda data: {"bias": number[np.asarray(data.bias)]})
+    return replace(chosen, biases=len(read), tilt=None), read
+
+
 def differing(model: Model, along: Sequence[np.ndarray]) -> Model:
     """Further biases by which the M may differ from row to row: q of each, times `along` (N, q) of every row.
 
