@@ -19,11 +19,11 @@ from probcal import linalg
 from probcal.gaussian.frame import log_joint, place, unit_normals
 from probcal.gaussian.mode import Point, factors, mixed_density
 from probcal.gaussian.recursion import trajectory
+from probcal.inference.chains import Sample
 from probcal.inference.coordinates import Free
 from probcal.inference.guides import Guide
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, log_prior, prior_precision, whiten
-from probcal.inference.sampler import Sample
 from probcal.inference.svi import Optimisation
 
 NARROW = 0.1  # scale of the coordinates to start from

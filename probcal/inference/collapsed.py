@@ -13,11 +13,13 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.gaussian.frame import log_weight
+from probcal.inference.chains import Sample
+from probcal.inference.framed import FramedSampler
 from probcal.inference.hierarchy import Phi
 from probcal.inference.leaps import Place, leap
 from probcal.inference.orbits import roam
 from probcal.inference.posed import Conditional, Form, Posed, conditional, prior_precision
-from probcal.inference.sampler import Sample, Sampler
+from probcal.inference.sampler import Sampler
 from probcal.priors import Horseshoe, Prior
 
 LEAPS = 4  # tries before a swing, which costs more than all of them
@@ -87,7 +89,7 @@ def hmc_step(
 
 
 @dataclass(frozen=True)
-class Collapsed(Sampler):
+class Collapsed(FramedSampler):
     """Exact posterior of biases, hyper-parameters and trajectories, sampled with the trajectories marginalised.
 
     Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it (None: as pays for the prior)

@@ -25,11 +25,11 @@ from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point, log_density
 from probcal.identifiability.directions import alone_directions, screened_directions
 from probcal.inference.blockwise import NAMED, BlockPosterior, declared_blocks, diverged, told_columns
-from probcal.inference.chains import Draw, Sample
+from probcal.inference.chains import Draw
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.method import Context
 from probcal.inference.mixed import mixing
-from probcal.inference.posed import Form, Natural, Posed
+from probcal.inference.posed import Form, Natural
 from probcal.inference.posterior import RARE, bias_status, judge_chains, values_by_datum
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
@@ -168,14 +168,6 @@ class Gibbs(Sampler):
                 f" {problem.model.state_size} states are more: take fewer draws, or leave save out (means and sds are"
                 " always there)"
             )
-
-    def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
-        """Not asked: there is no frame."""
-        raise AssertionError("Gibbs has no frame")
-
-    def step(self, form: Form, posed: Posed, chain: Any) -> tuple[Any, Sample]:
-        """Not asked: a sweep asks an engine, which no kernel holds."""
-        raise AssertionError("a sweep of Gibbs is no kernel")
 
 
 def check_gibbs(problem: Problem, prior: Prior) -> None:

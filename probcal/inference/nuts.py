@@ -10,12 +10,13 @@ import jax.numpy as jnp
 
 from probcal.errors import InputError
 from probcal.gaussian.frame import log_weight
+from probcal.inference.chains import Sample
 from probcal.inference.coordinates import Free, Parts, parts
+from probcal.inference.framed import FramedSampler
 from probcal.inference.hierarchy import Phi
 from probcal.inference.leaps import Place, leap
 from probcal.inference.orbits import roam
 from probcal.inference.posed import Form, Posed, conditional
-from probcal.inference.sampler import Sample, Sampler
 from probcal.lazy import Later
 from probcal.priors import Horseshoe, Prior
 
@@ -26,7 +27,7 @@ else:
 
 
 @dataclass(frozen=True)
-class NUTS(Sampler):
+class NUTS(FramedSampler):
     """Exact posterior of biases, hyper-parameters and trajectories by the no-U-turn sampler (Hoffman, Gelman 2014).
 
     `chains` of `warmup` and `draws` steps, a diagonal metric (`dense=True`: full), steps that are accepted with

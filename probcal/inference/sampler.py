@@ -1,25 +1,20 @@
-"""What samplers share: the base class."""
+"""The base class of samplers."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import ABC
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
-from probcal.gaussian.mode import Point
 from probcal.inference.chains import Sample
 from probcal.inference.hierarchy import Phi
 from probcal.inference.leaps import Place
-from probcal.inference.method import Context, Method
+from probcal.inference.method import Method
 from probcal.inference.posed import Form, Posed
-from probcal.inference.posterior import conclude_draws
-from probcal.inference.sampling import sample
 from probcal.priors import ARD, Prior
-from probcal.problem import Problem
-from probcal.results.answer import Answer
 
 CHAINS, DRAWS = 4_096, 10_000_000  # the most; draws with warm-up, of all chains
 
@@ -59,14 +54,6 @@ class Sampler(Method, ABC):
             super().takes(prior) and (prior.dense or self.atoms) and not (isinstance(prior, ARD) and prior.rate == 0.0)
         )
 
-    def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
-        """Draws of the posterior around a start, and what they say."""
-        run = sample(
-            problem, self, prior, start, context.key, monitor=context.monitor, storage=context.storage,
-            threads=context.threads, fallback=context.fallback,
-        )  # fmt: skip
-        return conclude_draws(problem, prior, run)
-
     def kernel(self) -> Sampler:
         """The method without what does not change its kernels, so that these are compiled once."""
         return self
@@ -75,13 +62,13 @@ class Sampler(Method, ABC):
         """What takes over where the frame does not stand for the posterior; None: this one goes on."""
         return None
 
-    @abstractmethod
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
-        """State of a chain that starts at theta and phi."""
+        """State of a chain that starts at theta and phi; needed of one in a frame."""
+        raise AssertionError(f"chains of {self.name} have no frame")
 
-    @abstractmethod
     def step(self, form: Form, posed: Posed, chain: Any) -> tuple[Any, Sample]:
-        """The next state, and the draw it stands for."""
+        """The next state, and the draw it stands for; needed of one whose step is a kernel."""
+        raise AssertionError(f"a step of {self.name} is no kernel")
 
     def place(self, form: Form, posed: Posed, chain: Any) -> Place:
         """Where a chain stands; needed of a sampler that crosses."""

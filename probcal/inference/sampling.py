@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -21,15 +21,13 @@ from probcal.inference.orbits import orbits_of
 from probcal.inference.pose import Pilot, Worth, chain_start, pose
 from probcal.inference.posed import Form, Natural, Posed
 from probcal.inference.progress import Monitor
+from probcal.inference.sampler import Sampler
 from probcal.inference.sides import Sided, distances, side_by_side
 from probcal.inference.storage import Chunks, Storage
 from probcal.modes.mirrors import Mirrored, other_sides
 from probcal.modes.reflections import new, reach
 from probcal.priors import Prior
 from probcal.problem import Problem
-
-if TYPE_CHECKING:
-    from probcal.inference.sampler import Sampler
 
 GROWTH = 4  # by how many times more steps a draw is tried again that has not mixed
 WARM_UP = "warm-up"  # the phase that leaves no draws

@@ -14,11 +14,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from probcal.errors import InputError
+from probcal.inference.chains import Sample
 from probcal.inference.coordinates import Free, parts
+from probcal.inference.framed import FramedSampler
 from probcal.inference.guides import Guide, GuideParameters, Structured
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, prior_precision
-from probcal.inference.sampler import Sample, Sampler
 from probcal.priors import Horseshoe, Prior
 
 DECAY, SQUARE = 0.9, 0.999  # of Adam: memory of the gradients and of their squares
@@ -39,7 +40,7 @@ class Optimisation(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SVI(Sampler):
+class SVI(FramedSampler):
     """A Gaussian approximation of the joint posterior by stochastic variational inference, quicker than `NUTS`.
 
     The guide has full rank over biases and hyper-parameters, given which each trajectory has a block-tridiagonal

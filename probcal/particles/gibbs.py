@@ -25,7 +25,7 @@ from probcal.inference.chains import Draw, Sample
 from probcal.inference.draws import slice_step
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.method import Context
-from probcal.inference.posed import Form, Natural, Posed, conditional, log_prior, prior_precision
+from probcal.inference.posed import Form, Natural, conditional, log_prior, prior_precision
 from probcal.inference.posterior import Chains, conclude_draws
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
@@ -152,10 +152,6 @@ class ParticleGibbs(Sampler):
             status = Status.NOT_CONVERGED if answer.status is Status.CONVERGED else answer.status
             answer = replace(answer, status=status, message=f"{answer.message} {more}".strip())
         return answer
-
-    def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
-        """Not asked: chains begin by paths."""
-        raise AssertionError("particle Gibbs begins by paths")
 
     def step(self, form: Form, posed: Any, chain: GibbsState) -> tuple[GibbsState, Sample]:
         """One sweep; `posed` is what is `Held`."""
