@@ -31,7 +31,7 @@ VALUES = {"problem": "Problem", "online": "Online", "motion": "Motion", "sensor_
 NOISY = ["ConstantVelocity", "ConstantAcceleration", "CoordinatedTurn", "RandomWalk", "White", "Known"]
 CALLED = {  # values that a filled-in name may have
     "own.family": NOISY, "method.name": ["EA", "MAP"], "name": HOOKS, "type(self).__name__": ["Gaussian", "ARD"],
-    "type(prior).__name__": ["Horseshoe", "BernoulliGaussian"],
+    "type(prior).__name__": ["Horseshoe", "BernoulliGaussian"], "method": ["EA", "MAP"],
 }  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import xarray as xr
 
 from probcal.analysis.standpoint import draw_states, on_tracks_of
 from probcal.errors import InputError, nearest
-from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows, trajectories_of
 from probcal.gaussian.mode import Point, smooth_tracks
 from probcal.model.model import At, Model
 from probcal.modes.grid import follow_states
@@ -131,7 +131,8 @@ def _first_order(model: Model, spans: Spans, true: tuple[jax.Array, ...]) -> tup
     def one(states: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
         point = Point(states, tuple(jnp.zeros_like(x) for x in states), jnp.zeros(M), levels)
         alone, gain = jnp.zeros(()), jnp.zeros(M)
-        for own, (a, b) in zip(DenseEngine().at(model, point).trajectories, spans, strict=True):
+        _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
+        for own, (a, b) in zip(trajectories_of(model, levels, solved), spans, strict=True):
             alone = alone + jnp.sum(jnp.diagonal(own.covariance, axis1=1, axis2=2)[:, a:b])
             gain = gain + jnp.sum(own.response[:, a:b] ** 2, (0, 1))
         epochs = sum(x.shape[0] for x in states)

@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.gaussian.choose import engine_of, estimates, is_thin
+from probcal.gaussian.choose import choose_fast, engine_of, estimates
 from probcal.gaussian.climb import climb_to_mode
 from probcal.gaussian.engine import Estimate, Expansion, Factors, Group, Spread, evidence, mean
 from probcal.gaussian.information import mean_square
-from probcal.gaussian.joint import blocks_of, missing
+from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point
 from probcal.identifiability.directions import alone_directions, screened_directions, shared_directions
 from probcal.identifiability.remedies import Direction
@@ -57,8 +57,8 @@ def takes_sparse(method: Iterated, problem: Problem) -> bool:
 def gains_by_sparse(method: Iterated, problem: Problem, prior: Prior, starts: int) -> bool:
     """Whether a fit that may take either form is faster in the sparse one, and loses nothing that
     was asked."""
-    either = getattr(method, "engine", "dense") == "auto" and not missing(problem.model)
-    return either and is_thin(problem.model) and not _lacking(method, prior, starts)
+    free = getattr(method, "engine", "dense") == "auto"
+    return free and not choose_fast(problem.model).cheap and not _lacking(method, prior, starts)
 
 
 def check_sparse(method: Iterated, prior: Prior, starts: int) -> None:

@@ -12,8 +12,7 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
-from probcal.gaussian.choose import engine_of
-from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.choose import engine_of, factoriser
 from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point
@@ -144,9 +143,9 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
     problem, datum, picks = identified(problem, fit, answer)
     group = fit["calibration"].to_dataset()
     spread = SensorBlocks.read(group, problem.labels, "assess", problem.scales)
-    asked = getattr(answer.method, "engine", "auto") if answer is not None else "auto"
-    asked = "iterative" if asked == "auto" and "sd_error" in group else asked
-    engine = engine_of(asked, problem.model) if fit.attrs.get("sparse", 0) else DenseEngine()
+    asked = factoriser() if answer is None else getattr(answer.method, "engine", "auto")
+    asked = "iterative" if "sd_error" in group else asked
+    engine = engine_of(asked if fit.attrs.get("sparse", 0) else "dense", problem.model)
     if answer is not None:
         at, scaled = answer.posterior.expansion, getattr(answer.posterior, "declared", None)
     else:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.choose import engine_of
 from probcal.gaussian.draws import draw, draw_biases, draws_a_chain
 from probcal.gaussian.engine import Expansion
 from probcal.gaussian.linearised import LaplaceApproximation
@@ -183,7 +183,7 @@ class Posterior(ABC):
 
     @cached_property
     def _expanded(self) -> Expansion:
-        return DenseEngine().at(self.problem.model, self.point)
+        return engine_of("dense", self.problem.model).at(self.problem.model, self.point)
 
 
 @dataclass(frozen=True, eq=False)
