@@ -24,10 +24,6 @@ ENGINES: dict[str, Callable[[], Engine]] = {
     "superlu": lambda: SparseEngine(SuperLU),
     "iterative": lambda: SparseEngine(Iterative(Cholmod if has_cholmod() else SuperLU)),
 }
-RENAMED: dict[str, Callable[[], str]] = {
-    "sparse": lambda: factoriser(),
-    "matrix-free": lambda: "iterative",
-}
 
 
 def has_cholmod() -> bool:
@@ -40,9 +36,9 @@ def factoriser() -> str:
     return "cholmod" if has_cholmod() else "superlu"
 
 
-def direct_engine() -> SparseEngine:
+def direct_engine() -> Engine:
     """That engine."""
-    return SparseEngine(Cholmod if has_cholmod() else SuperLU)
+    return ENGINES[factoriser()]()
 
 
 def engine_named(method: str, asked: str | Engine, form: str = "") -> str | Engine:
@@ -52,7 +48,7 @@ def engine_named(method: str, asked: str | Engine, form: str = "") -> str | Engi
     """
     given = f'form="{form}"' if form else f'engine="{asked}"'
     found = form or asked
-    found = RENAMED.get(str(found), lambda: found)()
+    found = {"sparse": factoriser(), "matrix-free": "iterative"}.get(str(found), found)
     if found is not asked:
         warnings.warn(f'{method}({given}) is {method}(engine="{found}") now', FutureWarning, stacklevel=4)
     if isinstance(found, str) and found not in ("auto", *ENGINES):
