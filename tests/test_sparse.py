@@ -857,6 +857,6 @@ def test_bounds_that_rounding_hides_are_none(monkeypatch):
 
     monkeypatch.setattr("probcal.gaussian.choose.ROOM", 0)
     monkeypatch.setattr("probcal.gaussian.sparse.WHOLE", 0)
-    monkeypatch.setattr("probcal.gaussian.joint.JointPrecision.factor", singular)
+    monkeypatch.setattr("probcal.gaussian.joint.JointPrecision.under", singular)
     with pytest.raises(InputError, match=r'rounding hides which biases of so many have none; .* take kind="posterior"'):
         pc.bounds(drawn()[0], kind="hybrid", truth=drawn()[1], draws=1)

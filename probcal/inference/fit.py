@@ -31,6 +31,7 @@ from probcal.inference.storage import Storage
 from probcal.inference.widen import judge_fit, judge_tracks
 from probcal.labels import NODE, START, listed
 from probcal.lazy import Later
+from probcal.modes import automatic_start
 from probcal.modes.grid import grid_start
 from probcal.modes.mirrors import SAME, Mirrored
 from probcal.priors import AnyPrior
@@ -293,10 +294,9 @@ def track(
         return smoother.tracked(problem, found.z, found.covariance, found.levels, as_key(key))
     check_linear(problem)
     engine = choose(problem.model)
-    before, after = (
-        at_levels(problem.model, grid_start(problem, jnp.asarray(z), 30), jnp.asarray(found.levels))
-        for z in (problem.first_z, found.z)
-    )
+    begun = automatic_start(problem) if engine.cheap else grid_start(problem, jnp.asarray(found.z), 30)
+    start = at_levels(problem.model, begun, jnp.asarray(found.levels))
+    before, after = (start._replace(z=jnp.asarray(z)) for z in (problem.first_z, found.z))
     before = engine.settled(problem.model, before).point
     if problem.model.tailed:
         covariance = jnp.asarray(found.covariance)
