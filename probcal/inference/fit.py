@@ -294,9 +294,10 @@ def track(
         return smoother.tracked(problem, found.z, found.covariance, found.levels, as_key(key))
     check_linear(problem)
     engine = choose(problem.model)
-    begun = automatic_start(problem) if engine.cheap else grid_start(problem, jnp.asarray(found.z), 30)
-    start = at_levels(problem.model, begun, jnp.asarray(found.levels))
-    before, after = (start._replace(z=jnp.asarray(z)) for z in (problem.first_z, found.z))
+    z = jnp.asarray(found.z)
+    tracks = automatic_start(problem) if engine.cheap else grid_start(problem, z, 30)
+    start = at_levels(problem.model, tracks, jnp.asarray(found.levels))
+    before, after = start._replace(z=jnp.asarray(problem.first_z)), start._replace(z=z)
     before = engine.settled(problem.model, before).point
     if problem.model.tailed:
         covariance = jnp.asarray(found.covariance)
