@@ -48,7 +48,7 @@ class Informed:
 
     @classmethod
     def of(cls, problem: Problem, point: Point | None, truth: Truth | None) -> Informed:
-        """That of a problem at a point, a truth, or its start; raises `InputError` where there is none."""
+        """The data of a problem at a point, at a truth, or at its start; raises `InputError` where there is none."""
         check_free(problem)
         model = problem.model.by_information()
         at = choose(model).at(model, standpoint(problem, point, truth))
@@ -95,7 +95,7 @@ class Informed:
 
 
 def _finite(rows: Sequence[Linearised]) -> list[np.ndarray]:
-    """Which rows (N,) of each block have derivatives."""
+    """True for rows (N,) of each block whose derivatives are finite."""
     return [np.all([np.isfinite(own).reshape(len(own), -1).all(1) for own in lin], 0) for lin in rows]
 
 

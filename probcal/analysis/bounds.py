@@ -78,8 +78,8 @@ def bounds(
     alone = _with_all_else_known(at) + prior
     information = at.information()
     if information is None:
-        variance, bounded, spread, error = _by_ridge(at, prior, alone)
-        return _tree(problem, kind, len(z), np.sqrt(variance), None, bounded, spread, error)
+        variance, bounded, spread = _by_ridge(at, prior, alone)
+        return _tree(problem, kind, len(z), np.sqrt(variance), None, bounded, spread)
     root, bounded = invert(information + np.diag(prior), alone)
     covariance = root @ root.T
     return _tree(problem, kind, len(z), np.sqrt(np.diagonal(covariance)), covariance, bounded, at.followed(root))
@@ -133,8 +133,8 @@ def _with_all_else_known(at: Expansion) -> np.ndarray:
 
 def _by_ridge(
     at: Expansion, prior: np.ndarray, alone: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...], float]:
-    """Variance (M,) of the biases, who is bounded (M,), variances (E, n) of the states, and the largest relative error.
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """Variance (M,) of the biases, who is bounded (M,), and variances (E, n) of the states.
 
     A share `LOST` of the information `alone` (M,) is added where there is no prior. A bias whose variance follows when
     ten times that is added has no bound.
@@ -148,8 +148,7 @@ def _by_ridge(
             "bounds: rounding hides which biases of so many have none; survey or fix some of those that"
             ' observability names, or take kind="posterior"'
         ) from None
-    error = float(np.max(found.error / found.biases))
-    return found.biases, found.biases < FOLLOWS * loose.biases, found.states, error
+    return found.biases, found.biases < FOLLOWS * loose.biases, found.states
 
 
 def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -170,12 +169,9 @@ def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.n
 
 def _tree(
     problem: Problem, kind: str, count: int, sd: np.ndarray, covariance: np.ndarray | None, bounded: np.ndarray,
-    variances: Sequence[np.ndarray], error: float = 0.0,
+    variances: Sequence[np.ndarray],
 ) -> xr.DataTree:  # fmt: skip
-    """The tree of standard deviations (M,) and a covariance (M, M) of z, and variances (E, n) of the states.
-
-    `error` is the largest standard error of a variance, over it.
-    """
+    """The tree of standard deviations (M,) and a covariance (M, M) of z, and variances (E, n) of the states."""
     labels, sd = np.array(problem.labels, str), (sd * problem.scales)[bounded]
     own = {"sd": sd, "scale": problem.scales[bounded]}
     bias = xr.Dataset({k: ("bias_label", value) for k, value in own.items()}, coords=bias_coords(problem, bounded))
@@ -192,8 +188,6 @@ def _tree(
         **{f"track/{name}": group for name, group in tracks.items() if name != node_of(NOBODY)},
     }
     message = _message(labels, bounded, sd > problem.scales[bounded])
-    if error:
-        message += f" Variances are estimated from draws, to {error:.0%}; install probcal[sparse] for exact ones."
     if not bounded.all():
         groups["unbounded"] = xr.Dataset(coords=bias_coords(problem, ~bounded))
     tree = xr.DataTree.from_dict(groups)
