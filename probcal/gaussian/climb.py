@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.engine import Expansion, Factors
-from probcal.gaussian.marginal import ENOUGH, HALVINGS, LEAST_CURVED, SETTLED, TRACK_STEPS
+from probcal.gaussian.marginal import ENOUGH, LEAST_CURVED, SETTLED, TRACK_STEPS
 from probcal.gaussian.mode import Point, eliminate, follow
+from probcal.gaussian.search import HALVINGS, between, halved
 from probcal.model.model import Model
 
 KEPT = 8  # secants
@@ -37,7 +38,7 @@ def settle_each(model: Model, point: Point) -> Point:
 
     def part_way(at: Point, full: Point, shares: list[jax.Array]) -> Point:
         def go(part: Any, old: jax.Array, new: jax.Array, share: jax.Array) -> jax.Array:
-            return old + share[part.target][:, None] * (new - old)
+            return between(old, new, share[part.target][:, None])
 
         states, noises = (
             model.each(go, old, new, shares)
@@ -50,19 +51,7 @@ def settle_each(model: Model, point: Point) -> Point:
         solved = eliminate(model, at, expected=False, joint=False)
         full = follow(model, at, solved, jnp.zeros_like(at.z))
 
-        def shorter(state: Any) -> Any:
-            shares, after, tries = state
-            shares = [jnp.where(new <= old, s, 0.5 * s) for s, new, old in zip(shares, after, before, strict=True)]
-            return shares, costs(part_way(at, full, shares)), tries + 1
-
-        def worse(state: Any) -> jax.Array:
-            some = [jnp.any(~(new <= old)) for new, old in zip(state[1], before, strict=True)]
-            return (state[2] < HALVINGS) & jnp.any(jnp.stack(some))
-
-        whole = [jnp.ones(count) for count in model.targets]
-        shares, after, _ = jax.lax.while_loop(worse, shorter, (whole, costs(full), 0))
-        shares = [jnp.where(new <= old, s, 0.0) for s, new, old in zip(shares, after, before, strict=True)]
-        after = [jnp.where(new <= old, new, old) for new, old in zip(after, before, strict=True)]
+        shares, after, _ = halved(lambda shares: costs(part_way(at, full, shares)), before)
         gain = jnp.max(jnp.stack([jnp.max(old - new) for new, old in zip(after, before, strict=True)]))
         return part_way(at, full, shares), after, gain, count + 1
 

@@ -13,12 +13,10 @@ import jax
 import jax.numpy as jnp
 
 from probcal.gaussian.information import state_covariances
-from probcal.gaussian.mode import Point, between, cost, eliminate_rows, find_mode, follow
+from probcal.gaussian.mode import Point, cost, eliminate_rows, find_mode, follow, shortened
 from probcal.model import sigma
 from probcal.model.model import Model
 from probcal.priors import Precision
-
-HALVINGS = 8
 
 
 class Expected(NamedTuple):
@@ -96,12 +94,5 @@ def shorten(model: Model, point: Point, proposal: Point, prior: Precision, slack
 
     Also whether there was none.
     """
-    bound = cost(model, point, prior) + slack
-
-    def worse(state: tuple[jax.Array, jax.Array]) -> jax.Array:
-        t, tries = state
-        return ~(cost(model, between(point, proposal, t), prior) <= bound) & (tries < HALVINGS)
-
-    t, tries = jax.lax.while_loop(worse, lambda s: (0.5 * s[0], s[1] + 1), (jnp.ones(()), jnp.zeros((), int)))
-    found = between(point, proposal, jnp.where(tries < HALVINGS, t, 0.0))
-    return jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), found, point), tries >= HALVINGS
+    found, _, better, _ = shortened(model, point, proposal, prior, cost(model, point, prior) + slack)
+    return found, ~better

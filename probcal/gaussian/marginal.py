@@ -14,7 +14,6 @@ from probcal.gaussian import recursion as rec
 from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
 from probcal.gaussian.mode import (
     DAMPING,
-    HALVINGS,
     ROUNDING,
     Eliminated,
     Mode,
@@ -26,6 +25,7 @@ from probcal.gaussian.mode import (
     follow,
     log_likelihood,
 )
+from probcal.gaussian.search import HALVINGS
 from probcal.gaussian.solves import Dense
 from probcal.model.model import At, Model
 from probcal.priors import Precision

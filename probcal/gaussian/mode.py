@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.room import check_room
+from probcal.gaussian.search import between, halved
 from probcal.gaussian.solves import Dense
 from probcal.model.model import At, Model, Recursion, Where
 from probcal.model.rows import Linearised
@@ -21,7 +22,6 @@ from probcal.model.trajectories import Trajectories
 from probcal.priors import Precision
 
 CHORD = 0.1  # share of the last gain up to which what was eliminated serves on
-HALVINGS = 12  # step lengths tried before the damping grows
 DAMPING = 1e10  # damping at which the iteration gives up
 ROUNDING = 1e-12  # of the cost: what a step that promises less cannot show
 apart = jax.lax.optimization_barrier  # keeps XLA from weaving two computations together, or doing one of them twice
@@ -268,26 +268,16 @@ def follow(model: Model, point: Point, solved: Eliminated, dz: jax.Array, *, fre
     return Point(tracks, point.z + dz, point.levels)
 
 
-def between(a: Point, b: Point, t: jax.Array) -> Point:
-    """Point a + t (b - a); consistent trajectories stay consistent."""
-    return jax.tree.map(lambda p, q: p + t * (q - p), a, b)
-
-
-def _shortened(
+def shortened(
     model: Model, point: Point, proposal: Point, prior: Precision, bound: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The part of a step whose cost does not exceed a bound, halved until then; that cost, and how many were tried."""
+) -> tuple[Point, jax.Array, jax.Array, jax.Array]:
+    """The part of a step whose cost does not exceed a bound, halved until then.
 
-    def shorter(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        t, _, tries = state
-        t = jnp.where(tries == 0, 1.0, 0.5 * t)
-        return t, cost(model, between(point, proposal, t), prior), tries + 1
-
-    def worse(state: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        _, value, tries = state
-        return (tries == 0) | (~(value <= bound) & (tries < HALVINGS))
-
-    return jax.lax.while_loop(worse, shorter, (jnp.ones(()), bound, jnp.zeros((), int)))
+    Returns the point, its cost, whether there was such a part, and how many were tried. Consistent
+    trajectories stay consistent.
+    """
+    share, value, tries = halved(lambda share: cost(model, between(point, proposal, share), prior), bound)
+    return between(point, proposal, share), value, share > 0, tries
 
 
 class _Search(NamedTuple):
@@ -333,9 +323,7 @@ def find_mode(
         solved = at(s.point) if known is None else jax.lax.cond(s.iteration == 0, lambda _: known, at, s.point)
         proposal, promised = _proposal(model, s.point, prior, s.damping, joint, solved)
 
-        t, value, tries = _shortened(model, s.point, proposal, prior, s.cost)
-        better = value <= s.cost
-        point = jax.tree.map(lambda new, old: jnp.where(better, new, old), between(s.point, proposal, t), s.point)
+        point, value, better, tries = shortened(model, s.point, proposal, prior, s.cost)
         damping = jnp.where(better & (tries <= 2), s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
         damping = jnp.where(damping < 1e-6, 0.0, damping)
         change = jnp.where(better, s.cost - value, jnp.inf)
@@ -344,7 +332,7 @@ def find_mode(
         still = (~better | (change <= rounding)) & (s.damping <= 1.0) & small & jnp.isfinite(s.cost)
         done = (better & (change < tolerance) & (s.damping <= 1.0)) | (damping > DAMPING) | still
         moved = s.moved | (better & (change > 0))
-        return _Search(point, jnp.where(better, value, s.cost), damping, change, still, moved, s.iteration + 1, done)
+        return _Search(point, value, damping, change, still, moved, s.iteration + 1, done)
 
     first = _Search(
         start,
@@ -391,13 +379,11 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
         pulls = score(s.point.states, s.point)
         parts = model.each(lambda _, kept, pull: kept._replace(pull=pull), solved.parts, pulls)
         proposal = follow(model, s.point, solved._replace(parts=parts), still, free=True)
-        t, value, _ = _shortened(model, s.point, proposal, flat, s.cost)
-        better = value <= s.cost
-        point = jax.tree.map(lambda new, old: jnp.where(better, new, old), between(s.point, proposal, t), s.point)
+        point, value, better, _ = shortened(model, s.point, proposal, flat, s.cost)
         change = jnp.where(better, s.cost - value, s.change)
         renew = ~better | (change > CHORD * s.change)
         done = (better & (change < tolerance)) | (~better & s.renew)
-        return _Tracking(point, jnp.where(better, value, s.cost), solved, renew, change, s.iteration + 1, done)
+        return _Tracking(point, value, solved, renew, change, s.iteration + 1, done)
 
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(at, start))
     yes, no = jnp.ones((), bool), jnp.zeros((), bool)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian.search import halved
 from probcal.inference.hierarchy import held
 from probcal.inference.method import Context, Given
 from probcal.inference.run import bare, check_method, given_of, learn
@@ -37,7 +38,6 @@ from probcal.results.answer import Answer
 CHUNK = 5  # iterations between two reports of progress
 SETTLING = 10  # iterations of stochastic approximation before it averages
 POWER = 0.7  # by which the weights of later passes fall
-HALVINGS = 5
 COOL = 0.02  # by which the log-likelihood counts at first, where it is tempered
 RIDGE = 1e-12  # of the information, where a flat prior meets a bias that no row reads
 WINDOW = 20  # iterations that are compared with as many before them
@@ -143,14 +143,8 @@ def _shortened(model: Model, found: Ensemble, states: Any, state: Climb, now: Pr
             told = sum((jnp.sum(part) for part in model.log_likelihood(At(states, z, state.levels))), jnp.zeros(()))
         return told - 0.5 * now.square(z)
 
-    least = value(state.z)
-
-    def worse(carry: tuple[jax.Array, jax.Array]) -> jax.Array:
-        t, tries = carry
-        return ~(value(state.z + t * step) >= least) & (tries < HALVINGS)
-
-    t, tries = jax.lax.while_loop(worse, lambda c: (0.5 * c[0], c[1] + 1), (jnp.ones(()), jnp.zeros((), int)))
-    return jnp.where(tries < HALVINGS, t, 0.0) * step
+    share, *_ = halved(lambda share: -value(state.z + share * step), -value(state.z))
+    return share * step
 
 
 @dataclass(frozen=True)

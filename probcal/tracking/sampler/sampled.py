@@ -16,6 +16,7 @@ from jax.scipy.special import gammaln
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import Eliminated, Kept, Point, eliminate, factors, follow, log_density
+from probcal.gaussian.search import between, halved
 from probcal.gaussian.solves import Dense
 from probcal.model.epochs import Move
 from probcal.model.model import Model
@@ -23,7 +24,7 @@ from probcal.priors import Precision
 from probcal.tracking.scan import View, Watch, detected, present
 from probcal.tracking.update import TINY, Biases, births, rows_from
 
-STEPS, HALVINGS = 40, 10  # of Gauss-Newton, and of one of its steps
+STEPS = 40  # of Gauss-Newton
 SETTLED = 1e-9  # nats at which they end
 
 
@@ -144,21 +145,8 @@ def fitted(scene: Recording, views: tuple[View, ...], a: Association) -> Fit:
         moved = jax.vmap(lambda x, u, own: follow(model, at(x, u, z), own, dz))(x, u, solved)
         full = (moved.states[0], moved.noises[0], z + dz)
 
-        def part_way(t: jax.Array) -> Any:
-            return jax.tree.map(lambda old, new: old + t * (new - old), (x, u, z), full)
-
-        def shorter(inner: Any) -> Any:
-            t, _, tries = inner
-            t = jnp.where(tries == 0, 1.0, 0.5 * t)
-            return t, cost(*part_way(t)), tries + 1
-
-        def worse(inner: Any) -> jax.Array:
-            return (inner[2] == 0) | (~(inner[1] <= value) & (inner[2] < HALVINGS))
-
-        t, new, _ = jax.lax.while_loop(worse, shorter, (jnp.ones(()), value, 0))
-        better = new <= value
-        after = jax.tree.map(lambda n, o: jnp.where(better, n, o), part_way(t), (x, u, z))
-        return after, solved, jnp.where(better, new, value), jnp.where(better, value - new, 0.0), count + 1
+        share, new, _ = halved(lambda share: cost(*between((x, u, z), full, share)), value)
+        return between((x, u, z), full, share), solved, new, value - new, count + 1
 
     start = _begun(scene, L, used, a)
     blank = jax.tree.map(
