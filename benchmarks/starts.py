@@ -43,7 +43,7 @@ def one_model(name, data):
 
     with jax.enable_x64(True):
         problem = importlib.import_module(name).problem(data)
-        scales = Precision.single(jnp.ones(problem.model.biases))
+        scales = Precision(jnp.ones(problem.model.biases))
 
         def reached(point):
             mode = find_mode(problem.model, point, scales, 100, 1e-3)

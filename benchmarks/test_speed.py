@@ -55,14 +55,14 @@ SIZES = [(10, 100), (20, 100), (40, 100), (100, 1000), (300, 300)]  # GTSAM: gts
 
 def mode(problem, start):
     """Joint MAP of all poses and states."""
-    prior = Precision.single(jnp.ones(len(problem.labels)))
+    prior = Precision(jnp.ones(len(problem.labels)))
     found = find_mode(problem.model, start, prior, 50, 1e-5)
     return jax.block_until_ready(found.point)
 
 
 def mode_and_marginals(problem, start):
     """Joint MAP and the marginal covariances of all biases."""
-    prior = Precision.single(jnp.ones(len(problem.labels)))
+    prior = Precision(jnp.ones(len(problem.labels)))
     point = mode(problem, start)
     return jax.block_until_ready(laplace(problem.model, point, prior).covariance)
 
@@ -82,7 +82,7 @@ def test_joint_map(benchmark, N, K, work):
 def test_one_elimination_grows_with_epochs_and_rows(benchmark, K):
     problem, start = network(10, K)
     with jax.enable_x64(True):
-        alpha = Precision.single(jnp.ones(len(problem.labels)))
+        alpha = Precision(jnp.ones(len(problem.labels)))
         benchmark(lambda: jax.block_until_ready(laplace(problem.model, start, alpha).covariance))
 
 
@@ -124,7 +124,7 @@ def test_one_smoothing_pass_of_c1(benchmark):
     problem, _ = radars.setting(0, 0.3, "C1")
     with jax.enable_x64(True):
         start: Point = track_mode(problem, automatic_start(problem))
-        alpha = Precision.single(jnp.ones(len(problem.labels)))
+        alpha = Precision(jnp.ones(len(problem.labels)))
         arguments = (problem.model, start, alpha, 1, 0.0)
         benchmark(lambda: jax.block_until_ready(find_mode(*arguments, joint=False).cost))
 

@@ -7,7 +7,7 @@ own, the last pattern that matches a bias being the one that counts. `by_kind` m
 a fit takes. `inference.table()` says which method takes which prior.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any, ClassVar, NamedTuple
@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg
 from probcal.errors import InputError, nearest
 
 PRECISION_BOUNDS = (1e-2, 1e8)  # of z; a fit with a bias at the lower bound is not an answer
@@ -24,34 +23,51 @@ GROUPS = ("owner", "node", "type", "component", "vector")
 Members = Sequence[Mapping[str, str]]  # of each bias: what it belongs to, by the names in GROUPS
 
 
-class Precision(NamedTuple):
-    """Gaussian prior of z with precision diag(alpha) + coupling; `logdet` is the coupling's share of log |.|.
+class Coupling(NamedTuple):
+    """Biases that are correlated with each other and no others."""
 
-    Independent biases have no coupling: nothing of size (M, M) is held for them.
-    """
+    members: Any  # (p,)
+    precision: Any  # (p, p) what the correlation adds to their precision
+
+
+class Precision(NamedTuple):
+    """Gaussian prior of z with precision diag(alpha) and couplings; `logdet` is the share of these in log |.|."""
 
     alpha: jax.Array  # (M,) precision of each bias alone, 0 where flat
-    coupling: jax.Array | None  # (M, M) what correlations add to diag(alpha)
-    logdet: jax.Array  # ()
+    coupling: tuple[Coupling, ...] = ()
+    logdet: Any = np.zeros(())
 
-    @staticmethod
-    def single(alpha: jax.Array) -> "Precision":
-        """Independent biases of precisions alpha (M,)."""
-        nothing: Any = np.zeros(())
-        return Precision(alpha, None, nothing)
+    @classmethod
+    def correlated(cls, alpha: jax.Array, groups: Iterable[tuple[np.ndarray, float]]) -> "Precision":
+        """Precisions alpha (M,), and groups of biases of unit variance each of whose pairs has one correlation."""
+        coupling, logdet = list[Coupling](), 0.0
+        for members, value in groups:
+            p = len(members)
+            shared = value / (1 + (p - 1) * value)  # Sherman, Morrison 1950
+            coupling.append(Coupling(members, (np.eye(p) - shared) / (1 - value) - np.eye(p)))
+            logdet -= (p - 1) * np.log(1 - value) + np.log(1 + (p - 1) * value)
+        return cls(alpha, *jax.device_put((tuple(coupling), np.array(logdet)))) if coupling else cls(alpha)
 
     def matrix(self) -> jax.Array:
         """The precision matrix (M, M)."""
-        return jnp.diag(self.alpha) if self.coupling is None else jnp.diag(self.alpha) + self.coupling
+        return self._added(jnp.diag(self.alpha))
 
     def coupled(self) -> jax.Array:
         """What correlations add to diag(alpha), (M, M)."""
         M = self.alpha.shape[0]
-        return jnp.zeros((M, M)) if self.coupling is None else self.coupling
+        return self._added(jnp.zeros((M, M)))
+
+    def _added(self, matrix: jax.Array) -> jax.Array:
+        for members, own in self.coupling:
+            matrix = matrix.at[members[:, None], members[None]].add(own)
+        return matrix
 
     def pull(self, z: jax.Array) -> jax.Array:
         """Precision times z, (M,)."""
-        return self.alpha * z if self.coupling is None else self.alpha * z + self.coupling @ z
+        found = self.alpha * z
+        for members, own in self.coupling:
+            found = found.at[members].add(own @ z[members])
+        return found
 
     def square(self, z: jax.Array) -> jax.Array:
         """z' (precision) z."""
@@ -149,19 +165,24 @@ class Prior:
 
     def precision(self, labels: Sequence[str], surveyed: np.ndarray) -> Precision:
         """First precision of biases by label; those in `surveyed` (M,) have their own Gaussian."""
-        M = len(labels)
         priors = [self, *(prior for _, prior in self.kinds)]
         own = [priors[self.kind_of(label) + 1] for label in labels]
         alpha = jax.device_put(np.where(surveyed, 1.0, np.array([one.first for one in own])))
-        if not self.correlation:
-            return Precision.single(alpha)
-        matrix, coupled = np.eye(M), np.zeros(M, bool)
+        return Precision.correlated(alpha, self.correlated(labels, surveyed))
+
+    def correlated(self, labels: Sequence[str], surveyed: np.ndarray) -> list[tuple[np.ndarray, float]]:
+        """Biases by number and their correlation for each pattern; those in `surveyed` (M,) have their own Gaussian.
+
+        Raises `InputError` for a pattern that reaches biases which are not Gaussian, or others have taken.
+        """
+        found, coupled = list[tuple[np.ndarray, float]](), np.zeros(len(labels), bool)
         for pattern, value in self.correlation:
             members = [m for m, label in enumerate(labels) if fnmatchcase(label, pattern)]
             if len(members) < 2:
                 raise InputError(f'correlation "{pattern}" reaches {len(members)} bias(es){nearest(pattern, labels)}')
             for m in members:
-                if not (surveyed[m] or isinstance(own[m], Gaussian)):
+                kind = self.kind_of(labels[m])
+                if not (surveyed[m] or isinstance(self if kind < 0 else self.kinds[kind][1], Gaussian)):
                     raise InputError(
                         f'correlation "{pattern}" reaches {labels[m]}, which has no survey: give it one, '
                         f"or use the prior Gaussian"
@@ -169,11 +190,10 @@ class Prior:
                 if coupled[m]:
                     raise InputError(f'correlation "{pattern}" reaches {labels[m]}, which another pattern has taken')
             coupled[members] = True
-            matrix[np.ix_(members, members)] = np.where(np.eye(len(members)) > 0, 1.0, value)
             if 1 + (len(members) - 1) * value <= 0:
                 raise InputError(f'correlation "{pattern}" is {value:g}: too negative for {len(members)} biases')
-        inverse, logdet = (np.asarray(part) for part in linalg.inverse_and_logdet(matrix))
-        return Precision(alpha, jax.device_put(inverse - np.eye(M)), jax.device_put(-logdet))
+            found.append((np.array(members), value))
+        return found
 
     def groups(self, members: Members) -> np.ndarray:
         """Which precision governs each bias, (M,)."""

@@ -546,7 +546,7 @@ def test_every_kind_of_noise_and_correlated_surveys():
     tree = probcal.fit(problem, EA(), prior=prior)
     with jax.enable_x64(True):
         coupling = np.asarray(take_up(problem, tree).prior.coupled())
-        wanted = np.asarray(prior.precision(problem.labels, problem.surveyed).coupling)
+        wanted = np.asarray(prior.precision(problem.labels, problem.surveyed).coupled())
     np.testing.assert_allclose(coupling, wanted, atol=1e-6)
     out = assess(problem, tree)
     assert "sensitivity" not in out.children  # correlated biases have no density each to be scaled

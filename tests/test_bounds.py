@@ -65,7 +65,7 @@ def hessian(problem, precision):
     model, levels = problem.model, jnp.zeros(len(problem.levels))
     shapes = [part.drift.shape for part in model.recursions]
     M, sizes = model.biases, [np.prod(shape) for shape in shapes]
-    prior = Precision.single(jnp.asarray(precision))
+    prior = Precision(jnp.asarray(precision))
 
     def split(v):
         parts = jnp.split(v[M:], np.cumsum(sizes)[:-1])
@@ -256,7 +256,7 @@ def likeliest(model, true, precision, keys):
 
     def one(key):
         measured = model.with_values(model.sample(true, key))
-        return find_mode(measured, true, Precision.single(precision), 30, 1e-7).point.z
+        return find_mode(measured, true, Precision(precision), 30, 1e-7).point.z
 
     return jax.lax.map(one, keys)
 

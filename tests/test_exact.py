@@ -88,7 +88,7 @@ def test_iterating_changes_nothing(name):
     """On a linear model one step reaches the mode and thirty leave it there: a datum counts once."""
     _, exact, problem, _ = solved(name)
     with jax.enable_x64(True):
-        alpha = Precision.single(jnp.ones(len(problem.labels)))
+        alpha = Precision(jnp.ones(len(problem.labels)))
         start = jax.tree.map(jnp.asarray, resting(problem))
         one = find_mode(problem.model, start, alpha, 1, 0.0)
         many = find_mode(problem.model, start, alpha, 30, 0.0)

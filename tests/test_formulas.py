@@ -69,7 +69,7 @@ def test_a_wider_process_noise_costs_its_logarithm_and_leaves_the_trajectory_alo
         np.testing.assert_allclose(there.noises[0], noises * [[1.0], [np.exp(-0.3)]])
         again = trajectory(part.F, factors(part, there.levels), part.drift[:, :, None], there.noises[0][:, :, None])
         np.testing.assert_allclose(again[:, :, 0], states)
-        prior = Precision.single(np.ones(1))
+        prior = Precision(np.ones(1))
         change = cost(problem.model, there, prior) - cost(problem.model, here, prior)
     wider = 4 * 0.3 + 0.5 * (np.exp(-0.6) - 1) * np.sum(noises[1] ** 2)
     assert float(change) == pytest.approx(wider + 0.5 * (0.3 / np.log(2.0)) ** 2)
@@ -128,7 +128,7 @@ def test_what_data_determine_is_what_priors_leave():
     """tr(H^-1 J) = tr(I - H^-1 P): leverages of the data, and what noises and biases have lost of their priors."""
     problem, _ = linear("plane")
     with jax.enable_x64(True):
-        prior = Precision.single(jnp.ones(problem.model.biases))
+        prior = Precision(jnp.ones(problem.model.biases))
         at = DenseEngine().at(problem.model, resting(problem))
         covariance = laplace(problem.model, at.point, prior).covariance
         predicted = predicted_variances(problem.model, at.rows, at.trajectories, covariance)
@@ -151,7 +151,7 @@ def test_an_unknown_level_moves_as_far_as_its_prior_lets_it(factor, least, most)
     table = pd.DataFrame({"time": np.arange(40.0), "sensor": "a", "height": heights})
     problem = Problem(network, ConstantVelocity(0.01), table)
     with jax.enable_x64(True):
-        point = find_mode(problem.model, resting(problem), Precision.single(jnp.ones(1)), 30, 1e-9).point
+        point = find_mode(problem.model, resting(problem), Precision(jnp.ones(1)), 30, 1e-9).point
         stds = [np.asarray(problem.model.noise_std(jnp.full(1, level))[0]) for level in (0.0, 0.5)]
         moved = float(jax.jit(update_levels)(problem.model, point, jnp.eye(1)).levels[0])
     np.testing.assert_allclose(stds[1], np.exp(0.5) * stds[0])

@@ -296,11 +296,11 @@ def test_a_search_that_never_moved_is_refused_and_one_at_the_mode_is_not():
     network, table = gauges()
     with jax.enable_x64(True):
         misled = Problem(Network([mirror.on(Node("m", (0.0, 0.0)))]), ConstantVelocity(0.5), MIRRORED)
-        never = find_mode(misled.model, resting(misled), Precision.single(jnp.ones(1)), 100, 1e-6)
+        never = find_mode(misled.model, resting(misled), Precision(jnp.ones(1)), 100, 1e-6)
         assert bool(never.refused)
         assert not bool(never.converged)
         problem = Problem(network, ConstantVelocity(0.5), table)
-        model, prior = problem.model, Precision.single(jnp.ones(3))
+        model, prior = problem.model, Precision(jnp.ones(3))
         point = automatic_start(problem)
         for _ in range(3):
             point = find_mode(model, point, prior, 30, 1e-13).point
@@ -319,7 +319,7 @@ def test_the_promise_of_a_step_is_what_it_keeps_on_a_linear_problem():
     problem, _ = linear("plane")
     with jax.enable_x64(True):
         model, start = problem.model, resting(problem)
-        prior = Precision.single(jnp.ones(len(problem.labels)))
+        prior = Precision(jnp.ones(len(problem.labels)))
         step = jax.jit(_proposal, static_argnums=4)
         promised = step(model, start, prior, jnp.zeros(()), True, eliminate(model, start, expected=False))[1]
         first = find_mode(model, start, prior, 0, 1e-9).cost
@@ -493,7 +493,7 @@ def test_the_mean_square_counts_residuals_and_process_noises():
     """Against the reference's posterior mean: residuals over their stds, and jumps of the states over theirs."""
     problem, naive = linear("plane")
     with jax.enable_x64(True):
-        prior = Precision.single(jnp.ones(len(problem.labels)))
+        prior = Precision(jnp.ones(len(problem.labels)))
         mode = find_mode(problem.model, resting(problem), prior, 30, 1e-9)
         square = float(mean_square(problem.model, mode.point)) * len(naive.data)
     z, rest = exact("plane").z[0], exact("plane").states[0]

@@ -65,7 +65,7 @@ def mixture(prior, matrix=G, pull=PULL, group=(0, 1, 2), key=0):
     """The mixture by Gibbs sweeps: moments and draws."""
     form = Form(3, kind_of(prior, group))
     with jax.enable_x64(True):
-        known = Natural(jnp.asarray(matrix), jnp.asarray(pull), jnp.zeros(0), Precision.single(jnp.ones(3)))
+        known = Natural(jnp.asarray(matrix), jnp.asarray(pull), jnp.zeros(0), Precision(jnp.ones(3)))
         keys = jax.random.split(jax.random.key(key))
         _, swept = run_sweeps(form, known, begin(form, known, keys[0]), keys[1], KEPT)
         found = jax.tree.map(np.asarray, moments(form, known, swept.phi))
@@ -110,7 +110,7 @@ def test_sweeps_go_on_without_another_burn_in():
     """A sweep kept second without burn-in is the one kept first after a burn-in of one."""
     form = Form(3, RegularisedHorseshoe(Horseshoe(), (0, 1, 2), (0, 1, 2)))
     with jax.enable_x64(True):
-        known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision.single(jnp.ones(3)))
+        known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision(jnp.ones(3)))
         key = jax.random.key(0)
         chains = begin(form, known, key)
         (ends, both), (_, last) = (run_sweeps(form, known, chains, key, 2 - burn, burn) for burn in (0, 1))
@@ -138,7 +138,7 @@ def test_expectation_propagation_agrees_too(prior, members):
     members = np.array(members)
     form = Form(3, kind_of(prior))
     with jax.enable_x64(True):
-        known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision.single(jnp.ones(3)))
+        known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision(jnp.ones(3)))
         point = Point((), (), jnp.zeros(3), jnp.zeros(0))
         likelihood = Fixed(Integration(form, True, sweeps=False), None, known, point)
         work = Propagation.of(form, known.first, likelihood, members, jax.random.key(0))
@@ -186,7 +186,7 @@ def test_one_gaussian_is_a_mixture_of_itself():
     """A spike and slab whose biases are all in: the plain Gaussian, its interval to rounding."""
     kind = SpikeAndSlab(BernoulliGaussian(share=0.5), (0, 1, 2), (0, 1, 2))
     with jax.enable_x64(True):
-        known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision.single(jnp.ones(3)))
+        known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision(jnp.ones(3)))
         phi = {"included": jnp.ones((CHAINS, KEPT, 3), bool)}
         found = jax.tree.map(np.asarray, moments(Form(3, kind), known, phi))
     covariance = np.linalg.inv(G + np.eye(3))

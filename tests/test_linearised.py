@@ -64,7 +64,7 @@ def test_one_linearisation_has_all_moments():
     """Covariance of biases, evidence and leverages of a linear problem, from one object."""
     (problem, naive), known = linear("plane"), exact("plane")
     with jax.enable_x64(True):
-        prior = Precision.single(jnp.ones(problem.model.biases))
+        prior = Precision(jnp.ones(problem.model.biases))
         mode = find_mode(problem.model, resting(problem), prior, 50, 1e-12).point
         at, found = DenseEngine().at(problem.model, mode), laplace(problem.model, mode, prior)
         told = sum(float(np.sum(a)) for a in leverages(problem.model, at.rows, at.trajectories, found.covariance))

@@ -25,7 +25,7 @@ STEP = 3e-4  # of z in the differences
 @partial(jax.jit, static_argnames="slope")
 def at(model, point, prior, z, *, slope):
     """Negative log marginal density at z with the trajectories at their mode, or its gradient."""
-    flat = Precision.single(jnp.zeros_like(z))
+    flat = Precision(jnp.zeros_like(z))
     point = find_mode(model, point._replace(z=z), flat, 200, 0.0, joint=False).point
     solved = eliminate(model, point, expected=True)
     if slope:
@@ -45,7 +45,7 @@ def test_the_gradient_is_that_of_differences(name):
     table = simulate(network, world.motion(), np.array(world.time), key=1, biases=biases).table
     problem = world.problem(table)
     with jax.enable_x64(True):
-        model, prior = problem.model, Precision.single(jnp.ones(problem.model.biases))
+        model, prior = problem.model, Precision(jnp.ones(problem.model.biases))
         point = find_mode(model, automatic_start(problem), prior, 50, 1e-10).point
         found = np.asarray(at(model, point, prior, point.z, slope=True))
         shifts = STEP * np.eye(len(found))
@@ -64,7 +64,7 @@ def test_the_gradient_is_that_of_differences(name):
 def test_on_a_linear_problem_it_is_the_joint_mode():
     problem, _ = linear("plane")
     with jax.enable_x64(True):
-        prior = Precision.single(jnp.ones(problem.model.biases))
+        prior = Precision(jnp.ones(problem.model.biases))
         joint = find_mode(problem.model, resting(problem), prior, 50, 1e-12)
         marginal, _ = find_marginal_mode(problem.model, resting(problem), prior, 50, 1e-10)
         evidence = laplace(problem.model, joint.point, prior).evidence

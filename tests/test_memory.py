@@ -89,7 +89,7 @@ def test_evidence_and_offsets_are_those_of_the_dense_covariance(dimension):
     problem, table, tracks = gathered(dimension)
     expected, K, data, mean = dense(table, tracks)
     with jax.enable_x64(True):
-        prior = Precision.single(jnp.ones(problem.model.biases))
+        prior = Precision(jnp.ones(problem.model.biases))
         point = find_mode(problem.model, resting(problem), prior, 30, 1e-12).point
         found = laplace(problem.model, point, prior)
         z = np.asarray(point.z)

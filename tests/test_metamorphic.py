@@ -52,7 +52,7 @@ class Estimate:
 @jax.jit
 def solved(model, start):
     """Whether the mode was reached, its point, covariance and evidence, and the variance of every state."""
-    alone = Precision.single(jnp.ones(model.biases))
+    alone = Precision(jnp.ones(model.biases))
     mode = find_mode(model, start, alone, 500, 1e-11)
     found = laplace(model, mode.point, alone)
     variances = DenseEngine().at(model, mode.point).variances(found.covariance)

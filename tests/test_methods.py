@@ -232,7 +232,7 @@ def test_an_e_step_draws_by_its_key_and_keeps_its_carry():
 
         exact, runs = end(Extended(), 0), [end(Drawn(400), seed) for seed in (0, 0, 1)]
         sd = np.sqrt(np.diagonal(exact.found.covariance))
-        density = -float(cost(problem.model, exact.point, Precision.single(jnp.ones(problem.model.biases))))
+        density = -float(cost(problem.model, exact.point, Precision(jnp.ones(problem.model.biases))))
     assert float(exact.objective) == pytest.approx(density), "the objective is the joint density, the prior once"
     z = np.stack([run.point.z for run in runs])
     assert [int(run.carry) for run in runs] == [16_000] * 3
@@ -251,7 +251,7 @@ def test_paper_b_marginalises_each_epoch_alone():
     alpha, M = np.full(len(naive.labels), 0.7), len(naive.labels)
     with jax.enable_x64(True):
         point = smooth_tracks(problem.model, jax.tree.map(jnp.asarray, resting(problem)))
-        found, step = jax.jit(paper_b)(problem.model, point, Precision.single(jnp.asarray(alpha)))
+        found, step = jax.jit(paper_b)(problem.model, point, Precision(jnp.asarray(alpha)))
     held = reference.dense(naive, None, hold=np.zeros(M))
     order = [problem.labels.index(label) for label in naive.labels]
     information, pull = np.zeros((M, M)), np.zeros(M)

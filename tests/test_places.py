@@ -93,7 +93,7 @@ def consistent(problem, z=None):
     start = automatic_start(problem)
     if z is not None:
         start = start._replace(z=jnp.asarray(z))
-    flat = Precision.single(jnp.zeros(model.biases))
+    flat = Precision(jnp.zeros(model.biases))
     return find_mode(model, start, flat, 200, 1e-10, joint=z is None).point
 
 

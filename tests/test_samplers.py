@@ -462,7 +462,7 @@ def test_a_process_noise_hardly_known_keeps_its_lower_tail():
     unknown = probcal.Target(probcal.ConstantVelocity(probcal.Unknown(0.3, 5.0)), start)
     problem = probcal.Problem(network, unknown, table)
     point = automatic_start(problem)
-    prior = Precision.single(jnp.ones(len(problem.labels)))
+    prior = Precision(jnp.ones(len(problem.labels)))
     grid = jnp.linspace(-9.0, 2.5, 400)
 
     def evidence(level):

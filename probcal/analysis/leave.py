@@ -97,15 +97,19 @@ class _Refits:
         elif weights is not None:
             at = at.weighed(tuple(jnp.asarray(own) for own in weights))
         found = _stepped(at, Factors.of(prior), held, prior)
-        return float(found.evidence) + 0.5 * _logdet(fit.prior.coupling, alpha, held), float(found.square)
+        return float(found.evidence) + 0.5 * _logdet(prior, held), float(found.square)
 
 
-def _logdet(coupling: jax.Array | None, alpha: np.ndarray, held: np.ndarray) -> float:
+def _logdet(prior: Precision, held: np.ndarray) -> float:
     """Log determinant of the prior of the biases that are not held, a flat one counted as one."""
-    own = np.where(alpha > 0, alpha, 1.0)[~held]
-    if coupling is None:
-        return float(np.log(own).sum())
-    return float(np.linalg.slogdet(np.diag(own) + np.asarray(coupling)[np.ix_(~held, ~held)])[1])
+    alpha = np.where((np.asarray(prior.alpha) > 0) & ~held, prior.alpha, 1.0)
+    total = float(np.log(alpha).sum())
+    for members, added in prior.coupling:
+        left = ~held[members]
+        own = np.diag(alpha[members][left])
+        both = own + np.asarray(added)[np.ix_(left, left)]
+        total += float(np.linalg.slogdet(both)[1] - np.linalg.slogdet(own)[1])
+    return total
 
 
 class Left(NamedTuple):

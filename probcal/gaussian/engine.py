@@ -54,10 +54,13 @@ class Factors:
     @classmethod
     def of(cls, prior: Precision) -> Factors:
         """The factors of a Gaussian prior around zero."""
-        if prior.coupling is None:
-            return cls.alone(prior.alpha)
-        whole = np.asarray(prior.matrix())
-        return cls((Group(np.arange(len(whole))[None], whole[None], np.zeros((1, len(whole)))),))
+        return cls.alone(prior.alpha) + cls.coupled(prior)
+
+    @classmethod
+    def coupled(cls, prior: Precision) -> Factors:
+        """What the correlations of a Gaussian prior add to `alone`: a factor for the biases of each."""
+        parts = [(np.asarray(members)[None], np.asarray(own)[None]) for members, own in prior.coupling]
+        return cls(tuple(Group(members, own, np.zeros(members.shape)) for members, own in parts))
 
     def __add__(self, other: Factors) -> Factors:
         return Factors((*self.groups, *other.groups))
@@ -216,17 +219,6 @@ class Engine(Protocol):
 
     def settled(self, model: Model, point: Point) -> Expansion:
         """The same at the modes of its trajectories for its biases."""
-
-
-def beyond_gaussian(model: Model) -> str:
-    """What a model has that no expansion holds as a Gaussian of known noise, in words; empty where it has nothing."""
-    if model.level_spread.shape[0]:
-        return "unknown noise levels"
-    if model.tailed:
-        return "process noise that is not Gaussian"
-    if any(form is not None for form in model.sampled):
-        return "a motion without a linear form"
-    return ""
 
 
 def mean(at: Expansion, factors: Factors) -> Any:

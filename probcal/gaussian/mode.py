@@ -367,7 +367,7 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
     What was eliminated serves the next steps too while each gains a tenth of the one before or less (Kelley 1995, 5.4):
     they need the score alone. A step that does not lower the cost is halved; where no part of it does, it ends.
     """
-    flat = Precision.single(jnp.zeros_like(start.z))
+    flat = Precision(jnp.zeros_like(start.z))
     still = jnp.zeros_like(start.z)
     score = jax.grad(lambda states, at: log_likelihood(model, At(states, at.z, at.levels)))
 

@@ -184,7 +184,7 @@ def blockwise_answer(method: Iterated, problem: Problem, prior: Prior, start: Po
     engine = engine_of(asked, model)
     integrated = hasattr(method, "integrates") and method.integrates(prior)
     first = prior.precision(problem.labels, problem.surveyed)
-    declared = Precision.single(jnp.ones(model.biases)) if integrated else first
+    declared = Precision(jnp.ones(model.biases)) if integrated else first
     factors = Factors.of(declared)
 
     def told(k: int, value: float) -> bool:
@@ -247,7 +247,7 @@ def side_climb(problem: Problem, asked: Any) -> SideClimb:
     An estimated log determinant of the biases would blur what tells the sides apart; reflected it
     is nearly the same.
     """
-    engine, scales = engine_of(asked, problem.model), Precision.single(jnp.ones(problem.model.biases))
+    engine, scales = engine_of(asked, problem.model), Precision(jnp.ones(problem.model.biases))
     factors = Factors.of(scales)
 
     def mode(point: Point) -> tuple[Point, float]:

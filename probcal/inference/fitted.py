@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg
 from probcal.errors import InputError
 from probcal.gaussian.choose import engine_of, factoriser
 from probcal.gaussian.engine import Engine, Expansion, Factors
@@ -199,9 +198,15 @@ def point_of(problem: Problem, fit: xr.DataTree) -> Point:
 
 def _prior(group: xr.Dataset) -> Precision:
     """The prior as saved: precisions, and couplings of correlated biases."""
-    alpha = group["precision"].values
-    if "coupling" not in group:
-        return Precision.single(jnp.asarray(alpha))
-    coupling, own = group["coupling"].values, np.where(alpha > 0, alpha, 1.0)
-    _, whole = linalg.inverse_and_logdet(jnp.asarray(np.diag(own) + coupling))
-    return Precision(jnp.asarray(alpha), jnp.asarray(coupling), whole - jnp.sum(jnp.log(own)))
+    found = list[tuple[np.ndarray, float]]()
+    if "coupling" in group:  # of results of version 3
+        added = group["coupling"].values
+        for row in np.unique(added[added.any(1)] != 0, axis=0):
+            members = np.flatnonzero(row)
+            found.append((members, np.linalg.inv(np.eye(len(members)) + added[np.ix_(members, members)])[0, 1]))
+    if "correlation" in group:
+        value, first = group["correlation"].values, group["correlated_with"].values
+        for name in np.unique(first[value != 0]):
+            members = np.flatnonzero(first == name)
+            found.append((members, value[members[0]]))
+    return Precision.correlated(jnp.asarray(group["precision"].values), found)

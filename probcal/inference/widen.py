@@ -363,7 +363,7 @@ def judge_tracks(tree: xr.DataTree, problem: Problem, known: Calibrated, engine:
     """
     datum, picks = datum_of(problem)
     data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
-    flat, root, spread, dz = Precision.single(jnp.zeros(len(known.z))), known.spread.root(), known.spread, None
+    flat, root, spread, dz = Precision(jnp.zeros(len(known.z))), known.spread.root(), known.spread, None
     if spread.whole and (information := at.information()) is not None:
         values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(root.T @ information @ root)))
         both = root @ (vectors / np.sqrt(1.0 + np.maximum(values, 0.0)))

@@ -87,7 +87,7 @@ def _polished(problem: Problem, tracked: Point, iterations: int) -> Optimum:
 
 def mode_from_start(model: Model, start: Point, iterations: int) -> Mode:
     """The joint mode at the declared scales next to a start, by that with growing stds at the measured values."""
-    scales = Precision.single(jnp.ones(model.biases))
+    scales = Precision(jnp.ones(model.biases))
     if (measured := variants.at_measured(model)) is not model:
         start = find_mode(measured, start, scales, iterations, 1e-3).point
     return find_mode(model, start, scales, iterations, 1e-3)
@@ -96,5 +96,5 @@ def mode_from_start(model: Model, start: Point, iterations: int) -> Mode:
 @jax.jit
 def sparse_cost(model: Model, point: Point) -> jax.Array:
     """Joint cost of a point with a Cauchy prior of scale one for each bias."""
-    flat = Precision.single(jnp.zeros(model.biases))
+    flat = Precision(jnp.zeros(model.biases))
     return cost(model, point, flat) + jnp.sum(jnp.log1p(point.z**2))

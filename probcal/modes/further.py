@@ -30,7 +30,7 @@ def further_starts(problem: Problem, count: int, key: jax.Array) -> list[Point]:
     moved = np.asarray(jax.random.uniform(seeds[1], shape)) < SPARSE
     drawn = np.where(moved, 2.0 * np.asarray(jax.random.normal(seeds[2], shape)), 0.0)
     points = [grid_start(problem, jnp.asarray(problem.first_z + z), 30) for z in np.concatenate([swaps, drawn])]
-    flat = Precision.single(jnp.zeros(len(problem.labels)))
+    flat = Precision(jnp.zeros(len(problem.labels)))
     costs = [float(joint_cost(problem.model, point, flat)) for point in points]
     value = np.nan_to_num(costs, nan=np.inf)
     pairs, others = np.argsort(value[: len(swaps)]), len(swaps) + np.argsort(value[len(swaps) :])

@@ -61,7 +61,7 @@ class SideClimb(NamedTuple):
     @classmethod
     def dense(cls, problem: Problem) -> "SideClimb":
         """To the joint mode, weighed by Laplace's formula."""
-        scales = Precision.single(jnp.ones(problem.model.biases))
+        scales = Precision(jnp.ones(problem.model.biases))
 
         def mode(point: Point) -> tuple[Point, float]:
             found = find_mode(problem.model, point, scales, 30, 1e-3)

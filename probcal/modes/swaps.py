@@ -64,7 +64,7 @@ def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> 
     if not far or (settled and max(far.values()) < GROSS):
         return
     order = sorted(swaps(problem), key=lambda pair: -max(far[pair[0]], far[pair[1]]))[:TRIED]
-    flat = Precision.single(jnp.zeros(len(problem.labels)))
+    flat = Precision(jnp.zeros(len(problem.labels)))
 
     def fitted(start: Point) -> float:
         value = float(joint_cost(problem.model, track_mode(problem, start, SCREENED), flat))

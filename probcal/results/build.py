@@ -129,7 +129,9 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
     if found.covariance is not None:  # too many biases for it else
         matrices = {"covariance": found.covariance * np.outer(scales, scales), "information": found.information}
     if answer.prior.correlation:
-        matrices["coupling"] = np.asarray(answer.prior.precision(problem.labels, problem.surveyed).coupling)
+        columns |= {"correlation": np.zeros(len(labels)), "correlated_with": np.array(labels, object)}
+        for members, value in answer.prior.correlated(labels, problem.surveyed):
+            columns["correlation"][members], columns["correlated_with"][members] = value, labels[members[0]]
     values: dict[str, Any] = {name: ("bias_label", column) for name, column in columns.items()}
     values |= {} if found.blocks is None else found.blocks.columns(scales)
     values |= {name: (("bias_label", "bias_label_other"), matrix) for name, matrix in matrices.items()}

@@ -216,7 +216,7 @@ class _Engine:
         """Near the truth, or None for a start from the data."""
         if self.start == "automatic":
             return None
-        wide = Precision.single(jnp.ones(trial.problem.model.biases))
+        wide = Precision(jnp.ones(trial.problem.model.biases))
         point = trial.point
         if trial.problem.clocks.any():  # whose states are those of other times
             followed = follow_states(trial.problem, [np.asarray(x) for x in point.states])
