@@ -35,6 +35,24 @@ def loud_ear(target, pose):
     return dict(azimuth=bearing(pose.local(target.position)))
 
 
+@pc.sensor(range=pc.Channel("m", std=pc.Unknown(1.0), noise=pc.StudentT(4.0)))
+def sonar(target, pose, *, range_offset=pc.Bias("m", 2.0, drift=pc.Drift([0.0, 6.0], scale=1.0))):
+    """Range of unknown noise with heavy tails."""
+    return dict(range=pc.geometry.norm(target.position - pose.position) + range_offset)
+
+
+@cache
+def loud():
+    """Unknown levels and heavy tails of data and of process noise, a bias that drifts."""
+    places = [(0.0, 0.0), (300.0, 0.0), (0.0, 300.0), (300.0, 300.0)]
+    nodes = [pc.Node(f"n{k}", p, scale={"position": 3.0} if k > 1 else None) for k, p in enumerate(places)]
+    network = pc.Network([*(sonar.on(node) for node in nodes[:3]), loud_ear.on(nodes[3])])
+    time = np.arange(12.0)
+    way = np.stack([60 + 15 * time, 100 + 40 * np.sin(time / 4)], 1)
+    run = pc.simulate(network, pc.ConstantVelocity(1.0), time, key=2, tracks={"t": way})
+    return pc.Problem(network, pc.ConstantVelocity(pc.Unknown(1.0), noise=pc.StudentT(4.0)), run.table)
+
+
 @cache
 def drawn():
     """Two moving targets and one at rest, seen by three radars, one surveyed, and two ears; some rows lost."""

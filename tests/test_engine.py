@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import worlds
 from reference import Naive, NaiveEngine
-from sparse_worlds import drawn, drawn_in_space, loud_ear
+from sparse_worlds import drawn, drawn_in_space, loud
 
 import probcal as pc
 from probcal.errors import InputError
@@ -21,28 +21,10 @@ from probcal.gaussian.mode import find_tracks
 from probcal.inference.fit import calibrate
 from probcal.model.model import Tilt
 from probcal.modes import automatic_start
-from probcal.noise import StudentT
 from probcal.types import float64
 
 EXACT = ("dense", "cholmod", pytest.param("superlu", marks=pytest.mark.ci))
 REFUSED = ("states", "noises", "predicted", "leverages", "noise_score")  # by an engine that estimates
-
-
-@pc.sensor(range=pc.Channel("m", std=pc.Unknown(1.0), noise=StudentT(4.0)))
-def sonar(target, pose, *, range_offset=pc.Bias("m", 2.0, drift=pc.Drift([0.0, 6.0], scale=1.0))):
-    """Range of unknown noise with heavy tails."""
-    return dict(range=pc.geometry.norm(target.position - pose.position) + range_offset)
-
-
-def loud():
-    """Unknown levels and heavy tails of data and of process noise, a bias that drifts."""
-    places = [(0.0, 0.0), (300.0, 0.0), (0.0, 300.0), (300.0, 300.0)]
-    nodes = [pc.Node(f"n{k}", p, scale={"position": 3.0} if k > 1 else None) for k, p in enumerate(places)]
-    network = pc.Network([*(sonar.on(node) for node in nodes[:3]), loud_ear.on(nodes[3])])
-    time = np.arange(12.0)
-    way = np.stack([60 + 15 * time, 100 + 40 * np.sin(time / 4)], 1)
-    run = pc.simulate(network, pc.ConstantVelocity(1.0), time, key=2, tracks={"t": way})
-    return pc.Problem(network, pc.ConstantVelocity(pc.Unknown(1.0), noise=StudentT(4.0)), run.table)
 
 
 WORLDS = ("flat", *(pytest.param(name, marks=pytest.mark.ci) for name in ("space", "loud", "correlated", "placed")))

@@ -2,17 +2,17 @@
 
 import re
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
 import worlds
 import xarray as xr
-from sparse_worlds import LIBRARIES, MOTION, TIME, drawn, ear, half_radar, loud_ear, radar
+from sparse_worlds import LIBRARIES, MOTION, TIME, drawn, ear, half_radar, loud, radar
 
 import probcal as pc
 from probcal.analysis.nees import of_biases
@@ -24,7 +24,7 @@ from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.engine import Factors
 from probcal.gaussian.factor import Entries
 from probcal.gaussian.iterative import Iterative
-from probcal.gaussian.joint import JointPrecision, blocks_of, missing
+from probcal.gaussian.joint import JointPrecision, blocks_of
 from probcal.gaussian.linearised import linearise_rows
 from probcal.gaussian.mode import compress
 from probcal.gaussian.room import check_room
@@ -33,6 +33,7 @@ from probcal.geometry import bearing, norm
 from probcal.identifiability.directions import shared_directions
 from probcal.inference import calibrate
 from probcal.inference.blockwise import gains_by_sparse, takes_sparse
+from probcal.inference.fitted import take_up
 from probcal.modes import automatic_start
 from probcal.results.blocks import SensorBlocks
 
@@ -65,6 +66,36 @@ def test_the_sparse_form_ends_where_the_dense_one_does(library, dense):
         one, other = (tree[f"track/{name}"].to_dataset() for tree in (dense, sparse))
         np.testing.assert_allclose(other["mean"], one["mean"], atol=1e-3)
         np.testing.assert_allclose(other["sd"], one["sd"], rtol=1e-5)
+
+
+CORRELATED = {"*.heading": 0.6}
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize(
+    ("world", "method", "prior"),
+    [
+        ("loud", pc.MAP(tolerance=1e-3), pc.Gaussian()),
+        ("drawn", pc.MAP(), pc.Gaussian(correlation=CORRELATED)),
+        ("drawn", pc.EA(), pc.Horseshoe(kinds={"*.heading": pc.Gaussian(correlation=CORRELATED)})),
+    ],
+)
+def test_unknown_noise_and_correlated_priors_end_where_the_dense_form_does(world, method, prior, monkeypatch):
+    """Unknown levels, heavy tails of data and process noise: by the same turns. Precisions: by propagation in both."""
+    monkeypatch.setattr("probcal.inference.ea.MANY", 0)
+    problem = loud() if world == "loud" else drawn()[0]
+    one, other = (calibrate(problem, replace(method, engine=engine), prior=prior) for engine in ("dense", "cholmod"))
+    a, b = (tree["calibration"].to_dataset() for tree, _ in (one, other))
+    assert one[0].attrs["status"] == other[0].attrs["status"] == "converged"
+    assert np.abs((b["mean"] - a["mean"]) / a["sd"]).max() < 0.02
+    np.testing.assert_allclose(b["sd"], a["sd"], rtol=0.02)
+    np.testing.assert_allclose(other[1].posterior.summary.levels, one[1].posterior.summary.levels, atol=1e-3)
+    for x, y in zip(*(jax.tree.leaves(answer.problem.model.mixing) for _, answer in (one, other)), strict=True):
+        np.testing.assert_allclose(y, x, rtol=1e-2)
+    with jax.enable_x64(True):
+        found, wanted = (take_up(answer.problem, tree).prior.matrix() for tree, answer in (other, one))
+    np.testing.assert_allclose(np.asarray(found), np.asarray(wanted), rtol=0.02, atol=1e-9)
+    assert (np.asarray(found)[~np.eye(len(found), dtype=bool)] != 0).any() == bool(prior.correlation)
 
 
 @pytest.mark.slow
@@ -353,12 +384,6 @@ def test_a_library_that_has_no_room_says_so(said, monkeypatch):
     ("method", "prior", "settings", "said"),
     [
         (pc.MAP(engine="cholmod", trajectory="joint"), pc.Gaussian(), {}, 'takes trajectory="marginal" alone'),
-        (
-            pc.MAP(engine="cholmod"),
-            pc.Gaussian(correlation={"*.heading": 0.5}),
-            {},
-            "takes a prior without correlations",
-        ),
         (pc.EA(engine="cholmod", precisions="maximised"), None, {}, "precisions that are integrated or given"),
         (pc.MAP(engine="cholmod"), pc.Gaussian(), {"starts": 3}, "takes one start"),
         (pc.MAP(engine="cholmod"), pc.Gaussian(), {"save": ("states",)}, "keeps no draws of states or replicas"),
@@ -382,17 +407,12 @@ def test_forms_are_words():
             method(engine="thin")
 
 
-def test_what_has_no_sparse_form_is_named():
+def test_what_has_no_sparse_form_is_named(monkeypatch):
     problem = drawn()[0]
-    levels = pc.Problem(
-        pc.Network([loud_ear.on(pc.Node("a", (0.0, 0.0), scale={"heading": 0.1}))]),
-        pc.ConstantVelocity(1.0),
-        pd.DataFrame({"time": [0.0, 1.0], "sensor": ["a", "a"], "azimuth": [0.1, 0.2]}),
-    )
-    assert missing(problem.model) == ""
-    with pytest.raises(InputError, match='engine="cholmod" does not take unknown noise levels: give engine="dense"'):
-        takes_sparse(pc.MAP(engine="cholmod"), levels)
     assert not takes_sparse(pc.MAP(), problem)
+    monkeypatch.setattr("probcal.gaussian.joint._drives", lambda part: np.zeros(len(part.L), bool))
+    with pytest.raises(InputError, match='engine="cholmod" does not take a motion whose noise reaches only a part of'):
+        takes_sparse(pc.MAP(engine="cholmod"), problem)
 
 
 def test_what_needs_the_whole_covariance_says_so():
@@ -653,7 +673,6 @@ def test_few_of_many_biases_at_an_epoch_take_the_sparse_form(monkeypatch):
     assert gains_by_sparse(*settings)
     assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(), 2)
     assert not gains_by_sparse(pc.MAP(engine="dense"), problem, pc.Gaussian(), 1)
-    assert not gains_by_sparse(pc.MAP(), problem, pc.Gaussian(correlation={"*": 0.1}), 1)
     monkeypatch.setattr("probcal.gaussian.choose.THIN", 1e-6)
     assert not gains_by_sparse(*settings)
 

@@ -7,17 +7,20 @@ the last steps say of log det W (L-BFGS around it); each track is settled by ste
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.engine import Expansion, Factors
+from probcal.gaussian.engine import Engine, Estimate, Expansion, Factors, evidence
 from probcal.gaussian.marginal import ENOUGH, LEAST_CURVED, SETTLED, TRACK_STEPS
 from probcal.gaussian.mode import Point, eliminate, follow
 from probcal.gaussian.search import HALVINGS, between, halved
+from probcal.gaussian.tails import Variances, renewed
 from probcal.model.model import Model
+from probcal.priors import Precision
 
 KEPT = 8  # secants
 SMALL = 1e-9  # of the density: what a step that promises less cannot show
@@ -115,6 +118,28 @@ def climb_to_mode(
         trace.append(-value)
         ended = told is not None and told(len(trace) - 1, -value)
     return Climbed(here, value, np.array(trace), converged, not converged and len(trace) == 1)
+
+
+def climb_with_noise(
+    engine: Engine, model: Model, start: Point, prior: Precision, steps: int, turns: int, tolerance: float,
+    told: Callable[[int, float], bool],
+) -> tuple[Climbed, Estimate]:  # fmt: skip
+    """Climb in turn to the mode of the biases and to the noise of largest evidence there, where it is not known.
+
+    It ends where a turn moves the evidence by less than the tolerance; the trace is then the evidence after each.
+    """
+    factors, point, trace = Factors.of(prior), start, [-np.inf]
+    while True:
+        mode = climb_to_mode(partial(engine.settled, model), point, factors, steps, 1e-2 * tolerance, told)
+        worth = evidence(mode.at, prior, factors)
+        if not model.learns_noise:
+            return mode, worth
+        trace.append(worth.value)
+        still = abs(trace[-1] - trace[-2]) < tolerance
+        if still or told(len(trace) - 1, worth.value) or len(trace) > turns or not np.isfinite(worth.value):
+            refused = mode.refused and len(trace) == 2
+            return mode._replace(trace=np.array(trace[1:]), converged=mode.converged and still, refused=refused), worth
+        model, point = renewed(model, mode.at.point, Variances.of(mode.at, factors))
 
 
 def _slope(at: Expansion, factors: Factors) -> np.ndarray:

@@ -6,9 +6,7 @@ import numpy as np
 
 from probcal import linalg
 from probcal.gaussian import recursion as rec
-from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.draws import residuals
-from probcal.gaussian.linearised import noise_variances, predicted_variances
 from probcal.gaussian.mode import Point, factors
 from probcal.misfit import Rejected
 from probcal.model.model import Data, Model, Recursion
@@ -97,18 +95,17 @@ def state_covariances(model: Model, point: Point) -> tuple[jax.Array, ...]:
     return model.each(of, compressed, map(model.entries, range(len(compressed))))
 
 
-def update_levels(model: Model, point: Point, covariance: jax.Array) -> Point:
+def update_levels(model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]) -> Point:
     """One MacKay step of every unknown noise level, kept within its declared factor by its log-normal prior.
 
-    A level sigma of N whitened residuals v solves N - sum Var v = sum v^2 (Paper B 25, for noise). The
-    trajectory stays; its whitened noises are rescaled.
+    A level sigma of N whitened residuals v solves N - sum Var v = sum v^2 (Paper B 25, for noise); the variances are
+    those of predicted values (N, C) and of whitened noises (E, n). The trajectory stays; its whitened noises are
+    rescaled.
     """
     H = point.levels.shape[0]
-    at = DenseEngine().at(model, point)
-    spread = predicted_variances(model, at.rows, at.trajectories, covariance)
     count, square = model.by_level(model.measured), model.by_level(model.level_score(point))
     variance = model.by_level(jax.tree.map(jnp.multiply, model.information(point), spread))
-    for part, u, own in model.each_layout(point.noises, noise_variances(at.trajectories, covariance)):
+    for part, u, own in model.each_layout(point.noises, driven):
         active = jnp.any(part.L != 0, 1)
         count = count.at[part.level].add(active)
         square = square.at[part.level].add(active * u**2)

@@ -9,7 +9,7 @@ complement do where it is dense.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.engine import Factors, beyond_gaussian
+from probcal.gaussian.engine import Factors
 from probcal.gaussian.factor import Entries, leading, mirrored
 from probcal.gaussian.mode import factors, inverse_factors
 from probcal.model.model import Model
@@ -27,8 +27,8 @@ from probcal.model.rows import Linearised
 def missing(model: Model) -> str:
     """What a model has that the sparse form does not take, in words; empty where it takes the
     model."""
-    if found := beyond_gaussian(model):
-        return found
+    if any(form is not None for form in model.sampled):
+        return "a motion without a linear form"
     if any(not np.all(_drives(part) | _carries(part) | _fixes(part)) for part in model.recursions):
         return "a motion whose noise reaches only a part of the state"
     return ""
@@ -69,6 +69,7 @@ class JointPrecision:
     states: int  # number of variables that are states
     count: int  # of all values of `_values`
     extra: np.ndarray  # (X, 2) further pairs of biases that have a place, before all others
+    _wider: list[JointPrecision] = field(default_factory=list)  # that was asked for last
 
     @classmethod
     def of(cls, model: Model, pairs: Sequence[np.ndarray] = ()) -> JointPrecision:
@@ -120,6 +121,15 @@ class JointPrecision:
             upper = np.triu(np.ones(pairs.shape[1:], bool))[None] & (pairs >= 0)
             np.add.at(whole, pairs[upper], precision[upper])
         return whole
+
+    def with_pairs(self, model: Model, pairs: Sequence[np.ndarray]) -> JointPrecision:
+        """A pattern in which biases in one row of `pairs` (B, p) have entries with each other: this one
+        where they have."""
+        if all(self.holds(own) for own in pairs):
+            return self
+        if not (self._wider and all(self._wider[0].holds(own) for own in pairs)):
+            self._wider[:] = [JointPrecision.of(model, pairs)]
+        return self._wider[0]
 
     def holds(self, members: np.ndarray) -> bool:
         """Whether all pairs of biases (B, p) of a row have a place."""

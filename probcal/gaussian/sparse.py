@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import operator
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -33,7 +34,7 @@ class SparseEngine:
     sparse matrix."""
 
     library: Library
-    _patterns: list[tuple[Model, JointPrecision]] = field(default_factory=list, compare=False)  # of the last model
+    _patterns: list[tuple[list[Any], JointPrecision]] = field(default_factory=list, compare=False)  # of the last form
 
     cheap: ClassVar[bool] = False
 
@@ -44,9 +45,10 @@ class SparseEngine:
 
     def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> SparseExpansion:
         """The posterior at a consistent point; rows as the caller linearised them."""
-        last = next((joint for own, joint in self._patterns if own is model), None)
-        joint = JointPrecision.of(model) if last is None else last
-        self._patterns[:] = [(model, joint)]
+        form = jax.tree.leaves(replace(model, recursions=tuple(own._replace(tails=()) for own in model.recursions)))
+        if not (self._patterns and all(map(operator.is_, self._patterns[0][0], form))):
+            self._patterns[:] = [(form, JointPrecision.of(model))]
+        joint = self._patterns[0][1]
         rows = linearise_rows(model, point) if rows is None else tuple(rows)
         return SparseExpansion(model, point, rows, joint, self.library)
 
@@ -112,9 +114,8 @@ class SparseExpansion:
         place there."""
         if not (self._kept and self._kept[0].of is factors):
             self._kept.clear()
-            joint, entries = self.joint, self.entries
-            if new := [own for own in factors.members if not joint.holds(own)]:
-                joint = JointPrecision.of(self.model, pairs=new)
+            joint, entries = self.joint.with_pairs(self.model, factors.members), self.entries
+            if joint is not self.joint:
                 entries = joint.values(self.model, self.rows, self.point.levels)
             self._kept.append(_Solved(factors, joint, self.library(joint.places, joint.under(entries, factors))))
         return self._kept[0]

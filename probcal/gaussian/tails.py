@@ -6,29 +6,59 @@ smoothed variance (biases and trajectory) included, which maximises a lower boun
 Weights at the mode of u alone would prefer small noises, the error of the joint mode again.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.dense import DenseEngine
-from probcal.gaussian.linearised import noise_variances
+from probcal.gaussian.engine import Expansion, Factors
+from probcal.gaussian.information import update_levels
+from probcal.gaussian.linearised import noise_variances, predicted_variances
 from probcal.gaussian.mode import Point, smooth_tracks
-from probcal.model.model import Mixing, Model, Recursion
+from probcal.model.model import Data, Mixing, Model, Recursion
 from probcal.problem import Problem
 
 ROUNDS, STILL = 50, 1e-3  # of precisions and trajectories in turn, and change of log precision at which they end
 
 
-def expected_mixing(model: Model, point: Point, covariance: jax.Array) -> Mixing:
-    """Mean precisions (E,) of every tail at a point, for a covariance (M, M) of z."""
+class Variances(NamedTuple):
+    """What noise levels and precisions follow from: posterior variances at a point."""
+
+    predicted: Data  # (N, C) of each predicted value
+    noises: tuple[jax.Array, ...]  # (E, n) of each whitened noise
+
+    @classmethod
+    def of(cls, at: Expansion, factors: Factors) -> "Variances":
+        """Those that the factors of a prior leave."""
+        return cls(tuple(at.predicted(factors)), tuple(at.noises(factors)))
+
+    @classmethod
+    def dense(cls, model: Model, point: Point, covariance: jax.Array) -> "Variances":
+        """Those for a covariance (M, M) of z; it can be traced."""
+        at = DenseEngine().at(model, point)
+        predicted = predicted_variances(model, at.rows, at.trajectories, covariance)
+        return cls(predicted, noise_variances(at.trajectories, covariance))
+
+
+@jax.jit
+def renewed(model: Model, point: Point, variances: Variances) -> tuple[Model, Point]:
+    """Model and point with the unknown levels and the precisions of tails that follow at the same states."""
+    weights = expected_mixing(model, point, variances.noises)
+    point = update_levels(model, point, *variances) if point.levels.shape[0] else point
+    return model.with_mixing(weights), rewhitened(model, point, weights)
+
+
+def expected_mixing(model: Model, point: Point, variances: tuple[jax.Array, ...]) -> Mixing:
+    """Mean precisions (E,) of every tail at a point, for variances (E, n) of its whitened noises."""
 
     def means(part: Recursion, u: jax.Array, variance: jax.Array) -> tuple[jax.Array, ...]:
         squares = [jnp.sum((u**2 + variance)[:, slice(*tail.columns)], 1) / tail.weight for tail in part.tails]
         means = [tail.family.mixing_mean(s, tail.size) for tail, s in zip(part.tails, squares, strict=True)]
         return tuple(jnp.where(tail.on, w, 1.0) for tail, w in zip(part.tails, means, strict=True))
 
-    trajectories = DenseEngine().at(model, point).trajectories
-    return model.each(means, point.noises, noise_variances(trajectories, covariance))
+    return model.each(means, point.noises, variances)
 
 
 def rewhitened(model: Model, point: Point, weights: Mixing) -> Point:
@@ -53,4 +83,6 @@ def settle(problem: Problem, point: Point, covariance: jax.Array) -> tuple[Probl
     return problem, point
 
 
-_expected = jax.jit(expected_mixing)
+@jax.jit
+def _expected(model: Model, point: Point, covariance: jax.Array) -> Mixing:
+    return expected_mixing(model, point, Variances.dense(model, point, covariance).noises)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, cast
 
 import jax
@@ -20,14 +21,14 @@ import numpy as np
 
 from probcal.errors import FitError, InputError
 from probcal.gaussian.choose import choose_fast, engine_of, estimates
-from probcal.gaussian.climb import climb_to_mode
-from probcal.gaussian.engine import Estimate, Expansion, Factors, Group, Spread, evidence, mean
+from probcal.gaussian.climb import climb_to_mode, climb_with_noise
+from probcal.gaussian.engine import Engine, Estimate, Expansion, Factors, Group, Spread, evidence, mean
 from probcal.gaussian.information import mean_square
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point
 from probcal.identifiability.directions import alone_directions, screened_directions, shared_directions
 from probcal.identifiability.remedies import Direction
-from probcal.inference.ending import conclude_at
+from probcal.inference.ending import conclude_at, fallen
 from probcal.inference.hierarchy import held, hierarchy_of
 from probcal.inference.integrate import quantile
 from probcal.inference.method import Context, Iterated
@@ -74,8 +75,6 @@ def _lacking(method: Iterated, prior: Prior, starts: int) -> str:
     wrong = ""
     if getattr(method, "trajectory", "") != "marginal":
         wrong = 'trajectory="marginal" alone'
-    elif prior.correlation:
-        wrong = "a prior without correlations"
     elif estimates(getattr(method, "engine", "auto")) and not isinstance(prior, (Gaussian, Flat)):
         wrong = "precisions that are given (MAP() with Gaussian() or Flat())"
     elif not (method.integrates(prior) if hasattr(method, "integrates") else isinstance(prior, (Gaussian, Flat))):
@@ -93,6 +92,7 @@ class ExpansionLikelihood:
 
     expand: Callable[[Point], Expansion]
     here: Expansion
+    prior: Factors  # of the biases that no hierarchy governs
 
     @property
     def z(self) -> np.ndarray:
@@ -100,8 +100,8 @@ class ExpansionLikelihood:
         return np.asarray(self.here.point.z)
 
     def marginals(self, members: np.ndarray, sites: Blocks) -> BlockMarginals:
-        """Marginals of the blocks, and the factors that are the sites."""
-        factors = Factors((Group(members, sites.precision, sites.pull),))
+        """Marginals of the blocks, and the factors of the prior and the sites."""
+        factors = self.prior + Factors((Group(members, sites.precision, sites.pull),))
         covariance = np.asarray(self.here.marginals(factors, members))
         return BlockMarginals(np.asarray(mean(self.here, factors)), covariance, factors)
 
@@ -154,7 +154,7 @@ class BlockPosterior(Posterior):
         count = CHAINS * int(np.clip(NUMBERS // (CHAINS * M), 2, MOST))
         normal = np.asarray(self.at.deviations(self.factors, key, count).z) / np.sqrt(self.spread.biases)
         z = (self.summary.mean + self.summary.sd * normal).reshape(CHAINS, -1, M)
-        levels = np.zeros((*z.shape[:2], 0))
+        levels = np.broadcast_to(self.summary.levels, (*z.shape[:2], len(self.summary.levels)))
         return Draws(z, levels, [], np.arange(z.shape[1]), [], [])
 
     def check_kept(self, keep: tuple[str, ...]) -> None:
@@ -184,25 +184,23 @@ def blockwise_answer(method: Iterated, problem: Problem, prior: Prior, start: Po
     engine = engine_of(asked, model)
     integrated = hasattr(method, "integrates") and method.integrates(prior)
     first = prior.precision(problem.labels, problem.surveyed)
-    declared = Precision(jnp.ones(model.biases)) if integrated else first
+    declared = first
+    if integrated:
+        declared = Gaussian(correlation=prior.correlation).precision(problem.labels, problem.surveyed)
     factors = Factors.of(declared)
 
     def told(k: int, value: float) -> bool:
         context.monitor.tell(method.name, min(k, method.iterations), method.iterations, value, bound=True)
         return bool(context.monitor.stopped)
 
-    def expand(point: Point) -> Expansion:
-        return engine.settled(model, point)
-
     try:
-        mode = climb_to_mode(expand, start, factors, min(STEPS, method.iterations), 1e-2 * method.tolerance, told)
-        worth = evidence(mode.at, declared, factors)
+        turns, tolerance = method.iterations, method.tolerance
+        mode, worth = climb_with_noise(engine, model, start, declared, min(STEPS, turns), turns, tolerance, told)
+        problem = problem.with_mixing(mode.at.model.mixing)
         form = Form(model.biases, hierarchy_of(prior, problem)) if integrated else None
         if form is not None and form.hierarchy.learnt:  # else every bias has a survey
             together = shared_directions(problem, mode.at, factors)  # while its factor is at hand
-            posterior, settled = _integrated(
-                problem, prior, form, first, ExpansionLikelihood(expand, mode.at), worth, context.key, told
-            )
+            posterior, settled = _integrated(problem, prior, form, first, engine, mode.at, worth, context.key, told)
             alone, count = alone_directions(problem, posterior.point, posterior.declared, NAMED)
             posterior = replace(posterior, open=(*together, *alone), weak=len(together) + count)
         else:
@@ -221,10 +219,12 @@ def blockwise_answer(method: Iterated, problem: Problem, prior: Prior, start: Po
         ) from None
     except np.linalg.LinAlgError:
         raise diverged(problem, engine.at(model, start), factors) from None
-    square = float(mean_square(model, posterior.point))
+    square = float(mean_square(problem.model, posterior.point))
     return conclude_at(
         problem, method, prior, posterior, mode.trace, square, len(mode.trace), converged=mode.converged and settled,
-        refused=mode.refused, evidence=worth.value, stopped=context.monitor.stopped,
+        refused=mode.refused, evidence=worth.value,
+        lost=fallen(prior, len(problem.levels), mode.trace.max(), mode.trace[-1]) if model.learns_noise else 0.0,
+        stopped=context.monitor.stopped,
     )  # fmt: skip
 
 
@@ -285,7 +285,7 @@ def _gaussian(problem: Problem, prior: Prior, at: Expansion, worth: Estimate, fi
     declared = blocks if prior.proper else blocks.under_scales()
     errors = {"sd_error": 0.5 * spread.error / spread.biases} if spread.error.any() else {}
     summary = Summary(
-        "Laplace", "given", z, None, z - half, z + half, gamma, alpha, None, np.zeros(0),
+        "Laplace", "given", z, None, z - half, z + half, gamma, alpha, None, np.asarray(at.point.levels),
         worth.value if prior.proper else None, told_columns(declared) | errors, blocks=blocks,
     )  # fmt: skip
     named = alone_directions(problem, at.point, declared, NAMED)  # a flat prior leaves no room for more
@@ -300,11 +300,13 @@ def told_columns(declared: SensorBlocks) -> dict[str, np.ndarray]:
 
 
 def _integrated(
-    problem: Problem, prior: Prior, form: Form, first: Precision, likelihood: ExpansionLikelihood, worth: Estimate,
+    problem: Problem, prior: Prior, form: Form, first: Precision, engine: Engine, at: Expansion, worth: Estimate,
     key: jax.Array, told: Any,
 ) -> tuple[BlockPosterior, bool]:  # fmt: skip
-    """The marginals that a hierarchy makes of a likelihood, this taken anew at their mean; nothing
-    said to be open."""
+    """The marginals that a hierarchy makes of the likelihood at a mode, this taken anew at their
+    mean; nothing said to be open."""
+    first = form.rest(first)
+    likelihood = ExpansionLikelihood(partial(engine.settled, at.model), at, Factors.of(first))
     work = Propagation.of(form, first, likelihood, blocks_of(problem.model), key)
     work.run(told)
     swept, last, begun, ended = work.swept, work.found, work.begun, work.likelihood
@@ -319,8 +321,8 @@ def _integrated(
     alpha = np.clip((1 - swept.gamma) / np.maximum(own, 1e-300), *PRECISION_BOUNDS)
     alpha = np.where(held(prior, problem), alone, alpha)
     summary = Summary(
-        "mixture", "integrated", middle, None, lower, upper, swept.gamma, alpha, None, np.zeros(0), worth.value,
-        told_columns(declared), SensorBlocks(len(middle), work.members, swept.covariance),
+        "mixture", "integrated", middle, None, lower, upper, swept.gamma, alpha, None, np.asarray(at.point.levels),
+        worth.value, told_columns(declared), SensorBlocks(len(middle), work.members, swept.covariance),
     )  # fmt: skip
     point = here.moved(middle - np.asarray(here.point.z))
     spread = here.spread(last.whole)

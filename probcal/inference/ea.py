@@ -13,7 +13,6 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.gaussian.choose import engine_named, estimates
 from probcal.gaussian.engine import Engine
-from probcal.gaussian.information import update_levels
 from probcal.gaussian.linearised import laplace_of
 from probcal.gaussian.marginal import find_marginal_mode
 from probcal.gaussian.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, mixing_gain
@@ -24,7 +23,7 @@ from probcal.inference.method import Context, Given, State
 from probcal.inference.posed import Form
 from probcal.inference.pruned import without_far_modes
 from probcal.inference.relevance import best_precisions
-from probcal.inference.run import Maximiser, first_precision, given_of, learn, maximise, reweighted, valued
+from probcal.inference.run import Maximiser, first_precision, given_of, learn, maximise, renew_noise, valued
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
@@ -46,12 +45,8 @@ def learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) ->
     alpha = learn(
         prior, given, state.alpha, state.found.gamma, jnp.diagonal(state.found.covariance), state.point.z, rule
     )
-    point = state.point
-    if point.levels.shape[0]:
-        moved = update_levels(model, point, state.found.covariance)
-        point = jax.tree.map(lambda after, before: jnp.where(fresh, before, after), moved, point)
-    state = state._replace(point=point, alpha=jnp.where(fresh, state.alpha, alpha))
-    return reweighted(model, state, state.found.covariance)
+    state = state._replace(alpha=jnp.where(fresh, state.alpha, alpha))
+    return renew_noise(model, state, state.found.covariance, fresh)
 
 
 def _climb(
@@ -99,7 +94,7 @@ def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode,
     still = jnp.abs(objective - state.objective) < given.tolerance
     # on a cusp, where a target grazes a sensor, and where rounding hides what is left, no step lowers the cost
     nothing = still & (mode.gained < given.tolerance)
-    learns = prior.learns or mode.point.levels.shape[0] or model.tailed
+    learns = prior.learns or model.learns_noise
     done = nothing | (mode.converged & still if learns else mode.converged)
     done = done | jnp.any(astray(prior, mode.point.z, given.surveyed))  # it diverged: no further step helps
     refused = state.refused & mode.refused
@@ -274,7 +269,7 @@ class EA(Maximiser):
 
         With noise that is not Gaussian steps have other weights, and unknown levels change the system in between.
         """
-        same = model.weighs_as_expected and not (model.level_spread.shape[0] or model.tailed)
+        same = model.weighs_as_expected and not model.learns_noise
         return _eliminated(model, start) if self.trajectory == "joint" and same else ()
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:

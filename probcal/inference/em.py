@@ -8,12 +8,11 @@ import jax.numpy as jnp
 
 from probcal.errors import InputError
 from probcal.gaussian.esteps import EStep, Extended, shorten
-from probcal.gaussian.information import update_levels
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point, cost, mixing_gain
 from probcal.gaussian.solves import Dense
 from probcal.inference.method import Context, Given, ParticleSmoother, State
-from probcal.inference.run import Maximiser, learn, reweighted, valued
+from probcal.inference.run import Maximiser, learn, renew_noise, valued
 from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
 from probcal.problem import Problem
@@ -50,10 +49,7 @@ def _iterate(model: Model, prior: Prior, given: Given, state: State, inner: int,
         point, variance, stuck, carry = _inner(model, step, point, now, carry, own)
         refused = refused & stuck
     alpha = learn(prior, given, state.alpha, jnp.zeros_like(variance), variance, point.z, "em")
-    if point.levels.shape[0]:
-        point = update_levels(model, point, jnp.diag(variance))
-    state = state._replace(point=point)
-    model, state = reweighted(model, state, jnp.diag(variance))
+    model, state = renew_noise(model, state._replace(point=point), jnp.diag(variance))
     point = state.point
     after = given.prior._replace(alpha=alpha)
     free = jnp.where(given.surveyed, 0.0, prior.penalty(point.z, alpha) - 0.5 * alpha * point.z**2)

@@ -148,7 +148,7 @@ class DenseLikelihood:
 
         M = len(self.z)
         precision, pull = np.zeros((M + 1, M + 1)), np.zeros(M + 1)
-        precision[:M, :M] = self.known.information + self.known.first.coupled()
+        precision[:M, :M] = self.known.information + self.known.first.matrix()
         pull[:M] = self.known.pull
         precision[members[:, :, None], members[:, None, :]] += sites.precision  # no two blocks have a bias in common
         pull[members] += sites.pull
@@ -167,6 +167,7 @@ class DenseLikelihood:
 
 def _propagated(how: Integration, model: Model, known: Natural, point: Point, key: jax.Array) -> Integrated:
     """What expectation propagation leaves, which keeps no draws of the hyper-parameters."""
+    known = known._replace(first=how.form.rest(known.first))
     work = Propagation.of(how.form, known.first, DenseLikelihood(how, model, known, point), blocks_of(model), key)
     work.run()
     swept, last = work.swept, work.likelihood

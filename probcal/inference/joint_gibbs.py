@@ -20,7 +20,7 @@ import numpy as np
 from probcal.errors import FitError, InputError
 from probcal.gaussian.choose import choose_fast
 from probcal.gaussian.climb import climb_to_mode
-from probcal.gaussian.engine import Engine, Expansion, Factors, Spread, beyond_gaussian
+from probcal.gaussian.engine import Engine, Expansion, Factors, Spread
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point, log_density
 from probcal.identifiability.directions import alone_directions, screened_directions
@@ -172,8 +172,12 @@ class Gibbs(Sampler):
 
 def check_gibbs(problem: Problem, prior: Prior) -> None:
     """Raise `InputError` naming what `Gibbs` does not take."""
-    if lacks := beyond_gaussian(problem.model):
-        raise InputError(f"Gibbs() does not take {lacks}: take Collapsed() or NUTS()")
+    model = problem.model
+    lacks = {"unknown noise levels": bool(problem.levels), "process noise that is not Gaussian": model.tailed}
+    lacks["a motion without a linear form"] = any(form is not None for form in model.sampled)
+    for what, has in lacks.items():
+        if has:
+            raise InputError(f"Gibbs() does not take {what}: take Collapsed() or NUTS()")
     if prior.correlation:
         raise InputError("Gibbs() takes a prior without correlations: take Collapsed(), or leave them out")
 

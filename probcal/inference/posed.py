@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from probcal import linalg
 from probcal.gaussian.frame import Frame
@@ -22,6 +23,11 @@ class Form:
 
     biases: int  # M, the number of biases
     hierarchy: Hierarchy
+
+    def rest(self, first: Precision) -> Precision:
+        """The prior of the biases that no hierarchy governs, flat for all others."""
+        governed = np.isin(np.arange(self.biases), self.hierarchy.learnt)
+        return first._replace(alpha=jnp.where(governed, 0.0, first.alpha))
 
 
 class Quadratic(Protocol):

@@ -83,7 +83,8 @@ def sweep_blocks(
 ) -> tuple[BlockChain, BlocksSwept]:
     """Gibbs sweeps over the hyper-parameters of all biases and the biases of each block, given its cavity (B, p, p).
 
-    The prior is exact, with all that biases share; moments are those of the Gaussians given hyper-parameters.
+    The prior is exact, with all that biases share; moments are those of the Gaussians given hyper-parameters. The
+    cavities hold the prior of what no hierarchy governs.
     """
     kind, M = form.hierarchy, form.biases
     learnt, (B, p) = jnp.asarray(kind.learnt, int), members.shape
@@ -110,7 +111,7 @@ def sweep_blocks(
         """Inclusions after moves of one or two members of each block, its biases integrated out."""
         share = kind.share(phi)
         odds = of_members(jnp.zeros(M).at[spiked].set(jnp.log(share) - jnp.log1p(-share)), 0.0)
-        alpha = of_members(kind.alpha(phi, first.alpha), 0.0)
+        alpha = of_members(kind.alpha(phi, jnp.zeros(M)), 0.0)
 
         def weight(active: jax.Array) -> jax.Array:
             root, half = given(alpha, active)
@@ -138,7 +139,7 @@ def sweep_blocks(
         if kind.spiked:
             phi = include(phi, keys[-2])
         alpha, active = kind.alpha(phi, first.alpha), of_members(kind.active(phi, M), True)
-        root, half = given(of_members(alpha, 0.0), active)
+        root, half = given(of_members(kind.alpha(phi, jnp.zeros(M)), 0.0), active)
         both = active[:, :, None] & active[:, None, :]
         middle = jnp.where(active, jnp.einsum("bji,bj->bi", root, half), 0.0)
         covariance = jnp.where(both, root.mT @ root, 0.0)
@@ -170,7 +171,7 @@ class Propagation:
     """Where a propagation stands: the likelihood, the sites in the place of the priors, and what both say."""
 
     form: Form
-    first: Precision
+    first: Precision  # the prior of what no hierarchy governs, which the likelihood counts
     likelihood: BiasLikelihood
     members: np.ndarray  # (B, p) biases of each block, M of none
     key: jax.Array
@@ -184,7 +185,7 @@ class Propagation:
     @classmethod
     def of(cls, form: Form, first: Precision, likelihood: BiasLikelihood, members: np.ndarray, key: jax.Array) -> Any:
         """The beginning: biases of their declared scales."""
-        precision = np.eye(members.shape[1])[None] * (members < form.biases)[:, :, None]
+        precision = np.eye(members.shape[1])[None] * np.isin(members, form.hierarchy.learnt)[:, :, None]
         return cls(form, first, likelihood, members, key, Blocks(precision, np.zeros(members.shape)))
 
     def of_biases(self, values: np.ndarray) -> np.ndarray:
@@ -231,7 +232,9 @@ class Propagation:
         tilted = np.linalg.inv(swept.covariance)
         new = Blocks(tilted - cavity.precision, np.einsum("bij,bj->bi", tilted, swept.mean) - cavity.pull)
         floor = -MINUS * cavity.precision  # what is left of a cavity stays positive
-        new = new._replace(precision=_positive(new.precision - floor) + floor)
+        there = np.isin(self.members, self.form.hierarchy.learnt)  # a site is of the biases that it governs alone
+        precision = np.where(there[:, :, None] & there[:, None, :], _positive(new.precision - floor) + floor, 0.0)
+        new = Blocks(precision, np.where(there, new.pull, 0.0))
         share = min(DAMPING, 1.0 / max(turn - SURE, 1))  # later rounds are averaged: sweeps are noisy
         self.sites = Blocks(*(share * a + (1 - share) * b for a, b in zip(new, self.sites, strict=True)))
         off = self.of_biases((swept.mean - middle) / np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)))

@@ -19,7 +19,7 @@ from probcal.gaussian.information import mean_square
 from probcal.gaussian.linearised import LaplaceApproximation, compress_and_eliminate, laplace, linearise_rows
 from probcal.gaussian.mode import Eliminated, Point, cost
 from probcal.gaussian.places import places_of, tilt_of
-from probcal.gaussian.tails import expected_mixing, rewhitened
+from probcal.gaussian.tails import Variances, renewed
 from probcal.inference.blockwise import blockwise_answer, takes_sparse
 from probcal.inference.ending import FAR, conclude
 from probcal.inference.hierarchy import held, learnt_groups
@@ -105,7 +105,7 @@ class Maximiser(Iterated, ABC):
         model = problem.model.with_mixing(state.mixing)
         tilt = jax.device_get(model.tilt)
         beside = 0.0 if tilt is None else float(tilt.value(np.asarray(state.point.z)))
-        if self.climbs_under(prior).learns or model.level_spread.shape[0] or model.tailed:
+        if self.climbs_under(prior).learns or model.learns_noise:
             return float(state.worth) - beside
         given = given_of(self, problem, prior).prior._replace(alpha=state.alpha)
         _, solved = compress_and_eliminate(model, state.point, linearise_rows(model, state.point))
@@ -213,18 +213,18 @@ def valued(prior: Prior, given: Given, state: State) -> State:
     return state._replace(worth=worth, best=jnp.fmax(state.best, worth))
 
 
-def reweighted(model: Model, state: State, covariance: jax.Array) -> tuple[Model, State]:
-    """Model and state with the precisions of process noise that follow from the point, for a covariance of z.
+def renew_noise(model: Model, state: State, covariance: jax.Array, fresh: Any = False) -> tuple[Model, State]:
+    """Model and state with the levels and precisions of noise that follow from the point, for a covariance of z.
 
-    Before the first iteration, and where all noise is Gaussian, they stay.
+    Where all noise is Gaussian and known, and where the state is `fresh`, they stay.
     """
-    if not model.tailed:
+    if not model.learns_noise:
         return model, state
-    fresh = jnp.isneginf(state.objective)
-    weights = expected_mixing(model, state.point, covariance)
-    weights = jax.tree.map(lambda new, old: jnp.where(fresh, old, new), weights, model.mixing)
-    point = rewhitened(model, state.point, weights)
-    return model.with_mixing(weights), state._replace(point=point, mixing=weights)
+    after, point = renewed(model, state.point, Variances.dense(model, state.point, covariance))
+    point, mixing = jax.tree.map(
+        lambda new, old: jnp.where(fresh, old, new), (point, after.mixing), (state.point, state.mixing)
+    )
+    return model.with_mixing(mixing), state._replace(point=point, mixing=mixing)
 
 
 def learn(prior: Prior, given: Given, alpha: jax.Array, gamma: Any, variance: Any, z: jax.Array, rule: str) -> Any:

@@ -168,7 +168,7 @@ def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point
         found = method.answer(problem, prior, start, context)
         used = cast("Method", found.method)  # of engine "iterative" where memory held no factor
         try:
-            return _beside_mirrors(found, used, context, side_climb(problem, getattr(used, "engine", "auto")))
+            return _beside_mirrors(found, used, context, side_climb(found.problem, getattr(used, "engine", "auto")))
         except MemoryError:
             unseen = "Memory did not hold what looking at the other side of a mirror takes."
             return replace(found, message=f"{found.message} {unseen}".strip())

@@ -414,6 +414,11 @@ class Model(Stepwise):
         return any(part.tails for part in self.recursions)
 
     @property
+    def learns_noise(self) -> bool:
+        """Whether a fit finds some of the noise: unknown levels, or precisions of noise that is not Gaussian."""
+        return self.tailed or self.level_spread.shape[0] > 0
+
+    @property
     def mixing(self) -> Mixing:
         """Precisions (E,) that the noises of each tail of each recursion are taken to have."""
         return tuple(tuple(tail.weight for tail in part.tails) for part in self.recursions)
