@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.engine import Engine, Estimate, Expansion, Factors, evidence
+from probcal.gaussian.engine import Engine, Expansion, Factors, evidence
 from probcal.gaussian.marginal import ENOUGH, LEAST_CURVED, SETTLED, TRACK_STEPS
 from probcal.gaussian.mode import Point, eliminate, follow
 from probcal.gaussian.search import HALVINGS, between, halved
@@ -121,24 +121,24 @@ def climb_to_mode(
 
 
 def climb_with_noise(
-    engine: Engine, model: Model, start: Point, prior: Precision, steps: int, turns: int, tolerance: float,
-    told: Callable[[int, float], bool],
-) -> tuple[Climbed, Estimate]:  # fmt: skip
+    engine: Engine, model: Model, start: Point, prior: Precision, factors: Factors, steps: int, turns: int,
+    tolerance: float, told: Callable[[int, float], bool],
+) -> Climbed:  # fmt: skip
     """Climb in turn to the mode of the biases and to the noise of largest evidence there, where it is not known.
 
     It ends where a turn moves the evidence by less than the tolerance; the trace is then the evidence after each.
+    `factors` are those of the prior.
     """
-    factors, point, trace = Factors.of(prior), start, [-np.inf]
+    point, trace = start, [-np.inf]
     while True:
         mode = climb_to_mode(partial(engine.settled, model), point, factors, steps, 1e-2 * tolerance, told)
-        worth = evidence(mode.at, prior, factors)
         if not model.learns_noise:
-            return mode, worth
-        trace.append(worth.value)
+            return mode
+        trace.append(evidence(mode.at, prior, factors).value)
         still = abs(trace[-1] - trace[-2]) < tolerance
-        if still or told(len(trace) - 1, worth.value) or len(trace) > turns or not np.isfinite(worth.value):
+        if still or told(len(trace) - 1, trace[-1]) or len(trace) > turns or not np.isfinite(trace[-1]):
             refused = mode.refused and len(trace) == 2
-            return mode._replace(trace=np.array(trace[1:]), converged=mode.converged and still, refused=refused), worth
+            return mode._replace(trace=np.array(trace[1:]), converged=mode.converged and still, refused=refused)
         model, point = renewed(model, mode.at.point, Variances.of(mode.at, factors))
 
 

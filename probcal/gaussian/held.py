@@ -34,4 +34,4 @@ def inform(model: Model, rows: tuple[Linearised, ...], held: Eliminated, z: Any)
 def _inform(model: Model, rows: tuple[Linearised, ...], held: Eliminated, z: jax.Array) -> jax.Array:
     states = follow_biases(model, rows, tuple(kept.gain for kept in held.parts), z)
     found = model.onto_biases(rows, times_weights(model, rows, model.responses(rows, states, z)))
-    return found if model.tilt is None else found + model.tilt.curvature @ z
+    return found if model.tilt is None else found + model.tilt.times(z)

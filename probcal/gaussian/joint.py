@@ -110,7 +110,7 @@ class JointPrecision:
         found = np.asarray(_values(model, lins, levels))
         more = np.zeros(len(self.extra))
         if model.tilt is not None:
-            more = np.asarray(model.tilt.curvature)[tuple(self.extra.T)]
+            more = np.asarray(model.tilt.between(*self.extra.T))
         return np.concatenate([more, found])[self.kept] * self.times
 
     def under(self, values: np.ndarray, factors: Factors) -> np.ndarray:
@@ -230,9 +230,10 @@ class JointPrecision:
 def _pairs_of(model: Model, pairs: Sequence[np.ndarray]) -> np.ndarray:
     """Further pairs (X, 2) of biases, low first, each once; those of a tilt too."""
     M = model.biases
-    tilted = model.tilt is not None and np.any(np.asarray(model.tilt.curvature))
     found = [np.zeros((0, 2), int)]
-    for own in (*pairs, *((np.arange(M)[None],) if tilted else ())):
+    if model.tilt is not None and np.any(np.asarray(model.tilt.curvature)):
+        pairs = [*pairs, np.arange(M).reshape((1, M) if model.tilt.curvature.ndim == 2 else (M, 1))]
+    for own in pairs:
         i, j = np.triu_indices(own.shape[1])
         found.append(np.sort(np.stack([own[:, i].ravel(), own[:, j].ravel()], 1), 1))
     every = np.unique(np.concatenate(found), axis=0)

@@ -196,7 +196,8 @@ def tilted(model: Model, z: jax.Array, compressed: Compressed) -> Compressed:
     """Compressed rows with the tilt of the model at z."""
     if model.tilt is None:
         return compressed
-    information, score = compressed.information + model.tilt.curvature, compressed.score + model.tilt.pull(z)
+    own = model.tilt.times(jnp.eye(model.biases))
+    information, score = compressed.information + own, compressed.score + model.tilt.pull(z)
     return compressed._replace(information=information, score=score)
 
 

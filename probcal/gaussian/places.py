@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian.held import hold
 from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
 from probcal.gaussian.marginal import volume_slope
 from probcal.gaussian.mode import Point, factors
@@ -58,11 +59,10 @@ def tilt_of(model: Model, point: Point, still: tuple[Still, ...]) -> Tilt | None
     if not any(np.any(s.on) for s in still):
         return Tilt.none(M)
     height, slope, information = _gain(model, point, still, *_cells(model, point, still))
-    _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
-    epochs = model.each(lambda part, s: s.on[part.target], still)
+    epochs, rows = model.each(lambda part, s: s.on[part.target], still), linearise_rows(model, point)
+    solved = hold(model, point, rows) if information is None else compress_and_eliminate(model, point, rows)[1]
     volume, sound = volume_slope(model, point, solved, epochs)
-    slope = slope + 0.5 * np.asarray(volume)
-    curvature = np.zeros((M, M))
+    slope, curvature = slope + 0.5 * np.asarray(volume), Tilt.none(M).curvature
     if information is not None:
         laplace, exact = np.asarray(solved.information), information + np.asarray(_schur(model, point, still))
         if not (np.isfinite(laplace).all() and np.isfinite(exact).all()):
@@ -154,7 +154,10 @@ def _look(model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.Arr
 
 
 class PlaceScores(NamedTuple):
-    """Of scores by the biases over shares of places: sums (T, M) of each recursion, squares and information (M, M)."""
+    """Of scores by the biases over shares of places: sums (T, M) of each recursion.
+
+    Where they are asked for, squares and information (M, M) too.
+    """
 
     first: tuple[jax.Array, ...]
     second: jax.Array
@@ -167,11 +170,12 @@ def _moments(
 ) -> PlaceScores:
     """PlaceScores over `BATCH` whitened places (K, T, n) of every target, each with its share (K, T)."""
     M, together = model.biases, _together(model)
+    square = jnp.zeros((M, M) if curved else ())
 
     def one(u: States, p: States) -> PlaceScores:
         lins = model.linearise(At(_placed(model, point, still, u), point.z, point.levels), expected=True)
         first = [jnp.zeros((T, M + 1)) for T in model.targets]
-        weighed, second, information = [], jnp.zeros((M, M)), jnp.zeros((M, M))
+        weighed, second, information = [], square, square
         for _, data, r, lin in model.each_block(lins):
             target = model.recursions[r].target[data.epoch]
             w = p[r][target][:, None]
@@ -190,7 +194,7 @@ def _moments(
         return jax.tree.map(lambda a, b: a + jnp.sum(b, 0), total, found), None
 
     parts = jax.tree.map(lambda x: x.reshape(-1, together, *x.shape[1:]), (u, shares))
-    nothing = PlaceScores(tuple(jnp.zeros((T, M)) for T in model.targets), jnp.zeros((M, M)), jnp.zeros((M, M)))
+    nothing = PlaceScores(tuple(jnp.zeros((T, M)) for T in model.targets), square, square)
     return jax.lax.scan(add, nothing, parts)[0]
 
 

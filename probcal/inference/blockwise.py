@@ -32,6 +32,7 @@ from probcal.inference.ending import conclude_at, fallen
 from probcal.inference.hierarchy import held, hierarchy_of
 from probcal.inference.integrate import quantile
 from probcal.inference.method import Context, Iterated
+from probcal.inference.placed import Reached, with_places
 from probcal.inference.posed import Form
 from probcal.inference.propagate import BlockMarginals, Blocks, Propagation
 from probcal.modes.mirrors import SideClimb
@@ -193,18 +194,27 @@ def blockwise_answer(method: Iterated, problem: Problem, prior: Prior, start: Po
         context.monitor.tell(method.name, min(k, method.iterations), method.iterations, value, bound=True)
         return bool(context.monitor.stopped)
 
-    try:
+    def climb(problem: Problem, start: Point) -> Reached:
         turns, tolerance = method.iterations, method.tolerance
-        mode, worth = climb_with_noise(engine, model, start, declared, min(STEPS, turns), turns, tolerance, told)
-        problem = problem.with_mixing(mode.at.model.mixing)
+        steps, model = min(STEPS, turns), problem.model
+        mode = climb_with_noise(engine, model, start, declared, factors, steps, turns, tolerance, told)
+        value = float(mode.trace[-1])  # without unknown noise the density
+        return Reached(problem.with_mixing(mode.at.model.mixing), mode.at, factors, value, mode)
+
+    try:
+        end, agree = climb(problem, start), True
+        if model.rests and getattr(method, "integrates_places", False):
+            end, agree = with_places(climb, end, engine, lambda: context.monitor.stopped)
+        problem, at, mode = end.problem, end.at, end.state
+        worth = evidence(at, declared, factors)
         form = Form(model.biases, hierarchy_of(prior, problem)) if integrated else None
         if form is not None and form.hierarchy.learnt:  # else every bias has a survey
-            together = shared_directions(problem, mode.at, factors)  # while its factor is at hand
-            posterior, settled = _integrated(problem, prior, form, first, engine, mode.at, worth, context.key, told)
+            together = shared_directions(problem, at, factors)  # while its factor is at hand
+            posterior, settled = _integrated(problem, prior, form, first, engine, at, worth, context.key, told)
             alone, count = alone_directions(problem, posterior.point, posterior.declared, NAMED)
             posterior = replace(posterior, open=(*together, *alone), weak=len(together) + count)
         else:
-            posterior, settled = _gaussian(problem, prior, mode.at, worth, first), True
+            posterior, settled = _gaussian(problem, prior, at, worth, first), True
     except MemoryError:
         size = f"{model.state_size} state entries and {model.biases} biases"
         if not engine.exact:
@@ -221,8 +231,8 @@ def blockwise_answer(method: Iterated, problem: Problem, prior: Prior, start: Po
         raise diverged(problem, engine.at(model, start), factors) from None
     square = float(mean_square(problem.model, posterior.point))
     return conclude_at(
-        problem, method, prior, posterior, mode.trace, square, len(mode.trace), converged=mode.converged and settled,
-        refused=mode.refused, evidence=worth.value,
+        problem, method, prior, posterior, mode.trace, square, len(mode.trace),
+        converged=mode.converged and settled and agree, refused=mode.refused, evidence=worth.value,
         lost=fallen(prior, len(problem.levels), mode.trace.max(), mode.trace[-1]) if model.learns_noise else 0.0,
         stopped=context.monitor.stopped,
     )  # fmt: skip

@@ -15,16 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.engine import Factors
 from probcal.gaussian.information import mean_square
-from probcal.gaussian.linearised import LaplaceApproximation, compress_and_eliminate, laplace, linearise_rows
-from probcal.gaussian.mode import Eliminated, Point, cost
-from probcal.gaussian.places import places_of, tilt_of
+from probcal.gaussian.linearised import LaplaceApproximation, laplace
+from probcal.gaussian.mode import Point
 from probcal.gaussian.tails import Variances, renewed
 from probcal.inference.blockwise import blockwise_answer, takes_sparse
 from probcal.inference.ending import FAR, conclude
 from probcal.inference.hierarchy import held, learnt_groups
 from probcal.inference.integrate import Integration, integrate
 from probcal.inference.method import Context, Given, Iterated, State
+from probcal.inference.placed import Reached, with_places
 from probcal.model.model import Model
 from probcal.priors import ARD, PRECISION_BOUNDS, Precision, Prior
 from probcal.priors import Laplace as LaplacePrior
@@ -33,8 +35,6 @@ from probcal.results.answer import Answer
 
 CHUNK = 5  # outer iterations between two reports of progress
 STALLED = 8  # climbs on the host after which one that gains nothing is given up
-TILTS, ASIDE = 12, 0.02  # most climbs with integrated places, and sds by which the last may leave a bias aside
-SLACK = 0.02  # nats by which the density of integrated places may fall by rounding
 
 
 class Maximiser(Iterated, ABC):
@@ -49,9 +49,8 @@ class Maximiser(Iterated, ABC):
         if takes_sparse(self, problem):
             return blockwise_answer(self, problem, prior, start, context)
         state, trace = self.climb(problem, prior, start, context)
-        chosen = places_of(problem.model, state.point) if self.integrates_places else None
-        if chosen is not None and any(np.any(own.on) for own in chosen):
-            problem, state, trace = self._with_places(problem, prior, state, trace, chosen, context)
+        if self.integrates_places and problem.model.rests:
+            problem, state, trace = self._with_places(problem, prior, state, trace, context)
         how, mixed = self.integration(problem, prior), None
         problem = problem.with_mixing(state.mixing)
         if how is not None:
@@ -62,54 +61,31 @@ class Maximiser(Iterated, ABC):
         return conclude(problem, self, prior, state, trace, square, len(trace), how, mixed, stopped)
 
     def _with_places(
-        self, plain: Problem, prior: Prior, state: State, trace: np.ndarray, chosen: Any, context: Context
+        self, plain: Problem, prior: Prior, state: State, trace: np.ndarray, context: Context
     ) -> tuple[Problem, State, np.ndarray]:
-        """The problem with what chosen places add where the density is largest, the state there and all objectives.
+        """The problem with what integrated places add, the state there and all objectives."""
+        traces, given, engine = [trace], given_of(self, plain, prior).prior, DenseEngine()
 
-        What they add is known near a point: a climb that does not raise the density is repeated with a leash, and
-        has one where it leaves as much to go as the climb before.
-        """
-        tilt, leash, wanted = tilt_of(plain.model, state.point, chosen), 0.0, np.inf
-        if tilt is None:
-            return plain, state._replace(done=jax.device_put(np.array(False))), trace
-        worth = self._worth(plain, prior, state) + float(tilt.height)
-        for _ in range(TILTS):
-            held = tilt._replace(curvature=tilt.curvature + leash * np.asarray(_metric(state)))
-            problem = plain.with_tilt(held)
-            tried, more = self.climb(problem, prior, state.point, context)
-            trace = np.concatenate([trace, more])
-            after = tilt_of(plain.model, tried.point, chosen)
-            better = -np.inf if after is None else self._worth(problem, prior, tried) + float(after.height)
-            if after is None or not better > worth - SLACK:
-                leash = max(4.0 * leash, 1.0)
-                continue
-            wants = _sds(tried, after.slope - held.pull(np.asarray(tried.point.z)))
-            state, tilt, worth = tried, after, better
-            if wants < ASIDE:
-                break
-            if context.monitor.stopped:
-                state = state._replace(done=jax.device_put(np.array(False)))
-                break
-            looser = 0.25 * leash if leash > 0.1 else 0.0
-            leash, wanted = max(4.0 * leash, 1.0) if wants > 0.5 * wanted else looser, wants
-        else:
-            state = state._replace(done=jax.device_put(np.array(False)))
-        problem = plain.with_tilt(tilt)
-        given = given_of(self, problem, prior)
-        model = problem.model.with_mixing(state.mixing)
-        found = laplace(model, state.point, given.prior._replace(alpha=state.alpha))
-        return problem, state._replace(found=found), trace
+        def reached(problem: Problem, state: State) -> Reached:
+            problem = problem.with_mixing(state.mixing)
+            at, factors = engine.at(problem.model, state.point), Factors.of(given._replace(alpha=state.alpha))
+            value = float(state.worth)
+            if not (self.climbs_under(prior).learns or problem.model.learns_noise):
+                value = at.density() + factors.value(state.point.z)
+            return Reached(problem, at, factors, value, state)
 
-    def _worth(self, problem: Problem, prior: Prior, state: State) -> float:
-        """What a climb maximises but for the tilt: the marginal density of the biases, its own where it learns more."""
-        model = problem.model.with_mixing(state.mixing)
-        tilt = jax.device_get(model.tilt)
-        beside = 0.0 if tilt is None else float(tilt.value(np.asarray(state.point.z)))
-        if self.climbs_under(prior).learns or model.learns_noise:
-            return float(state.worth) - beside
-        given = given_of(self, problem, prior).prior._replace(alpha=state.alpha)
-        _, solved = compress_and_eliminate(model, state.point, linearise_rows(model, state.point))
-        return -float(_marginal_cost(model, state.point, given, solved)) - beside
+        def climb(problem: Problem, start: Point) -> Reached:
+            state, more = self.climb(problem, prior, start, context)
+            traces.append(more)
+            return reached(problem, state)
+
+        end, agree = with_places(climb, reached(plain, state), engine, lambda: context.monitor.stopped)
+        state = end.state
+        if end.problem.tilted:
+            found = laplace(end.at.model, state.point, given._replace(alpha=state.alpha))
+            state = state._replace(found=found)
+        done = state.done if agree else jax.device_put(np.array(False))
+        return end.problem, state._replace(done=done), np.concatenate(traces)
 
     def climbs_once(self, problem: Problem, prior: Prior) -> bool:
         """Whether an answer is what one climb finds (and an integration there), so that many are one kernel."""
@@ -147,24 +123,6 @@ class Maximiser(Iterated, ABC):
     def close(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """What is computed once a chunk."""
         return state
-
-
-@jax.jit
-def _marginal_cost(model: Model, point: Point, prior: Precision, solved: Eliminated) -> jax.Array:
-    """Negative log marginal density of the biases at a point whose trajectories are at their mode."""
-    return cost(model, point, prior) + 0.5 * solved.logdet
-
-
-def _metric(state: State) -> np.ndarray:
-    """Information (M, M) of the data and of a prior of unit scale."""
-    return np.asarray(state.found.information) + np.eye(len(state.point.z))
-
-
-def _sds(state: State, pull: jax.Array) -> float:
-    """The most sds by which a pull (M,) on the biases would move one."""
-    covariance = np.asarray(state.found.covariance)
-    scale = np.sqrt(np.maximum(np.diagonal(covariance), np.finfo(float).tiny))
-    return float(np.max(np.abs(covariance @ np.asarray(pull)) / scale, initial=0.0))
 
 
 def kernel(method: Any) -> Any:

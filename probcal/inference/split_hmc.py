@@ -182,7 +182,8 @@ def _own_precisions(model: Model, rows: tuple[Linearised, ...]) -> jax.Array:
         summed = jax.ops.segment_sum(own, data.sensor, data.bias.shape[0])
         found = found.at[data.bias].add(jnp.sum(jnp.where(same, summed, 0.0), 2))
     found = found[: model.biases]
-    return found if model.tilt is None else found + jnp.diagonal(model.tilt.curvature)
+    every = np.arange(model.biases)
+    return found if model.tilt is None else found + model.tilt.between(every, every)
 
 
 @jax.jit
@@ -191,4 +192,4 @@ def _precision_times(model: Model, rows: tuple[Linearised, ...], variables: jax.
     states, z = split_variables(model, variables)
     along = model.responses(rows, [x[:, :, None] for x in states], z[:, None])
     found = model.onto_biases(rows, times_weights(model, rows, along))[:, 0]
-    return found if model.tilt is None else found + model.tilt.curvature @ z
+    return found if model.tilt is None else found + model.tilt.times(z)

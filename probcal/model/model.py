@@ -74,7 +74,7 @@ class Tail:
         return jnp.sum(u[:, slice(*self.columns)] ** 2, 1) / self.weight
 
 
-TILTED = 200  # biases up to which the curvature of a tilt is worked out, and room for one is kept
+TILTED = 200  # biases up to which the curvature of a tilt is worked out, and memory for one is kept
 
 
 class Tilt(NamedTuple):
@@ -86,22 +86,32 @@ class Tilt(NamedTuple):
     at: Any  # (M,) point z
     height: Any  # () value there
     slope: Any  # (M,) by z there
-    curvature: Any  # (M, M) minus its second derivative
+    curvature: Any  # (M, M) minus its second derivative; of more than `TILTED` biases its diagonal (M,)
 
     @classmethod
     def none(cls, biases: int) -> "Tilt":
         """Nothing, in the form of something: kernels compiled for it serve what is found later."""
         zero = np.zeros(biases)
-        return cls(zero, np.zeros(()), zero, np.zeros((biases, biases)))
+        return cls(zero, np.zeros(()), zero, np.zeros((biases,) * (2 if biases <= TILTED else 1)))
 
     def value(self, z: Any) -> Any:
         """What is added at z."""
         moved = z - self.at
-        return self.height + moved @ (self.slope - 0.5 * self.curvature @ moved)
+        return self.height + moved @ (self.slope - 0.5 * self.times(moved))
 
     def pull(self, z: Any) -> Any:
         """Slope (M,) at z."""
-        return self.slope - self.curvature @ (z - self.at)
+        return self.slope - self.times(z - self.at)
+
+    def times(self, columns: Any) -> Any:
+        """The curvature times columns, (M,) or (M, K)."""
+        return self.curvature @ columns if self.curvature.ndim == 2 else (self.curvature * columns.T).T
+
+    def between(self, first: Any, second: Any) -> Any:
+        """Its entries at pairs of biases, two arrays of numbers."""
+        if self.curvature.ndim == 2:
+            return self.curvature[first, second]
+        return (first == second) * self.curvature[first]
 
 
 class Recursion(NamedTuple):
