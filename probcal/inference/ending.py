@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from probcal.errors import FitError
 from probcal.gaussian.choose import choose
 from probcal.gaussian.draws import residuals
+from probcal.gaussian.engine import Expansion, Factors
 from probcal.gaussian.information import growing_square, rejected, squares_of
 from probcal.gaussian.mode import Point
 from probcal.inference.integrate import Integrated, Integration
@@ -22,9 +24,11 @@ from probcal.modes.grid import track_mode
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, NormalPosterior, Posterior, Summary, uncalibrated
+from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import datum_of, gather
 from probcal.status import Status
 
+NAMED = 20  # biases that no row tells, of which a message says so
 FAR = 10.0  # scales from the stated value beyond which an estimate is none
 FALL = 1.0  # nats below its best at which an evidence may end
 # Monte Carlo error of a mean in sd, or of an sd over it, above which a message states it
@@ -52,14 +56,36 @@ def conclude(
     Where precisions were integrated after it, `mixed` is what came of it; `stopped` says why it was
     ended early.
     """
+    alpha, worth = np.asarray(state.alpha), float(state.found.evidence)
+    posterior: NormalPosterior
+    if how is None or mixed is None:
+        covariance, information = SensorBlocks.of(np.asarray(state.found.covariance)), state.found.information
+        posterior = NormalPosterior.on(
+            problem, prior, state.point, covariance, alpha, information=information, evidence=worth
+        )
+    else:
+        alpha = np.asarray(prior.precision(problem.labels, problem.surveyed).alpha)
+        posterior = MixturePosterior.of(problem, prior, how.form, alpha, mixed, worth)
     answer = conclude_at(
-        problem, method, prior, _posterior(problem, prior, state, how, mixed), trace, square, iterations,
+        problem, method, prior, posterior, trace, square, iterations,
         converged=bool(state.done) and (mixed is None or bool(mixed.settled)), refused=bool(state.refused),
-        evidence=float(state.found.evidence),
-        lost=fallen(prior, len(problem.levels), state.best, state.worth), stopped=stopped,
+        evidence=worth, lost=fallen(prior, len(problem.levels), state.best, state.worth), stopped=stopped,
     )  # fmt: skip
     said = uncertain(problem.labels, mixed) if mixed is not None and answer.status.valid else ""
     return replace(answer, message=f"{answer.message} {said}".strip()) if said else answer
+
+
+def diverged(problem: Problem, at: Expansion, factors: Factors) -> FitError:
+    """What to say where the precision at a point with the factors of a prior is not positive
+    definite."""
+    told = np.append(np.zeros(problem.model.biases), 0.0)
+    for *_, read, lin in problem.model.each_block(problem.model.read, at.rows):
+        own = np.einsum("ncp,nc->np", np.asarray(lin.bias) ** 2, np.asarray(lin.weight))
+        np.add.at(told, read, own)
+    nothing = np.flatnonzero(told[:-1] + np.asarray(factors.diagonal(problem.model.biases)) == 0)
+    silent = ", ".join([problem.labels[m] for m in nothing][:NAMED])
+    why = f"no row tells {silent}" if silent else "the information matrix is singular"
+    return FitError(f"The fit diverged: {why}; the estimate is invalid. Use a prior, or fix some biases.")
 
 
 def uncertain(labels: Sequence[str], mixed: Integrated) -> str:
@@ -103,16 +129,6 @@ def conclude_at(
     ended = _bias_status(problem, summary, low, far)
     message = " ".join(part for part in (message, method.remark(prior)) if part)
     return Answer(problem, method, method, prior, posterior, status, message, ended, iterations, trace, interrupted=cut)
-
-
-def _posterior(
-    problem: Problem, prior: Prior, state: State, how: Integration | None, mixed: Integrated | None
-) -> Posterior:
-    """The Gaussian at the end of a climb, or the mixture that the integration made of it."""
-    if how is None or mixed is None:
-        return NormalPosterior.of(problem, prior, state.point, state.found, np.asarray(state.alpha))
-    first = np.asarray(prior.precision(problem.labels, problem.surveyed).alpha)
-    return MixturePosterior.of(problem, prior, how.form, first, mixed, float(state.found.evidence))
 
 
 def _bias_status(problem: Problem, summary: Summary, low: np.ndarray, far: np.ndarray) -> tuple[str, ...]:

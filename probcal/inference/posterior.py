@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from probcal.gaussian.draws import draws_a_chain, predictive
 from probcal.gaussian.information import at_levels, mean_square
 from probcal.gaussian.mode import Point
 from probcal.inference.ending import FAR, misfit_sentence
-from probcal.inference.hierarchy import LEAST, MOST, held
+from probcal.inference.hierarchy import drawn_precisions, inclusions
 from probcal.inference.mixed import ESS, R_HAT, UNSURE, mixing, weights_of_sides, within_sides
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Posed
@@ -22,9 +22,10 @@ from probcal.inference.sampling import SamplerRun
 from probcal.model.motions import level_values
 from probcal.modes.grid import track_mode
 from probcal.modes.mirrors import Mirrored
-from probcal.priors import PRECISION_BOUNDS, Flat, Prior
+from probcal.priors import Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
+from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
 from probcal.status import Status
 
@@ -40,28 +41,41 @@ class Chains(Posterior):
 
     run: SamplerRun
 
-    chained: ClassVar[bool] = True
     held: ClassVar[bool] = False
 
     @classmethod
-    def of(cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> Chains:
-        """The posterior of a run, whose quantities mixed as they did."""
-        z, M, gamma = run.z, run.form.biases, np.asarray(run.draws.gamma).mean((0, 1))
-        flat = z.reshape(-1, M)  # one draw has no spread: then its variances given the hyper-parameters
-        spread = np.asarray(run.draws.variance)[0, 0]
-        covariance = np.atleast_2d(np.cov(flat, rowvar=False)) if len(flat) > 1 else np.diag(spread)
+    def of(
+        cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray],
+        covariance: SensorBlocks | None = None, gamma: np.ndarray | None = None, **known: Any,
+    ) -> Self:  # fmt: skip
+        """The posterior of a run, whose quantities mixed as they did.
+
+        Covariance and gamma (M,) are those of the draws where they are not given.
+        """
+        z, M, information, columns = run.z, run.form.biases, None, _columns(run, mixed, run.form.biases)
+        if covariance is None:
+            flat = z.reshape(-1, M)  # one draw has no spread: then its variances given the hyper-parameters
+            spread = np.asarray(run.draws.variance)[0, 0]
+            covariance = SensorBlocks.of(
+                np.atleast_2d(np.cov(flat, rowvar=False)) if len(flat) > 1 else np.diag(spread)
+            )
+            gamma, information = np.asarray(run.draws.gamma).mean((0, 1)), run.posed.information[:M, :M]
+        if (declared := known.get("declared")) is not None:
+            columns |= declared.contraction()
         half = 50 * (1 - INTERVAL)
-        lower, upper = np.percentile(z, [half, 100 - half], axis=(0, 1))
-        precision = np.clip((1 - gamma) / np.maximum(np.diag(covariance), 1e-300), *PRECISION_BOUNDS)
-        precision = np.where(
-            held(prior, problem) | isinstance(prior, Flat), np.asarray(run.posed.first.alpha), precision
-        )
-        summary = Summary(
-            "exact" if run.method.exact else "variational", "sampled", z.mean((0, 1)), covariance, lower, upper, gamma,
-            precision, np.asarray(run.posed.information)[:M, :M], run.levels.mean((0, 1)), None,
-            _columns(run, mixed, M),
+        summary = Summary.of(
+            "exact" if run.method.exact else "variational", "sampled", z.mean((0, 1)), covariance,
+            run.posed.first.alpha, gamma=gamma, interval=np.percentile(z, [half, 100 - half], axis=(0, 1)),
+            governed=np.isin(np.arange(M), run.form.hierarchy.learnt), information=information,
+            levels=run.levels.mean((0, 1)), columns=columns,
         )  # fmt: skip
-        return cls(problem, prior, cls.point_of(problem, run), summary, run)
+        point = cls.point_of(problem, run) if "at" not in known else known["at"].point
+        known.setdefault("moments", [Tracks(x.mean((0, 1)), x.std((0, 1))) for x in run.states])
+        return cls(
+            problem, prior, point, summary, run, hyper={k: np.asarray(a) for k, a in run.draws.phi.items()},
+            variables=_variables(problem, run), stats={"lp": np.asarray(run.draws.density)} | _stats(run),
+            attrs=_numbers(run), **known,
+        )  # fmt: skip
 
     @classmethod
     def point_of(cls, problem: Problem, run: SamplerRun) -> Point:
@@ -74,60 +88,36 @@ class Chains(Posterior):
         mine = self.run.z[self.run.side == heaviest(self.run)]
         return mine.mean(0), mine.std(0) if len(mine) > 1 else self.summary.sd
 
-    @property
-    def states(self) -> Sequence[np.ndarray]:
-        """Mean states (E, n) of each recursion."""
-        return [x.mean((0, 1)) for x in self.run.states]
-
-    def tracks(self) -> Sequence[Tracks]:
-        """Mean and sd of all states."""
-        return [Tracks(x.mean((0, 1)), x.std((0, 1))) for x in self.run.states]
-
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """The draws that were made; of data that are many, values by datum at some of them."""
+        keep = keep if self.run.states else ()
         kept, likelihood, replicas = values_by_datum(self.problem, self.run, key, keep)
         states = self.run.states if "states" in keep else []
         return Draws(self.run.z, self.run.levels, states, kept, likelihood, replicas)
 
     def log_prior(self, draws: Draws) -> np.ndarray | None:
         """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
-        run = self.run
-        if isinstance(self.prior, Flat) or self.prior.correlation or run.form.hierarchy.spiked:
-            return None
-        return log_prior_normal(run.z, np.clip(_alpha(run), LEAST, MOST))
-
-    @property
-    def variables(self) -> Mapping[str, Any]:
-        """Gamma, contraction, hyper-parameters and levels of every draw."""
-        return _variables(self.problem, self.run)
-
-    @property
-    def hyper(self) -> Mapping[str, np.ndarray]:
-        """Draws of the hyper-parameters, (chain, draw, ...)."""
-        return {name: np.asarray(a) for name, a in self.run.draws.phi.items()}
-
-    @property
-    def stats(self) -> Mapping[str, np.ndarray]:
-        """Log density of every draw, and what its steps say."""
-        return {"lp": np.asarray(self.run.draws.density)} | _stats(self.run)
-
-    @property
-    def attrs(self) -> Mapping[str, float]:
-        """Seconds, the frame's worth, and the limits used."""
-        run = self.run
-        found: dict[str, Any] = {"seconds": run.seconds, "rope": ROPE, "thin": run.thin}
-        if run.worth is not None:
-            found |= {"frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
-            found |= {"frame_acceptance": run.worth.acceptance}
-        if not run.method.exact:
-            found["khat"] = pareto_khat(_stats(run)["log_weight"].ravel())
-        return {name: float(value) for name, value in found.items()}
+        alpha = drawn_precisions(self.prior, self.run.form.hierarchy, self.hyper, self.run.posed.first.alpha)
+        return None if alpha is None or self.declared is not None else log_prior_normal(self.run.z, alpha)
 
 
-def conclude_draws(problem: Problem, prior: Prior, run: SamplerRun, kind: type[Chains] = Chains) -> Answer:
+def _numbers(run: SamplerRun) -> dict[str, float]:
+    """Seconds, the worth of the frame, and the limits used."""
+    found: dict[str, Any] = {"seconds": run.seconds, "rope": ROPE, "thin": run.thin}
+    if run.worth is not None:
+        found |= {"frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
+        found |= {"frame_acceptance": run.worth.acceptance}
+    if not run.method.exact:
+        found["khat"] = pareto_khat(_stats(run)["log_weight"].ravel())
+    return {name: float(value) for name, value in found.items()}
+
+
+def conclude_draws(
+    problem: Problem, prior: Prior, run: SamplerRun, posterior_of: Callable[..., Chains] = Chains.of
+) -> Answer:
     """The answer of a sampler's run."""
     mixed = mixing(within_sides(np.asarray(run.draws.theta), run.side))
-    posterior = kind.of(problem, prior, run, mixed)
+    posterior = posterior_of(problem, prior, run, mixed)
     status, message = judge_chains(problem, prior, run, mixed, posterior.point)
     ended = bias_status(problem, mixed, run.form.biases)
     return Answer(
@@ -192,24 +182,11 @@ def values_by_datum(
     return kept, likelihood, replicas
 
 
-def _alpha(run: SamplerRun) -> np.ndarray:
-    """Prior precision (chain, draw, M) of each bias, draw by draw."""
-    phi = {name: jnp.asarray(a) for name, a in run.draws.phi.items()}
-    first = run.posed.first.alpha
-    if not phi:
-        return np.broadcast_to(np.asarray(first), run.z.shape)
-    return np.asarray(jax.vmap(jax.vmap(lambda one: run.form.hierarchy.alpha(one, first)))(phi))
-
-
 def _columns(run: SamplerRun, mixed: Mapping[str, np.ndarray], M: int) -> dict[str, np.ndarray]:
     """Columns by bias beyond the usual ones."""
     found = {name: values[:M] for name, values in mixed.items()}
-    found["contraction"] = 1.0 - run.z.var((0, 1))
-    found["inclusion"] = (np.abs(run.z) > ROPE).mean((0, 1))
-    if "included" in run.draws.phi:
-        found["included"] = np.ones(M)
-        found["included"][list(run.form.hierarchy.spiked)] = np.asarray(run.draws.phi["included"]).mean((0, 1))
-    return found
+    contraction = {"contraction": 1.0 - run.z.var((0, 1))}
+    return found | contraction | inclusions(run.form.hierarchy, run.z, run.draws.phi)
 
 
 def _variables(problem: Problem, run: SamplerRun) -> dict[str, Any]:
@@ -218,6 +195,7 @@ def _variables(problem: Problem, run: SamplerRun) -> dict[str, Any]:
         "gamma": (("bias_label",), np.asarray(run.draws.gamma)),
         "contraction": (("bias_label",), 1.0 - np.asarray(run.draws.variance)),
     }
+    found = found if np.size(run.draws.gamma) else {}
     found |= run.form.hierarchy.variables(problem.labels, run.draws.phi)
     if problem.levels:
         names = [level.label for level in problem.levels]
@@ -321,5 +299,8 @@ def _say_steps(run: SamplerRun, said: list[str]) -> bool:
         said.append(f"Leaps are taken in {rate:.1%} of the tries: biases move by swings alone.")
     if "swung" in found and (rate := found["swung"].mean(1).min()) < RARE:
         said.append(f"A chain takes {rate:.1%} of its swings: its tracks hardly move; take nuts.")
+        good = False
+    if run.method.refusal and (rate := found["acceptance_rate"].mean(1).min()) < RARE:
+        said.append(f"A chain takes {rate:.1%} of its {run.method.refusal}.")
         good = False
     return good

@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.gaussian.choose import choose, choose_fast, estimates, factoriser
+from probcal.gaussian.choose import choose, choose_fast, engine_of, estimates, factoriser
 from probcal.gaussian.mode import Point
 from probcal.gaussian.room import check_room
-from probcal.inference.blockwise import check_sparse, gains_by_sparse, side_climb, takes_sparse
 from probcal.inference.joint_gibbs import check_gibbs
 from probcal.inference.method import Context, Method
 from probcal.inference.methods import MAP
@@ -88,9 +87,9 @@ def _solve(
     if method.by_particles:
         return _by_particles(problem, method, prior, context, start, starts)
     given, problem = problem, method.prepare(problem)
-    if (sparse := _sparsely(problem, method, prior, starts)) is not None:
+    if (sparse := _on_engine(problem, method, prior, starts)) is not None:
         first = grid_start(problem, jnp.asarray(problem.first_z), 30) if start is None else start
-        return _in_sparse_form(problem, sparse, prior, first, context)
+        return _answer_on_engine(problem, sparse, prior, first, context)
     if start is None:
         points = [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))]
     else:
@@ -141,38 +140,45 @@ def _without(answer: Answer, unseen: str, monitor: Monitor) -> Answer:
     return replace(answer, message=f"{answer.message} {said}".strip())
 
 
-def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> Method | None:
-    """The method where it solves a problem in sparse form; raises `InputError` where it must, and does not take it."""
+def _on_engine(problem: Problem, method: Method, prior: Prior, starts: int) -> Method | None:
+    """The method where an engine of large networks solves the problem; raises `InputError` for what it lacks."""
     if method.engined:
         if starts > 1:
             raise InputError(f"{method.name} takes one start: its chains begin at different draws (chains=...)")
         check_gibbs(problem, prior)
         return method
-    if isinstance(method, Maximiser) and takes_sparse(method, problem):
-        check_sparse(method, prior, starts)
-        return method
-    if isinstance(method, Maximiser) and gains_by_sparse(method, problem, prior, starts):
-        sparse: Any = method  # of those that have a form
-        return replace(sparse, engine=factoriser())
+    if isinstance(method, Maximiser):
+        lacks = method.lacking(prior, starts)
+        if method.expands_by(problem.model) is not None:
+            if lacks and estimates(method.engine):
+                raise InputError(f'{method.name}(engine="iterative") takes {lacks}')
+            if lacks:
+                raise InputError(
+                    f"{method.name} on a network of this size is solved in sparse form, which takes {lacks}"
+                )
+            return method
+        if not lacks and method.expands_by(problem.model, fast=True) is not None:
+            sparse: Any = method  # of those that have an engine
+            return replace(sparse, engine=factoriser())
     check_room(problem.model)
     return None
 
 
-def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point, context: Context) -> Answer:
-    """The answer of a method in sparse form, the other sides of a mirror seen to.
+def _answer_on_engine(problem: Problem, method: Method, prior: Prior, start: Point, context: Context) -> Answer:
+    """The answer of a method on an engine of large networks, the other sides of a mirror seen to.
 
     A sampler starts on the side that fits best, and its answer tells of the others.
     """
     if method.climbs:
         context.monitor.enter("climb", answering=True)
         found = method.answer(problem, prior, start, context)
-        used = cast("Method", found.method)  # of engine "iterative" where memory held no factor
+        used = cast("Maximiser", found.method)  # of engine "iterative" where memory held no factor
         try:
-            return _beside_mirrors(found, used, context, side_climb(problem, getattr(used, "engine", "auto")))
+            return _beside_mirrors(found, used, context, SideClimb.on(problem, engine_of(used.engine, problem.model)))
         except MemoryError:
             unseen = "Memory did not hold what looking at the other side of a mirror takes."
             return replace(found, message=f"{found.message} {unseen}".strip())
-    climb = side_climb(problem, choose_fast(problem.model))
+    climb = SideClimb.on(problem, choose_fast(problem.model))
     try:
         sides = other_sides(problem, climb.mode(start)[0], climb)
     except MemoryError:  # which the method says
@@ -231,7 +237,8 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
     problem, here, monitor = answer.problem.untilted, answer.posterior.point, context.monitor
     if monitor.stopped:
         return answer if answer.interrupted else _without(answer, "mirror images", monitor)
-    sides = _sides_in_time(problem, here, SideClimb.dense(problem) if climb is None else climb, monitor)
+    climb = SideClimb.on(problem, engine_of("dense", problem.model)) if climb is None else climb
+    sides = _sides_in_time(problem, here, climb, monitor)
     if sides is None:
         return _without(answer, "mirror images", monitor)
     places = [Mirrored(sides.name, 0.0, sides.point, np.zeros(0), sides.kind)] if sides.moved else []

@@ -37,6 +37,10 @@ class SensorBlocks(NamedTuple):
         """Variance of each bias, (M,)."""
         return self.of_biases(np.diagonal(self.covariance, axis1=1, axis2=2))
 
+    def contraction(self) -> dict[str, np.ndarray]:
+        """A column with the share that data narrow each bias, of its declared scale; of blocks under these."""
+        return {"contraction": np.clip(1.0 - self.variance, 0.0, 1.0)}
+
     def of_biases(self, values: np.ndarray) -> np.ndarray:
         """Values (B, p) of the members as (M,)."""
         found = np.zeros(self.biases + 1, values.dtype)
