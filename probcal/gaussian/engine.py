@@ -229,11 +229,6 @@ def beyond_gaussian(model: Model) -> str:
     return ""
 
 
-def mean(at: Expansion, factors: Factors) -> Any:
-    """Mean (M,) of the biases: one step from the point."""
-    return np.asarray(at.point.z) + np.asarray(at.solve(factors, at.score() + factors.pull(at.point.z)))
-
-
 def evidence(at: Expansion, prior: Precision, factors: Factors | None = None) -> Estimate:
     """Log evidence at the mode under a Gaussian prior, trajectories and biases integrated by
     Laplace's formula.

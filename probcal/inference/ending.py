@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer, NormalPosterior, Posterior, Summary, uncalibrated
 from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import datum_of, gather
-from probcal.status import Status
+from probcal.status import CLIMB, judge
 
 NAMED = 20  # biases that no row tells, of which a message says so
 FAR = 10.0  # scales from the stated value beyond which an estimate is none
@@ -72,7 +71,7 @@ def conclude(
         evidence=worth, lost=fallen(prior, len(problem.levels), state.best, state.worth), stopped=stopped,
     )  # fmt: skip
     said = uncertain(problem.labels, mixed) if mixed is not None and answer.status.valid else ""
-    return replace(answer, message=f"{answer.message} {said}".strip()) if said else answer
+    return answer.noted(said)
 
 
 def diverged(problem: Problem, at: Expansion, factors: Factors) -> FitError:
@@ -113,19 +112,21 @@ def conclude_at(
     low, far = low_and_far(prior, summary, problem.surveyed)
     cut = bool(stopped) and not converged and iterations < method.iterations
     asked = method.tolerance == 0.0 and not cut  # to run so many iterations, whatever they reach
-    sound = posterior.sound and bool(np.isfinite(evidence))
-    misfit = misfit_sentence(problem, point, square)
-    end = End(converged, asked, bool(low.any()), bool(far.any()), sound, refused, lost, misfit)
-    status = verdict(end)
-    message = _message(problem, status, end, low, far, iterations, summary.precisions)
-    if cut and status is Status.NOT_CONVERGED:
-        steps = f"{iterations} iteration{'s' * (iterations > 1)}"
-        message = f"{stopped} after {steps}, before it converged: this is the best estimate so far."
-    if status is Status.SPENT and np.isfinite(trace[-2:]).all() and len(trace) > 1:
-        message = (
-            f"All {iterations} iterations were run, as asked; the last moved the objective by"
-            f" {trace[-1] - trace[-2]:.2g}. {message}"
-        ).strip()
+    moved = trace[-1] - trace[-2] if len(trace) > 1 else np.nan
+    beyond = "outside" if summary.precisions == "integrated" else "low"
+
+    def named(mask: np.ndarray) -> str:
+        return listed([label for label, hit in zip(problem.labels, mask, strict=True) if hit], 12)
+
+    known = {
+        "misfit": misfit_sentence(problem, point, square), "far": named(far),
+        "singular": not (posterior.sound and np.isfinite(evidence)), "refused": refused, beyond: named(low),
+        "fallen": 0.0 if cut or lost <= FALL else lost, "converged": converged,
+        "cut": f"{stopped} after {iterations} iteration{'s' * (iterations > 1)}" if cut else "",
+        "moved": f"{moved:.2g}" if asked and np.isfinite(moved) else "", "spent": asked,
+    }  # fmt: skip
+    facts = {"iterations": iterations, "limit": FAR} | {name: value for name, value in known.items() if value}
+    status, message = judge(CLIMB, facts)
     ended = _bias_status(problem, summary, low, far)
     message = " ".join(part for part in (message, method.remark(prior)) if part)
     return Answer(problem, method, method, prior, posterior, status, message, ended, iterations, trace, interrupted=cut)
@@ -158,32 +159,6 @@ def astray(prior: Prior, mean: Any, surveyed: Any) -> Any:
 def fallen(prior: Prior, levels: int, best: Any, worth: Any) -> float:
     """Nats by which the last evidence lies below the best, where a method maximises it: precisions or levels learnt."""
     return max(float(best) - float(worth), 0.0) if prior.proper and (prior.learns or levels) else 0.0
-
-
-class End(NamedTuple):
-    """What the status of a fit follows from."""
-
-    still: bool  # the method says that it is done
-    asked: bool  # it was to run so many iterations, and did
-    low: bool  # a precision stands at its lower bound
-    far: bool  # a bias without prior ran away
-    sound: bool  # everything is finite
-    refused: bool  # the search never left its start, though a step promised to
-    fallen: float  # nats that the evidence lost
-    misfit: str  # why the data are not explained; empty where they are
-
-
-def verdict(end: End) -> Status:
-    """Status of a fit."""
-    if end.misfit:
-        return Status.MISFIT
-    if end.far or not end.sound or end.refused:
-        return Status.DIVERGED
-    if end.low:
-        return Status.AT_BOUND
-    if end.fallen > FALL:
-        return Status.NOT_CONVERGED
-    return Status.CONVERGED if end.still else Status.SPENT if end.asked else Status.NOT_CONVERGED
 
 
 def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
@@ -239,46 +214,3 @@ def _remains(problem: Problem, point: Point) -> MisfitData:
         time=names["time"],
         unit=np.array([units[pair] for pair in zip(sensor, channel, strict=True)]),
     )
-
-
-def _message(
-    problem: Problem,
-    status: Status,
-    end: End,
-    low: np.ndarray,
-    far: np.ndarray,
-    iterations: int,
-    precisions: str,
-) -> str:
-    def named(mask: np.ndarray) -> str:
-        return listed([label for label, hit in zip(problem.labels, mask, strict=True) if hit], 12)
-
-    if status is Status.AT_BOUND and precisions == "integrated":
-        return (
-            f"{named(low)} lie more than {FAR:g} scales from the stated value: the estimate is invalid. Check labels,"
-            " units and the declared scales."
-        )
-    if status is Status.AT_BOUND:
-        return f"The precision of {named(low)} stands at its lower bound: the estimate is invalid."
-    if status is Status.MISFIT:
-        return end.misfit
-    if status is Status.DIVERGED and end.sound and end.refused and not end.far:
-        return (
-            "The fit diverged: it never left its start, since no step fitted better; the estimate is invalid. Check"
-            " units, the time column, sentinels such as -9999 and the noise std, or give a start."
-        )
-    if status is Status.DIVERGED:
-        where = (
-            f"{named(far)} lie more than {FAR:g} scales from the stated value"
-            if far.any()
-            else "the information matrix is singular"
-        )
-        return f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases."
-    if status is Status.NOT_CONVERGED and end.fallen > FALL:
-        return (
-            f"The evidence fell by {end.fallen:.3g} nats below its best on the way: the fit ran to a place that the"
-            f" data as a whole do not favour. Survey or fix more, state narrower scales, or take a sampler."
-        )
-    if status is Status.NOT_CONVERGED:
-        return f"The fit did not converge in {iterations} iterations: allow more, or fix what the data leave open."
-    return ""

@@ -164,7 +164,7 @@ def _interrupted(answer: Answer, monitor: Monitor) -> Answer:
     """The answer, marked where Ctrl-C ended the search for it or for others."""
     if not monitor.signal:
         return answer
-    status = Status.NOT_CONVERGED if answer.status.settled else answer.status
+    status = answer.status.unsettled
     said = "" if monitor.stopped in answer.message else f"{monitor.stopped} while other answers were looked for."
     return replace(answer, interrupted=True, status=status, message=f"{said} {answer.message}".strip())
 

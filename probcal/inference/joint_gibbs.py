@@ -186,9 +186,6 @@ class _Sweeps:
         self._reference: Reference | None = None
         self._last: SplitGaussian | None = None
 
-    def _rng(self, *which: int) -> np.random.Generator:
-        return np.random.default_rng([*np.asarray(jax.random.key_data(self.key)).ravel().tolist(), *which])
-
     def _at(self, variables: np.ndarray) -> Reference:
         """The reference at variables (n,), made once."""
         if self._reference is None or not np.array_equal(self._reference.variables, variables):

@@ -27,7 +27,7 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
-from probcal.status import Status
+from probcal.status import CHAINS, Status, judge
 
 RARE = 0.05  # share of leaps, or of swings, taken below which it is said
 # Pareto k-hat from which importance weights, and so a guide, are unreliable (Vehtari et al. 2024)
@@ -218,89 +218,51 @@ def judge_chains(
     problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray], mean: Point
 ) -> tuple[Status, str]:
     """Status of a run whose posterior has this mean, and one or more sentences on what hurts and what to do."""
-    said = [run.note] if run.note else []
     chains, draws = run.z.shape[:2]
-    good = True
     names = [*problem.labels, *(level.label for level in problem.levels)]
+    facts: dict[str, Any] = {"note": run.note} if run.note else {}
     if run.stopped:
-        again = draws == run.method.draws
-        how = (
-            "while more steps were made, as the draws had not mixed"
-            if again
-            else f"after {draws} of {run.method.draws}"
-        )
-        said.append(f"{run.stopped} {how}{'' if again else ' draws a chain'}; --resume goes on.")
-        good = False
+        how = f"after {draws} of {run.method.draws} draws a chain"
+        again = "while more steps were made, as the draws had not mixed"
+        facts["stopped"] = f"{run.stopped} {again if draws == run.method.draws else how}"
     if "r_hat" in mixed and mixed["r_hat"].max() > R_HAT:
-        worst = int(mixed["r_hat"].argmax())
-        said.append(
-            f"The chains have not mixed: r_hat of {names[worst]} is {mixed['r_hat'][worst]:.3f}; take more draws."
-        )
-        good = False
+        facts["r_hat"] = names[int(mixed["r_hat"].argmax())], mixed["r_hat"].max()
     worst = int(mixed["ess"].argmin())
     if mixed["ess"][worst] < ESS * chains:
-        said.append(f"Only {mixed['ess'][worst]:.0f} effective draws of {names[worst]}; take more draws.")
-        good = False
-    good = _say_sides(run, said) and good
-    if misfit := misfit_sentence(problem, mean, float(mean_square(problem.model, mean))):
-        return Status.MISFIT, " ".join([misfit, *said])
-    good = _say_steps(run, said) and good
-    if not run.method.exact:
-        good = _say_guide(run, said) and good
-    if isinstance(prior, Flat) and (np.abs(run.z.mean((0, 1))[~problem.surveyed]) > FAR).any():
-        said.append("Some biases lie far from the stated values: use a prior, or fix some.")
-        return Status.DIVERGED, " ".join(said)
-    return Status.CONVERGED if good else Status.NOT_CONVERGED, " ".join(said)
-
-
-def _say_sides(run: SamplerRun, said: list[str]) -> bool:
-    """What each side of a mirror weighs, and whether the chains agree on it."""
+        facts["few"] = names[worst], mixed["ess"][worst]
     share, error = weights_of_sides(run.side, len(run.sides) + 1)
-    if np.count_nonzero(share) < 2:
-        return True
-    listed = ", ".join(f"{share[k]:.2f} ± {error[k]:.2f}" for k in np.flatnonzero(share))
-    said.append(f"The posterior has {np.count_nonzero(share)} sides, of weights {listed}; r_hat is within sides.")
-    if error.max() > UNSURE:
-        said.append("The chains hardly cross between the sides, so that their weights are not known; take more draws.")
-        return False
-    return True
+    if np.count_nonzero(share) > 1:
+        listed = ", ".join(f"{share[k]:.2f} ± {error[k]:.2f}" for k in np.flatnonzero(share))
+        facts["sides"] = np.count_nonzero(share), listed
+        facts |= {"unsure": True} if error.max() > UNSURE else {}
+    if misfit := misfit_sentence(problem, mean, float(mean_square(problem.model, mean))):
+        return judge(CHAINS, facts | {"misfit": misfit})
+    facts |= _steps(run)
+    if not run.method.exact:
+        khat = pareto_khat(_stats(run)["log_weight"].ravel())
+        facts["fitting" if khat < K_HAT else "unfitting"] = khat, K_HAT
+    if isinstance(prior, Flat) and (np.abs(run.z.mean((0, 1))[~problem.surveyed]) > FAR).any():
+        facts["far"] = True
+    return judge(CHAINS, facts)
 
 
-def _say_guide(run: SamplerRun, said: list[str]) -> bool:
-    """Add a sentence on the fit of a guide to the posterior; true where it fits."""
-    khat = pareto_khat(_stats(run)["log_weight"].ravel())
-    fits, worth = khat < K_HAT, f"below {K_HAT:g}: it stands for the posterior"
-    if not fits:
-        worth = f"not below {K_HAT:g}: it does not fit the posterior; fit with NUTS() or Collapsed()"
-    said.append(f"Pareto k-hat of the guide is {khat:.2f}, {worth}.")
-    return fits
-
-
-def _say_steps(run: SamplerRun, said: list[str]) -> bool:
-    """What the steps of NUTS or of the Metropolis correction say; whether all is well."""
-    found, good = _stats(run), True
+def _steps(run: SamplerRun) -> dict[str, Any]:
+    """What the steps of NUTS or of the Metropolis correction say that hurts."""
+    found, facts = _stats(run), dict[str, Any]()
     if "diverging" in found and found["diverging"].any():
-        remedy = ", or take collapsed" if run.asked is run.method else ""
-        said.append(f"{int(found['diverging'].sum())} divergences: take NUTS with a higher target (0.95){remedy}.")
-        good = False
+        facts["divergences"] = int(found["diverging"].sum())
+        facts["or"] = ", or take collapsed" if run.asked is run.method else ""
     if "tree_depth" in found:
         share = float((found["tree_depth"] >= getattr(run.method, "depth", np.inf)).mean())
-        if share > 0.05:
-            said.append(
-                f"{share:.0%} of the trees reached the greatest depth: the step is short (dense=True may help)."
-            )
+        facts |= {"depth": share} if share > 0.05 else {}
     if "energy" in found and np.ptp(found["energy"], axis=1).min() > 0:
-        energy = found["energy"]
-        bfmi = (np.diff(energy, axis=1) ** 2).mean(1) / energy.var(1)
-        if bfmi.min() < BFMI:
-            said.append(f"BFMI {bfmi.min():.2f} is below {BFMI}: the energy is hardly explored; take more draws.")
-            good = False
-    if "swung" in found and (rate := found["acceptance_rate"].mean()) < RARE:
-        said.append(f"Leaps are taken in {rate:.1%} of the tries: biases move by swings alone.")
-    if "swung" in found and (rate := found["swung"].mean(1).min()) < RARE:
-        said.append(f"A chain takes {rate:.1%} of its swings: its tracks hardly move; take nuts.")
-        good = False
-    if run.method.refusal and (rate := found["acceptance_rate"].mean(1).min()) < RARE:
-        said.append(f"A chain takes {rate:.1%} of its {run.method.refusal}.")
-        good = False
-    return good
+        bfmi = (np.diff(found["energy"], axis=1) ** 2).mean(1) / found["energy"].var(1)
+        facts |= {"bfmi": (bfmi.min(), BFMI)} if bfmi.min() < BFMI else {}
+    rate = found["acceptance_rate"].mean(1) if "acceptance_rate" in found else np.ones(1)
+    if "swung" in found:
+        swings = found["swung"].mean(1).min()
+        facts |= {"leaps": rate.mean()} if rate.mean() < RARE else {}
+        facts |= {"swings": swings} if swings < RARE else {}
+    if run.method.refusal and rate.min() < RARE:
+        facts["turns"] = rate.min(), run.method.refusal
+    return facts

@@ -69,8 +69,7 @@ def solve(
         problem, start = taken_there(problem, answer.posterior.point)
     moving = [problem.labels[m] for m in np.flatnonzero(away > STILL * summary.sd)]
     said = f"The times of the rows have not converged: {listed(moving, 3)} still moves from round to round."
-    status = Status.NOT_CONVERGED if answer.status.settled else answer.status
-    return replace(answer, status=status, message=f"{answer.message} {said}".strip())
+    return answer.noted(said, status=answer.status.unsettled)
 
 
 def _solve(
@@ -137,7 +136,7 @@ def _without(answer: Answer, unseen: str, monitor: Monitor) -> Answer:
     if not unseen:
         return answer
     said = f"{monitor.stopped} before {unseen} were looked at: there may be other answers."
-    return replace(answer, message=f"{answer.message} {said}".strip())
+    return answer.noted(said)
 
 
 def _on_engine(problem: Problem, method: Method, prior: Prior, starts: int) -> Method | None:
@@ -177,7 +176,7 @@ def _answer_on_engine(problem: Problem, method: Method, prior: Prior, start: Poi
             return _beside_mirrors(found, used, context, SideClimb.on(problem, engine_of(used.engine, problem.model)))
         except MemoryError:
             unseen = "Memory did not hold what looking at the other side of a mirror takes."
-            return replace(found, message=f"{found.message} {unseen}".strip())
+            return found.noted(unseen)
     climb = SideClimb.on(problem, choose_fast(problem.model))
     try:
         sides = other_sides(problem, climb.mode(start)[0], climb)
@@ -274,10 +273,7 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
             mirrors.append(Mirrored(name, _weight(one) - first - gain, place.point, place.summary.mean - mean, kind))
     mirrors += [o._replace(gain=o.gain - gain, shift=np.asarray(o.point.z) - mean) for o in unfitted]
     mirrors = sorted((other for other in mirrors if other.gain > -NEAR), key=lambda other: -other.gain)
-    best = replace(
-        best, motion=answer.motion, optima=answer.optima, best=answer.best, mirrors=tuple(mirrors),
-        message=f"{best.message} {unseen}".strip(),
-    )  # fmt: skip
+    best = best.noted(unseen, motion=answer.motion, optima=answer.optima, best=answer.best, mirrors=tuple(mirrors))
     return _without(best, f"{skipped} of {len(places)} mirror images" if skipped else "", monitor)
 
 

@@ -149,8 +149,7 @@ class ParticleGibbs(Sampler):
             return replace(answer, status=Status.MISFIT, message=misfit)
         if (share := float(np.mean(drawn.stats["renewed"]))) < STUCK:
             more = f"A sweep renews {share:.0%} of the paths only: take more particles."
-            status = Status.NOT_CONVERGED if answer.status is Status.CONVERGED else answer.status
-            answer = replace(answer, status=status, message=f"{answer.message} {more}".strip())
+            answer = answer.noted(more, status=answer.status.unsettled)
         return answer
 
     def step(self, form: Form, posed: Any, chain: GibbsState) -> tuple[GibbsState, Sample]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, Self
@@ -311,6 +311,10 @@ class Answer:
     optima: tuple[Answer, ...] = ()  # those found from several starts
     best: int = 0  # which of them is reported, or where a sampler began
     mirrors: tuple[Mirrored, ...] = ()  # answers on the other side of a line or plane that fit about as well
+
+    def noted(self, said: str, **changes: Any) -> Answer:
+        """The answer with a further sentence in its message, and other changes."""
+        return replace(self, message=f"{self.message} {said}".strip(), **changes)
 
     @property
     def objective(self) -> float:
