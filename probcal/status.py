@@ -1,4 +1,4 @@
-"""How a fit ended: one enumeration for all methods, and the rules by which a climb and chains get theirs."""
+"""How a fit ended: one enumeration for all methods, and the rules that decide."""
 
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
@@ -47,11 +47,18 @@ WORDS = {
     Status.MISFIT: "explains nothing: its numbers are no estimate",
 }
 INVALID = tuple(str(status) for status in Status if not status.valid)  # of a fit or of a bias
-GRAVITY = (Status.MISFIT, Status.DIVERGED, Status.AT_BOUND, Status.NOT_CONVERGED, Status.SPENT, Status.CONVERGED)
+GRAVITY = (
+    Status.MISFIT,
+    Status.DIVERGED,
+    Status.AT_BOUND,
+    Status.NOT_CONVERGED,
+    Status.SPENT,
+    Status.CONVERGED,
+)
 
 
 class Rule(NamedTuple):
-    """The status of a fit of which a fact is known, and the sentence with the remedy, facts in braces."""
+    """The status that follows from a fact, and a sentence with the remedy, facts in braces."""
 
     fact: str
     status: Status
@@ -81,15 +88,19 @@ CLIMB = (  # the first of them that holds
     Rule(
         "outside",
         Status.AT_BOUND,
-        "{outside} lie more than {limit:g} scales from the stated value: the estimate is invalid. Check labels, units"
-        " and the declared scales.",
+        "{outside} lie more than {limit:g} scales from the stated value: the estimate is invalid."
+        " Check labels, units and the declared scales.",
     ),
-    Rule("low", Status.AT_BOUND, "The precision of {low} stands at its lower bound: the estimate is invalid."),
+    Rule(
+        "low",
+        Status.AT_BOUND,
+        "The precision of {low} stands at its lower bound: the estimate is invalid.",
+    ),
     Rule(
         "fallen",
         Status.NOT_CONVERGED,
-        "The evidence fell by {fallen:.3g} nats below its best on the way: the fit ran to a place that the data as a"
-        " whole do not favour. Survey or fix more, state narrower scales, or take a sampler.",
+        "The evidence fell by {fallen:.3g} nats below its best on the way: the fit ran to a place"
+        " that the data as a whole do not favour. Survey or fix more, state narrower scales, or take a sampler.",
     ),
     Rule("converged", Status.CONVERGED, ""),
     Rule("cut", Status.NOT_CONVERGED, "{cut}, before it converged: this is the best estimate so far."),
@@ -114,16 +125,26 @@ CHAINS = (  # the gravest of those that hold; all are said
         Status.NOT_CONVERGED,
         "The chains have not mixed: r_hat of {r_hat[0]} is {r_hat[1]:.3f}; take more draws.",
     ),
-    Rule("few", Status.NOT_CONVERGED, "Only {few[1]:.0f} effective draws of {few[0]}; take more draws."),
     Rule(
-        "sides", Status.CONVERGED, "The posterior has {sides[0]} sides, of weights {sides[1]}; r_hat is within sides."
+        "few",
+        Status.NOT_CONVERGED,
+        "Only {few[1]:.0f} effective draws of {few[0]}; take more draws.",
+    ),
+    Rule(
+        "sides",
+        Status.CONVERGED,
+        "The posterior has {sides[0]} sides, of weights {sides[1]}; r_hat is within sides.",
     ),
     Rule(
         "unsure",
         Status.NOT_CONVERGED,
         "The chains hardly cross between the sides, so that their weights are not known; take more draws.",
     ),
-    Rule("divergences", Status.NOT_CONVERGED, "{divergences} divergences: take NUTS with a higher target (0.95){or}."),
+    Rule(
+        "divergences",
+        Status.NOT_CONVERGED,
+        "{divergences} divergences: take NUTS with a higher target (0.95){or}.",
+    ),
     Rule(
         "depth",
         Status.CONVERGED,
@@ -134,9 +155,15 @@ CHAINS = (  # the gravest of those that hold; all are said
         Status.NOT_CONVERGED,
         "BFMI {bfmi[0]:.2f} is below {bfmi[1]}: the energy is hardly explored; take more draws.",
     ),
-    Rule("leaps", Status.CONVERGED, "Leaps are taken in {leaps:.1%} of the tries: biases move by swings alone."),
     Rule(
-        "swings", Status.NOT_CONVERGED, "A chain takes {swings:.1%} of its swings: its tracks hardly move; take nuts."
+        "accepted",
+        Status.CONVERGED,
+        "Leaps are taken in {accepted:.1%} of the tries: biases move by swings alone.",
+    ),
+    Rule(
+        "hmc",
+        Status.NOT_CONVERGED,
+        "A chain takes {hmc:.1%} of its swings: its tracks hardly move; take nuts.",
     ),
     Rule("turns", Status.NOT_CONVERGED, "A chain takes {turns[0]:.1%} of its {turns[1]}."),
     Rule(
@@ -147,15 +174,19 @@ CHAINS = (  # the gravest of those that hold; all are said
     Rule(
         "unfitting",
         Status.NOT_CONVERGED,
-        "Pareto k-hat of the guide is {unfitting[0]:.2f}, not below {unfitting[1]:g}: it does not fit the posterior;"
-        " fit with NUTS() or Collapsed().",
+        "Pareto k-hat of the guide is {unfitting[0]:.2f}, not below {unfitting[1]:g}: it does not"
+        " fit the posterior; fit with NUTS() or Collapsed().",
     ),
-    Rule("far", Status.DIVERGED, "Some biases lie far from the stated values: use a prior, or fix some."),
+    Rule(
+        "far",
+        Status.DIVERGED,
+        "Some biases lie far from the stated values: use a prior, or fix some.",
+    ),
 )
 
 
 def judge(rules: Sequence[Rule], facts: Mapping[str, Any]) -> tuple[Status, str]:
-    """Status and sentences of the rules whose facts are known; of those of a climb the first alone."""
+    """Status and sentences of the rules whose facts are known; of a climb the first of them alone."""
     known = [rule for rule in rules if rule.fact in facts][: 1 if rules is CLIMB else None]
     said = " ".join(rule.sentence for rule in known if rule.sentence).format(**facts)
     return min((rule.status for rule in known), key=GRAVITY.index, default=Status.CONVERGED), said

@@ -15,14 +15,14 @@ from probcal.gaussian.information import growing_square, rejected, squares_of
 from probcal.gaussian.mode import Point
 from probcal.inference.integrate import Integrated, Integration
 from probcal.inference.method import Iterated, State
-from probcal.inference.mixture import MixturePosterior
+from probcal.inference.mixture import MixturePosterior, NormalPosterior
 from probcal.labels import listed
 from probcal.misfit import MisfitData, misfit_text, rejection_text
 from probcal.modes import automatic_start
 from probcal.modes.grid import track_mode
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, NormalPosterior, Posterior, Summary, uncalibrated
+from probcal.results.answer import Answer, Posterior, Summary, uncalibrated
 from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import datum_of, gather
 from probcal.status import CLIMB, judge

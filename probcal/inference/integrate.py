@@ -89,7 +89,7 @@ def integrate(
     if not how.sweeps:
         engine = engine_of("dense", model)
         found = BiasLikelihood.of(engine, engine.at(model, start), first, marginal=how.marginal)
-        return propagated(how.form, first, found, key)[0]
+        return by_propagation(how.form, first, found, key)[0]
     known, _ = likelihood(how, model, first, start)
     chains, point = begin(how.form, known, jax.random.fold_in(key, 0)), start
     for turn in range(MOVES if search else 1):
@@ -133,7 +133,7 @@ def pooled(found: Sequence[Moments]) -> tuple[Moments, np.ndarray, np.ndarray]:
     return Moments(middle, covariance, lower.mean(0), upper.mean(0), gamma.mean(0)), errors[0], errors[1]
 
 
-def propagated(
+def by_propagation(
     form: Form,
     first: Precision,
     known: BiasLikelihood,

@@ -33,12 +33,12 @@ from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
 from probcal.inference.split_hmc import Reference, SplitGaussian, placed, split_variables, variables_of
 from probcal.model.model import Model
+from probcal.modes.mirrors import CLIMB
 from probcal.priors import Horseshoe, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Tracks, blocks_under
 from probcal.results.blocks import SensorBlocks
 
-STEPS = 60  # of the climb to the mode
 PILOT = 40  # sweeps on the Gaussian alone, the last half of which tells where the reference is taken
 KICKS, TRIED, WANTED = (1, 2, 4, 8, 16, 32, 64), 6, 0.7  # kicks of a turn: the fewest of which so many are taken
 NUMBERS = 4_000_000  # most numbers of draws of states, and of hyper-parameters by bias, that are kept
@@ -112,7 +112,7 @@ class Gibbs(Sampler):
         first = prior.precision(problem.labels, problem.surveyed)
         factors = Factors.alone(np.ones(model.biases) if form.hierarchy.learnt else np.asarray(first.alpha))
         try:
-            mode = climb_to_mode(lambda at: engine.settled(model, at), start, factors, STEPS, 1e-3).at
+            mode = climb_to_mode(lambda at: engine.settled(model, at), start, factors, CLIMB, 1e-3).at
             runs = _Sweeps(self, form, first, engine, mode, context.key)
             drawn, thin, stopped = drawn_by(self, runs, 1, context.monitor, context.storage, context.threads)
             natural = Natural(jnp.zeros((0, 0)), jnp.zeros(0), model.level_spread, first)
@@ -308,20 +308,6 @@ class _Sweeps:
         return Draw(**fields | {"states": self._states(at), "stats": {"acceptance_rate": np.array(chain.rate)}})
 
 
-def _covariances(z: np.ndarray, members: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Covariances (B, p, p) of the members (B, p) of each block over draws z; of a single draw, variances (M,)."""
-    M, none = len(variance), members == len(variance)
-    flat = np.concatenate([z.reshape(-1, M), np.zeros((z.shape[0] * z.shape[1], 1))], 1)
-    found = np.zeros((*members.shape, members.shape[1]))
-    own = flat - flat.mean(0)
-    for b, block in enumerate(members):
-        found[b] = own[:, block].T @ own[:, block] / max(len(flat) - 1, 1)
-    eye = np.eye(members.shape[1])[None]
-    if len(flat) == 1:
-        found = eye * np.append(variance, 0.0)[members][:, None]
-    return found + eye * none[:, None]
-
-
 @dataclass(frozen=True, eq=False)
 class GibbsChains(Chains):
     """The draws of the biases by `Gibbs`, and moments of the states."""
@@ -335,8 +321,7 @@ class GibbsChains(Chains):
         assert state is not None
         which = 0 if int(state.thin) == run.thin else 1  # a longer run that was interrupted leaves the draws before it
         count, total, square, told, spread = (np.asarray(getattr(state, name))[which] for name in SUMS)
-        members = blocks_of(model)
-        blocks = SensorBlocks(M, members, _covariances(z, members, spread / count))
+        blocks = SensorBlocks.drawn(z.reshape(-1, M), blocks_of(model), spread / count)
         at = runs.engine.settled(model, runs.mode.moved(z.mean((0, 1)) - np.asarray(runs.mode.point.z)))
         middle = np.asarray(state.reference)[: model.state_size] + total / count
         sd = np.sqrt(np.maximum(square / count - (total / count) ** 2, 0.0))

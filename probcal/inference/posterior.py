@@ -54,11 +54,7 @@ class Chains(Posterior):
         """
         z, M, information, columns = run.z, run.form.biases, None, _columns(run, mixed, run.form.biases)
         if covariance is None:
-            flat = z.reshape(-1, M)  # one draw has no spread: then its variances given the hyper-parameters
-            spread = np.asarray(run.draws.variance)[0, 0]
-            covariance = SensorBlocks.of(
-                np.atleast_2d(np.cov(flat, rowvar=False)) if len(flat) > 1 else np.diag(spread)
-            )
+            covariance = SensorBlocks.drawn(z.reshape(-1, M), np.arange(M)[None], np.asarray(run.draws.variance)[0, 0])
             gamma, information = np.asarray(run.draws.gamma).mean((0, 1)), run.posed.information[:M, :M]
         if (declared := known.get("declared")) is not None:
             columns |= declared.contraction()
@@ -260,9 +256,9 @@ def _steps(run: SamplerRun) -> dict[str, Any]:
         facts |= {"bfmi": (bfmi.min(), BFMI)} if bfmi.min() < BFMI else {}
     rate = found["acceptance_rate"].mean(1) if "acceptance_rate" in found else np.ones(1)
     if "swung" in found:
-        swings = found["swung"].mean(1).min()
-        facts |= {"leaps": rate.mean()} if rate.mean() < RARE else {}
-        facts |= {"swings": swings} if swings < RARE else {}
+        taken = found["swung"].mean(1).min()
+        facts |= {"accepted": rate.mean()} if rate.mean() < RARE else {}
+        facts |= {"hmc": taken} if taken < RARE else {}
     if run.method.refusal and rate.min() < RARE:
         facts["turns"] = rate.min(), run.method.refusal
     return facts

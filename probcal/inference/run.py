@@ -8,35 +8,31 @@ a study many at once.
 from abc import ABC, abstractmethod
 from dataclasses import replace
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.errors import FitError, InputError
+from probcal.errors import InputError
 from probcal.gaussian.choose import engine_of, estimates
-from probcal.gaussian.climb import climb_to_mode
-from probcal.gaussian.engine import Engine, Estimate, Expansion, Factors, evidence
+from probcal.gaussian.engine import Engine
 from probcal.gaussian.information import mean_square
 from probcal.gaussian.linearised import LaplaceApproximation, compress_and_eliminate, laplace, linearise_rows
 from probcal.gaussian.mode import Eliminated, Point, cost
 from probcal.gaussian.places import places_of, tilt_of
 from probcal.gaussian.tails import expected_mixing, rewhitened
-from probcal.inference.ending import FAR, conclude, conclude_at, diverged
+from probcal.inference.ending import FAR, conclude
+from probcal.inference.engined import climb_on
 from probcal.inference.hierarchy import held, learnt_groups
-from probcal.inference.integrate import Integration, integrate, propagated
+from probcal.inference.integrate import Integration, integrate
 from probcal.inference.method import Context, Given, Iterated, State
-from probcal.inference.mixture import MixturePosterior
-from probcal.inference.propagate import BiasLikelihood
 from probcal.model.model import Model
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Precision, Prior
 from probcal.priors import Laplace as LaplacePrior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, NormalPosterior, blocks_under, tracks_at
-from probcal.results.schema import ROPE
+from probcal.results.answer import Answer
 
-HOST_STEPS = 60  # of a climb from the host
 CHUNK = 5  # outer iterations between two reports of progress
 STALLED = 8  # climbs on the host after which one that gains nothing is given up
 TILTS, ASIDE = 12, 0.02  # most climbs with integrated places, and sds by which the last may leave a bias aside
@@ -47,16 +43,17 @@ class Maximiser(Iterated, ABC):
     """A method that climbs to a point by a pure `iterate` and reports a Gaussian there."""
 
     engine: str | Engine = "dense"  # that expands the posterior, by name or as a value
+    trajectory: str = "joint"  # mode of biases and trajectories, or "marginal": of the biases
 
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Climb from a start until it is done or its iterations are spent.
 
         Where a method integrates trajectories, places that are far from Gaussian are integrated at the point that was
-        reached, and it climbs again with what they add. What is too large for the dense engine is climbed from the
-        host on another.
+        reached, and it climbs again with what they add. What is too large for the dense engine is
+        climbed from the host on another.
         """
         if (engine := self.expands_by(problem.model)) is not None:
-            return self._by_expansions(engine, problem, prior, start, context)
+            return climb_on(engine, self, problem, prior, start, context)
         state, trace = self.climb(problem, prior, start, context)
         chosen = places_of(problem.model, state.point) if self.integrates_places else None
         if chosen is not None and any(np.any(own.on) for own in chosen):
@@ -88,58 +85,10 @@ class Maximiser(Iterated, ABC):
             return "precisions that are given (MAP() with Gaussian() or Flat())"
         if not isinstance(self.climbs_under(prior), (Gaussian, Flat)):
             return (
-                "precisions that are integrated or given (EA() with Horseshoe() or ARD(rate=0.5), MAP() with"
-                " Gaussian())"
+                "precisions that are integrated or given (EA() with Horseshoe() or ARD(rate=0.5),"
+                " MAP() with Gaussian())"
             )
         return "one start" if starts > 1 else ""
-
-    def _by_expansions(self, engine: Engine, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
-        """The answer of a climb from the host to the marginal mode, on any engine.
-
-        Raises `FitError` where a flat prior leaves no interval, and where memory does not hold what the engine makes.
-        """
-        model, first = problem.model, first_precision(problem, prior)
-        scales = first_precision(problem, self.climbs_under(prior))
-        factors, how = Factors.of(scales), self.integration(problem, prior)
-
-        def told(k: int, value: float) -> bool:
-            context.monitor.tell(self.name, min(k, self.iterations), self.iterations, value, bound=True)
-            return bool(context.monitor.stopped)
-
-        try:
-            steps = min(HOST_STEPS, self.iterations)
-            mode = climb_to_mode(
-                lambda at: engine.settled(model, at), start, factors, steps, 1e-2 * self.tolerance, told
-            )
-            worth, settled = evidence(mode.at, scales, factors), True
-            posterior: NormalPosterior
-            if how is None:
-                posterior = _normal(problem, prior, mode.at, first, worth)
-            else:
-                known = BiasLikelihood.of(engine, mode.at, first)
-                mixed, work = propagated(how.form, first, known, context.key, told)
-                posterior = MixturePosterior.of(problem, prior, how.form, first.alpha, mixed, worth.value, work)
-                settled = bool(mixed.settled)
-        except MemoryError:
-            size = f"{model.state_size} state entries and {model.biases} biases"
-            if not engine.exact:
-                raise FitError(
-                    f"memory does not hold {size}, not even without a factor: take fewer sensors or a shorter time"
-                ) from None
-            if self.engine == "auto" and isinstance(prior, (Gaussian, Flat)):
-                other: Any = replace(cast("Any", self), engine="iterative")
-                return cast("Answer", other.answer(problem, prior, start, context))
-            raise FitError(
-                f"the sparse factor of {size} does not fit in memory:"
-                ' MAP(engine="iterative") makes none; or take fewer sensors or a shorter time'
-            ) from None
-        except np.linalg.LinAlgError:
-            raise diverged(problem, engine.at(model, start), factors) from None
-        square = float(mean_square(model, posterior.point))
-        return conclude_at(
-            problem, self, prior, posterior, mode.trace, square, len(mode.trace), refused=mode.refused,
-            converged=mode.converged and settled, evidence=worth.value, stopped=context.monitor.stopped,
-        )  # fmt: skip
 
     def _with_places(
         self, plain: Problem, prior: Prior, state: State, trace: np.ndarray, chosen: Any, context: Context
@@ -199,7 +148,7 @@ class Maximiser(Iterated, ABC):
     @property
     def integrates_places(self) -> bool:
         """Whether trajectories are integrated, so that places that are far from Gaussian matter."""
-        return False
+        return self.trajectory == "marginal"
 
     def climb(self, problem: Problem, prior: Prior, start: Point, context: Context) -> tuple[State, np.ndarray]:
         """The last state of the outer loop and the objectives on the way."""
@@ -218,8 +167,11 @@ class Maximiser(Iterated, ABC):
         """One outer iteration."""
 
     def steps_on_host(self, model: Model, prior: Prior) -> bool:
-        """Whether iterations are long and few, so that kernels shared with the rest of a fit beat one of their own."""
-        return False
+        """Whether iterations are long and few: those of a climb to the marginal mode alone.
+
+        Kernels shared with the rest of a fit then beat one of their own.
+        """
+        return self.trajectory == "marginal" and not (prior.learns or model.tailed)
 
     def begin(self, model: Model, start: Point) -> Any:
         """What is carried to the first iteration: nothing, unless said otherwise."""
@@ -228,21 +180,6 @@ class Maximiser(Iterated, ABC):
     def close(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """What is computed once a chunk."""
         return state
-
-
-def _normal(problem: Problem, prior: Prior, at: Expansion, first: Precision, worth: Estimate) -> NormalPosterior:
-    """The Gaussian at a mode under precisions `first`; `worth` is its log evidence."""
-    factors = Factors.of(first)
-    spread = at.spread(factors)
-    blocks = blocks_under(at, factors, spread)
-    declared = blocks if prior.proper else blocks.under_scales()
-    errors = {"sd_error": 0.5 * spread.error / spread.biases} if spread.error.any() else {}
-    numbers = {"log_evidence_error": worth.error} if prior.proper and worth.error else {}
-    return NormalPosterior.on(
-        problem, prior, at.point, blocks, first.alpha, evidence=worth.value, columns=declared.contraction() | errors,
-        at=at, factors=factors, moments=tracks_at(at.point, spread.states), declared=declared,
-        attrs={"rope": ROPE} | numbers,
-    )  # fmt: skip
 
 
 @jax.jit

@@ -86,14 +86,17 @@ def _solve(
     if method.by_particles:
         return _by_particles(problem, method, prior, context, start, starts)
     given, problem = problem, method.prepare(problem)
-    if (sparse := _on_engine(problem, method, prior, starts)) is not None:
-        first = grid_start(problem, jnp.asarray(problem.first_z), 30) if start is None else start
-        return _answer_on_engine(problem, sparse, prior, first, context)
-    if start is None:
-        points = [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))]
-    else:
+    engined = _on_engine(problem, method, prior, starts)
+    method, large = engined or method, engined is not None
+    if start is not None:
         points = [_suited(given, problem, start)]
-    if not monitor.stopped:
+    elif large:
+        points = [grid_start(problem, jnp.asarray(problem.first_z), 30)]
+    else:
+        points = [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))]
+    if method.engined:
+        return _sampled_on_best_side(problem, method, prior, points[0], context)
+    if not (monitor.stopped or large):
         points += further_starts(problem, starts - len(points), jax.random.fold_in(context.key, 1))
     climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint"), Gaussian())
     optima, unseen = list[Answer](), ""
@@ -111,7 +114,10 @@ def _solve(
     found = _without(found, unseen, monitor)
     if not method.climbs or found.motion != "used":
         return found
-    beside = _beside_mirrors(found, method, context)
+    try:
+        beside = _beside_mirrors(found, cast("Maximiser", found.method), context)
+    except MemoryError:
+        return found.noted("Memory did not hold what looking at the other side of a mirror takes.")
     return replace(beside, mirrors=(*beside.mirrors, *_beside_optima(beside, (found, *found.optima))))
 
 
@@ -163,20 +169,8 @@ def _on_engine(problem: Problem, method: Method, prior: Prior, starts: int) -> M
     return None
 
 
-def _answer_on_engine(problem: Problem, method: Method, prior: Prior, start: Point, context: Context) -> Answer:
-    """The answer of a method on an engine of large networks, the other sides of a mirror seen to.
-
-    A sampler starts on the side that fits best, and its answer tells of the others.
-    """
-    if method.climbs:
-        context.monitor.enter("climb", answering=True)
-        found = method.answer(problem, prior, start, context)
-        used = cast("Maximiser", found.method)  # of engine "iterative" where memory held no factor
-        try:
-            return _beside_mirrors(found, used, context, SideClimb.on(problem, engine_of(used.engine, problem.model)))
-        except MemoryError:
-            unseen = "Memory did not hold what looking at the other side of a mirror takes."
-            return found.noted(unseen)
+def _sampled_on_best_side(problem: Problem, method: Method, prior: Prior, start: Point, context: Context) -> Answer:
+    """The answer of a sampler on an engine: it starts on the side that fits best, and tells of the others."""
     climb = SideClimb.on(problem, choose_fast(problem.model))
     try:
         sides = other_sides(problem, climb.mode(start)[0], climb)
@@ -224,7 +218,7 @@ def _by_particles(
     return replace(found, optima=tuple(answers) if len(answers) > 1 else (), best=best, mirrors=mirrors)
 
 
-def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: SideClimb | None = None) -> Answer:
+def _beside_mirrors(answer: Answer, method: Maximiser, context: Context) -> Answer:
     """The answer on the side of a mirror that fits best, and those of other sides that fit about as well.
 
     Sides are found under the declared scales, without what integrated places add, which is known near this answer
@@ -236,7 +230,7 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
     problem, here, monitor = answer.problem.untilted, answer.posterior.point, context.monitor
     if monitor.stopped:
         return answer if answer.interrupted else _without(answer, "mirror images", monitor)
-    climb = SideClimb.on(problem, engine_of("dense", problem.model)) if climb is None else climb
+    climb = SideClimb.on(problem, engine_of(method.engine, problem.model))
     sides = _sides_in_time(problem, here, climb, monitor)
     if sides is None:
         return _without(answer, "mirror images", monitor)

@@ -10,15 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.errors import InputError
 from probcal.gaussian.choose import engine_of
-from probcal.gaussian.draws import draw, draw_biases, draws_a_chain
 from probcal.gaussian.engine import Expansion, Factors, Spread
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point
@@ -33,7 +31,7 @@ if TYPE_CHECKING:
     from probcal.problem import Problem
 
 CHAINS = 4  # of the draws of a Gaussian, so that ArviZ reads them as it reads a sampler's
-NUMBERS = 400_000  # of the draws of all biases that a tree holds, where their covariance is not held
+NUMBERS = 400_000  # of the draws of all biases in a tree, where their covariance is not held
 MOST = 250  # draws of a chain then
 HALF = NormalDist().inv_cdf(0.5 + INTERVAL / 2)  # sds from the mean to an end of an interval
 
@@ -78,7 +76,7 @@ class Summary:
     gamma: np.ndarray  # (M,)
     precision: np.ndarray  # (M,) of the prior
     levels: np.ndarray  # (H,) log factors of the unknown noise levels
-    information: np.ndarray | None  # (M, M) of the data, trajectories marginalised; None where it is not held
+    information: np.ndarray | None  # (M, M) of the data, trajectories marginalised, if held
     evidence: float | None  # where the method has one
     columns: Mapping[str, np.ndarray]  # further ones by name, (M,)
 
@@ -114,7 +112,18 @@ class Summary:
         information = None if information is None else np.asarray(information)
         levels, columns = np.asarray(levels, float), columns or {}
         return cls(
-            kind, precisions, mean, covariance, lower, upper, gamma, precision, levels, information, evidence, columns
+            kind,
+            precisions,
+            mean,
+            covariance,
+            lower,
+            upper,
+            gamma,
+            precision,
+            levels,
+            information,
+            evidence,
+            columns,
         )
 
     @property
@@ -131,16 +140,20 @@ class Posterior(ABC):
     prior: Prior
     point: Point  # the mode, or the mean with the trajectories at their mode
     summary: Summary
-    # the posterior expanded at the point or near it; None: by the dense engine, when it is asked for
+    # the posterior expanded at the point or near it; None: by the dense engine, when asked for
     at: Expansion | None = field(default=None, kw_only=True)
     # the covariance that the declared scales leave, where that of all biases is not held
     declared: SensorBlocks | None = field(default=None, kw_only=True)
-    moments: Sequence[Tracks] | None = field(default=None, kw_only=True)  # of each recursion, where they are known
-    hyper: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)  # (chain, draw, ...) hyper-parameters
+    # of the states of each recursion, where they are known
+    moments: Sequence[Tracks] | None = field(default=None, kw_only=True)
+    # (chain, draw, ...) hyper-parameters
+    hyper: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
     # further variables by draw: dims beyond chain and draw, values, and their coordinates
     variables: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
-    stats: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)  # (chain, draw) of a sampler
-    attrs: Mapping[str, float] = field(default_factory=dict, kw_only=True)  # numbers of the whole run
+    # (chain, draw) of a sampler
+    stats: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    # numbers of the whole run
+    attrs: Mapping[str, float] = field(default_factory=dict, kw_only=True)
 
     chained: ClassVar[bool] = True  # whether draws depend on each other
     held: ClassVar[bool] = True  # whether noise levels are the same in every draw
@@ -148,11 +161,15 @@ class Posterior(ABC):
     @property
     def states(self) -> Sequence[np.ndarray]:
         """Mean states (E, n) of each recursion."""
-        return [np.asarray(x) for x in self.point.states] if self.moments is None else [x.mean for x in self.moments]
+        if self.moments is not None:
+            return [own.mean for own in self.moments]
+        return [np.asarray(x) for x in self.point.states]
 
     def tracks(self) -> Sequence[Tracks]:
         """Mean and sd of all states."""
-        return tracks_of(self.expansion, self.summary.covariance) if self.moments is None else self.moments
+        if self.moments is not None:
+            return self.moments
+        return tracks_of(self.expansion, self.summary.covariance)
 
     @abstractmethod
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
@@ -166,7 +183,8 @@ class Posterior(ABC):
     @property
     def sound(self) -> bool:
         """Whether every number is finite: a flat prior on a singular problem leaves no interval."""
-        return bool(np.isfinite(self.summary.covariance.covariance).all() and np.isfinite(self.summary.mean).all())
+        parts = self.summary.covariance.covariance, self.summary.mean
+        return all(bool(np.isfinite(part).all()) for part in parts)
 
     @property
     def here(self) -> tuple[np.ndarray, np.ndarray]:
@@ -196,64 +214,8 @@ class Posterior(ABC):
     @cached_property
     def expansion(self) -> Expansion:
         """The posterior expanded about the point."""
-        return engine_of("dense", self.problem.model).at(self.problem.model, self.point) if self.at is None else self.at
-
-
-@dataclass(frozen=True, eq=False)
-class NormalPosterior(Posterior):
-    """A Gaussian of the biases around a point, noise levels held."""
-
-    factors: Factors | None = field(default=None, kw_only=True)  # of the prior, where the expansion is at hand
-    chained: ClassVar[bool] = False
-
-    @classmethod
-    def on(
-        cls, problem: Problem, prior: Prior, point: Point, covariance: SensorBlocks, alpha: Any,
-        *, information: Any = None, evidence: float = np.nan, columns: Any = None, **known: Any,
-    ) -> Self:  # fmt: skip
-        """The Gaussian at a point, with the precisions alpha (M,) that a method ended with."""
-        summary = Summary.of(
-            "Laplace", precisions_of(problem, prior), np.asarray(point.z), covariance, alpha, information=information,
-            levels=point.levels, evidence=evidence if prior.proper else None, columns=columns,
-        )  # fmt: skip
-        return cls(problem, prior, point, summary, **known)
-
-    def biases(self, key: jax.Array) -> np.ndarray:
-        """Independent draws (chain, draw, M) of the biases, as many as their number and the size of the data allow."""
-        M = len(self.summary.mean)
-        if self.summary.covariance.whole:
-            shape = (CHAINS, draws_a_chain(self.problem.model.size, CHAINS))
-            z = draw_biases(self.point, jnp.asarray(self.summary.covariance.matrix()), key, shape[0] * shape[1])
-        else:
-            assert self.factors is not None
-            shape = (CHAINS, few_draws(M))
-            z = self.summary.mean + np.asarray(self.expansion.deviations(self.factors, key, shape[0] * shape[1]).z)
-        return np.asarray(z).reshape(*shape, M)
-
-    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
-        """Independent draws, as many as the size of the data lets be kept."""
-        keys = jax.random.split(key)
-        return self.along(self.biases(keys[0]), keys[1], keep)
-
-    def along(self, z: np.ndarray, key: jax.Array, keep: tuple[str, ...]) -> Draws:
-        """Draws of the biases z (chain, draw, M) with a trajectory each, where the covariance of all is held.
-
-        Raises `InputError` for draws of what would take too much room.
-        """
-        if not self.summary.covariance.whole:
-            if {"states", "replicas"} & set(keep):
-                raise InputError(
-                    "fit(save=...): a fit in sparse form keeps no draws of states or replicas; leave save out, or give"
-                    ' engine="dense"'
-                )
-            keep = ()
-        shape, M = z.shape[:2], z.shape[2]
-        drawn: Any = ((), (), ())
-        if keep:
-            drawn = draw(self.expansion, jnp.asarray(z.reshape(-1, M)), self.point.levels, key, keep)
-        states, likelihood, replicas = ([np.asarray(a).reshape(*shape, *a.shape[1:]) for a in part] for part in drawn)
-        levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
-        return Draws(z, levels, states, np.arange(shape[1]), likelihood, replicas)
+        model = self.problem.model
+        return engine_of("dense", model).at(model, self.point) if self.at is None else self.at
 
 
 def few_draws(biases: int) -> int:
@@ -262,7 +224,7 @@ def few_draws(biases: int) -> int:
 
 
 def blocks_under(at: Expansion, factors: Factors, spread: Spread | None = None) -> SensorBlocks:
-    """Covariances of the biases of each sensor under factors; their variances alone where these are estimated."""
+    """Covariances of the biases of each sensor under factors; estimated, their variances alone."""
     spread, M = at.spread(factors) if spread is None else spread, at.model.biases
     if spread.error.any():
         return SensorBlocks(M, np.arange(M)[:, None], spread.biases[:, None, None])

@@ -27,6 +27,18 @@ class SensorBlocks(NamedTuple):
         """All biases in one block, by their covariance (M, M)."""
         return cls(len(covariance), np.arange(len(covariance))[None], covariance[None])
 
+    @classmethod
+    def drawn(cls, z: np.ndarray, members: np.ndarray, variance: np.ndarray) -> SensorBlocks:
+        """Those of draws z (D, M); of a single draw, which has no spread, the variances (M,)."""
+        M, none = len(variance), members == len(variance)
+        away = np.pad(z - z.mean(0), ((0, 0), (0, 1)))
+        eye, covariance = np.eye(members.shape[1])[None], np.zeros((*members.shape, members.shape[1]))
+        for b, block in enumerate(members):
+            covariance[b] = away[:, block].T @ away[:, block] / max(len(z) - 1, 1)
+        if len(z) == 1:
+            covariance = eye * np.append(variance, 0.0)[members][:, None]
+        return cls(M, members, covariance + eye * none[:, None])
+
     @property
     def whole(self) -> bool:
         """Whether the covariance of all biases is held."""
@@ -54,7 +66,9 @@ class SensorBlocks(NamedTuple):
         return self.of_biases(number), self.of_biases(place)
 
     def columns(self, scales: np.ndarray) -> dict[str, Any]:
-        """Variables of the group `calibration`: the block of each bias, and its covariance with the members of that."""
+        """Variables of the group `calibration`: of each bias its block, and its covariance with the members of that."""
+        if self.whole:
+            return {"covariance": (("bias_label", "bias_label_other"), self.matrix() * np.outer(scales, scales))}
         own, (number, place) = np.append(scales, 0.0)[self.members], self.located()
         rows = self.covariance * own[:, :, None] * own[:, None, :]
         return {

@@ -128,11 +128,11 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
     matrices: dict[str, Any] = {}
     if found.covariance.whole:
         known = answer.posterior.expansion.information() if found.information is None else found.information
-        matrices = {"covariance": found.covariance.matrix() * np.outer(scales, scales), "information": known}
+        matrices = {"information": known}
     if answer.prior.correlation:
         matrices["coupling"] = np.asarray(answer.prior.precision(problem.labels, problem.surveyed).coupling)
     values: dict[str, Any] = {name: ("bias_label", column) for name, column in columns.items()}
-    values |= {} if found.covariance.whole else found.covariance.columns(scales)
+    values |= found.covariance.columns(scales)
     values |= {name: (("bias_label", "bias_label_other"), matrix) for name, matrix in matrices.items()}
     coords = bias_coords(problem) | ({"bias_label_other": labels} if matrices else {})
     return xr.Dataset(values, coords=coords)

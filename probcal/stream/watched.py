@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.mode import Point
+from probcal.inference.mixture import NormalPosterior
 from probcal.inference.widen import widened_by
 from probcal.modes import automatic_start
 from probcal.modes.grid import track_mode
 from probcal.motion import Target
 from probcal.priors import Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, Draws, NormalPosterior, Tracks
+from probcal.results.answer import Answer, Draws, Tracks
 from probcal.results.blocks import SensorBlocks
 from probcal.results.build import build
 from probcal.status import Status
