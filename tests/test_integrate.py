@@ -10,6 +10,7 @@ from contracts import check_tree, close
 import probcal
 from probcal import ARD, EA, MAP, BernoulliGaussian, Gaussian, Horseshoe, Laplace, fit
 from probcal.errors import InputError
+from probcal.gaussian.engine import Estimate, Factors, Sampled
 from probcal.gaussian.mode import Point
 from probcal.inference.ending import uncertain
 from probcal.inference.hierarchy import (
@@ -23,7 +24,6 @@ from probcal.inference.hierarchy import (
 from probcal.inference.integrate import (
     CHAINS,
     KEPT,
-    DenseLikelihood,
     Integrated,
     Integration,
     Moments,
@@ -35,7 +35,7 @@ from probcal.inference.integrate import (
     run_sweeps,
 )
 from probcal.inference.posed import Form, Natural
-from probcal.inference.propagate import CLOSE, ROUNDS, Propagation
+from probcal.inference.propagate import CLOSE, ROUNDS, BiasLikelihood, Propagation
 from probcal.modes.grid import track_mode
 from probcal.priors import Precision, by_kind
 
@@ -118,11 +118,28 @@ def test_sweeps_go_on_without_another_burn_in():
     np.testing.assert_array_equal(both.z[:, 1], ends[0])
 
 
-class Fixed(DenseLikelihood):
-    """The hand-made likelihood, the same at any point."""
+class HandMade:
+    """The expansion of the hand-made likelihood about zero."""
 
-    def at(self, z):
-        return self
+    point = Point((), (), np.zeros(3), np.zeros(0))
+
+    def score(self):
+        return PULL
+
+    def log_det(self, factors):
+        return Estimate(np.linalg.slogdet(G + factors.matrix(3))[1])
+
+    def solve(self, factors, right):
+        return np.linalg.solve(G + factors.matrix(3), right)
+
+    def marginals(self, factors, members):
+        covariance = np.eye(4)
+        covariance[:3, :3] = np.linalg.inv(G + factors.matrix(3))
+        return covariance[members[:, :, None], members[:, None, :]]
+
+    def deviations(self, factors, key, count):
+        root = np.linalg.cholesky(np.linalg.inv(G + factors.matrix(3)))
+        return Sampled(np.random.default_rng(0).standard_normal((count, 3)) @ root.T, ())
 
 
 @pytest.mark.parametrize(
@@ -138,13 +155,12 @@ def test_expectation_propagation_agrees_too(prior, members):
     members = np.array(members)
     form = Form(3, kind_of(prior))
     with jax.enable_x64(True):
-        known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision(jnp.ones(3)))
-        point = Point((), (), jnp.zeros(3), jnp.zeros(0))
-        likelihood = Fixed(Integration(form, True, sweeps=False), None, known, point)
-        work = Propagation.of(form, known.first, likelihood, members, jax.random.key(0))
+        likelihood = BiasLikelihood(None, HandMade(), Factors(), whole=True)
+        work = Propagation.of(form, Precision(jnp.ones(3)), likelihood, members, jax.random.key(0))
         for turn in range(ROUNDS):
             off = work.round(turn)
-        z, covariance = joint_draws(work)
+        z, blocks = joint_draws(work)
+    z, covariance = z.reshape(-1, 3), blocks.matrix()
     assert off < CLOSE
     middle, spread, gamma = weighed(prior)
     sd = np.sqrt(np.diag(spread))

@@ -23,6 +23,7 @@ from probcal.modes.grid import track_mode
 from probcal.modes.mirrors import Mirrored, Sides, other_sides
 from probcal.modes.reflections import planes, reflect, reflect_nodes
 from probcal.plots.map import plot_map
+from probcal.results.answer import Answer
 from probcal.sensors import radar, ranger
 from probcal.status import Status
 
@@ -370,9 +371,10 @@ class Stub:
     best: int = 0
     trace: tuple = (0.0,)
     prior = None
-    problem = SimpleNamespace(untilted=None)
+    problem = SimpleNamespace(untilted=SimpleNamespace(model=None))
     method: object = None
     interrupted: bool = False
+    noted = Answer.noted
 
     @property
     def posterior(self):
@@ -402,7 +404,8 @@ def beside_others(monkeypatch, sides, ends, method=None):
     first = Stub(0.0, 100.0, method=method)
     climb = SimpleNamespace(mode=None, _replace=lambda **_: None)
     context = SimpleNamespace(monitor=Monitor())
-    return solve._beside_mirrors(first, SimpleNamespace(answer=answer), context, climb)
+    monkeypatch.setattr(solve.SideClimb, "on", lambda *_: climb)
+    return solve._beside_mirrors(first, SimpleNamespace(answer=answer, engine="dense"), context)
 
 
 def listed(found):

@@ -589,7 +589,6 @@ def sparse(place, covariance=1.0):
         one = one.assign({name: ("bias_label", values) for name, values in columns.items()})
         one["block_covariance"] = (("bias_label", "place"), np.full((M, 1), covariance))
         tree["calibration"] = xr.DataTree(one)
-        tree.attrs["sparse"] = 1
 
     return change
 

@@ -66,15 +66,15 @@ def choose(model: Model) -> Engine:
     return direct_engine() if prefers_sparse(model) and not missing(model) else DenseEngine()
 
 
-def engine_of(asked: str | Engine, model: Model) -> Engine:
-    """The engine of a name; of "auto" that which the size of a model calls for.
+def engine_of(asked: str | Engine, model: Model, *, fast: bool = False) -> Engine:
+    """The engine of a name; of "auto" that which the size of a model calls for, or with `fast` its shape too.
 
     Raises `InputError` where its library is not installed, or where it does not take the model.
     """
     if asked == "cholmod" and not has_cholmod():
         raise InputError('engine="cholmod" needs sparsax: install probcal[sparse], or take engine="superlu"')
     if asked == "auto":
-        return choose(model)
+        return choose_fast(model) if fast else choose(model)
     engine = ENGINES[asked]() if isinstance(asked, str) else asked
     if not engine.cheap and (lacks := missing(model)):
         raise InputError(f'engine="{asked}" does not take {lacks}: give engine="dense"')

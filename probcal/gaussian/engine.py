@@ -221,9 +221,6 @@ class Engine(Protocol):
         """The same at the modes of its trajectories for its biases."""
 
 
-def mean(at: Expansion, factors: Factors) -> Any:
-    """Mean (M,) of the biases: one step from the point."""
-    return np.asarray(at.point.z) + np.asarray(at.solve(factors, at.score() + factors.pull(at.point.z)))
 
 
 def evidence(at: Expansion, prior: Precision, factors: Factors | None = None) -> Estimate:

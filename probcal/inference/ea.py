@@ -68,11 +68,6 @@ def _eliminated(model: Model, point: Point) -> Eliminated:
     return eliminate(model, point, expected=True)
 
 
-def _alone(model: Model, prior: Prior, trajectory: str) -> bool:
-    """Whether a climb is to marginal modes of which each takes many steps, no precision being learnt in between."""
-    return trajectory == "marginal" and not (prior.learns or model.tailed)
-
-
 def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, trajectory: str) -> State:
     """New precisions and levels, then the mode and the evidence at that mode: all of one state belongs together."""
     model, state = learnt(model, prior, given, state, rule)
@@ -254,15 +249,6 @@ class EA(Maximiser):
             " narrow; Horseshoe() or ARD(rate=0.5) is integrated."
         )
 
-    @property
-    def integrates_places(self) -> bool:
-        """Where the mode is that of the marginal."""
-        return self.trajectory == "marginal"
-
-    def steps_on_host(self, model: Model, prior: Prior) -> bool:
-        """Where the marginal mode is all that is climbed to: each iteration is then long."""
-        return _alone(model, prior, self.trajectory)
-
     def begin(self, model: Model, start: Point) -> Any:
         """The system at the start, where climbs to the joint mode solve what they report: precisions then change with
         every step.
@@ -310,15 +296,6 @@ class MAP(Maximiser):
         if not estimates(self.engine):
             return ""
         return "No factor of the biases was made: sds and evidence are estimated, each with its standard error."
-
-    @property
-    def integrates_places(self) -> bool:
-        """Where the mode is that of the marginal."""
-        return self.trajectory == "marginal"
-
-    def steps_on_host(self, model: Model, prior: Prior) -> bool:
-        """Where the marginal mode is all that is climbed to: each iteration is then long."""
-        return _alone(model, prior, self.trajectory)
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Mode and its covariance."""

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from probcal.errors import FitError
 from probcal.gaussian.choose import choose
 from probcal.gaussian.draws import residuals
+from probcal.gaussian.engine import Expansion, Factors
 from probcal.gaussian.information import growing_square, rejected, squares_of
 from probcal.gaussian.mode import Point
 from probcal.inference.integrate import Integrated, Integration
 from probcal.inference.method import Iterated, State
-from probcal.inference.mixture import MixturePosterior
+from probcal.inference.mixture import MixturePosterior, NormalPosterior
 from probcal.labels import listed
 from probcal.misfit import MisfitData, misfit_text, rejection_text
 from probcal.modes import automatic_start
 from probcal.modes.grid import track_mode
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, NormalPosterior, Posterior, Summary, uncalibrated
+from probcal.results.answer import Answer, Posterior, Summary, uncalibrated
+from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import datum_of, gather
-from probcal.status import Status
+from probcal.status import CLIMB, judge
 
+NAMED = 20  # biases that no row tells, of which a message says so
 FAR = 10.0  # scales from the stated value beyond which an estimate is none
 FALL = 1.0  # nats below its best at which an evidence may end
 # Monte Carlo error of a mean in sd, or of an sd over it, above which a message states it
@@ -52,14 +55,36 @@ def conclude(
     Where precisions were integrated after it, `mixed` is what came of it; `stopped` says why it was
     ended early.
     """
+    alpha, worth = np.asarray(state.alpha), float(state.found.evidence)
+    posterior: NormalPosterior
+    if how is None or mixed is None:
+        covariance, information = SensorBlocks.of(np.asarray(state.found.covariance)), state.found.information
+        posterior = NormalPosterior.on(
+            problem, prior, state.point, covariance, alpha, information=information, evidence=worth
+        )
+    else:
+        alpha = np.asarray(prior.precision(problem.labels, problem.surveyed).alpha)
+        posterior = MixturePosterior.of(problem, prior, how.form, alpha, mixed, worth)
     answer = conclude_at(
-        problem, method, prior, _posterior(problem, prior, state, how, mixed), trace, square, iterations,
+        problem, method, prior, posterior, trace, square, iterations,
         converged=bool(state.done) and (mixed is None or bool(mixed.settled)), refused=bool(state.refused),
-        evidence=float(state.found.evidence),
-        lost=fallen(prior, len(problem.levels), state.best, state.worth), stopped=stopped,
+        evidence=worth, lost=fallen(prior, len(problem.levels), state.best, state.worth), stopped=stopped,
     )  # fmt: skip
     said = uncertain(problem.labels, mixed) if mixed is not None and answer.status.valid else ""
-    return replace(answer, message=f"{answer.message} {said}".strip()) if said else answer
+    return answer.noted(said)
+
+
+def diverged(problem: Problem, at: Expansion, factors: Factors) -> FitError:
+    """What to say where the precision at a point with the factors of a prior is not positive
+    definite."""
+    told = np.append(np.zeros(problem.model.biases), 0.0)
+    for *_, read, lin in problem.model.each_block(problem.model.read, at.rows):
+        own = np.einsum("ncp,nc->np", np.asarray(lin.bias) ** 2, np.asarray(lin.weight))
+        np.add.at(told, read, own)
+    nothing = np.flatnonzero(told[:-1] + np.asarray(factors.diagonal(problem.model.biases)) == 0)
+    silent = ", ".join([problem.labels[m] for m in nothing][:NAMED])
+    why = f"no row tells {silent}" if silent else "the information matrix is singular"
+    return FitError(f"The fit diverged: {why}; the estimate is invalid. Use a prior, or fix some biases.")
 
 
 def uncertain(labels: Sequence[str], mixed: Integrated) -> str:
@@ -87,32 +112,24 @@ def conclude_at(
     low, far = low_and_far(prior, summary, problem.surveyed)
     cut = bool(stopped) and not converged and iterations < method.iterations
     asked = method.tolerance == 0.0 and not cut  # to run so many iterations, whatever they reach
-    sound = posterior.sound and bool(np.isfinite(evidence))
-    misfit = misfit_sentence(problem, point, square)
-    end = End(converged, asked, bool(low.any()), bool(far.any()), sound, refused, lost, misfit)
-    status = verdict(end)
-    message = _message(problem, status, end, low, far, iterations, summary.precisions)
-    if cut and status is Status.NOT_CONVERGED:
-        steps = f"{iterations} iteration{'s' * (iterations > 1)}"
-        message = f"{stopped} after {steps}, before it converged: this is the best estimate so far."
-    if status is Status.SPENT and np.isfinite(trace[-2:]).all() and len(trace) > 1:
-        message = (
-            f"All {iterations} iterations were run, as asked; the last moved the objective by"
-            f" {trace[-1] - trace[-2]:.2g}. {message}"
-        ).strip()
+    moved = trace[-1] - trace[-2] if len(trace) > 1 else np.nan
+    beyond = "outside" if summary.precisions == "integrated" else "low"
+
+    def named(mask: np.ndarray) -> str:
+        return listed([label for label, hit in zip(problem.labels, mask, strict=True) if hit], 12)
+
+    known = {
+        "misfit": misfit_sentence(problem, point, square), "far": named(far),
+        "singular": not (posterior.sound and np.isfinite(evidence)), "refused": refused, beyond: named(low),
+        "fallen": 0.0 if cut or lost <= FALL else lost, "converged": converged,
+        "cut": f"{stopped} after {iterations} iteration{'s' * (iterations > 1)}" if cut else "",
+        "moved": f"{moved:.2g}" if asked and np.isfinite(moved) else "", "spent": asked,
+    }  # fmt: skip
+    facts = {"iterations": iterations, "limit": FAR} | {name: value for name, value in known.items() if value}
+    status, message = judge(CLIMB, facts)
     ended = _bias_status(problem, summary, low, far)
     message = " ".join(part for part in (message, method.remark(prior)) if part)
     return Answer(problem, method, method, prior, posterior, status, message, ended, iterations, trace, interrupted=cut)
-
-
-def _posterior(
-    problem: Problem, prior: Prior, state: State, how: Integration | None, mixed: Integrated | None
-) -> Posterior:
-    """The Gaussian at the end of a climb, or the mixture that the integration made of it."""
-    if how is None or mixed is None:
-        return NormalPosterior.of(problem, prior, state.point, state.found, np.asarray(state.alpha))
-    first = np.asarray(prior.precision(problem.labels, problem.surveyed).alpha)
-    return MixturePosterior.of(problem, prior, how.form, first, mixed, float(state.found.evidence))
 
 
 def _bias_status(problem: Problem, summary: Summary, low: np.ndarray, far: np.ndarray) -> tuple[str, ...]:
@@ -142,32 +159,6 @@ def astray(prior: Prior, mean: Any, surveyed: Any) -> Any:
 def fallen(prior: Prior, levels: int, best: Any, worth: Any) -> float:
     """Nats by which the last evidence lies below the best, where a method maximises it: precisions or levels learnt."""
     return max(float(best) - float(worth), 0.0) if prior.proper and (prior.learns or levels) else 0.0
-
-
-class End(NamedTuple):
-    """What the status of a fit follows from."""
-
-    still: bool  # the method says that it is done
-    asked: bool  # it was to run so many iterations, and did
-    low: bool  # a precision stands at its lower bound
-    far: bool  # a bias without prior ran away
-    sound: bool  # everything is finite
-    refused: bool  # the search never left its start, though a step promised to
-    fallen: float  # nats that the evidence lost
-    misfit: str  # why the data are not explained; empty where they are
-
-
-def verdict(end: End) -> Status:
-    """Status of a fit."""
-    if end.misfit:
-        return Status.MISFIT
-    if end.far or not end.sound or end.refused:
-        return Status.DIVERGED
-    if end.low:
-        return Status.AT_BOUND
-    if end.fallen > FALL:
-        return Status.NOT_CONVERGED
-    return Status.CONVERGED if end.still else Status.SPENT if end.asked else Status.NOT_CONVERGED
 
 
 def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
@@ -223,46 +214,3 @@ def _remains(problem: Problem, point: Point) -> MisfitData:
         time=names["time"],
         unit=np.array([units[pair] for pair in zip(sensor, channel, strict=True)]),
     )
-
-
-def _message(
-    problem: Problem,
-    status: Status,
-    end: End,
-    low: np.ndarray,
-    far: np.ndarray,
-    iterations: int,
-    precisions: str,
-) -> str:
-    def named(mask: np.ndarray) -> str:
-        return listed([label for label, hit in zip(problem.labels, mask, strict=True) if hit], 12)
-
-    if status is Status.AT_BOUND and precisions == "integrated":
-        return (
-            f"{named(low)} lie more than {FAR:g} scales from the stated value: the estimate is invalid. Check labels,"
-            " units and the declared scales."
-        )
-    if status is Status.AT_BOUND:
-        return f"The precision of {named(low)} stands at its lower bound: the estimate is invalid."
-    if status is Status.MISFIT:
-        return end.misfit
-    if status is Status.DIVERGED and end.sound and end.refused and not end.far:
-        return (
-            "The fit diverged: it never left its start, since no step fitted better; the estimate is invalid. Check"
-            " units, the time column, sentinels such as -9999 and the noise std, or give a start."
-        )
-    if status is Status.DIVERGED:
-        where = (
-            f"{named(far)} lie more than {FAR:g} scales from the stated value"
-            if far.any()
-            else "the information matrix is singular"
-        )
-        return f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases."
-    if status is Status.NOT_CONVERGED and end.fallen > FALL:
-        return (
-            f"The evidence fell by {end.fallen:.3g} nats below its best on the way: the fit ran to a place that the"
-            f" data as a whole do not favour. Survey or fix more, state narrower scales, or take a sampler."
-        )
-    if status is Status.NOT_CONVERGED:
-        return f"The fit did not converge in {iterations} iterations: allow more, or fix what the data leave open."
-    return ""

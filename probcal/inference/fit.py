@@ -17,10 +17,9 @@ from probcal.gaussian.choose import choose
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point
 from probcal.gaussian.tails import settle
-from probcal.identifiability.directions import weak_directions
+from probcal.identifiability.directions import alone_directions, screened_directions, weak_directions
 from probcal.identifiability.remedies import Direction
 from probcal.identifiability.watch import runs, strained_starts
-from probcal.inference.blockwise import BlockPosterior
 from probcal.inference.identity import identity_of, points_digest, seed_text
 from probcal.inference.manifest import stored_run
 from probcal.inference.method import Context, Method, ParticleSmoother
@@ -51,6 +50,7 @@ else:
 
 SAVE = ("states", "predictive")
 NAMED = 4  # directions, or biases, that a message names
+ALONE = 20  # combinations of the biases of single sensors that a large fit names
 DIFFERENT = 2.0  # sd from which a bias is another one in another answer
 
 
@@ -142,8 +142,8 @@ def calibrate(
         keys = jax.random.split(as_key(key))
         context = Context(keys[0], monitor, storage, fallback=NUTS())
         answer = _interrupted(solve(problem, method, chosen, context, start=start, starts=starts), monitor)
-        directions = _directions(answer)
-        answer = _watched(replace(answer, message=_advised(answer, directions)))
+        directions, count = _directions(answer)
+        answer = _watched(replace(answer, message=_advised(answer, directions, count)))
         if not answer.posterior.sound:  # a flat prior on a singular problem: no interval exists
             raise FitError(answer.message)
         found = build(answer, directions, keys[1], keep)
@@ -151,6 +151,7 @@ def calibrate(
         found = add_optima(found, answer.optima, answer.best)
     if answer.mirrors:
         found = add_mirrors(found, answer)
+    found.attrs["weak"] = count
     found.attrs["seed"] = int(key) if isinstance(key, (int, np.integer)) else -1
     if store is not None:
         found.attrs["identity"] = storage.digest
@@ -163,19 +164,22 @@ def _interrupted(answer: Answer, monitor: Monitor) -> Answer:
     """The answer, marked where Ctrl-C ended the search for it or for others."""
     if not monitor.signal:
         return answer
-    status = Status.NOT_CONVERGED if answer.status.settled else answer.status
+    status = answer.status.unsettled
     said = "" if monitor.stopped in answer.message else f"{monitor.stopped} while other answers were looked for."
     return replace(answer, interrupted=True, status=status, message=f"{said} {answer.message}".strip())
 
 
-def _directions(answer: Answer) -> tuple[Direction, ...]:
-    """What the data leave open where the answer stands."""
-    information = answer.posterior.summary.information
-    if isinstance(answer.posterior, BlockPosterior):
-        return answer.posterior.open
+def _directions(answer: Answer) -> tuple[tuple[Direction, ...], int]:
+    """What the data leave open where the answer stands, and how many directions that are; some may have no name."""
+    posterior, information = answer.posterior, answer.posterior.summary.information
+    if (blocks := posterior.declared) is not None:
+        if not answer.prior.proper:  # a flat prior leaves no room for more
+            return alone_directions(answer.problem, posterior.point, blocks, ALONE)
+        return screened_directions(answer.problem, posterior.expansion, blocks, ALONE)
     if information is None or not linear_form(answer) or not np.isfinite(information).all():
-        return ()
-    return weak_directions(answer.problem, information, answer.posterior.point)
+        return (), 0
+    found = weak_directions(answer.problem, information, posterior.point)
+    return found, len(found)
 
 
 def linear_form(answer: Answer) -> bool:
@@ -184,12 +188,11 @@ def linear_form(answer: Answer) -> bool:
     return states == noises
 
 
-def _advised(answer: Answer, directions: Sequence[Direction]) -> str:
+def _advised(answer: Answer, directions: Sequence[Direction], count: int) -> str:
     """The message of an answer, with what the data leave open; a misfit is not for lack of data."""
     if not directions or answer.status is Status.MISFIT:
         return answer.message
     named = "; ".join(direction.sentence for direction in directions[:NAMED])
-    count = answer.posterior.weak if isinstance(answer.posterior, BlockPosterior) else len(directions)
     named += f"; and {count - NAMED} more" if count > NAMED else ""
     about = "Weakly determined by the data" if answer.status.settled else "The data do not fix"
     return f"{answer.message} {about}: {named}.".strip()
@@ -201,7 +204,7 @@ def _watched(answer: Answer) -> Answer:
     if not linear_form(answer) or not answer.status.valid or not np.isfinite(np.asarray(point.z)).all():
         return answer
     found, status = [answer.message] if answer.message else [], answer.status
-    for run in runs(problem, point, many=isinstance(answer.posterior, BlockPosterior)):
+    for run in runs(problem, point, many=not answer.posterior.summary.covariance.whole):
         if run.gauge:
             status = Status.GAUGE
             found.append(

@@ -16,7 +16,6 @@ from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point
 from probcal.gaussian.places import tilt_at
-from probcal.inference.blockwise import declared_blocks
 from probcal.lazy import Later
 from probcal.model.model import Recursion
 from probcal.model.motions import level_logs
@@ -24,7 +23,7 @@ from probcal.model.rows import Linearised
 from probcal.modes.grid import follow_states, track_mode
 from probcal.priors import Precision
 from probcal.problem import Epochs, Problem
-from probcal.results.answer import Answer
+from probcal.results.answer import Answer, blocks_under
 from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import datum_of, gather, weights_of_tails
 from probcal.results.read import each_track, saved_by_epoch
@@ -122,7 +121,7 @@ class Judged:
         if not self.engine.exact:
             apart = 1.0 - told["contraction"].values
             return SensorBlocks(len(apart), np.arange(len(apart))[:, None], apart[:, None, None])
-        return declared_blocks(self.expansion)
+        return blocks_under(self.expansion, Factors.alone(np.ones(self.expansion.model.biases)))
 
     @property
     def readers(self) -> np.ndarray:
@@ -144,9 +143,9 @@ def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) ->
     spread = SensorBlocks.read(group, problem.labels, "assess", problem.scales)
     asked = factoriser() if answer is None else getattr(answer.method, "engine", "auto")
     asked = "iterative" if "sd_error" in group else asked
-    engine = engine_of(asked if fit.attrs.get("sparse", 0) else "dense", problem.model)
+    engine = engine_of(asked if "block" in group else "dense", problem.model)
     if answer is not None:
-        at, scaled = answer.posterior.expansion, getattr(answer.posterior, "declared", None)
+        at, scaled = answer.posterior.expansion, answer.posterior.declared
     else:
         point = point_of(problem, fit)
         if fit.attrs.get("places") == "integrated":

@@ -12,6 +12,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -23,8 +24,9 @@ from probcal.errors import InputError
 from probcal.inference.draws import inverse_gaussian, slice_step
 from probcal.labels import AXES
 from probcal.lazy import Later
-from probcal.priors import ARD, BernoulliGaussian, Gaussian, Horseshoe, Laplace, Prior
+from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace, Prior
 from probcal.problem import Problem
+from probcal.results.schema import ROPE
 
 if TYPE_CHECKING:
     from numpyro import distributions as dist
@@ -594,3 +596,28 @@ def hierarchy_of(prior: Prior, problem: Problem) -> Hierarchy:
     words = [word for word, _ in found]
     apart = [(f"{word}_{k}" if words.count(word) > 1 else word, one) for k, (word, one) in enumerate(found)]
     return Product.of(prior, apart) if found else NoHyperprior(prior, (), ())
+
+
+def inclusions(hierarchy: Hierarchy, z: np.ndarray, phi: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Columns by bias: the fraction of draws z (chain, draw, M) beyond the practical zero, and of those that are in."""
+    found = {"inclusion": (np.abs(z) > ROPE).mean((0, 1))}
+    if "included" in phi:
+        found["included"] = np.ones(z.shape[2])
+        found["included"][list(hierarchy.spiked)] = np.asarray(phi["included"]).mean((0, 1))
+    return found
+
+
+def drawn_precisions(prior: Prior, hierarchy: Hierarchy, hyper: Mapping[str, Any], first: Any) -> np.ndarray | None:
+    """Precision (chain, draw, M) of each bias by draw, (M,) where all draws have the same.
+
+    None where not every bias has one of its own, and where hyper-parameters have no draws.
+    """
+    if isinstance(prior, Flat) or prior.correlation or hierarchy.spiked or (hierarchy.learnt and not hyper):
+        return None
+    alpha = _by_draw(hierarchy, dict(hyper), jnp.asarray(first)) if hyper else first
+    return np.clip(np.asarray(alpha), LEAST, MOST)
+
+
+@partial(jax.jit, static_argnames="hierarchy")
+def _by_draw(hierarchy: Hierarchy, phi: Phi, first: jax.Array) -> jax.Array:
+    return jax.vmap(jax.vmap(lambda one: hierarchy.alpha(one, first)))(phi)

@@ -5,8 +5,8 @@ marginal density. Gibbs sweeps over hyper-parameters and biases sample what a hi
 then moves to the mean of the mixture, once, and the sweeps go on. Noise levels are held.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,6 +16,8 @@ import numpy as np
 from jax.scipy.special import ndtr
 
 from probcal import linalg
+from probcal.gaussian.choose import engine_of
+from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
 from probcal.gaussian.marginal import volume_slope
@@ -23,9 +25,11 @@ from probcal.gaussian.mode import Eliminated, Point, smooth_tracks
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Natural, activity, draw_given, prior_precision
-from probcal.inference.propagate import BlockMarginals, Blocks, Propagation
+from probcal.inference.propagate import BiasLikelihood, Propagation
 from probcal.model.model import Model
 from probcal.priors import Precision
+from probcal.results.answer import few_draws
+from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL
 
 CHAINS, BURN, FIRST, KEPT = (
@@ -66,7 +70,7 @@ class Integrated(NamedTuple):
     """Where the integration ended: the mixture, its draws, and the likelihood behind it."""
 
     point: Point  # biases at the mean, trajectories at their mode
-    information: jax.Array  # (M, M) of the data about z
+    information: Any  # (M, M) of the data about z; None where it is not held
     moments: Moments
     z: Any  # (CHAINS, KEPT, M)
     phi: Phi  # leading dims (CHAINS, KEPT)
@@ -83,9 +87,10 @@ def integrate(
     `first` is the prior of what no hierarchy governs. Once the mean of the mixture is known the likelihood is taken
     there; with `search`, which no kernel can hold, until the mean moves by less than an sd.
     """
-    known, _ = likelihood(how, model, first, start)
     if not how.sweeps:
-        return _propagated(how, model, known, start, key)
+        engine = engine_of("dense", model)
+        return by_propagation(how.form, first, engine, engine.at(model, start), key, marginal=how.marginal)[0]
+    known, _ = likelihood(how, model, first, start)
     chains, point = begin(how.form, known, jax.random.fold_in(key, 0)), start
     for turn in range(MOVES if search else 1):
         chains, swept = run_sweeps(how.form, known, chains, jax.random.fold_in(key, turn + 2), FIRST, BURN)
@@ -128,76 +133,54 @@ def pooled(found: Sequence[Moments]) -> tuple[Moments, np.ndarray, np.ndarray]:
     return Moments(middle, covariance, lower.mean(0), upper.mean(0), gamma.mean(0)), errors[0], errors[1]
 
 
-@dataclass(frozen=True, eq=False)
-class DenseLikelihood:
-    """The likelihood of a model at a point as a propagation reads it."""
+def by_propagation(
+    form: Form,
+    first: Precision,
+    engine: Engine,
+    at: Expansion,
+    key: jax.Array,
+    told: Callable[[int, float], bool] | None = None,
+    *,
+    marginal: bool = True,
+) -> tuple[Integrated, Propagation]:
+    """What expectation propagation leaves, which keeps no draws of the hyper-parameters, and where it ended.
 
-    how: Integration
-    model: Model
-    known: Natural
-    point: Point
-
-    @property
-    def z(self) -> np.ndarray:
-        """Biases (M,) of the point."""
-        return np.asarray(self.point.z)
-
-    def marginals(self, members: np.ndarray, sites: Blocks) -> BlockMarginals:
-        """Marginals of the blocks, and the covariance (M, M) of all."""
-        from scipy.linalg import cho_solve  # loaded where it is used
-
-        M = len(self.z)
-        precision, pull = np.zeros((M + 1, M + 1)), np.zeros(M + 1)
-        precision[:M, :M] = self.known.information + self.known.first.matrix()
-        pull[:M] = self.known.pull
-        precision[members[:, :, None], members[:, None, :]] += sites.precision  # no two blocks have a bias in common
-        pull[members] += sites.pull
-        lower = np.linalg.cholesky(precision[:M, :M])  # what is not positive is said here
-        covariance = cho_solve((lower, True), np.eye(M))
-        at = np.minimum(members, M - 1)
-        none = (members == M)[:, :, None] | (members == M)[:, None, :]
-        blocks = np.where(none, np.eye(members.shape[1])[None], covariance[at[:, :, None], at[:, None, :]])
-        return BlockMarginals(covariance @ pull[:M], blocks, covariance)
-
-    def at(self, z: np.ndarray) -> "DenseLikelihood":
-        """The likelihood at other biases (M,); as it is where there is none there."""
-        point, known = recentred(self.how, self.model, self.point, self.known, jnp.asarray(z))
-        return replace(self, point=point, known=known)
-
-
-def _propagated(how: Integration, model: Model, known: Natural, point: Point, key: jax.Array) -> Integrated:
-    """What expectation propagation leaves, which keeps no draws of the hyper-parameters."""
-    known = known._replace(first=how.form.rest(known.first))
-    work = Propagation.of(how.form, known.first, DenseLikelihood(how, model, known, point), blocks_of(model), key)
-    work.run()
-    swept, last = work.swept, work.likelihood
+    `first` is the prior of what no hierarchy governs, `at` where the climb ended.
+    """
+    first = form.rest(first)
+    known = BiasLikelihood.of(engine, at, Factors.of(first), marginal=marginal)
+    work = Propagation.of(form, first, known, blocks_of(at.model), key)
+    work.run(told)
+    swept, here = work.swept, work.likelihood.here
     assert swept is not None
-    assert isinstance(last, DenseLikelihood)
     z, covariance = joint_draws(work)
     tail = 0.5 * (1.0 - INTERVAL)
     lower, upper = (quantile(swept.means, swept.sds, share) for share in (tail, 1.0 - tail))
     total = Moments(work.mean, covariance, lower, upper, swept.gamma)
-    z = z.reshape(CHAINS, KEPT, how.form.biases)
-    return Integrated(point_at(model, last.point, work.mean), last.known.information, total, z, {}, work.settled)
+    point = work.likelihood.expand(here.moved(work.mean - work.likelihood.z)).point
+    return Integrated(point, here.information() if covariance.whole else None, total, z, {}, work.settled), work
 
 
-def joint_draws(work: Propagation) -> tuple[np.ndarray, np.ndarray]:
-    """Draws (D, M) that have the marginals of a dense propagation, and their covariance (M, M).
+def joint_draws(work: Propagation) -> tuple[np.ndarray, SensorBlocks]:
+    """Draws (chain, draw, M) that have the marginals of a propagation, and the covariance as far as it is held.
 
     They are ordered as those of the Gaussian of likelihood and sites are (Iman and Conover 1982).
     """
-    swept, found = work.swept, work.found
+    swept, found, here = work.swept, work.found, work.likelihood.here
     assert swept is not None
     assert found is not None
-    rng = np.random.default_rng(np.asarray(jax.random.key_data(work.key)))
-    count, M, own = CHAINS * KEPT, work.form.biases, np.sqrt(np.diagonal(found.whole))
-    ordered = rng.standard_normal((count, M)) @ np.linalg.cholesky(found.whole).T
+    M, whole = work.form.biases, work.likelihood.whole
+    shape = (CHAINS, KEPT if whole else few_draws(M))
+    count, rng = shape[0] * shape[1], np.random.default_rng(np.asarray(jax.random.key_data(work.key)))
+    ordered = np.asarray(here.deviations(found.factors, work.key, count).z)
     pick = rng.integers(len(swept.means), size=(count, M))
     centre, spread = (np.take_along_axis(np.asarray(part), pick, 0) for part in (swept.means, swept.sds))
     alone = np.sort(centre + spread * rng.standard_normal((count, M)), 0)
-    z = np.take_along_axis(alone, np.argsort(np.argsort(ordered, 0), 0), 0)
-    share = np.sqrt(work.variance) / own
-    return z, found.whole * np.outer(share, share)
+    z = np.take_along_axis(alone, np.argsort(np.argsort(ordered, 0), 0), 0).reshape(*shape, M)
+    if not whole:
+        return z, SensorBlocks(M, work.members, swept.covariance)
+    own = SensorBlocks.of(np.asarray(here.marginals(found.factors, np.arange(M)[None]))[0])
+    return z, own.widened(np.sqrt(work.variance / own.variance))
 
 
 def likelihood(how: Integration, model: Model, first: Precision, point: Point) -> tuple[Natural, jax.Array]:

@@ -7,9 +7,9 @@ those, by split HMC (`split_hmc.py`) about an expansion of the engine that suits
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,29 +20,25 @@ import numpy as np
 from probcal.errors import FitError, InputError
 from probcal.gaussian.choose import choose_fast
 from probcal.gaussian.climb import climb_to_mode
-from probcal.gaussian.engine import Engine, Expansion, Factors, Spread
+from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point, log_density
-from probcal.identifiability.directions import alone_directions, screened_directions
-from probcal.inference.blockwise import NAMED, BlockPosterior, declared_blocks, diverged, told_columns
 from probcal.inference.chains import Draw
+from probcal.inference.ending import diverged
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.method import Context
-from probcal.inference.mixed import mixing
 from probcal.inference.posed import Form, Natural
-from probcal.inference.posterior import RARE, bias_status, judge_chains, values_by_datum
+from probcal.inference.posterior import Chains, conclude_draws
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
 from probcal.inference.split_hmc import Reference, SplitGaussian, placed, split_variables, variables_of
 from probcal.model.model import Model
-from probcal.priors import PRECISION_BOUNDS, Horseshoe, Precision, Prior
+from probcal.modes.mirrors import CLIMB
+from probcal.priors import Horseshoe, Precision, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, Draws, Summary
+from probcal.results.answer import Answer, Tracks, blocks_under
 from probcal.results.blocks import SensorBlocks
-from probcal.results.schema import INTERVAL, ROPE
-from probcal.status import Status
 
-STEPS = 60  # of the climb to the mode
 PILOT = 40  # sweeps on the Gaussian alone, the last half of which tells where the reference is taken
 KICKS, TRIED, WANTED = (1, 2, 4, 8, 16, 32, 64), 6, 0.7  # kicks of a turn: the fewest of which so many are taken
 NUMBERS = 4_000_000  # most numbers of draws of states, and of hyper-parameters by bias, that are kept
@@ -102,6 +98,10 @@ class Gibbs(Sampler):
     priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
     chunk: ClassVar[int] = 25
     engined: ClassVar[bool] = True
+    refusal: ClassVar[str] = (
+        "turns: the posterior is too far from the Gaussian of its linearised rows; take collapsed or nuts, of fewer"
+        " sensors where these do not fit"
+    )
 
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Draws of the posterior from a start, and what they say."""
@@ -112,14 +112,13 @@ class Gibbs(Sampler):
         first = prior.precision(problem.labels, problem.surveyed)
         factors = Factors.alone(np.ones(model.biases) if form.hierarchy.learnt else np.asarray(first.alpha))
         try:
-            mode = climb_to_mode(lambda at: engine.settled(model, at), start, factors, STEPS, 1e-3).at
+            mode = climb_to_mode(lambda at: engine.settled(model, at), start, factors, CLIMB, 1e-3).at
             runs = _Sweeps(self, form, first, engine, mode, context.key)
             drawn, thin, stopped = drawn_by(self, runs, 1, context.monitor, context.storage, context.threads)
             natural = Natural(jnp.zeros((0, 0)), jnp.zeros(0), model.level_spread, first)
             seconds = time.perf_counter() - began
             run = SamplerRun(self, self, form, natural, None, drawn, seconds, stopped, "", (), thin)
-            mixed = mixing(run.z)
-            posterior = GibbsChains.drawn(problem, prior, run, runs, mixed)
+            return conclude_draws(problem, prior, run, partial(GibbsChains.drawn, runs=runs))
         except MemoryError:
             raise FitError(
                 f"the factor of {model.state_size} state entries and {model.biases} biases does not fit in"
@@ -132,29 +131,6 @@ class Gibbs(Sampler):
                     " survey or fix what no row tells"
                 ) from None
             raise diverged(problem, engine.at(model, start), factors) from None
-        named = alone_directions(problem, posterior.point, posterior.declared, NAMED)  # a flat prior has no more
-        found, weak = screened_directions(problem, posterior.at, posterior.declared, NAMED) if prior.proper else named
-        posterior = replace(posterior, open=found, weak=weak)
-        status, message = judge_chains(problem, prior, run, mixed, posterior.point)
-        if (rate := float(np.asarray(drawn.stats["acceptance_rate"]).mean(1).min())) < RARE:
-            status = Status.NOT_CONVERGED if status is Status.CONVERGED else status
-            message = (
-                f"{message} A chain takes {rate:.1%} of its turns: the posterior is too far from the Gaussian of its"
-                " linearised rows; take collapsed or nuts, of fewer sensors where these do not fit."
-            ).strip()
-        ended = bias_status(problem, mixed, model.biases)
-        return Answer(
-            problem,
-            self,
-            self,
-            prior,
-            posterior,
-            status,
-            message,
-            ended,
-            run.z.shape[1],
-            interrupted=bool(stopped),
-        )
 
     def keeps_states(self, model: Model) -> bool:
         """Whether draws of all states are few enough to be kept."""
@@ -213,9 +189,6 @@ class _Sweeps:
         self.state: SweepState | None = None  # where the chains stood last
         self._reference: Reference | None = None
         self._last: SplitGaussian | None = None
-
-    def _rng(self, *which: int) -> np.random.Generator:
-        return np.random.default_rng([*np.asarray(jax.random.key_data(self.key)).ravel().tolist(), *which])
 
     def _at(self, variables: np.ndarray) -> Reference:
         """The reference at variables (n,), made once."""
@@ -339,100 +312,30 @@ class _Sweeps:
         return Draw(**fields | {"states": self._states(at), "stats": {"acceptance_rate": np.array(chain.rate)}})
 
 
-def _covariances(z: np.ndarray, members: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Covariances (B, p, p) of the members (B, p) of each block over draws z; of a single draw, variances (M,)."""
-    M, none = len(variance), members == len(variance)
-    flat = np.concatenate([z.reshape(-1, M), np.zeros((z.shape[0] * z.shape[1], 1))], 1)
-    found = np.zeros((*members.shape, members.shape[1]))
-    own = flat - flat.mean(0)
-    for b, block in enumerate(members):
-        found[b] = own[:, block].T @ own[:, block] / max(len(flat) - 1, 1)
-    eye = np.eye(members.shape[1])[None]
-    if len(flat) == 1:
-        found = eye * np.append(variance, 0.0)[members][:, None]
-    return found + eye * none[:, None]
-
-
 @dataclass(frozen=True, eq=False)
-class GibbsChains(BlockPosterior):
+class GibbsChains(Chains):
     """The draws of the biases by `Gibbs`, and moments of the states."""
-
-    run: SamplerRun | None = None
-    middle: tuple[np.ndarray, ...] = ()  # (E, n) mean states of each recursion
-
-    chained: ClassVar[bool] = True
 
     @classmethod
     def drawn(
-        cls, problem: Problem, prior: Prior, run: SamplerRun, runs: _Sweeps, mixed: Mapping[str, np.ndarray]
+        cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray], runs: _Sweeps
     ) -> GibbsChains:
-        """The posterior of a run, what the data leave open not yet said."""
+        """The posterior of a run."""
         z, model, M, state = run.z, problem.model, run.form.biases, runs.state
         assert state is not None
-        mean = z.mean((0, 1))
         which = 0 if int(state.thin) == run.thin else 1  # a longer run that was interrupted leaves the draws before it
         count, total, square, told, spread = (np.asarray(getattr(state, name))[which] for name in SUMS)
-        members = blocks_of(model)
-        blocks = SensorBlocks(M, members, _covariances(z, members, spread / count))
-        variance, gamma = square / count - (total / count) ** 2, np.clip(told / count, 0.0, 1.0)
-        tail = 50 * (1 - INTERVAL)
-        lower, upper = np.percentile(z, [tail, 100 - tail], axis=(0, 1))
-        alpha = np.clip((1 - gamma) / np.maximum(blocks.variance, 1e-300), *PRECISION_BOUNDS)
-        held = np.isin(np.arange(M), run.form.hierarchy.learnt, invert=True)
-        alpha = np.where(held, np.asarray(run.posed.first.alpha), alpha)
-        at = runs.engine.settled(model, runs.mode.moved(mean - np.asarray(runs.mode.point.z)))
-        declared = declared_blocks(at)
-        columns = dict(mixed) | told_columns(declared) | {"inclusion": (np.abs(z) > ROPE).mean((0, 1))}
-        summary = Summary(
-            "exact", "sampled", mean, None, lower, upper, gamma, alpha, None, np.zeros(0), None, columns, blocks
-        )
-        middle, _ = split_variables(model, np.asarray(state.reference)[: model.state_size] + total / count)
-        variances, _ = split_variables(model, np.maximum(variance, 0.0))
-        spread = Spread(blocks.variance, np.zeros(M), variances)
-        return cls(
-            problem, prior, at.point, summary, at, Factors.alone(alpha), spread, declared, (), 0, None, run, middle,
+        blocks = SensorBlocks.drawn(z.reshape(-1, M), blocks_of(model), spread / count)
+        at = runs.engine.settled(model, runs.mode.moved(z.mean((0, 1)) - np.asarray(runs.mode.point.z)))
+        middle = np.asarray(state.reference)[: model.state_size] + total / count
+        sd = np.sqrt(np.maximum(square / count - (total / count) ** 2, 0.0))
+        moments = tuple(map(Tracks, split_variables(model, middle)[0], split_variables(model, sd)[0]))
+        return cls.of(
+            problem, prior, run, mixed, blocks, np.clip(told / count, 0.0, 1.0), at=at, moments=moments,
+            declared=blocks_under(at, Factors.alone(np.ones(M))),
         )  # fmt: skip
 
     def log_joint(self, point: Point, phi: Phi) -> float:
         """Log density of data, noises, biases and hyper-parameters at a point, as it is kept of each draw."""
-        known = _log_prior(self._run.form, phi, self._run.posed.first, np.asarray(point.z))
+        known = _log_prior(self.run.form, phi, self.run.posed.first, np.asarray(point.z))
         return float(log_density(self.problem.model, point)) + known
-
-    @property
-    def states(self) -> Sequence[np.ndarray]:
-        """Mean states (E, n) of each recursion."""
-        return self.middle
-
-    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
-        """The draws that were made, those of states where they are few."""
-        run = self._run
-        if not run.states:
-            return Draws(run.z, run.levels, [], np.arange(run.z.shape[1]), [], [])
-        kept, likelihood, replicas = values_by_datum(self.problem, run, key, keep)
-        return Draws(run.z, run.levels, run.states if "states" in keep else [], kept, likelihood, replicas)
-
-    @property
-    def _run(self) -> SamplerRun:
-        assert self.run is not None
-        return self.run
-
-    @property
-    def variables(self) -> Mapping[str, Any]:
-        """Hyper-parameters of every draw; those by bias where they are few."""
-        return self._run.form.hierarchy.variables(self.problem.labels, self.hyper)
-
-    @property
-    def hyper(self) -> Mapping[str, np.ndarray]:
-        """Draws of the hyper-parameters, (chain, draw, ...)."""
-        return {name: np.asarray(a) for name, a in self._run.draws.phi.items()}
-
-    @property
-    def stats(self) -> Mapping[str, np.ndarray]:
-        """Log density of every draw, and how likely its turn was taken."""
-        own = {name: np.asarray(value) for name, value in self._run.draws.stats.items()}
-        return {"lp": np.asarray(self._run.draws.density)} | own
-
-    @property
-    def attrs(self) -> Mapping[str, float]:
-        """Seconds, and steps from one draw to the next, beside what a sparse fit tells."""
-        return {**super().attrs, "seconds": self._run.seconds, "thin": float(self._run.thin)}

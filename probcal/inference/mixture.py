@@ -1,120 +1,212 @@
-"""The posterior of a fit whose precisions are integrated: a mixture of Gaussians, by its moments and its draws."""
+"""The posterior of a climb: a Gaussian, or where precisions are integrated a mixture of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import Any, ClassVar
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.draws import draw, draws_a_chain
+from probcal.errors import InputError
+from probcal.gaussian.draws import draw, draw_biases, draws_a_chain
+from probcal.gaussian.engine import Factors
 from probcal.gaussian.linearised import laplace
-from probcal.inference.hierarchy import LEAST, MOST, Hierarchy, Phi, held
+from probcal.gaussian.mode import Point
+from probcal.inference.hierarchy import Hierarchy, drawn_precisions, held, inclusions
 from probcal.inference.integrate import Integrated
 from probcal.inference.posed import Form
-from probcal.priors import PRECISION_BOUNDS, Prior
+from probcal.inference.propagate import Propagation
+from probcal.priors import Prior
 from probcal.problem import Problem
-from probcal.results.answer import Draws, Posterior, Summary, Tracks, log_prior_normal, tracks_of
+from probcal.results.answer import (
+    CHAINS,
+    Draws,
+    Posterior,
+    Summary,
+    few_draws,
+    log_prior_normal,
+    precisions_of,
+    tracks_at,
+)
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import ROPE
 
 
 @dataclass(frozen=True, eq=False)
-class MixturePosterior(Posterior):
+class NormalPosterior(Posterior):
+    """A Gaussian of the biases around a point, noise levels held."""
+
+    # of the prior, where the expansion is at hand
+    factors: Factors | None = field(default=None, kw_only=True)
+    chained: ClassVar[bool] = False
+
+    @classmethod
+    def on(
+        cls,
+        problem: Problem,
+        prior: Prior,
+        point: Point,
+        covariance: SensorBlocks,
+        alpha: Any,
+        *,
+        information: Any = None,
+        evidence: float = np.nan,
+        columns: Any = None,
+        **known: Any,
+    ) -> Self:
+        """The Gaussian at a point, with the precisions alpha (M,) that a method ended with."""
+        summary = Summary.of(
+            "Laplace",
+            precisions_of(problem, prior),
+            np.asarray(point.z),
+            covariance,
+            alpha,
+            information=information,
+            levels=point.levels,
+            evidence=evidence if prior.proper else None,
+            columns=columns,
+        )
+        return cls(problem, prior, point, summary, **known)
+
+    def biases(self, key: jax.Array) -> np.ndarray:
+        """Independent draws (chain, draw, M), as many as their size and that of the data allow."""
+        M = len(self.summary.mean)
+        if self.summary.covariance.whole:
+            shape = (CHAINS, draws_a_chain(self.problem.model.size, CHAINS))
+            covariance = jnp.asarray(self.summary.covariance.matrix())
+            z = draw_biases(self.point, covariance, key, shape[0] * shape[1])
+        else:
+            assert self.factors is not None
+            shape = (CHAINS, few_draws(M))
+            drawn = self.expansion.deviations(self.factors, key, shape[0] * shape[1])
+            z = self.summary.mean + np.asarray(drawn.z)
+        return np.asarray(z).reshape(*shape, M)
+
+    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
+        """Independent draws, as many as the size of the data lets be kept."""
+        keys = jax.random.split(key)
+        return self.along(self.biases(keys[0]), keys[1], keep)
+
+    def along(self, z: np.ndarray, key: jax.Array, keep: tuple[str, ...]) -> Draws:
+        """Draws of the biases z (chain, draw, M), with a trajectory each where all is held.
+
+        Raises `InputError` for draws of what would take too much room.
+        """
+        if not self.summary.covariance.whole:
+            if {"states", "replicas"} & set(keep):
+                raise InputError(
+                    "fit(save=...): a fit in sparse form keeps no draws of states or replicas;"
+                    ' leave save out, or give engine="dense"'
+                )
+            keep = ()
+        shape, M = z.shape[:2], z.shape[2]
+        drawn: Any = ((), (), ())
+        if keep:
+            drawn = draw(self.expansion, jnp.asarray(z.reshape(-1, M)), self.point.levels, key, keep)
+        states, likelihood, replicas = ([np.asarray(a).reshape(*shape, *a.shape[1:]) for a in part] for part in drawn)
+        levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
+        return Draws(z, levels, states, np.arange(shape[1]), likelihood, replicas)
+
+
+@dataclass(frozen=True, eq=False)
+class MixturePosterior(NormalPosterior):
     """A mixture of Gaussians of the biases around a point, noise levels held."""
 
-    found: Integrated
+    z: np.ndarray  # (chain, draw, M)
     hierarchy: Hierarchy
     first: np.ndarray  # (M,) precisions before the hierarchy governs some
 
     chained: ClassVar[bool] = True
-    held: ClassVar[bool] = True
 
     @classmethod
     def of(
-        cls, problem: Problem, prior: Prior, form: Form, first: np.ndarray, found: Integrated, evidence: float
+        cls,
+        problem: Problem,
+        prior: Prior,
+        form: Form,
+        first: Any,
+        found: Integrated,
+        evidence: float,
+        work: Propagation | None = None,
     ) -> MixturePosterior:
-        """The mixture of an integration; `first` (M,) are the precisions of what no hierarchy governs.
+        """The mixture of an integration.
 
-        `evidence` is that under the declared scales.
+        `first` (M,) are the precisions of what no hierarchy governs, `evidence` is that under the
+        declared scales, `work` where a propagation ended that holds no covariance of all biases.
         """
-        mean, covariance, lower, upper, gamma = (np.asarray(part) for part in found.moments)
-        z = np.asarray(found.z)
-        columns = {"inclusion": (np.abs(z) > ROPE).mean((0, 1))}
-        if "included" in found.phi:
-            columns["included"] = np.ones(len(mean))
-            columns["included"][list(form.hierarchy.spiked)] = np.asarray(found.phi["included"]).mean((0, 1))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            own = np.clip((1 - gamma) / np.maximum(np.diag(covariance), 1e-300), *PRECISION_BOUNDS)
-        precision = np.where(held(prior, problem), first, own)
-        summary = Summary(
-            "mixture", "integrated", mean, covariance, lower, upper, gamma, precision, np.asarray(found.information),
-            np.asarray(found.point.levels), evidence, columns,
-        )  # fmt: skip
-        return cls(problem, prior, found.point, summary, found, form.hierarchy, first)
+        mean, spread, *others = found.moments
+        mean, lower, upper, gamma = map(np.asarray, (mean, *others))
+        held_whole = not isinstance(spread, SensorBlocks)
+        covariance = SensorBlocks.of(np.asarray(spread)) if held_whole else spread
+        known: dict[str, Any] = {}
+        if work is None:
+            columns = inclusions(form.hierarchy, np.asarray(found.z), found.phi)
+        else:
+            assert work.found is not None
+            assert work.begun is not None
+            factors, at = work.found.factors, work.likelihood.here
+            known = {
+                "at": at,
+                "factors": factors,
+                "moments": tracks_at(found.point, at.spread(factors).states),
+            }
+            known["declared"] = SensorBlocks(len(mean), work.members, work.begun.covariance)
+            columns = known["declared"].contraction()
+        summary = Summary.of(
+            "mixture",
+            "integrated",
+            mean,
+            covariance,
+            first,
+            gamma=gamma,
+            interval=(lower, upper),
+            governed=~held(prior, problem),
+            information=found.information,
+            levels=found.point.levels,
+            evidence=evidence,
+            columns=columns,
+        )
+        numbers = {"rope": ROPE}
+        if work is None:
+            for name in ("mean_error", "sd_error"):
+                numbers[name] = float(np.max(getattr(found, name), initial=0.0))
+        chains, count = found.z.shape[:2]  # fewer draws are kept where the data are many
+        most = min(count, draws_a_chain(problem.model.size, chains))
+        kept = np.linspace(0, count - 1, most).round().astype(int)
+        hyper = {name: np.asarray(values)[:, kept] for name, values in found.phi.items()}
+        z, variables = np.asarray(found.z)[:, kept], form.hierarchy.variables(problem.labels, hyper)
+        return cls(
+            problem,
+            prior,
+            found.point,
+            summary,
+            z,
+            form.hierarchy,
+            np.asarray(first),
+            hyper=hyper,
+            variables=variables,
+            attrs=numbers,
+            **known,
+        )
 
     @cached_property
     def worth(self) -> float | None:
         """Evidence at the mean with the precisions that the mixture ended with: declared scales would shun a swap."""
+        if self.declared is not None:
+            return super().worth
         prior = self.prior.precision(self.problem.labels, self.problem.surveyed)
         alpha = jnp.asarray(self.summary.precision)
         with jax.enable_x64(True):
             return float(laplace(self.problem.model, self.point, prior._replace(alpha=alpha)).evidence)
 
-    @property
-    def states(self) -> Sequence[np.ndarray]:
-        """States (E, n) of each recursion at the mean of the biases."""
-        return [np.asarray(x) for x in self.point.states]
-
-    def tracks(self) -> Sequence[Tracks]:
-        """States at the mean of the biases, and their sd with the biases uncertain."""
-        return tracks_of(self.expansion, SensorBlocks.of(self.summary.whole))
-
-    def _kept(self) -> np.ndarray:
-        """Which draws of each chain are kept: fewer where the data are many."""
-        chains, count = self.found.z.shape[:2]
-        return np.linspace(0, count - 1, draws_a_chain(self.problem.model.size, chains)).round().astype(int)
-
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """Draws of the mixture with a trajectory each, as many as the size of the data lets be kept."""
-        z = np.asarray(self.found.z)[:, self._kept()]
-        shape, M = z.shape[:2], z.shape[2]
-        drawn = draw(self.expansion, jnp.asarray(z.reshape(-1, M)), self.point.levels, key, keep)
-        states, likelihood, replicas = ([np.asarray(a).reshape(*shape, *a.shape[1:]) for a in part] for part in drawn)
-        levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
-        return Draws(z, levels, states, np.arange(shape[1]), likelihood, replicas)
+        return self.along(self.z, key, keep)
 
     def log_prior(self, draws: Draws) -> np.ndarray | None:
         """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
-        if self.prior.correlation or self.hierarchy.spiked or not self.found.phi:
-            return None
-        alpha = np.asarray(_precisions(self.hierarchy, dict(self.hyper), self.first))
-        return log_prior_normal(draws.z, np.clip(alpha, LEAST, MOST))
-
-    @property
-    def variables(self) -> Mapping[str, Any]:
-        """Hyper-parameters of every draw."""
-        return self.hierarchy.variables(self.problem.labels, self.hyper)
-
-    @property
-    def hyper(self) -> Mapping[str, np.ndarray]:
-        """Draws of the hyper-parameters, (chain, draw, ...)."""
-        kept = self._kept()
-        return {name: np.asarray(values)[:, kept] for name, values in self.found.phi.items()}
-
-    @property
-    def attrs(self) -> Mapping[str, float]:
-        """The limit of inclusion, and the largest Monte Carlo errors: of a mean in sd, of an sd
-        over it."""
-        errors = {"mean_error": self.found.mean_error, "sd_error": self.found.sd_error}
-        return {"rope": ROPE} | {name: float(np.max(error, initial=0.0)) for name, error in errors.items()}
-
-
-@partial(jax.jit, static_argnames="hierarchy")
-def _precisions(hierarchy: Hierarchy, phi: Phi, first: jax.Array) -> jax.Array:
-    """Precisions of all biases for draws of hyper-parameters, (chain, draw, M)."""
-    return jax.vmap(jax.vmap(lambda one: hierarchy.alpha(one, first)))(phi)
+        alpha = drawn_precisions(self.prior, self.hierarchy, self.hyper, self.first)
+        return None if alpha is None else log_prior_normal(draws.z, alpha)

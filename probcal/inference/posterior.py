@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from probcal.gaussian.draws import draws_a_chain, predictive
 from probcal.gaussian.information import at_levels, mean_square
 from probcal.gaussian.mode import Point
 from probcal.inference.ending import FAR, misfit_sentence
-from probcal.inference.hierarchy import LEAST, MOST, held
+from probcal.inference.hierarchy import drawn_precisions, inclusions
 from probcal.inference.mixed import ESS, R_HAT, UNSURE, mixing, weights_of_sides, within_sides
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Posed
@@ -22,11 +22,12 @@ from probcal.inference.sampling import SamplerRun
 from probcal.model.motions import level_values
 from probcal.modes.grid import track_mode
 from probcal.modes.mirrors import Mirrored
-from probcal.priors import PRECISION_BOUNDS, Flat, Prior
+from probcal.priors import Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
+from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
-from probcal.status import Status
+from probcal.status import CHAINS, Status, judge
 
 RARE = 0.05  # share of leaps, or of swings, taken below which it is said
 # Pareto k-hat from which importance weights, and so a guide, are unreliable (Vehtari et al. 2024)
@@ -40,28 +41,37 @@ class Chains(Posterior):
 
     run: SamplerRun
 
-    chained: ClassVar[bool] = True
     held: ClassVar[bool] = False
 
     @classmethod
-    def of(cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> Chains:
-        """The posterior of a run, whose quantities mixed as they did."""
-        z, M, gamma = run.z, run.form.biases, np.asarray(run.draws.gamma).mean((0, 1))
-        flat = z.reshape(-1, M)  # one draw has no spread: then its variances given the hyper-parameters
-        spread = np.asarray(run.draws.variance)[0, 0]
-        covariance = np.atleast_2d(np.cov(flat, rowvar=False)) if len(flat) > 1 else np.diag(spread)
+    def of(
+        cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray],
+        covariance: SensorBlocks | None = None, gamma: np.ndarray | None = None, **known: Any,
+    ) -> Self:  # fmt: skip
+        """The posterior of a run, whose quantities mixed as they did.
+
+        Covariance and gamma (M,) are those of the draws where they are not given.
+        """
+        z, M, information, columns = run.z, run.form.biases, None, _columns(run, mixed, run.form.biases)
+        if covariance is None:
+            covariance = SensorBlocks.drawn(z.reshape(-1, M), np.arange(M)[None], np.asarray(run.draws.variance)[0, 0])
+            gamma, information = np.asarray(run.draws.gamma).mean((0, 1)), run.posed.information[:M, :M]
+        if (declared := known.get("declared")) is not None:
+            columns |= declared.contraction()
         half = 50 * (1 - INTERVAL)
-        lower, upper = np.percentile(z, [half, 100 - half], axis=(0, 1))
-        precision = np.clip((1 - gamma) / np.maximum(np.diag(covariance), 1e-300), *PRECISION_BOUNDS)
-        precision = np.where(
-            held(prior, problem) | isinstance(prior, Flat), np.asarray(run.posed.first.alpha), precision
-        )
-        summary = Summary(
-            "exact" if run.method.exact else "variational", "sampled", z.mean((0, 1)), covariance, lower, upper, gamma,
-            precision, np.asarray(run.posed.information)[:M, :M], run.levels.mean((0, 1)), None,
-            _columns(run, mixed, M),
+        summary = Summary.of(
+            "exact" if run.method.exact else "variational", "sampled", z.mean((0, 1)), covariance,
+            run.posed.first.alpha, gamma=gamma, interval=np.percentile(z, [half, 100 - half], axis=(0, 1)),
+            governed=np.isin(np.arange(M), run.form.hierarchy.learnt), information=information,
+            levels=run.levels.mean((0, 1)), columns=columns,
         )  # fmt: skip
-        return cls(problem, prior, cls.point_of(problem, run), summary, run)
+        point = cls.point_of(problem, run) if "at" not in known else known["at"].point
+        known.setdefault("moments", [Tracks(x.mean((0, 1)), x.std((0, 1))) for x in run.states])
+        return cls(
+            problem, prior, point, summary, run, hyper={k: np.asarray(a) for k, a in run.draws.phi.items()},
+            variables=_variables(problem, run), stats={"lp": np.asarray(run.draws.density)} | _stats(run),
+            attrs=_numbers(run), **known,
+        )  # fmt: skip
 
     @classmethod
     def point_of(cls, problem: Problem, run: SamplerRun) -> Point:
@@ -74,60 +84,36 @@ class Chains(Posterior):
         mine = self.run.z[self.run.side == heaviest(self.run)]
         return mine.mean(0), mine.std(0) if len(mine) > 1 else self.summary.sd
 
-    @property
-    def states(self) -> Sequence[np.ndarray]:
-        """Mean states (E, n) of each recursion."""
-        return [x.mean((0, 1)) for x in self.run.states]
-
-    def tracks(self) -> Sequence[Tracks]:
-        """Mean and sd of all states."""
-        return [Tracks(x.mean((0, 1)), x.std((0, 1))) for x in self.run.states]
-
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """The draws that were made; of data that are many, values by datum at some of them."""
+        keep = keep if self.run.states else ()
         kept, likelihood, replicas = values_by_datum(self.problem, self.run, key, keep)
         states = self.run.states if "states" in keep else []
         return Draws(self.run.z, self.run.levels, states, kept, likelihood, replicas)
 
     def log_prior(self, draws: Draws) -> np.ndarray | None:
         """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
-        run = self.run
-        if isinstance(self.prior, Flat) or self.prior.correlation or run.form.hierarchy.spiked:
-            return None
-        return log_prior_normal(run.z, np.clip(_alpha(run), LEAST, MOST))
-
-    @property
-    def variables(self) -> Mapping[str, Any]:
-        """Gamma, contraction, hyper-parameters and levels of every draw."""
-        return _variables(self.problem, self.run)
-
-    @property
-    def hyper(self) -> Mapping[str, np.ndarray]:
-        """Draws of the hyper-parameters, (chain, draw, ...)."""
-        return {name: np.asarray(a) for name, a in self.run.draws.phi.items()}
-
-    @property
-    def stats(self) -> Mapping[str, np.ndarray]:
-        """Log density of every draw, and what its steps say."""
-        return {"lp": np.asarray(self.run.draws.density)} | _stats(self.run)
-
-    @property
-    def attrs(self) -> Mapping[str, float]:
-        """Seconds, the frame's worth, and the limits used."""
-        run = self.run
-        found: dict[str, Any] = {"seconds": run.seconds, "rope": ROPE, "thin": run.thin}
-        if run.worth is not None:
-            found |= {"frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
-            found |= {"frame_acceptance": run.worth.acceptance}
-        if not run.method.exact:
-            found["khat"] = pareto_khat(_stats(run)["log_weight"].ravel())
-        return {name: float(value) for name, value in found.items()}
+        alpha = drawn_precisions(self.prior, self.run.form.hierarchy, self.hyper, self.run.posed.first.alpha)
+        return None if alpha is None or self.declared is not None else log_prior_normal(self.run.z, alpha)
 
 
-def conclude_draws(problem: Problem, prior: Prior, run: SamplerRun, kind: type[Chains] = Chains) -> Answer:
+def _numbers(run: SamplerRun) -> dict[str, float]:
+    """Seconds, the worth of the frame, and the limits used."""
+    found: dict[str, Any] = {"seconds": run.seconds, "rope": ROPE, "thin": run.thin}
+    if run.worth is not None:
+        found |= {"frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
+        found |= {"frame_acceptance": run.worth.acceptance}
+    if not run.method.exact:
+        found["khat"] = pareto_khat(_stats(run)["log_weight"].ravel())
+    return {name: float(value) for name, value in found.items()}
+
+
+def conclude_draws(
+    problem: Problem, prior: Prior, run: SamplerRun, posterior_of: Callable[..., Chains] = Chains.of
+) -> Answer:
     """The answer of a sampler's run."""
     mixed = mixing(within_sides(np.asarray(run.draws.theta), run.side))
-    posterior = kind.of(problem, prior, run, mixed)
+    posterior = posterior_of(problem, prior, run, mixed)
     status, message = judge_chains(problem, prior, run, mixed, posterior.point)
     ended = bias_status(problem, mixed, run.form.biases)
     return Answer(
@@ -192,24 +178,11 @@ def values_by_datum(
     return kept, likelihood, replicas
 
 
-def _alpha(run: SamplerRun) -> np.ndarray:
-    """Prior precision (chain, draw, M) of each bias, draw by draw."""
-    phi = {name: jnp.asarray(a) for name, a in run.draws.phi.items()}
-    first = run.posed.first.alpha
-    if not phi:
-        return np.broadcast_to(np.asarray(first), run.z.shape)
-    return np.asarray(jax.vmap(jax.vmap(lambda one: run.form.hierarchy.alpha(one, first)))(phi))
-
-
 def _columns(run: SamplerRun, mixed: Mapping[str, np.ndarray], M: int) -> dict[str, np.ndarray]:
     """Columns by bias beyond the usual ones."""
     found = {name: values[:M] for name, values in mixed.items()}
-    found["contraction"] = 1.0 - run.z.var((0, 1))
-    found["inclusion"] = (np.abs(run.z) > ROPE).mean((0, 1))
-    if "included" in run.draws.phi:
-        found["included"] = np.ones(M)
-        found["included"][list(run.form.hierarchy.spiked)] = np.asarray(run.draws.phi["included"]).mean((0, 1))
-    return found
+    contraction = {"contraction": 1.0 - run.z.var((0, 1))}
+    return found | contraction | inclusions(run.form.hierarchy, run.z, run.draws.phi)
 
 
 def _variables(problem: Problem, run: SamplerRun) -> dict[str, Any]:
@@ -218,6 +191,7 @@ def _variables(problem: Problem, run: SamplerRun) -> dict[str, Any]:
         "gamma": (("bias_label",), np.asarray(run.draws.gamma)),
         "contraction": (("bias_label",), 1.0 - np.asarray(run.draws.variance)),
     }
+    found = found if np.size(run.draws.gamma) else {}
     found |= run.form.hierarchy.variables(problem.labels, run.draws.phi)
     if problem.levels:
         names = [level.label for level in problem.levels]
@@ -240,86 +214,51 @@ def judge_chains(
     problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray], mean: Point
 ) -> tuple[Status, str]:
     """Status of a run whose posterior has this mean, and one or more sentences on what hurts and what to do."""
-    said = [run.note] if run.note else []
     chains, draws = run.z.shape[:2]
-    good = True
     names = [*problem.labels, *(level.label for level in problem.levels)]
+    facts: dict[str, Any] = {"note": run.note} if run.note else {}
     if run.stopped:
-        again = draws == run.method.draws
-        how = (
-            "while more steps were made, as the draws had not mixed"
-            if again
-            else f"after {draws} of {run.method.draws}"
-        )
-        said.append(f"{run.stopped} {how}{'' if again else ' draws a chain'}; --resume goes on.")
-        good = False
+        how = f"after {draws} of {run.method.draws} draws a chain"
+        again = "while more steps were made, as the draws had not mixed"
+        facts["stopped"] = f"{run.stopped} {again if draws == run.method.draws else how}"
     if "r_hat" in mixed and mixed["r_hat"].max() > R_HAT:
-        worst = int(mixed["r_hat"].argmax())
-        said.append(
-            f"The chains have not mixed: r_hat of {names[worst]} is {mixed['r_hat'][worst]:.3f}; take more draws."
-        )
-        good = False
+        facts["r_hat"] = names[int(mixed["r_hat"].argmax())], mixed["r_hat"].max()
     worst = int(mixed["ess"].argmin())
     if mixed["ess"][worst] < ESS * chains:
-        said.append(f"Only {mixed['ess'][worst]:.0f} effective draws of {names[worst]}; take more draws.")
-        good = False
-    good = _say_sides(run, said) and good
-    if misfit := misfit_sentence(problem, mean, float(mean_square(problem.model, mean))):
-        return Status.MISFIT, " ".join([misfit, *said])
-    good = _say_steps(run, said) and good
-    if not run.method.exact:
-        good = _say_guide(run, said) and good
-    if isinstance(prior, Flat) and (np.abs(run.z.mean((0, 1))[~problem.surveyed]) > FAR).any():
-        said.append("Some biases lie far from the stated values: use a prior, or fix some.")
-        return Status.DIVERGED, " ".join(said)
-    return Status.CONVERGED if good else Status.NOT_CONVERGED, " ".join(said)
-
-
-def _say_sides(run: SamplerRun, said: list[str]) -> bool:
-    """What each side of a mirror weighs, and whether the chains agree on it."""
+        facts["few"] = names[worst], mixed["ess"][worst]
     share, error = weights_of_sides(run.side, len(run.sides) + 1)
-    if np.count_nonzero(share) < 2:
-        return True
-    listed = ", ".join(f"{share[k]:.2f} ± {error[k]:.2f}" for k in np.flatnonzero(share))
-    said.append(f"The posterior has {np.count_nonzero(share)} sides, of weights {listed}; r_hat is within sides.")
-    if error.max() > UNSURE:
-        said.append("The chains hardly cross between the sides, so that their weights are not known; take more draws.")
-        return False
-    return True
+    if np.count_nonzero(share) > 1:
+        listed = ", ".join(f"{share[k]:.2f} ± {error[k]:.2f}" for k in np.flatnonzero(share))
+        facts["sides"] = np.count_nonzero(share), listed
+        facts |= {"unsure": True} if error.max() > UNSURE else {}
+    if misfit := misfit_sentence(problem, mean, float(mean_square(problem.model, mean))):
+        return judge(CHAINS, facts | {"misfit": misfit})
+    facts |= _steps(run)
+    if not run.method.exact:
+        khat = pareto_khat(_stats(run)["log_weight"].ravel())
+        facts["fitting" if khat < K_HAT else "unfitting"] = khat, K_HAT
+    if isinstance(prior, Flat) and (np.abs(run.z.mean((0, 1))[~problem.surveyed]) > FAR).any():
+        facts["far"] = True
+    return judge(CHAINS, facts)
 
 
-def _say_guide(run: SamplerRun, said: list[str]) -> bool:
-    """Add a sentence on the fit of a guide to the posterior; true where it fits."""
-    khat = pareto_khat(_stats(run)["log_weight"].ravel())
-    fits, worth = khat < K_HAT, f"below {K_HAT:g}: it stands for the posterior"
-    if not fits:
-        worth = f"not below {K_HAT:g}: it does not fit the posterior; fit with NUTS() or Collapsed()"
-    said.append(f"Pareto k-hat of the guide is {khat:.2f}, {worth}.")
-    return fits
-
-
-def _say_steps(run: SamplerRun, said: list[str]) -> bool:
-    """What the steps of NUTS or of the Metropolis correction say; whether all is well."""
-    found, good = _stats(run), True
+def _steps(run: SamplerRun) -> dict[str, Any]:
+    """What the steps of NUTS or of the Metropolis correction say that hurts."""
+    found, facts = _stats(run), dict[str, Any]()
     if "diverging" in found and found["diverging"].any():
-        remedy = ", or take collapsed" if run.asked is run.method else ""
-        said.append(f"{int(found['diverging'].sum())} divergences: take NUTS with a higher target (0.95){remedy}.")
-        good = False
+        facts["divergences"] = int(found["diverging"].sum())
+        facts["or"] = ", or take collapsed" if run.asked is run.method else ""
     if "tree_depth" in found:
         share = float((found["tree_depth"] >= getattr(run.method, "depth", np.inf)).mean())
-        if share > 0.05:
-            said.append(
-                f"{share:.0%} of the trees reached the greatest depth: the step is short (dense=True may help)."
-            )
+        facts |= {"depth": share} if share > 0.05 else {}
     if "energy" in found and np.ptp(found["energy"], axis=1).min() > 0:
-        energy = found["energy"]
-        bfmi = (np.diff(energy, axis=1) ** 2).mean(1) / energy.var(1)
-        if bfmi.min() < BFMI:
-            said.append(f"BFMI {bfmi.min():.2f} is below {BFMI}: the energy is hardly explored; take more draws.")
-            good = False
-    if "swung" in found and (rate := found["acceptance_rate"].mean()) < RARE:
-        said.append(f"Leaps are taken in {rate:.1%} of the tries: biases move by swings alone.")
-    if "swung" in found and (rate := found["swung"].mean(1).min()) < RARE:
-        said.append(f"A chain takes {rate:.1%} of its swings: its tracks hardly move; take nuts.")
-        good = False
-    return good
+        bfmi = (np.diff(found["energy"], axis=1) ** 2).mean(1) / found["energy"].var(1)
+        facts |= {"bfmi": (bfmi.min(), BFMI)} if bfmi.min() < BFMI else {}
+    rate = found["acceptance_rate"].mean(1) if "acceptance_rate" in found else np.ones(1)
+    if "swung" in found:
+        taken = found["swung"].mean(1).min()
+        facts |= {"accepted": rate.mean()} if rate.mean() < RARE else {}
+        facts |= {"hmc": taken} if taken < RARE else {}
+    if run.method.refusal and rate.min() < RARE:
+        facts["turns"] = rate.min(), run.method.refusal
+    return facts

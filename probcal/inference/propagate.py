@@ -3,22 +3,24 @@
 A Gaussian site stands for the priors of the biases of each sensor (a block), which its own data tell apart worst: what
 is left open between a place and an offset has several answers under a sparse prior. Sites are renewed, all at once,
 until the moments of every block agree with those that the prior gives (Minka 2001; Seeger 2008); these are found by
-Gibbs sweeps within the blocks. What gives marginals of blocks, dense or sparse, is a `BiasLikelihood`.
+Gibbs sweeps within the blocks. Any engine gives the marginals of blocks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian.engine import Engine, Expansion, Factors, Group
+from probcal.gaussian.mode import Point
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form
 from probcal.priors import Precision
@@ -60,21 +62,42 @@ class BlockMarginals(NamedTuple):
 
     mean: np.ndarray  # (M,)
     covariance: np.ndarray  # (B, p, p) of each block; 1 on the diagonal where a block has fewer
-    whole: Any  # what else the likelihood found on the way, for whoever made it
+    factors: Factors  # the prior of what no hierarchy governs, and the sites
 
 
-class BiasLikelihood(Protocol):
-    """A Gaussian likelihood of the biases, taken at a point."""
+@dataclass(frozen=True, eq=False)
+class BiasLikelihood:
+    """The Gaussian likelihood of the biases at a point, by what any engine gives."""
+
+    expand: Callable[[Point], Expansion]
+    here: Expansion
+    prior: Factors  # of the biases that no hierarchy governs
+    whole: bool  # whether the covariance of all biases is made
+    marginal: bool = True  # whether the determinant of the trajectories belongs to it; not at a joint mode
+
+    @classmethod
+    def of(cls, engine: Engine, at: Expansion, prior: Factors, *, marginal: bool = True) -> BiasLikelihood:
+        """The likelihood at an expansion by an engine, and the prior of the biases that no hierarchy governs."""
+        return cls(partial(engine.settled, at.model), at, prior, engine.cheap, marginal)
 
     @property
     def z(self) -> np.ndarray:
         """Biases (M,) of the point."""
+        return np.asarray(self.here.point.z)
 
     def marginals(self, members: np.ndarray, sites: Blocks) -> BlockMarginals:
         """Marginals of blocks of members (B, p); raises `numpy.linalg.LinAlgError` where there are none."""
+        factors, here = self.prior + Factors((Group(members, sites.precision, sites.pull),)), self.here
+        if not np.isfinite(here.log_det(factors).value):
+            raise np.linalg.LinAlgError("the precision of the biases is not positive definite")
+        score = np.asarray(here.score() if self.marginal else here.slope()) + factors.pull(self.z)
+        covariance = np.asarray(here.marginals(factors, members))
+        return BlockMarginals(self.z + np.asarray(here.solve(factors, score)), covariance, factors)
 
     def at(self, z: np.ndarray) -> BiasLikelihood:
-        """The likelihood taken at other biases (M,)."""
+        """The likelihood at other biases (M,), every track at its mode; as it is where there is none there."""
+        there = self.expand(self.here.moved(z - self.z))
+        return replace(self, here=there) if np.isfinite(np.asarray(there.score())).all() else self
 
 
 @partial(jax.jit, static_argnames="form")

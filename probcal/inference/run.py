@@ -15,20 +15,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.choose import engine_of, estimates
 from probcal.gaussian.dense import DenseEngine
-from probcal.gaussian.engine import Factors
+from probcal.gaussian.engine import Engine, Factors
 from probcal.gaussian.information import mean_square
 from probcal.gaussian.linearised import LaplaceApproximation, laplace
 from probcal.gaussian.mode import Point
 from probcal.gaussian.tails import Variances, renewed
-from probcal.inference.blockwise import blockwise_answer, takes_sparse
 from probcal.inference.ending import FAR, conclude
+from probcal.inference.engined import climb_on
 from probcal.inference.hierarchy import held, learnt_groups
 from probcal.inference.integrate import Integration, integrate
 from probcal.inference.method import Context, Given, Iterated, State
 from probcal.inference.placed import Reached, with_places
 from probcal.model.model import Model
-from probcal.priors import ARD, PRECISION_BOUNDS, Precision, Prior
+from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Precision, Prior
 from probcal.priors import Laplace as LaplacePrior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -40,14 +41,18 @@ STALLED = 8  # climbs on the host after which one that gains nothing is given up
 class Maximiser(Iterated, ABC):
     """A method that climbs to a point by a pure `iterate` and reports a Gaussian there."""
 
+    engine: str | Engine = "dense"  # that expands the posterior, by name or as a value
+    trajectory: str = "joint"  # mode of biases and trajectories, or "marginal": of the biases
+
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Climb from a start until it is done or its iterations are spent.
 
         Where a method integrates trajectories, places that are far from Gaussian are integrated at the point that was
-        reached, and it climbs again with what they add. What is too large for the dense form is solved in sparse form.
+        reached, and it climbs again with what they add. What is too large for the dense engine is
+        climbed from the host on another.
         """
-        if takes_sparse(self, problem):
-            return blockwise_answer(self, problem, prior, start, context)
+        if (engine := self.expands_by(problem.model)) is not None:
+            return climb_on(engine, self, problem, prior, start, context)
         state, trace = self.climb(problem, prior, start, context)
         if self.integrates_places and problem.model.rests:
             problem, state, trace = self._with_places(problem, prior, state, trace, context)
@@ -59,6 +64,27 @@ class Maximiser(Iterated, ABC):
         square = float(mean_square(problem.model, state.point if mixed is None else mixed.point))
         stopped = context.monitor.stopped
         return conclude(problem, self, prior, state, trace, square, len(trace), how, mixed, stopped)
+
+    def expands_by(self, model: Model, *, fast: bool = False) -> Engine | None:
+        """The engine that a climb from the host asks; None where kernels of the dense one climb.
+
+        Raises `InputError` for an engine that does not take the model.
+        """
+        engine = engine_of(self.engine, model, fast=fast)
+        return None if engine.cheap and engine is not self.engine else engine
+
+    def lacking(self, prior: Prior, starts: int) -> str:
+        """What such a climb takes in the place of what was asked; empty where it does that."""
+        if not self.integrates_places:
+            return 'trajectory="marginal" alone'
+        if estimates(self.engine) and not isinstance(prior, (Gaussian, Flat)):
+            return "precisions that are given (MAP() with Gaussian() or Flat())"
+        if not isinstance(self.climbs_under(prior), (Gaussian, Flat)):
+            return (
+                "precisions that are integrated or given (EA() with Horseshoe() or ARD(rate=0.5),"
+                " MAP() with Gaussian())"
+            )
+        return "one start" if starts > 1 else ""
 
     def _with_places(
         self, plain: Problem, prior: Prior, state: State, trace: np.ndarray, context: Context
@@ -89,12 +115,13 @@ class Maximiser(Iterated, ABC):
 
     def climbs_once(self, problem: Problem, prior: Prior) -> bool:
         """Whether an answer is what one climb finds (and an integration there), so that many are one kernel."""
-        return not (takes_sparse(self, problem) or (self.integrates_places and problem.model.rests))
+        dense = self.expands_by(problem.model) is None
+        return dense and not (self.integrates_places and problem.model.rests)
 
     @property
     def integrates_places(self) -> bool:
         """Whether trajectories are integrated, so that places that are far from Gaussian matter."""
-        return False
+        return self.trajectory == "marginal"
 
     def climb(self, problem: Problem, prior: Prior, start: Point, context: Context) -> tuple[State, np.ndarray]:
         """The last state of the outer loop and the objectives on the way."""
@@ -113,8 +140,11 @@ class Maximiser(Iterated, ABC):
         """One outer iteration."""
 
     def steps_on_host(self, model: Model, prior: Prior) -> bool:
-        """Whether iterations are long and few, so that kernels shared with the rest of a fit beat one of their own."""
-        return False
+        """Whether iterations are long and few: those of a climb to the marginal mode alone.
+
+        Kernels shared with the rest of a fit then beat one of their own.
+        """
+        return self.trajectory == "marginal" and not (prior.learns or model.tailed)
 
     def begin(self, model: Model, start: Point) -> Any:
         """What is carried to the first iteration: nothing, unless said otherwise."""

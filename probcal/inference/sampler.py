@@ -39,6 +39,7 @@ class Sampler(Method, ABC):
     atoms: ClassVar[bool] = False  # whether it takes priors under which a bias may be exactly zero
     crosses: ClassVar[bool] = False  # whether its chains visit other sides of a mirror, by `across`
     roams: ClassVar[bool] = False  # whether its chains move along orbits where the frame fits badly, by `roam`
+    refusal: ClassVar[str] = ""  # its steps, and what is wrong where a chain takes few of them; empty: not looked at
     intervals: ClassVar[str] = "quantiles of the exact posterior"
     climbs: ClassVar[bool] = False
 

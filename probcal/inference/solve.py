@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
-from probcal.gaussian.choose import choose, choose_fast, estimates, factoriser
+from probcal.gaussian.choose import choose, choose_fast, engine_of, estimates, factoriser
 from probcal.gaussian.mode import Point
 from probcal.gaussian.room import check_room
-from probcal.inference.blockwise import check_sparse, gains_by_sparse, side_climb, takes_sparse
 from probcal.inference.joint_gibbs import check_gibbs
 from probcal.inference.method import Context, Method
 from probcal.inference.methods import MAP
@@ -70,8 +69,7 @@ def solve(
         problem, start = taken_there(problem, answer.posterior.point)
     moving = [problem.labels[m] for m in np.flatnonzero(away > STILL * summary.sd)]
     said = f"The times of the rows have not converged: {listed(moving, 3)} still moves from round to round."
-    status = Status.NOT_CONVERGED if answer.status.settled else answer.status
-    return replace(answer, status=status, message=f"{answer.message} {said}".strip())
+    return answer.noted(said, status=answer.status.unsettled)
 
 
 def _solve(
@@ -88,14 +86,17 @@ def _solve(
     if method.by_particles:
         return _by_particles(problem, method, prior, context, start, starts)
     given, problem = problem, method.prepare(problem)
-    if (sparse := _sparsely(problem, method, prior, starts)) is not None:
-        first = grid_start(problem, jnp.asarray(problem.first_z), 30) if start is None else start
-        return _in_sparse_form(problem, sparse, prior, first, context)
-    if start is None:
-        points = [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))]
-    else:
+    engined = _on_engine(problem, method, prior, starts)
+    method, large = engined or method, engined is not None
+    if start is not None:
         points = [_suited(given, problem, start)]
-    if not monitor.stopped:
+    elif large:
+        points = [grid_start(problem, jnp.asarray(problem.first_z), 30)]
+    else:
+        points = [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))]
+    if method.engined:
+        return _sampled_on_best_side(problem, method, prior, points[0], context)
+    if not (monitor.stopped or large):
         points += further_starts(problem, starts - len(points), jax.random.fold_in(context.key, 1))
     climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint"), Gaussian())
     optima, unseen = list[Answer](), ""
@@ -113,7 +114,10 @@ def _solve(
     found = _without(found, unseen, monitor)
     if not method.climbs or found.motion != "used":
         return found
-    beside = _beside_mirrors(found, method, context)
+    try:
+        beside = _beside_mirrors(found, cast("Maximiser", found.method), context)
+    except MemoryError:
+        return found.noted("Memory did not hold what looking at the other side of a mirror takes.")
     return replace(beside, mirrors=(*beside.mirrors, *_beside_optima(beside, (found, *found.optima))))
 
 
@@ -138,41 +142,36 @@ def _without(answer: Answer, unseen: str, monitor: Monitor) -> Answer:
     if not unseen:
         return answer
     said = f"{monitor.stopped} before {unseen} were looked at: there may be other answers."
-    return replace(answer, message=f"{answer.message} {said}".strip())
+    return answer.noted(said)
 
 
-def _sparsely(problem: Problem, method: Method, prior: Prior, starts: int) -> Method | None:
-    """The method where it solves a problem in sparse form; raises `InputError` where it must, and does not take it."""
+def _on_engine(problem: Problem, method: Method, prior: Prior, starts: int) -> Method | None:
+    """The method where an engine of large networks solves the problem; raises `InputError` for what it lacks."""
     if method.engined:
         if starts > 1:
             raise InputError(f"{method.name} takes one start: its chains begin at different draws (chains=...)")
         check_gibbs(problem, prior)
         return method
-    if isinstance(method, Maximiser) and takes_sparse(method, problem):
-        check_sparse(method, prior, starts)
-        return method
-    if isinstance(method, Maximiser) and gains_by_sparse(method, problem, prior, starts):
-        sparse: Any = method  # of those that have a form
-        return replace(sparse, engine=factoriser())
+    if isinstance(method, Maximiser):
+        lacks = method.lacking(prior, starts)
+        if method.expands_by(problem.model) is not None:
+            if lacks and estimates(method.engine):
+                raise InputError(f'{method.name}(engine="iterative") takes {lacks}')
+            if lacks:
+                raise InputError(
+                    f"{method.name} on a network of this size is solved in sparse form, which takes {lacks}"
+                )
+            return method
+        if not lacks and method.expands_by(problem.model, fast=True) is not None:
+            sparse: Any = method  # of those that have an engine
+            return replace(sparse, engine=factoriser())
     check_room(problem.model)
     return None
 
 
-def _in_sparse_form(problem: Problem, method: Method, prior: Prior, start: Point, context: Context) -> Answer:
-    """The answer of a method in sparse form, the other sides of a mirror seen to.
-
-    A sampler starts on the side that fits best, and its answer tells of the others.
-    """
-    if method.climbs:
-        context.monitor.enter("climb", answering=True)
-        found = method.answer(problem, prior, start, context)
-        used = cast("Method", found.method)  # of engine "iterative" where memory held no factor
-        try:
-            return _beside_mirrors(found, used, context, side_climb(found.problem, getattr(used, "engine", "auto")))
-        except MemoryError:
-            unseen = "Memory did not hold what looking at the other side of a mirror takes."
-            return replace(found, message=f"{found.message} {unseen}".strip())
-    climb = side_climb(problem, choose_fast(problem.model))
+def _sampled_on_best_side(problem: Problem, method: Method, prior: Prior, start: Point, context: Context) -> Answer:
+    """The answer of a sampler on an engine: it starts on the side that fits best, and tells of the others."""
+    climb = SideClimb.on(problem, choose_fast(problem.model))
     try:
         sides = other_sides(problem, climb.mode(start)[0], climb)
     except MemoryError:  # which the method says
@@ -219,7 +218,7 @@ def _by_particles(
     return replace(found, optima=tuple(answers) if len(answers) > 1 else (), best=best, mirrors=mirrors)
 
 
-def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: SideClimb | None = None) -> Answer:
+def _beside_mirrors(answer: Answer, method: Maximiser, context: Context) -> Answer:
     """The answer on the side of a mirror that fits best, and those of other sides that fit about as well.
 
     Sides are found under the declared scales, without what integrated places add, which is known near this answer
@@ -231,7 +230,8 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
     problem, here, monitor = answer.problem.untilted, answer.posterior.point, context.monitor
     if monitor.stopped:
         return answer if answer.interrupted else _without(answer, "mirror images", monitor)
-    sides = _sides_in_time(problem, here, SideClimb.dense(problem) if climb is None else climb, monitor)
+    climb = SideClimb.on(problem, engine_of(method.engine, problem.model))
+    sides = _sides_in_time(problem, here, climb, monitor)
     if sides is None:
         return _without(answer, "mirror images", monitor)
     places = [Mirrored(sides.name, 0.0, sides.point, np.zeros(0), sides.kind)] if sides.moved else []
@@ -267,10 +267,7 @@ def _beside_mirrors(answer: Answer, method: Method, context: Context, climb: Sid
             mirrors.append(Mirrored(name, _weight(one) - first - gain, place.point, place.summary.mean - mean, kind))
     mirrors += [o._replace(gain=o.gain - gain, shift=np.asarray(o.point.z) - mean) for o in unfitted]
     mirrors = sorted((other for other in mirrors if other.gain > -NEAR), key=lambda other: -other.gain)
-    best = replace(
-        best, motion=answer.motion, optima=answer.optima, best=answer.best, mirrors=tuple(mirrors),
-        message=f"{best.message} {unseen}".strip(),
-    )  # fmt: skip
+    best = best.noted(unseen, motion=answer.motion, optima=answer.optima, best=answer.best, mirrors=tuple(mirrors))
     return _without(best, f"{skipped} of {len(places)} mirror images" if skipped else "", monitor)
 
 

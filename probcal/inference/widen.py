@@ -289,9 +289,8 @@ def _widen_biases(result: xr.DataTree, group: xr.Dataset, wide: np.ndarray) -> N
     mean = group["mean"].values
     ends = {name: mean + wide * (group[name].values - mean) for name in ("lower", "upper")}
     columns = {"sd": group["sd"].values * wide, **ends, "widened": wide}
-    scales = np.ones(len(wide))
     spread = SensorBlocks.read(group, group["bias_label"].values.tolist(), "widened").widened(wide)
-    grown = spread.columns(scales) if "block" in group else {"covariance": (group["covariance"].dims, spread.matrix())}
+    grown = spread.columns(np.ones(len(wide)))
     group = group.assign({name: ("bias_label", values) for name, values in columns.items()})
     result["calibration"] = xr.DataTree(group.assign(grown))
     draws = result["posterior"].to_dataset()

@@ -14,6 +14,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.errors import FitError
+from probcal.gaussian.choose import engine_of
+from probcal.gaussian.climb import climb_to_mode
+from probcal.gaussian.engine import Engine, Factors, evidence
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point, find_mode
@@ -38,6 +42,8 @@ GAIN, MORE = 1.0, 0.1  # nats from which a piece belongs on the other side, and 
 SAME, NEAR = 3.0, 10.0  # nats within which another answer is as good, and within which it is mentioned
 CROSSED = 30  # times that nodes may cross
 MOST = 4  # answers that are kept
+CLIMB = 60  # steps of a climb by an engine
+HELD = 30.0  # nats that a node may fit worse on its other side, tracks held, where each trial is such a climb
 PIECES = "pieces of tracks on their other side"
 
 
@@ -59,15 +65,30 @@ class SideClimb(NamedTuple):
     most: float = np.inf  # nats that a node may fit worse on its other side, tracks held, and is still tried
 
     @classmethod
-    def dense(cls, problem: Problem) -> "SideClimb":
-        """To the joint mode, weighed by Laplace's formula."""
-        scales = Precision(jnp.ones(problem.model.biases))
+    def on(cls, problem: Problem, engine: Engine) -> "SideClimb":
+        """To the joint mode, weighed by Laplace's formula; on an engine of large networks to the marginal mode.
 
-        def mode(point: Point) -> tuple[Point, float]:
-            found = find_mode(problem.model, point, scales, 30, 1e-3)
+        Where log determinants are estimated the log marginal density weighs it: of reflected biases they are nearly
+        the same, and their errors would blur what tells the sides apart.
+        """
+        model, scales = problem.model, Precision(jnp.ones(problem.model.biases))
+        factors = Factors.of(scales)
+
+        def joint(point: Point) -> tuple[Point, float]:
+            found = find_mode(model, point, scales, 30, 1e-3)
             return found.point, -float(found.cost)
 
-        return cls(mode, lambda at, _: float(laplace(problem.model, at, scales).evidence))
+        def marginal(point: Point) -> tuple[Point, float]:
+            try:
+                found = climb_to_mode(lambda at: engine.settled(model, at), point, factors, CLIMB, 1e-3)
+                value = evidence(found.at, scales, factors).value if engine.exact else -found.value
+            except (np.linalg.LinAlgError, FitError):  # not positive definite, or conjugate gradients did not end
+                return point, -np.inf
+            return found.at.point, value
+
+        if engine.cheap:
+            return cls(joint, lambda at, _: float(laplace(model, at, scales).evidence))
+        return cls(marginal, lambda _, value: value, HELD)
 
 
 class Sides(NamedTuple):
@@ -87,7 +108,7 @@ def other_sides(problem: Problem, point: Point, climb: SideClimb | None = None) 
 
     Where a scene fits better on another side its pieces are looked at again from there.
     """
-    climb = SideClimb.dense(problem) if climb is None else climb
+    climb = SideClimb.on(problem, engine_of("dense", problem.model)) if climb is None else climb
     given, name, kind = point, "", SCENE
     for _ in range(ROUNDS):
         sides = _searched(problem, point, climb)

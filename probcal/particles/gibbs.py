@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -144,13 +144,12 @@ class ParticleGibbs(Sampler):
             self, self, form, natural, None, drawn, time.perf_counter() - began, stopped, "", (), thin, paths
         )  # fmt: skip
         linear = all(part is None for part in problem.model.sampled)
-        answer = conclude_draws(problem if linear else problem.seen(), prior, run, ParticleChains)
+        answer = conclude_draws(problem if linear else problem.seen(), prior, run, ParticleChains.of)
         if misfit := unexplained(answer.posterior.problem, answer.posterior.point):
             return replace(answer, status=Status.MISFIT, message=misfit)
         if (share := float(np.mean(drawn.stats["renewed"]))) < STUCK:
             more = f"A sweep renews {share:.0%} of the paths only: take more particles."
-            status = Status.NOT_CONVERGED if answer.status is Status.CONVERGED else answer.status
-            answer = replace(answer, status=status, message=f"{answer.message} {more}".strip())
+            answer = answer.noted(more, status=answer.status.unsettled)
         return answer
 
     def step(self, form: Form, posed: Any, chain: GibbsState) -> tuple[GibbsState, Sample]:
@@ -369,12 +368,14 @@ class ParticleChains(Chains):
     """The draws of particle Gibbs."""
 
     @classmethod
-    def of(cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> Chains:
+    def of(
+        cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray], *known: Any, **more: Any
+    ) -> Self:
         """The posterior of a run; where the precisions are known, the draws say what the data tell of the biases."""
-        found = super().of(problem, prior, run, mixed)
+        found = super().of(problem, prior, run, mixed, *known, **more)
         if run.form.hierarchy.learnt or run.z.shape[0] * run.z.shape[1] < MANY * run.form.biases:
             return found
-        told = np.linalg.inv(found.summary.whole) - np.asarray(run.posed.first.matrix())
+        told = np.linalg.inv(found.summary.covariance.matrix()) - np.asarray(run.posed.first.matrix())
         return replace(found, summary=replace(found.summary, information=positive(told)))
 
     @classmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -36,15 +36,14 @@ from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.results.answer import (
     CHAINS,
-    HALF,
     Answer,
     Draws,
     Posterior,
     Summary,
     Tracks,
-    log_prior_normal,
     precisions_of,
 )
+from probcal.results.blocks import SensorBlocks
 from probcal.results.build import build_tracks
 from probcal.results.groups import Band
 from probcal.status import Status
@@ -154,25 +153,14 @@ class EnsemblePosterior(Posterior):
     term: np.ndarray  # (M,)
     without: Point
     over: DrawnTracks
-    numbers: Mapping[str, float]
 
     chained: ClassVar[bool] = False
-    held: ClassVar[bool] = True
-
-    @property
-    def states(self) -> Sequence[np.ndarray]:
-        """Mean states (E, n) of each recursion."""
-        return [own.mean for own in self.over.tracks]
-
-    def tracks(self) -> Sequence[Tracks]:
-        """Mean and sd of all states, the biases uncertain."""
-        return self.over.tracks
 
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """Independent draws of the biases; of some of them, or of all where states are kept, a path and its values."""
         M, model = self.problem.model.biases, self.problem.model
         shape, keys = (CHAINS, draws_a_chain(model.size, CHAINS)), jax.random.split(key, 3)
-        covariance = jnp.asarray(self.summary.covariance)
+        covariance = jnp.asarray(self.summary.covariance.matrix())
         z = np.array(draw_biases(self.point._replace(z=jnp.asarray(self.summary.mean)), covariance, keys[0],
                                  shape[0] * shape[1])).reshape(*shape, M)  # fmt: skip
         count = shape[1] if "states" in keep else min(shape[1], SPREAD // CHAINS)
@@ -197,11 +185,6 @@ class EnsemblePosterior(Posterior):
         likelihood, replicas = ([split(a) for a in part] for part in found)
         return Draws(z, levels, [split(x) for x in states] if "states" in keep else [], kept, likelihood, replicas)
 
-    def log_prior(self, draws: Draws) -> np.ndarray | None:
-        """Log density (chain, draw, M) of each bias given its precision; None for flat or correlated ones."""
-        independent = self.prior.proper and not self.prior.correlation
-        return log_prior_normal(draws.z, self.summary.precision) if independent else None
-
     @property
     def pull(self) -> np.ndarray:
         """Linear term (M,) of the log-likelihood of z about zero."""
@@ -211,11 +194,6 @@ class EnsemblePosterior(Posterior):
     def before(self) -> Point:
         """The point with all biases zero: mean states by particles."""
         return self.without
-
-    @property
-    def attrs(self) -> Mapping[str, float]:
-        """Numbers of the last pass."""
-        return self.numbers
 
 
 class Louis(NamedTuple):
@@ -360,12 +338,10 @@ def conclude_particles(
     covariance, volume = (np.asarray(a) for a in linalg.inverse_and_logdet(matrix))
     evidence = told.log_likelihood + 0.5 * float(now.log_determinant() - now.square(ended.z)) - 0.5 * float(volume)
     alpha = np.asarray(ended.alpha)
-    with np.errstate(invalid="ignore"):  # a singular problem has no sd
-        half = HALF * np.sqrt(np.diag(covariance))
-    gamma = np.clip(1.0 - alpha * np.diag(covariance), 0.0, 1.0)
-    summary = Summary(
-        "Laplace", precisions_of(problem, prior), z, covariance, z - half, z + half, gamma, alpha,
-        slope.information, levels, evidence if prior.proper else None, {"sd_error": slope.sd_error},
+    summary = Summary.of(
+        "Laplace", precisions_of(problem, prior), z, SensorBlocks.of(covariance), alpha,
+        information=slope.information, levels=levels, evidence=evidence if prior.proper else None,
+        columns={"sd_error": slope.sd_error},
     )  # fmt: skip
     numbers = {"log_likelihood": told.log_likelihood, "log_likelihood_se": told.error, "particles": float(how.count)}
     posterior = posterior_of(paths, prior, summary, told, keys[1], numbers)
@@ -401,7 +377,7 @@ def posterior_of(
     zero = paths.at(jnp.zeros_like(z), levels, keys[0])
     before = paths.point(zero, jnp.zeros_like(z), levels)
     before = before._replace(states=tuple(m.mean for m in state_moments(problem.model, zero)))
-    drawn = np.asarray(draw_biases(point, jnp.asarray(summary.covariance), keys[1], SPREAD))
+    drawn = np.asarray(draw_biases(point, jnp.asarray(summary.covariance.matrix()), keys[1], SPREAD))
     sound = np.isfinite(drawn).all()
     over = paths.over(drawn if sound else np.asarray(z)[None], levels, keys[2])
     seen = problem
@@ -411,7 +387,7 @@ def posterior_of(
         near = follow_states(problem, [np.asarray(x) for x in point.states])
         point = track_mode(problem, near._replace(z=z, levels=jnp.asarray(levels)))
     pull = summary.information @ np.asarray(z) + told.score
-    return EnsemblePosterior(seen, prior, point, summary, paths, pull, before, over, numbers)
+    return EnsemblePosterior(seen, prior, point, summary, paths, pull, before, over, moments=over.tracks, attrs=numbers)
 
 
 def track_by_particles(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
@@ -16,15 +16,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.errors import InputError
 from probcal.gaussian.choose import engine_of
-from probcal.gaussian.draws import draw, draw_biases, draws_a_chain
-from probcal.gaussian.engine import Expansion
-from probcal.gaussian.linearised import LaplaceApproximation
+from probcal.gaussian.engine import Expansion, Factors, Spread
+from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point
 from probcal.modes.grid import track_mode
 from probcal.modes.mirrors import Mirrored
-from probcal.priors import Prior
+from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL
 from probcal.status import Status
@@ -33,6 +31,8 @@ if TYPE_CHECKING:
     from probcal.problem import Problem
 
 CHAINS = 4  # of the draws of a Gaussian, so that ArviZ reads them as it reads a sampler's
+NUMBERS = 400_000  # of the draws of all biases in a tree, where their covariance is not held
+MOST = 250  # draws of a chain then
 HALF = NormalDist().inv_cdf(0.5 + INTERVAL / 2)  # sds from the mean to an end of an interval
 
 
@@ -70,31 +70,66 @@ class Summary:
     kind: str  # "Laplace", "mixture", "exact" or "variational"
     precisions: str  # of the prior: "given", "maximised", "integrated" or "sampled"
     mean: np.ndarray  # (M,)
-    covariance: np.ndarray | None  # (M, M); None where the biases are too many for it
+    covariance: SensorBlocks
     lower: np.ndarray  # (M,) of the interval
     upper: np.ndarray  # (M,)
     gamma: np.ndarray  # (M,)
     precision: np.ndarray  # (M,) of the prior
-    information: np.ndarray | None  # (M, M) of the data, trajectories marginalised; None as well
     levels: np.ndarray  # (H,) log factors of the unknown noise levels
-    evidence: float | None = None  # where the method has one
-    columns: Mapping[str, np.ndarray] = field(default_factory=dict)  # further ones by name, (M,)
-    blocks: SensorBlocks | None = None  # of the covariance, where there is none of all
+    information: np.ndarray | None  # (M, M) of the data, trajectories marginalised, if held
+    evidence: float | None  # where the method has one
+    columns: Mapping[str, np.ndarray]  # further ones by name, (M,)
 
-    @property
-    def whole(self) -> np.ndarray:
-        """The covariance (M, M); raises `InputError` where the biases are too many for it."""
-        if self.covariance is None:
-            raise InputError(f"a fit of {len(self.mean)} biases in sparse form holds no covariance of all of them")
-        return self.covariance
+    @classmethod
+    def of(
+        cls,
+        kind: str,
+        precisions: str,
+        mean: np.ndarray,
+        covariance: SensorBlocks,
+        alpha: Any,
+        *,
+        gamma: np.ndarray | None = None,
+        interval: Any = None,
+        governed: np.ndarray | None = None,
+        levels: Any = (),
+        information: Any = None,
+        evidence: float | None = None,
+        columns: Mapping[str, np.ndarray] | None = None,
+    ) -> Summary:
+        """The summary of biases of these moments under precisions alpha (M,).
+
+        The interval and gamma are those of a Gaussian where they are not given. The precision of a bias that a
+        hierarchy governs, True in `governed` (M,), is the one that leaves its gamma.
+        """
+        alpha, variance = np.asarray(alpha), covariance.variance
+        with np.errstate(invalid="ignore", divide="ignore"):  # a singular problem has no sd
+            half = HALF * np.sqrt(variance)
+            gamma = np.clip(1.0 - alpha * variance, 0.0, 1.0) if gamma is None else gamma
+            own = np.clip((1 - gamma) / np.maximum(variance, 1e-300), *PRECISION_BOUNDS)
+        lower, upper = (mean - half, mean + half) if interval is None else interval
+        precision = alpha if governed is None else np.where(governed, own, alpha)
+        information = None if information is None else np.asarray(information)
+        levels, columns = np.asarray(levels, float), columns or {}
+        return cls(
+            kind,
+            precisions,
+            mean,
+            covariance,
+            lower,
+            upper,
+            gamma,
+            precision,
+            levels,
+            information,
+            evidence,
+            columns,
+        )
 
     @property
     def sd(self) -> np.ndarray:
         """Standard deviation of each bias, (M,)."""
-        if self.covariance is not None:
-            return np.sqrt(np.diag(self.covariance))
-        assert self.blocks is not None
-        return np.sqrt(self.blocks.variance)
+        return np.sqrt(self.covariance.variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,31 +140,51 @@ class Posterior(ABC):
     prior: Prior
     point: Point  # the mode, or the mean with the trajectories at their mode
     summary: Summary
+    # the posterior expanded at the point or near it; None: by the dense engine, when asked for
+    at: Expansion | None = field(default=None, kw_only=True)
+    # the covariance that the declared scales leave, where that of all biases is not held
+    declared: SensorBlocks | None = field(default=None, kw_only=True)
+    # of the states of each recursion, where they are known
+    moments: Sequence[Tracks] | None = field(default=None, kw_only=True)
+    # (chain, draw, ...) hyper-parameters
+    hyper: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    # further variables by draw: dims beyond chain and draw, values, and their coordinates
+    variables: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+    # (chain, draw) of a sampler
+    stats: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    # numbers of the whole run
+    attrs: Mapping[str, float] = field(default_factory=dict, kw_only=True)
 
-    chained: ClassVar[bool]  # whether draws depend on each other
-    held: ClassVar[bool]  # whether noise levels are the same in every draw
+    chained: ClassVar[bool] = True  # whether draws depend on each other
+    held: ClassVar[bool] = True  # whether noise levels are the same in every draw
 
     @property
-    @abstractmethod
     def states(self) -> Sequence[np.ndarray]:
         """Mean states (E, n) of each recursion."""
+        if self.moments is not None:
+            return [own.mean for own in self.moments]
+        return [np.asarray(x) for x in self.point.states]
 
-    @abstractmethod
     def tracks(self) -> Sequence[Tracks]:
         """Mean and sd of all states."""
+        if self.moments is not None:
+            return self.moments
+        return tracks_of(self.expansion, self.summary.covariance)
 
     @abstractmethod
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """Draws; `keep` names "states", "log_likelihood" and "replicas"."""
 
-    @abstractmethod
     def log_prior(self, draws: Draws) -> np.ndarray | None:
-        """Log density (chain, draw, M) of each bias given its precision, where each has one of its own."""
+        """Log density (chain, draw, M) of each bias given its precision; None for flat or correlated ones."""
+        known = self.prior.proper and not self.prior.correlation and self.summary.covariance.whole
+        return log_prior_normal(draws.z, self.summary.precision) if known else None
 
     @property
     def sound(self) -> bool:
         """Whether every number is finite: a flat prior on a singular problem leaves no interval."""
-        return bool(np.isfinite(self.summary.whole).all() and np.isfinite(self.summary.mean).all())
+        parts = self.summary.covariance.covariance, self.summary.mean
+        return all(bool(np.isfinite(part).all()) for part in parts)
 
     @property
     def here(self) -> tuple[np.ndarray, np.ndarray]:
@@ -156,87 +211,25 @@ class Posterior(ABC):
         z = np.asarray(at.point.z)
         return np.asarray(at.apply(z) if information is None else information @ z) + np.asarray(at.score())
 
-    @property
-    def variables(self) -> Mapping[str, Any]:
-        """Further variables by draw: dims beyond chain and draw, values, and their coordinates."""
-        return {}
-
-    @property
-    def hyper(self) -> Mapping[str, np.ndarray]:
-        """Draws of the hyper-parameters, (chain, draw, ...)."""
-        return {}
-
-    @property
-    def stats(self) -> Mapping[str, np.ndarray]:
-        """What the sampler says of each draw, (chain, draw)."""
-        return {}
-
-    @property
-    def attrs(self) -> Mapping[str, float]:
-        """Numbers of the whole run."""
-        return {}
-
-    @property
+    @cached_property
     def expansion(self) -> Expansion:
         """The posterior expanded about the point."""
-        return self._expanded
-
-    @cached_property
-    def _expanded(self) -> Expansion:
-        return engine_of("dense", self.problem.model).at(self.problem.model, self.point)
+        model = self.problem.model
+        return engine_of("dense", model).at(model, self.point) if self.at is None else self.at
 
 
-@dataclass(frozen=True, eq=False)
-class NormalPosterior(Posterior):
-    """A Gaussian of the biases around a point, noise levels held."""
+def few_draws(biases: int) -> int:
+    """Number of draws of a chain of which a tree holds every bias: few where these are many."""
+    return int(np.clip(NUMBERS // (CHAINS * max(biases, 1)), 2, MOST))
 
-    found: LaplaceApproximation
 
-    chained: ClassVar[bool] = False
-    held: ClassVar[bool] = True
-
-    @classmethod
-    def of(
-        cls, problem: Problem, prior: Prior, point: Point, found: LaplaceApproximation, alpha: np.ndarray
-    ) -> NormalPosterior:
-        """The Gaussian at a point, with the precisions alpha (M,) that a method ended with."""
-        mean, covariance = np.asarray(point.z), np.asarray(found.covariance)
-        with np.errstate(invalid="ignore"):  # a singular problem has no sd
-            half = HALF * np.sqrt(np.diag(covariance))
-        summary = Summary(
-            "Laplace", precisions_of(problem, prior), mean, covariance, mean - half, mean + half,
-            np.asarray(found.gamma), alpha, np.asarray(found.information), np.asarray(point.levels),
-            float(found.evidence) if prior.proper else None,
-        )  # fmt: skip
-        return cls(problem, prior, point, summary, found)
-
-    @property
-    def states(self) -> Sequence[np.ndarray]:
-        """States (E, n) of each recursion at the point."""
-        return [np.asarray(x) for x in self.point.states]
-
-    def tracks(self) -> Sequence[Tracks]:
-        """States at the point, and their sd with the biases uncertain."""
-        return tracks_of(self.expansion, SensorBlocks.of(np.asarray(self.found.covariance)))
-
-    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
-        """Independent draws, as many as the size of the data lets be kept."""
-        shape = (CHAINS, draws_a_chain(self.problem.model.size, CHAINS))
-        keys = jax.random.split(key)
-        z = draw_biases(self.point, self.found.covariance, keys[0], shape[0] * shape[1])
-        drawn = draw(self.expansion, z, self.point.levels, keys[1], keep)
-
-        def split(a: Any) -> np.ndarray:
-            return np.asarray(a).reshape(*shape, *a.shape[1:])
-
-        levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
-        states, likelihood, replicas = ([split(a) for a in part] for part in drawn)
-        return Draws(split(z), levels, states, np.arange(shape[1]), likelihood, replicas)
-
-    def log_prior(self, draws: Draws) -> np.ndarray | None:
-        """Log density (chain, draw, M) of each bias given its precision; None for flat or correlated ones."""
-        independent = self.prior.proper and not self.prior.correlation
-        return log_prior_normal(draws.z, self.summary.precision) if independent else None
+def blocks_under(at: Expansion, factors: Factors, spread: Spread | None = None) -> SensorBlocks:
+    """Covariances of the biases of each sensor under factors; estimated, their variances alone."""
+    spread, M = at.spread(factors) if spread is None else spread, at.model.biases
+    if spread.error.any():
+        return SensorBlocks(M, np.arange(M)[:, None], spread.biases[:, None, None])
+    members = blocks_of(at.model)
+    return SensorBlocks(M, members, np.asarray(at.marginals(factors, members)))
 
 
 def precisions_of(problem: Problem, prior: Prior) -> str:
@@ -246,8 +239,13 @@ def precisions_of(problem: Problem, prior: Prior) -> str:
 
 def tracks_of(at: Expansion, spread: SensorBlocks) -> list[Tracks]:
     """States of each recursion at a point, and their sd for a covariance of the biases."""
-    pairs = at.model.each_layout(at.point.states, at.followed(spread.root()))
-    return [Tracks(np.asarray(x), np.sqrt(np.maximum(np.asarray(variance), 0.0))) for _, x, variance in pairs]
+    return tracks_at(at.point, at.followed(spread.root()))
+
+
+def tracks_at(point: Point, variances: Sequence[Any]) -> list[Tracks]:
+    """States of each recursion at a point, with their variances (E, n)."""
+    sds = [np.sqrt(np.maximum(np.asarray(own), 0.0)) for own in variances]
+    return list(map(Tracks, map(np.asarray, point.states), sds))
 
 
 def log_prior_normal(z: np.ndarray, precision: np.ndarray) -> np.ndarray:
@@ -275,6 +273,10 @@ class Answer:
     optima: tuple[Answer, ...] = ()  # those found from several starts
     best: int = 0  # which of them is reported, or where a sampler began
     mirrors: tuple[Mirrored, ...] = ()  # answers on the other side of a line or plane that fit about as well
+
+    def noted(self, said: str, **changes: Any) -> Answer:
+        """The answer with a further sentence in its message, and other changes."""
+        return replace(self, message=f"{self.message} {said}".strip(), **changes)
 
     @property
     def objective(self) -> float:

@@ -27,6 +27,18 @@ class SensorBlocks(NamedTuple):
         """All biases in one block, by their covariance (M, M)."""
         return cls(len(covariance), np.arange(len(covariance))[None], covariance[None])
 
+    @classmethod
+    def drawn(cls, z: np.ndarray, members: np.ndarray, variance: np.ndarray) -> SensorBlocks:
+        """Those of draws z (D, M); of a single draw, which has no spread, the variances (M,)."""
+        M, none = len(variance), members == len(variance)
+        away = np.pad(z - z.mean(0), ((0, 0), (0, 1)))
+        eye, covariance = np.eye(members.shape[1])[None], np.zeros((*members.shape, members.shape[1]))
+        for b, block in enumerate(members):
+            covariance[b] = away[:, block].T @ away[:, block] / max(len(z) - 1, 1)
+        if len(z) == 1:
+            covariance = eye * np.append(variance, 0.0)[members][:, None]
+        return cls(M, members, covariance + eye * none[:, None])
+
     @property
     def whole(self) -> bool:
         """Whether the covariance of all biases is held."""
@@ -36,6 +48,10 @@ class SensorBlocks(NamedTuple):
     def variance(self) -> np.ndarray:
         """Variance of each bias, (M,)."""
         return self.of_biases(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    def contraction(self) -> dict[str, np.ndarray]:
+        """A column with the share that data narrow each bias, of its declared scale; of blocks under these."""
+        return {"contraction": np.clip(1.0 - self.variance, 0.0, 1.0)}
 
     def of_biases(self, values: np.ndarray) -> np.ndarray:
         """Values (B, p) of the members as (M,)."""
@@ -50,7 +66,9 @@ class SensorBlocks(NamedTuple):
         return self.of_biases(number), self.of_biases(place)
 
     def columns(self, scales: np.ndarray) -> dict[str, Any]:
-        """Variables of the group `calibration`: the block of each bias, and its covariance with the members of that."""
+        """Variables of the group `calibration`: of each bias its block, and its covariance with the members of that."""
+        if self.whole:
+            return {"covariance": (("bias_label", "bias_label_other"), self.matrix() * np.outer(scales, scales))}
         own, (number, place) = np.append(scales, 0.0)[self.members], self.located()
         rows = self.covariance * own[:, :, None] * own[:, None, :]
         return {

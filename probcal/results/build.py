@@ -125,15 +125,16 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
         "status": np.array(answer.bias_status, str), "pull": answer.posterior.pull,
         "kind": np.array([b.kind for b in problem.biases], str), **found.columns,
     }  # fmt: skip
-    matrices = {}
-    if found.covariance is not None:  # too many biases for it else
-        matrices = {"covariance": found.covariance * np.outer(scales, scales), "information": found.information}
+    matrices: dict[str, Any] = {}
+    if found.covariance.whole:
+        known = answer.posterior.expansion.information() if found.information is None else found.information
+        matrices = {"information": known}
     if answer.prior.correlation:
         columns |= {"correlation": np.zeros(len(labels)), "correlated_with": np.array(labels, object)}
         for members, value in answer.prior.correlated(labels, problem.surveyed):
             columns["correlation"][members], columns["correlated_with"][members] = value, labels[members[0]]
     values: dict[str, Any] = {name: ("bias_label", column) for name, column in columns.items()}
-    values |= {} if found.blocks is None else found.blocks.columns(scales)
+    values |= found.covariance.columns(scales)
     values |= {name: (("bias_label", "bias_label_other"), matrix) for name, matrix in matrices.items()}
     coords = bias_coords(problem) | ({"bias_label_other": labels} if matrices else {})
     return xr.Dataset(values, coords=coords)

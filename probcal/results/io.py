@@ -127,12 +127,11 @@ def check_content(tree: xr.DataTree, path: Path) -> None:
     if (found := tree.attrs.get("results_version")) != RESULTS_VERSION:
         age = "a newer" if isinstance(found, (int, np.integer)) and found > RESULTS_VERSION else "an older"
         raise InputError(f"{path} was written by {age} probcal; fit again")
-    sparse = tree.attrs.get("sparse", 0)
     tracks = list(tree["track"].children.values()) if "track" in tree.children else []
     if not tracks or any("target" not in node.attrs for node in tracks):
         raise InputError(f"{path} is incomplete: its group track lacks what a fit holds; fit again")
     judged = {group: members for group, members in JUDGED.items() if group in tree.children}
-    expected = [*NEEDED.items(), ("calibration", BLOCKS if sparse else WHOLE), *judged.items()]
+    expected = [*NEEDED.items(), ("calibration", BLOCKS if "block" in tree["calibration"] else WHOLE), *judged.items()]
     parts = [(group, tree.children.get(group), members) for group, members in expected]
     for name, node, members in [*parts, *((f"track/{node.name}", node, TRACKED) for node in tracks)]:
         if node is None or not set(members) <= set(node.variables):

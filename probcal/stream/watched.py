@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.draws import draw_biases, draws_a_chain
-from probcal.gaussian.linearised import LaplaceApproximation
 from probcal.gaussian.mode import Point
+from probcal.inference.mixture import NormalPosterior
 from probcal.inference.widen import widened_by
 from probcal.modes import automatic_start
 from probcal.modes.grid import track_mode
 from probcal.motion import Target
 from probcal.priors import Prior
 from probcal.problem import Problem
-from probcal.results.answer import CHAINS, Answer, Draws, NormalPosterior, Tracks
+from probcal.results.answer import Answer, Draws, Tracks
+from probcal.results.blocks import SensorBlocks
 from probcal.results.build import build
 from probcal.status import Status
 from probcal.stream.arrivals import Arrivals
@@ -91,25 +90,16 @@ class StreamPosterior(NormalPosterior):
     @property
     def pull(self) -> np.ndarray:
         """Linear term (M,) of the log-likelihood of all rows about zero."""
-        return np.linalg.solve(self.summary.whole, self.summary.mean)
+        return np.linalg.solve(self.summary.covariance.matrix(), self.summary.mean)
 
 
 @dataclass(frozen=True, eq=False)
 class FilteredPosterior(StreamPosterior):
     """The same with the tracks that particles had of the last rows, whatever the motion."""
 
-    filtered: Sequence[Tracks] = ()
-
-    def tracks(self) -> Sequence[Tracks]:
-        """Mean and sd of all states, as filtered."""
-        return self.filtered
-
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """Independent draws of the biases."""
-        shape = (CHAINS, draws_a_chain(self.problem.model.size, CHAINS))
-        z = draw_biases(self.point, self.found.covariance, key, shape[0] * shape[1])
-        levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
-        return Draws(np.asarray(z).reshape(*shape, -1), levels, [], np.arange(shape[1]), [], [])
+        return self.along(self.biases(key), key, ())
 
     @property
     def before(self) -> Point:
@@ -136,13 +126,12 @@ def calibration_tree(online: FilteredStream) -> xr.DataTree:
         point = track_mode(problem, automatic_start(problem)._replace(z=jnp.asarray(z), levels=levels))
     covariance = root @ root.T
     before = np.asarray(online.prior.precision(problem.labels, problem.surveyed).matrix())
-    alpha = np.diag(before)
-    found = LaplaceApproximation(
-        jnp.asarray(np.linalg.inv(covariance) - before), jnp.asarray(covariance),
-        jnp.asarray(np.clip(1.0 - alpha * np.diag(covariance), 0.0, 1.0)), jnp.asarray(online.log_evidence),
+    kind: Any = FilteredPosterior if sampled else StreamPosterior
+    posterior = kind.on(
+        problem, online.prior, point, SensorBlocks.of(covariance), np.diag(before),
+        information=np.linalg.inv(covariance) - before, evidence=float(online.log_evidence),
+        moments=tracks if sampled else None,
     )  # fmt: skip
-    posterior: Any = (FilteredPosterior if sampled else StreamPosterior).of(problem, online.prior, point, found, alpha)
-    posterior = replace(posterior, filtered=tracks) if sampled else posterior
     method = Watched(online.method)
     answer = Answer(
         problem, method, method, online.prior, posterior, online.status, online.message,

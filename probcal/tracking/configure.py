@@ -84,9 +84,9 @@ def configure(problem: Problem, how: Rounds, prior: Prior, context: Context) -> 
             return Configured(objects, problem, rates, k, True, beliefs)
         held.append(objects.rows)
         summary = solve(problem.assigned(room.filled(objects.rows)), how.method, prior, context).posterior.summary
-        sd = np.sqrt(np.maximum(np.diagonal(summary.whole), 1e-300))
+        sd = np.sqrt(np.maximum(np.diagonal(summary.covariance.matrix()), 1e-300))
         moves.append(float(np.max(np.abs(summary.mean - z) / sd, initial=0.0)))
-        z, covariance = summary.mean, summary.whole
+        z, covariance = summary.mean, summary.covariance.matrix()
         if k and moves[-1] < how.tolerance:
             return Configured(objects, problem, rates, k + 1, True, beliefs)
         if context.monitor.stopped:
