@@ -169,6 +169,19 @@ def test_every_member_of_an_engine_is_that_of_the_naive_one(engine, member, name
 
 
 @pytest.mark.ci
+@pytest.mark.parametrize("engine", [*EXACT, "iterative"])
+def test_a_curvature_of_many_biases_is_a_diagonal(engine):
+    """Integrated places: what many biases have is as if it stood on the diagonal of a matrix."""
+    with jax.enable_x64(True):
+        _, model, point, factors = expanded("flat")
+        M, rng = model.biases, np.random.default_rng(6)
+        own, slope = 1.0 + rng.random(M), rng.standard_normal(M)
+        tilts = (Tilt(np.zeros(M), np.array(0.4), slope, curvature) for curvature in (own, np.diag(own)))
+        one, other = (CALLED[engine]().at(model.with_tilt(tilt), point) for tilt in tilts)
+        agree(*([at.density(), at.score(), at.solve(factors, np.eye(M)), at.apply(np.eye(M))] for at in (one, other)))
+
+
+@pytest.mark.ci
 @pytest.mark.parametrize("name", WORLDS)
 def test_an_engine_without_a_factor_solves_estimates_and_refuses(name):
     """Solves to the tolerance of conjugate gradients, estimates within 5 standard errors, the rest in one sentence."""

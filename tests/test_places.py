@@ -71,7 +71,7 @@ def offset(world, engine="auto"):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "engine"), [(0, "dense"), (0, "cholmod"), (1, "cholmod"), (2, "dense")])
+@pytest.mark.parametrize(("seed", "engine"), [(0, "dense"), (0, "cholmod"), (1, "dense"), (2, "cholmod")])
 def test_tags_that_one_or_two_hear_are_integrated(seed, engine, monkeypatch):
     """Rings and pairs of places: MAP is the mode of a grid, from which Laplace's formula is far."""
     world = tags(seed, hears=[1, 2] * 8)
@@ -93,16 +93,6 @@ def consistent(problem, z=None):
         start = start._replace(z=jnp.asarray(z))
     flat = Precision(jnp.zeros(model.biases))
     return find_mode(model, start, flat, 200, 1e-10, joint=z is None).point
-
-
-@pytest.mark.ci
-def test_places_are_integrated_by_every_engine_where_biases_are_many(monkeypatch):
-    """Without the curvature, for which many biases have no memory: the mode is that of the grid."""
-    for name in ("model.model", "gaussian.places", "problem"):
-        monkeypatch.setattr(f"probcal.{name}.TILTED", 0)
-    world = tags(0, hears=[1, 2] * 8)
-    middle, sd = mode(world[-1])
-    assert all(abs(offset(world, engine)[0] - middle) < 0.1 * sd for engine in ("dense", "cholmod"))
 
 
 @pytest.mark.ci

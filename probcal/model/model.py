@@ -105,7 +105,9 @@ class Tilt(NamedTuple):
 
     def times(self, columns: Any) -> Any:
         """The curvature times columns, (M,) or (M, K)."""
-        return self.curvature @ columns if self.curvature.ndim == 2 else (self.curvature * columns.T).T
+        if self.curvature.ndim == 2:
+            return self.curvature @ columns
+        return self.curvature.reshape(-1, *(1,) * (columns.ndim - 1)) * columns
 
     def between(self, first: Any, second: Any) -> Any:
         """Its entries at pairs of biases, two arrays of numbers."""
