@@ -93,8 +93,10 @@ class Chains(Posterior):
 
     def log_prior(self, draws: Draws) -> np.ndarray | None:
         """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
+        if self.declared is not None:  # of some hyper-parameters no draws are kept
+            return None
         alpha = drawn_precisions(self.prior, self.run.form.hierarchy, self.hyper, self.run.posed.first.alpha)
-        return None if alpha is None or self.declared is not None else log_prior_normal(self.run.z, alpha)
+        return None if alpha is None else log_prior_normal(self.run.z, alpha)
 
 
 def _numbers(run: SamplerRun) -> dict[str, float]:
