@@ -31,6 +31,7 @@ from probcal.inference import residuals
 from probcal.inference.fitted import Judged, take_up
 from probcal.inference.widen import Rejection, rejection, unwidened, widened
 from probcal.labels import listed
+from probcal.linalg import invert
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.groups import bias_coords, node_of
@@ -215,7 +216,7 @@ def _shared(tree: xr.DataTree) -> dict[int, str]:
     group = tree["direction"].to_dataset()
     information, vectors = group["information"].values, group["vector"].values
     known = tree["calibration"].to_dataset()["information"].values
-    left = np.linalg.inv(known + np.eye(vectors.shape[1]))
+    left = invert(known + np.eye(vectors.shape[1]))
     off = np.abs(vectors @ left) / np.sqrt(np.diag(left)) / np.abs(vectors).max(1, keepdims=True)
     off[information >= WEAK] = 0.0
     for m in np.flatnonzero(off.max(0, initial=0.0) > SHARED):

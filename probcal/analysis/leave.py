@@ -23,6 +23,7 @@ from probcal.gaussian.places import tilt_at
 from probcal.inference.fitted import Judged
 from probcal.inference.pose import TAILED
 from probcal.inference.psis import smoothed
+from probcal.linalg import log_determinant
 from probcal.model import variants
 from probcal.model.model import Model
 from probcal.model.rows import Linearised, standardised
@@ -105,7 +106,7 @@ def _logdet(coupling: jax.Array | None, alpha: np.ndarray, held: np.ndarray) -> 
     own = np.where(alpha > 0, alpha, 1.0)[~held]
     if coupling is None:
         return float(np.log(own).sum())
-    return float(np.linalg.slogdet(np.diag(own) + np.asarray(coupling)[np.ix_(~held, ~held)])[1])
+    return float(log_determinant(np.diag(own) + np.asarray(coupling)[np.ix_(~held, ~held)]))
 
 
 class Left(NamedTuple):

@@ -14,6 +14,7 @@ from probcal import linalg
 from probcal.errors import InputError, nearest
 from probcal.gaussian.mode import compress, factors
 from probcal.labels import AXES, NOBODY
+from probcal.linalg import root_of
 from probcal.model.model import At, Model
 from probcal.problem import Problem, check_linear
 from probcal.results.read import apply
@@ -63,8 +64,7 @@ def bound_map(
             raise InputError("bound_map: the tree of biases has no group calibration; give the result of fit()")
         found = apply(at, biases)
         at, mean, levels = found.problem, found.z, found.levels
-        variances, vectors = np.linalg.eigh(found.covariance)
-        root = vectors * np.sqrt(np.maximum(variances, 0.0))
+        root = root_of(found.covariance)
     elif biases == "unknown":
         root = None
     elif biases != "known":

@@ -99,7 +99,7 @@ def _by_bias(
     model: Model, rows: Sequence[Linearised], trajectories: Sequence[Trajectory], covariance: jax.Array
 ) -> Data:
     """Variance (N, C) of each predicted value by the biases, trajectories following."""
-    root = linalg.factor(covariance)
+    root = linalg.factor_and_inverse(covariance)[0]
     return model.spread(rows, [own.response @ root for own in trajectories], root)
 
 

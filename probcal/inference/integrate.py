@@ -24,6 +24,7 @@ from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Natural, activity, draw_given, prior_precision
 from probcal.inference.propagate import BlockMarginals, Blocks, Propagation
+from probcal.linalg import cholesky
 from probcal.model.model import Model
 from probcal.priors import Precision
 from probcal.results.schema import INTERVAL
@@ -152,7 +153,7 @@ class DenseLikelihood:
         pull[:M] = self.known.pull
         precision[members[:, :, None], members[:, None, :]] += sites.precision  # no two blocks have a bias in common
         pull[members] += sites.pull
-        lower = np.linalg.cholesky(precision[:M, :M])  # what is not positive is said here
+        lower = cholesky(precision[:M, :M])  # what is not positive is said here
         covariance = cho_solve((lower, True), np.eye(M))
         at = np.minimum(members, M - 1)
         none = (members == M)[:, :, None] | (members == M)[:, None, :]
@@ -190,7 +191,7 @@ def joint_draws(work: Propagation) -> tuple[np.ndarray, np.ndarray]:
     assert found is not None
     rng = np.random.default_rng(np.asarray(jax.random.key_data(work.key)))
     count, M, own = CHAINS * KEPT, work.form.biases, np.sqrt(np.diagonal(found.whole))
-    ordered = rng.standard_normal((count, M)) @ np.linalg.cholesky(found.whole).T
+    ordered = rng.standard_normal((count, M)) @ cholesky(found.whole).T
     pick = rng.integers(len(swept.means), size=(count, M))
     centre, spread = (np.take_along_axis(np.asarray(part), pick, 0) for part in (swept.means, swept.sds))
     alone = np.sort(centre + spread * rng.standard_normal((count, M)), 0)

@@ -21,6 +21,7 @@ import numpy as np
 from probcal import linalg
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form
+from probcal.linalg import invert, without_negative
 from probcal.priors import Precision
 
 ROUNDS, SURE, CLOSE, DAMPING = 10, 2, 0.15, 0.7  # rounds, those not yet averaged, sds (rms) of a move, share of a site
@@ -210,17 +211,18 @@ class Propagation:
         try:
             return self.likelihood.marginals(self.members, self.sites)
         except np.linalg.LinAlgError:
-            self.sites = self.sites._replace(precision=_positive(self.sites.precision))
+            self.sites = self.sites._replace(precision=without_negative(self.sites.precision, LEAST))
             return self.likelihood.marginals(self.members, self.sites)
 
     def round(self, turn: int) -> float:
         """Renew all sites; the root mean square of how far the means moved, in sds."""
         self.found = found = self._marginals()
         self.begun = found if self.begun is None else self.begun
-        precision = np.linalg.inv(found.covariance)
+        precision = invert(found.covariance)
         middle = np.append(found.mean, 0.0)[self.members]
         cavity = Blocks(
-            _positive(precision - self.sites.precision), np.einsum("bij,bj->bi", precision, middle) - self.sites.pull
+            without_negative(precision - self.sites.precision, LEAST),
+            np.einsum("bij,bj->bi", precision, middle) - self.sites.pull,
         )
         if self.chain is None:
             begin = self.form.hierarchy.begin(jax.random.fold_in(self.key, 0))
@@ -228,10 +230,10 @@ class Propagation:
         own = jax.random.fold_in(self.key, 1 + turn)
         self.chain, swept = sweep_blocks(self.form, self.first, self.members, cavity, self.chain, own)
         self.swept = swept = jax.device_get(swept)
-        tilted = np.linalg.inv(swept.covariance)
+        tilted = invert(swept.covariance)
         new = Blocks(tilted - cavity.precision, np.einsum("bij,bj->bi", tilted, swept.mean) - cavity.pull)
         floor = -MINUS * cavity.precision  # what is left of a cavity stays positive
-        new = new._replace(precision=_positive(new.precision - floor) + floor)
+        new = new._replace(precision=without_negative(new.precision - floor, LEAST) + floor)
         share = min(DAMPING, 1.0 / max(turn - SURE, 1))  # later rounds are averaged: sweeps are noisy
         self.sites = Blocks(*(share * a + (1 - share) * b for a, b in zip(new, self.sites, strict=True)))
         off = self.of_biases((swept.mean - middle) / np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)))
@@ -252,9 +254,3 @@ class Propagation:
                 break
             if far >= AGAIN:
                 self.likelihood = self.likelihood.at(self.mean)
-
-
-def _positive(matrices: np.ndarray) -> np.ndarray:
-    """Symmetric matrices (B, p, p) with eigenvalues that are not negative."""
-    values, vectors = np.linalg.eigh(0.5 * (matrices + matrices.transpose(0, 2, 1)))
-    return np.einsum("bik,bk,bjk->bij", vectors, np.maximum(values, LEAST), vectors)

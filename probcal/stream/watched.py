@@ -14,6 +14,7 @@ from probcal.gaussian.draws import draw_biases, draws_a_chain
 from probcal.gaussian.linearised import LaplaceApproximation
 from probcal.gaussian.mode import Point
 from probcal.inference.widen import widened_by
+from probcal.linalg import invert, solve_square
 from probcal.modes import automatic_start
 from probcal.modes.grid import track_mode
 from probcal.motion import Target
@@ -91,7 +92,7 @@ class StreamPosterior(NormalPosterior):
     @property
     def pull(self) -> np.ndarray:
         """Linear term (M,) of the log-likelihood of all rows about zero."""
-        return np.linalg.solve(self.summary.whole, self.summary.mean)
+        return solve_square(self.summary.whole, self.summary.mean)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +139,7 @@ def calibration_tree(online: FilteredStream) -> xr.DataTree:
     before = np.asarray(online.prior.precision(problem.labels, problem.surveyed).matrix())
     alpha = np.diag(before)
     found = LaplaceApproximation(
-        jnp.asarray(np.linalg.inv(covariance) - before), jnp.asarray(covariance),
+        jnp.asarray(invert(covariance) - before), jnp.asarray(covariance),
         jnp.asarray(np.clip(1.0 - alpha * np.diag(covariance), 0.0, 1.0)), jnp.asarray(online.log_evidence),
     )  # fmt: skip
     posterior: Any = (FilteredPosterior if sampled else StreamPosterior).of(problem, online.prior, point, found, alpha)
