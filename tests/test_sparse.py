@@ -397,7 +397,7 @@ def test_what_has_no_sparse_form_is_named():
 
 def test_what_needs_the_whole_covariance_says_so():
     tree = fitted(pc.MAP(engine="cholmod"), pc.Gaussian())
-    with pytest.raises(InputError, match="needs the covariance of all biases, which a fit in sparse form"):
+    with pytest.raises(InputError, match="needs the covariance of all biases, which a large fit in sparse form"):
         of_biases(tree, drawn()[1], 0.01)
 
 

@@ -13,6 +13,7 @@ import xarray as xr
 from probcal import linalg
 from probcal.errors import InputError, nearest
 from probcal.gaussian.mode import compress, factors
+from probcal.gaussian.room import check_room
 from probcal.labels import AXES, NOBODY
 from probcal.linalg import root_of
 from probcal.model.model import At, Model
@@ -56,6 +57,8 @@ def bound_map(
     if (z is None) == (d == 3):
         raise InputError(f"bound_map: the network is {d}-D; {'give the height z' if d == 3 else 'leave z out'}")
     at = snapshot(problem, target, time)
+    if not isinstance(biases, str) or biases != "known":
+        check_room(at.model)
     M = len(at.labels)
     mean, levels = np.zeros(M), np.zeros(len(at.levels))
     root: np.ndarray | None = np.zeros((0, 0))

@@ -118,7 +118,7 @@ class Judged:
     def declared(self, tree: xr.DataTree) -> SensorBlocks | None:
         """Covariance of z by sensor that the declared scales leave; None where the information of all is held."""
         told = tree["calibration"].to_dataset()
-        if self.scaled is not None or "information" in told:
+        if self.scaled is not None or self.whole:
             return self.scaled
         if not self.engine.exact:
             apart = 1.0 - told["contraction"].values

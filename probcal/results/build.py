@@ -125,9 +125,10 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
         "status": np.array(answer.bias_status, str), "pull": answer.posterior.pull,
         "kind": np.array([b.kind for b in problem.biases], str), **found.columns,
     }  # fmt: skip
-    matrices = {}
-    if found.covariance is not None:  # too many biases for it else
-        matrices = {"covariance": found.covariance * np.outer(scales, scales), "information": found.information}
+    known = answer.posterior.expansion.information() if found.information is None else found.information
+    matrices = {} if known is None else {"information": known}  # too many biases for it else
+    if found.covariance is not None:
+        matrices["covariance"] = found.covariance * np.outer(scales, scales)
     if answer.prior.correlation:
         matrices["coupling"] = np.asarray(answer.prior.precision(problem.labels, problem.surveyed).coupling)
     values: dict[str, Any] = {name: ("bias_label", column) for name, column in columns.items()}
