@@ -332,16 +332,16 @@ def nearest_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (left * signs) @ right, values
 
 
-def root_of(covariances: np.ndarray) -> np.ndarray:
+def root_of(covariances: Any) -> Any:
     """Roots (..., n, n) of covariances of any rank, their columns along the axes: root @ root.mT is the covariance."""
     values, vectors = spectrum(covariances)
-    return vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    return vectors * library(values).sqrt(library(values).maximum(values, 0.0))[..., None, :]
 
 
-def without_negative(matrices: np.ndarray, least: float = 0.0) -> np.ndarray:
+def without_negative(matrices: Any, least: float = 0.0) -> Any:
     """The nearest symmetric matrices (..., n, n) whose eigenvalues are at least `least`."""
     values, vectors = spectrum(0.5 * (matrices + matrices.mT))
-    return (vectors * np.maximum(values, least)[..., None, :]) @ vectors.mT
+    return (vectors * library(values).maximum(values, least)[..., None, :]) @ vectors.mT
 
 
 def symmetric_root(covariance: np.ndarray) -> np.ndarray:

@@ -57,8 +57,6 @@ def bound_map(
     if (z is None) == (d == 3):
         raise InputError(f"bound_map: the network is {d}-D; {'give the height z' if d == 3 else 'leave z out'}")
     at = snapshot(problem, target, time)
-    if not isinstance(biases, str) or biases != "known":
-        check_room(at.model)
     M = len(at.labels)
     mean, levels = np.zeros(M), np.zeros(len(at.levels))
     root: np.ndarray | None = np.zeros((0, 0))
@@ -72,6 +70,8 @@ def bound_map(
         root = None
     elif biases != "known":
         raise InputError(f'bound_map: biases is {biases!r}; give "known", "unknown" or the result of fit()')
+    if root is None or len(root):
+        check_room(at.model)
     flat = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     places = flat if z is None else np.column_stack([flat, np.full(len(flat), float(z))])
     span = at.epochs[0].position

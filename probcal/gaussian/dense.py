@@ -25,6 +25,7 @@ from probcal.gaussian.linearised import (
 from probcal.gaussian.marginal import SETTLED, TRACK_STEPS, volume_slope
 from probcal.gaussian.mode import Compressed, Eliminated, Point, find_tracks, follow
 from probcal.gaussian.solves import Dense
+from probcal.linalg import without_negative
 from probcal.model.model import Data, Model, scaled
 from probcal.model.rows import Linearised
 
@@ -121,8 +122,7 @@ class DenseExpansion:
             np.linalg.cholesky(information + own)
         except np.linalg.LinAlgError:
             if np.isfinite(information).all():
-                values, vectors = np.linalg.eigh(information)
-                information = (vectors * np.maximum(values, 0.0)) @ vectors.T
+                information = without_negative(information)
         return information + own
 
     def covariance(self, factors: Factors) -> jax.Array:
