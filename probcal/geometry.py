@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.linalg import handedness
 
 TURNED = 1e-3  # by how much a rotation matrix may miss being one, of numbers that were rounded
 
@@ -61,7 +62,7 @@ def attitude(rotation: Any, *, scalar_first: bool = False) -> dict[str, Any]:
     flat = given.reshape(-1, *given.shape[-2:])
     whole = np.isfinite(flat).all((1, 2))
     safe = np.where(whole[:, None, None], flat, 0.0)
-    square, size = safe @ safe.mT - np.eye(flat.shape[-1]), np.linalg.det(safe)
+    square, size = safe @ safe.mT - np.eye(flat.shape[-1]), handedness(safe)
     bad = ~whole | (np.abs(square).max((1, 2), initial=0.0) > TURNED) | (size < 0)
     if bad.any():
         k = int(np.flatnonzero(bad)[0])

@@ -1,6 +1,7 @@
 """The only place that factorises: small triangular factors for the recursion, dense ones for the biases."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -245,40 +246,105 @@ def shortest_drive(residual: jax.Array, root: jax.Array) -> jax.Array:
     return root.T @ (inverse.T @ (inverse @ residual))
 
 
-def factor(matrix: jax.Array) -> jax.Array:
-    """Lower Cholesky factor of a symmetric positive definite matrix."""
-    return factor_and_inverse(matrix)[0]
-
-
 def solve_batched(matrices: jax.Array, right: jax.Array) -> jax.Array:
     """Solve small positive definite systems (E, n, n) for vectors (E, n)."""
     inverses = jax.vmap(inverse_cholesky)(matrices)
     return (inverses.mT @ (inverses @ right[:, :, None]))[:, :, 0]
 
 
-def inverses(matrices: jax.Array) -> jax.Array:
-    """Inverses (E, n, n) of small regular matrices."""
-    return jnp.linalg.inv(matrices)
+def library(*leaves: Any) -> Any:
+    """The library that computes with these: that of jax where one is traced, else NumPy, which compiles nothing."""
+    return jnp if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves) else np
 
 
-def spectrum(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Eigenvalues (ascending) and eigenvectors (columns) of a symmetric matrix."""
-    return jnp.linalg.eigh(matrix)
+def spectrum(matrices: Any) -> tuple[Any, Any]:
+    """Eigenvalues (ascending) and eigenvectors (columns) of symmetric matrices (..., n, n)."""
+    return library(matrices).linalg.eigh(matrices)
 
 
-def pseudo_inverse(matrices: np.ndarray) -> np.ndarray:
-    """Pseudo-inverses (E, m, n) of matrices (E, n, m), on the host."""
-    return np.linalg.pinv(matrices)
+def singular(matrices: Any, whole: bool = False) -> tuple[Any, Any, Any]:
+    """Left vectors, singular values (descending) and right vectors (rows) of matrices; all of them where `whole`."""
+    return library(matrices).linalg.svd(matrices, full_matrices=whole)
 
 
-def singular(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Singular values (descending) of a matrix and its left singular vectors (columns)."""
-    vectors, values, _ = jnp.linalg.svd(matrix, full_matrices=False)
-    return values, vectors
+def eigenvalues(matrices: Any) -> np.ndarray:
+    """Eigenvalues (..., n), ascending, of symmetric matrices on the host."""
+    return np.linalg.eigvalsh(matrices)
+
+
+def invert(matrices: Any) -> np.ndarray:
+    """Inverses of matrices (..., n, n) on the host."""
+    return np.linalg.inv(matrices)
+
+
+def pseudo_inverse(matrices: Any, symmetric: bool = False) -> np.ndarray:
+    """Pseudo-inverses (..., m, n) of matrices (..., n, m) on the host."""
+    return np.linalg.pinv(matrices, hermitian=symmetric)
+
+
+def solve_square(matrices: Any, right: Any) -> np.ndarray:
+    """Solutions of square systems on the host."""
+    return np.linalg.solve(matrices, right)
+
+
+def log_determinant(matrices: Any) -> Any:
+    """Logarithms of the determinants of matrices (..., n, n) on the host."""
+    return np.linalg.slogdet(matrices)[1]
+
+
+def handedness(matrices: Any) -> Any:
+    """Signs of the determinants: negative where a matrix mirrors, 0 where it is singular."""
+    return np.linalg.slogdet(matrices)[0]
+
+
+def cholesky(matrices: Any) -> np.ndarray:
+    """Lower Cholesky factors on the host; raises `numpy.linalg.LinAlgError` where one is not positive definite."""
+    return np.linalg.cholesky(matrices)
+
+
+def orthogonalise(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal columns with the span of those given."""
+    return np.linalg.qr(columns)[0]
+
+
+def least_squares(columns: np.ndarray, right: np.ndarray, least: float | None = None) -> np.ndarray:
+    """The shortest x with columns @ x nearest to `right`; singular values below `least` of the largest count as 0."""
+    return np.linalg.lstsq(columns, right, rcond=least)[0]
+
+
+def marginalise(information: np.ndarray, free: Any, held: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Information (F, F) of some entries, an index of F of M, the others integrated under a prior of precision `held`.
+
+    Also the C (M - F, F) by which the others move against them (Schur complement).
+    """
+    index = np.arange(len(information))
+    own, rest = index[free], np.delete(index, free)
+    across = information[np.ix_(rest, own)]
+    gain = solve_square(information[np.ix_(rest, rest)] + held * np.eye(len(rest)), across)
+    return information[np.ix_(own, own)] - across.T @ gain, gain
+
+
+def nearest_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rotation nearest to a matrix (Kabsch 1976), and the singular values of the matrix."""
+    left, values, right = singular(matrix)
+    signs = np.ones(len(matrix))
+    signs[-1] = handedness(left @ right) or 1.0
+    return (left * signs) @ right, values
+
+
+def root_of(covariances: Any) -> Any:
+    """Roots (..., n, n) of covariances of any rank, their columns along the axes: root @ root.mT is the covariance."""
+    values, vectors = spectrum(covariances)
+    return vectors * library(values).sqrt(library(values).maximum(values, 0.0))[..., None, :]
+
+
+def without_negative(matrices: Any, least: float = 0.0) -> Any:
+    """The nearest symmetric matrices (..., n, n) whose eigenvalues are at least `least`."""
+    values, vectors = spectrum(0.5 * (matrices + matrices.mT))
+    return (vectors * library(values).maximum(values, least)[..., None, :]) @ vectors.mT
 
 
 def symmetric_root(covariance: np.ndarray) -> np.ndarray:
     """The symmetric root (M, M) of a covariance: it does not turn with rounding, and may be singular."""
-    values, vectors = (np.asarray(part) for part in spectrum(jnp.asarray(covariance)))
-    root: np.ndarray = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return root
+    values, vectors = spectrum(covariance)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T

@@ -17,6 +17,7 @@ import numpy as np
 from probcal.clocks import CLOCK
 from probcal.errors import InputError, nearest
 from probcal.labels import NOBODY
+from probcal.linalg import handedness
 from probcal.model.epochs import Epoch, merged
 from probcal.model.model import TILTED, Mixing, Model, Recursion, Tail, Tilt, at_rest
 from probcal.model.motions import (
@@ -562,7 +563,7 @@ class Problem:
             driven,
             counts,
             # rows of clocks may fall on one time, here or where they are taken next
-            not self.clocks.any() and all(bool((np.linalg.slogdet(part.L)[0] != 0).all()) for part in recursions),
+            not self.clocks.any() and all(bool(handedness(part.L).all()) for part in recursions),
             sampled_of_each,
             recursions,
             rows,

@@ -115,7 +115,7 @@ MUTATIONS = [
     Mutation("solved.information @ z + score", "solved.information @ z - score", "test_integrate.py"),
     Mutation("clip(1.0 - alpha * jnp.diagonal(covariance)", "clip(1.0 - jnp.diagonal(covariance)", "test_integrate.py"),
     Mutation("total / count + jnp.cov(", "total / count + 0 * jnp.cov(", "test_integrate.py"),
-    Mutation("_positive(precision - self.sites.precision)", "_positive(precision)", "test_integrate.py"),
+    Mutation("without_negative(precision - self.sites.precision, LEAST)", "without_negative(precision, LEAST)", "test_integrate.py"),
     Mutation("middle) - self.sites.pull\n", "middle)\n", "test_integrate.py"),
     Mutation("odds + 0.5 * jnp.log(", "0.5 * jnp.log(", "test_integrate.py"),
     # inference/widen.py
@@ -193,7 +193,7 @@ MUTATIONS = [
     Mutation("round(float(np.rad2deg(value)), 12)", "round(float(value), 12)", "test_nodes.py"),
     Mutation("self.path.position + (stated - self.position)", "self.path.position", "test_nodes.py"),
     Mutation("node.sizes[component] = tuple(sds)", "node.sizes[component] = (max(sds),) * len(sds)", "test_nodes.py"),
-    Mutation("np.linalg.cholesky(unit + LOSS", "np.linalg.cholesky(unit + 4.0", "test_storage.py"),
+    Mutation("cholesky(unit + LOSS", "cholesky(unit + 4.0", "test_storage.py"),
     # geometry.py
     Mutation("jnp.round(angle / period)", "jnp.floor(angle / period)", "test_catalogue.py"),
     Mutation("jnp.stack([norm(line[:2]), line[2]])", "jnp.stack([norm(line), line[2]])", "test_catalogue.py"),

@@ -16,6 +16,7 @@ from probcal.files import parsed_json, write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place
 from probcal.labels import AXES
 from probcal.lazy import Later
+from probcal.linalg import handedness, spectrum
 from probcal.results.read import each_target
 
 if TYPE_CHECKING:
@@ -244,8 +245,8 @@ def _found(tree: xr.DataTree) -> tuple[dict[str, Any], Any]:
 
 def _ellipse(centre: np.ndarray, covariance: np.ndarray, deviations: float) -> np.ndarray:
     """Outline (CORNERS + 1, d) of an ellipse about a centre (d,), closed, counter-clockwise."""
-    values, vectors = np.linalg.eigh(covariance)
-    vectors[:, 1] *= np.sign(np.linalg.det(vectors))
+    values, vectors = spectrum(covariance)
+    vectors[:, 1] *= handedness(vectors)
     angle = np.linspace(0.0, 2 * np.pi, CORNERS + 1)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     outline = np.tile(centre, (CORNERS + 1, 1)).astype(float)

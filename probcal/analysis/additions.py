@@ -24,6 +24,7 @@ from probcal.gaussian.held import hold, inform
 from probcal.gaussian.linearised import linearise_rows
 from probcal.gaussian.mode import Point
 from probcal.labels import NOBODY
+from probcal.linalg import log_determinant
 from probcal.model import variants
 from probcal.model.model import Model, scaled
 from probcal.model.rows import Linearised, pose_vector
@@ -263,7 +264,7 @@ def gains_of_sensors(told: Informed, kind: SensorType, places: np.ndarray) -> np
                 " there; move it aside"
             )
         inner = np.eye(len(own)) + np.asarray(at.apply(np.eye(len(old))[:, own]))[own]
-        gains[k] = 0.5 * (at.log_det(scales).value - np.linalg.slogdet(inner)[1] - told.volume)
+        gains[k] = 0.5 * (at.log_det(scales).value - log_determinant(inner) - told.volume)
     return gains
 
 

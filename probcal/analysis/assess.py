@@ -31,6 +31,7 @@ from probcal.inference import residuals
 from probcal.inference.fitted import Judged, take_up
 from probcal.inference.widen import Rejection, rejection, unwidened, widened
 from probcal.labels import listed
+from probcal.linalg import invert
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.groups import bias_coords, node_of
@@ -129,7 +130,7 @@ def _assessed(fit: Judged, tree: xr.DataTree, truth: Truth | None, key: jax.Arra
     scaled = scaling.power_scaling(tree) if leave.weighable(tree) else None
     if scaled is not None:
         groups["sensitivity"] = scaled
-    if truth is not None and drawn is not None:
+    if truth is not None:
         _score(fit, tree, drawn, truth, groups)
     result, text = widened(fit, rejected, tree, fit.root)
     return completed(result, text, groups, findings)
@@ -215,7 +216,7 @@ def _shared(tree: xr.DataTree) -> dict[int, str]:
     group = tree["direction"].to_dataset()
     information, vectors = group["information"].values, group["vector"].values
     known = tree["calibration"].to_dataset()["information"].values
-    left = np.linalg.inv(known + np.eye(vectors.shape[1]))
+    left = invert(known + np.eye(vectors.shape[1]))
     off = np.abs(vectors @ left) / np.sqrt(np.diag(left)) / np.abs(vectors).max(1, keepdims=True)
     off[information >= WEAK] = 0.0
     for m in np.flatnonzero(off.max(0, initial=0.0) > SHARED):
@@ -251,14 +252,18 @@ def _disagreement(problem: Problem, change: Change, limit: float) -> str:
 
 
 def _score(
-    fit: Judged, tree: xr.DataTree, drawn: predictive.FitDraws, truth: Truth, groups: dict[str, xr.Dataset]
+    fit: Judged, tree: xr.DataTree, drawn: predictive.FitDraws | None, truth: Truth, groups: dict[str, xr.Dataset]
 ) -> None:
-    """Add NEES of positions by epoch to `epoch_check`, and those of all positions and biases to its attributes."""
+    """Add NEES of positions by epoch to `epoch_check`, and those of all positions and biases to its attributes.
+
+    Positions are judged by draws of their tracks, where there are some.
+    """
     tracked = dict(each_target(tree))
     truth.check_targets(tracked)
-    for r, epochs in enumerate(fit.problem.epochs):
+    for r, draws in enumerate(() if drawn is None else drawn.states):
+        epochs = fit.problem.epochs[r]
         for target in (name for name in tracked if name in epochs.target):
-            states = np.asarray(drawn.states[r])[:, epochs.target == target]
+            states = np.asarray(draws)[:, epochs.target == target]
             found = nees.of_positions(target, tracked[target], states, truth, RATE)
             if found is not None:
                 name = f"epoch_check/{node_of(target)}"

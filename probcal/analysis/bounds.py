@@ -20,6 +20,7 @@ from probcal.gaussian.choose import choose
 from probcal.gaussian.engine import Expansion, Factors
 from probcal.gaussian.mode import Point
 from probcal.labels import NOBODY, listed
+from probcal.linalg import spectrum
 from probcal.model.model import At, Model
 from probcal.model.rows import Linearised
 from probcal.problem import Problem
@@ -80,7 +81,7 @@ def bounds(
     if information is None:
         variance, bounded, spread = _by_ridge(at, prior, alone)
         return _tree(problem, kind, len(z), np.sqrt(variance), None, bounded, spread)
-    root, bounded = invert(information + np.diag(prior), alone)
+    root, bounded = _bounded_root(information + np.diag(prior), alone)
     covariance = root @ root.T
     return _tree(problem, kind, len(z), np.sqrt(np.diagonal(covariance)), covariance, bounded, at.followed(root))
 
@@ -151,7 +152,7 @@ def _by_ridge(
     return found.biases, found.biases < FOLLOWS * loose.biases, found.states
 
 
-def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _bounded_root(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Root (M, R) of the covariance bound, from information (M, M) and that with all else known (M,); who is bounded.
 
     A parameter is bounded where its unit vector lies in the range of the information. The range is taken after
@@ -161,7 +162,7 @@ def invert(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.n
     if not len(alone):
         return np.zeros((0, 0)), np.zeros(0, bool)
     size = np.sqrt(np.where(alone > 0, alone, 1.0))
-    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    values, vectors = spectrum(information / np.outer(size, size))
     lost = values <= LOST
     bounded = np.abs(vectors[:, lost]).max(1, initial=0.0) <= INVOLVED
     return vectors[:, ~lost] / np.sqrt(values[~lost]) / size[:, None], bounded

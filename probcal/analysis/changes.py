@@ -18,6 +18,7 @@ from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.errors import InputError, checked
 from probcal.labels import check_name, listed, step_of
+from probcal.linalg import marginalise
 from probcal.results.answer import HALF
 from probcal.results.schema import INTERVAL, matrix_of
 from probcal.status import Status
@@ -38,11 +39,8 @@ class Likelihood(NamedTuple):
     def about(self, labels: list[str]) -> "Likelihood":
         """The same about these biases alone, the others integrated under their declared scales."""
         at = [self.labels.index(label) for label in labels]
-        rest = [k for k in range(len(self.labels)) if self.labels[k] not in set(labels)]
-        G, h = self.information, self.pull
-        gain = np.linalg.solve(G[np.ix_(rest, rest)] + np.eye(len(rest)), G[np.ix_(rest, at)])
-        information = G[np.ix_(at, at)] - G[np.ix_(at, rest)] @ gain
-        return Likelihood(labels, information, h[at] - gain.T @ h[rest], self.inflation[at])
+        information, gain = marginalise(self.information, at)
+        return Likelihood(labels, information, self.pull[at] - gain.T @ np.delete(self.pull, at), self.inflation[at])
 
 
 @checked

@@ -23,6 +23,7 @@ from probcal.gaussian.places import tilt_at
 from probcal.inference.fitted import Judged
 from probcal.inference.pose import TAILED
 from probcal.inference.psis import smoothed
+from probcal.linalg import log_determinant
 from probcal.model import variants
 from probcal.model.model import Model
 from probcal.model.rows import Linearised, standardised
@@ -108,7 +109,7 @@ def _logdet(prior: Precision, held: np.ndarray) -> float:
         left = ~held[members]
         own = np.diag(alpha[members][left])
         both = own + np.asarray(added)[np.ix_(left, left)]
-        total += float(np.linalg.slogdet(both)[1] - np.linalg.slogdet(own)[1])
+        total += float(log_determinant(both) - log_determinant(own))
     return total
 
 

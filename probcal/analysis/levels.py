@@ -23,6 +23,7 @@ from probcal.gaussian.engine import Engine, Expansion, Factors, noise_informatio
 from probcal.inference.fitted import Judged
 from probcal.inference.residuals import PRACTICAL
 from probcal.labels import listed
+from probcal.linalg import eigenvalues, invert
 from probcal.model.motions import by_component, linear_of
 from probcal.motion import as_motion
 from probcal.motion.base import level_label
@@ -203,9 +204,9 @@ def _expanded(
     if not (np.isfinite(matrix).all() and np.isfinite(slope).all() and (alone > 0).all()):
         return None, at
     matrix = matrix + np.diag(known)
-    if not np.linalg.eigvalsh(matrix).min() > 0:  # far from the maximum: each level by itself
+    if not eigenvalues(matrix).min() > 0:  # far from the maximum: each level by itself
         matrix = np.diag(alone)
-    return _Expansion(slope, np.linalg.inv(matrix), pull, follow), at
+    return _Expansion(slope, invert(matrix), pull, follow), at
 
 
 def ask(fit: Judged, members: Members, factors: Factors) -> Wanted | None:

@@ -13,7 +13,9 @@ import xarray as xr
 from probcal import linalg
 from probcal.errors import InputError, nearest
 from probcal.gaussian.mode import compress, factors
+from probcal.gaussian.room import check_room
 from probcal.labels import AXES, NOBODY
+from probcal.linalg import root_of
 from probcal.model.model import At, Model
 from probcal.problem import Problem, check_linear
 from probcal.results.read import apply
@@ -63,12 +65,13 @@ def bound_map(
             raise InputError("bound_map: the tree of biases has no group calibration; give the result of fit()")
         found = apply(at, biases)
         at, mean, levels = found.problem, found.z, found.levels
-        variances, vectors = np.linalg.eigh(found.covariance)
-        root = vectors * np.sqrt(np.maximum(variances, 0.0))
+        root = root_of(found.covariance)
     elif biases == "unknown":
         root = None
     elif biases != "known":
         raise InputError(f'bound_map: biases is {biases!r}; give "known", "unknown" or the result of fit()')
+    if root is None or len(root):
+        check_room(at.model)
     flat = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     places = flat if z is None else np.column_stack([flat, np.full(len(flat), float(z))])
     span = at.epochs[0].position

@@ -10,6 +10,7 @@ from scipy import special
 from probcal import linalg
 from probcal.inference.fitted import Judged
 from probcal.labels import AXES
+from probcal.linalg import eigenvalues, spectrum
 from probcal.results.schema import matrix_of
 from probcal.simulate import Truth
 
@@ -42,7 +43,7 @@ def of_positions(target: str, track: xr.Dataset, states: np.ndarray, truth: Trut
         return None
     deviation = draws - draws.mean(0)
     covariance = np.einsum("sei,sej->eij", deviation, deviation) / (len(draws) - 1)
-    free = np.linalg.eigvalsh(covariance)[:, 0] > (EXACT * (1.0 + np.abs(true[known]).max())) ** 2
+    free = eigenvalues(covariance)[:, 0] > (EXACT * (1.0 + np.abs(true[known]).max())) ** 2
     if not free.any():
         return None
     known[known] = free
@@ -71,7 +72,7 @@ def of_biases(tree: xr.DataTree, truth: Truth, rate: float) -> tuple[float, int,
     covariance = chosen["covariance"].values / np.outer(chosen["scale"].values, chosen["scale"].values)
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     free = sd > EXACT
-    variance, vectors = np.linalg.eigh(covariance[np.ix_(free, free)] / np.outer(sd[free], sd[free]))
+    variance, vectors = spectrum(covariance[np.ix_(free, free)] / np.outer(sd[free], sd[free]))
     spread = variance > len(variance) * np.finfo(float).eps * variance.max(initial=1.0)
     along = ((error[free] / sd[free]) @ vectors)[spread]
     value = np.inf if (np.abs(error[~free]) > EXACT).any() else float(np.sum(along**2 / variance[spread]))

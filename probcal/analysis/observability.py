@@ -15,9 +15,10 @@ from probcal.gaussian.choose import choose
 from probcal.gaussian.engine import Factors
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point
-from probcal.identifiability.directions import marginal, screened_directions, weak_directions
+from probcal.identifiability.directions import screened_directions, weak_directions
 from probcal.identifiability.gauge import NULL, gauge, unfixed
 from probcal.identifiability.remedies import WEAK, Direction
+from probcal.linalg import eigenvalues, marginalise
 from probcal.problem import Problem
 from probcal.results.answer import Tracks
 from probcal.results.blocks import SensorBlocks
@@ -105,7 +106,7 @@ def _directions(
     itself.
     """
     free = ~problem.surveyed
-    values = np.linalg.eigvalsh(marginal(information, free)) if free.any() else np.full(1, np.inf)
+    values = eigenvalues(marginalise(information, free)[0]) if free.any() else np.full(1, np.inf)
     if exact:
         null = gauge(problem, point)
         found = weak_directions(problem, information, point, null)
@@ -145,7 +146,7 @@ def _biases(problem: Problem, share: np.ndarray, sd: np.ndarray, information: np
 
 def _spectrum(information: np.ndarray) -> xr.Dataset:
     """Eigenvalues of the information in z, ascending, and their shares."""
-    values = np.maximum(np.linalg.eigvalsh(information), 0.0)
+    values = np.maximum(eigenvalues(information), 0.0)
     return xr.Dataset({"information": ("eigenvalue", values), "share": ("eigenvalue", values / (1.0 + values))})
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.inference.fitted import Judged
+from probcal.linalg import invert, pseudo_inverse, solve_square, spectrum
 from probcal.model import variants
 from probcal.problem import Problem
 
@@ -47,8 +48,8 @@ class Contrast(NamedTuple):
         """The part of the chi-square that changes of the order of the declared scale explain."""
         q = len(self.estimate)
         pull = self.information @ self.estimate
-        held = np.linalg.inv(np.eye(q) + np.ones((q, q)))  # each piece its own draw: differences share the first
-        return float(pull @ np.linalg.solve(self.information + held, pull))
+        held = invert(np.eye(q) + np.ones((q, q)))  # each piece its own draw: differences share the first
+        return float(pull @ solve_square(self.information + held, pull))
 
     def along(self, direction: np.ndarray) -> float:
         """The part of the chi-square that coefficients in one direction (q,) explain."""
@@ -83,7 +84,7 @@ def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.
     K, slope = to.T @ pieces.information @ to, to.T @ pieces.score
     K[:M, :M] += prior
     slope[:M] -= prior @ pieces.z
-    inverse = np.linalg.pinv(K, hermitian=True)
+    inverse = pseudo_inverse(K, symmetric=True)
     found = {}
     for m in range(M):
         others, pull, columns = inverse, slope, pattern
@@ -115,7 +116,7 @@ def beside_level(information: np.ndarray, score: np.ndarray, least: float) -> Co
 
 def _contrast(information: np.ndarray, score: np.ndarray, least: float = LEAST) -> Contrast | None:
     information = 0.5 * (information + information.T)
-    values, vectors = np.linalg.eigh(information)
+    values, vectors = spectrum(information)
     seen = values > least
     if not seen.any():
         return None
@@ -134,7 +135,7 @@ def freed(pieces: Pieces, free: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
         K, slope = columns.T @ pieces.information @ columns, columns.T @ pieces.score
         K[:M, :M] += prior
         slope[:M] = slope[:M] - prior @ pieces.z
-        steps.append((np.linalg.pinv(K, hermitian=True) @ slope)[:M])
+        steps.append((pseudo_inverse(K, symmetric=True) @ slope)[:M])
     change: np.ndarray = steps[1] - steps[0]
     return change
 
@@ -143,7 +144,7 @@ def own_biases(pieces: Pieces, member: np.ndarray) -> np.ndarray:
     """Change (P, M) from the fit where groups of pieces, `member` (P,), have own biases, held by their scales."""
     M = len(pieces.z)
     to = np.kron(np.eye(int(member.max()) + 1)[member], np.eye(M))
-    step = np.linalg.solve(to.T @ pieces.information @ to + np.eye(to.shape[1]), to.T @ pieces.score)
+    step = solve_square(to.T @ pieces.information @ to + np.eye(to.shape[1]), to.T @ pieces.score)
     return step.reshape(-1, M)[member]
 
 

@@ -14,6 +14,7 @@ from probcal.errors import InputError
 from probcal.gaussian.mode import Point
 from probcal.identifiability.remedies import WEAK
 from probcal.labels import AXES, NOBODY
+from probcal.linalg import eigenvalues, invert, log_determinant
 from probcal.problem import Epochs, Problem
 from probcal.simulate import Truth
 from probcal.types import float64
@@ -54,7 +55,7 @@ def next_passes(
         found["weak"] = np.full(len(paths), attrs["weak_before"])
     states = np.stack([_state(epochs, like, time, path) for path in paths])
     for k, met, added in informations_of_passes(told, name, instants, states):
-        found["gain"][k] = 0.5 * np.linalg.slogdet(np.eye(len(met)) + added @ told.covariance(met))[1]
+        found["gain"][k] = 0.5 * log_determinant(np.eye(len(met)) + added @ told.covariance(met))
         if known is not None:
             with_it = known.copy()
             with_it[np.ix_(met, met)] += added
@@ -92,14 +93,14 @@ def next_anchors(
     there, eye = members < len(problem.labels), np.eye(members.shape[1])
     pairs = there[:, :, None] & there[:, None, :]
     covariance = np.where(pairs, told.at.marginals(told.scales, members), 0.0)
-    own = 0.5 * np.linalg.slogdet(eye + covariance / survey**2)[1]
+    own = 0.5 * log_determinant(eye + covariance / survey**2)
     gain = np.full(len(own), -np.inf)
     looked = np.argsort(-own, kind="stable")[:LOOKED]
     for mine in np.split(looked, np.arange(AT_ONCE, len(looked), AT_ONCE)):
         if len(own) > LOOKED and np.sort(gain)[-LISTED:][0] >= own[mine[0]]:  # no other can have more
             break
-        alone = np.where(pairs[mine], np.linalg.inv(_others_known(told, members[mine])), 0.0)
-        gain[mine] = own[mine] - 0.5 * np.linalg.slogdet(eye + alone / survey**2)[1]
+        alone = np.where(pairs[mine], invert(_others_known(told, members[mine])), 0.0)
+        gain[mine] = own[mine] - 0.5 * log_determinant(eye + alone / survey**2)
     kept = np.flatnonzero(np.isfinite(gain))
     columns = {"gain": gain[kept], "own": own[kept], "std": survey * problem.scales[members[kept, 0]]}
     attrs = {"survey": survey, "looked": len(kept)}
@@ -112,9 +113,9 @@ def next_anchors(
 
 def _weak_after(problem: Problem, information: np.ndarray, members: np.ndarray, survey: float) -> np.ndarray:
     """Numbers (B,) of weak directions that a survey of biases (B, p) each would leave."""
-    eye, apart = np.eye(members.shape[1]), np.pad(np.linalg.inv(_less_one(problem, information)), (0, 1))
+    eye, apart = np.eye(members.shape[1]), np.pad(invert(_less_one(problem, information)), (0, 1))
     inner = -eye - apart[members[:, :, None], members[:, None, :]] / survey**2
-    gone = len(eye) - (np.linalg.eigvalsh(inner) < 0).sum(1)  # inertia of the sum (Haynsworth 1968)
+    gone = len(eye) - (eigenvalues(inner) < 0).sum(1)  # inertia of the sum (Haynsworth 1968)
     return _weak(problem, information) - gone
 
 
@@ -195,7 +196,7 @@ def next_sensors(
 
 def _weak(problem: Problem, information: np.ndarray) -> int:
     """Number of weak directions of an information (M, M), surveyed biases marginalised."""
-    return int((np.linalg.eigvalsh(_less_one(problem, information)) < 0).sum())
+    return int((eigenvalues(_less_one(problem, information)) < 0).sum())
 
 
 def _less_one(problem: Problem, information: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ from probcal.analysis.verdict import RATE, limit_of
 from probcal.gaussian.engine import Expansion, Factors, Group
 from probcal.inference import residuals
 from probcal.inference.fitted import Judged
+from probcal.linalg import invert
 from probcal.model import variants
 from probcal.problem import Problem
 from probcal.results.groups import bias_coords
@@ -199,7 +200,7 @@ class _ByDifferences:
 
         Without their own factors (B, p).
         """
-        inverse = np.linalg.inv(np.asarray(self.at.marginals(factors, members)))
+        inverse = invert(np.asarray(self.at.marginals(factors, members)))
         score = np.einsum("bij,bj->bi", inverse, step[members]) + own * self.z[members]
         return inverse - np.asarray(own)[..., None] * np.eye(members.shape[1]), score
 

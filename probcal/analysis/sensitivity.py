@@ -11,7 +11,7 @@ import xarray as xr
 
 from probcal.analysis.standpoint import draw_states, on_tracks_of
 from probcal.errors import InputError, nearest
-from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows, trajectories_of
+from probcal.gaussian.choose import choose
 from probcal.gaussian.mode import Point, smooth_tracks
 from probcal.model.model import At, Model
 from probcal.modes.grid import follow_states
@@ -46,7 +46,8 @@ def sensitivity(
     Raises `InputError` for a pattern that matches no bias or one taken, and for stds that are no list of numbers.
     """
     values = {str(name): np.asarray(value, float) for name, value in stds.items()}
-    spread = _spread(problem, values)
+    units = _units(problem, values)
+    grid = np.stack(np.meshgrid(*values.values(), indexing="ij"), -1).reshape(-1, len(values))
     if runs < 1:
         raise InputError(f"sensitivity: runs={runs}; take at least one")
     given = Truth() if truth is None else truth
@@ -56,11 +57,11 @@ def sensitivity(
     start = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
     spans = tuple(epochs.position for epochs in problem.epochs)
     unit = jax.random.normal(keys[1], (runs, problem.model.biases))
-    arguments = (problem.model, spans)
-    errors = _errors(*arguments, jnp.asarray(spread), unit, true, start, jax.random.split(keys[2], runs))
-    alone, gain = _first_order(*arguments, true)
+    spread, seeds = jnp.asarray(grid @ units), jax.random.split(keys[2], runs)
+    squares = np.asarray(_errors(problem.model, spans, spread, unit, true, start, seeds))
+    alone, gain = _first_order(problem, units, true)
     shape = tuple(len(v) for v in values.values())
-    squares, predicted = np.asarray(errors), np.asarray(alone) + spread**2 @ np.asarray(gain)
+    predicted = alone + grid**2 @ gain
     dims = tuple(values)
     return xr.Dataset(
         {
@@ -73,27 +74,21 @@ def sensitivity(
     )
 
 
-def _spread(problem: Problem, values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Standard deviations of z (cells, M), the last pattern running fastest."""
+def _units(problem: Problem, values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Standard deviations of z (P, M) where the std of one pattern is 1 in the unit of its biases."""
     if not values:
         raise InputError("sensitivity: stds is empty; give label patterns with their standard deviations")
-    members: dict[str, list[int]] = {}
-    taken: set[int] = set()
-    for pattern, value in values.items():
+    found = np.zeros((len(values), len(problem.labels)))
+    for own, (pattern, value) in zip(found, values.items(), strict=True):
         if value.ndim != 1 or not len(value) or not np.isfinite(value).all() or (value < 0).any():
             raise InputError(f'sensitivity: the stds of "{pattern}" must be a list of finite numbers, none negative')
-        members[pattern] = [m for m, label in enumerate(problem.labels) if fnmatchcase(label, pattern)]
-        if not members[pattern]:
+        members = [m for m, label in enumerate(problem.labels) if fnmatchcase(label, pattern)]
+        if not members:
             raise InputError(f'sensitivity: no bias is called "{pattern}"{nearest(pattern, problem.labels)}')
-        if both := taken & set(members[pattern]):
-            raise InputError(f'sensitivity: "{pattern}" and another pattern both match {problem.labels[min(both)]}')
-        taken |= set(members[pattern])
-    spread = np.zeros((*(len(v) for v in values.values()), len(problem.labels)))
-    for axis, (pattern, value) in enumerate(values.items()):
-        mine = members[pattern]
-        along = value.reshape(-1, *(1,) * (len(values) - axis))
-        spread[..., mine] = along / problem.scales[mine]
-    return spread.reshape(-1, len(problem.labels))
+        if both := [problem.labels[m] for m in members if found[:, m].any()]:
+            raise InputError(f'sensitivity: "{pattern}" and another pattern both match {both[0]}')
+        own[members] = 1.0 / problem.scales[members]
+    return found
 
 
 @partial(jax.jit, static_argnames="spans")
@@ -123,20 +118,15 @@ def _errors(
     return jax.lax.map(one, pairs, batch_size=together).reshape(cells, runs)
 
 
-@partial(jax.jit, static_argnames="spans")
-def _first_order(model: Model, spans: Spans, true: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-    """Mean squared position error without biases, and by the square of each z (M,), averaged over runs and epochs."""
-    M, levels = model.biases, jnp.zeros(model.level_spread.shape)
-
-    def one(states: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-        point = Point(states, tuple(jnp.zeros_like(x) for x in states), jnp.zeros(M), levels)
-        alone, gain = jnp.zeros(()), jnp.zeros(M)
-        _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
-        for own, (a, b) in zip(trajectories_of(model, levels, solved), spans, strict=True):
-            alone = alone + jnp.sum(jnp.diagonal(own.covariance, axis1=1, axis2=2)[:, a:b])
-            gain = gain + jnp.sum(own.response[:, a:b] ** 2, (0, 1))
-        epochs = sum(x.shape[0] for x in states)
-        return alone / epochs, gain / epochs
-
-    alone, gain = jax.lax.map(one, true)
-    return jnp.mean(alone), jnp.mean(gain, 0)
+def _first_order(problem: Problem, units: np.ndarray, true: Sequence[jax.Array]) -> tuple[float, np.ndarray]:
+    """Mean squared position error without biases, and by the square of the std of each pattern (P,)."""
+    model, engine, found = problem.model, choose(problem.model), list[list[float]]()
+    roots = [np.zeros((model.biases, 0)), *(np.diag(own)[:, own > 0] for own in units)]
+    for k in range(len(true[0])):
+        states = tuple(x[k] for x in true)
+        noises, levels = tuple(jnp.zeros_like(x) for x in states), jnp.zeros(model.level_spread.shape)
+        at = engine.at(model, Point(states, noises, jnp.zeros(model.biases), levels))
+        variances = (problem.positions(at.followed(root)) for root in roots)
+        found.append([sum(float(own.sum()) for own in each) for each in variances])
+    alone, *whole = np.mean(found, 0) / sum(x.shape[1] for x in true)
+    return alone, np.array(whole) - alone

@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
+from probcal.linalg import invert
 from probcal.problem import Problem
 from probcal.status import Status
 
@@ -55,7 +56,7 @@ class Grounds(NamedTuple):
 
 def contraction(information: np.ndarray) -> np.ndarray:
     """How much the data narrow each bias in units of its declared scale, s = 1 - [(G + I)^-1]_mm."""
-    return np.clip(1.0 - np.diag(np.linalg.inv(information + np.eye(len(information)))), 0.0, 1.0)
+    return np.clip(1.0 - np.diag(invert(information + np.eye(len(information)))), 0.0, 1.0)
 
 
 def narrowed(share: float) -> str:

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from probcal.linalg import pseudo_inverse, solve_square
 from probcal.modes.modified import (
     GAMMA,
     Bearings,
@@ -97,7 +98,7 @@ class _Filter(NamedTuple):
                 x[-1] += _curved(all_six(at, data.kept), whole, dt)
             if data.there[k]:
                 R = np.diag(data.sigma[k, : len(data.seen)] ** 2)
-                K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
+                K = solve_square(H @ P @ H.T + R, H @ P).T
                 x = x + K @ data.innovation(x[data.seen], data.angles[k, : len(data.seen)])
                 P = (np.eye(n) - K @ H) @ P @ (np.eye(n) - K @ H).T + K @ R @ K.T
             states[k], covariances[k] = x, P
@@ -123,7 +124,7 @@ class _Filter(NamedTuple):
             moved, F, Q = self._step(at, dt)
             mean, P = moved + F @ (filtered[k] - at), F @ covariances[k] @ F.T + Q
             size = np.sqrt(np.maximum(np.diagonal(P), 1e-300))
-            G = (np.linalg.pinv(P / np.outer(size, size), hermitian=True) / np.outer(size, size) @ F @ covariances[k]).T
+            G = (pseudo_inverse(P / np.outer(size, size), symmetric=True) / np.outer(size, size) @ F @ covariances[k]).T
             states[k] = filtered[k] + G @ (states[k + 1] - mean)
             spreads[k] = covariances[k] + G @ (spreads[k + 1] - P) @ G.T
         return states, spreads

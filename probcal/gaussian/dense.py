@@ -25,6 +25,7 @@ from probcal.gaussian.linearised import (
 from probcal.gaussian.marginal import SETTLED, TRACK_STEPS, volume_slope
 from probcal.gaussian.mode import Compressed, Eliminated, Point, find_tracks, follow
 from probcal.gaussian.solves import Dense
+from probcal.linalg import without_negative
 from probcal.model.model import Data, Model, scaled
 from probcal.model.rows import Linearised
 
@@ -121,8 +122,7 @@ class DenseExpansion:
             np.linalg.cholesky(information + own)
         except np.linalg.LinAlgError:
             if np.isfinite(information).all():
-                values, vectors = np.linalg.eigh(information)
-                information = (vectors * np.maximum(values, 0.0)) @ vectors.T
+                information = without_negative(information)
         return information + own
 
     def covariance(self, factors: Factors) -> jax.Array:
@@ -175,9 +175,10 @@ class DenseExpansion:
     def followed(self, root: Any) -> list[np.ndarray]:
         """Variance (E, n) of every state where the biases have the covariance root root', root (M,
         R)."""
-        whole = root @ root.T
-        whole = whole if isinstance(whole, np.ndarray) else whole.toarray()
-        return [np.asarray(own) for own in self.variances(jnp.asarray(whole))]
+        root = root if isinstance(root, np.ndarray) else root.toarray()
+        moved = (np.sum((np.asarray(own.response) @ root) ** 2, 2) for own in self.trajectories)
+        pairs = zip(self.held_states, moved, strict=True)
+        return [np.diagonal(np.asarray(held), axis1=1, axis2=2) + own for held, own in pairs]
 
     def variances(self, covariance: jax.Array) -> tuple[jax.Array, ...]:
         """Variance (E, n) of every state of each recursion, for a covariance (M, M) of the biases."""

@@ -44,7 +44,7 @@ def draws_a_chain(data: int, chains: int) -> int:
 def draw_biases(point: Point, covariance: jax.Array, key: jax.Array, count: int) -> jax.Array:
     """Draws (D, M) of the biases from a Gaussian around a point."""
     M = point.z.shape[0]
-    root = linalg.factor(covariance) if M else jnp.zeros((0, 0))
+    root = linalg.factor_and_inverse(covariance)[0] if M else jnp.zeros((0, 0))
     return point.z[None, :] + jax.random.normal(key, (count, M)) @ root.T
 
 

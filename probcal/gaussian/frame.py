@@ -220,8 +220,7 @@ def _with_levels(
     corner = jnp.stack([jnp.stack(row) for row in own])
     # what the levels tell once the biases are found is kept positive: differences are no proof of it
     explained = cross @ linalg.solve_positive(G + 1e-6 * jnp.eye(G.shape[0]), cross.T)
-    values, vectors = linalg.spectrum(corner - explained)
-    corner = explained + (vectors * jnp.maximum(values, 1.0)[None]) @ vectors.T
+    corner = explained + linalg.without_negative(corner - explained, 1.0)
     return jnp.block([[G, cross.T], [cross, 0.5 * (corner + corner.T)]]), jnp.concatenate([g, slope])
 
 

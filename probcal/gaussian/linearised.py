@@ -99,7 +99,7 @@ def _by_bias(
     model: Model, rows: Sequence[Linearised], trajectories: Sequence[Trajectory], covariance: jax.Array
 ) -> Data:
     """Variance (N, C) of each predicted value by the biases, trajectories following."""
-    root = linalg.factor(covariance)
+    root = linalg.factor_and_inverse(covariance)[0]
     return model.spread(rows, [own.response @ root for own in trajectories], root)
 
 
@@ -110,13 +110,8 @@ def given_biases(model: Model, levels: jax.Array, solved: Eliminated) -> tuple[G
     for part, kept in model.each_layout(solved.parts):
         L = factors(part, levels)
         spread = jnp.diagonal(rec.covariances(part.F, L, kept.gain)[1], axis1=1, axis2=2)
-        found.append(GivenBiases(L, _half(kept.J), spread))
+        found.append(GivenBiases(L, linalg.root_of(kept.J), spread))
     return tuple(found)
-
-
-def _half(J: jax.Array) -> jax.Array:
-    values, vectors = linalg.spectrum(J)
-    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
 
 
 @jax.jit
@@ -138,7 +133,7 @@ def trajectories_of(model: Model, levels: jax.Array, solved: Eliminated) -> tupl
     found = []
     for part, kept in model.each_layout(solved.parts):
         L = factors(part, levels)
-        half = _half(kept.J)
+        half = linalg.root_of(kept.J)
         response = rec.smooth(part.F, kept.gain, kept.cross)
         states, noises = rec.covariances(part.F, L, kept.gain)
         spread = jnp.diagonal(noises, axis1=1, axis2=2)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
@@ -27,6 +28,7 @@ from probcal.gaussian.mode import (
 )
 from probcal.gaussian.search import HALVINGS
 from probcal.gaussian.solves import Dense
+from probcal.linalg import library
 from probcal.model.model import At, Model
 from probcal.priors import Precision
 
@@ -285,7 +287,7 @@ def find_marginal_mode(
         return _shorter(s, prior)
 
     s = _begun(model, start)
-    if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((s, model, start, prior, tolerance))):
+    if library(*jax.tree.leaves((s, model, start, prior, tolerance))) is np:
         while not s.done and s.iteration <= iterations:
             point, solved, value, better = look(s)
             s = turned(s, point, solved, value) if better else shorter(s)

@@ -16,6 +16,7 @@ from probcal.identifiability.patterns import DILATION, Pattern, cause, common_sh
 from probcal.identifiability.remedies import TRIED, WEAK, Direction, with_remedies
 from probcal.identifiability.spaces import complete, inside, orthonormal, readable
 from probcal.identifiability.wording import amount, in_words, involved, name_without_owner, owner_of
+from probcal.linalg import invert, least_squares, marginalise, spectrum
 from probcal.problem import Problem
 from probcal.results.blocks import SensorBlocks
 
@@ -39,19 +40,11 @@ def weak_directions(
     free = ~problem.surveyed
     if not free.any():
         return ()
-    naming = _Naming(problem, free, marginal(information, free), point)
+    naming = _Naming(problem, free, marginalise(information, free)[0], point)
     if gauge is not None and gauge.countable:
         naming.name_gauge(gauge.basis[free])
     naming.name_weak()
     return tuple(with_remedies(problem, naming.known, np.flatnonzero(free), naming.found, naming.anchors))
-
-
-def marginal(information: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Information of the free biases with the surveyed ones (whose survey is 1 in z) marginalised."""
-    held = ~free
-    inner = information[np.ix_(held, held)] + np.eye(held.sum())
-    cross = information[np.ix_(held, free)]
-    return information[np.ix_(free, free)] - cross.T @ np.linalg.solve(inner, cross)
 
 
 class _Naming:
@@ -74,7 +67,7 @@ class _Naming:
 
         def follow(pattern: np.ndarray) -> np.ndarray | None:
             own = pattern != 0
-            mixed, *_ = np.linalg.lstsq(space[own], pattern[own], rcond=1e-9)
+            mixed = least_squares(space[own], pattern[own], 1e-9)
             near = np.linalg.norm(space[own] @ mixed - pattern[own]) <= MATCH * np.linalg.norm(pattern)
             return space @ mixed if near else None
 
@@ -82,7 +75,7 @@ class _Naming:
 
     def name_weak(self) -> None:
         """Name what else the data leave weak."""
-        values, vectors = np.linalg.eigh(self.known)
+        values, vectors = spectrum(self.known)
         space = vectors[:, values < WEAK]
 
         def follow(pattern: np.ndarray) -> np.ndarray | None:
@@ -218,7 +211,7 @@ def shared_directions(problem: Problem, at: Expansion, scales: Factors) -> tuple
     own = unfixed(problem, at.point, np.stack([direction.vector for direction in found], 1))
     found = [replace(d, kind="gauge" if free else d.kind) for d, free in zip(found, own, strict=True)]
     among = np.array(sorted({problem.labels.index(name) for groups in anchors for group in groups for name in group}))
-    known = np.linalg.inv(np.asarray(at.marginals(scales, among[None]))[0]) - np.eye(len(among))
+    known = invert(np.asarray(at.marginals(scales, among[None]))[0]) - np.eye(len(among))
     return tuple(with_remedies(problem, known, among, found, anchors))
 
 
@@ -241,7 +234,7 @@ def alone_directions(
     """
     M, members = len(problem.labels), blocks.members
     free = np.append(~problem.surveyed, False)[members]
-    values, vectors = np.linalg.eigh(np.where(free[:, :, None] & free[:, None, :], blocks.covariance, 0.0))
+    values, vectors = spectrum(np.where(free[:, :, None] & free[:, None, :], blocks.covariance, 0.0))
     information = 1.0 / np.maximum(values, 1e-300) - 1.0
     weak = np.argwhere(information < WEAK)
     weak = weak[np.argsort(information[tuple(weak.T)], kind="stable")]
@@ -259,7 +252,7 @@ def alone_directions(
     done = list[Direction]()
     for b, pairs in found.items():
         own = members[b][free[b]]
-        known = np.linalg.inv(blocks.covariance[b][np.ix_(free[b], free[b])]) - np.eye(len(own))
+        known = invert(blocks.covariance[b][np.ix_(free[b], free[b])]) - np.eye(len(own))
         done += with_remedies(problem, known, own, [one for one, _ in pairs], [p.anchors for _, p in pairs])
     return tuple(sorted(done, key=lambda direction: direction.information)), len(weak)
 
@@ -274,7 +267,7 @@ def shared_in_blocks(
     """
     free = np.append(~problem.surveyed, False)[members]
     known = np.where(free[:, :, None] & free[:, None, :], covariance, 0.0)
-    values, vectors = np.linalg.eigh(known)
+    values, vectors = spectrum(known)
     sd = np.sqrt(np.maximum(np.diagonal(known, axis1=1, axis2=2), 1e-300))[:, :, None]
     off = np.abs(known @ vectors) / sd / np.maximum(np.abs(vectors).max(1, keepdims=True), 1e-300)
     information = 1.0 / np.maximum(values, 1e-300) - 1.0

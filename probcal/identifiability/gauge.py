@@ -13,6 +13,7 @@ import numpy as np
 
 from probcal import linalg
 from probcal.gaussian.mode import Point, compress
+from probcal.linalg import orthogonalise, spectrum
 from probcal.model import variants
 from probcal.model.model import Model
 from probcal.motion import Known, as_motion
@@ -104,12 +105,11 @@ def gauge(problem: Problem, point: Point) -> Gauge:
     information = np.asarray(free.information) + np.diag(survey)
     alone = np.diag(np.asarray(free.known)) + survey
     unit = 1 / np.sqrt(np.where(alone > 0, alone, 1.0))
-    values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
+    values, vectors = spectrum(information * np.outer(unit, unit))
     near = unit[:, None] * vectors[:, values < CLOSE]
     exact = np.asarray(within(model, point, hold, jnp.asarray(near))) + near.T @ (survey[:, None] * near)
-    values, turned = np.linalg.eigh(0.5 * (exact + exact.T))
-    basis, _ = np.linalg.qr(near @ turned[:, values < NULL])
-    return Gauge(basis, _countable(problem, free.ranks))
+    values, turned = spectrum(0.5 * (exact + exact.T))
+    return Gauge(orthogonalise(near @ turned[:, values < NULL]), _countable(problem, free.ranks))
 
 
 @jax.jit

@@ -6,6 +6,7 @@ import numpy as np
 
 from probcal.gaussian.mode import Point
 from probcal.labels import AXES, NOBODY, label_parts
+from probcal.linalg import singular
 from probcal.problem import Problem
 
 STRAIGHT = 0.03  # width of a path over its length below which it is one line
@@ -107,7 +108,7 @@ def cause(problem: Problem, point: Point) -> str:
             continue
         if len(path) < 3:
             return ""
-        _, sizes, along = np.linalg.svd(path - path.mean(0), full_matrices=False)
+        _, sizes, along = singular(path - path.mean(0))
         if sizes[1] > STRAIGHT * sizes[0]:
             return ""
         lines.append(along[0])

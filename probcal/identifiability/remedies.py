@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probcal.identifiability.wording import together
+from probcal.linalg import solve_square, spectrum
 from probcal.problem import Problem
 
 WEAK = 1.0  # marginal information below which a direction is left to the prior
@@ -81,7 +82,7 @@ def with_remedies(
 def _spectrum(known: np.ndarray, done: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues and vectors (F, F - fixed) of the information with some biases fixed."""
     stay = np.setdiff1d(np.arange(len(known)), list(done))
-    values, vectors = np.linalg.eigh(known[np.ix_(stay, stay)])
+    values, vectors = spectrum(known[np.ix_(stay, stay)])
     whole = np.zeros((len(known), len(stay)))
     whole[stay] = vectors
     return values, whole
@@ -117,7 +118,7 @@ def _survey(
     for halving in range(HALVINGS if largest.max() > 0 else 0):
         std = _round_down(float(largest.max()) / 2**halving)
         inner = known[np.ix_(chosen, chosen)] + np.diag((scales[chosen] / std) ** 2)
-        rest = known - known[:, chosen] @ np.linalg.solve(inner, known[chosen])
+        rest = known - known[:, chosen] @ solve_square(inner, known[chosen])
         if _count(rest, [*done, *chosen]) <= left:
             return std
     return None

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from probcal.linalg import marginalise, singular, solve_square
+
 RIDGE = 1e-2  # keeps the completion of a pattern from running along other weak directions
 
 
@@ -11,13 +13,13 @@ def orthonormal(space: np.ndarray, least: float) -> np.ndarray:
     """Orthonormal basis of the columns (F, k), without directions of singular value at most `least`."""
     if not space.shape[1]:
         return space
-    left, sizes, _ = np.linalg.svd(space, full_matrices=False)
+    left, sizes, _ = singular(space)
     return left[:, sizes > least]
 
 
 def inside(space: np.ndarray, own: np.ndarray, most: float) -> np.ndarray:
     """The directions of an orthonormal space (F, k) of which at most `most` lies outside the entries `own` (F,)."""
-    _, sizes, rows = np.linalg.svd(space[~own], full_matrices=True)
+    _, sizes, rows = singular(space[~own], whole=True)
     sizes = np.concatenate([sizes, np.zeros(len(rows) - len(sizes))])
     return space @ rows[sizes < most].T
 
@@ -29,7 +31,7 @@ def readable(space: np.ndarray) -> Iterator[np.ndarray]:
     from scipy import linalg as dense  # here, that a fit without weak directions does not load it
 
     pivots = dense.qr(space.T, mode="r", pivoting=True)[1][: space.shape[1]]
-    for vector in np.linalg.solve(space[pivots].T, space.T):
+    for vector in solve_square(space[pivots].T, space.T):
         yield vector / np.linalg.norm(vector)
 
 
@@ -37,8 +39,5 @@ def complete(information: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     """Unit vector that holds a pattern and lets the other biases move so as to hide it from the data."""
     own = pattern != 0
     unit = pattern / np.linalg.norm(pattern)
-    other = ~own
-    if other.any():
-        inner = information[np.ix_(other, other)] + RIDGE * np.eye(other.sum())
-        unit[other] = -np.linalg.solve(inner, information[np.ix_(other, own)] @ unit[own])
+    unit[~own] = -marginalise(information, own, RIDGE)[1] @ unit[own]
     return unit / np.linalg.norm(unit)

@@ -11,6 +11,7 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.gaussian.mode import Point
+from probcal.gaussian.room import check_room
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.methods import check_problem
@@ -52,6 +53,7 @@ def log_evidence(problem: Problem, *, prior: AnyPrior = None, key: Key = 0, star
     if isinstance(chosen, Flat):
         raise InputError("log_evidence: a flat prior has no evidence; give a proper one")
     check_problem(problem)
+    check_room(problem.model)
     if problem.model.tailed:
         raise InputError(
             "log_evidence: the frame is no match for process noise that is not Gaussian; compare the"

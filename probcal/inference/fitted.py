@@ -17,6 +17,7 @@ from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point
 from probcal.gaussian.places import tilt_at
 from probcal.lazy import Later
+from probcal.linalg import invert
 from probcal.model.model import Recursion
 from probcal.model.motions import level_logs
 from probcal.model.rows import Linearised
@@ -116,7 +117,7 @@ class Judged:
     def declared(self, tree: xr.DataTree) -> SensorBlocks | None:
         """Covariance of z by sensor that the declared scales leave; None where the information of all is held."""
         told = tree["calibration"].to_dataset()
-        if self.scaled is not None or "information" in told:
+        if self.scaled is not None or self.whole:
             return self.scaled
         if not self.engine.exact:
             apart = 1.0 - told["contraction"].values
@@ -202,7 +203,7 @@ def _prior(group: xr.Dataset) -> Precision:
         added = group["coupling"].values
         for row in np.unique(added[added.any(1)] != 0, axis=0):
             members = np.flatnonzero(row)
-            found.append((members, np.linalg.inv(np.eye(len(members)) + added[np.ix_(members, members)])[0, 1]))
+            found.append((members, invert(np.eye(len(members)) + added[np.ix_(members, members)])[0, 1]))
     if "correlation" in group:
         value, first = group["correlation"].values, group["correlated_with"].values
         for name in np.unique(first[value != 0]):

@@ -19,6 +19,7 @@ from probcal.gaussian.frame import log_weight, place, unit_normals, volume
 from probcal.gaussian.mode import Point, driven_states
 from probcal.inference.leaps import Place
 from probcal.inference.posed import Form, Posed, log_prior
+from probcal.linalg import least_squares
 from probcal.model.model import Recursion
 from probcal.model.trajectories import Trajectories
 from probcal.problem import Problem
@@ -170,7 +171,7 @@ def orbits_of(problem: Problem, posed: Posed, covariance: np.ndarray) -> tuple[O
     kept = []
     for orbit, (miss, slope) in zip(tried, _tried(tried, posed, point), strict=True):
         if float(miss) < CLOSE:
-            wide = np.asarray(slope) @ np.linalg.lstsq(covariance, np.asarray(slope), rcond=None)[0]
+            wide = np.asarray(slope) @ least_squares(covariance, np.asarray(slope))
             kept.append(replace(orbit, size=jnp.asarray(1.0 / np.sqrt(max(wide, 1e-12)))))
     return tuple(kept)
 

@@ -23,6 +23,7 @@ from probcal.gaussian.engine import Engine, Expansion, Factors, Group
 from probcal.gaussian.mode import Point
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form
+from probcal.linalg import invert, without_negative
 from probcal.priors import Precision
 
 ROUNDS, SURE, CLOSE, DAMPING = 10, 2, 0.15, 0.7  # rounds, those not yet averaged, sds (rms) of a move, share of a site
@@ -234,17 +235,18 @@ class Propagation:
         try:
             return self.likelihood.marginals(self.members, self.sites)
         except np.linalg.LinAlgError:
-            self.sites = self.sites._replace(precision=_positive(self.sites.precision))
+            self.sites = self.sites._replace(precision=without_negative(self.sites.precision, LEAST))
             return self.likelihood.marginals(self.members, self.sites)
 
     def round(self, turn: int) -> float:
         """Renew all sites; the root mean square of how far the means moved, in sds."""
         self.found = found = self._marginals()
         self.begun = found if self.begun is None else self.begun
-        precision = np.linalg.inv(found.covariance)
+        precision = invert(found.covariance)
         middle = np.append(found.mean, 0.0)[self.members]
         cavity = Blocks(
-            _positive(precision - self.sites.precision), np.einsum("bij,bj->bi", precision, middle) - self.sites.pull
+            without_negative(precision - self.sites.precision, LEAST),
+            np.einsum("bij,bj->bi", precision, middle) - self.sites.pull,
         )
         if self.chain is None:
             begin = self.form.hierarchy.begin(jax.random.fold_in(self.key, 0))
@@ -252,11 +254,12 @@ class Propagation:
         own = jax.random.fold_in(self.key, 1 + turn)
         self.chain, swept = sweep_blocks(self.form, self.first, self.members, cavity, self.chain, own)
         self.swept = swept = jax.device_get(swept)
-        tilted = np.linalg.inv(swept.covariance)
+        tilted = invert(swept.covariance)
         new = Blocks(tilted - cavity.precision, np.einsum("bij,bj->bi", tilted, swept.mean) - cavity.pull)
         floor = -MINUS * cavity.precision  # what is left of a cavity stays positive
         there = np.isin(self.members, self.form.hierarchy.learnt)  # a site is of the biases that it governs alone
-        precision = np.where(there[:, :, None] & there[:, None, :], _positive(new.precision - floor) + floor, 0.0)
+        positive = without_negative(new.precision - floor, LEAST) + floor
+        precision = np.where(there[:, :, None] & there[:, None, :], positive, 0.0)
         new = Blocks(precision, np.where(there, new.pull, 0.0))
         share = min(DAMPING, 1.0 / max(turn - SURE, 1))  # later rounds are averaged: sweeps are noisy
         self.sites = Blocks(*(share * a + (1 - share) * b for a, b in zip(new, self.sites, strict=True)))
@@ -278,9 +281,3 @@ class Propagation:
                 break
             if far >= AGAIN:
                 self.likelihood = self.likelihood.at(self.mean)
-
-
-def _positive(matrices: np.ndarray) -> np.ndarray:
-    """Symmetric matrices (B, p, p) with eigenvalues that are not negative."""
-    values, vectors = np.linalg.eigh(0.5 * (matrices + matrices.transpose(0, 2, 1)))
-    return np.einsum("bik,bk,bjk->bij", vectors, np.maximum(values, LEAST), vectors)

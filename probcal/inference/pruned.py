@@ -15,6 +15,7 @@ import numpy as np
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point, find_mode, smooth_tracks
 from probcal.inference.method import Given, State
+from probcal.linalg import invert, spectrum
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, PRECISION_BOUNDS
 
@@ -35,7 +36,7 @@ class GroupEvidence:
     @classmethod
     def of(cls, covariance: np.ndarray, mean: np.ndarray, alpha: float) -> "GroupEvidence":
         """From the posterior of the group, the others integrated."""
-        values, axes = np.linalg.eigh(np.linalg.inv(covariance))
+        values, axes = spectrum(invert(covariance))
         return cls(np.maximum(values - alpha, 0.0), (values * (axes.T @ mean)) ** 2)
 
     def gain(self, alpha: np.ndarray) -> np.ndarray:

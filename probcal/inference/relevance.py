@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from probcal.linalg import invert, log_determinant
 from probcal.priors import PRECISION_BOUNDS
 
 SWEEPS, STILL = 200, 1e-6  # of single updates at most, and nats by which the last may have gained
@@ -38,7 +39,7 @@ class Relevance:
         own = np.flatnonzero(self.inside)
         matrix = self.information[np.ix_(own, own)] + np.diag(self.alpha[own])
         self.covariance = np.zeros_like(self.information)
-        self.covariance[np.ix_(own, own)] = np.linalg.inv(matrix) if len(own) else 0.0
+        self.covariance[np.ix_(own, own)] = invert(matrix) if len(own) else 0.0
         self.mean = self.covariance @ self.pull
 
     @property
@@ -48,7 +49,7 @@ class Relevance:
         if not len(own):
             return 0.0
         matrix = self.information[np.ix_(own, own)] + np.diag(self.alpha[own])
-        volume = np.log(self.alpha[own]).sum() - np.linalg.slogdet(matrix)[1]
+        volume = np.log(self.alpha[own]).sum() - log_determinant(matrix)
         return float(0.5 * (volume + self.pull[own] @ self.mean[own]))
 
     def alone(self, m: int) -> tuple[float, float]:

@@ -86,7 +86,7 @@ def prepare(solved: Eliminated) -> list[Filter]:
     found = []
     for kept in solved.parts:
         gain = kept.gain
-        values, vectors = linalg.singular(gain.predicted.mT @ gain.data)
+        vectors, values, _ = linalg.singular(gain.predicted.mT @ gain.data)
         size = jnp.sqrt(1.0 + values**2)
         half = gain.predicted @ vectors
         found.append(Filter(gain, (half * (-1.0 / (size * (1.0 + size)))[:, None, :]) @ half.mT))

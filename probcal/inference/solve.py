@@ -98,7 +98,7 @@ def _solve(
         return _sampled_on_best_side(problem, method, prior, points[0], context)
     if not (monitor.stopped or large):
         points += further_starts(problem, starts - len(points), jax.random.fold_in(context.key, 1))
-    climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint"), Gaussian())
+    climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint", engine="dense"), Gaussian())
     optima, unseen = list[Answer](), ""
     if method.climbs or len(points) > 1 or problem.levels or problem.model.tailed:
         optima = [climber.answer(problem, own, point, context) for _, point in _starts(points, method, monitor)]
@@ -196,7 +196,7 @@ def _by_particles(
     mirrors: tuple[Mirrored, ...] = ()
     if start is None and near is not None:
         silent = context._replace(monitor=context.monitor.silent())
-        first = _solve(near, MAP(trajectory="joint"), Gaussian(), silent, None, 1)
+        first = _solve(near, MAP(trajectory="joint", engine="dense"), Gaussian(), silent, None, 1)
         start = first.posterior.point if first.status.valid and first.posterior.sound else None
         mirrors = first.mirrors if linear and start is not None and method.climbs else ()
     drawn = np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(context.key, 1))))

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.engine import Engine, Expansion
 from probcal.gaussian.information import rejected
@@ -20,6 +19,7 @@ from probcal.inference import residuals
 from probcal.inference.fitted import COLUMNS, Judged, take_up
 from probcal.inference.residuals import LAGGED, NOTABLE, PRACTICAL, Channels, Innovations
 from probcal.lazy import Later
+from probcal.linalg import spectrum
 from probcal.misfit import rejection_text
 from probcal.model.model import Data, Model
 from probcal.model.rows import Linearised
@@ -364,7 +364,7 @@ def judge_tracks(tree: xr.DataTree, problem: Problem, known: Calibrated, engine:
     data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
     flat, root, spread, dz = Precision(jnp.zeros(len(known.z))), known.spread.root(), known.spread, None
     if spread.whole and (information := at.information()) is not None:
-        values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(root.T @ information @ root)))
+        values, vectors = spectrum(root.T @ information @ root)
         both = root @ (vectors / np.sqrt(1.0 + np.maximum(values, 0.0)))
         spread = SensorBlocks.of(both @ both.T)
         dz = spread.matrix() @ np.asarray(at.slope())

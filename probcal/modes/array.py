@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.linalg import pseudo_inverse
 from probcal.modes.modified import SensorTrack, step
 from probcal.modes.triangles import similarity, turn_of
 
@@ -193,8 +194,8 @@ def _reach_sensors(
         turn, sure = turn_of(turns, level)
         found = [similarity(B, A, CB, CA, rotation=turn) for B, A, CB, CA in pairs]
         found = [f for f in found if f.scale > 0] or found
-        information = [np.linalg.pinv(f.spread, hermitian=True) for f in found]
-        total = np.linalg.pinv(sum(information), hermitian=True)
+        information = [pseudo_inverse(f.spread, symmetric=True) for f in found]
+        total = pseudo_inverse(sum(information), symmetric=True)
         position[sensor] = total @ sum(J @ f.position for J, f in zip(information, found, strict=True))
         rotation[sensor] = turn
         if not sure:

@@ -8,6 +8,7 @@ from probcal.errors import InputError
 from probcal.gaussian.mode import Point
 from probcal.geometry import attitude
 from probcal.labels import AXES
+from probcal.linalg import nearest_rotation
 from probcal.modes.array import Array, match
 from probcal.modes.modified import SensorTrack, straight_track
 from probcal.modes.recognise import Directions, kinds, members, seen_directions
@@ -303,6 +304,4 @@ def _turns(
         Q[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
         yield Q
     if d == 3:
-        left, _, right = np.linalg.svd((a * w[:, None]).T @ b)
-        signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right)) or 1.0])
-        yield (left * signs) @ right
+        yield nearest_rotation((a * w[:, None]).T @ b)[0]

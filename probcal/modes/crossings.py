@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.mode import Point
+from probcal.linalg import solve_square, spectrum
 from probcal.model.model import At, Model
 from probcal.model.rows import Linearised
 from probcal.modes.reflections import FAR, SHIFTED, Plane, node_places, place_biases
@@ -170,7 +171,7 @@ class _Own:
                     own = np.sum(weight * slope[:, :, a] * slope[:, :, b], 1)
                     much += np.bincount((first * P + at[:, b])[both], own[both], size)
         information = much.reshape(-1, P, P) + np.eye(P)
-        change = np.linalg.solve(information, pull.reshape(-1, P, 1))[:, :, 0]
+        change = solve_square(information, pull.reshape(-1, P, 1))[:, :, 0]
         change *= STRIDE / np.maximum(np.abs(np.nan_to_num(change)).max(1, keepdims=True), STRIDE)
         after = np.append(z, 0.0)
         after[self.biases[moving]] += np.nan_to_num(change)
@@ -208,7 +209,7 @@ def _paths(problem: Problem, point: Point, heard: list[np.ndarray], place: np.nd
             np.add.at(square, node[mine], away[:, :, None] * away[:, None, :])
     enough = np.flatnonzero(count >= FEW)
     mean = total[enough] / count[enough, None]
-    values, axes = np.linalg.eigh(square[enough] / count[enough, None, None] - mean[:, :, None] * mean[:, None, :])
+    values, axes = spectrum(square[enough] / count[enough, None, None] - mean[:, :, None] * mean[:, None, :])
     for k, centre, value, axis in zip(enough.tolist(), mean, values, axes, strict=True):
         if value[-1] > STILL**2 * np.sum(centre**2):
             yield k, Plane("its path", place[k] + centre, axis[:, 0])

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.linalg import pseudo_inverse, singular, solve_square
 
 PLANE = [0, 2, 3, 5]  # of the six in space, with q = e = 0
 GAMMA = 0.1  # 1/s, prior sd of the radial speed over the range
@@ -186,7 +187,7 @@ class Bearings(NamedTuple):
         rows = np.concatenate([across, dt[:, None, None] * across], 2).reshape(-1, 6)
         if len(self.kept) == 4:  # nothing leaves the plane
             rows = np.concatenate([rows, 1e3 * np.eye(6)[[2, 5]]])
-        path = np.linalg.svd(rows, full_matrices=False)[2][-1]
+        path = singular(rows)[2][-1]
         ahead = (u * (path[:3] + dt[:, None] * path[3:])).sum(1)
         path = path * (np.sign(ahead.sum()) or 1.0)
         size = max(float(np.linalg.norm(path[:3])), 1e-12)
@@ -202,7 +203,7 @@ class Bearings(NamedTuple):
         found = [self._climb(x, t, free) for x in (self._linear(t), all_six(first, self.kept))]
         x, J, _ = min(found, key=lambda f: f[2])
         covariance = np.zeros((6, 6))
-        covariance[np.ix_(free, free)] = np.linalg.pinv(J, hermitian=True)
+        covariance[np.ix_(free, free)] = pseudo_inverse(J, symmetric=True)
         moved = [step(x, dt) for dt in t]
         states, slope = np.array([m[0] for m in moved]), np.array([m[1] for m in moved])
         log = slope[:, 5] / states[:, 5:]
@@ -231,7 +232,7 @@ class Bearings(NamedTuple):
         cost, J, score = look(x)
         for _ in range(60):
             trial = x.copy()
-            trial[free] += np.linalg.solve(J + damping * np.diag(np.diagonal(J) + 1e-12), score)
+            trial[free] += solve_square(J + damping * np.diag(np.diagonal(J) + 1e-12), score)
             new = look(trial)
             if np.isfinite(new[0]) and new[0] <= cost:
                 done = cost - new[0] < 1e-10 * (1 + cost)

@@ -14,6 +14,7 @@ import numpy as np
 
 from probcal.geometry import bearing, elevation, norm
 from probcal.labels import AXES
+from probcal.linalg import least_squares
 from probcal.network import ANGLES, CLOCK, MOVING
 from probcal.noise import guess_of
 from probcal.problem import Problem
@@ -117,7 +118,7 @@ def _family(
     if found := _shifted("range", value, distance):
         return found if np.allclose(value, other) else ("arrival", *found[1:])
     log = np.stack([np.ones_like(distance), np.log10(distance)], 1)
-    fit = np.linalg.lstsq(log, value, rcond=None)[0]
+    fit = least_squares(log, value)
     if abs(fit[1]) > EXACT and np.abs(log @ fit - value).max() < EXACT * max(1.0, np.abs(value).max()):
         return "level", float(fit[1]), float(fit[0])
     return None

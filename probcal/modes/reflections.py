@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point
 from probcal.labels import AXES
+from probcal.linalg import spectrum
 from probcal.modes.grid import follow_states, known_places
 from probcal.problem import Problem
 
@@ -49,7 +49,7 @@ def planes(problem: Problem, z: np.ndarray) -> list[Plane]:
         if len(group) < d:
             continue
         centre = points.mean(0)
-        values, vectors = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(np.cov(points.T))))
+        values, vectors = spectrum(np.cov(points.T))
         if values[1] <= 1e-9 * values[-1]:  # nodes at one place, or on one line in 3-D
             continue
         plane = Plane(f"the {'line' if d == 2 else 'plane'} of {name}", centre, vectors[:, 0])

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.linalg import nearest_rotation
 
 FLAT = 1e-3  # spread across a path, over that along it, below which a path in space turns about itself unseen
 
@@ -46,11 +47,9 @@ def turn_of(pairs: list[tuple[np.ndarray, np.ndarray, np.ndarray]], level: bool 
 
 def _turn(total: np.ndarray) -> tuple[np.ndarray, bool]:
     """Nearest rotation of a correlation matrix, and whether it is determined."""
-    left, values, right = np.linalg.svd(total)
-    signs = np.ones(len(total))
-    signs[-1] = np.sign(np.linalg.det(left @ right)) or 1.0
+    rotation, values = nearest_rotation(total)
     needed = values[len(total) - 2] if len(total) == 3 else values[0]
-    return (left * signs) @ right, bool(needed > FLAT * max(values[0], 1e-300))
+    return rotation, bool(needed > FLAT * max(values[0], 1e-300))
 
 
 def similarity(

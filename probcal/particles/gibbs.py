@@ -29,6 +29,7 @@ from probcal.inference.posed import Form, Natural, conditional, log_prior, prior
 from probcal.inference.posterior import Chains, conclude_draws
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
+from probcal.linalg import invert, without_negative
 from probcal.model.model import At, Model, Recursion
 from probcal.modes.grid import follow_states, track_mode
 from probcal.particles.conditional import conditional_path
@@ -37,7 +38,7 @@ from probcal.particles.ensemble import ensemble, expected_over_paths, first_path
 from probcal.particles.particles import Particles
 from probcal.particles.proposals import check_proposal
 from probcal.particles.targets import Targets, place_by_epoch
-from probcal.particles.weighted import Paths, check_learnt, louis, positive, prepared, unexplained
+from probcal.particles.weighted import Paths, check_learnt, louis, prepared, unexplained
 from probcal.priors import Gaussian, Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -375,8 +376,8 @@ class ParticleChains(Chains):
         found = super().of(problem, prior, run, mixed, *known, **more)
         if run.form.hierarchy.learnt or run.z.shape[0] * run.z.shape[1] < MANY * run.form.biases:
             return found
-        told = np.linalg.inv(found.summary.covariance.matrix()) - np.asarray(run.posed.first.matrix())
-        return replace(found, summary=replace(found.summary, information=positive(told)))
+        told = invert(found.summary.covariance.matrix()) - np.asarray(run.posed.first.matrix())
+        return replace(found, summary=replace(found.summary, information=without_negative(told)))
 
     @classmethod
     def point_of(cls, problem: Problem, run: SamplerRun) -> Point:

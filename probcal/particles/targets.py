@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.linalg import handedness
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
 from probcal.model.rows import BY_ROW
@@ -63,7 +64,7 @@ def _alone(model: Model, r: int, blocks: list[int]) -> Model:
     rows = [model.rows[b] for b in blocks]
     rows = [data._replace(**{name: getattr(data, name)[:1] for name in BY_ROW}) for data in rows]
     moving = np.asarray(model.recursions[r].L)[~np.asarray(model.recursions[r].first)]  # a start needs no density
-    rank = bool((np.linalg.slogdet(moving)[0] != 0).all())
+    rank = bool(handedness(moving).all())
     return replace(
         model, blocks=tuple(model.blocks[b] for b in blocks), recursion=(0,) * len(blocks), targets=(1,),
         full_rank=rank, sampled=(model.sampled[r],), recursions=(part,), rows=tuple(rows),

@@ -18,6 +18,7 @@ from probcal.gaussian.mode import Point
 from probcal.inference.ending import ABSURD, FAR, low_and_far
 from probcal.inference.method import Given
 from probcal.labels import listed
+from probcal.linalg import cholesky, invert, orthogonalise, without_negative
 from probcal.misfit import rejection_text
 from probcal.model.model import Model
 from probcal.modes.grid import follow_states, track_mode
@@ -228,7 +229,7 @@ def louis(paths: Paths, z: Any, levels: Any, key: jax.Array) -> Louis:
     off = scores - score
     within = np.einsum("k,kab->ab", share, spread) + np.einsum("k,ka,kb->ab", share, off, off)
     return Louis(
-        positive(np.einsum("k,kab->ab", share, information) - within), score,
+        without_negative(np.einsum("k,kab->ab", share, information) - within), score,
         np.einsum("k,ka,kb->ab", share**2, off, off), *log_mean(np.array(logs)), best,
     )  # fmt: skip
 
@@ -257,10 +258,10 @@ def score_slope(paths: Paths, told: Louis, prior: np.ndarray, z: Any, levels: An
     logs = np.zeros(0)
     while M and found.filters < FILTERED and not (found.sd_error <= SD_ERROR).all():
         try:
-            root = np.linalg.inv(np.linalg.cholesky(found.information + prior)).T
+            root = invert(cholesky(found.information + prior)).T
         except np.linalg.LinAlgError:  # singular, which the covariance says
             break
-        turns = [np.linalg.qr(rng.standard_normal((M, M)))[0] for _ in range(-(-PAIRS // M))]
+        turns = [orthogonalise(rng.standard_normal((M, M))) for _ in range(-(-PAIRS // M))]
         half = np.sqrt(M) * np.concatenate(turns) @ root.T
         for d in np.concatenate([half, -half]):
             at = jnp.asarray(np.asarray(z) + d)
@@ -283,10 +284,10 @@ def regressed_scores(away: np.ndarray, scores: np.ndarray, logs: np.ndarray, pri
     K, M = away.shape
     weight = np.exp(np.minimum(logs - np.median(logs) + LOST, 0.0))
     x, y = (part - weight @ part / weight.sum() for part in (away, scores))
-    inverse = np.linalg.inv(x.T @ (weight[:, None] * x))
+    inverse = invert(x.T @ (weight[:, None] * x))
     slope = inverse @ x.T @ (weight[:, None] * y)
-    information = positive(-slope)
-    covariance = np.linalg.inv(information + prior)
+    information = without_negative(-slope)
+    covariance = invert(information + prior)
     left, pull = (y - x @ slope) @ covariance, x @ inverse @ covariance  # of each filter, by bias
     variance = (weight[:, None] ** 2 * left**2 * pull**2).sum(0) * K / max(K - M - 1, 1)
     return ScoreSlope(information, 0.5 * np.sqrt(variance) / np.diag(covariance), K)
@@ -299,12 +300,6 @@ single_vectors = jax.jit(Model.vectors_of)
 def squares_by_epoch(model: Model, point: Point) -> tuple[list[jax.Array], list[jax.Array]]:
     """Sums (E,) of squares and of data over the rows of each epoch, for each recursion."""
     return model.by_epoch(model.square(point)), model.by_epoch(model.measured)
-
-
-def positive(matrix: np.ndarray) -> np.ndarray:
-    """The nearest matrix without negative eigenvalues: an estimated information may have some."""
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
 def log_likelihood_at(paths: Paths, z: Any, levels: Any, key: jax.Array, filters: int = FILTERS) -> tuple[float, float]:

@@ -125,10 +125,8 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
         "status": np.array(answer.bias_status, str), "pull": answer.posterior.pull,
         "kind": np.array([b.kind for b in problem.biases], str), **found.columns,
     }  # fmt: skip
-    matrices: dict[str, Any] = {}
-    if found.covariance.whole:
-        known = answer.posterior.expansion.information() if found.information is None else found.information
-        matrices = {"information": known}
+    known = answer.posterior.expansion.information() if found.information is None else found.information
+    matrices = {} if known is None else {"information": known}  # too many biases for it else
     if answer.prior.correlation:
         columns |= {"correlation": np.zeros(len(labels)), "correlated_with": np.array(labels, object)}
         for members, value in answer.prior.correlated(labels, problem.surveyed):

@@ -87,12 +87,12 @@ EVIDENCES = {
 def matrix_of(group: Any, name: str, whose: str) -> Any:
     """The matrix "covariance" or "information" of a group `calibration`, for a reader that cannot do without.
 
-    Raises `InputError` for a fit in sparse form, which holds none.
+    Raises `InputError` where there is none, as of a large fit in sparse form.
     """
     if name not in group:
         raise InputError(
-            f"{whose} needs the {name} of all biases, which a fit in sparse form does not hold: fit fewer sensors, or"
-            ' take EA(engine="dense") where it fits'
+            f"{whose} needs the {name} of all biases, which a large fit in sparse form does not hold: fit fewer"
+            ' sensors, or take EA(engine="dense") where it fits'
         )
     return group[name]
 

@@ -11,6 +11,7 @@ from scipy import stats
 from scipy.special import log_ndtr, logsumexp
 
 from probcal.errors import InputError, nearest
+from probcal.linalg import least_squares, singular, spectrum
 
 CRITERIA = ("snls", "predicted", "residual", "virtual", "gml", "huber", "student", "nls")
 """How residuals at a place are weighed: `snls` equally (the profile likelihood, and the default); by their variance
@@ -191,7 +192,7 @@ def position_information(
         columns = [np.ones(mine.sum())] + ([c[mine]] if exponent is None else [])
         X = np.stack(columns, 1) / at.std[mine, None]
         J = slope[i] * gradient[mine] / at.std[mine, None]
-        J = J - X @ np.linalg.lstsq(X, J, rcond=None)[0]
+        J = J - X @ least_squares(X, J)
         total += J.T @ J
     return total
 
@@ -256,7 +257,7 @@ def localise(
     power, slope = (np.array([getattr(f, name)[0] for _, f in fits]) for name in ("power", "slope"))
     widened = at if criterion != "gml" else _learnt(at, fits, d)
     J = position_information(widened, x, slope, exponent=known)
-    values, vectors = np.linalg.eigh(J)
+    values, vectors = spectrum(J)
     message = ""
     if (x <= box[:, 0] + 0.5 * step).any() or (x >= box[:, 1] - 0.5 * step).any():
         message = "the best point lies on the edge of the area: the levels tell a direction, or nothing"
@@ -337,7 +338,7 @@ def _integrated(
 def _mirrored(at: Snapshot, x: np.ndarray, criterion: str, exponent: float | None, cost: float) -> np.ndarray | None:
     """The place on the other side of the line (plane) of the nodes, where that fits as well."""
     centre = at.position.mean(0)
-    normal = np.linalg.svd(at.position - centre)[2][-1]
+    normal = singular(at.position - centre, whole=True)[2][-1]
     away = float((x - centre) @ normal)
     other = x - 2 * away * normal
     same = float(losses(at, other[None], criterion, exponent=exponent)[0]) - cost < 0.5
@@ -376,11 +377,11 @@ def _quadratic(
     value = losses(at, x + u * step, criterion, exponent=exponent)
     pairs = [(i, j) for i in range(d) for j in range(i, d)]
     X = np.column_stack([np.ones(len(u)), u, *(u[:, i] * u[:, j] * (0.5 if i == j else 1.0) for i, j in pairs)])
-    eta = np.linalg.lstsq(X, value, rcond=None)[0]
+    eta = least_squares(X, value)
     P = np.zeros((d, d))
     for (i, j), v in zip(pairs, eta[1 + d :], strict=True):
         P[i, j] = P[j, i] = v
-    values, vectors = np.linalg.eigh(P)
+    values, vectors = spectrum(P)
     if values[0] <= 0:  # no minimum here
         return x, np.diag(step**2)
     inverse = (vectors / values) @ vectors.T
@@ -402,7 +403,7 @@ def _climbed(
         slope = np.array([f.slope[0] for _, f in fits])
         J = position_information(at, x, slope, exponent=exponent)
         score = _descent(at, x, criterion, exponent)
-        move = np.linalg.lstsq(J + damping * np.diag(np.diagonal(J)) + 1e-15 * np.eye(len(x)), score, rcond=None)[0]
+        move = least_squares(J + damping * np.diag(np.diagonal(J)) + 1e-15 * np.eye(len(x)), score)
         move = move / max(1.0, float(np.max(np.abs(move) / reach)))
         t = 1.0
         while t > 1e-4:

@@ -9,6 +9,7 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.labels import AXES
 from probcal.lazy import Later
+from probcal.linalg import singular
 from probcal.problem import Problem
 from probcal.simulate import Truth
 
@@ -131,7 +132,7 @@ def _fitted(name: str, rows: _Rows, model: str, power: str, reference: str | Non
             f'power_law: channel "{name}" has {n} rows for {p} parameters; give more rows, or power="target"'
         )
     size = np.sqrt((X**2).mean(0))
-    U, values, V = np.linalg.svd(X / size, full_matrices=False)
+    U, values, V = singular(X / size)
     if p and values[-1] < 1e-9 * values[0]:
         lost = names[int(np.abs(V[-1] / size).argmax())]
         raise InputError(

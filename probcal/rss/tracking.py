@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.linalg import invert, least_squares, solve_square
 from probcal.rss.localise import CLOSE, Snapshot, localise, losses
 
 ITERATIONS = 10  # of the update at one epoch
@@ -99,7 +100,7 @@ def _begin(
 
 def _updated(at: Snapshot, x: np.ndarray, P: np.ndarray, d: int) -> tuple[np.ndarray, np.ndarray]:
     """State and covariance after the levels of one epoch, linearised about the updated place again."""
-    prior, mean = np.linalg.inv(P), x
+    prior, mean = invert(P), x
 
     def worth(trial: np.ndarray) -> float:
         return float(0.5 * (trial - mean) @ prior @ (trial - mean) + losses(at, trial[None, :d])[0])
@@ -111,7 +112,7 @@ def _updated(at: Snapshot, x: np.ndarray, P: np.ndarray, d: int) -> tuple[np.nda
         information[:d, :d] += J
         right = prior @ (mean - x)
         right[:d] += score
-        step, t = np.linalg.solve(information, right), 1.0
+        step, t = solve_square(information, right), 1.0
         while (trial := worth(x + t * step)) > cost and t > 1e-3:
             t *= 0.5
         if trial > cost:
@@ -120,7 +121,7 @@ def _updated(at: Snapshot, x: np.ndarray, P: np.ndarray, d: int) -> tuple[np.nda
     J, _ = _projected(at, x[:d])
     information = prior.copy()
     information[:d, :d] += J
-    return x, np.linalg.inv(information)
+    return x, invert(information)
 
 
 def _projected(at: Snapshot, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -136,11 +137,11 @@ def _projected(at: Snapshot, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]
             continue
         X = np.stack([np.ones(mine.sum()), c[mine]], 1) / at.std[mine, None]
         y = at.level[mine] / at.std[mine]
-        theta = np.linalg.lstsq(X, y, rcond=None)[0]
+        theta = least_squares(X, y)
         if theta[1] > 0:  # levels that grow with the distance say nothing here
             continue
         H = theta[1] * 10 / np.log(10) * (line / squared[:, None])[mine] / at.std[mine, None]
-        H = H - X @ np.linalg.lstsq(X, H, rcond=None)[0]
+        H = H - X @ least_squares(X, H)
         J += H.T @ H
         score += H.T @ (y - X @ theta)
     return J, score

@@ -21,6 +21,7 @@ from probcal.inference.identity import declared_identity
 from probcal.inference.widen import widening_factors
 from probcal.labels import NOBODY, label_parts
 from probcal.lazy import Later
+from probcal.linalg import cholesky, invert
 from probcal.modes.grid import NEAR
 from probcal.network import Network
 from probcal.priors import AnyPrior, Gaussian, Horseshoe, Prior, as_prior
@@ -331,9 +332,7 @@ class Online:
         """Each bias as all rows so far have it, those in the window too: label, unit, mean, sd, interval, gamma."""
         problem, end = self._problem, self.end
         z, root = np.asarray(end.mean), np.asarray(end.root)
-        before = np.sqrt(
-            np.diag(np.linalg.inv(np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix())))
-        )
+        before = np.sqrt(np.diag(invert(np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix()))))
         sd = np.sqrt((root**2).sum(1))
         sd = sd * widening_factors(sd, before, self.inflation)
         scales = problem.scales
@@ -503,9 +502,9 @@ class Online:
         """Mean and root of the biases before the stream."""
         if self.calibration is not None:
             known = apply(problem, self.calibration)
-            return jnp.asarray(known.z), jnp.asarray(np.linalg.cholesky(_positive(known.covariance)))
+            return jnp.asarray(known.z), jnp.asarray(cholesky(_positive(known.covariance)))
         matrix = np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix())
-        root = np.linalg.cholesky(_positive(np.linalg.inv(matrix)))
+        root = cholesky(_positive(invert(matrix)))
         return jnp.zeros(problem.model.biases), jnp.asarray(root)
 
     # epochs through the filter
@@ -769,7 +768,7 @@ class Online:
             frames.append(self._rows_of(batch, begun, count, left.x, left.sd))
             begun, self.epochs = begun + count, self.epochs + count
         mean, covariance = particles.bias_moments(self.cloud)
-        root = np.linalg.cholesky(_positive(np.asarray(covariance)))
+        root = cholesky(_positive(np.asarray(covariance)))
         self.belief = self.end = self.belief._replace(mean=np.asarray(mean), root=root)
         self.walked = self.time = max(self.time, float(batch.time[-1]))
         self.arrivals.settled(batch, frame, K)

@@ -11,6 +11,7 @@ from probcal.inference.hierarchy import held as held_biases
 from probcal.inference.hierarchy import hierarchy_of, learnt_groups
 from probcal.inference.integrate import KEPT, Moments, begin, moments, run_sweeps
 from probcal.inference.posed import Form, Natural
+from probcal.linalg import invert
 from probcal.priors import ARD, PRECISION_BOUNDS, Gaussian, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import HALF
@@ -24,7 +25,7 @@ def relearnt(problem: Problem, prior: Prior, held: Precision, mean: np.ndarray, 
 
     Raises `InputError` for a prior that has no precisions.
     """
-    inverse = np.linalg.inv(root)
+    inverse = invert(root)
     whole = inverse.T @ inverse
     information, pull = whole - np.asarray(held.matrix()), whole @ mean
     first = prior.precision(problem.labels, problem.surveyed)
@@ -44,7 +45,7 @@ def _maximised(problem: Problem, prior: ARD, first: Precision, information: np.n
     group, surveyed = learnt_groups(prior, problem), held_biases(prior, problem)
     alpha, coupling = np.asarray(first.alpha), np.asarray(first.coupled())
     for _ in range(SWEEPS):
-        covariance = np.linalg.inv(information + coupling + np.diag(alpha))
+        covariance = invert(information + coupling + np.diag(alpha))
         mean, variance = covariance @ pull, np.diag(covariance)
         gamma = np.clip(1.0 - alpha * variance, 0.0, 1.0)
         learnt = prior.learn(jnp.asarray(gamma), jnp.asarray(variance), jnp.asarray(mean), jnp.asarray(group), "mackay")

@@ -12,6 +12,7 @@ import numpy as np
 from probcal.gaussian.mode import Point
 from probcal.inference.mixture import NormalPosterior
 from probcal.inference.widen import widened_by
+from probcal.linalg import invert, solve_square
 from probcal.modes import automatic_start
 from probcal.modes.grid import track_mode
 from probcal.motion import Target
@@ -90,7 +91,7 @@ class StreamPosterior(NormalPosterior):
     @property
     def pull(self) -> np.ndarray:
         """Linear term (M,) of the log-likelihood of all rows about zero."""
-        return np.linalg.solve(self.summary.covariance.matrix(), self.summary.mean)
+        return solve_square(self.summary.covariance.matrix(), self.summary.mean)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +130,7 @@ def calibration_tree(online: FilteredStream) -> xr.DataTree:
     kind: Any = FilteredPosterior if sampled else StreamPosterior
     posterior = kind.on(
         problem, online.prior, point, SensorBlocks.of(covariance), np.diag(before),
-        information=np.linalg.inv(covariance) - before, evidence=float(online.log_evidence),
+        information=invert(covariance) - before, evidence=float(online.log_evidence),
         moments=tracks if sampled else None,
     )  # fmt: skip
     method = Watched(online.method)

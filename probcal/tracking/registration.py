@@ -10,6 +10,7 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.labels import AXES
 from probcal.lazy import Later
+from probcal.linalg import least_squares, pseudo_inverse
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -226,7 +227,7 @@ def _refined(a: dict[str, Track], b: dict[str, Track], frame: Frame, cut: float,
             r.append(off.ravel())
         whole, left = np.concatenate(J), np.concatenate(r)
         used = slice(0, 2 + d if clock > 0 else 1 + d)
-        step = np.linalg.lstsq(whole[:, used], left, rcond=None)[0]
+        step = least_squares(whole[:, used], left)
         step = np.concatenate([step, np.zeros(2 + d - len(step))])
         frame = (heading + step[0], position + step[1 : 1 + d], float(np.clip(shift + step[-1], -clock, clock)))
         if np.abs(step).max() < 1e-9:
@@ -238,7 +239,7 @@ def _refined(a: dict[str, Track], b: dict[str, Track], frame: Frame, cut: float,
         rows.append((names[i], others[j], spent, _rms(x, y, frame[0], frame[1])))
     if pairs:
         std = float(np.sqrt(np.sum(left**2) / max(len(left) - whole[:, used].shape[1], 1)))
-        covariance = np.linalg.pinv(whole[:, used].T @ whole[:, used]) * std**2
+        covariance = pseudo_inverse(whole[:, used].T @ whole[:, used]) * std**2
         sd[: covariance.shape[0]] = np.sqrt(np.diagonal(covariance))
     table = pd.DataFrame(rows, columns=["first", "second", "seconds", "rms"])
     heading = float((frame[0] + np.pi) % (2 * np.pi) - np.pi)

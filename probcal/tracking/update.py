@@ -72,7 +72,7 @@ def updated(rows: SlotRows, mean: jax.Array, covariance: jax.Array) -> tuple[jax
     The extended update in information form, which takes rows with missing channels and any noise family.
     """
     n = len(mean)
-    root = linalg.factor(covariance)
+    root = linalg.factor_and_inverse(covariance)[0]
     half = jnp.eye(n)[None] + jnp.einsum("mi,dmk,kj->dij", root, rows.information, root)
     pull = jnp.einsum("mi,dm->di", root, rows.score)
     return _pulled(rows.log_density, half, pull, mean, root)
@@ -103,7 +103,7 @@ def updated_by_points(
     score and its expected information at the predicted mean, as in the extended update.
     """
     n = len(mean)
-    root = linalg.factor(covariance)
+    root = linalg.factor_and_inverse(covariance)[0]
     away = jnp.sqrt(float(n)) * root.T
     points = jnp.concatenate([mean[None] + away, mean[None] - away])
     centres = model.predict_at(scan.epoch, (mean[None],), at.z)

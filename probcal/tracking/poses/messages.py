@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg
+from probcal.linalg import marginalise, root_of, solve_square, spectrum
 from probcal.tracking.poses.search import Potential
 from probcal.tracking.poses.vertices import Vertex
 
@@ -37,13 +36,13 @@ class Edge(NamedTuple):
 
 def _normal(precision: np.ndarray, pull: np.ndarray) -> Belief:
     """The Gaussian exp(-x'Px/2 + x'h)."""
-    covariance = np.linalg.solve(precision, np.eye(len(pull)))
+    covariance = solve_square(precision, np.eye(len(pull)))
     return Belief(covariance @ pull, 0.5 * (covariance + covariance.T))
 
 
 def _forms(belief: Belief) -> tuple[np.ndarray, np.ndarray]:
     """Precision and pull of a belief."""
-    precision = np.linalg.solve(belief.covariance, np.eye(len(belief.mean)))
+    precision = solve_square(belief.covariance, np.eye(len(belief.mean)))
     return precision, precision @ belief.mean
 
 
@@ -71,9 +70,10 @@ class Normals:
                 if not len(place[theirs]):
                     continue
                 precision, h = self._gathered(source, e) if self.sent else _forms(before[source])
-                whole = H[mine, mine] + precision
-                gain = np.linalg.solve(whole, H[mine, theirs]).T
-                sent[e, to] = H[theirs, theirs] - gain @ H[mine, theirs], pull[theirs] - gain @ (pull[mine] + h)
+                whole = H.copy()
+                whole[mine, mine] += precision
+                left, gain = marginalise(whole, theirs, 0.0)
+                sent[e, to] = left, pull[theirs] - gain.T @ (pull[mine] + h)
         self.sent |= sent
         moved = 0.0
         for v, old in before.items():
@@ -116,7 +116,7 @@ class Kernels:
         for v, belief in beliefs.items():
             points[v] = belief.points
             if belief.points is None:
-                root = _root(belief.covariance)
+                root = root_of(belief.covariance)
                 points[v] = belief.mean + rng.standard_normal((POINTS, len(belief.mean))) @ root.T
         sent: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {v: [] for v in beliefs}
         for edge in self.edges:
@@ -142,7 +142,7 @@ class Kernels:
         rng = self.rng
         weighed = [(own, _tempered(value)) for own, value in messages]
         drawn = np.concatenate([
-            own[rng.choice(POINTS, POINTS, p=w)] + rng.standard_normal(own.shape) @ _root(_width(own, w)).T
+            own[rng.choice(POINTS, POINTS, p=w)] + rng.standard_normal(own.shape) @ root_of(_width(own, w)).T
             for own, w in weighed
         ])  # fmt: skip
         logs = np.stack([_log_density(drawn, own, w) for own, w in weighed])
@@ -175,15 +175,10 @@ def _width(points: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return factor**2 * (off * weight[:, None]).T @ off + FLOOR * np.eye(p)
 
 
-def _root(covariance: np.ndarray) -> np.ndarray:
-    lengths, axes = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(covariance)))
-    return axes * np.sqrt(np.maximum(lengths, 0.0))
-
-
 def _log_density(at: np.ndarray, points: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Log density (N,) of a kernel mixture, up to nothing."""
     width = _width(points, weight)
-    lengths, axes = (np.asarray(part) for part in linalg.spectrum(jnp.asarray(width)))
+    lengths, axes = spectrum(width)
     white = axes / np.sqrt(lengths)
     square = np.sum(((at @ white)[:, None] - (points @ white)[None]) ** 2, 2)
     logs = np.log(np.maximum(weight, 1e-300))[None] - 0.5 * square

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.linalg import solve_square
 from probcal.tracking.poses.quad import Paired, normaliser
 from probcal.tracking.poses.separable import Crossed, Explained, crossed
 from probcal.tracking.scan import View
@@ -176,7 +177,7 @@ def ascend(potential: Potential, start: np.ndarray) -> Peak | None:
     value, slope, H = potential.expanded(theta)
     for _ in range(CLIMB):
         W = H + eye
-        step = np.linalg.solve(W + damping * np.diag(np.diagonal(W)), slope - theta)
+        step = solve_square(W + damping * np.diag(np.diagonal(W)), slope - theta)
         new = potential.expanded(theta + step)
         if new[0] - 0.5 * np.sum((theta + step) ** 2) >= value - 0.5 * theta @ theta - 1e-9:
             theta, (value, slope, H), damping = theta + step, new, 0.1 * damping
