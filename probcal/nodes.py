@@ -401,8 +401,8 @@ def _calibrated(tree: xr.DataTree) -> list[_Record]:
         raise InputError("the tree holds no calibrated nodes; give the result of fit()")
     constant, found = tree["constant_data"].to_dataset(), tree["calibration"].to_dataset()
     table = found[["mean", "sd", "unit"]].to_dataframe().to_dict("index")
-    fixed = constant["fixed"].to_series().to_dict() if "fixed" in constant else {}
-    shift: dict[str, float] = fixed | {label: row["mean"] for label, row in table.items()}
+    shift: dict[Any, float] = constant["fixed"].to_series().to_dict() if "fixed" in constant else {}
+    shift |= {label: row["mean"] for label, row in table.items()}
     stated = zip(*(constant[name].values for name in ("stated_node", "stated_component", "stated")), strict=True)
     components: dict[str, dict[str, float]] = {}
     for node, component, value in stated:

@@ -17,8 +17,9 @@ from probcal.analysis.compare import common_labels
 from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.errors import InputError, checked
-from probcal.labels import check_name, listed, step_of
+from probcal.labels import check_name, label_parts, listed, step_of
 from probcal.results.answer import HALF
+from probcal.results.read import fixed_biases, stated_values
 from probcal.results.schema import INTERVAL, matrix_of
 from probcal.status import Status
 
@@ -117,7 +118,7 @@ def _check(name: str, tree: xr.DataTree) -> None:
 
 def _check_zero(pair: dict[str, xr.DataTree]) -> None:
     """Raise `InputError` where the fits count a bias from other stated values, or hold one that the other does not."""
-    (one, first), (two, second) = ((name, tree["constant_data"].to_dataset()) for name, tree in pair.items())
+    (one, first), (two, second) = pair.items()
     if len({str(tree.attrs.get("network", "")) for tree in pair.values()}) > 1:
         raise InputError(f'changes: "{one}" and "{two}" started from different networks; give both one --network')
     stated = [_stated(first), _stated(second)]
@@ -126,10 +127,7 @@ def _check_zero(pair: dict[str, xr.DataTree]) -> None:
         if not np.isclose(a, b, rtol=1e-9, atol=1e-12):
             values = f'{a:.10g} in "{one}" and {b:.10g} in "{two}"'
             raise InputError(f"changes: {what} is stated as {values}; state the same values in both")
-    held = [
-        {str(label): float(value) for label, value in own["fixed"].to_series().items()} if "fixed" in own else {}
-        for own in (first, second)
-    ]
+    held = [fixed_biases(tree) for tree in (first, second)]
     free = [set(tree["calibration"].to_dataset()["bias_label"].values.tolist()) for tree in pair.values()]
     for k, name in enumerate(pair):
         for label, value in held[k].items():
@@ -137,16 +135,11 @@ def _check_zero(pair: dict[str, xr.DataTree]) -> None:
                 raise InputError(f'changes: {label} is fixed at {value:g} in "{name}" only; fix the same in both')
 
 
-def _stated(group: xr.Dataset) -> dict[str, float]:
+def _stated(tree: xr.DataTree) -> dict[str, float]:
     """Stated values of the nodes that rest, by node and component."""
-    moving = dict(zip(group["node"].values.tolist(), group["moving"].values.tolist(), strict=True))
-    names = zip(group["stated_node"].values.tolist(), group["stated_component"].values.tolist(), strict=True)
-    found = {f"{n}.{c}": float(v) for (n, c), v in zip(names, group["stated"].values, strict=True) if not moving[n]}
-    for name, place in zip(group["node"].values.tolist(), group["node_position"].values, strict=True):
-        if not moving[name]:
-            axes = zip(group["axis"].values.tolist(), place.tolist(), strict=True)
-            found |= {f"{name}.position_{axis}": value for axis, value in axes}
-    return found
+    moving = tree["constant_data"].to_dataset()["moving"].to_series()
+    values = stated_values(tree)
+    return {label: value for label, value in values.items() if not moving[label_parts(label)[0]]}
 
 
 def _still(tree: xr.DataTree, label: str) -> bool:

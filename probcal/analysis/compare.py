@@ -14,6 +14,7 @@ from probcal.analysis.findings import Finding
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
 from probcal.errors import InputError, checked, nearest
 from probcal.labels import label_parts
+from probcal.results.read import true_biases
 from probcal.results.schema import EVIDENCES
 from probcal.status import INVALID
 
@@ -237,10 +238,8 @@ def _truth(fits: Mapping[str, xr.DataTree], labels: list[str]) -> dict[str, floa
     """True biases that any of the fits knows."""
     found: dict[str, float] = {}
     for name, tree in fits.items():
-        if "truth" not in tree.children:
-            continue
-        for label, value in tree["truth"].to_dataset()["bias"].to_series().items():
-            if found.setdefault(str(label), float(value)) != float(value):
+        for label, value in true_biases(tree).items():
+            if found.setdefault(str(label), value) != value:
                 raise InputError(
                     f'compare: the true {label} of "{name}" is not that of the fits before it; score them alike'
                 )

@@ -17,11 +17,13 @@ from bokeh.models import (
 )
 from bokeh.models.annotations.legends import ColorBar, Legend, LegendItem
 from bokeh.plotting import figure
+from matplotlib.colors import LinearSegmentedColormap, to_hex
 
 from probcal.geodesy import LocalFrame
 from probcal.labels import AXES
 from probcal.plots.base import BEFORE, FAINT, NAMED, SURE, colour, probability
-from probcal.plots.scene import Outline, Scene, Track, ellipse, scene
+from probcal.plots.scene import Outline, Scene, Track, ellipse, scene, thinned
+from probcal.results.read import frame_of
 
 POINTS = 5_000  # epochs of all tracks together
 CORNERS = 32  # of an ellipse
@@ -81,17 +83,17 @@ def _sources(tree: xr.DataTree, shown: Scene) -> dict[str, ColumnDataSource]:
     """Columns that all panels share: epochs, nodes."""
     nodes, d = shown.nodes, shown.dimension
     most = max(2, POINTS // max(len(shown.tracks), 1))
-    tracks = [track.thin(most) for track in shown.tracks]
+    tracks = [thinned(track, most) for track in shown.tracks]
+    sizes = [len(track.time) for track in tracks]
     epochs: dict[str, Any] = {
-        "target": [track.target for track in tracks for _ in track.time],
+        "target": np.repeat([track.target for track in tracks], sizes).tolist(),
         "time": np.concatenate([np.empty(0), *(track.time for track in tracks)]),
-        "colour": [colour(k) for k, track in enumerate(tracks) for _ in track.time],
+        "colour": np.repeat([colour(k) for k in range(len(tracks))], sizes).tolist(),
     }
+    places = np.concatenate([np.empty((0, d)), *(track.after for track in tracks)])
+    sds = np.concatenate([np.empty((0, d)), *(track.sd for track in tracks)]).astype("f4")
     for axis in range(d):
-        epochs[AXES[axis]] = np.concatenate([np.empty(0), *(track.after[:, axis] for track in tracks)])
-        epochs[f"sd_{AXES[axis]}"] = np.concatenate(
-            [np.empty(0, "f4"), *(track.sd[:, axis].astype("f4") for track in tracks)]
-        )
+        epochs[AXES[axis]], epochs[f"sd_{AXES[axis]}"] = places[:, axis], sds[:, axis]
     points: dict[str, Any] = {"name": nodes.name.tolist(), "words": list(_words(tree, shown))}
     for axis in range(d):
         points[AXES[axis]], points[f"to_{AXES[axis]}"] = nodes.stated[:, axis], nodes.calibrated[:, axis]
@@ -100,19 +102,16 @@ def _sources(tree: xr.DataTree, shown: Scene) -> dict[str, ColumnDataSource]:
 
 def _words(tree: xr.DataTree, shown: Scene) -> Iterator[str]:
     """What the map says of each node: where it is, and its biases and those of its sensors."""
-    group, constant = tree["calibration"].to_dataset(), tree["constant_data"].to_dataset()
-    owners = group["owner"].values.tolist() if "owner" in group else [""] * group.sizes["bias_label"]
-    said: dict[str, list[str]] = {}
-    columns = (group[name].values.tolist() for name in ("bias_label", "mean", "sd", "unit"))
-    for owner, label, mean, sd, unit in zip(owners, *columns, strict=True):
-        value = f"{mean:.4g} ± {sd:.2g} {'' if unit == '1' else unit}".rstrip()
-        said.setdefault(owner, []).append(f"{label.removeprefix(f'{owner}.')} {value}")
-    placed: dict[str, list[str]] = {}
+    constant, said = tree["constant_data"].to_dataset(), dict[str, list[str]]()
+    for row in frame_of(tree, "calibration", "owner", "mean", "sd", "unit").itertuples():
+        value = f"{row.mean:.4g} ± {row.sd:.2g} {'' if row.unit == '1' else row.unit}".rstrip()
+        said.setdefault(row.owner, []).append(f"{row.Index.removeprefix(f'{row.owner}.')} {value}")
+    placed = list[tuple[str, str]]()
     if "placement" in constant.dims:
-        for sensor, node in zip(constant["placed_sensor"].values, constant["placed_node"].values, strict=True):
-            placed.setdefault(str(node), []).append(str(sensor))
+        placed = list(zip(constant["placed_node"].values, constant["placed_sensor"].values, strict=True))
     for name, place in zip(shown.nodes.name.tolist(), shown.nodes.stated, strict=True):
-        own = [text for owner in dict.fromkeys([name, *placed.get(name, [])]) for text in said.get(owner, [])]
+        owners = dict.fromkeys([name, *(sensor for node, sensor in placed if node == name)])
+        own = [text for owner in owners for text in said.get(owner, [])]
         more = [f"and {len(own) - LISTED} more"] if len(own) > LISTED else []
         where = ", ".join(f"{axis} {value:.6g}" for axis, value in zip(AXES, place, strict=False))
         yield "\n".join([f"stated {where} m", *own[:LISTED], *more])
@@ -153,14 +152,14 @@ def _panel(shown: Scene, sources: dict[str, ColumnDataSource], axes: tuple[int, 
 
 def _draw_views(sheet: figure, views: list[Outline]) -> None:
     """Where the view of each sensor ends; filled where one line goes round it."""
-    columns: dict[str, list[Any]] = {"xs": [], "ys": [], "colour": [], "fill": [], "sensor": []}
-    for k, own in enumerate(views):
-        for line in own.lines:
-            one = (line[:, 0], line[:, 1], colour(k), 0.05 if own.whole else 0.0, own.sensor)
-            for name, value in zip(columns, one, strict=True):
-                columns[name].append(value)
-    if columns["xs"]:
-        source = ColumnDataSource(data=columns)
+    lines = [
+        (*line.T, colour(k), 0.05 if own.whole else 0.0, own.sensor)
+        for k, own in enumerate(views)
+        for line in own.lines
+    ]
+    if lines:
+        names = ("xs", "ys", "colour", "fill", "sensor")
+        source = ColumnDataSource(data=dict(zip(names, map(list, zip(*lines, strict=True)), strict=True)))
         _tagged("views", sheet.patches("xs", "ys", source=source, color="colour", alpha="fill", line_color=None))
         ends = sheet.multi_line("xs", "ys", source=source, line_color="colour", line_dash="dotdash", line_alpha=0.7)
         said = "<b>@sensor</b><div>its view ends here</div>"
@@ -171,7 +170,7 @@ def _draw_objects(sheet: figure, shown: Scene, plane: list[int]) -> None:
     """Objects that nobody named, by existence, with a bar that says which colour is how sure."""
     if not shown.objects:
         return
-    tracks = [own.thin(max(2, POINTS // len(shown.objects))) for own in shown.objects]
+    tracks = [thinned(own, max(2, POINTS // len(shown.objects))) for own in shown.objects]
     sure = np.concatenate([own.existence[1:] for own in tracks])
     columns: dict[str, Any] = {
         "name": [own.name for own in tracks for _ in own.time[1:]],
@@ -199,15 +198,13 @@ def _draw_objects(sheet: figure, shown: Scene, plane: list[int]) -> None:
 
 def shades(first: str, last: str, count: int = 64) -> list[str]:
     """Colours from one to another, in even steps."""
-    ends = np.array([[int(text[k : k + 2], 16) for k in (1, 3, 5)] for text in (first, last)])
-    steps = ends[0] + np.linspace(0.0, 1.0, count)[:, None] * (ends[1] - ends[0])
-    return [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in steps.round().astype(int).tolist()]
+    return [to_hex(colour) for colour in LinearSegmentedColormap.from_list("", [first, last], count)(range(count))]
 
 
 def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: list[int]) -> None:
     """Lines by layer, and a dot at each epoch that says where it is."""
     most = max(2, POINTS // max(len(shown.tracks), 1))
-    tracks = [track.thin(most) for track in shown.tracks]
+    tracks = [thinned(track, most) for track in shown.tracks]
 
     def lines(tag: str, chosen: Sequence[Track], part: str, **style: Any) -> Any:
         places = [getattr(track, part)[:, plane].T for track in chosen]
@@ -231,7 +228,7 @@ def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: l
         _tagged("mirror", sheet.line(u, v, line_dash="dashed", line_color=MIDDLE))
         _tagged("mirror", sheet.scatter(u[1:], v[1:], size=9, fill_color=None, line_color=MIDDLE))
     if shown.mirrored:
-        lines("mirror", [track.thin(most) for track in shown.mirrored], "after", line_dash="dashed", line_width=1.5)
+        lines("mirror", [thinned(track, most) for track in shown.mirrored], "after", line_dash="dashed", line_width=1.5)
     x, y = (AXES[axis] for axis in plane)
     size = 6 if len(alone) == len(tracks) else 3
     dots = _tagged("after", sheet.scatter(x, y, source=epochs, size=size, fill_color="colour", line_color=None))
@@ -255,8 +252,8 @@ def _draw_nodes(sheet: figure, shown: Scene, source: ColumnDataSource, plane: li
         ]
         rings = [ring for ring in rings if np.isfinite(ring).all()]
         corners = ColumnDataSource(data={"xs": [ring[0] for ring in rings], "ys": [ring[1] for ring in rings]})
-        style: dict[str, Any] = {"fill_color": MIDDLE, "fill_alpha": 0.2, "line_color": MIDDLE}
-        _tagged("ellipses", sheet.patches("xs", "ys", source=corners, **style))
+        drawn = sheet.patches("xs", "ys", source=corners, fill_color=MIDDLE, fill_alpha=0.2, line_color=MIDDLE)
+        _tagged("ellipses", drawn)
     sheet.segment(x, y, f"to_{x}", f"to_{y}", source=source, line_color=MIDDLE, line_width=1.5)
     turned = np.isfinite(nodes.heading)
     if plane == [0, 1] and turned.any():

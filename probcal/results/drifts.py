@@ -10,6 +10,7 @@ import pandas as pd
 from probcal.errors import checked
 from probcal.labels import step_of
 from probcal.results.blocks import SensorBlocks
+from probcal.results.read import fixed_biases
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -30,8 +31,7 @@ def drift_table(tree: xr.DataTree) -> pd.DataFrame:
         return pd.DataFrame(columns=columns)
     group, draws = tree["calibration"].to_dataset(), tree["posterior"].to_dataset()["bias"].values
     labels = group["bias_label"].values.astype(str).tolist()
-    constant = tree["constant_data"].to_dataset()
-    fixed = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
+    fixed = fixed_biases(tree)
     every = [*labels, *fixed]
     units = dict(zip(labels, group["unit"].values, strict=True))
     mean = group["mean"].values
