@@ -181,9 +181,7 @@ def _place_columns(table: Table, cells: pd.DataFrame) -> tuple[str, ...]:
 
 def _stated_place(table: Table, column: pd.Series, name: str, unit: str | None) -> np.ndarray:
     values, there = numbers(table, column, name)
-    blank = np.flatnonzero(~there)
-    if len(blank):
-        raise InputError(f'{table.where(blank[0])} column "{name}" is blank; state it for every node')
+    table.refuse(~there, name, " is blank; state it for every node")
     return values * unit_factor(table, name, unit, PLACE_UNITS[name])
 
 
@@ -364,9 +362,7 @@ def write_nodes(
 
 def _left_out(tree: xr.DataTree, written: int) -> str:
     """The sentence that says what of a fit a map of its nodes lacks; empty where it lacks nothing."""
-    sensors = (
-        int((tree["calibration"]["sensor_type"] != "").sum()) if "sensor_type" in tree["calibration"].coords else 0
-    )
+    sensors = int((tree["calibration"]["sensor_type"] != "").sum())
     nodes = tree["constant_data"].sizes["node"] - written
     counts = ((sensors, "biases of sensors"), (nodes, "nodes that move or drift"))
     left = ", ".join(f"{what} ({count})" for count, what in counts if count)

@@ -44,6 +44,7 @@ def calibration(labels, scale, status):
         "status": status,
         "unit": np.full(count, "m"),
         "kind": np.full(count, "scale"),
+        "owner": [str(label).rpartition(".")[0] for label in labels],
     }
     return xr.Dataset(
         {name: ("bias_label", value) for name, value in columns.items()}

@@ -16,6 +16,7 @@ from probcal.errors import InputError, checked, nearest
 from probcal.labels import label_parts
 from probcal.results.read import true_biases
 from probcal.results.schema import EVIDENCES
+from probcal.results.scores import judged_by, rms
 from probcal.status import INVALID
 
 Fits = Mapping[str, xr.DataTree] | Sequence[xr.DataTree]
@@ -250,14 +251,12 @@ def _scores(tree: xr.DataTree, truth: Mapping[str, float]) -> dict[str, Any]:
     """Error in scales, and how many intervals hold the truth: of all known biases and of those that are not zero."""
     if not truth:
         return {}
-    group, true = tree["calibration"].to_dataset().sel(bias_label=list(truth)), np.array(list(truth.values()))
-    error = (group["mean"].values - true) / group["scale"].values
-    inside = (group["lower"].values <= true) & (true <= group["upper"].values)
-    found: dict[str, Any] = {"bias_rmse": float(np.sqrt(np.mean(error**2)))}
-    for suffix, mine in (("", np.ones(len(true), bool)), ("_nonzero", true != 0)):
-        if mine.any():
-            count = {f"covered{suffix}": int(inside[mine].sum()), f"known{suffix}": int(mine.sum())}
-            found |= count | {f"coverage{suffix}": float(inside[mine].mean())}
+    known = judged_by(tree, truth)
+    found: dict[str, Any] = {"bias_rmse": rms(known["error"])}
+    for suffix, own in (("", known["inside"]), ("_nonzero", known["inside"][known["true"] != 0])):
+        if len(own):
+            count = {f"covered{suffix}": int(own.sum()), f"known{suffix}": len(own)}
+            found |= count | {f"coverage{suffix}": float(own.mean())}
     return found
 
 

@@ -106,9 +106,7 @@ def _words(tree: xr.DataTree, shown: Scene) -> Iterator[str]:
     for row in frame_of(tree, "calibration", "owner", "mean", "sd", "unit").itertuples():
         value = f"{row.mean:.4g} ± {row.sd:.2g} {'' if row.unit == '1' else row.unit}".rstrip()
         said.setdefault(row.owner, []).append(f"{row.Index.removeprefix(f'{row.owner}.')} {value}")
-    placed = list[tuple[str, str]]()
-    if "placement" in constant.dims:
-        placed = list(zip(constant["placed_node"].values, constant["placed_sensor"].values, strict=True))
+    placed = list(zip(constant["placed_node"].values, constant["placed_sensor"].values, strict=True))
     for name, place in zip(shown.nodes.name.tolist(), shown.nodes.stated, strict=True):
         owners = dict.fromkeys([name, *(sensor for node, sensor in placed if node == name)])
         own = [text for owner in owners for text in said.get(owner, [])]

@@ -137,7 +137,6 @@ def _places(tree: xr.DataTree) -> Places:
     names, stated, moved = nodes["node"].values.astype(str), nodes["node_position"].values, pd.Series(bias_values(tree))
     labels = _coordinates(names, stated.shape[1])
     at = group.get_index("bias_label").get_indexer(pd.Index(labels)).reshape(stated.shape)
-    heading = nodes["node_heading"].values if "node_heading" in nodes else np.nan
     return Places(
         name=names,
         stated=stated,
@@ -145,7 +144,7 @@ def _places(tree: xr.DataTree) -> Places:
         covariance=_of_places(group, at),
         free=(at >= 0).any(1),
         moving=nodes["moving"].values.astype(bool),
-        heading=heading + moved.reindex(names + ".heading").to_numpy(),
+        heading=nodes["node_heading"].values + moved.reindex(names + ".heading").to_numpy(),
     )
 
 
@@ -182,7 +181,7 @@ def _alike(tree: xr.DataTree) -> xr.Dataset | None:
 
 def _mirrored(tree: xr.DataTree, alike: xr.Dataset) -> Iterator[Track]:
     """Tracks of the best answer on the other side of a mirror, where one fits as well."""
-    others = alike.isel(mirror=alike["kind"].values != NODE) if "kind" in alike else alike
+    others = alike.isel(mirror=alike["kind"].values != NODE)
     if others.sizes["mirror"]:
         best = int(others["number"].values[others["gain"].values.argmax()])
         for target, group in each_target(tree.children["mirror"]):

@@ -75,8 +75,7 @@ def biases(tree: xr.DataTree) -> tuple[list[str], list[dict[str, Any]]]:
 
 def weighted(tree: xr.DataTree) -> bool:
     """Whether some data count less than others."""
-    group = tree["residual"].to_dataset() if "residual" in tree.children else xr.Dataset()
-    return "weight" in group and bool((group["weight"] < 1).any())
+    return "residual" in tree.children and bool((tree["residual"]["weight"] < 1).any())
 
 
 def noted(tree: xr.DataTree) -> list[str]:
