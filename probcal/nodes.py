@@ -16,7 +16,7 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.files import parsed_json, write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place, earth_axes
-from probcal.labels import AXES, step_of, unescaped
+from probcal.labels import coordinates, step_of, unescaped
 from probcal.lazy import Later
 from probcal.network import ANGLES, POSE_UNITS, Network, Node
 from probcal.sensor import Bias
@@ -399,21 +399,21 @@ def _calibrated(tree: xr.DataTree) -> list[_Record]:
     table = found[["mean", "sd", "unit"]].to_dataframe().to_dict("index")
     shift: dict[Any, float] = constant["fixed"].to_series().to_dict() if "fixed" in constant else {}
     shift |= {label: row["mean"] for label, row in table.items()}
-    stated = zip(*(constant[name].values for name in ("stated_node", "stated_component", "stated")), strict=True)
-    components: dict[str, dict[str, float]] = {}
-    for node, component, value in stated:
-        components.setdefault(str(node), {})[str(component)] = float(value) + shift.get(f"{node}.{component}", 0.0)
+    steps = [step_of(label, shift) for label in shift]
+    drifting = {step[0] for step in steps if step is not None}
+    stated = constant[["stated_node", "stated_component", "stated"]].to_dataframe()
     records = []
     for node, place, moving in zip(*(constant[n].values for n in ("node", "node_position", "moving")), strict=True):
-        axes = [f"position_{axis}" for axis in AXES[: len(place)]]
-        own = {name: table[f"{node}.{name}"] for name in (*axes, *components[node]) if f"{node}.{name}" in table}
-        position = place + [shift.get(f"{node}.{axis}", 0.0) for axis in axes]
-        further = {f"sd_{name}": row["sd"] for name, row in own.items()}
-        units = {name: row["unit"] for name, row in own.items() if name not in axes}
-        names = {f"{node}.{name}" for name in (*axes, *components[node])}
-        drifts = any((step := step_of(label, shift)) is not None and step[0] in names for label in shift)
-        if not moving and not drifts:
-            records.append(_Record(str(node), position, components[node], further, units))
+        axes = coordinates()[: len(place)]
+        rows = stated.loc[stated["stated_node"] == node, ["stated_component", "stated"]].itertuples(index=False)
+        components = {str(name): value + shift.get(f"{node}.{name}", 0.0) for name, value in rows}
+        labels = {name: f"{node}.{name}" for name in (*axes, *components)}
+        own = {name: table[label] for name, label in labels.items() if label in table}
+        if not moving and drifting.isdisjoint(labels.values()):
+            position = place + [shift.get(labels[axis], 0.0) for axis in axes]
+            further = {f"sd_{name}": row["sd"] for name, row in own.items()}
+            units = {name: row["unit"] for name, row in own.items() if name not in axes}
+            records.append(_Record(str(node), position, components, further, units))
     return records
 
 

@@ -14,7 +14,7 @@ import xarray as xr
 
 from probcal.analysis import pieces
 from probcal.analysis.compare import common_labels
-from probcal.analysis.findings import Finding
+from probcal.analysis.findings import Finding, finding_group
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.errors import InputError, checked
 from probcal.labels import check_name, label_parts, listed, step_of
@@ -93,7 +93,7 @@ def changes(first: xr.DataTree, second: xr.DataTree, *, names: Sequence[str] = (
     tree = xr.DataTree.from_dict(
         {
             "change": found,
-            "finding": xr.Dataset({name: ("finding", [getattr(f, name) for f in told]) for name in Finding._fields}),
+            "finding": finding_group(told),
         }
     )
     tree.attrs |= {"first": str(names[0]), "second": str(names[1]), "interval_probability": INTERVAL}

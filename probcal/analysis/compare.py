@@ -10,7 +10,7 @@ import xarray as xr
 from probcal.analysis import loo
 from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.analysis.differences import findings
-from probcal.analysis.findings import Finding
+from probcal.analysis.findings import Finding, finding_group
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
 from probcal.errors import InputError, checked, nearest
 from probcal.labels import label_parts
@@ -72,8 +72,7 @@ def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
         "interval_probability": float(next(iter(known.values())).attrs["interval_probability"]),
     }
     said = [*_left_out(known, labels), *findings(tree)]
-    columns = {name: ("finding", [getattr(one, name) for one in said]) for name in Finding._fields}
-    tree["finding"] = xr.DataTree(xr.Dataset(columns))
+    tree["finding"] = xr.DataTree(finding_group(said))
     return tree
 
 
@@ -194,15 +193,13 @@ def _pairs(fits: Mapping[str, xr.DataTree], labels: list[str]) -> xr.Dataset:
     columns: dict[str, Any] = {
         measure.__name__: (
             ("pair", "bias_label"),
-            [
-                [measure(a, b) for a, b in zip(marginals[first], marginals[second], strict=True)]
-                for first, second in pairs
-            ],
+            [[measure(*own) for own in zip(marginals[a], marginals[b], strict=True)] for a, b in pairs],
         )
         for measure in (overlap, wasserstein)
     }
-    coords = {name: ("pair", [pair[k] for pair in pairs]) for k, name in enumerate(("first", "second"))}
-    return xr.Dataset(columns, {**coords, "bias_label": labels})
+    first, second = zip(*pairs, strict=True)
+    ends = {"first": ("pair", list(first)), "second": ("pair", list(second))}
+    return xr.Dataset(columns, {**ends, "bias_label": labels})
 
 
 def _method(tree: xr.DataTree, labels: list[str]) -> xr.Dataset:

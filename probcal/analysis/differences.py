@@ -101,7 +101,7 @@ def _by_bias(comparison: xr.DataTree, name: str, reference: str) -> Any:
     """One row a bias: what a method says of it, what the reference does (`_there`), and how they differ."""
     group, pair = comparison["estimate"].to_dataset(), comparison["pair"].to_dataset()
     one, other = (group.sel(estimator=own).to_dataframe() for own in (name, reference))
-    frame = one.join(other[["mean", "sd"]], rsuffix="_there")
+    frame = one.join(other[["mean", "sd"]].add_suffix("_there"))
     frame["pruned"], frame["pruned_there"] = one["status"] == "pruned", other["status"] == "pruned"
     frame["ratio"] = (one["sd"] / other["sd"]).where(other["sd"] > 0, 1.0)
     frame["away"] = (one["mean"] - other["mean"]).abs() / one["scale"]

@@ -12,7 +12,7 @@ import xarray as xr
 from probcal import plots
 from probcal.analysis import bound_map, next_anchors, next_passes, next_sensors, observability
 from probcal.analysis.standpoint import standpoint
-from probcal.cli.files import write_result
+from probcal.cli.files import formatted, write_result
 from probcal.cli.models import load_problem, on_network
 from probcal.cli.progress import shown
 from probcal.errors import InputError
@@ -116,9 +116,9 @@ def print_known(problem: Problem, tree: xr.DataTree) -> None:
     if len(table) < tree["bias"].sizes["bias_label"]:
         print(f"{len(table)} of {tree['bias'].sizes['bias_label']} biases, those that the data tell least of")
     print("share: how much of the answer the data give under a prior of one scale; sd: the bound that goes with it")
-    sensors = tree["sensor"].to_dataset().to_dataframe().sort_values("leverage")
-    print("biases that the rows of each sensor determine: " + _listed(sensors["leverage"]))
-    targets = tree["target"].to_dataset()["leverage"].to_series().sort_values().drop(NOBODY, errors="ignore")
+    sensors, targets = (frame_of(tree, group, "leverage")["leverage"].sort_values() for group in ("sensor", "target"))
+    print(f"biases that the rows of each sensor determine: {_listed(sensors)}")
+    targets = targets.drop(NOBODY, errors="ignore")
     listed = f"of each target: {_listed(targets)}; of" if len(targets) else "of"
     print(f"{listed} the motion: {tree['target'].attrs['motion']:.2f}")
     print(_directions_text(tree))
@@ -129,16 +129,16 @@ def _directions_text(tree: xr.DataTree) -> str:
     if "direction" not in tree.children:
         surveyed = "survey" in tree["bias"].to_dataset()["kind"].values.tolist()
         return f"the data determine every direction of the biases{' without a survey' if surveyed else ''}"
-    group = tree["direction"].to_dataset()
-    count = max(group.sizes["direction"], int(tree.attrs["weak"]))
+    frame = frame_of(tree, "direction", "kind", "share", "words", "remedy")
+    count = max(len(frame), int(tree.attrs["weak"]))
     plural = "s" * (count > 1)
     lines = [f"{count} direction{plural} of the biases that the data hardly determine; remedies add up (--fix LABEL):"]
-    if count > group.sizes["direction"]:
+    if count > len(frame):
         lines = [f"{count} directions of the biases that the data hardly determine, {LISTED} of them:"]
-    for k in range(min(group.sizes["direction"], LISTED if count > group.sizes["direction"] else count)):
-        kind, share, words = (group[name].values[k] for name in ("kind", "share", "words"))
-        lines.append(f"  {k + 1}. {group['direction'].values[k]} ({kind}, the data give {share:.2g} of the answer)")
-        lines += [f"     {words}", f"     {group['remedy'].values[k]}"]
+    shown = frame[:LISTED] if count > len(frame) else frame
+    for k, (name, kind, share, words, remedy) in enumerate(shown.itertuples(name=None), 1):
+        lines.append(f"  {k}. {name} ({kind}, the data give {share:.2g} of the answer)")
+        lines += [f"     {words}", f"     {remedy}"]
     return "\n".join([*lines, tree.attrs["rule"]])
 
 
@@ -155,8 +155,7 @@ def _biases(tree: xr.DataTree) -> pd.DataFrame:
 
 def check_table(tree: xr.DataTree) -> pd.DataFrame:
     """The same with its numbers as texts."""
-    frame, forms = _biases(tree), {"scale": "{:.4g}", "sd": "{:.4g}", "share": "{:.3f}"}
-    return frame.assign(**{name: frame[name].map(form.format) for name, form in forms.items()})
+    return formatted(_biases(tree), {"scale": "{:.4g}", "sd": "{:.4g}", "share": "{:.3f}"})
 
 
 def _draw(problem: Problem, tree: xr.DataTree, passes: xr.Dataset, path: Path) -> None:

@@ -1,7 +1,7 @@
 """What the commands write: tables in one step, the report."""
 
 import importlib.util
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,12 @@ def report_of(tree: "xr.DataTree", out: Path, *, static: bool = False) -> Path:
     return write_report(tree, out / "report.html", static=static)
 
 
+def formatted(frame: "pd.DataFrame", forms: Mapping[str, str]) -> "pd.DataFrame":
+    """A table with the numbers of some columns as texts, those that it has."""
+    texts = {name: frame[name].map(form.format) for name, form in forms.items() if name in frame}
+    return frame.assign(**texts)
+
+
 def write_result(
     outputs: Outputs, tree: "xr.DataTree", frame: "pd.DataFrame", draw: Callable[[Path], None] | None, run: str = ""
 ) -> None:
@@ -48,10 +54,14 @@ def write_result(
         say_written(files)
 
 
-def say_findings(tree: "xr.DataTree") -> None:
-    """Print the sentences of a result."""
-    for sentence in tree["finding"].to_dataset()["sentence"].values:
-        print(f"- {sentence}")
+def say_findings(tree: "xr.DataTree", most: int | None = None, where: str = "") -> None:
+    """Print the sentences of a result, all or the first, and where the others are; nothing where it has none."""
+    if "finding" in tree.children:
+        sentences = tree["finding"].to_dataset()["sentence"].values.tolist()
+        shown = sentences[:most]
+        left = len(sentences) - len(shown)
+        for sentence in [*shown, *([f"and {left} more {where}"] if left else [])]:
+            print(f"- {sentence}")
 
 
 def say_written(files: Sequence[Path]) -> None:

@@ -110,9 +110,9 @@ def plot_pair(fits: Fits, labels: Sequence[str], names: Sequence[str] | None = N
             keys.append(Line2D([], [], color=colour(k), label=f"{plain_text(name)}, {probability(tree):.0%} ellipse"))
             continue
         draws = tree["posterior"].to_dataset()["bias"].sel(bias_label=[first, second])
-        z = draws.transpose("chain", "draw", "bias_label").values.reshape(-1, 2)
-        z = z[np.linspace(0, len(z) - 1, min(SCATTER, len(z))).astype(int)]
-        ax.plot(*z.T, ".", color=colour(k), markersize=2.5, alpha=0.4, zorder=2, rasterized=True)
+        z = draws.transpose("bias_label", "chain", "draw").values.reshape(2, -1)
+        z = z[:, np.linspace(0, z.shape[1] - 1, min(SCATTER, z.shape[1])).astype(int)]
+        ax.plot(*z, ".", color=colour(k), markersize=2.5, alpha=0.4, zorder=2, rasterized=True)
         keys.append(Line2D([], [], marker=".", linestyle="", color=colour(k), label=f"{plain_text(name)}, draws"))
     true = pd.concat([true_biases(tree) for tree in known.values()])
     if first in true and second in true:

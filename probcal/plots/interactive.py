@@ -1,6 +1,7 @@
 """The map of a fit in a browser: zoom, a word on every node and epoch, layers before and after calibration."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,14 @@ def interactive_map(tree: xr.DataTree) -> LayoutDOM:
     >>> interactive_map(tree).select_one({"name": "map"}).x_range.name
     'x'
     """
-    shown = scene(tree)
+    whole = scene(tree)
+    most, of_object = (max(2, POINTS // max(len(own), 1)) for own in (whole.tracks, whole.objects))
+    shown = replace(
+        whole,
+        tracks=[thinned(own, most) for own in whole.tracks],
+        mirrored=[thinned(own, most) for own in whole.mirrored],
+        objects=[thinned(own, of_object) for own in whole.objects],
+    )
     sources = _sources(tree, shown)
     plan = _panel(shown, sources, (0, 1), probability(tree))
     if shown.dimension == 2:
@@ -82,8 +90,7 @@ def _encircled(shown: Scene) -> bool:
 def _sources(tree: xr.DataTree, shown: Scene) -> dict[str, ColumnDataSource]:
     """Columns that all panels share: epochs, nodes."""
     nodes, d = shown.nodes, shown.dimension
-    most = max(2, POINTS // max(len(shown.tracks), 1))
-    tracks = [thinned(track, most) for track in shown.tracks]
+    tracks = shown.tracks
     sizes = [len(track.time) for track in tracks]
     epochs: dict[str, Any] = {
         "target": np.repeat([track.target for track in tracks], sizes).tolist(),
@@ -161,14 +168,14 @@ def _draw_views(sheet: figure, views: list[Outline]) -> None:
         _tagged("views", sheet.patches("xs", "ys", source=source, color="colour", alpha="fill", line_color=None))
         ends = sheet.multi_line("xs", "ys", source=source, line_color="colour", line_dash="dotdash", line_alpha=0.7)
         said = "<b>@sensor</b><div>its view ends here</div>"
-        sheet.add_tools(HoverTool(renderers=[_tagged("views", ends)], tooltips=said, visible=False, name="views"))
+        _hover(sheet, [_tagged("views", ends)], said, name="views", visible=False)
 
 
 def _draw_objects(sheet: figure, shown: Scene, plane: list[int]) -> None:
     """Objects that nobody named, by existence, with a bar that says which colour is how sure."""
     if not shown.objects:
         return
-    tracks = [thinned(own, max(2, POINTS // len(shown.objects))) for own in shown.objects]
+    tracks = shown.objects
     sure = np.concatenate([own.existence[1:] for own in tracks])
     columns: dict[str, Any] = {
         "name": [own.name for own in tracks for _ in own.time[1:]],
@@ -183,9 +190,7 @@ def _draw_objects(sheet: figure, shown: Scene, plane: list[int]) -> None:
         line_color={"field": "existence", "transform": tint},
     )  # fmt: skip
     said = "<b>@name</b><div>time @time{0.000} s</div><div>existence @existence{0.00}</div>"
-    sheet.add_tools(
-        HoverTool(renderers=[_tagged("objects", band)], tooltips=said, description="Objects", name="objects")
-    )
+    _hover(sheet, [_tagged("objects", band)], said, name="objects", description="Objects")
     if plane == [0, 1]:
         bar = ColorBar(
             color_mapper=tint, title="existence", width=10, height=120, background_fill_alpha=0.0, location=(0, 0),
@@ -201,8 +206,7 @@ def shades(first: str, last: str, count: int = 64) -> list[str]:
 
 def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: list[int]) -> None:
     """Lines by layer, and a dot at each epoch that says where it is."""
-    most = max(2, POINTS // max(len(shown.tracks), 1))
-    tracks = [thinned(track, most) for track in shown.tracks]
+    tracks = shown.tracks
 
     def lines(tag: str, chosen: Sequence[Track], part: str, **style: Any) -> Any:
         places = [getattr(track, part)[:, plane].T for track in chosen]
@@ -213,9 +217,9 @@ def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: l
     if not tracks:
         return
     alone = [track for track in tracks if len(track.time) == 1]  # a line of one point is none
-    for tag, part, marker in (("before", "before", "circle"), ("truth", "true", "x")) if alone else ():
+    marks = (("before", "before", "circle", BEFORE), ("truth", "true", "x", MIDDLE))
+    for tag, part, marker, tint in marks if alone else ():
         u, v = np.array([getattr(track, part)[0, plane] for track in alone]).T
-        tint = BEFORE if tag == "before" else MIDDLE
         _tagged(tag, sheet.scatter(u, v, marker=marker, size=6, fill_color=tint, line_color=tint))
     lines("before", tracks, "before", line_color=BEFORE, line_width=1)
     after = lines("after", tracks, "after", line_width=1.5)
@@ -226,14 +230,14 @@ def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: l
         _tagged("mirror", sheet.line(u, v, line_dash="dashed", line_color=MIDDLE))
         _tagged("mirror", sheet.scatter(u[1:], v[1:], size=9, fill_color=None, line_color=MIDDLE))
     if shown.mirrored:
-        lines("mirror", [thinned(track, most) for track in shown.mirrored], "after", line_dash="dashed", line_width=1.5)
+        lines("mirror", shown.mirrored, "after", line_dash="dashed", line_width=1.5)
     x, y = (AXES[axis] for axis in plane)
     size = 6 if len(alone) == len(tracks) else 3
     dots = _tagged("after", sheet.scatter(x, y, source=epochs, size=size, fill_color="colour", line_color=None))
     axes = AXES[: shown.dimension]
     where = "".join(f"<div>{axis} @{axis}{{0.000}} ± @sd_{axis}{{0.000}} m</div>" for axis in axes)
     said = f"<b>@target</b><div>time @time{{0.000}} s</div>{where}"
-    sheet.add_tools(HoverTool(renderers=[dots], tooltips=said, description="Epochs", name="epochs"))
+    _hover(sheet, [dots], said, name="epochs", description="Epochs")
     if plane == [0, 1] and 1 < len(tracks) <= LISTED:
         items = [LegendItem(label=track.target, renderers=[after], index=k) for k, track in enumerate(tracks)]
         key: dict[str, Any] = {"items": items, "border_line_color": None, "background_fill_alpha": 0.5}
@@ -245,10 +249,9 @@ def _draw_nodes(sheet: figure, shown: Scene, source: ColumnDataSource, plane: li
     nodes, (x, y) = shown.nodes, (AXES[axis] for axis in plane)
     moved = nodes.calibrated[:, plane]
     if _encircled(shown):
-        rings = [
-            _ring(moved[k], nodes.covariance[k][np.ix_(plane, plane)], probability) for k in np.flatnonzero(nodes.free)
-        ]
-        rings = [ring for ring in rings if np.isfinite(ring).all()]
+        spread = nodes.covariance[:, plane][:, :, plane]
+        known = nodes.free & np.isfinite(moved).all(1) & np.isfinite(spread).all((1, 2))
+        rings = [_ring(moved[k], spread[k], probability) for k in np.flatnonzero(known)]
         corners = ColumnDataSource(data={"xs": [ring[0] for ring in rings], "ys": [ring[1] for ring in rings]})
         drawn = sheet.patches("xs", "ys", source=corners, fill_color=MIDDLE, fill_alpha=0.2, line_color=MIDDLE)
         _tagged("ellipses", drawn)
@@ -256,22 +259,20 @@ def _draw_nodes(sheet: figure, shown: Scene, source: ColumnDataSource, plane: li
     turned = np.isfinite(nodes.heading)
     if plane == [0, 1] and turned.any():
         size = 0.04 * float((shown.high - shown.low)[:2].max())
-        tips = moved[turned] + size * np.stack([np.cos(nodes.heading[turned]), np.sin(nodes.heading[turned])], 1)
+        heading = nodes.heading[turned]
+        tips = moved[turned] + size * np.stack([np.cos(heading), np.sin(heading)], 1)
         sheet.segment(*moved[turned].T, *tips.T, line_color="#d00000", line_width=2)
     stated = sheet.scatter(x, y, source=source, marker="square", size=10, fill_color=None, line_color=MIDDLE)
     found = sheet.scatter(f"to_{x}", f"to_{y}", source=source, size=6, fill_color=MIDDLE, line_color=None)
     said = '<b>@name</b><div style="white-space: pre-line">@words</div>'
-    sheet.add_tools(HoverTool(renderers=[stated, found], tooltips=said, description="Nodes", name="nodes"))
+    _hover(sheet, [stated, found], said, name="nodes", description="Nodes")
     if plane == [0, 1] and len(nodes.name) <= NAMED:
         at = nodes.named
         inner = at[:, 0] < shown.low[0] + 0.75 * (shown.high - shown.low)[0]  # names stay on the sheet
-        side: dict[str, Any] = {
-            "x_offset": np.where(inner, 8, -8), "text_align": np.where(inner, "left", "right").tolist()
-        }  # fmt: skip
-        columns = {"x": at[:, 0], "y": at[:, 1], "name": nodes.name.tolist()} | side
-        named = ColumnDataSource(data=columns)
-        aside: dict[str, Any] = {key: key for key in side}
-        _tagged("names", sheet.text("x", "y", text="name", source=named, y_offset=-6, **aside, **TEXT))
+        side = {"x_offset": np.where(inner, 8, -8), "text_align": np.where(inner, "left", "right").tolist()}
+        named = ColumnDataSource(data={"x": at[:, 0], "y": at[:, 1], "name": nodes.name.tolist()} | side)
+        options: dict[str, Any] = TEXT | {key: key for key in side}
+        _tagged("names", sheet.text("x", "y", text="name", source=named, y_offset=-6, **options))
 
 
 def _tagged(layer: str, renderer: Any) -> Any:
@@ -279,13 +280,17 @@ def _tagged(layer: str, renderer: Any) -> Any:
     return renderer
 
 
+def _hover(sheet: figure, renderers: list[Any], text: str, **options: Any) -> None:
+    """Show a text where the pointer is on what is drawn."""
+    sheet.add_tools(HoverTool(renderers=renderers, tooltips=text, **options))
+
+
 def _ring(centre: np.ndarray, covariance: np.ndarray, probability: float) -> np.ndarray:
     """Corners (2, CORNERS) of an ellipse."""
     width, height, angle = ellipse(covariance, probability)
-    turn = np.linspace(0.0, 2 * np.pi, CORNERS, endpoint=False)
-    along, across = width / 2 * np.cos(turn), height / 2 * np.sin(turn)
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([centre[0] + c * along - s * across, centre[1] + s * along + c * across])
+    turn = np.exp(1j * np.linspace(0.0, 2 * np.pi, CORNERS, endpoint=False))
+    corners = np.exp(1j * angle) * (width / 2 * turn.real + 0.5j * height * turn.imag)
+    return np.stack([centre[0] + corners.real, centre[1] + corners.imag])
 
 
 # Meridians and parallels

@@ -12,7 +12,7 @@ from probcal.labels import NOBODY, coordinates
 from probcal.lazy import Later
 from probcal.results.alignment import Alignment
 from probcal.results.alignment import align as laid_on
-from probcal.results.read import each_target, summary
+from probcal.results.read import each_target, frame_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -75,7 +75,7 @@ def scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> dict
 
 def judged_by(tree: xr.DataTree, true: Mapping[str, float]) -> Any:
     """One row a bias whose true value is known: `true`, its `error` in scales, whether the interval has it `inside`."""
-    frame = summary(tree).set_index("bias")
+    frame = frame_of(tree, "calibration", "mean", "scale", "lower", "upper")
     frame["true"] = [true.get(label, np.nan) for label in frame.index]
     frame["error"] = (frame["mean"] - frame["true"]) / frame["scale"]
     frame["inside"] = frame["true"].between(frame["lower"], frame["upper"])
