@@ -19,6 +19,7 @@ from bokeh.models import (
 from bokeh.models.annotations.legends import ColorBar, Legend, LegendItem
 from bokeh.plotting import figure
 from matplotlib.colors import LinearSegmentedColormap, to_hex
+from matplotlib.ticker import MaxNLocator
 
 from probcal.geodesy import LocalFrame
 from probcal.labels import AXES
@@ -318,18 +319,11 @@ def graticule(frame: LocalFrame, low: np.ndarray, high: np.ndarray, dimension: i
     spans = [(part.min(), part.max()) for part in (latitude, longitude)]
     height = [] if dimension == 2 else [frame.height]
     for own, (first, last) in enumerate(spans):
-        step = _round_step((last - first) / (3 * LINES))
+        values: Any = MaxNLocator(3 * LINES, steps=[1, 2, 5, 10]).tick_values(first, last)
         along = np.linspace(*spans[1 - own], 61)
-        for value in np.arange(np.ceil(first / step), np.floor(last / step) + 1) * step:
-            fixed = np.full(len(along), value)
-            pair = (fixed, along) if own == 0 else (along, fixed)
-            side = ("N", "S") if own == 0 else ("E", "W")
+        for value in values[(values >= first) & (values <= last)]:
+            place = [np.full(len(along), value), along]
             shown = value if own == 0 else (value + 180.0) % 360.0 - 180.0
-            text = f"{np.format_float_positional(abs(round(shown, 9)), trim='-')}° {side[int(shown < 0)]}"
-            yield text, frame.to_local(*pair, *height)[:, :2]
-
-
-def _round_step(step: float) -> float:
-    """The next of 1, 2 and 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(step))
-    return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= step * (1 - 1e-9))
+            side = ("NS", "EW")[own][int(shown < 0)]
+            text = f"{np.format_float_positional(abs(round(shown, 9)), trim='-')}° {side}"
+            yield text, frame.to_local(*(place if own == 0 else place[::-1]), *height)[:, :2]

@@ -1,6 +1,7 @@
 """Numbers and sentences of a report: what a fit found, in words."""
 
 import re
+from collections import Counter
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -80,27 +81,28 @@ def headline(tree: xr.DataTree) -> str:
     return f"The fit {status.said}: {told}{_judged(tree)}."
 
 
+def _verdicts(tree: xr.DataTree) -> list[str]:
+    """Verdict of every bias; empty where the fit was not assessed."""
+    return tree["verdict"].to_dataset()["verdict"].values.tolist() if "verdict" in tree.children else []
+
+
 def _judged(tree: xr.DataTree) -> str:
     """How many biases have which verdict."""
-    if "verdict" not in tree.children:
-        return ""
-    verdicts = tree["verdict"].to_dataset()["verdict"].values.tolist()
-    counts = {name: verdicts.count(name) for name in ("determined", *ASIDE, "weak", "prior only")}
-    return "; " + ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    count = Counter(_verdicts(tree))
+    told = [f"{count[name]} {name}" for name in ("determined", *ASIDE, "weak", "prior only") if count[name]]
+    return f"; {', '.join(told)}" if told else ""
 
 
 def nothing_found(tree: xr.DataTree) -> str:
     """What it means that no bias is shown: how many the data tell of, or that nobody asked."""
-    if "verdict" not in tree.children:
-        return "; the fit was not assessed"
-    verdicts = tree["verdict"].to_dataset()["verdict"].values
-    told = int((verdicts == "determined").sum())
-    return f"; the data determine {told} of {len(verdicts)}"
+    verdicts = _verdicts(tree)
+    told = f"the data determine {verdicts.count('determined')} of {len(verdicts)}"
+    return f"; {told if verdicts else 'the fit was not assessed'}"
 
 
 def in_conflict(tree: xr.DataTree) -> bool:
     """Whether some bias conflicts with the model or drifts."""
-    return "verdict" in tree.children and bool(np.isin(tree["verdict"].to_dataset()["verdict"].values, ASIDE).any())
+    return not set(ASIDE).isdisjoint(_verdicts(tree))
 
 
 def bias_frame(tree: xr.DataTree) -> Any:
