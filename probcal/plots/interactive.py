@@ -210,10 +210,9 @@ def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: l
     tracks = shown.tracks
 
     def lines(tag: str, chosen: Sequence[Track], part: str, **style: Any) -> Any:
-        places = [getattr(track, part)[:, plane].T for track in chosen]
-        columns = {"xs": [p[0] for p in places], "ys": [p[1] for p in places]}
-        source = ColumnDataSource(data=columns | {"colour": [colour(k) for k in range(len(chosen))]})
-        return _tagged(tag, sheet.multi_line("xs", "ys", source=source, **({"line_color": "colour"} | style)))
+        xs, ys = ([getattr(track, part)[:, axis] for track in chosen] for axis in plane)
+        tints = [colour(k) for k in range(len(chosen))]
+        return _tagged(tag, sheet.multi_line(xs, ys, **({"line_color": tints} | style)))
 
     if not tracks:
         return
@@ -252,10 +251,9 @@ def _draw_nodes(sheet: figure, shown: Scene, source: ColumnDataSource, plane: li
     if _encircled(shown):
         spread = nodes.covariance[:, plane][:, :, plane]
         known = nodes.free & np.isfinite(moved).all(1) & np.isfinite(spread).all((1, 2))
-        rings = [_ring(moved[k], spread[k], probability) for k in np.flatnonzero(known)]
-        corners = ColumnDataSource(data={"xs": [ring[0] for ring in rings], "ys": [ring[1] for ring in rings]})
-        drawn = sheet.patches("xs", "ys", source=corners, fill_color=MIDDLE, fill_alpha=0.2, line_color=MIDDLE)
-        _tagged("ellipses", drawn)
+        rings = np.reshape([_ring(moved[k], spread[k], probability) for k in np.flatnonzero(known)], (-1, 2, CORNERS))
+        style: dict[str, Any] = {"fill_color": MIDDLE, "fill_alpha": 0.2, "line_color": MIDDLE}
+        _tagged("ellipses", sheet.patches(list(rings[:, 0]), list(rings[:, 1]), **style))
     sheet.segment(x, y, f"to_{x}", f"to_{y}", source=source, line_color=MIDDLE, line_width=1.5)
     turned = np.isfinite(nodes.heading)
     if plane == [0, 1] and turned.any():
@@ -270,10 +268,10 @@ def _draw_nodes(sheet: figure, shown: Scene, source: ColumnDataSource, plane: li
     if plane == [0, 1] and len(nodes.name) <= NAMED:
         at = nodes.named
         inner = at[:, 0] < shown.low[0] + 0.75 * (shown.high - shown.low)[0]  # names stay on the sheet
-        side = {"x_offset": np.where(inner, 8, -8), "text_align": np.where(inner, "left", "right").tolist()}
-        named = ColumnDataSource(data={"x": at[:, 0], "y": at[:, 1], "name": nodes.name.tolist()} | side)
-        options: dict[str, Any] = TEXT | {key: key for key in side}
-        _tagged("names", sheet.text("x", "y", text="name", source=named, y_offset=-6, **options))
+        side: dict[str, Any] = {
+            "x_offset": np.where(inner, 8, -8), "text_align": np.where(inner, "left", "right").tolist()
+        }  # fmt: skip
+        _tagged("names", sheet.text(at[:, 0], at[:, 1], text=nodes.name.tolist(), y_offset=-6, **side, **TEXT))
 
 
 def _tagged(layer: str, renderer: Any) -> Any:
@@ -299,13 +297,13 @@ def _ring(centre: np.ndarray, covariance: np.ndarray, probability: float) -> np.
 
 def _draw_graticule(sheet: figure, frame: LocalFrame, low: np.ndarray, high: np.ndarray, dimension: int) -> None:
     """Meridians and parallels at round degrees over three times the map, named where they enter it."""
-    lines = list(graticule(frame, low, high, dimension))
-    places = ColumnDataSource(data={"xs": [line[:, 0] for _, line in lines], "ys": [line[:, 1] for _, line in lines]})
-    sheet.multi_line("xs", "ys", source=places, line_color=MIDDLE, line_alpha=0.45, line_dash="dotdash")
-    entries = [(text, line[((line > low) & (line < high)).all(1)][:1]) for text, line in lines]
-    named = [(text, *place[0].tolist()) for text, place in entries if len(place)]
-    columns = {key: [entry[k] for entry in named] for k, key in enumerate(("text", "x", "y"))}
-    sheet.text("x", "y", text="text", source=ColumnDataSource(data=columns), x_offset=3, y_offset=-2, **TEXT)
+    lines: list[Any] = list(graticule(frame, low, high, dimension))
+    xs, ys = ([line[:, axis] for _, line in lines] for axis in (0, 1))
+    sheet.multi_line(xs, ys, line_color=MIDDLE, line_alpha=0.45, line_dash="dotdash")
+    inside = [(text, line[((line > low) & (line < high)).all(1)][:1]) for text, line in lines]
+    named = [text for text, place in inside if len(place)]
+    at = np.concatenate([np.empty((0, 2)), *(place for _, place in inside)])
+    sheet.text(at[:, 0], at[:, 1], text=named, x_offset=3, y_offset=-2, **TEXT)
 
 
 def graticule(frame: LocalFrame, low: np.ndarray, high: np.ndarray, dimension: int) -> Iterator[tuple[str, np.ndarray]]:
