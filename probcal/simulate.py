@@ -94,19 +94,11 @@ class Truth:
         if columns[-1] not in self.tracks:
             raise InputError(f'truth: the tracks have no column "{columns[-1]}", the network is {dimension}-D')
         for name in np.unique(target):
-            own = self._of(name)
+            own = _track_of(self.tracks, name)
             if len(own):
                 rows, known = target == name, own["time"].to_numpy(float)
                 found[rows] = _interpolated(time[rows], known, own[columns].to_numpy(float))
         return found
-
-    def _of(self, target: str) -> pd.DataFrame:
-        """Rows of the track of a target in order of time."""
-        assert isinstance(self.tracks, pd.DataFrame)
-        track = self.tracks
-        if "target" in track:
-            track = track[track["target"].map(name_as_text) == target]
-        return track.sort_values("time", kind="stable")
 
     def track(self, target: str, time: np.ndarray) -> pd.DataFrame | None:
         """State of a target at times (E,), interpolated, one column a component; NaN outside its track, None without.
@@ -115,7 +107,7 @@ class Truth:
         """
         if not isinstance(self.tracks, pd.DataFrame):
             return None
-        track = self._of(target)
+        track = _track_of(self.tracks, target)
         if not len(track):
             return None
         values = track.drop(columns=["time", "target"], errors="ignore").apply(pd.to_numeric, errors="coerce")
@@ -137,6 +129,13 @@ class Simulation:
         biases = pd.DataFrame(self.truth.biases.items(), columns=["bias", "value"])
         tables: Any = zip([path, *_beside(path)], [self.table, self.truth.tracks, biases], strict=True)
         return [write_whole(target, csv_text(frame)) for target, frame in tables]
+
+
+def _track_of(tracks: pd.DataFrame, target: str) -> pd.DataFrame:
+    """Rows of the track of a target in order of time."""
+    named = "target" in tracks
+    own = tracks[tracks["target"].map(name_as_text) == target] if named else tracks
+    return own.sort_values("time", kind="stable")
 
 
 def _interpolated(time: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:

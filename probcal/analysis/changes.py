@@ -19,8 +19,8 @@ from probcal.analysis.verdict import RATE, limit_of
 from probcal.errors import InputError, checked
 from probcal.labels import check_name, label_parts, listed, step_of
 from probcal.results.answer import HALF
-from probcal.results.read import fixed_biases, stated_values
-from probcal.results.schema import INTERVAL, matrix_of
+from probcal.results.read import stated_values
+from probcal.results.schema import INTERVAL, held_biases, matrix_of
 from probcal.status import Status
 
 PATTERN = np.array([[0.0], [1.0]])  # what the second recording has beyond the first
@@ -127,7 +127,7 @@ def _check_zero(pair: dict[str, xr.DataTree]) -> None:
         if not np.isclose(a, b, rtol=1e-9, atol=1e-12):
             values = f'{a:.10g} in "{one}" and {b:.10g} in "{two}"'
             raise InputError(f"changes: {what} is stated as {values}; state the same values in both")
-    held = [fixed_biases(tree) for tree in (first, second)]
+    held = [held_biases(tree) for tree in (first, second)]
     free = [set(tree["calibration"].to_dataset()["bias_label"].values.tolist()) for tree in pair.values()]
     for k, name in enumerate(pair):
         for label, value in held[k].items():

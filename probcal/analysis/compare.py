@@ -14,7 +14,7 @@ from probcal.analysis.findings import Finding, finding_group
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
 from probcal.errors import InputError, checked, nearest
 from probcal.labels import label_parts
-from probcal.results.read import true_biases
+from probcal.results.read import known_truth
 from probcal.results.schema import EVIDENCES
 from probcal.results.scores import judged_by, rms
 from probcal.status import INVALID
@@ -236,7 +236,7 @@ def _truth(fits: Mapping[str, xr.DataTree], labels: list[str]) -> dict[str, floa
     """True biases that any of the fits knows."""
     found: dict[str, float] = {}
     for name, tree in fits.items():
-        for label, value in true_biases(tree).items():
+        for label, value in known_truth(tree).items():
             if found.setdefault(str(label), value) != value:
                 raise InputError(
                     f'compare: the true {label} of "{name}" is not that of the fits before it; score them alike'

@@ -14,7 +14,7 @@ from probcal.cli.files import say_findings, write_result
 from probcal.diagnostics import comparison_rows
 from probcal.files import Outputs
 from probcal.results.io import load
-from probcal.results.read import true_biases
+from probcal.results.read import known_truth
 from probcal.results.schema import EVIDENCES
 from probcal.status import INVALID
 
@@ -44,7 +44,7 @@ def estimates_text(comparison: xr.DataTree) -> str:
     labels, names = estimate["bias_label"].values.tolist(), estimate["estimator"].values.tolist()
     first = names[0]
     columns: list[tuple[str, list[str]]] = [("bias", labels), ("unit", estimate["unit"].values.tolist())]
-    if len(true := true_biases(comparison)):
+    if len(true := known_truth(comparison)):
         columns.append(("true", [f"{true[label] + 0.0:.4g}" if label in true else "" for label in labels]))
     for name in names:
         one = estimate.sel(estimator=name)

@@ -24,6 +24,7 @@ POINTS = 3_000  # of one track
 ALL_POINTS = 40_000  # of all tracks together
 ROWS = 120  # biases in one forest
 FEW = 25  # nodes above which their names and marks are small
+LISTED = 12  # targets or objects in a legend, and biases in the words of a node
 NAMED = 60  # nodes, targets or biases above which names are left out
 LINEAR = 12.0  # scales up to which the axis of a forest stays linear
 BESIDE: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "frameon": False, "fontsize": 8}  # of a legend

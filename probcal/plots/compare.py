@@ -26,7 +26,7 @@ from probcal.plots.base import (
     write_figure,
 )
 from probcal.results.blocks import SensorBlocks
-from probcal.results.read import true_biases
+from probcal.results.read import known_truth
 from probcal.status import INVALID
 
 SCATTER = 2_000  # draws of one fit in the picture of a pair
@@ -56,7 +56,7 @@ def plot_methods(comparison: xr.DataTree, ax: Axes | None = None) -> Axes:
         label = plain_text(name) + ("" if valid else f", {status}")
         ax.plot(mean, place, "o", color=colour(k), markersize=3.5, label=label, zorder=3)
         seen += [lower, upper] if valid else []  # what diverged is cut
-    true = true_biases(comparison).reindex(labels).to_numpy() / scale
+    true = known_truth(comparison).reindex(labels).to_numpy() / scale
     if np.isfinite(true).any():
         ax.plot(true, rows, "|", color="#d00000", markersize=11, markeredgewidth=1.4, zorder=4, label="true")
     scale_axis(ax, *seen, true)
@@ -114,7 +114,7 @@ def plot_pair(fits: Fits, labels: Sequence[str], names: Sequence[str] | None = N
         z = z[:, np.linspace(0, z.shape[1] - 1, min(SCATTER, z.shape[1])).astype(int)]
         ax.plot(*z, ".", color=colour(k), markersize=2.5, alpha=0.4, zorder=2, rasterized=True)
         keys.append(Line2D([], [], marker=".", linestyle="", color=colour(k), label=f"{plain_text(name)}, draws"))
-    true = pd.concat([true_biases(tree) for tree in known.values()])
+    true = pd.concat([known_truth(tree) for tree in known.values()])
     if first in true and second in true:
         place = [true[[label]].iloc[-1] for label in (first, second)]
         ax.plot(*place, "x", color="#d00000", markersize=8, markeredgewidth=1.8, zorder=5)

@@ -30,7 +30,7 @@ from probcal.plots.base import (
     scale_axis,
 )
 from probcal.results.drifts import drift_table
-from probcal.results.read import frame_of, summary, true_biases
+from probcal.results.read import frame_of, known_truth, summary
 from probcal.results.schema import EVIDENCES, evidence_in
 from probcal.status import INVALID
 
@@ -39,7 +39,7 @@ def plot_biases(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw mean and interval of every bias in units of its scale, coloured by gamma, with the true value."""
     frame = summary(tree).set_index("bias")
     total, invalid = len(frame), frame["status"].isin(INVALID)
-    known = frame[["mean", "lower", "upper"]].assign(true=true_biases(tree)).div(frame["scale"], axis=0)
+    known = frame[["mean", "lower", "upper"]].assign(true=known_truth(tree)).div(frame["scale"], axis=0)
     size = known["mean"].abs().fillna(np.inf).mask(invalid, np.inf)
     chosen = most_first(size.to_numpy())
     frame, known = frame.iloc[chosen], known.iloc[chosen]

@@ -23,14 +23,13 @@ from matplotlib.ticker import MaxNLocator
 
 from probcal.geodesy import LocalFrame
 from probcal.labels import AXES
-from probcal.plots.base import BEFORE, FAINT, NAMED, SURE, colour, probability
+from probcal.plots.base import BEFORE, FAINT, LISTED, NAMED, SURE, colour, probability
 from probcal.plots.scene import Outline, Scene, Track, ellipse, scene, thinned
 from probcal.results.read import frame_of
 
 POINTS = 5_000  # epochs of all tracks together
 CORNERS = 32  # of an ellipse
 ENCIRCLED = 500  # nodes above which there are no ellipses
-LISTED = 12  # targets in the legend, and biases in the words of a node
 LINES = 6  # meridians, and parallels, across the map
 MIDDLE = "#767676"  # readable on white and on black
 TEXT: dict[str, Any] = {"text_color": MIDDLE, "text_font_size": "12px"}

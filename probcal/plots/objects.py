@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from probcal.errors import InputError
-from probcal.plots.base import ALL_POINTS, SURE, colour, finish, plain_text
+from probcal.plots.base import ALL_POINTS, LISTED, SURE, colour, finish, plain_text
 
-LISTED = 12  # objects in the legend
 THERE = 0.5  # existence from which an object is counted
 
 

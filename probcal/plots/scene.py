@@ -49,7 +49,7 @@ def thinned[T: (Track, Found)](whole: T, most: int) -> T:
     if len(whole.time) <= most:
         return whole
     chosen = np.linspace(0, len(whole.time) - 1, most).round().astype(int)
-    parts = {name: values[chosen] for name, values in vars(whole).items() if isinstance(values, np.ndarray)}
+    parts = {name: values[chosen] for name, values in vars(whole).items() if np.ndim(values)}
     return replace(whole, **parts)
 
 

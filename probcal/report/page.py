@@ -9,6 +9,7 @@ from typing import Any
 
 import jinja2
 import matplotlib
+import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
@@ -140,7 +141,7 @@ def _pictures(tree: xr.DataTree, light: tuple[str, ...]) -> list[dict[str, str]]
 
 def _embed(drawn: Axes | list[Axes], kind: str) -> str:
     """The figure of these axes in a data address, the same for the same tree."""
-    ax = drawn[0] if isinstance(drawn, list) else drawn
+    ax = np.atleast_1d(np.array(drawn, object))[0]
     sheet = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "probcal"}):
         metadata = {"Date": None} if kind == "svg" else {"Software": None}

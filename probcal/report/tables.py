@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 
 from probcal.report.words import bias_frame, fixed, number, rounded, said_once
-from probcal.results.read import fixed_biases, frame_of, outliers
-from probcal.results.schema import EVIDENCES, evidence_in
+from probcal.results.read import frame_of, outliers
+from probcal.results.schema import EVIDENCES, evidence_in, held_biases
 from probcal.status import INVALID
 
 BIASES = 400  # of the table of all: the others are in summary.csv
@@ -96,10 +96,9 @@ def tables(tree: xr.DataTree) -> list[dict[str, Any]]:
     return [table for maker in (_of_fit, _of_scans, _of_data) for table in maker(tree)]
 
 
-def _table(title: str, columns: Mapping[str, Iterable[Any]], most: int = CHECKED) -> dict[str, Any]:
-    """A table of columns of texts or numbers; of many rows the first."""
-    cells = [[one if isinstance(one, str) else number(one) for one in column] for column in columns.values()]
-    rows = list(zip(*cells, strict=True))
+def _table(title: str, columns: Mapping[str, Iterable[str]], most: int = CHECKED) -> dict[str, Any]:
+    """A table of columns of texts; of many rows the first."""
+    rows = list(zip(*columns.values(), strict=True))
     more = f", the first {most}" if len(rows) > most else ""
     return {"title": title + more, "columns": list(columns), "rows": rows[:most]}
 
@@ -108,8 +107,9 @@ def _of_fit(tree: xr.DataTree) -> Iterator[dict[str, Any]]:
     """Tables of the noise levels and of the biases that were fixed."""
     if "level" in tree.children:
         frame = frame_of(tree, "level", "std", "guess")
-        yield _table("Unknown noise levels", {"level": frame.index, "std": frame["std"], "guess": frame["guess"]})
-    if fixed_ := fixed_biases(tree):
+        columns = {"level": frame.index} | {name: map(number, frame[name]) for name in frame}
+        yield _table("Unknown noise levels", columns)
+    if fixed_ := held_biases(tree):
         values = [number(value, 6) for value in fixed_.values()]
         yield _table("Fixed biases", {"bias": fixed_, "value": values}, most=len(values))
 
@@ -138,11 +138,11 @@ def _of_scans(tree: xr.DataTree) -> Iterator[dict[str, Any]]:
             "scans": frame["scans"].astype(int).astype(str),
             "detections": frame["detections"].astype(int).astype(str),
             "share of objects": [fixed(value, 2) for value in frame["of_objects"] / frame["detections"]],
-            "false a scan": false,
-            "declared clutter": frame["clutter"],
+            "false a scan": map(number, false),
+            "declared clutter": map(number, frame["clutter"]),
             "looks": [f"{value:.0f}" for value in frame["looks"]],
             "share of looks detected": [fixed(value, 2) for value in frame["of_objects"] / frame["looks"]],
-            "declared probability": frame["detection_probability"],
+            "declared probability": map(number, frame["detection_probability"]),
         }
         yield _table("Detections by sensor", columns)
 
@@ -154,11 +154,11 @@ def _of_data(tree: xr.DataTree) -> Iterator[dict[str, Any]]:
         scale = tree["calibration"].to_dataset()["scale"].values
         apart = np.abs((group["bias"].values - group["bias"].values[0]) / scale).max(1)
         score = evidence_in(group) or "objective"
-        columns = {
+        columns: dict[str, Any] = {
             "start": group["start"].values.astype(str),
             "status": group["status"].values,
             EVIDENCES.get(score, score): [number(value, 7) for value in group[score].values],
-            "largest difference, in scales": apart,
+            "largest difference, in scales": [number(value) for value in apart],
         }
         yield _table("Optima of several starts", columns, most=len(apart))
     if weighted(tree) and len(listed := outliers(tree)):

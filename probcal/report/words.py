@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from markupsafe import Markup, escape
 
-from probcal.results.read import summary, true_biases
+from probcal.results.read import known_truth, summary
 from probcal.status import INVALID, Status
 
 NONE = "–"  # where there is no finite number
@@ -110,7 +110,7 @@ def bias_frame(tree: xr.DataTree) -> Any:
 
     Verdict and reason are empty where the fit was not assessed.
     """
-    frame = summary(tree).set_index("bias").assign(true=true_biases(tree))
+    frame = summary(tree).set_index("bias").assign(true=known_truth(tree))
     frame["far"] = (frame["mean"] / frame["sd"]).abs().fillna(np.inf)
     frame["away"] = (frame["lower"] > 0) | (frame["upper"] < 0)
     frame["grain"] = np.maximum(frame["sd"], 1e-3 * frame["scale"])  # digits finer than that say nothing

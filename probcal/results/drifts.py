@@ -10,7 +10,7 @@ import pandas as pd
 from probcal.errors import checked
 from probcal.labels import step_of
 from probcal.results.blocks import SensorBlocks
-from probcal.results.read import fixed_biases
+from probcal.results.schema import held_biases
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -30,7 +30,7 @@ def drift_table(tree: xr.DataTree) -> pd.DataFrame:
     if not {"calibration", "posterior"} <= set(tree.children):
         return pd.DataFrame(columns=columns)
     group, draws = tree["calibration"].to_dataset(), tree["posterior"].to_dataset()["bias"]
-    free, fixed = group["unit"].to_series(), fixed_biases(tree)
+    free, fixed = group["unit"].to_series(), held_biases(tree)
     every = [*free.index, *fixed]
     start = float(tree["observed_data"].to_dataset()["time"].min())
     tail = (1 - tree.attrs["interval_probability"]) / 2

@@ -13,7 +13,7 @@ import numpy as np
 from probcal.errors import InputError, checked
 from probcal.labels import NOBODY
 from probcal.results.blocks import SensorBlocks
-from probcal.results.schema import MORE, SUMMARY
+from probcal.results.schema import MORE, SUMMARY, held_biases
 from probcal.status import INVALID
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def frame_of(tree: xr.DataTree, group: str, *columns: str) -> Any:
     return data[chosen].to_dataframe()[chosen] if chosen else data.to_dataframe()
 
 
-def true_biases(tree: xr.DataTree) -> pd.Series:
+def known_truth(tree: xr.DataTree) -> pd.Series:
     """The true biases that a scored tree knows, by label; empty where it was not scored."""
     import pandas as pd  # loaded where a table is made
 
@@ -147,16 +147,10 @@ class Calibrated:
         return self.spread.matrix()
 
 
-def fixed_biases(tree: xr.DataTree) -> dict[str, float]:
-    """The biases that a fit held, and their values."""
-    constant = tree["constant_data"].to_dataset() if "constant_data" in tree.children else {}
-    return {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
-
-
 def bias_values(tree: xr.DataTree) -> dict[str, float]:
     """Value of every bias by label: the mean of a fit, or what it was held at."""
     means = tree["calibration"].to_dataset()["mean"].to_series().items()
-    return {str(label): float(value) for label, value in means} | fixed_biases(tree)
+    return {str(label): float(value) for label, value in means} | held_biases(tree)
 
 
 def stated_values(tree: xr.DataTree) -> dict[str, float]:
@@ -170,7 +164,7 @@ def stated_values(tree: xr.DataTree) -> dict[str, float]:
 
 def held_by(calibration: xr.DataTree, labels: Sequence[str]) -> dict[str, float]:
     """The biases among some labels that a fit held fixed, and their values."""
-    return {label: value for label, value in fixed_biases(calibration).items() if label in labels}
+    return {label: value for label, value in held_biases(calibration).items() if label in labels}
 
 
 @checked
